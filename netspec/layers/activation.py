@@ -145,7 +145,8 @@ class ReLU(Activation):
             return torch.clamp_min(x, 0, out=rooms[0].like(x))
 
         def backward(diff: torch.Tensor) -> torch.Tensor:
-            return gradient(diff, rooms[0].like(diff), 0, grad_input=rooms[1].like(diff))
+            top = rooms[0].like(diff)
+            return gradient(diff, top, 0, grad_input=rooms[1].like(top))  # in the order in which autograd has it
 
         return Kernels(forward, backward)
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 
@@ -11,7 +13,16 @@ from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.folding import Affine, blob_in_double
-from netspec.layers.contract.kernels import RELU, Kernel, Kernels, Preparation, channel_factors, finished, finishing
+from netspec.layers.contract.kernels import (
+    RELU,
+    Kernel,
+    Kernels,
+    Preparation,
+    Room,
+    channel_factors,
+    finished,
+    finishing,
+)
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import TEST
@@ -36,6 +47,7 @@ class BatchNorm(Layer):
     """
 
     default_param_lr = 0.0
+    joined: tuple[Layer, ...] = ()  # a Scale of its channels, a ReLU: it does their work too, where the batch counts
     fresh = True
     any_layout = True
 
@@ -64,6 +76,10 @@ class BatchNorm(Layer):
             return self._by_past(self.is_exact(data, self.small))(data)
         return self._by_batch(data)
 
+    @property
+    def _eps(self) -> float:
+        return self.param.batch_norm_param.eps
+
     def past(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the mean and the variance of each channel, (C,), that the sums stand for."""
         with torch.no_grad():
@@ -81,48 +97,97 @@ class BatchNorm(Layer):
         arguments = (torch.zeros_like(mean) if far else mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
         return lambda data: torch.batch_norm(data - by_channel if far else data, None, None, *arguments)
 
-    def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
-        """Normalize a batch; torch's kernel also scales by channel, and its top may be overwritten by an activation."""
-        data, factors = bottoms[0], channel_factors(following[0]) if following else None
-        self.fit([tuple(data.shape)])
-        if factors is None or self.use_global_stats or self.is_exact(data, self.small):
-            return 0, self.run(*bottoms)
-        top = self._by_batch(data, *factors)
-        if len(following) > 1 and finishing(following[1]) == RELU:
-            return 2, (RELU.change(top),)
-        return 1, (top,)
+    def join(self, after: Layer) -> Layer | None:
+        """Return this layer with a Scale of its channels after it, or a ReLU: torch's kernel does all in one."""
+        scales = not self.joined and channel_factors(after) is not None
+        rectifies = finishing(after) == RELU and RELU not in map(finishing, self.joined)
+        if self.use_global_stats or self.is_exact(self.blob(0), self.small) or not (scales or rectifies):
+            return None
+        made = copy.copy(self)
+        made.joined = (*self.joined, after)
+        return made
 
-    def _by_batch(
-        self, data: torch.Tensor, factors: torch.Tensor | None = None, bias: torch.Tensor | None = None
-    ) -> torch.Tensor:
-        eps, keep = self.param.batch_norm_param.eps, self.param.batch_norm_param.moving_average_fraction
-        values = data.numel() // self.channels
-        unbiased = 1.0
+    def _factors(self) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+        """Return the learned factors and biases of the Scale that it was joined with."""
+        return (channel_factors(self.joined[0]) if self.joined else None) or (None, None)
+
+    def _rectifies(self) -> bool:
+        return bool(self.joined) and finishing(self.joined[-1]) == RELU
+
+    def _by_batch(self, data: torch.Tensor) -> torch.Tensor:
         if self.is_exact(data, self.small):
-            top, mean, variance = BatchNormalization.apply(data.reshape(*data.shape[:2], -1), eps)
-            top = top.reshape(data.shape)
-            unbiased = values / (values - 1) if values > 1 else 1.0
-        else:
-            top, mean, variance = _normalize(data, eps, factors, bias)
-            if _far_from_zero(mean, variance, eps):
-                # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
-                top, _, variance = _normalize(data - mean.view(-1, *(1,) * (data.dim() - 2)), eps, factors, bias)
-            if values == 1:
-                variance = torch.zeros_like(variance)  # torch's unbiased variance is 0 / 0, Caffe's 0
-        with torch.no_grad():
-            self.blob(0).mul_(keep).add_(mean)
-            self.blob(1).mul_(keep).add_(variance, alpha=unbiased)
-            self.blob(2).mul_(keep).add_(1)
-        return top
+            values = data.numel() // self.channels
+            top, mean, variance = BatchNormalization.apply(data.reshape(*data.shape[:2], -1), self._eps)
+            self._add(mean, variance, values / (values - 1) if values > 1 else 1.0)
+            tops = (top.reshape(data.shape),)
+            for layer in self.joined:
+                tops = layer.run(*tops)
+            return tops[0]
+        top = self._normalized(data, torch.batch_norm, torch.backends.cudnn.enabled)[0]
+        return RELU.change(top) if self._rectifies() else top
+
+    def _normalized(self, data: torch.Tensor, normalize: Callable[..., Any], *options: Any) -> tuple[Any, torch.Tensor]:
+        """Return what torch's function ``normalize`` makes of a batch, and of which numbers; add up its statistics."""
+        made, mean, variance = self._by_torch(data, normalize, options)
+        if _far_from_zero(mean, variance, self._eps):
+            # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
+            data = data - mean.view(-1, *(1,) * (data.dim() - 2))
+            made, _, variance = self._by_torch(data, normalize, options)
+        # Torch's unbiased variance of one value is 0 / 0, Caffe's 0.
+        self._add(mean, torch.zeros_like(variance) if data.numel() == self.channels else variance)
+        return made, data
+
+    def _by_torch(
+        self, data: torch.Tensor, normalize: Callable[..., Any], options: Sequence[Any]
+    ) -> tuple[Any, torch.Tensor, torch.Tensor]:
+        """Return what ``normalize`` makes of a batch, its mean and its unbiased variance: running ones of one batch."""
+        exact_enough = torch.promote_types(data.dtype, torch.float32)
+        mean, variance = data.new_zeros(2, self.channels, dtype=exact_enough).unbind()
+        made = normalize(data, *self._factors(), mean, variance, True, 1.0, self._eps, *options)
+        return made, mean, variance
+
+    @torch.no_grad()
+    def _add(self, mean: torch.Tensor, variance: torch.Tensor, unbiased: float = 1.0) -> None:
+        """Add a batch's statistics to the sums."""
+        keep = self.param.batch_norm_param.moving_average_fraction
+        self.blob(0).mul_(keep).add_(mean)
+        self.blob(1).mul_(keep).add_(variance, alpha=unbiased)
+        self.blob(2).mul_(keep).add_(1)
 
     @property
     def small(self) -> bool:
         return math.prod(self.bottom_shapes[0][1:]) <= SMALL_ITEM
 
     def kernels(self, how: Preparation) -> Kernels | None:
-        if how.learns or not self.use_global_stats:
+        exact = self.is_exact(self.blob(0), self.small)
+        if self.use_global_stats:
+            return None if how.learns else finished(self._by_past(exact), how.finish)
+        if not how.learns or math.prod(self.top_shapes[0]) == 0:
             return None
-        return finished(self._by_past(self.is_exact(self.blob(0), self.small)), how.finish)
+        return None if exact else self._learning_kernels(how)
+
+    def _learning_kernels(self, how: Preparation) -> Kernels:
+        room, rectifies, sums = Room(), self._rectifies(), [*how.sums[3:], None, None][:2]
+        asked = [how.wants(0), *(total is not None for total in sums)]
+        gradients, rectified = torch.ops.aten.native_batch_norm_backward, torch.ops.aten.threshold_backward.grad_input
+        given = top = mean = deviation = torch.empty(0)
+
+        def forward(data: torch.Tensor) -> torch.Tensor:
+            nonlocal given, top, mean, deviation
+            (top, mean, deviation), given = self._normalized(data, torch.native_batch_norm)
+            return top.relu_() if rectifies else top
+
+        def backward(diff: torch.Tensor) -> torch.Tensor | None:
+            if rectifies:
+                diff = rectified(diff, top, 0, grad_input=room.like(top))
+            factors = self._factors()[0]
+            found, *learned = gradients(diff, given, factors, None, None, mean, deviation, True, self._eps, asked)
+            for total, gradient in zip(sums, learned, strict=True):
+                if total is not None:
+                    total.add_(gradient)
+            return found
+
+        return Kernels(forward, backward)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         eps = self.param.batch_norm_param.eps
@@ -185,19 +250,6 @@ def _onnx_channel_means(graph: OnnxGraph, data: str, axes: int) -> str:
     for part in ([0], list(range(2, axes))):
         data = graph.node("ReduceMean", data, graph.constant(part), keepdims=1) if part else data
     return data
-
-
-def _normalize(
-    data: torch.Tensor, eps: float, factors: torch.Tensor | None, bias: torch.Tensor | None
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the normalized batch, times factors, plus a bias, its mean and its unbiased variance, by torch's kernel.
-
-    The statistics come out exact as that kernel's running ones, all weight on the present batch.
-    """
-    exact_enough = torch.promote_types(data.dtype, torch.float32)
-    mean, variance = data.new_zeros(2, data.shape[1], dtype=exact_enough).unbind()
-    top = torch.batch_norm(data, factors, bias, mean, variance, True, 1.0, eps, torch.backends.cudnn.enabled)
-    return top, mean, variance
 
 
 def _far_from_zero(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> bool:

@@ -13,7 +13,7 @@ from netspec.exact import SMALL_ITEM
 from netspec.exact.channels import ChannelProducts
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.folding import Absorbed, Affine, blob_in_double, copy_of
-from netspec.layers.contract.kernels import Kernel, Kernels, Preparation, finished
+from netspec.layers.contract.kernels import Kernel, Kernels, Preparation, finished, recorded
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
@@ -128,9 +128,12 @@ class Scale(_Affine):
         return self.axis == 1 and axes == 1 and math.prod(shape[1:]) <= SMALL_ITEM
 
     def kernels(self, how: Preparation) -> Kernels | None:
-        if how.learns or not self.by_channel:
+        if not self.by_channel:
             return None
         scale, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
+        if how.wanted is not None:
+            adds = self.is_exact(scale, self.small) and self.context.options.accumulate_in_place  # as Caffe, by itself
+            return recorded(self.run, how.wanted, list(self.blobs)) if adds and how.steady else None
         if not self.is_exact(scale, self.small):
             return finished(_by_channel(scale, bias), how.finish)
         axes = (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))

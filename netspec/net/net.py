@@ -172,10 +172,10 @@ class Net(torch.nn.Module):
 
     def training_step(self) -> TrainingStep | str:
         """Return what trains the net by kernels prepared once, or in words why there is none."""
-        if why := obstacle(self.plan, list(self.layers), self.eager.chains):
+        if why := obstacle(self.plan, self.eager.parts()):
             return why
         weighted = partial(weighted_sum, exact=self.options.exact)
-        return TrainingStep(self.plan, list(self.layers), self.loss_weights, self.eager.overwritten, weighted)
+        return TrainingStep(self.plan, self.eager.parts(), self.loss_weights, self.eager.overwritten, weighted)
 
     def given(self, inputs: Mapping[str, Array]) -> dict[int, torch.Tensor]:
         """Return the values of the net's inputs. Raises SpecError where one is missing, or unknown."""

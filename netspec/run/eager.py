@@ -9,7 +9,7 @@ import torch
 
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.run.chains import chains, together
+from netspec.run.fold import Part, parts_of
 from netspec.run.in_place import Memory, is_overwritten, run_overwritten
 from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
 
@@ -31,7 +31,7 @@ class Eager:
         self._losses = losses_of(loss_weights)
         self._last_uses = last_uses(plan)
         self.overwritten = [is_overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
-        self.chains = chains(plan, self._layers, self._apart())
+        self._apart = self._must_be_apart()
         self._lines: dict[frozenset[int], list[Step]] = {}  # by what is kept, of the last run
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
@@ -47,20 +47,18 @@ class Eager:
 
     def _line(self, kept: frozenset[int]) -> list[Step]:
         """Return the steps of runs that keep some values."""
-        steps: list[Step] = []
-        end = -1
-        for i, node in enumerate(self._plan.nodes):
-            if i <= end:
+        nodes, steps = self._plan.nodes, list[Step]()
+        for part in self.parts(kept):
+            if len(part.members) == 1:
+                steps += self._alone(part.first, kept)
                 continue
-            following = self._chains_to(i, kept)
-            if not following:
-                steps += self._alone(i, kept)
-                continue
-            end = following[-1]
-            run = together([self._layers[k] for k in (i, *following)])
-            tops, ends = self._plan.nodes[end].tops, self._ends(i, end, kept)
-            steps.append(Step(end, run, node.bottoms, tops, ends=ends))
+            ends = self._ends(part.first, part.last, kept)
+            steps.append(Step(part.last, part.run, nodes[part.first].bottoms, nodes[part.last].tops, ends=ends))
         return steps
+
+    def parts(self, kept: frozenset[int] = frozenset()) -> list[Part]:
+        """Return the layers, those as one that may run as one where these values are kept."""
+        return parts_of(self._plan, self._layers, self._apart, kept)
 
     def _alone(self, i: int, kept: frozenset[int] = frozenset()) -> list[Step]:
         """Return the step that runs layer ``i`` alone; none for an input, whose values are given."""
@@ -85,16 +83,10 @@ class Eager:
 
         return run
 
-    def _chains_to(self, i: int, kept: frozenset[int]) -> list[int]:
-        """Return the layers that may run with layer ``i``: nothing else reads what lies between."""
-        row = self.chains[i]
-        seen = next((n for n, k in enumerate(row) if self._plan.nodes[k].bottoms[0] in kept), len(row))
-        return row[:seen]
-
     def _ends(self, first: int, last: int, kept: frozenset[int]) -> tuple[int, ...]:
         return tuple(v for i in range(first, last + 1) for v in self._last_uses[i] if v not in kept)
 
-    def _apart(self) -> list[bool]:
+    def _must_be_apart(self) -> list[bool]:
         """Return which layers must run by themselves, whatever they compute."""
         final, nodes = self._plan.final, self._plan.nodes
         read_again = {final[node.tops[0]] for node, is_read in zip(nodes, self.overwritten, strict=True) if is_read}

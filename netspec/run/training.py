@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import is_
 from typing import Any
@@ -33,21 +33,17 @@ from netspec.layers.contract.kernels import (
     own_kernels,
     recorded,
 )
+from netspec.run.fold import Part
 from netspec.run.walk import losses_of
 
 LARGEST = 2**22  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory
 Values = list[Any]  # by value number, a tensor or None
 
 
-def obstacle(plan: Plan, layers: Sequence[Layer], chained: Iterable[Sequence[int]] = ()) -> str:
-    """Return why a net is not trained by prepared kernels, in words; "" if it is.
-
-    ``chained[i]`` has the layers that may run together with layer i (netspec/run/chains.py).
-    """
-    for node, row in zip(plan.nodes, chained, strict=False):
-        if row:
-            return f'"{node.name}" runs together with the layers after it'
-    count = sum(math.prod(shape) for layer in layers for shape in layer.top_shapes)
+def obstacle(plan: Plan, parts: Sequence[Part]) -> str:
+    """Return why a net of these parts is not trained by prepared kernels, in words; "" if it is."""
+    layers = [layer for part in parts for layer in part.members]
+    count = sum(math.prod(shape) for part in parts for shape in part.layer.top_shapes)
     if count > LARGEST:
         return f"its tops have {count:,} numbers, more than {LARGEST:,}"
     for node, layer in zip(plan.nodes, layers, strict=True):
@@ -62,10 +58,11 @@ def obstacle(plan: Plan, layers: Sequence[Layer], chained: Iterable[Sequence[int
     readers = Counter(v for node in plan.nodes for v in node.bottoms)
     if any(count > 1 for count in readers.values()):
         return "a blob has several readers without a Split"
-    owned = Counter(id(blob) for layer in layers for blob in layer.blobs)
-    for node, layer in zip(plan.nodes, layers, strict=True):
-        if any(owned[id(blob)] > 1 for blob in layer.blobs) and not learns_alone(layer):
-            return f'"{node.name}" shares parameters, and only autograd adds up their gradients'
+    owned = Counter(id(blob) for layer in layers for blob in layer.blobs if blob.requires_grad)
+    for part in parts:
+        if any(owned[id(blob)] > 1 for blob in part.blobs) and not learns_alone(part.layer):
+            name = plan.nodes[part.last].name
+            return f'"{name}" shares parameters, and only autograd adds up their gradients'
     return ""
 
 
@@ -101,12 +98,13 @@ class TrainingStep:
     def __init__(
         self,
         plan: Plan,
-        layers: Sequence[Layer],
+        parts: Sequence[Part],
         loss_weights: Sequence[Sequence[float]],
         overwritten: Sequence[bool],
         weighted: Callable[[torch.Tensor, float], torch.Tensor],
     ) -> None:
-        self._plan, self._layers, self._loss_of = plan, list(layers), losses_of(loss_weights)
+        self._plan, self._parts, self._loss_of = plan, list(parts), losses_of(loss_weights)
+        self._layers = layers = [layer for part in parts for layer in part.members]
         self._overwritten, self._weighted = overwritten, weighted
         self._sources = [i for i, node in enumerate(plan.nodes) if not node.bottoms and not len(layers[i].blobs)]
         self._hooks: list[Any] = [
@@ -205,20 +203,20 @@ class TrainingStep:
             [blob.requires_grad for blob in blobs],
             [blob.grad for blob in blobs],
         )
-        for i, (node, layer) in enumerate(zip(plan.nodes, self._layers, strict=True)):
+        for part in self._parts:
+            i, layer, node, tops = part.last, part.layer, plan.nodes[part.first], plan.nodes[part.last].tops
             if i in self._sources:
                 if losses := self._losses(i, layer, made):
-                    made.forward.append((lambda *tops: tops, node.tops, (), losses))
+                    made.forward.append((lambda *tops: tops, tops, (), losses))
                 continue
             layer.fit([shapes[v] for v in node.bottoms])
-            shapes.update(zip(node.tops, layer.top_shapes, strict=False))
+            shapes.update(zip(tops, layer.top_shapes, strict=False))
             free = [plan.net.force_backward or not blocked for blocked in node.blocked]
             wanted = tuple(v in needs and f for v, f in zip(node.bottoms, free, strict=True))
-            learns = any(blob.requires_grad for blob in layer.blobs)
-            forward, backward = self._kernels(i, wanted)
-            made.forward.append((forward, node.bottoms, node.tops, self._losses(i, layer, made)))
-            if any(wanted) or learns:
-                needs.update(node.tops)
+            forward, backward = self._kernels(part, wanted)
+            made.forward.append((forward, node.bottoms, tops, self._losses(i, layer, made)))
+            if any(wanted) or any(blob.requires_grad for blob in part.blobs):
+                needs.update(tops)
                 bottoms = tuple(v if w else -1 for v, w in zip(node.bottoms, wanted, strict=True))
                 made.backward.append((backward, self._tops(i), bottoms))
         made.backward.reverse()
@@ -234,13 +232,16 @@ class TrainingStep:
         """Return the values that layer i makes; a loss may have a top without a name."""
         return self._plan.nodes[i].tops or (len(self._plan.blobs) + i,)
 
-    def _kernels(self, i: int, wanted: tuple[bool, ...]) -> Kernels:
-        layer = self._layers[i]
-        if self._overwritten[i]:
-            return self._overwritten_kernels(i)
-        whole = all(layer.blob(j) is blob and blob.is_contiguous() for j, blob in enumerate(layer.blobs))
-        how = Preparation(wanted, tuple(blob.grad if blob.requires_grad else None for blob in layer.blobs))
-        return (whole and own_kernels(layer, how)) or recorded(layer.run, wanted)
+    def _kernels(self, part: Part, wanted: tuple[bool, ...]) -> Kernels:
+        if self._overwritten[part.first]:
+            return self._overwritten_kernels(part.first)
+        whole = all(
+            layer.blob(j) is blob and blob.is_contiguous()
+            for layer in part.members
+            for j, blob in enumerate(layer.blobs)
+        )
+        how = Preparation(wanted, tuple(blob.grad if blob.requires_grad else None for blob in part.blobs))
+        return (whole and own_kernels(part.layer, how)) or recorded(part.layer.run, wanted, part.blobs)
 
     def _overwritten_kernels(self, i: int) -> Kernels:
         """Return the kernels of a layer whose gradient reads what later layers have left in its memory."""

@@ -161,7 +161,7 @@ class Passes:
             and not any(self._is_in_place(i, blob) for blob in self.bottoms[i])
             and all(blob.dtype == torch.float32 and blob.is_contiguous() for blob in layer.blobs)
             and all(layer.blob(j) is blob for j, blob in enumerate(layer.blobs))
-            and learns_alone(layer)
+            and learns_alone(layer, steady=False)
         )
 
     # Running
@@ -371,7 +371,8 @@ class Passes:
             layer.fit(shapes)
             sums = tuple(gradient_of(blob) if blob.requires_grad else None for blob in layer.blobs)
             wanted = tuple(self.net.backward_plan.bottoms[i])
-            made = own_kernels(layer, Preparation(wanted, sums, steady=False)) or recorded(layer.run, wanted)
+            made = own_kernels(layer, Preparation(wanted, sums, steady=False))
+            made = made or recorded(layer.run, wanted, list(layer.blobs))
             bound = self._bound[i] = Bound(shapes, places_of(layer), made)
         return bound
 

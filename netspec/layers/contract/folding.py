@@ -30,6 +30,14 @@ class Folds(Protocol):
     absorbs: bool  # whether it can absorb, at its present settings, after its own work
     absorbs_before: bool  # likewise, before it
 
+    def join(self, after: Layer) -> Layer | None:
+        """Return a layer that does the work of this one and then of another, whose blobs it reads in each run.
+
+        None where there is nothing faster than one after the other. Whoever makes its kernels gives it the sums of the
+        blobs of both.
+        """
+        ...
+
     def as_affine(self) -> Affine | None:
         """Return the map that scales and shifts the channels, axis 1, of its bottom, None where it is another."""
         ...
@@ -46,6 +54,11 @@ class Folds(Protocol):
 def as_affine(layer: Layer) -> Affine | None:
     """Return the map that a layer is, if it only scales and shifts the channels of its bottom."""
     return call(layer, "as_affine")
+
+
+def joined_with(layer: Layer, after: Layer) -> Layer | None:
+    """Return a layer that does the work of both, if the first offers one."""
+    return call(layer, "join", after)
 
 
 def passes_on(layer: Layer) -> bool:

@@ -102,14 +102,6 @@ class HasKernels(Protocol):
         """Return the map from number to number that the layer is, None where no function does it in place."""
         ...
 
-    def run_with(self, following: Sequence[Layer], *bottoms: torch.Tensor) -> tuple[int, tuple[torch.Tensor, ...]]:
-        """Run this layer and, where one kernel does their work too, some of those that follow.
-
-        Each of ``following`` has one bottom, the top of the layer before it, which nobody else reads. Returns how many
-        of them were run, and the tops of the last.
-        """
-        ...
-
     def channel_factors(self) -> tuple[torch.Tensor, torch.Tensor | None] | None:
         """Return the factors of channels, axis 1, and the biases added then, None where it does something else."""
         ...
@@ -120,9 +112,9 @@ def own_kernels(layer: Layer, how: Preparation) -> Kernels | None:
     return call(layer, "kernels", how)
 
 
-def learns_alone(layer: Layer) -> bool:
+def learns_alone(layer: Layer, steady: bool = True) -> bool:
     """Return whether a layer has kernels of its own, backward too, at its present shapes."""
-    how = Preparation((True,) * len(layer.bottom_shapes), (None,) * len(layer.blobs))
+    how = Preparation((True,) * len(layer.bottom_shapes), (None,) * len(layer.blobs), steady)
     return own_kernels(layer, how) is not None
 
 
@@ -171,8 +163,10 @@ def weight_and_bias(
     return (values[0], values[1] if has_bias else None), (how.sums[0], how.sums[1] if has_bias else None)
 
 
-def recorded(run: Callable[..., Sequence[torch.Tensor]], wanted: Sequence[bool]) -> Kernels:
-    """Return the kernels of a layer whose gradients autograd computes; ``run`` is the layer's."""
+def recorded(
+    run: Callable[..., Sequence[torch.Tensor]], wanted: Sequence[bool], blobs: Sequence[torch.Tensor] = ()
+) -> Kernels:
+    """Return the kernels of a layer whose gradients autograd computes; ``run`` is the layer's, with these blobs."""
     leaves: list[torch.Tensor] = []
     made: Sequence[torch.Tensor] = ()
 
@@ -186,10 +180,18 @@ def recorded(run: Callable[..., Sequence[torch.Tensor]], wanted: Sequence[bool])
     def backward(*diffs: Diff) -> Sequence[Diff]:
         nonlocal made
         ends = [(top, diff) for top, diff in zip(made, diffs, strict=False) if diff is not None and top.requires_grad]
-        if ends:
-            torch.autograd.backward([top for top, _ in ends], [diff for _, diff in ends])
-        made = ()
-        return [leaf.grad for leaf in leaves]
+        made, learned = (), [blob for blob in blobs if blob.requires_grad]
+        asked = [leaf for leaf in leaves if leaf.requires_grad]
+        if not ends or not (asked or learned):
+            return [None] * len(leaves)
+        # Not torch.autograd.backward: it would copy the gradients into the layout of the leaves.
+        tops, given = zip(*ends, strict=True)
+        found = torch.autograd.grad(tops, [*asked, *learned], given, allow_unused=True)
+        for blob, gradient in zip(learned, found[len(asked) :], strict=True):
+            if gradient is not None:
+                blob.grad = gradient if blob.grad is None else blob.grad.add_(gradient)
+        of_asked = iter(found)
+        return [next(of_asked) if leaf.requires_grad else None for leaf in leaves]
 
     return Kernels(forward, backward)
 

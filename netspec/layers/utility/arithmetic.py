@@ -76,8 +76,10 @@ class Eltwise(Layer):
         return top
 
     def kernels(self, how: Preparation) -> Kernels | None:
-        if how.learns or self.operation != self.SUM or self.coeff != [1.0, 1.0]:
+        if self.operation != self.SUM or self.coeff != [1.0, 1.0]:
             return None
+        if how.learns:
+            return Kernels(torch.add, lambda diff: (diff, diff))
         return finished(torch.Tensor.add_ if how.reuse else torch.add, how.finish)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:

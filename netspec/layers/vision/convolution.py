@@ -195,22 +195,25 @@ class Convolution(SlidingFilter):
         geometry = (sliding.stride, sliding.pad, sliding.dilation)
         asked = (wanted, *(total is not None for total in sums))
         bias_shape = None if bias is None else list(bias.shape)
+        # As autograd does it: of a single image, the strides that a reshape leaves decide how BatchNorm rounds.
+        shape, top_shape = self.bottom_shapes[0], self.top_shapes[0]
         gradients = torch.ops.aten.convolution_backward.default
         maps = laid_out = weight
 
         def forward(x: torch.Tensor) -> torch.Tensor:
             nonlocal maps, laid_out
-            maps, laid_out = x, lay_out(x)
-            return torch.conv2d(laid_out, weight, bias, *geometry, self.group)
+            maps = x.reshape(shape)
+            laid_out = lay_out(maps)
+            return torch.conv2d(laid_out, weight, bias, *geometry, self.group).reshape(top_shape)
 
         def backward(diff: torch.Tensor) -> torch.Tensor | None:
             maps_diff, *found = gradients(
-                diff, laid_out, weight, bias_shape, *geometry, False, [0, 0], self.group, asked
+                diff.reshape(top_shape), laid_out, weight, bias_shape, *geometry, False, [0, 0], self.group, asked
             )
             for total, gradient in zip(sums, found, strict=True):
                 if total is not None:
                     total.add_(gradient)
-            return laid_out_like(maps, maps_diff) if wanted else None
+            return laid_out_like(maps, maps_diff).reshape(shape) if wanted else None
 
         return Kernels(forward, backward)
 

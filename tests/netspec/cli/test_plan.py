@@ -44,12 +44,11 @@ def test_a_training_net_has_no_passes(run: Callable[..., Any]) -> None:
 def test_says_how_a_net_is_trained(run: Callable[..., Any]) -> None:
     folder = DEPLOY.parents[1]
     shape = ("--shape", "pair_data=2,6,64,64")
-    small = run("check", folder / "siamese_8" / "train_val.prototxt", "--plan", "--phase", "TRAIN", *shape)
-    assert "by kernels prepared once" in small.out
-    residual = run(
-        "check", folder / "siamese_resnet27_256" / "train_val.prototxt", "--plan", "--phase", "TRAIN", *shape
-    )
-    assert "runs together with the layers after it" in residual.out
+    for name, said in (("siamese_8", "by kernels prepared once"), ("siamese_resnet27_256", "by kernels prepared once")):
+        net = folder / name / "train_val.prototxt"
+        assert said in run("check", net, "--plan", "--phase", "TRAIN", *shape).out
+    large = ("--shape", "pair_data=8,6,224,224")
+    assert "more than 4,194,304" in run("check", net, "--plan", "--phase", "TRAIN", *large).out
 
 
 def test_extract_takes_passes(run: Callable[..., Any]) -> None:
