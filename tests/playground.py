@@ -94,6 +94,18 @@ def make(folder: Path) -> Path:
     return folder
 
 
+def quickstart(folder: Path) -> None:
+    """Make what ``tools/quickstart`` leaves, with fewer images and without its results."""
+    _run(
+        folder,
+        "lmdb-build walk walk --sequences 3 --frames 40 --size 160x120 --depth\n"
+        "lmdb-build pairs walk/walk_1 walk/walk_2 walk/walk_3 --different-scenes --split sequence --train-sequences "
+        "walk_1,walk_2 --val-sequences walk_3 --train 64 --val 16 --test 0 --min-gap 1 --out pairs\n"
+        "for s in train val; do lmdb-build convert -resize_width 64 -resize_height 64 walk/ pairs/$s.txt "
+        "data/pairs64_${s}_lmdb; done",
+    )
+
+
 def _run(folder: Path, text: str) -> None:
     log = folder / "log"
     for command in documents.commands(text, folder):

@@ -72,6 +72,8 @@ def test_a_page_runs_as_it_stands(page: str, made: Path, tmp_path: Path) -> None
             assert run_snippet(GIVEN + block.text, folder, log) == 0, f"{block.where}\n{log.read_text()[-3000:]}"
         elif not block.language and not block.not_run:
             for command in commands(block.text, folder):
+                if command.words[0] == "tools/quickstart":
+                    playground.quickstart(folder)
                 if PROGRAMS[command.words[0]] and not NEEDS & set(command.words):
                     status = run(Command(less(command.words), command.folder), log)
                     line = f"{block.where}: {shlex.join(command.words)}"
