@@ -171,6 +171,12 @@ def too_large(size: int) -> str:
 def write_hdf5(net: Net, path: str | Path, diff: bool = False) -> None:
     """Do what :func:`save_weights` does in HDF5, whatever the file's name."""
     shared = _shared(net)
+    nested = [layer.param.name for layer in net.layers if "/" in layer.param.name and layer.blobs]
+    if nested:
+        log.logger.warning(
+            f'{path}: Caffe loads no weights of layers with "/" in their names from HDF5: {_names(nested)}; '
+            "for Caffe write the binary format: .caffemodel without .h5, or snapshot_format: BINARYPROTO"
+        )
     with new_hdf5(path) as file:
         data = file.create_group("data")
         diffs = file.create_group("diff") if diff else None

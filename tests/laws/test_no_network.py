@@ -1,12 +1,16 @@
-"""No command reaches for the network."""
+"""No command and no engine reaches for the network."""
 
+import os
 import socket
+import subprocess
+import sys
 from pathlib import Path
 from typing import NoReturn
 
 import pytest
 
 from faults.commands import CASES
+from paths import ROOT
 
 pytestmark = pytest.mark.slow
 
@@ -24,3 +28,34 @@ def test_a_command_opens_no_connection(name: str, tmp_path: Path, monkeypatch: p
     for function in ("getaddrinfo", "gethostbyname", "create_connection"):
         monkeypatch.setattr(socket, function, refuse)
     assert CASES[name].main(CASES[name].words) == 0
+
+
+ENGINE = """
+import socket, sys
+def refuse(*arguments, **options):
+    print("looked up", arguments, flush=True)
+    raise OSError
+socket.getaddrinfo = socket.create_connection = socket.gethostbyname = socket.socket.connect = refuse
+import netspec
+net = netspec.load_net(sys.argv[1], engine=sys.argv[2], cache="none")
+net(__import__("numpy").zeros((1, 1, 4, 4), "float32"))
+assert sys.argv[2] in sys.modules and "openvino_telemetry" not in sys.modules
+"""
+
+
+@pytest.mark.parametrize("engine", ["onnxruntime", "openvino"])
+def test_an_engine_looks_up_no_host_and_writes_nothing_at_home(engine: str, tmp_path: Path) -> None:
+    pytest.importorskip(engine)
+    net, home = tmp_path / "net.prototxt", tmp_path / "home"
+    net.write_text(
+        'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 dim: 1 dim: 4 dim: 4 } } }\n'
+        'layer { name: "y" type: "ReLU" bottom: "x" top: "y" }\n'
+    )
+    home.mkdir()
+    here = {name: value for name, value in os.environ.items() if name != "CI" and not name.startswith("XDG_")}
+    env = {**here, "HOME": str(home), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", ENGINE, str(net), engine]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "looked up" not in done.stdout
+    assert [path for path in home.rglob("*") if path.is_file()] == []

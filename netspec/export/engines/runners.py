@@ -10,7 +10,8 @@ import sys
 from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from types import ModuleType
+from typing import Any, Protocol, cast
 
 import numpy as np
 
@@ -102,13 +103,24 @@ class OnnxRuntime:
         return options
 
 
+def _openvino() -> Any:
+    """Import OpenVINO without its telemetry, which looks up a host of its maker and writes to the home folder."""
+    telemetry = "openvino_telemetry"
+    before = {telemetry: sys.modules[telemetry]} if telemetry in sys.modules else {}
+    sys.modules[telemetry] = cast(ModuleType, None)  # cannot be imported: OpenVINO then takes its own empty stub
+    try:
+        import openvino
+    finally:
+        del sys.modules[telemetry]
+        sys.modules.update(before)
+    return openvino
+
+
 class OpenVino:
     """OpenVINO on the CPU; a model is compiled for each set of input shapes."""
 
     def __init__(self, folder: Path, precision: str) -> None:
-        import openvino
-
-        self._core = openvino.Core()
+        self._core = _openvino().Core()
         if precision == BF16:
             with signal_stack_kept():
                 able = self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
@@ -120,9 +132,7 @@ class OpenVino:
     @staticmethod
     def identity() -> dict[str, str]:
         """Return what a prepared model depends on."""
-        import openvino
-
-        return {"openvino": openvino.__version__}
+        return {"openvino": _openvino().__version__}
 
     @staticmethod
     def prepare(folder: Path) -> None:
