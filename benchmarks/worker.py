@@ -90,6 +90,7 @@ def opencv4(task: Task) -> Run:
 
 def onnxruntime(task: Task) -> Run:
     """Run the exported model in onnxruntime itself."""
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # it would look up a host
     import onnxruntime as ort
 
     options = ort.SessionOptions()

@@ -125,8 +125,7 @@ def _tell_missing(net: Net, loaded: set[int], paths: list[Path], strict: bool, s
         return
     nothing = not any(id(blob) in loaded for layer in learning for blob in layer.blobs)
     files = ", ".join(map(str, paths))
-    names = ", ".join(layer.param.name for layer in missing[:MOST_NAMES])
-    names += f" and {len(missing) - MOST_NAMES} more" if len(missing) > MOST_NAMES else ""
+    names = _names([layer.param.name for layer in missing])
     if nothing:
         fault = f"holds weights for none of the net's {len(learning)} layers that have any: {names}"
     else:
@@ -136,6 +135,11 @@ def _tell_missing(net: Net, loaded: set[int], paths: list[Path], strict: bool, s
         net.plan.source.report(SpecError(f"{fault}; {advice}", Where(files)))
     else:
         log.logger.warning(f"{files}: {fault}; they stay as they were filled")
+
+
+def _names(layers: list[str]) -> str:
+    more = f" and {len(layers) - MOST_NAMES} more" if len(layers) > MOST_NAMES else ""
+    return ", ".join(layers[:MOST_NAMES]) + more
 
 
 def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 import sys
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, cast
@@ -37,6 +38,26 @@ def tell_unable(choice: Choice, reason: str) -> None:
         log.logger.warning(f"precision {choice.precision}: torch runs the net in {FP32}")
 
 
+@contextmanager
+def _no_telemetry() -> Iterator[None]:
+    """Import a library in it: it then neither looks up a host of its maker's nor writes to the home folder.
+
+    OpenVINO takes an empty stub where its package for telemetry is missing; onnxruntime asks a variable at its start.
+    """
+    module, variable = "openvino_telemetry", "ORT_DISABLE_TELEMETRY"
+    before, chosen = sys.modules.get(module), os.environ.get(variable)
+    sys.modules[module] = cast(ModuleType, None)
+    os.environ[variable] = chosen or "1"
+    try:
+        yield
+    finally:
+        del sys.modules[module]
+        if before is not None:
+            sys.modules[module] = before
+        if chosen is None:
+            del os.environ[variable]
+
+
 class Runner(Protocol):
     """An open model."""
 
@@ -59,7 +80,8 @@ class OnnxRuntime:
     """onnxruntime on the CPU. Its own optimizations of a model are done once, for its version and for the processor."""
 
     def __init__(self, folder: Path) -> None:
-        import onnxruntime
+        with _no_telemetry():
+            import onnxruntime
 
         options = self._options(onnxruntime)
         options.intra_op_num_threads = threads()
@@ -73,14 +95,16 @@ class OnnxRuntime:
     @staticmethod
     def identity() -> dict[str, str]:
         """Return what a prepared model depends on."""
-        import onnxruntime
+        with _no_telemetry():
+            import onnxruntime
 
         return {"onnxruntime": onnxruntime.__version__, "processor": processor()}
 
     @classmethod
     def prepare(cls, folder: Path) -> None:
         """Optimize the model in a folder; the one that was exported goes."""
-        import onnxruntime
+        with _no_telemetry():
+            import onnxruntime
 
         options = cls._options(onnxruntime)
         options.optimized_model_filepath = str(folder / OPTIMIZED)
@@ -103,24 +127,13 @@ class OnnxRuntime:
         return options
 
 
-def _openvino() -> Any:
-    """Import OpenVINO without its telemetry, which looks up a host of its maker and writes to the home folder."""
-    telemetry = "openvino_telemetry"
-    before = {telemetry: sys.modules[telemetry]} if telemetry in sys.modules else {}
-    sys.modules[telemetry] = cast(ModuleType, None)  # cannot be imported: OpenVINO then takes its own empty stub
-    try:
-        import openvino
-    finally:
-        del sys.modules[telemetry]
-        sys.modules.update(before)
-    return openvino
-
-
 class OpenVino:
     """OpenVINO on the CPU; a model is compiled for each set of input shapes."""
 
     def __init__(self, folder: Path, precision: str) -> None:
-        self._core = _openvino().Core()
+        with _no_telemetry():
+            import openvino
+        self._core = openvino.Core()
         if precision == BF16:
             with signal_stack_kept():
                 able = self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
@@ -132,7 +145,9 @@ class OpenVino:
     @staticmethod
     def identity() -> dict[str, str]:
         """Return what a prepared model depends on."""
-        return {"openvino": _openvino().__version__}
+        with _no_telemetry():
+            import openvino
+        return {"openvino": openvino.__version__}
 
     @staticmethod
     def prepare(folder: Path) -> None:

@@ -79,6 +79,20 @@ def test_weights_of_caffes_are_written_again_byte_for_byte(case: str, golden_net
     assert (tmp_path / "again.caffemodel").read_bytes() == (GOLDEN / "train" / case / "init.caffemodel").read_bytes()
 
 
+@pytest.mark.parametrize(("name", "ending", "warned"), [("a/b", ".h5", 1), ("a/b", "", 0), ("a", ".h5", 0)])
+def test_hdf5_weights_that_caffe_would_not_load_are_warned_of(
+    name: str, ending: str, warned: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    net = net_of(
+        'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 dim: 2 } } }'
+        f'layer {{ name: "{name}" type: "InnerProduct" bottom: "x" top: "y" inner_product_param {{ num_output: 1 }} }}'
+    )
+    save_weights(net, tmp_path / f"w.caffemodel{ending}")
+    told = [record.getMessage() for record in caplog.records if "Caffe loads no weights" in record.getMessage()]
+    assert len(told) == warned
+    assert all("a/b" in text and "BINARYPROTO" in text for text in told)
+
+
 def test_the_hdf5_form_has_caffes_structure(golden_net, tmp_path: Path):
     theirs = GOLDEN / "snapshot/h5_iter_10.caffemodel.h5"
     net = golden_net("snapshot")
