@@ -37,7 +37,7 @@ def refuse(*arguments, **options):
     raise OSError
 socket.getaddrinfo = socket.create_connection = socket.gethostbyname = socket.socket.connect = refuse
 import netspec
-net = netspec.load_net(sys.argv[1], engine=sys.argv[2], cache="none")
+net = netspec.load_net(sys.argv[1], engine=sys.argv[2], cache=sys.argv[3])
 net(__import__("numpy").zeros((1, 1, 4, 4), "float32"))
 assert sys.argv[2] in sys.modules and "openvino_telemetry" not in sys.modules
 assert "ORT_DISABLE_TELEMETRY" not in __import__("os").environ
@@ -55,7 +55,7 @@ def test_an_engine_looks_up_no_host_and_writes_nothing_at_home(engine: str, tmp_
     home.mkdir()
     here = {name: value for name, value in os.environ.items() if not name.startswith(("CI", "ORT_", "XDG_"))}
     env = {**here, "HOME": str(home), "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", ENGINE, str(net), engine]
+    command = [sys.executable, "-c", ENGINE, str(net), engine, str(tmp_path / "cache")]
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "looked up" not in done.stdout
