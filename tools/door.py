@@ -16,12 +16,14 @@ def run(module: str, *words: str) -> int:
     stderr says what to run.
     """
     sys.path[0] = str(ROOT)  # in place of this folder
+    typed = sys.argv
     try:
-        return import_module("netspec.terminal.main").program(module, [*words, *sys.argv[1:]])
+        sys.argv = [typed[0], *words, *typed[1:]]
+        return import_module("netspec.terminal.main").program(module)
     except ModuleNotFoundError as fault:
         python = VENV / "bin" / "python"
         if python.is_file() and Path(sys.prefix).resolve() != VENV.resolve():
-            os.execv(python, [str(python), *sys.argv])
+            os.execv(python, [str(python), *typed])
         needed = f"to install the required packages: bash {ROOT / 'tools' / 'setup.sh'}"
         print(f"{sys.argv[0]}: {fault.msg} for {sys.executable}; {needed}", file=sys.stderr)
         return 1

@@ -157,9 +157,17 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
         return 128 + int(end.args[0] if end.args else signal.SIGINT)
 
 
+class Interrupted(KeyboardInterrupt):
+    """An interrupt by a signal, its number.
+
+    Where a KeyboardInterrupt itself passes through C code that runs Python source, as some modules do when they are
+    imported, Python notes it for good, and ends by SIGINT in the end though it was caught (Py_RunMain).
+    """
+
+
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Make SIGTERM interrupt the block as Ctrl-C does: a KeyboardInterrupt with the signal's number.
+    """Make SIGTERM interrupt the block as Ctrl-C does: an Interrupted with the signal's number.
 
     A second of either ends the process at once. Signals that the program around it handles or ignores are left alone.
     """
@@ -174,7 +182,7 @@ def interruptible() -> Iterator[None]:
         if came:
             os._exit(128 + number)
         came.append(number)
-        raise KeyboardInterrupt(number)
+        raise Interrupted(number)
 
     try:
         for number in before:
@@ -182,7 +190,7 @@ def interruptible() -> Iterator[None]:
         yield
     except Exception:
         if came:  # what is imported meanwhile may make another error of it
-            raise KeyboardInterrupt(*came) from None
+            raise Interrupted(*came) from None
         raise
     finally:
         for number, handler in before.items():

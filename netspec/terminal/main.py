@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import io
 import os
 import signal
@@ -17,14 +18,18 @@ def program(module: str, words: Sequence[str] | None = None) -> int:
     """Run the command line of a module, and return its exit status.
 
     An interrupt is one line and status 128 + its number from the start: most of a short command's time goes into
-    imports. What the encoding of stdout does not have, such as bytes of a file name that are not UTF-8, is printed as
-    escapes. Where stderr is closed, what goes there is lost.
+    imports. Without ``words`` those of the process are taken, and it ends with the command: it answers signals to
+    Python's own end, which takes 0.1 s and longer, and lets them pass then. What the encoding of stdout does not have,
+    such as bytes of a file name that are not UTF-8, is printed as escapes. Where stderr is closed, what goes there is
+    lost.
     """
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     ours = [number for number, handler in before.items() if handler in (signal.SIG_DFL, signal.default_int_handler)]
     try:
         for number in ours:
             signal.signal(number, end_at_once)
+        if words is None:
+            atexit.register(_ignore, ours)  # what is registered first comes last
         if sys.stderr is None:
             # No file gets descriptor 2 either, where libraries write.
             sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
@@ -33,7 +38,7 @@ def program(module: str, words: Sequence[str] | None = None) -> int:
         set_up()
         return _written(import_module(module).main(words))
     finally:
-        for number in ours:
+        for number in ours if words is not None else ():
             signal.signal(number, before[number])
 
 
@@ -42,6 +47,13 @@ def end_at_once(number: int, _: object) -> None:
     with suppress(OSError):
         os.write(2, b"interrupted\n")
     os._exit(128 + number)
+
+
+def _ignore(numbers: Sequence[int]) -> None:
+    """Pass signals over that would end the process at once: Python forgets that handler while it ends."""
+    for number in numbers:
+        if signal.getsignal(number) is end_at_once:
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _written(status: int) -> int:

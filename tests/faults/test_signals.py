@@ -31,9 +31,10 @@ sys.exit(run(parser, ["endless"]))
 """
 
 
-def start(code: str) -> subprocess.Popen[str]:
-    environment, pipe = {**os.environ, "PYTHONPATH": str(ROOT)}, subprocess.PIPE
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=pipe, stderr=pipe, text=True, env=environment)
+def start(*words: str) -> subprocess.Popen[str]:
+    environment, pipe = {**os.environ, "PYTHONPATH": f"{ROOT}:."}, subprocess.PIPE
+    words = words if words[1:] else ("-c", *words)
+    process = subprocess.Popen([sys.executable, *words], stdout=pipe, stderr=pipe, text=True, env=environment)
     assert line_of(process) == "begun"
     return process
 
@@ -93,6 +94,33 @@ sys.exit(run(parser, ["loading"]))
 """
 
 
+THROUGH_C = """
+import argparse, ctypes, sys, time
+from netspec.terminal.commands import Commands, run
+
+def loading(arguments):
+    names = ctypes.py_object({"print": print, "time": time})
+    ctypes.pythonapi.PyRun_String(b"print('begun', flush=True)\\nwhile True: time.sleep(0.01)", 257, names, names)
+
+ctypes.pythonapi.PyRun_String.restype = ctypes.py_object
+parser = argparse.ArgumentParser()
+Commands(parser).add("loading", loading, "")
+sys.exit(run(parser, ["loading"]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_status_where_c_code_runs_python(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # of a program started by -m
+    monkeypatch.chdir(tmp_path)
+    Path("through_c.py").write_text(THROUGH_C)
+    process = start("-m", "through_c")
+    process.send_signal(number)
+    _, said = process.communicate(timeout=30)
+    assert (process.returncode, said) == (128 + number, "interrupted\n")
+
+
 def test_one_line_where_an_import_makes_another_error_of_it() -> None:
     """Modules in C do: they know only that they could not be loaded."""
     process = start(MANGLED)
@@ -115,6 +143,37 @@ def test_one_line_from_the_first_line_of_the_program(package: str) -> None:
         words = [sys.executable, "-c", code, "--help", str(0.002 + tenth / 20)]
         done = subprocess.run(words, capture_output=True, text=True, env=environment)
         assert done.returncode == 0 or (done.returncode, done.stderr) == (143, "interrupted\n")
+
+
+LATE = """
+import atexit, os, signal, sys
+from netspec.__main__ import main
+
+def kill(*_):
+    os.kill(os.getpid(), {number})
+
+{before}
+status = main()
+{after}
+sys.exit(status)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        pytest.param("", "kill()", "interrupted\n", id="after the command"),
+        pytest.param("", "atexit.register(kill)", "interrupted\n", id="among what is to be done at the end"),
+        pytest.param("atexit.register(kill)", "", "", id="after that"),
+    ],
+)
+def test_a_signal_at_the_end(before: str, after: str, says: str, number: int) -> None:
+    """A scheduler sees the command's status, or that of one that was interrupted, and no death by a signal."""
+    code = LATE.format(before=before, after=after, number=int(number))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stderr) == (128 + number if says else 0, says)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
