@@ -10,6 +10,7 @@ import torch
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
+from netspec.layers.contract.whose import whose
 from netspec.proto.schema import given, value
 
 SSD, TSN, HAPPYNEAR = "ssd", "tsn", "happynear"
@@ -67,7 +68,7 @@ class Normalize(Layer):
         if len(shape) < 2:
             raise self.error(f"found a bottom of shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
         of_happynear = self.num_tops > 1 or "normalize_param" in fields
-        self.fork = HAPPYNEAR if of_happynear else SSD if "norm_param" in fields else self.whose()
+        self.fork = HAPPYNEAR if of_happynear else SSD if "norm_param" in fields else whose(self)
         self.across, self.eps, self.squares = self.fork == TSN, 0.0, True
         if self.fork == HAPPYNEAR:
             self._set_up_as_happynears(value(self.param, "normalize_param") if "normalize_param" in fields else None)

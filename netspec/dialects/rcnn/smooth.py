@@ -14,6 +14,7 @@ from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
+from netspec.layers.contract.whose import whose
 from netspec.layers.loss.base import (
     BATCH_SIZE,
     VALID,
@@ -98,7 +99,7 @@ class SmoothL1Loss(Loss):
         if "smooth_l1_loss_param" in fields or len(self.bottom_shapes) == 4:
             return "rcnn"
         alike = len(self.bottom_shapes) == 2 and math.prod(shape[2:]) == 1 and "loss_weight" in fields
-        return "rcnn" if alike else self.whose()
+        return "rcnn" if alike else whose(self)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the tops' shapes; the bottoms must be of one shape, but for ones at its end."""

@@ -13,6 +13,7 @@ from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.folding import Affine, blob_in_double
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
+from netspec.layers.contract.whose import whose
 from netspec.layers.normalization import as_before, onnx_normalized, torch_batch_norm
 from netspec.proto.schema import TRAIN, given, value
 
@@ -162,7 +163,7 @@ class BN(Layer):
             raise self.error(
                 f"{other} is PSPNet's and {min(segnets)} is SegNet's; use one kind only", "bn_param", other
             )
-        fork = "segmentation" if segnets else self.whose()
+        fork = "segmentation" if segnets else whose(self)
         segnet = fork == "segmentation" and not fields - segnets
         self.channels = shape[1]
         size = (1, self.channels, 1, 1)

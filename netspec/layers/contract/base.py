@@ -117,20 +117,6 @@ class Layer(torch.nn.Module):
         applies = switch.applies(self.context.options.exact, bottom, bool(small))
         return applies and all(blob.dtype == bottom.dtype for blob in self.blobs)
 
-    def whose(self) -> str:
-        """Return the dialect whose layer this is, of ``forks``: one that the net uses, else the first and a warning."""
-        used = [dialect for dialect in self.forks if dialect in self.context.options.dialects]
-        if used:
-            return used[-1]
-        names = [name for name, numbers in self.forks.items() if numbers]
-        first, *others = (f'"{name}" ({self.forks[name]})' for name in names)
-        self.unsure = (
-            "forks have other layers of this type, and nothing here shows whose it is; it is computed as that of "
-            f'{first}, not of {" or ".join(others)}; to choose, write a line "# dialect: {names[-1]}" into the '
-            f"prototxt, or pass --plugin {names[-1]}"
-        )
-        return names[0]
-
     def close(self) -> None:
         """Close files and stop threads, if the layer has any."""
 
