@@ -9,7 +9,7 @@ from netspec.layers.contract import exporting, folding, gradients, kernels, read
 from netspec.layers.data.files import ReadingLayer
 from paths import ROOT
 
-MOST_METHODS, MOST_ATTRIBUTES = 24, 14
+MOST_METHODS, MOST_ATTRIBUTES = 24, 18
 ROOMS = [exporting, folding, gradients, kernels, reading]
 
 

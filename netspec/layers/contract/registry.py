@@ -54,7 +54,7 @@ def register(
 def dialects_of(net: NetParameter) -> frozenset[str]:
     """Return the dialects that count for a net: those whose fields and layer types it has, and those for every net.
 
-    A layer of a type that several forks have shows none of them; its class tells by its fields (netspec/layers/contract/whose.py).
+    A layer of a type that several forks have shows none of them; its class tells by its fields (whose.py).
     """
     classes = {layer.type: layer_class(layer.type) for layer in net.layer}
     shown = {name for name, cls in classes.items() if cls and not cls.forks}
