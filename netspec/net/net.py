@@ -29,7 +29,7 @@ from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST
 from netspec.run.eager import Eager
 from netspec.run.prepared import Prepared
-from netspec.run.training import TrainingStep, obstacle
+from netspec.run.training import LARGEST, TrainingStep, obstacle
 from netspec.run.walk import Runner, weighted_sum
 
 Array = np.ndarray | torch.Tensor
@@ -90,6 +90,7 @@ class Net(torch.nn.Module):
         self.eager = Eager(*made)
         self.prepared = Prepared(*made, options.passes) if self.phase == TEST and options.passes else None
         self._training: TrainingStep | str | None = None  # made at the first pass that trains
+        self.largest_trained: float = LARGEST  # numbers in all tops, for training_step
         self.runners: list[Runner] = [runner for runner in (self.prepared, self.eager) if runner]
 
     def replace_layer(self, i: int, layer: Layer) -> None:
@@ -161,18 +162,26 @@ class Net(torch.nn.Module):
         Gradients are added to ``grad``. None where autograd must do it: see :meth:`training_step`, or where hooks or
         ``keep`` look at the pass. The loss is good until the next call.
         """
-        if self._training is None:
-            self._training = self.training_step()
-        if isinstance(self._training, str) or self.keep or self._training.is_watched():
+        training = self.training_kernels()
+        if training is None or self.keep or training.is_watched():
             return None
         with self._passing.lock:
-            loss, outputs = self._training.run()
+            loss, outputs = training.run()
             self._passing.own.blobs = self._passing.last = outputs
         return loss, outputs
 
+    def training_kernels(self, anew: bool = False) -> TrainingStep | None:
+        """Return what :meth:`forward_backward` runs, made once, or ``anew`` where it is next used; None without it."""
+        if anew:
+            self._training = None
+            return None
+        if self._training is None:
+            self._training = self.training_step()
+        return None if isinstance(self._training, str) else self._training
+
     def training_step(self) -> TrainingStep | str:
         """Return what trains the net by kernels prepared once, or in words why there is none."""
-        if why := obstacle(self.plan, self.eager.parts()):
+        if why := obstacle(self.plan, self.eager.parts(), self.largest_trained):
             return why
         weighted = partial(weighted_sum, exact=self.options.exact)
         return TrainingStep(self.plan, self.eager.parts(), self.loss_weights, self.eager.overwritten, weighted)

@@ -40,12 +40,12 @@ LARGEST = 2**22  # numbers in all tops: beyond, autograd's work is nothing besid
 Values = list[Any]  # by value number, a tensor or None
 
 
-def obstacle(plan: Plan, parts: Sequence[Part]) -> str:
+def obstacle(plan: Plan, parts: Sequence[Part], largest: float = LARGEST) -> str:
     """Return why a net of these parts is not trained by prepared kernels, in words; "" if it is."""
     layers = [layer for part in parts for layer in part.members]
     count = sum(math.prod(shape) for part in parts for shape in part.layer.top_shapes)
-    if count > LARGEST:
-        return f"its tops have {count:,} numbers, more than {LARGEST:,}"
+    if count > largest:
+        return f"its tops have {count:,} numbers, more than {largest:,}"
     for node, layer in zip(plan.nodes, layers, strict=True):
         if layer.context.device.type != "cpu":
             return "it runs on a GPU"
@@ -120,6 +120,8 @@ class TrainingStep:
         self._owners = [(layer.blobs._parameters, name) for layer in layers for name in layer.blobs._parameters]
         self._made: dict[tuple[torch.Size, ...], _Prepared] = {}
         self._values: Values = []
+        self.keeps = False  # whether ``passed`` has the values of a pass, and their gradients, until the next
+        self.passed: tuple[Values, Values] | None = None
 
     def is_watched(self) -> bool:
         """Return whether hooks wait for autograd's passes, on layers or learnable blobs, or there is no autograd."""
@@ -182,6 +184,7 @@ class TrainingStep:
                     if v >= 0 and diff is not None:
                         diffs[v] = diff if diffs[v] is None else diffs[v] + diff
         self._values = []
+        self.passed = (values, diffs) if self.keeps else None
         outputs = {name: values[v].clone() for name, v in self._plan.outputs.items()}
         return torch.zeros(()) if loss is None else loss, outputs
 

@@ -196,6 +196,13 @@ class Passes:
         for memory in fresh.values():
             memory.leave_views()
         self._bound = [None] * len(self._layers)  # kernels keep the memory that they compute into
+        self.net.training_kernels(anew=True)
+
+    def forget(self, kernels: bool) -> None:
+        """Forget the runs of layers: a later backward pass takes what their blobs hold now; and their kernels."""
+        self._tapes = [None] * len(self._layers)
+        if kernels:
+            self._bound = [None] * len(self._layers)
 
     @torch.no_grad()
     def forward(self, start: int, end: int) -> torch.Tensor:

@@ -5,6 +5,7 @@ Caffe: python/caffe/_caffe.cpp, src/caffe/solver.cpp
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -18,6 +19,7 @@ from netspec.compat.pycaffe import mode
 from netspec.compat.pycaffe.debug import debug_info
 from netspec.compat.pycaffe.errors import caffes_errors
 from netspec.compat.pycaffe.net import FilePath, Net
+from netspec.compat.pycaffe.whole import WholePass
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.reading import Constant
 from netspec.layers.utility.python import Python
@@ -41,6 +43,8 @@ class _Training(core_solver.Solver):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
+        self.net.largest_trained = math.inf  # blobs keep all tops in any case
+        self._whole: WholePass | None = None  # which the first pass may show to be possible
         self.is_watched = bool(self.net.inputs) or any(
             isinstance(layer, Python)
             or (isinstance(layer, Constant) and any(top is not None for top in layer.filled_once()))
@@ -67,11 +71,12 @@ class _Training(core_solver.Solver):
     @override
     def forward_backward(self) -> tuple[torch.Tensor, Outputs]:
         """Run forward and backward; only the last pass of several, and one that somebody watches, fills the blobs."""
-        seen = self.is_watched or self.param.debug_info or not self.to_come
-        if not seen and (passed := self.net.forward_backward()):
+        seen, passes = self.is_watched or self.param.debug_info, self.shown[self.net].passes
+        if not seen and (passed := self._whole.run() if self._whole else self.to_come and self.net.forward_backward()):
             return passed
         loss, outputs = self.forward(self.net)
-        self.shown[self.net].passes.backward(len(self.net.layers) - 1, 0)
+        passes.backward(len(self.net.layers) - 1, 0)
+        self._whole = WholePass(passes) if WholePass.suits(passes) else None
         return loss, outputs
 
     @override

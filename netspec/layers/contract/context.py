@@ -59,6 +59,11 @@ class Random:
             self._begun.add(key)
         return self._generators[key]
 
+    @property
+    def has_drawn(self) -> bool:
+        """Whether something was drawn for this part."""
+        return bool(self._begun)
+
     @contextmanager
     def undisturbed(self) -> Iterator[None]:
         """Let draws within the block be drawn again after it."""

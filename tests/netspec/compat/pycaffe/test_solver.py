@@ -1,6 +1,7 @@
 """caffe.SGDSolver and the others: what Caffe's test_solver.py checks, and loops as scripts have them."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,9 @@ import pytest
 
 import netspec
 import netspec.pycaffe as caffe
+from benchmarks.case import training_case
+from benchmarks.zoo import ZOO
+from netspec.compat.pycaffe import mode
 from pycaffe_nets import CLASSES, SMALL
 
 SETTINGS = """
@@ -216,3 +220,60 @@ def test_debug_info_logs_what_netspecs_own_solver_logs(
         logs.append([m for m in caplog.messages if "ward]" in m])
     assert logs[0] == logs[1]
     assert len(logs[0]) > 10
+
+
+def shown(solver: caffe.SGDSolver) -> dict[str, np.ndarray]:
+    """Copies of all that a script can see."""
+    seen = {
+        f"{name}/{what}": getattr(blob, what) for name, blob in solver.net.blobs.items() for what in ("data", "diff")
+    }
+    for name, blobs in solver.net.params.items():
+        seen |= {f"{name}/{j}/{what}": getattr(b, what) for j, b in enumerate(blobs) for what in ("data", "diff")}
+    return {key: value.copy() for key, value in seen.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["sgd_step", "sgd_iter_size", "adam", "tiny", "lenet", "cifar10_quick", "pnet"])
+def test_single_steps_leave_in_the_blobs_what_passes_from_layer_to_layer_do(
+    case: str, work_in: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bit by bit where all is computed in Caffe's order; otherwise kernels may round otherwise than autograd."""
+    monkeypatch.setattr("netspec.net.net.LARGEST", 2**10)  # pycaffe has no limit
+    monkeypatch.setattr(mode, "exact", lambda: "all")
+    with ExitStack() as stack:
+        if case in ZOO:
+            made = stack.enter_context(training_case(case, 3))
+            file, weights = made.solver, made.caffemodel
+        else:
+            work_in(f"train/{case}")
+            file, weights = f"{case}/solver.prototxt", f"{case}/init.caffemodel"
+        whole, slow = caffe.get_solver(file), caffe.get_solver(file)
+        slow._training.is_watched = True
+        for solver in (whole, slow):
+            solver.net.copy_from(weights)
+        last = list(whole.net.blobs)[-1]
+        for k in range(5):
+            view = whole.net.blobs[last].data if k == 3 else None
+            for solver in (whole, slow):
+                solver.step(2 if k == 4 else 1)
+                if k == 2 and case != "pnet":  # where autograd watches PReLU in place, it refuses
+                    solver.net.backward()
+            assert view is None or view == slow.net.blobs[last].data
+            expected = shown(slow)
+            for key, value in shown(whole).items():
+                np.testing.assert_array_equal(value, expected[key], err_msg=f"{k}: {key}")
+        assert whole._training._whole is not None
+        for solver in (whole, slow):  # what a script writes counts
+            next(iter(solver.net.params.values()))[0].data[...] *= 0.5
+            solver.step(1)
+            solver.net.forward(start=list(solver.net.layer_dict)[1])
+        np.testing.assert_array_equal(whole.net.blobs[last].data, slow.net.blobs[last].data)
+
+
+def test_a_net_that_draws_is_run_from_layer_to_layer(write: Callable[..., str]) -> None:
+    write(SMALL)  # its data are drawn
+    solver = caffe.SGDSolver(write(SETTINGS, "solver.prototxt"))
+    solver._training.is_watched = False
+    solver.step(1)
+    solver.step(1)
+    assert solver._training._whole is None
