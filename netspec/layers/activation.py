@@ -18,7 +18,8 @@ from netspec.exact import ALL, libm, switch
 from netspec.exact.channels import Slopes
 from netspec.exact.pointwise import Pointwise, tanh_gradient
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.kernels import RELU, Finish, Kernels, Preparation, Room, finished
+from netspec.layers.contract.folding import Folds
+from netspec.layers.contract.kernels import RELU, Finish, Kernels, Preparation, Room, clip, finished
 from netspec.layers.contract.learned import values_of
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
@@ -51,8 +52,8 @@ class Rounded(Activation):
 
     in_place: ClassVar[Finish | None] = None  # where torch has a function that overwrites its argument
 
-    def finishing(self) -> Finish | None:
-        return None if self.context.options.exact == ALL else type(self).in_place
+    def folds(self) -> Folds:
+        return Folds(finish=None if self.context.options.exact == ALL else type(self).in_place)
 
     # Torch's function into ``out``, and its gradient, from the top's and the top, into ``grad_input``.
     by_torch: ClassVar[tuple[Callable[..., torch.Tensor], Callable[..., torch.Tensor]] | None] = None
@@ -131,10 +132,10 @@ class ReLU(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return F.leaky_relu(x, self.slope) if self.slope else F.relu(x)
 
-    def finishing(self) -> Finish:
+    def folds(self) -> Folds:
         if not self.slope:
-            return RELU
-        return Finish(f"leaky_relu {self.slope}", partial(F.leaky_relu_, negative_slope=self.slope))
+            return Folds(finish=RELU)
+        return Folds(finish=Finish(f"leaky_relu {self.slope}", partial(F.leaky_relu_, negative_slope=self.slope)))
 
     def kernels(self, how: Preparation) -> Kernels | None:
         if self.slope or not how.learns:
@@ -346,6 +347,9 @@ class Clip(Activation):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.clamp(max=self.high).clamp(min=self.low)
+
+    def folds(self) -> Folds:
+        return Folds(finish=clip(self.low, self.high) if self.low <= self.high else None)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return diff * ((bottom >= self.low) & (bottom <= self.high))

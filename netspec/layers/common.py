@@ -14,7 +14,7 @@ from netspec.exact.vectors import ChosenRows, SummedProducts, VectorProducts
 from netspec.layers.contract import fused
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.folding import Absorbed, blob_like, copy_of
+from netspec.layers.contract.folding import Absorbed, Folds, blob_like, copy_of
 from netspec.layers.contract.kernels import Kernels, Preparation, Room, copies, finished, lent, weight_and_bias
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
@@ -139,11 +139,10 @@ class InnerProduct(Layer):
         top = graph.node("Gemm", vectors, graph.blob(0), *bias, transB=transposed)
         return top if self.axis == 1 else graph.reshape_to_top(top)
 
-    @property
-    def absorbs(self) -> bool:
-        return self.axis == 1
+    def folds(self) -> Folds:
+        return Folds(absorb=self._absorb if self.axis == 1 else None)
 
-    def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
+    def _absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
         param = copy_of(self.param)
         param.inner_product_param.bias_term = True
         outputs = param.inner_product_param.num_output
@@ -211,9 +210,8 @@ class Dropout(Layer):
             raise refusal(self, "ONNX", "it draws random numbers in the training phase")
         return graph.node("Identity", *bottoms)
 
-    @property
-    def passes_on(self) -> bool:
-        return self.phase != TRAIN
+    def folds(self) -> Folds:
+        return Folds(passes_on=self.phase != TRAIN)
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.phase != TRAIN:

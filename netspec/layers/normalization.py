@@ -12,16 +12,14 @@ import torch
 from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.folding import Affine, blob_in_double
+from netspec.layers.contract.folding import Affine, Folds, blob_in_double, folds_of
 from netspec.layers.contract.kernels import (
     RELU,
     Kernel,
     Kernels,
     Preparation,
     Room,
-    channel_factors,
     finished,
-    finishing,
 )
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
@@ -48,6 +46,7 @@ class BatchNorm(Layer):
 
     default_param_lr = 0.0
     joined: tuple[Layer, ...] = ()  # a Scale of its channels, a ReLU: it does their work too, where the batch counts
+    rectifies = False  # whether there is a ReLU among them
     fresh = True
     any_layout = True
 
@@ -97,22 +96,23 @@ class BatchNorm(Layer):
         arguments = (torch.zeros_like(mean) if far else mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
         return lambda data: torch.batch_norm(data - by_channel if far else data, None, None, *arguments)
 
-    def join(self, after: Layer) -> Layer | None:
+    def folds(self) -> Folds:
+        return Folds(affine=self._affine) if self.use_global_stats else Folds(join=self._join)
+
+    def _join(self, after: Layer) -> Layer | None:
         """Return this layer with a Scale of its channels after it, or a ReLU: torch's kernel does all in one."""
-        scales = not self.joined and channel_factors(after) is not None
-        rectifies = finishing(after) == RELU and RELU not in map(finishing, self.joined)
-        if self.use_global_stats or self.is_exact(self.blob(0), self.small) or not (scales or rectifies):
+        it = folds_of(after)
+        fits = (it.scales and not self.joined) or (it.finish == RELU and not self.rectifies)
+        if not fits or self.is_exact(self.blob(0), self.small):
             return None
         made = copy.copy(self)
-        made.joined = (*self.joined, after)
+        made.joined, made.rectifies = (*self.joined, after), it.finish == RELU
         return made
 
     def _factors(self) -> tuple[torch.Tensor | None, torch.Tensor | None]:
         """Return the learned factors and biases of the Scale that it was joined with."""
-        return (channel_factors(self.joined[0]) if self.joined else None) or (None, None)
-
-    def _rectifies(self) -> bool:
-        return bool(self.joined) and finishing(self.joined[-1]) == RELU
+        blobs = [layer.blob(j) for layer in self.joined for j in range(len(layer.blobs))]
+        return blobs[0] if blobs else None, blobs[1] if len(blobs) > 1 else None
 
     def _by_batch(self, data: torch.Tensor) -> torch.Tensor:
         if self.is_exact(data, self.small):
@@ -124,7 +124,7 @@ class BatchNorm(Layer):
                 tops = layer.run(*tops)
             return tops[0]
         top = self._normalized(data, torch.batch_norm, torch.backends.cudnn.enabled)[0]
-        return RELU.change(top) if self._rectifies() else top
+        return RELU.change(top) if self.rectifies else top
 
     def _normalized(self, data: torch.Tensor, normalize: Callable[..., Any], *options: Any) -> tuple[Any, torch.Tensor]:
         """Return what torch's function ``normalize`` makes of a batch, and of which numbers; add up its statistics."""
@@ -167,7 +167,7 @@ class BatchNorm(Layer):
         return None if exact else self._learning_kernels(how)
 
     def _learning_kernels(self, how: Preparation) -> Kernels:
-        room, rectifies, sums = Room(), self._rectifies(), [*how.sums[3:], None, None][:2]
+        room, rectifies, sums = Room(), self.rectifies, [*how.sums[3:], None, None][:2]
         asked = [how.wants(0), *(total is not None for total in sums)]
         gradients, rectified = torch.ops.aten.native_batch_norm_backward, torch.ops.aten.threshold_backward.grad_input
         given = top = mean = deviation = torch.empty(0)
@@ -197,9 +197,7 @@ class BatchNorm(Layer):
         constants = [graph.constant(values) for values in (ones, zeros, *self.past())]
         return graph.node("BatchNormalization", *bottoms, *constants, epsilon=eps)
 
-    def as_affine(self) -> Affine | None:
-        if not self.use_global_stats:
-            return None
+    def _affine(self) -> Affine:
         mean, variance = _means(*(blob_in_double(self, i) for i in range(3)))
         scale = (variance + self.param.batch_norm_param.eps).rsqrt()
         return scale, -mean * scale

@@ -12,7 +12,7 @@ from netspec.data.blobs import Shape
 from netspec.exact import SMALL_ITEM
 from netspec.exact.channels import ChannelProducts
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.folding import Absorbed, Affine, blob_in_double, copy_of
+from netspec.layers.contract.folding import Absorbed, Affine, Folds, blob_in_double, copy_of
 from netspec.layers.contract.kernels import Kernel, Kernels, Preparation, finished, recorded
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
@@ -147,27 +147,19 @@ class Scale(_Affine):
         """Whether it multiplies each channel by a learned factor."""
         return len(self.bottom_shapes) == 1 and self.axis == 1 and len(self.blob_shapes[0]) == 1
 
-    def channel_factors(self) -> tuple[torch.Tensor, torch.Tensor | None] | None:
+    def folds(self) -> Folds:
         if not self.by_channel:
-            return None
-        return self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
+            return Folds()
+        return Folds(affine=self._affine, scales=True, absorb_before=self._absorb_before)
 
-    def as_affine(self) -> Affine | None:
-        if not self.by_channel:
-            return None
+    def _affine(self) -> Affine:
         scale = blob_in_double(self, 0)
         return scale, blob_in_double(self, 1) if len(self.blobs) > 1 else torch.zeros_like(scale)
 
-    @property
-    def absorbs_before(self) -> bool:
-        return self.by_channel
-
-    def absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
-        own = self.as_affine()
-        assert own is not None
+    def _absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
         param = copy_of(self.param)
         param.scale_param.bias_term = True
-        factor, offset = (values.to(scale) for values in own)
+        factor, offset = (values.to(scale) for values in self._affine())
         return Absorbed(param, (factor * scale, factor * shift + offset))
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
@@ -210,9 +202,11 @@ class Bias(_Affine):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Add", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
 
-    def as_affine(self) -> Affine | None:
-        if len(self.bottom_shapes) > 1 or self.axis != 1 or len(self.blob_shapes[0]) != 1:
-            return None
+    def folds(self) -> Folds:
+        by_channel = len(self.bottom_shapes) == 1 and self.axis == 1 and len(self.blob_shapes[0]) == 1
+        return Folds(affine=self._affine if by_channel else None)
+
+    def _affine(self) -> Affine:
         shift = blob_in_double(self, 0)
         return torch.ones_like(shift), shift
 

@@ -20,8 +20,7 @@ import torch
 from netspec.graph.fold import Chain, Roles, find_chains
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.folding import Absorbed, Affine, as_affine, joined_with, passes_on
-from netspec.layers.contract.offers import offered
+from netspec.layers.contract.folding import Absorbed, Affine, folds_of
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,8 @@ def parts_of(
     for i, (node, layer) in enumerate(zip(plan.nodes, layers, strict=True)):
         before, joined = parts[-1] if parts else None, None
         if before and plan.nodes[before.last].tops == node.bottoms and not (apart[before.first] or apart[i]):
-            joined = joined_with(before.layer, layer) if [*map(is_between, node.bottoms)] == [True] else None
+            join = folds_of(before.layer).join
+            joined = join(layer) if join and [*map(is_between, node.bottoms)] == [True] else None
         if before and joined:
             parts[-1] = Part(before.first, i, joined, (*before.members, layer))
         else:
@@ -81,14 +81,15 @@ def parts_of(
 
 def roles_of(plan: Plan, layers: Sequence[Layer]) -> Roles:
     """Return what each layer of a plan is for folding."""
+    folds = [folds_of(layer) for layer in layers]
     one_top = [len(node.tops) == 1 for node in plan.nodes]
     one_to_one = [one and len(node.bottoms) == 1 for one, node in zip(one_top, plan.nodes, strict=True)]
-    affine = [one and as_affine(layer) is not None for one, layer in zip(one_to_one, layers, strict=True)]
+    affine = [one and its.affine is not None for one, its in zip(one_to_one, folds, strict=True)]
     return Roles(
-        absorbs=[one and bool(offered(layer, "absorbs")) for one, layer in zip(one_top, layers, strict=True)],
+        absorbs=[one and its.absorb is not None for one, its in zip(one_top, folds, strict=True)],
         affine=affine,
-        absorbs_before=[a and bool(offered(layer, "absorbs_before")) for a, layer in zip(affine, layers, strict=True)],
-        passes_on=[passes_on(layer) for layer in layers],
+        absorbs_before=[a and its.absorb_before is not None for a, its in zip(affine, folds, strict=True)],
+        passes_on=[its.passes_on for its in folds],
     )
 
 
@@ -102,17 +103,18 @@ def absorbed_by(chain: Chain, layers: Sequence[Layer], like: torch.Tensor | None
 
     What scales and shifts is composed in double in any case.
     """
-    scale, shift = composed([as_affine(layers[i]) for i in chain.folded])
+    affine, keeper = [folds_of(layers[i]).affine for i in chain.folded], folds_of(layers[chain.keeper])
+    scale, shift = composed([each() for each in affine if each])
     if like is not None:
         scale, shift = scale.to(like), shift.to(like)
-    absorb = offered(layers[chain.keeper], "absorb" if chain.keeper < chain.folded[0] else "absorb_before")
+    absorb = keeper.absorb if chain.keeper < chain.folded[0] else keeper.absorb_before
+    assert absorb is not None, "the chain's keeper absorbs"
     return absorb(scale, shift)
 
 
-def composed(maps: Sequence[Affine | None]) -> Affine:
+def composed(maps: Sequence[Affine]) -> Affine:
     """Return the one map that does what these do one after the other."""
     scale, shift = torch.ones((), dtype=torch.double), torch.zeros((), dtype=torch.double)
     for each in maps:
-        assert each is not None, "the chain consists of affine layers"
         scale, shift = each[0] * scale, each[0] * shift + each[1]
     return scale, shift

@@ -25,8 +25,8 @@ from netspec.graph import steps as planned
 from netspec.graph.plan import Plan
 from netspec.graph.steps import PACK, Schedule, schedule
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.folding import Absorbed, absorbing
-from netspec.layers.contract.kernels import Kernel, Preparation, finished, finishing, own_kernels
+from netspec.layers.contract.folding import Absorbed, absorbing, folds_of
+from netspec.layers.contract.kernels import Kernel, Preparation, finished, own_kernels
 from netspec.layers.contract.learned import Stamp, is_lent, stamp
 from netspec.layers.contract.offers import offered
 from netspec.layers.contract.reading import changes_itself
@@ -155,7 +155,7 @@ class Prepared:
                 affine=_both(roles.affine, foldable),
                 absorbs_before=_both(roles.absorbs_before, foldable),
             ),
-            finishes=[fit is not None and finishing(fit) is not None for fit in found],
+            finishes=[fit is not None and folds_of(fit).finish is not None for fit in found],
             fresh=[fit is not None and bool(offered(fit, "fresh")) for fit in found],
             given=[v for v, *_ in given],
             kept=kept | {v for node, losses in zip(plan.nodes, self._losses, strict=True) if losses for v in node.tops},
@@ -214,7 +214,7 @@ class Prepared:
         if step.chain:
             chain = step.chain
             layer = absorbing(layer, memo("fold", lambda: absorbed_by(chain, layers, layers[chain.keeper].blobs[0])))
-        finish = None if step.finish is None else finishing(layers[step.finish])
+        finish = None if step.finish is None else folds_of(layers[step.finish]).finish
         how = Preparation(
             finish=finish, reuse=step.reuse, lasts=step.lasts, memo=memo, pack=PACK in self.passes, keeps=keeps
         )

@@ -18,6 +18,7 @@ from netspec.dialects.blocks.relu6 import Capped
 from netspec.layers import activation, common, register
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.folding import Folds
 from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.vision import convolution, pooling, windows
@@ -112,8 +113,8 @@ class Convolution(convolution.Convolution):
             bottoms = tuple(F.pad(bottom, self.sides) for bottom in bottoms)
         return super().forward(*bottoms)
 
-    absorbs = convolution.Convolution.absorbs
-    absorb = convolution.Convolution.absorb
+    def folds(self) -> Folds:
+        return super().folds()
 
     def kernels(self, how: Preparation) -> Kernels | None:
         return None if any(self.sides) else super().kernels(how)
@@ -279,9 +280,8 @@ class Dropout(common.Dropout):
             return top
         return graph.node("Mul", *bottoms, graph.constant(1 - self.ratio))
 
-    @property
-    def passes_on(self) -> bool:
-        return super().passes_on and bool(value(self.param.dropout_param, "scale_train"))
+    def folds(self) -> Folds:
+        return super().folds() if value(self.param.dropout_param, "scale_train") else Folds()
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if value(self.param.dropout_param, "scale_train"):

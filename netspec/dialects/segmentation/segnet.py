@@ -11,7 +11,7 @@ import torch.nn.functional as F
 
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.folding import Affine, blob_in_double
+from netspec.layers.contract.folding import Affine, Folds, blob_in_double
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.layers.contract.whose import whose
 from netspec.layers.normalization import as_before, onnx_normalized, torch_batch_norm
@@ -218,9 +218,10 @@ class BN(Layer):
         normalized = onnx_normalized(graph, bottoms[0], len(self.bottom_shapes[0]), self.eps)
         return graph.node("Add", graph.node("Mul", normalized, slope), bias)
 
-    def as_affine(self) -> Affine | None:
-        if self.by_batch:
-            return None
+    def folds(self) -> Folds:
+        return Folds(affine=None if self.by_batch else self._affine)
+
+    def _affine(self) -> Affine:
         slope, bias = (blob_in_double(self, i).reshape(-1) for i in (0, 1))
         if not self.moving:
             return slope, bias

@@ -18,7 +18,7 @@ from netspec.export.formats.torch import export_torch, write_tensors
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.graph.prune import prune
-from netspec.layers.contract.folding import passes_on
+from netspec.layers.contract.folding import folds_of
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights
@@ -114,7 +114,7 @@ def fold_files(source: Source, prefix: Path) -> tuple[int, int]:
     net = source.net()
     message = fold(net)
     write_caffe(message, prefix)
-    splits = sum(passes_on(layer) for layer in net.layers)
+    splits = sum(folds_of(layer).passes_on for layer in net.layers)
     return len(net.layers) - splits, len(message.layer)
 
 

@@ -18,7 +18,7 @@ from netspec.graph.filter import filter_net
 from netspec.graph.fold import origins
 from netspec.graph.inputs import add_input
 from netspec.graph.options import BuildOptions
-from netspec.layers.contract.folding import passes_on
+from netspec.layers.contract.folding import folds_of
 from netspec.layers.contract.reading import reads_data
 from netspec.net.build import build_net
 from netspec.net.given_shapes import not_to_be_given
@@ -68,7 +68,7 @@ def fold(net: Net) -> NetParameter:
     """
     folds = find_folds(net.plan, list(net.layers))
     plan = net.plan
-    passes = [passes_on(layer) for layer in net.layers]
+    passes = [folds_of(layer).passes_on for layer in net.layers]
     origin = origins(plan, passes)
     names = _names(net, origin)
     gone = {i for each in folds for i in each.chain.folded}
@@ -107,7 +107,7 @@ def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
     taken.update(
         origin[v]
         for node, layer in zip(plan.nodes, net.layers, strict=True)
-        if not passes_on(layer)
+        if not folds_of(layer).passes_on
         for v in node.bottoms
     )
     taken.update(v for node, layer in zip(plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops)

@@ -13,7 +13,7 @@ from netspec.export.formats.source import MARK, Module, Program, Statement, mark
 from netspec.graph.fold import origins
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.exporting import export
-from netspec.layers.contract.folding import passes_on
+from netspec.layers.contract.folding import folds_of
 from netspec.layers.contract.targets import Sizes
 from netspec.net.net import Net
 
@@ -41,7 +41,7 @@ class _Collector:
         self.net, self.shapes = net, shapes
         self.program = Program(names=dict(enumerate(net.plan.blobs)))
         self.value = list(range(len(net.plan.blobs)))  # value of the Plan -> value of the program
-        passes = [passes_on(layer) for layer in net.layers]
+        passes = [folds_of(layer).passes_on for layer in net.layers]
         origin = origins(net.plan, passes)
         self.readers = [0] * len(self.value)
         for node, passed in zip(net.plan.nodes, passes, strict=True):

@@ -1,16 +1,24 @@
-"""How one layer does the work of others, once weights stay as they are: netspec/run/fold.py puts the parts together."""
+"""How the work of a layer and that of its neighbors become one: netspec/graph/fold.py and run/fold.py put it together.
+
+A convolution y = W x + b followed by z = s y + t, both s and t one number for each channel, is a convolution with the
+weights s W and the bias s b + t. A map from number to number can be done in place to the top of the layer before it.
+Both leave layers out where weights stay as they are. Where a net learns, two layers may be joined: one layer does the
+work of both, and reads the blobs of both in each run.
+"""
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
 
 from netspec.layers.contract.base import Layer
+from netspec.layers.contract.kernels import Finish
 from netspec.layers.contract.learned import values_of
-from netspec.layers.contract.offers import call, offered
+from netspec.layers.contract.offers import call
 
 Affine = tuple[torch.Tensor, torch.Tensor]  # scale and shift of each channel, (C,) in double: y = scale x + shift
 
@@ -23,47 +31,44 @@ class Absorbed:
     blobs: tuple[torch.Tensor, ...]
 
 
-class Folds(Protocol):
-    """What a layer can offer to those who fold a net; any part of it may be missing."""
+Absorb = Callable[[torch.Tensor, torch.Tensor], Absorbed]  # of a scale and a shift, in their precision
 
-    passes_on: bool  # whether every top is the bottom, unchanged
-    absorbs: bool  # whether it can absorb, at its present settings, after its own work
-    absorbs_before: bool  # likewise, before it
 
-    def join(self, after: Layer) -> Layer | None:
-        """Return a layer that does the work of this one and then of another, whose blobs it reads in each run.
+@dataclass(frozen=True)
+class Folds:
+    """What a layer is to its neighbors, at its present settings.
 
-        None where there is nothing faster than one after the other. Whoever makes its kernels gives it the sums of the
-        blobs of both.
-        """
+    ``passes_on``: every top is the bottom, unchanged. ``finish``: the layer is this map from number to number.
+    ``affine`` returns how it scales and shifts the channels, axis 1, of its bottom, where that is all it does; it
+    ``scales`` where factors are its blob 0 and biases, if any, its blob 1. ``absorb`` returns the layer that scales and
+    shifts the channels of its top as well, ``absorb_before`` that which does so to its bottom before its own work.
+    ``join(after)`` returns a layer that does the work of this one and then of another, None where nothing is faster
+    than one after the other; its kernels get the sums of the blobs of both.
+    """
+
+    passes_on: bool = False
+    finish: Finish | None = None
+    affine: Callable[[], Affine] | None = None
+    scales: bool = False
+    absorb: Absorb | None = None
+    absorb_before: Absorb | None = None
+    join: Callable[[Layer], Layer | None] | None = None
+
+
+class Foldable(Protocol):
+    """What a layer can offer to those who fold a net."""
+
+    def folds(self) -> Folds:
+        """Return what the layer is to its neighbors."""
         ...
 
-    def as_affine(self) -> Affine | None:
-        """Return the map that scales and shifts the channels, axis 1, of its bottom, None where it is another."""
-        ...
 
-    def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
-        """Return the layer that scales and shifts the channels of its top as well; in their precision."""
-        ...
-
-    def absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
-        """Return the layer that scales and shifts the channels of its bottom before its own work."""
-        ...
+_NOTHING = Folds()
 
 
-def as_affine(layer: Layer) -> Affine | None:
-    """Return the map that a layer is, if it only scales and shifts the channels of its bottom."""
-    return call(layer, "as_affine")
-
-
-def joined_with(layer: Layer, after: Layer) -> Layer | None:
-    """Return a layer that does the work of both, if the first offers one."""
-    return call(layer, "join", after)
-
-
-def passes_on(layer: Layer) -> bool:
-    """Return whether every top of a layer is its bottom, unchanged."""
-    return bool(offered(layer, "passes_on"))
+def folds_of(layer: Layer) -> Folds:
+    """Return what a layer is to its neighbors."""
+    return call(layer, "folds") or _NOTHING
 
 
 def absorbing(layer: Layer, absorbed: Absorbed) -> Layer:

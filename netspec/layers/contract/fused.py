@@ -15,7 +15,7 @@ import torch
 
 from netspec.exact.products import Filter
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.kernels import RELU, Kernels, Preparation, finished
+from netspec.layers.contract.kernels import Finish, Kernels, Preparation, finished
 from netspec.layers.contract.learned import values_of
 
 _NEEDED = ("_convolution_pointwise", "_linear_pointwise", "_convolution_transpose_pointwise")
@@ -49,13 +49,13 @@ def convolution(
     geometry = [list(sliding.pad), list(sliding.stride), list(sliding.dilation), group]
     weight = _laid_out(_ops()._reorder_convolution_weight, weight, geometry, shape, how)
     bias = _kept(bias, how)
-    call, relu = _ops()._convolution_pointwise.default, how.finish == RELU
-    arguments = (*geometry, "relu" if relu else "none", [], "")
+    call, (operation, rest) = _ops()._convolution_pointwise.default, _within(how.finish)
+    arguments = (*geometry, *operation, "")
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         return call(maps.contiguous(memory_format=torch.channels_last), weight, bias, *arguments)
 
-    return finished(kernel, None if relu else how.finish)
+    return finished(kernel, rest)
 
 
 def deconvolution(
@@ -126,6 +126,13 @@ def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -
     name = f"rows {tuple(weight.shape)} {weight.stride()}"  # of a shared matrix one layer may take the transpose
     weight = how.memo(name, lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))
     bias = _kept(bias, how)
-    call, relu = _ops()._linear_pointwise.default, how.finish == RELU
-    arguments = ("relu" if relu else "none", [], "")
-    return finished(lambda vectors: call(vectors, weight, bias, *arguments), None if relu else how.finish)
+    call, (operation, rest) = _ops()._linear_pointwise.default, _within(how.finish)
+    return finished(lambda vectors: call(vectors, weight, bias, *operation, ""), rest)
+
+
+def _within(finish: Finish | None) -> tuple[tuple[str, list[float]], Finish | None]:
+    """Return what a kernel does to its top itself, and what is left to do then."""
+    if finish is None or finish.operation is None:
+        return ("none", []), finish
+    name, numbers = finish.operation
+    return (name, list(numbers)), None

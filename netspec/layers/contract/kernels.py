@@ -38,13 +38,22 @@ class Kernels(NamedTuple):
 
 @dataclass(frozen=True)
 class Finish:
-    """A map from number to number, known by its name; ``change`` does it to its argument in place, and returns it."""
+    """A map from number to number, known by its name; ``change`` does it to its argument in place, and returns it.
+
+    ``operation``: its name and numbers in the kernels of oneDNN, where these compute the same bits, NaN aside.
+    """
 
     name: str
     change: Callable[[torch.Tensor], torch.Tensor] = field(compare=False)
+    operation: tuple[str, tuple[float, ...]] | None = None
 
 
-RELU = Finish("relu", F.relu_)  # whose gradient does not read what it overwrites
+RELU = Finish("relu", F.relu_, ("relu", ()))  # whose gradient does not read what it overwrites
+
+
+def clip(low: float, high: float) -> Finish:
+    """Return the map max(low, min(x, high)), for ``low`` up to ``high``."""
+    return Finish(f"clip {low} {high}", lambda x: x.clamp_(low, high), ("hardtanh", (low, high)))
 
 
 @dataclass(frozen=True)
@@ -98,14 +107,6 @@ class HasKernels(Protocol):
         """
         ...
 
-    def finishing(self) -> Finish | None:
-        """Return the map from number to number that the layer is, None where no function does it in place."""
-        ...
-
-    def channel_factors(self) -> tuple[torch.Tensor, torch.Tensor | None] | None:
-        """Return the factors of channels, axis 1, and the biases added then, None where it does something else."""
-        ...
-
 
 def own_kernels(layer: Layer, how: Preparation) -> Kernels | None:
     """Return the kernels that a layer has for its present shapes, None where it has none of its own."""
@@ -116,16 +117,6 @@ def learns_alone(layer: Layer, steady: bool = True) -> bool:
     """Return whether a layer has kernels of its own, backward too, at its present shapes."""
     how = Preparation((True,) * len(layer.bottom_shapes), (None,) * len(layer.blobs), steady)
     return own_kernels(layer, how) is not None
-
-
-def finishing(layer: Layer) -> Finish | None:
-    """Return the map from number to number that a layer is, where it can be done in place."""
-    return call(layer, "finishing")
-
-
-def channel_factors(layer: Layer) -> tuple[torch.Tensor, torch.Tensor | None] | None:
-    """Return the learned factors and biases of channels, where to multiply and add them is all that a layer does."""
-    return call(layer, "channel_factors")
 
 
 def finished(kernel: Kernel, finish: Finish | None) -> Kernels:

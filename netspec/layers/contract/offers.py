@@ -1,8 +1,8 @@
 """What a layer may offer beside its forward pass, each thing by an attribute that the class defines.
 
 exporting.py  to_onnx, to_torch: the layer in another form
-kernels.py    kernels, finishing, and facts about memory: what is faster than forward and autograd
-folding.py    as_affine, absorb, absorb_before, join, passes_on: one layer does the work of others
+kernels.py    kernels, fresh, any_layout: what is faster than forward and autograd
+folding.py    folds: one layer does the work of others
 gradients.py  caffes_gradient: the gradient from what lies in memory
 reading.py    running_state, restart, and the like: records, and what goes on from one pass to the next
 

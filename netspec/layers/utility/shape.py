@@ -10,6 +10,7 @@ import torch
 from netspec.exact import switch
 from netspec.exact.sums import Copies, tiles
 from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.folding import Folds
 from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
@@ -131,9 +132,8 @@ class Split(Layer):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         return bottoms * self.num_tops
 
-    @property
-    def passes_on(self) -> bool:
-        return True
+    def folds(self) -> Folds:
+        return Folds(passes_on=True)
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         return bottoms * self.num_tops

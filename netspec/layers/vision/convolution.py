@@ -25,7 +25,7 @@ from netspec.exact.switch import is_recorded
 from netspec.layers.contract import fused
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.folding import Absorbed, blob_like, copy_of
+from netspec.layers.contract.folding import Absorbed, Folds, blob_like, copy_of
 from netspec.layers.contract.kernels import Kernels, Preparation, copies, finished, lent, weight_and_bias
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
@@ -252,11 +252,10 @@ class Convolution(SlidingFilter):
         spatial = [graph.size(0, axis, why) for axis in range(first, first + self.spatial_axes)] or [1]
         return graph.reshape(bottom, [-1, self.channels, *spatial])
 
-    @property
-    def absorbs(self) -> bool:
-        return self.channel_axis == 1
+    def folds(self) -> Folds:
+        return Folds(absorb=self._absorb if self.channel_axis == 1 else None)
 
-    def absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
+    def _absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
         param = copy_of(self.param)
         param.convolution_param.bias_term = True
         bias = blob_like(self, 1, shift) if len(self.blobs) > 1 else torch.zeros_like(shift)

@@ -428,7 +428,20 @@ def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> No
         param.convolution_param.kernel_size.append(3)
         return cls(param, [(1, 2, 4, 4)])
 
-    names = ("kernels", "absorbs", "absorb", "fresh", "to_onnx")
+    names = ("kernels", "folds", "fresh", "to_onnx")
     assert [offered(made(Halved), name) for name in names] == [None] * len(names)
     assert None not in [offered(made(Named), name) for name in names]
     assert offered(made(ReLU), "fresh")
+
+
+@pytest.mark.parametrize(("low", "high", "steps"), [(0, 6, 1), (-1, 0.5, 1), (2, 1, 2)])
+def test_clip_is_done_by_the_layer_before_it(net_of, low: float, high: float, steps: int) -> None:
+    text = f"""
+layer {{ name: "data" type: "Input" top: "data" input_param {{ shape {{ dim: 2 dim: 8 dim: 20 dim: 20 }} }} }}
+layer {{ name: "c" type: "Convolution" bottom: "data" top: "c"
+  convolution_param {{ num_output: 32 kernel_size: 3 weight_filler {{ type: "gaussian" std: 1 }} }} }}
+layer {{ name: "clip" type: "Clip" bottom: "c" top: "c" clip_param {{ min: {low} max: {high} }} }}
+"""
+    net, x = net_of(text, exact="none"), torch.randn(2, 8, 20, 20)
+    assert_same(quickly(net, data=x), slowly(net, data=x))
+    assert len(last_program(net).line) == steps
