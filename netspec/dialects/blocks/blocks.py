@@ -66,11 +66,18 @@ message ReLU6Parameter {
 message ShuffleChannelParameter {
   optional uint32 group = 1 [default = 1];
 }
+message SegAccuracyParameter {
+  enum AccuracyMetric { PixelAccuracy = 0; ClassAccuracy = 1; PixelIOU = 2; }
+  optional AccuracyMetric metric = 1 [default = PixelAccuracy];
+  repeated int32 ignore_label = 2;
+  optional bool reset = 3 [default = true];
+}
 extend LayerParameter {
   optional UpsampleParameter upsample_param = 160;
   optional InterpParameter interp_param = 163;
   optional ShuffleChannelParameter shuffle_channel_param = 164;
   optional BNParameter bn_param = 1137;
+  optional SegAccuracyParameter seg_accuracy_param = 1138;
   optional DeephiResizeParameter deephi_resize_param = 1139;
   optional ReLU6Parameter relu6_param = 100000;
 }
@@ -345,3 +352,46 @@ class DeephiResize(Layer):
 
 register("Upsample", "upsample_param")(Upsample)
 register("BN", "bn_param")(BN)
+
+
+@register("SegAccuracy", "seg_accuracy_param")
+class SegAccuracy(Layer):
+    """How well the pixels are classified, by counts of pairs of label and best class: they go on with reset: false.
+
+    Of equal scores the last class counts. A class that is neither there nor found has 1 in the mean of intersections.
+
+    bottom[0]  scores (N, C, H, W)
+    bottom[1]  labels (N, 1, H, W); those of ignore_label do not count
+    top[0]     (1, 1, 1, 3): share of the pixels that are right, its mean over the classes that are there, mean of
+               intersection / union over all classes
+    Fork: hszhao/PSPNet, src/caffe/layers/seg_accuracy_layer.cpp
+    """
+
+    bottoms = (2, 2)
+    label_bottoms = frozenset({0, 1})
+    not_exported = "it is for tests"
+
+    def setup(self) -> None:
+        self.settings, self.counts_before = value(self.param, "seg_accuracy_param"), torch.zeros(0)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        scores, labels = bottom_shapes
+        if len(scores) != 4 or labels != (scores[0], 1, *scores[2:]):
+            message = f"found bottoms of shapes {scores} and {labels}, expected (N, C, H, W) and (N, 1, H, W)"
+            raise self.error(message, "bottom", 1)
+        return [(1, 1, 1, 3)]
+
+    def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        classes, labels = scores.shape[1], labels[:, 0].long()
+        counts = ~torch.isin(labels, torch.tensor(list(self.settings.ignore_label), device=labels.device))
+        label, best = labels[counts], classes - 1 - scores.flip(1).argmax(1)[counts]
+        if label.numel() and not 0 <= int(label.min()) <= int(label.max()) < classes:
+            raise self.error(f"found a label outside 0 to {classes - 1}; write it as ignore_label", "bottom", 1)
+        found = torch.bincount(label * classes + best, minlength=classes**2).view(classes, classes).double()
+        found = found if self.settings.reset or not self.counts_before.numel() else found + self.counts_before
+        self.counts_before = found
+        right, there = found.diagonal(), found.sum(1)
+        union = there + found.sum(0) - right
+        recall = (right / there)[there > 0]
+        shares = right.sum() / found.sum().clamp(min=1), recall.sum() / max(len(recall), 1)
+        return torch.stack([*shares, torch.where(union > 0, right / union, 1.0).mean()]).to(scores).view(1, 1, 1, 3)

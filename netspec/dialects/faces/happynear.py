@@ -1,8 +1,23 @@
-"""happynear/caffe-windows, which recognizes faces: Normalize without a scale (blocks/normalize.py).
+"""happynear/caffe-windows, which recognizes faces: Normalize without a scale (blocks/normalize.py), losses, margins.
 
 Its BN keeps 1 / std in blobs[3] (segmentation/segnet.py), as do wy1iu/LargeMargin_Softmax_Loss and Cysu/caffe, branch
 domain-guided-dropout. Where no field shows whose a layer is, the dialect has to be named.
 """
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+
+from netspec.dialects.faces.margins import MarginProduct
+from netspec.layers import Layer, common, register
+from netspec.layers.contract.base import Shape
+from netspec.layers.loss.base import VALID, Classified, Loss, ignore_label, normalization_mode, normalizer
+from netspec.layers.loss.scores import FLT_MIN
+from netspec.proto.schema import TEST, value
 
 DECLARATIONS = """
 message NormalizeLengthParameter {
@@ -10,7 +25,375 @@ message NormalizeLengthParameter {
   optional bool fix_gradient = 2 [default = false];
   optional bool bp_norm = 3 [default = false];
 }
+message FlipParameter {
+  optional bool flip_width = 1 [default = true];
+  optional bool flip_height = 2 [default = false];
+}
+message TripletLossParameter {
+  optional float margin = 1 [default = 1.0];
+}
+message FocalLossParameter {
+  enum Type { ORIGIN = 0; LINEAR = 1; ONEADDP = 2; }
+  optional Type type = 1 [default = ORIGIN];
+  optional float gamma = 2 [default = 2];
+  optional float alpha = 3 [default = 1.0];
+  optional float beta = 4 [default = 1.0];
+}
+message ChannelScaleParameter {
+  optional bool do_forward = 1 [default = true];
+  optional bool do_backward_feature = 2 [default = true];
+  optional bool do_backward_scale = 3 [default = true];
+  optional bool global_scale = 4 [default = false];
+  optional float max_global_scale = 5 [default = 1000.0];
+  optional float min_global_scale = 6 [default = 0.0];
+  optional float init_global_scale = 7 [default = 1.0];
+}
+message LabelSpecificAddParameter {
+  optional float bias = 1 [default = 0.0];
+  optional bool transform_test = 2 [default = false];
+  optional float bias_base = 3 [default = 0.0];
+  optional float bias_gamma = 4 [default = 0.0];
+  optional float bias_power = 5 [default = 1.0];
+  optional float bias_min = 6 [default = 0.0];
+  optional float bias_max = 7 [default = 0.0];
+  optional uint32 iteration = 8 [default = 0];
+}
+message LargeMarginInnerProductParameter {
+  optional uint32 num_output = 1;
+  enum LargeMarginType { SINGLE = 0; DOUBLE = 1; TRIPLE = 2; QUADRUPLE = 3; }
+  optional LargeMarginType type = 2 [default = SINGLE];
+  optional FillerParameter weight_filler = 3;
+  optional int32 axis = 4 [default = 1];
+  optional float base = 5 [default = 1];
+  optional float gamma = 6 [default = 0];
+  optional float power = 7 [default = 1];
+  optional int32 iteration = 8 [default = 0];
+  optional float lambda_min = 9 [default = 0];
+}
+extend InnerProductParameter {
+  optional bool normalize = 7 [default = false];
+}
 extend LayerParameter {
   optional NormalizeLengthParameter normalize_param = 1214;
+  optional FlipParameter flip_param = 1232;
+  optional TripletLossParameter triplet_loss_param = 1233;
+  optional FocalLossParameter focal_loss_param = 1234;
+  optional ChannelScaleParameter channel_scale_param = 1235;
+  optional LabelSpecificAddParameter label_specific_add_param = 1236;
+  optional LargeMarginInnerProductParameter largemargin_inner_product_param = 1237;
 }
 """
+
+
+@register("LargeMarginInnerProduct", "largemargin_inner_product_param")
+class LargeMarginInnerProduct(MarginProduct):
+    """L-Softmax: products, at the label (|x| |w| psi(angle) + lambda x w) / (1 + lambda).
+
+    Fork: wy1iu/LargeMargin_Softmax_Loss, src/caffe/layers/largemargin_inner_product_layer.cpp
+    """
+
+    message = "largemargin_inner_product_param"
+
+    def products(self, x: torch.Tensor, labels: torch.Tensor, share: float) -> torch.Tensor:
+        weight = self.blob(0)
+        top = x @ weight.t()
+        if self.margin is None:
+            return top
+        plain = top.gather(1, labels[:, None])
+        lengths = (x.norm(dim=1) * weight.norm(dim=1)[labels])[:, None] + 1e-9
+        found = lengths * self.margin(plain / lengths)[0]
+        return top.scatter_add(1, labels[:, None], share * (found - plain))
+
+
+def normalizes(param: Any) -> bool:
+    """Return whether a LayerParameter asks for weights of length 1."""
+    return value(param.inner_product_param, "normalize")
+
+
+@register(
+    "InnerProduct",
+    "inner_product_param",
+    "inner_product_param.normalize",
+    replaces=common.InnerProduct,
+    where=normalizes,
+)
+class NormalizedInnerProduct(common.InnerProduct):
+    """Products with weights of length 1, which each pass makes so: of each num_output-th part of the memory.
+
+    The gradient does not go through the length.
+    Fork: happynear/caffe-windows, src/caffe/layers/inner_product_layer.cpp
+    """
+
+    not_exported = "its weights are for training; what is used is its bottom"
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        with torch.no_grad():
+            rows = self.blob(0).view(self.param.inner_product_param.num_output, -1)
+            rows.div_((rows.square().sum(1, keepdim=True) + 1e-6).sqrt())
+        return super().forward(data)
+
+
+@register("LabelSpecificAdd", "label_specific_add_param")
+class LabelSpecificAdd(Layer):
+    """Add a bias to each item's score of its label, where that is above -bias; in TRAIN only. The margin of AM-Softmax.
+
+    With bias_base the bias of pass i, from ``iteration`` on, is bias_base + (1 + bias_gamma i)^bias_power - 1, within
+    bias_min and bias_max. The gradient is the top's.
+
+    bottom[0]  scores (N, ...)
+    bottom[1]  labels (N,)
+    top[0]     the shape of bottom[0]
+    top[1]     optional: the bias (1,)
+    Fork: happynear/caffe-windows, src/caffe/layers/label_specific_add.cpp
+    """
+
+    bottoms, tops = (2, 2), (1, 2)
+    label_bottoms = frozenset({1})
+    not_exported = "it is for training"
+
+    def setup(self) -> None:
+        self.settings = value(self.param, "label_specific_add_param")
+        self.passes, self.bias = int(self.settings.iteration), self.settings.bias
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        scores, labels = (torch.Size(shape) for shape in bottom_shapes)
+        if labels.numel() != (scores[0] if scores else 0):
+            raise self.error(f"found {labels.numel()} labels for scores of shape {bottom_shapes[0]}", "bottom", 1)
+        return [bottom_shapes[0], (1,)][: self.num_tops]
+
+    def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
+        p, top = self.settings, scores
+        if self.phase != TEST:
+            if p.HasField("bias_base"):
+                bias = p.bias_base + (1 + p.bias_gamma * self.passes) ** p.bias_power - 1
+                self.bias = min(max(bias, p.bias_min), p.bias_max)
+                self.passes += 1
+            flat, labels = scores.detach().flatten(1), labels.reshape(-1, 1).long()
+            if labels.numel() and not 0 <= int(labels.min()) <= int(labels.max()) < flat.shape[1]:
+                raise self.error(f"found a label outside 0 to {flat.shape[1] - 1}", "bottom", 1)
+            added = torch.where(flat.gather(1, labels) > -self.bias, self.bias, 0.0)
+            top = scores + torch.zeros_like(flat).scatter_(1, labels, added).view_as(scores)
+        return top if self.num_tops == 1 else (top, scores.new_full((1,), self.bias))
+
+    def running_state(self) -> dict[str, Any]:
+        return {"passes": self.passes}
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        self.passes = int(state["passes"])
+
+
+@register("TripletLoss", "triplet_loss_param")
+class TripletLoss(Loss):
+    """Sum of max(margin + |a - p|^2 - |a - n|^2, 0), divided by 2 N.
+
+    bottom[0]  vectors a (N, C)
+    bottom[1]  vectors p of the same class, the same shape
+    bottom[2]  vectors n of another class, the same shape
+    top[0]     the loss, ()
+    Fork: happynear/caffe-windows, src/caffe/layers/triplet_loss_layer.cpp
+    """
+
+    bottoms = (3, 3)
+    label_bottoms = frozenset()
+    not_exported = "it is for training"
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        shapes = [torch.Size(shape) for shape in bottom_shapes]
+        if any(shape != shapes[0] or shape.numel() != shape[:2].numel() for shape in shapes):
+            raise self.error(f"found bottoms of shapes {bottom_shapes}, expected three of one shape (N, C)", "bottom")
+        return [()]
+
+    def forward(self, a: torch.Tensor, p: torch.Tensor, n: torch.Tensor) -> torch.Tensor:
+        near, far = ((a - other).flatten(1).square().sum(1) for other in (p, n))
+        return F.relu(value(self.param, "triplet_loss_param").margin + near - far).sum() / (2 * len(a))
+
+
+class _Focal(torch.autograd.Function):
+    """-(alpha -+ p)^gamma log(p) of each label's p; the gradient is the fork's, right where alpha is 1."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: torch.Tensor, labels: torch.Tensor, alpha: float, gamma: float, sign: int
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        softmax = x.softmax(1)
+        p = softmax.gather(1, labels)
+        factor, log = (alpha + sign * p) ** gamma, p.clamp(min=FLT_MIN).log()
+        along = sign * gamma * (factor / (1 + sign * p).clamp(min=1e-10)) * log * p + factor
+        ctx.save_for_backward(softmax, labels, along)
+        ctx.mark_non_differentiable(softmax)
+        return -factor * log, softmax
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        softmax, labels, along = ctx.saved_tensors
+        minus_one = -torch.ones_like(along)
+        return softmax.scatter_add(1, labels, minus_one) * along * grads[0], None, None, None, None
+
+
+@register("FocalLoss", "focal_loss_param", "loss_param", "softmax_param")
+class FocalLoss(Loss, Classified):
+    """-(alpha - p)^gamma log(p), p the softmax of the label; (alpha + p)^gamma with type: ONEADDP.
+
+    bottom[0]  scores (N, C, ...), C at softmax_param.axis
+    bottom[1]  labels, one per prediction
+    top[0]     the loss, (): the sum, normalized as loss_param says (default VALID)
+    top[1]     optional: the softmax, bottom[0]'s shape; brings no gradient
+    Fork: happynear/caffe-windows, src/caffe/layers/focal_loss_layer.cpp. Paper: Lin et al., ICCV 2017, where alpha is a
+    factor
+    """
+
+    tops = (1, 2)
+    not_exported = "it is for training"
+
+    def setup(self) -> None:
+        self.settings = p = value(self.param, "focal_loss_param")
+        for name, wrong, expected in (("alpha", p.alpha <= 0, "above 0"), ("gamma", p.gamma < 0, "at least 0")):
+            if wrong:
+                message = f"{name} must be {expected}, found {getattr(p, name):g}"
+                raise self.error(message, "focal_loss_param", name)
+        self.ignored = ignore_label(self.param.loss_param)
+        self.normalization = normalization_mode(self.param.loss_param, VALID)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        self.reshape_scores(bottom_shapes, self.param.softmax_param.axis, "softmax_param", "axis")
+        return [(), bottom_shapes[0]][: self.num_tops]
+
+    def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
+        x, labels = self.scores_and_labels(scores, labels)
+        valid, p = self.valid(labels, self.ignored), self.settings
+        used = (labels if valid is None else labels * valid).unsqueeze(1)
+        losses, softmax = _Focal.apply(x, used, p.alpha, p.gamma, 1 if p.type == 2 else -1)
+        losses = losses.squeeze(1) if valid is None else losses.squeeze(1) * valid
+        loss = losses.sum() / normalizer(self.normalization, self.outer, self.inner, valid)
+        return loss if self.num_tops == 1 else (loss, softmax.reshape(scores.shape))
+
+
+@register("Flip", "flip_param")
+class Flip(Layer):
+    """Turn maps around: from right to left unless flip_width is false, from bottom to top with flip_height.
+
+    bottom[0]  (N, C, H, W)
+    top[0]     the same shape
+    Fork: happynear/caffe-windows, src/caffe/layers/flip_layer.cpp
+    """
+
+    def setup(self) -> None:
+        param, axes = value(self.param, "flip_param"), len(self.bottom_shapes[0])
+        flipped = ((2, param.flip_height), (3, param.flip_width))
+        self.axes = [axis for axis, wanted in flipped if wanted and axis < axes]
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return bottom_shapes
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return data.flip(self.axes)
+
+
+class _Scaled(torch.autograd.Function):
+    """x times factor; the gradients are those of x times scale, where they are wanted."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: torch.Tensor, scale: torch.Tensor, factor: torch.Tensor, to_x: bool, to_scale: bool
+    ) -> torch.Tensor:
+        ctx.save_for_backward(x, scale)
+        ctx.wanted = to_x, to_scale
+        return x * factor
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        (x, scale), (to_x, to_scale) = ctx.saved_tensors, ctx.wanted
+        to_scale = (x * grads[0]).sum(1, keepdim=True) if to_scale else torch.zeros_like(scale)
+        return grads[0] * scale if to_x else grads[0], to_scale, None, None, None
+
+
+@register("ChannelScale", "channel_scale_param")
+class ChannelScale(Layer):
+    """Multiply all channels of a pixel by one number; with global_scale, everything by their running mean.
+
+    do_forward: false leaves the maps as they are, do_backward_feature: false their gradient; do_backward_scale: false
+    brings the numbers none. The gradients are those of the numbers with global_scale too.
+
+    bottom[0]  (N, C, ...)
+    bottom[1]  the numbers (N, 1, ...)
+    top[0]     the shape of bottom[0]
+    top[1]     optional, with global_scale: the scale (1,)
+    blobs[0]   with global_scale: the scale (1,), kept within its bounds; below 0 before the first pass
+    Fork: happynear/caffe-windows, src/caffe/layers/channel_scale_layer.cu; its code for CPUs keeps no running mean
+    """
+
+    bottoms, tops = (2, 2), (1, 2)
+    not_exported = "its scale is for training"
+
+    def setup(self) -> None:
+        self.settings = p = value(self.param, "channel_scale_param")
+        if p.global_scale:
+            self.add_blob((1,), value=-1.0)
+            self.not_learned = frozenset({0})
+        elif self.num_tops > 1:
+            raise self.error("a second top is there with global_scale only", "top", 1)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        maps, scales = (torch.Size(shape) for shape in bottom_shapes)
+        if len(maps) < 2 or scales.numel() * maps[1] != maps.numel() or scales[0] != maps[0]:
+            message = f"found bottoms of shapes {bottom_shapes}, expected (N, C, ...) and (N, 1, ...)"
+            raise self.error(message, "bottom", 1)
+        return [bottom_shapes[0], (1,)][: self.num_tops]
+
+    def forward(self, maps: torch.Tensor, scales: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
+        p, scales = self.settings, scales.reshape(len(maps), 1, *maps.shape[2:])
+        factor = scales.detach()
+        if p.global_scale:
+            with torch.no_grad():
+                factor = self._averaged(self.blob(0), scales.abs().mean()).clone()
+        used = factor if p.do_forward else torch.ones_like(factor)
+        used = used.reshape(1, *[1] * (maps.dim() - 1)) if p.global_scale else used
+        top = _Scaled.apply(maps, scales, used, p.do_backward_feature, p.do_backward_scale)
+        return top if self.num_tops == 1 else (top, factor)
+
+    def _averaged(self, scale: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
+        """Return the scale; in TRAIN a hundredth of the new mean goes into it, all of the first."""
+        if self.phase == TEST:
+            return scale
+        p, found = self.settings, torch.where(scale < 0, mean, 0.99 * scale + 0.01 * mean)
+        return scale.copy_(found.clamp(p.min_global_scale, p.max_global_scale))
+
+
+@register("Cosine")
+class Cosine(Layer):
+    """The cosine of each number.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Fork: happynear/caffe-windows, src/caffe/layers/cosine_layer.cu; its gradient for CPUs leaves the top's out
+    """
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return bottom_shapes
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return data.cos()
+
+
+class _Arccos(torch.autograd.Function):
+    """The arc cosine, whose gradient is that of 0.99 above it."""
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(x)
+        return x.acos()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> torch.Tensor:
+        return -grads[0] / (1 - ctx.saved_tensors[0].clamp(max=0.99) ** 2).sqrt()
+
+
+@register("Arccos")
+class Arccos(Cosine):
+    """The arc cosine of each number, nan beyond 1; above 0.99 the gradient is that of 0.99.
+
+    Fork: happynear/caffe-windows, src/caffe/layers/arccos_layer.cpp
+    """
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return _Arccos.apply(data)

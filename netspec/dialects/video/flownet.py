@@ -1,6 +1,6 @@
 """FlowNet and FlowNet 2: maps of two images compared, resampled and warped. Fork: lmb-freiburg/flownet2.
 
-Its augmenting, reading and writing layers, and its losses, are not here: nets run.
+Its augmenting, reading and writing layers are not here.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import ClassVar
 import torch
 import torch.nn.functional as F
 
+from netspec.data.mean import read_mean
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import value
@@ -39,15 +40,45 @@ message FlowWarpParameter {
   enum FillParameter { ZERO = 1; NOT_A_NUMBER = 2; }
   optional FillParameter fill_value = 1 [default = ZERO];
 }
+message AccumParameter {
+  optional uint32 top_height = 1 [default = 0];
+  optional uint32 top_width = 2 [default = 0];
+  optional uint32 size_divisible_by = 3 [default = 0];
+  optional bool have_reference = 4 [default = false];
+}
+message DownsampleParameter {
+  optional uint32 top_height = 1 [default = 0];
+  optional uint32 top_width = 2 [default = 0];
+}
+message L1LossParameter {
+  optional bool l2_per_location = 1 [default = false];
+  optional bool l2_prescale_by_channels = 2 [default = false];
+  optional bool normalize_by_num_entries = 3 [default = false];
+  optional float epsilon = 4 [default = 1e-2];
+  optional float plateau = 3001 [default = 0];
+}
+message MeanParameter {
+  enum MeanOperation { ADD = 1; SUBTRACT = 4; }
+  optional MeanOperation operation = 1;
+  optional string file = 2;
+  repeated float value = 3;
+  optional float mean_scale = 4 [default = 1];
+  optional float input_scale = 5 [default = 1];
+  optional float output_scale = 6 [default = 1];
+}
 extend LayerParameter {
   optional CorrelationParameter correlation_param = 1210;
   optional ResampleParameter resample_param = 1211;
   optional FlowWarpParameter flow_warp_param = 1212;
   optional bool reshape_every_iter = 1213 [default = true];
+  optional L1LossParameter l1_loss_param = 1215;
+  optional MeanParameter mean_param = 1216;
+  optional DownsampleParameter downsample_param = 1217;
+  optional AccumParameter accum_param = 1218;
 }
 """
 
-SUBTRACT, NEAREST, CUBIC, AREA, NOT_A_NUMBER = 1, 1, 3, 4, 2  # values of the enums above
+SUBTRACT, NEAREST, CUBIC, AREA, NOT_A_NUMBER, SUBTRACTED = 1, 1, 3, 4, 2, 4  # values of the enums above
 
 
 class _OfMaps(Layer):
@@ -224,3 +255,181 @@ class ChannelNorm(_OfMaps):
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         return maps.norm(dim=1, keepdim=True)
+
+
+@register("Accum", "accum_param")
+class Accum(_OfMaps):
+    """Bring maps to one size, corner to corner, and put their channels after one another.
+
+    The size is the largest of the bottoms; top_height x top_width, or the next multiple of size_divisible_by,
+    where both sides of it are larger; with have_reference that of the last bottom, which is not read otherwise.
+
+    bottom[i]  (N, C_i, H_i, W_i)
+    top[0]     (N, sum of C_i, H, W)
+    Fork: src/caffe/layers/accum_layer.cpp
+    """
+
+    bottoms = (1, None)
+    same = slice(0, 1)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        self.check_maps(bottom_shapes)
+        p = value(self.param, "accum_param")
+        self.read = len(bottom_shapes) - p.have_reference
+        if not self.read:
+            raise self.error("found one bottom, expected maps before the one whose size is taken", "bottom")
+        size = [max(sides) for sides in zip(*(shape[2:] for shape in bottom_shapes), strict=True)]
+        wanted = [p.top_height, p.top_width]
+        if p.size_divisible_by:
+            wanted = [-(-side // p.size_divisible_by) * p.size_divisible_by for side in size]
+        if p.have_reference:
+            size = list(bottom_shapes[-1][2:])
+        elif wanted[0] > size[0] and wanted[1] > size[1]:
+            size = wanted
+        return [(bottom_shapes[0][0], sum(shape[1] for shape in bottom_shapes[: self.read]), *size)]
+
+    def forward(self, *maps: torch.Tensor) -> torch.Tensor:
+        size = self.top_shapes[0][2:]
+        return torch.cat(
+            [F.interpolate(each, size, mode="bilinear", align_corners=True) for each in maps[: self.read]], 1
+        )
+
+
+@register("Downsample", "downsample_param")
+class Downsample(_OfMaps):
+    """Bring maps to another size, corner to corner: the mean of the pixels near, weighed by their distance.
+
+    Pixels that are nan are left out; where they have more than half the weight of the others, the top is nan.
+
+    bottom[0]  (N, C, H, W)
+    bottom[1]  optional: maps whose size is taken, in place of top_height and top_width
+    top[0]     (N, C, top_height, top_width); brings no gradient, as in the fork
+    Fork: src/caffe/layers/downsample_layer.cu
+    """
+
+    bottoms = (1, 2)
+    label_bottoms = frozenset({0, 1})
+    same = slice(0, 0)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        self.check_maps(bottom_shapes)
+        p, shape = value(self.param, "downsample_param"), bottom_shapes[0]
+        size = (p.top_height, p.top_width) if len(bottom_shapes) == 1 else bottom_shapes[1][2:]
+        if any(to != side and to < 2 for to, side in zip(size, shape[2:], strict=True)):
+            raise self.error(
+                f"found a top of {size[0]} x {size[1]} pixels, expected at least 2 x 2", "downsample_param"
+            )
+        return [(*shape[:2], *size)]
+
+    def forward(self, maps: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+        maps = maps.detach()
+        if maps.shape == self.top_shapes[0]:
+            return maps.clone()
+        over = [_near(side, to).to(maps) for side, to in zip(maps.shape[2:], self.top_shapes[0][2:], strict=True)]
+        missing = maps.isnan()
+        total, counted, left_out = (
+            over[0] @ each @ over[1].t() for each in (maps.nan_to_num(0), (~missing).to(maps), missing.to(maps))
+        )
+        return torch.where(left_out / counted > 0.5, torch.nan, total / counted)
+
+
+def _near(side: int, to: int) -> torch.Tensor:
+    """Return how much each of ``side`` pixels counts for each of ``to``."""
+    step = (side - 1) / max(to - 1, 1)
+    places = torch.arange(to).unsqueeze(1) * step
+    return (1 - (torch.arange(side) - places).abs() / step).clamp(min=0) if step else torch.eye(to, side)
+
+
+@register("L1Loss", "l1_loss_param")
+class L1Loss(Layer):
+    """Sum of the absolute differences, divided by the number of images; pixels that are nan do not count.
+
+    l2_per_location: sum over the pixels of sqrt(sum of squares over the channels + epsilon). plateau: less than this is
+    0. normalize_by_num_entries: divided by the number of those that are not nan, by channel. l2_prescale_by_channels:
+    the mean of squares in place of the sum. Where the difference is 0, the gradient is -1.
+
+    bottom[0]  (N, C, H, W)
+    bottom[1]  optional: what is subtracted, the same shape
+    top[0]     the loss, ()
+    Fork: src/caffe/layers/l1loss_layer.cu
+    """
+
+    bottoms, is_loss = (1, 2), True
+    not_exported = "it is for training"
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        if bottom_shapes[-1] != bottom_shapes[0]:
+            raise self.error(f"found bottoms of shapes {bottom_shapes}, expected two of one shape", "bottom", 1)
+        return [()]
+
+    def forward(self, x: torch.Tensor, *others: torch.Tensor) -> torch.Tensor:
+        p, difference = value(self.param, "l1_loss_param"), x - others[0] if others else x
+        counts = ~difference.isnan()
+        channels = x.shape[1] if x.dim() > 1 else 1
+        divisor = counts.sum() / channels if p.normalize_by_num_entries else len(x)
+        if p.l2_per_location:
+            squares = difference.where(counts, 0).square().sum(1)
+            squares = squares / channels if p.l2_prescale_by_channels else squares
+            squares = squares.where(squares.detach() >= p.plateau**2, 0) if p.plateau > 0 else squares
+            return (squares + p.epsilon).sqrt().sum() / divisor
+        if p.plateau > 0:
+            counts &= difference.detach().abs() >= p.plateau
+        sign = torch.where(difference.detach() > 0, 1.0, -1.0).to(x)
+        return (difference.where(counts, 0) * sign).sum() / divisor
+
+
+@register("NegReLU", "relu_param")
+class NegReLU(Layer):
+    """min(x, 0) + negative_slope max(x, 0); the gradient at 0 is the positive side's.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Fork: src/caffe/layers/neg_relu_layer.cpp
+    """
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return bottom_shapes
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return torch.where(data < 0, data, data * self.param.relu_param.negative_slope)
+
+
+@register("Mean", "mean_param")
+class Mean(Layer):
+    """output_scale (input_scale x + mean_scale mean); with operation: SUBTRACT, less the mean.
+
+    bottom[i]  (N, C, H, W)
+    top[i]     the same shape; the mean is a value for each channel, in turn, or the numbers of ``file``
+    Fork: src/caffe/layers/mean_layer.cpp
+    """
+
+    bottoms = tops = (1, None)
+
+    def setup(self) -> None:
+        p, where = value(self.param, "mean_param"), self.context.at("mean_param", "file")
+        if not p.HasField("operation") or not (p.value or p.HasField("file")):
+            raise self.error("expected an operation, ADD or SUBTRACT, and a file or values", "mean_param")
+        numbers = torch.tensor(p.value).view(1, -1, 1, 1)
+        if p.HasField("file"):
+            numbers = torch.from_numpy(read_mean(p.file, where)).float().unsqueeze(0)
+        self.numbers = numbers * p.mean_scale * (-1 if p.operation == SUBTRACTED else 1)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        if self.num_tops != len(bottom_shapes):
+            raise self.error(f"found {self.num_tops} top(s), expected one for each bottom, {len(bottom_shapes)}", "top")
+        _, channels, *size = self.numbers.shape
+        for i, shape in enumerate(bottom_shapes):
+            if (
+                len(shape) != 4
+                or shape[1] % channels
+                or list(shape[2:]) != (size if size != [1, 1] else list(shape[2:]))
+            ):
+                raise self.error(f"found a bottom of shape {shape} for a mean of {channels} x {size}", "bottom", i)
+        return bottom_shapes
+
+    def forward(self, *maps: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        p, numbers = value(self.param, "mean_param"), self.numbers.to(maps[0])
+        times = [x.shape[1] // numbers.shape[1] for x in maps]
+        return tuple(
+            p.output_scale * (p.input_scale * x + numbers.repeat(1, n, 1, 1)) for x, n in zip(maps, times, strict=True)
+        )

@@ -210,3 +210,31 @@ class Yolov3DetectionOutput(_YoloOutput):
         found = np.nonzero(confidence > np.float32(param.confidence_threshold))
         columns = [found[3][:, None], confidence[found][:, None], boxes[found[:3]]]
         return np.concatenate(columns, axis=1, dtype=np.float32)
+
+
+class _HardSigmoid(torch.autograd.Function):
+    """x / 5 + 1/2 between 0 and 1. The fork's gradient is 1/5 beyond them too: it looks at the top, not the bottom."""
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
+        return (0.2 * x + 0.5).clamp(0, 1)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> torch.Tensor:
+        return 0.2 * grads[0]
+
+
+@register("HardSigmoid")
+class HardSigmoid(Layer):
+    """min(max(0.2 x + 0.5, 0), 1); the gradient is 0.2 everywhere.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Fork: eric612/MobileNet-YOLO, src/caffe/layers/hard_sigmoid_layer.cpp
+    """
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return bottom_shapes
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return _HardSigmoid.apply(data)

@@ -1,0 +1,158 @@
+"""Recognizing faces: the center loss, and products with an angular margin.
+
+Forks: ydwen/caffe-face, wy1iu/sphereface, wy1iu/LargeMargin_Softmax_Loss; happynear/caffe-windows has them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import torch
+
+from netspec.dialects.faces.margins import Margin, MarginProduct
+from netspec.layers import register
+from netspec.layers.contract.base import Shape
+from netspec.layers.loss.base import Classified, Loss
+from netspec.proto.schema import TRAIN, value
+
+DECLARATIONS = """
+message CenterLossParameter {
+  optional uint32 num_output = 1;
+  optional FillerParameter center_filler = 2;
+  optional int32 axis = 3 [default = 1];
+  optional string distance_type = 29 [default = "L2"];
+}
+message MarginInnerProductParameter {
+  optional uint32 num_output = 1;
+  enum MarginType { SINGLE = 0; DOUBLE = 1; TRIPLE = 2; QUADRUPLE = 3; }
+  optional MarginType type = 2 [default = SINGLE];
+  optional FillerParameter weight_filler = 3;
+  optional int32 axis = 4 [default = 1];
+  optional float base = 5 [default = 1];
+  optional float gamma = 6 [default = 0];
+  optional float power = 7 [default = 1];
+  optional int32 iteration = 8 [default = 0];
+  optional float lambda_min = 9 [default = 0];
+}
+extend LayerParameter {
+  optional CenterLossParameter center_loss_param = 1230;
+  optional MarginInnerProductParameter margin_inner_product_param = 1231;
+}
+"""
+
+
+class _Distance(torch.autograd.Function):
+    """Distances to the centers, summed and divided by M. The centers' gradient is no derivative.
+
+    It is the sum of the differences of a class, divided by 1 + their number n, and not scaled by the loss's weight;
+    happynear's code adds it n times.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: torch.Tensor, centers: torch.Tensor, labels: torch.Tensor, absolute: bool, n_times: bool
+    ) -> torch.Tensor:
+        difference = x - centers[labels]
+        ctx.save_for_backward(difference.sign() if absolute else difference, labels)
+        ctx.classes, ctx.n_times = len(centers), n_times
+        return (difference.abs().sum() if absolute else difference.square().sum() / 2) / len(x)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        difference, labels = ctx.saved_tensors
+        number = torch.bincount(labels, minlength=ctx.classes).to(difference).unsqueeze(1)
+        sums = torch.zeros(ctx.classes, difference.shape[1]).to(difference).index_add_(0, labels, -difference)
+        step = sums / (number + 1) * (number if ctx.n_times else 1)
+        return difference * (grads[0] / len(difference)), step, None, None, None
+
+
+@register("CenterLoss", "center_loss_param")
+class CenterLoss(Loss, Classified):
+    """Half the squared distances of vectors to the centers of their classes, divided by their number M.
+
+    With distance_type: "L1" (happynear's), the sums of absolute differences. Without loss_weight it does not count.
+
+    bottom[0]  (M, ...): vectors of length K from ``axis`` on
+    bottom[1]  labels (M,)
+    top[0]     the loss, ()
+    blobs[0]   the centers (num_output, K)
+    Fork: ydwen/caffe-face, happynear/caffe-windows, src/caffe/layers/center_loss_layer.cpp
+    """
+
+    counts = False
+    not_exported = "it is for training"
+    forks: ClassVar[Mapping[str, str]] = {
+        "faces": "a center moves by the sum of differences / (n + 1), n the number of its class in a batch",
+        "happynear": "a center moves by n times that",
+    }
+
+    def setup(self) -> None:
+        p, shape = value(self.param, "center_loss_param"), self.bottom_shapes[0]
+        if p.num_output < 1:
+            raise self.error("num_output must be at least 1", "center_loss_param", "num_output")
+        if p.distance_type not in ("L1", "L2"):
+            message = f'found "{p.distance_type}", expected "L1" or "L2"'
+            raise self.error(message, "center_loss_param", "distance_type")
+        self.absolute, self.classes = p.distance_type == "L1", p.num_output
+        axis = self.canonical_axis(p.axis, shape, "center_loss_param", "axis")
+        self.length = torch.Size(shape[axis:]).numel()
+        self.add_blob((p.num_output, self.length), p.center_filler)
+        self.n_times = p.HasField("distance_type") or (self.phase == TRAIN and self.whose() == "happynear")
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        vectors, labels = (torch.Size(shape) for shape in bottom_shapes)
+        if vectors.numel() != vectors[0] * self.length or labels.numel() != vectors[0]:
+            message = f"found bottoms of shapes {vectors} and {labels}, expected (M, {self.length}) and (M,)"
+            raise self.error(message.replace("torch.Size", ""), "bottom")
+        return [()]
+
+    def forward(self, x: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        labels = labels.flatten().long()
+        self.valid(labels, None)
+        return _Distance.apply(x.reshape(-1, self.length), self.blob(0), labels, self.absolute, self.n_times)
+
+
+class _SphereProduct(torch.autograd.Function):
+    """Products with the margin at the labels. There the gradient's two parts are divided by their common length."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: torch.Tensor, weight: torch.Tensor, labels: torch.Tensor, margin: Margin, share: float
+    ) -> torch.Tensor:
+        rows, top = torch.arange(len(x), device=x.device), x @ weight.t()
+        length = x.norm(dim=1)
+        found, slope = margin(top[rows, labels] / length)
+        along = (found - top[rows, labels] / length * slope) / length  # of the derivative, the factor of x
+        ctx.save_for_backward(x, weight, labels, slope, along)
+        ctx.share = share
+        top[rows, labels] += share * (length * found - top[rows, labels])
+        return top
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        x, weight, labels, slope, along = ctx.saved_tensors
+        both = torch.hypot(slope, along)
+        at_label = grads[0].gather(1, labels[:, None]) * ctx.share
+        step = (slope / both - 1)[:, None] * weight[labels] + (along / both)[:, None] * x
+        return grads[0] @ weight + at_label * step, grads[0].t() @ x, None, None, None
+
+
+@register("MarginInnerProduct", "margin_inner_product_param")
+class MarginInnerProduct(MarginProduct):
+    """The angular softmax of SphereFace: products with weights of length 1, which each pass makes so.
+
+    At the label it is (|x| psi(angle) + lambda x w) / (1 + lambda). The gradient is the fork's: the label's two parts
+    divided by their common length; the weights' as without a margin.
+    Fork: wy1iu/sphereface, src/caffe/layers/margin_inner_product_layer.cpp
+    """
+
+    message = "margin_inner_product_param"
+
+    def products(self, x: torch.Tensor, labels: torch.Tensor, share: float) -> torch.Tensor:
+        weight = self.blob(0)
+        with torch.no_grad():
+            weight.div_(weight.norm(dim=1, keepdim=True))
+        if self.margin is None:
+            return x @ weight.t()
+        return _SphereProduct.apply(x, weight, labels, self.margin, share)
