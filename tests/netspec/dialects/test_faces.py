@@ -10,7 +10,6 @@ import netspec
 from netspec.dialects.faces.margins import MARGINS
 from netspec.errors import SpecError
 
-
 MAP = [[[[1.0, 2], [3, 4]]]]
 
 
