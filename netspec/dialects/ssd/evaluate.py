@@ -6,7 +6,7 @@ ComputeAP (src/caffe/util/bbox_util.cpp)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from netspec import log
 from netspec.dialects.boxes import Array, as_array, highest, overlaps
 from netspec.errors import SpecError, Where
 from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.reading import State
 from netspec.proto.schema import value
 
 IMAGE, LABEL, CONFIDENCE = 0, 1, 2  # columns of a detection; its box follows
@@ -79,6 +80,14 @@ class DetectionEvaluate(Layer):
 
     def restart(self) -> None:
         self._image = 0
+
+    def running_state(self) -> State:
+        return {"image": self._image}
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        if state["image"] < 0:
+            raise self.error(f"found image {state['image']} to go on from, expected at least 0")
+        self._image = state["image"]
 
     def forward(self, detections: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
         param = value(self.param, "detection_evaluate_param")

@@ -6,7 +6,8 @@ Connectionist Temporal Classification, ICML 2006.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 
@@ -21,6 +22,7 @@ from netspec.dialects.text.ctc import (
 )
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
+from netspec.layers.contract.reading import State
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import has, value
 
@@ -228,6 +230,15 @@ class Lstm(Layer):
         if begins:
             self.state = (h.detach(), c.detach())
         return torch.stack(tops)
+
+    def running_state(self) -> State:
+        return {"state": self.state} if self.remembers else {}
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        found, shape = state["state"], (self.bottom_shapes[0][1], self.size)
+        if found and [s.shape for s in found] != [shape] * 2:
+            raise self.error(f"found states of shapes {[tuple(s.shape) for s in found]}, expected 2 of {shape}")
+        self.state = tuple(s.to(self.context.device) for s in found)
 
 
 register("CTCGreedyDecoder", DECODER)(CTCGreedyDecoder)

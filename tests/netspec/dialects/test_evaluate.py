@@ -13,6 +13,7 @@ from netspec.cli import main
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.layers import Layer
+from netspec.layers.contract.reading import resume, running_state
 
 Build = Callable[..., Layer]
 
@@ -74,6 +75,19 @@ def test_boxes_are_compared_in_whole_pixels_where_sizes_are_known(build: Build, 
     (tmp_path / "sizes.txt").write_text("a 10\n")
     with pytest.raises(SpecError, match=r'sizes\.txt:1:1: found "a 10", expected a name, a height and a width'):
         evaluate(build, settings + "0.5")
+
+
+def test_a_resumed_training_goes_on_with_the_next_size(build: Build, tmp_path: Path) -> None:
+    (tmp_path / "sizes.txt").write_text("a 10 20\nb 1 1\n")
+    settings = f"num_classes: 3 name_size_file: '{tmp_path / 'sizes.txt'}'"
+    text = f"type: 'DetectionEvaluate' detection_evaluate_param {{ {settings} }}"
+    bottoms = [torch.tensor([[rows]], dtype=torch.float32) for rows in (FOUND[:1], TRUTH)]
+    first, second = (build("ssd", text, *(bottom.shape for bottom in bottoms)) for _ in range(2))
+    first.run(*bottoms)
+    resume(second, running_state(first))
+    assert running_state(second) == {"image": 1}
+    with pytest.raises(SpecError, match="found image -1 to go on from"):
+        resume(second, {"image": -1})
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import torch
 
 from netspec.errors import SpecError
 from netspec.layers import Layer
+from netspec.layers.contract.reading import resume, running_state
 
 Build = Callable[..., Layer]
 Gradcheck = Callable[..., None]
@@ -151,8 +152,15 @@ def test_lstm_goes_on_where_a_second_bottom_says_so(build: Build) -> None:
     parts = build("text", LSTM % "", (2, 2, 5), (2, 2))
     parts.load_state_dict(whole.state_dict())
     first = parts.run(data[:2], torch.tensor([[0.0, 0], [1, 1]]))[0]
-    second = parts.run(data[2:], torch.ones(2, 2))[0]
-    torch.testing.assert_close(torch.cat([first, second]), whole.run(data)[0])
+    resumed = build("text", LSTM % "", (2, 2, 5), (2, 2))  # a training, from a snapshot
+    resumed.load_state_dict(parts.state_dict())
+    resume(resumed, running_state(parts))
+    for each in (parts, resumed):
+        second = each.run(data[2:], torch.ones(2, 2))[0]
+        torch.testing.assert_close(torch.cat([first, second]), whole.run(data)[0])
+    with pytest.raises(SpecError, match=r"found states of shapes \[\(3, 3\)\], expected 2 of \(2, 3\)"):
+        resume(resumed, {"state": (torch.zeros(3, 3),)})
+    assert running_state(whole) == {}
 
 
 @pytest.mark.parametrize(
