@@ -83,6 +83,12 @@ class Drawn:
     def step(self, blob: str, maps: bool) -> tuple[str, bool]:
         """Add a layer on a blob; return its top, and whether that has maps."""
         draw, kind = self.draw, self.draw.random()
+        if draw.random() < 0.15:  # changed in place, then read twice
+            if draw.random() < 0.3:  # and read before
+                blob = self.add('type: "Eltwise"', [blob, self.add(draw.choice(POINTWISE), [blob])])
+            self.add(draw.choice(POINTWISE), [blob], [blob])
+            readers = [self.add(draw.choice([*POINTWISE, *OTHERS[:6]]), [blob]) for _ in range(2)]
+            return self.add('type: "Eltwise"', readers), maps
         if kind < 0.35:
             return self.add(draw.choice(POINTWISE), [blob], [blob] if draw.random() < 0.6 else None), maps
         if kind < 0.5:
