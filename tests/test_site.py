@@ -71,7 +71,17 @@ def text_of(site: Path, pages: str) -> str:
 def test_pages_that_newcomers_look_for_are_found_and_shown(site: Path) -> None:
     index = (site / "searchindex.js").read_text()
     texts = (site / "_static" / "texts.js").read_text()
-    for words, page in (("custom layer", "layer"), ("fine-tune", "how-to"), ("mean.binaryproto", "how-to")):
+    for words, page in (
+        ("custom layer", "layer"),
+        ("fine-tune", "how-to"),
+        ("mean.binaryproto", "how-to"),
+        ("docker", "how-to"),
+        ("own video", "how-to"),
+        ("gpu", "how-to"),
+        ("pretrained", "trained"),
+        ("which weights are there", "faq"),
+        ("rtab-map", "robot"),
+    ):
         text = re.search(rf'"{page}": "((?:[^"\\]|\\.)*)"', texts)
         assert text is not None
         assert words in text[1].lower()
