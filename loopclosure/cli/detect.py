@@ -38,7 +38,7 @@ SETTINGS = (
     "consistency",
     "consistency_window",
 )
-RECENT_SECONDS = 10.0  # of --video: the place of now is not seen again
+RECENT_SECONDS = 10.0  # of --video: the present place does not count as seen again
 # Settings of the search frame by frame.
 ONLINE = ("top_k", "consistency", "consistency_window")
 

@@ -3,7 +3,7 @@
 The scores of METHOD are searched for sequences, and decoys tell which matches are loops
 (:mod:`loopclosure.methods.decoys`). Matches are verified by geometry where that can work here: it must find many of the
 matches and none of the pairs that the scores call unlike. Then what is verified is a loop even where sequences tell
-nothing, and what sequences find without any verified pair on it is none.
+nothing, and a sequence without a verified pair is rejected.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class Lines:
     match    (Q,) each query's best reference, -1 without one
     targets  (Q,) its score, -inf without one
     decoys   (Q,) the best score of a reverse line, or of frames far apart in odometry, -inf without one
-    near     (Q,) bool: of the queries just before and after, none that is far fits the match better, and the middle of
+    near     (Q,) bool: of the queries just before and after, no distant one fits the match better, and the middle of
              the line is nearer to its mean than to chance. Where a loop ends, the line through its last place is the
              best one for a while
     """

@@ -33,7 +33,7 @@ def _library(name: str) -> Any:
 
     OpenBLAS chooses others on some newer CPUs. What the environment says stays; if SciPy's BLAS was loaded before, so
     do its kernels. Only this module of ``scipy.linalg`` is loaded: all of it takes ten times as long. It does not
-    stay in ``sys.modules``: who imports ``scipy.linalg`` afterwards would not find it there as an attribute.
+    stay in ``sys.modules``: code that imports ``scipy.linalg`` later would not find it as an attribute.
     """
     name = f"scipy.linalg.{name}"
     if name in sys.modules:

@@ -42,7 +42,7 @@ _swept: set[Path] = set()
 def whole_file(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside ``path`` to write to; it is renamed once the block is done and all is on disk.
 
-    A symbolic link stays one; a pipe or a device gets the bytes. A file that is replaced passes on its mode and owner.
+    A symbolic link stays one; a pipe or a device is written to. The new file gets the mode and owner of the old one.
     If the block fails, the temporary file is removed, and what was at ``path`` is still there. Raises SpecError if it
     cannot be written.
     """

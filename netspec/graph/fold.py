@@ -1,4 +1,4 @@
-"""Which layers of a net can do the work of those that follow: a plan without what only scales, shifts or passes on.
+"""Fold layers that only scale, shift or copy into the layers before them.
 
 The pass knows no layer type. Its callers say of each layer whether it is an affine map of its channels, can take one
 on, or hands its bottom on unchanged; netspec/run/fold.py asks the layers.

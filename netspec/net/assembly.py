@@ -28,7 +28,7 @@ from netspec.net.ignored_fields import unsure_layers, unused_fields
 from netspec.net.need import BYTES, Need, limit_on, limit_text
 from netspec.run.eager import last_uses
 
-MUCH = 8  # a net that takes more than this part of the limit is first looked at as a whole
+MUCH = 8  # a net that needs more than 1/8 of the limit is summed up before it is built
 
 
 @dataclass(frozen=True)

@@ -160,7 +160,7 @@ class Net(torch.nn.Module):
         """Run forward and backward by kernels prepared once; return the loss and the outputs, as forward_loss does.
 
         Gradients are added to ``grad``. None where autograd must do it: see :meth:`training_step`, or where hooks or
-        ``keep`` look at the pass. The loss is good until the next call.
+        ``keep`` look at the pass. The loss is valid until the next call.
         """
         training = self.training_kernels()
         if training is None or self.keep or training.is_watched():
@@ -180,7 +180,7 @@ class Net(torch.nn.Module):
         return None if isinstance(self._training, str) else self._training
 
     def training_step(self) -> TrainingStep | str:
-        """Return what trains the net by kernels prepared once, or in words why there is none."""
+        """Return the prepared kernels that train the net, or the reason why it has none."""
         if why := obstacle(self.plan, self.eager.parts(), self.largest_trained):
             return why
         weighted = partial(weighted_sum, exact=self.options.exact)

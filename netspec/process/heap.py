@@ -1,4 +1,4 @@
-"""Memory that an iteration frees is kept for the next, and holes that runs of ever other sizes leave are given back.
+"""Memory that an iteration frees is kept for the next; gaps left by runs of changing sizes go back to the system.
 
 The C library gives freed memory back to the system, which must clear it before the process gets it again: of a training
 on a CPU that can take a twentieth of the time.
@@ -35,7 +35,7 @@ def keep_freed_memory() -> None:
 def give_back_freed_memory() -> None:
     """Give the system what lies free between blocks in use, where the C library can (glibc: malloc_trim).
 
-    Passes on inputs of ever other sizes leave ever other holes: a net of six convolutions that had seen 70 batch sizes
+    Runs on inputs of changing sizes leave gaps of many sizes: a net of six convolutions that had seen 70 batch sizes
     held five times the memory that it used.
     """
     if trim := _malloc_trim():

@@ -135,7 +135,7 @@ class TrainingStep:
     def run(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net forward and backward; return the weighted sum of its losses, and the outputs.
 
-        The gradients of the learnable blobs are added to ``grad``. The loss is good until the next call.
+        The gradients of the learnable blobs are added to ``grad``. The loss is valid until the next call.
         """
         plan, layer = self._plan, self._layers[0]
         try:

@@ -28,7 +28,7 @@ def __getattr__(name: str) -> Any:
     if name in _WITHOUT_TORCH:
         return getattr(importlib.import_module(f"{__name__}.{_WITHOUT_TORCH[name]}"), name)
     dunder = name.startswith("__") and name != "__all__"
-    if not dunder and _INTERFACE not in sys.modules:  # else it has this name not, or is being loaded
+    if not dunder and _INTERFACE not in sys.modules:  # otherwise the name does not exist, or is being loaded
         names = vars(importlib.import_module(_INTERFACE))
         globals().update({given: value for given, value in names.items() if not given.startswith("__")})
         globals()["__all__"] = [given for given in names if not given.startswith("_")]

@@ -386,7 +386,7 @@ class Passes:
     def _tape(self, i: int) -> Tape:
         """Return the record of the last forward pass of layer ``i``, its bottoms' values as they are now in memory.
 
-        A layer that has not run, or on other shapes, runs for it, and leaves no trace.
+        If the layer has not run at these shapes, it is run first, with no effect on the net.
         """
         tape, bottoms = self._tapes[i], self.bottoms[i]
         if tape is None or any(leaf.shape != blob.shape for leaf, blob in zip(tape.leaves, bottoms, strict=True)):

@@ -1,4 +1,4 @@
-"""A rectifier that ends at 6, under whichever name a fork has it."""
+"""ReLU with an upper limit of 6, under the names that forks give it."""
 
 from __future__ import annotations
 

@@ -101,5 +101,5 @@ class Context:
 
     @property
     def data_seed(self) -> int:
-        """From it follow the draws of layers that read records; it is the same for all ranks."""
+        """The seed of layers that read records; it is the same for all ranks."""
         return self.random.seed if self.options.data_seed is None else self.options.data_seed

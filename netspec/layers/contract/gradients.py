@@ -1,4 +1,4 @@
-"""Layers whose gradient follows from what lies in memory when the backward pass comes, as Caffe's does."""
+"""Layers that compute gradients from what is in memory at the time of the backward pass, as Caffe does."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ class HasKernels(Protocol):
 
         Only these kernels use the layer from now on, at these shapes. Without gradients they may keep the blobs in
         another form, copied: after a write to them the layer is asked again; no kernel may keep an alias of them.
-        None: there is nothing better at these shapes than ``forward`` and what autograd records.
+        None: at these shapes ``forward`` with autograd is as good.
         """
         ...
 

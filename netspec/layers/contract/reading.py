@@ -71,7 +71,7 @@ class Constant(Protocol):
     """A layer some of whose tops are written when it is made and never again."""
 
     def filled_once(self) -> Sequence[torch.Tensor | None]:
-        """Return these by top; empty where there is none."""
+        """Return these by top; an empty dict if there are none."""
         ...
 
 
