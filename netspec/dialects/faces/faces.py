@@ -13,6 +13,7 @@ import torch
 from netspec.dialects.faces.margins import Margin, MarginProduct
 from netspec.layers import register
 from netspec.layers.contract.base import Shape
+from netspec.layers.contract.whose import whose
 from netspec.layers.loss.base import Classified, Loss
 from netspec.proto.schema import TRAIN, value
 
@@ -98,7 +99,7 @@ class CenterLoss(Loss, Classified):
         axis = self.canonical_axis(p.axis, shape, "center_loss_param", "axis")
         self.length = torch.Size(shape[axis:]).numel()
         self.add_blob((p.num_output, self.length), p.center_filler)
-        self.n_times = p.HasField("distance_type") or (self.phase == TRAIN and self.whose() == "happynear")
+        self.n_times = p.HasField("distance_type") or (self.phase == TRAIN and whose(self) == "happynear")
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         vectors, labels = (torch.Size(shape) for shape in bottom_shapes)
