@@ -199,10 +199,10 @@ def _caffe_stops(net: Net) -> Said:
     Here such a net runs: no gradient passes.
     """
     for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
-        if node.type == "AbsVal" and any(node.in_place):
+        if node.type in ("AbsVal", "Flatten", "Reshape") and any(node.in_place):
             yield (
                 _place(net.plan, i, "top"),
-                "Caffe stops here: AbsVal may not work in place; give its top another name",
+                f"Caffe stops here: {node.type} may not work in place; give its top another name",
             )
         asked = net.backward_plan.bottoms[i] if net.phase == TRAIN and net.backward_plan.layers[i] else ()
         for j, wanted in enumerate(asked):
