@@ -48,5 +48,6 @@ class Messages:
                 while length and (part := self._stream.read(min(length, 1 << 20))):
                     length -= len(part)
             elif not line.strip() and length:
-                return self._stream.read(length)
+                body = self._stream.read(length)
+                return body if len(body) == length else b""
         return b""

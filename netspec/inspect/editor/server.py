@@ -79,12 +79,13 @@ def make_server(version: str) -> LanguageServer:
         server.text_document_publish_diagnostics(lsp.PublishDiagnosticsParams(uri, told))
 
     def look(params: Any) -> None:
-        """Check a saved file; its text alone where it is not on disk."""
+        """Check a saved file with all that lint finds; its text alone where it is not on disk."""
         uri, path = params.text_document.uri, to_fs_path(params.text_document.uri)
         faults = faults_of(params)
-        if not faults and path and urlparse(uri).scheme == "file":
+        if path and urlparse(uri).scheme == "file" and TOO_LARGE not in (each.message for each in faults):
             with log.silent():
-                faults, shapes[uri] = file_faults(path)
+                found, shapes[uri] = file_faults(path)
+            faults = list({(each.where, each.message): each for each in (*faults, *found)}.values())
         publish(uri, faults)
 
     @server.feature(lsp.TEXT_DOCUMENT_DID_OPEN)
