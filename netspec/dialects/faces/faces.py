@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
+from typing_extensions import override
 
 from netspec.dialects.faces.margins import Margin, MarginProduct
 from netspec.layers import register
@@ -150,6 +151,7 @@ class MarginInnerProduct(MarginProduct):
 
     message = "margin_inner_product_param"
 
+    @override
     def products(self, x: torch.Tensor, labels: torch.Tensor, share: float) -> torch.Tensor:
         weight = self.blob(0)
         with torch.no_grad():

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from typing_extensions import override
 
 from netspec.dialects.faces.margins import MarginProduct
 from netspec.layers import Layer, common, register
@@ -94,6 +95,7 @@ class LargeMarginInnerProduct(MarginProduct):
 
     message = "largemargin_inner_product_param"
 
+    @override
     def products(self, x: torch.Tensor, labels: torch.Tensor, share: float) -> torch.Tensor:
         weight = self.blob(0)
         top = x @ weight.t()

@@ -34,10 +34,11 @@ MEANS = np.array([102.9801, 115.9465, 122.7717], np.float32)  # blue, green, red
 _SETTING = r"""(\w+)['"]?\s*:\s*(?:[^\s\[(]*\s*[\[(]([^\])]*)[\])]|([-+.\w]+))"""  # a name; a list or a number
 
 
-def settings(layer: Layer, **least: int | None) -> dict[str, Any]:
+def settings(layer: Layer, *others: str, **least: int | None) -> dict[str, Any]:
     """Return the numbers and lists of numbers of ``param_str``, a line of YAML each: ``'feat_stride': 16``.
 
-    ``least`` names the integers that must be given, with the least value, None for those that may be missing.
+    ``least`` names the integers that must be given, with the least value, None for those that may be missing;
+    ``others`` the rest of what is read. Raises SpecError for any other name.
     """
     text = layer.param.python_param.param_str
     found: dict[str, Any] = {}
@@ -48,7 +49,15 @@ def settings(layer: Layer, **least: int | None) -> dict[str, Any]:
         if minimum is not None and not (isinstance(found.get(name), float) and found[name] >= minimum):
             message = f"param_str has no {name} of at least {minimum}; found {text!r}"
             raise layer.error(message, "python_param", "param_str")
+    if unknown := found.keys() - {*others, *least}:
+        message = f"param_str has {min(unknown)}, which is not read here; it may have {', '.join((*least, *others))}"
+        raise layer.error(message, "python_param", "param_str")
     return found
+
+
+def anchors_of(found: Mapping[str, Any]) -> Array:
+    """Return the anchors of py-faster-rcnn, or those of the ``scales`` and ``ratios`` that a param_str has."""
+    return base_anchors(16, found.get("ratios", RATIOS), found.get("scales", SCALES))
 
 
 def overlaps(boxes: Array, others: Array) -> Array:
@@ -107,9 +116,9 @@ class AnchorTarget(_Sampling):
     label_bottoms = frozenset(range(4))
 
     def setup(self) -> None:
-        found = settings(self, feat_stride=1)
+        found = settings(self, "scales", "ratios", "allowed_border", feat_stride=1)
         self.stride, self.border = int(found["feat_stride"]), found.get("allowed_border", 0)
-        self.anchors = base_anchors(16, RATIOS, found.get("scales", SCALES))
+        self.anchors = anchors_of(found)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         if len(bottom_shapes[0]) != 4 or bottom_shapes[0][0] != 1:

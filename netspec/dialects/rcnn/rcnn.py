@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from netspec.dialects.boxes import as_array
-from netspec.dialects.rcnn.faster import RATIOS, SCALES, AnchorTarget, ProposalTarget, RoIData, settings
+from netspec.dialects.rcnn.faster import AnchorTarget, ProposalTarget, RoIData, anchors_of, settings
 from netspec.dialects.rcnn.proposals import all_anchors, base_anchors, moved, suppress
 from netspec.dialects.rcnn.regions import RegionPooling, whole
 from netspec.dialects.rcnn.smooth import NORMALIZED, SmoothL1Loss
@@ -85,7 +85,7 @@ class ROIPooling(RegionPooling):
     def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
         images, channels, height, width = maps.shape
         with torch.no_grad():
-            regions = regions.reshape(-1, 5)
+            regions = self.rows(regions)
             image = self.images_of(regions, images)
             first, last = regions[:, 1:3], regions[:, 3:]
             pad = (last - first + 1) * self.pad_ratio
@@ -204,8 +204,8 @@ class Proposal(Layer):
         if deltas != (1, 4 * count, *scores[2:]):
             expected = (1, 4 * count, *scores[2:])
             raise self.error(f"found boxes of shape {deltas}, expected {expected}", "bottom", 1)
-        if image[:1] != (1,) or math.prod(image) not in (3, 4):
-            raise self.error(f"found an image's sizes of shape {image}, expected (1, 3) or (1, 4)", "bottom", 2)
+        if image[:1] != (1,) or math.prod(image) not in (3, 4, 6):
+            raise self.error(f"found an image's sizes of shape {image}, expected (1, 3), (1, 4) or (1, 6)", "bottom", 2)
         most = self.settings.post_nms_topn
         return [(most, 5), (most,)][: self.num_tops]
 
@@ -216,7 +216,7 @@ class Proposal(Layer):
         anchors = all_anchors(self.anchors, param.feat_stride, height, width)
         moves = as_array(deltas)[0].reshape(count, 4, height, width).transpose(2, 3, 0, 1).reshape(-1, 4)
         boxes = moved(anchors, moves, sizes[0], sizes[1])
-        least = param.min_size * sizes[[-1, 2]]  # of width and height
+        least = param.min_size * sizes[[3 if len(sizes) == 4 else 2, 2]]  # of width and height
         large = (boxes[:, 2:] - boxes[:, :2] + 1 >= least).all(axis=1)
         found = np.where(large, as_array(scores)[0, count:].transpose(1, 2, 0).reshape(-1), np.float32(0))
         order = np.argsort(-found, kind="stable")[: param.pre_nms_topn]
@@ -231,7 +231,7 @@ class Proposal(Layer):
 class ProposalLayer(Proposal):
     """Proposal with the settings of py-faster-rcnn, whose Python layer rpn.proposal_layer.ProposalLayer it is.
 
-    In training 2000 of 12000 regions stay, in testing 300 of 6000; param_str has feat_stride and scales.
+    In training 2000 of 12000 regions stay, in testing 300 of 6000; param_str has feat_stride, scales, ratios.
 
     bottom[0]  scores (1, 2 A, H, W): background, then object, of the A anchors
     bottom[1]  (1, 4 A, H, W): dx, dy, log dw, log dh of each anchor
@@ -242,11 +242,11 @@ class ProposalLayer(Proposal):
     """
 
     def setup(self) -> None:
-        found = settings(self, feat_stride=1)
+        found = settings(self, "scales", "ratios", feat_stride=1)
         self.settings = param = copy.deepcopy(value(self.param, "proposal_param"))
         param.feat_stride = int(found["feat_stride"])
         param.pre_nms_topn, param.post_nms_topn = (12000, 2000) if self.phase == TRAIN else (6000, 300)
-        self.anchors = base_anchors(param.base_size, RATIOS, found.get("scales", SCALES))
+        self.anchors = anchors_of(found)
 
 
 register("rpn.anchor_target_layer.AnchorTargetLayer", "python_param")(AnchorTarget)

@@ -75,7 +75,7 @@ class PSROIPooling(RegionPooling):
 
     def forward(self, maps: torch.Tensor, regions: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
-            regions = regions.reshape(-1, 5)
+            regions = self.rows(regions)
             image = self.images_of(regions, maps.shape[0])
             corners = whole(regions[:, 1:])
             columns = self._inside(corners[:, 0], corners[:, 2], maps.shape[3])

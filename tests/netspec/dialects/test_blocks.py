@@ -70,9 +70,10 @@ def test_relu6_in_place_has_the_gradient_of_what_lies_in_memory() -> None:
     (top,) = net(x=x).values()
     torch.testing.assert_close(top, torch.tensor([-1.0, -0.6, 3.0, 7.0, 11.0]))
     top.sum().backward()
-    # Caffe's ReLU6 reads its bottom where Power has written: 0 < -0.6 is false, 7 < 6 is.
+    # Caffe's ReLU6 reads its bottom where Power has written: 0 < -0.6 is false, 7 < 6 is. Its Power in place overwrites
+    # the gradient with the slope: 2 times 2.
     assert x.grad is not None
-    assert x.grad.tolist() == [0, 0, 2, 0, 0]
+    assert x.grad.tolist() == [0, 0, 4, 0, 0]
 
 
 CONVOLVED = "kernel_size: 3 pad: 1 stride: 2 weight_filler { type: 'xavier' } bias_filler { type: 'uniform' }"

@@ -57,7 +57,17 @@ def test_what_param_str_says(build: Build, text: str, found: dict[str, object]) 
     escaped = text.replace("\n", "\\n")
     param = PYTHON.format("rpn.anchor_target_layer", "AnchorTargetLayer", escaped)
     layer = build("rcnn", param, (1, 18, 20, 30), (3, 5), (1, 3), tops=4)
-    assert found.items() <= settings(layer).items()
+    assert found.items() <= settings(layer, "feat_stride", "scales", "ratios", "allowed_border").items()
+
+
+def test_ratios_make_other_anchors_and_another_name_is_refused(build: Build) -> None:
+    text = ANCHORS.replace("'feat_stride': 16", "'feat_stride': 16, 'ratios': [0.5, 1]")
+    layer = build("rcnn", text, (1, 12, 20, 30), (3, 5), (1, 3), tops=4)
+    assert len(layer.anchors) == 6
+    with pytest.raises(
+        SpecError, match="param_str has ration, which is not read here; it may have feat_stride, scales"
+    ):
+        build("rcnn", text.replace("ratios", "ration"), (1, 18, 20, 30), (3, 5), (1, 3), tops=4)
 
 
 def test_a_stride_must_be_given(build: Build) -> None:

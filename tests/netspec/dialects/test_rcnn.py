@@ -251,3 +251,11 @@ def test_proposal_refuses_other_shapes(build: Build, shapes: tuple, fault: str) 
         build("rcnn", ONE % "", *shapes)
     with pytest.raises(SpecError, match="scale must be above 0"):
         build("rcnn", "type: 'Proposal' proposal_param { scale: -1 }", *shapes)
+
+
+def test_a_placeholder_of_regions_is_refused_when_the_net_runs(build: Build) -> None:
+    layer = build(
+        "rcnn", "name: 'p' type: 'ROIPooling' roi_pooling_param { pooled_w: 2 pooled_h: 2 }", (1, 3, 8, 8), (1, 4)
+    )
+    with pytest.raises(SpecError, match=r"found regions of shape \(1, 4\), expected \(R, 5\)"):
+        layer.run(torch.zeros(1, 3, 8, 8), torch.zeros(1, 4))
