@@ -259,7 +259,7 @@ def own_settings(layer: Any) -> Iterator[tuple[str, Any]]:
             yield name, field.get(layer)
 
 
-def _place(plan: Plan, i: int, *path: str) -> Where:
+def _place(plan: Plan, i: int, *path: str | int) -> Where:
     return plan.source.at(i, *path, layer=plan.nodes[i].name, type=plan.nodes[i].type)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -63,7 +64,8 @@ def test_what_param_str_says(build: Build, text: str, found: dict[str, object]) 
 def test_ratios_make_other_anchors_and_another_name_is_refused(build: Build) -> None:
     text = ANCHORS.replace("'feat_stride': 16", "'feat_stride': 16, 'ratios': [0.5, 1]")
     layer = build("rcnn", text, (1, 12, 20, 30), (3, 5), (1, 3), tops=4)
-    assert len(layer.anchors) == 6
+    anchors: Any = layer.anchors
+    assert len(anchors) == 6
     with pytest.raises(
         SpecError, match="param_str has ration, which is not read here; it may have feat_stride, scales"
     ):

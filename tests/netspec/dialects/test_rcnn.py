@@ -66,6 +66,7 @@ def test_roi_pooling(build: Build, gradcheck: Gradcheck, shape: tuple[int, ...])
     (backward,) = (np.flatnonzero((regions.reshape(8, 5)[:, 3:] < regions.reshape(8, 5)[:, 1:3]).any(1)),)
     assert len(backward) == 1
     layer.run(maps.requires_grad_(), regions)[0][backward].sum().backward()
+    assert maps.grad is not None
     assert not maps.grad.any()  # a region that ends before it begins
     forward = regions[np.delete(np.arange(8), backward)]
     gradcheck(layer, maps.detach(), forward, fixed=(1,))

@@ -15,7 +15,7 @@ from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, net_to_proto, save_weights
 from netspec.proto.binary import net_beside_numbers
-from netspec.proto.schema import TRAIN, BlobProto, NetParameter, V0LayerParameter, V1LayerParameter
+from netspec.proto.schema import TRAIN, BlobProto, BlobShape, NetParameter, V0LayerParameter, V1LayerParameter
 from netspec.proto.text import parse_net_text
 from paths import GOLDEN
 
@@ -238,7 +238,7 @@ layer { name: "ip" type: "InnerProduct" bottom: "a" top: "x" inner_product_param
 def wide(kind: str) -> bytes:
     """A file of weights 0 to 1199 and biases 0 to 39, as long as those whose numbers are read where they lie."""
     weights, biases = np.arange(1200, dtype="<f4"), np.arange(40, dtype="<f4")
-    new = [BlobProto(shape={"dim": [40, 30]}, data=weights), BlobProto(shape={"dim": [40]}, data=biases)]
+    new = [BlobProto(shape=BlobShape(dim=shape), data=data) for shape, data in (([40, 30], weights), ([40], biases))]
     old = [
         BlobProto(num=1, channels=1, height=40, width=30, data=weights),
         BlobProto(width=40, num=1, channels=1, height=1, data=biases),

@@ -155,6 +155,7 @@ def _in_place(settings: str, phase: int, net_of: Callable[..., caffe.Net]) -> tu
     text += f'layer {{ name: "it" bottom: "y" top: "y" {settings} }}'
     net = net_of(text, phase)
     view = net.blobs["y"].data if phase == caffe.TRAIN else None
+    x = y = diff = np.zeros(0)
     for seed in range(2):
         x, diff = np.random.default_rng(seed).standard_normal((2, 4, 3)).astype(np.float32)
         y = net.forward(x=x)["y"].copy()
@@ -467,7 +468,7 @@ def test_bad_use_is_answered_and_the_net_lives(
 
 
 X = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 dim: 8 dim: 8 } } }\n'
-FC = 'layer { name: "ip" type: "InnerProduct" bottom: "x" top: "ip" inner_product_param { num_output: 4 } }\n'
+FOUR = 'layer { name: "ip" type: "InnerProduct" bottom: "x" top: "ip" inner_product_param { num_output: 4 } }\n'
 
 
 @pytest.mark.parametrize(
@@ -481,17 +482,17 @@ FC = 'layer { name: "ip" type: "InnerProduct" bottom: "x" top: "ip" inner_produc
             "Check failed: kernel_shape_data[i] > 0 Filter dimensions must be nonzero.",
         ),
         (
-            FC + 'layer { name: "c" type: "Concat" bottom: "x" bottom: "ip" top: "c" concat_param { axis: 0 } }',
+            FOUR + 'layer { name: "c" type: "Concat" bottom: "x" bottom: "ip" top: "c" concat_param { axis: 0 } }',
             "3:46",
             "All inputs must have the same shape, except at concat_axis.",
         ),
         (
-            FC + 'layer { name: "e" type: "Eltwise" bottom: "x" bottom: "ip" top: "e" }',
+            FOUR + 'layer { name: "e" type: "Eltwise" bottom: "x" bottom: "ip" top: "e" }',
             "3:47",
             "Check failed: bottom[0]->shape() == bottom[i]->shape()",
         ),
         (
-            FC + 'layer { name: "l" type: "SoftmaxWithLoss" bottom: "ip" bottom: "x" top: "l" }',
+            FOUR + 'layer { name: "l" type: "SoftmaxWithLoss" bottom: "ip" bottom: "x" top: "l" }',
             "3:56",
             "(2 vs. 384) Number of labels must match number of predictions; e.g., if softmax axis == 1 and prediction",
         ),
@@ -506,7 +507,7 @@ def test_a_failed_check_has_caffes_words_and_the_place(
 
 
 def test_a_failed_check_of_a_pass_has_caffes_words(net_of: Callable[..., caffe.Net], tmp_path: Path) -> None:
-    net = net_of(X + FC)
+    net = net_of(X + FOUR)
     net.blobs["x"].reshape(2, 3, 9, 9)
     for run in (net.forward, net.reshape):
         with pytest.raises(ValueError, match="InnerProduct") as fault:

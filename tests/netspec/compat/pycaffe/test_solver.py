@@ -222,7 +222,7 @@ def test_debug_info_logs_what_netspecs_own_solver_logs(
     assert len(logs[0]) > 10
 
 
-def shown(solver: caffe.SGDSolver) -> dict[str, np.ndarray]:
+def shown(solver: caffe.Solver) -> dict[str, np.ndarray]:
     """Copies of all that a script can see."""
     seen = {
         f"{name}/{what}": getattr(blob, what) for name, blob in solver.net.blobs.items() for what in ("data", "diff")
