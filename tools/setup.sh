@@ -16,5 +16,5 @@ if [ ! -x "$VENV/bin/netspec" ] || [ ! -e "$INSTALLED" ] || [ "$ROOT/pyproject.t
   install -e "$ROOT${NEEDS:+[$NEEDS]}"
   touch "$VENV/installed" "$INSTALLED"
 fi
-"$VENV/bin/python" "$ROOT/prototxt/variants.py"
+"${PYTHON:-python3}" "$ROOT/prototxt/variants.py"
 export PATH="$VENV/bin:$PATH"

@@ -26,10 +26,12 @@ from netspec import log
 from netspec.data.lmdb_file import LmdbFile, Record
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import pointer_fault_at
+from netspec.files.limits import amount
 from netspec.files.whole_file import whole_folder
 
 BACKENDS = ("lmdb", "leveldb")
 _SCAN = 4096  # keys listed ahead of the requested one
+LITTLE = 1 << 16  # bytes that a full disk may have left
 _FIRST_MAP_SIZE = 1 << 20  # Caffe's
 _COMMIT_RECORDS, _COMMIT_BYTES = 1000, 64 << 20  # a batch stays in memory until it is committed
 
@@ -262,7 +264,7 @@ class Writer:
             self._store.put(key, value)
         except (lmdb.Error, OSError) as fault:
             name = key.decode(errors="backslashreplace")
-            raise SpecError(f'cannot write record "{name}" ({fault})', Where(self.path)) from None
+            raise SpecError(f'cannot write record "{name}" ({self._why(fault)})', Where(self.path)) from None
 
     def commit(self) -> None:
         """Write the records put so far to the file system."""
@@ -270,7 +272,12 @@ class Writer:
         try:
             self._store.commit()
         except (lmdb.Error, OSError) as fault:
-            raise SpecError(f"cannot write to the database ({fault})", Where(self.path)) from None
+            raise SpecError(f"cannot write to the database ({self._why(fault)})", Where(self.path)) from None
+
+    def _why(self, fault: Exception) -> str:
+        """Return why something could not be written. LMDB says "Input/output error" where a disk is full."""
+        free = shutil.disk_usage(Path(self.path).absolute().parent).free
+        return f"the disk is full: {amount(free)} left" if free < LITTLE else str(fault)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

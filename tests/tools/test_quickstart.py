@@ -24,7 +24,9 @@ def project(tmp_path: Path) -> Path:
     """A clone whose environment is ready, and has programs that do nothing."""
     folder = tmp_path / "clone"
     shutil.copytree(ROOT / "tools", folder / "tools")
-    (folder / "prototxt").mkdir()
+    shutil.copytree(
+        ROOT / "prototxt", folder / "prototxt", ignore=shutil.ignore_patterns("*.caffemodel", "SOURCES.csv")
+    )
     shutil.copy(ROOT / "pyproject.toml", folder)
     programs = folder / ".venv" / "bin"
     programs.mkdir(parents=True)

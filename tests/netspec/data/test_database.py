@@ -6,6 +6,7 @@ import sys
 import tempfile
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import lmdb
 import numpy as np
@@ -318,3 +319,12 @@ def test_without_plyvel_leveldb_says_what_to_install(tmp_path: Path, monkeypatch
     with pytest.raises(SpecError, match="pip install plyvel"):
         write(tmp_path / "new", {}, "leveldb")
     assert os.listdir(tmp_path) == ["db"]
+
+
+def test_a_full_disk_is_called_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """LMDB itself says "Input/output error"."""
+    with Writer(str(tmp_path / "db"), "LMDB") as writer:
+        monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=0))
+        assert writer._why(OSError("mdb_txn_commit: Input/output error")) == "the disk is full: 0 bytes left"
+        monkeypatch.undo()
+        assert writer._why(OSError("other")) == "other"

@@ -36,9 +36,9 @@ def example() -> str:
     return "\n".join(line.removeprefix("    ") for line in lines)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def fork(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One file for all tests: what its declarations add stays in the schema's pool, unseen, after a test."""
+    """One file for all tests of a process: what it declares stays in the schema's pool, unseen, after a test."""
     path = tmp_path_factory.mktemp("fork") / "doubling.py"
     path.write_text(example())
     path.with_name("net.prototxt").write_text(NET)
