@@ -59,7 +59,7 @@ def __getattr__(name: str) -> "Any":
     import importlib.util
 
     if name == "__version__":
-        from netspec.terminal.version import version
+        from netspec.terminal.commands import version
 
         return version()
     if name in _HOMES:

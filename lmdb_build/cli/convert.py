@@ -24,7 +24,7 @@ from netspec.data.database import BACKENDS, open_reader
 from netspec.data.mean import channel_means, compute_mean, write_mean
 from netspec.errors import Where
 from netspec.terminal.commands import Commands, WrongUsage, refuse
-from netspec.terminal.progress import bar
+from netspec.terminal.output import bar
 
 
 def add_to(commands: Commands) -> None:

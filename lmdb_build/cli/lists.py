@@ -7,8 +7,7 @@ from pathlib import Path
 
 from lmdb_build.pairs.contact_sheet import write_contact_sheet
 from lmdb_build.pairs.list_file import join_lists, root_of
-from netspec.terminal.commands import Commands
-from netspec.terminal.options import seed
+from netspec.terminal.commands import Commands, seed
 
 
 def add_to(commands: Commands) -> None:

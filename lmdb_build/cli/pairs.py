@@ -26,9 +26,8 @@ from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_posed
 from loopclosure.places.source import POSES, TOPICS, Source, read_source
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
-from netspec.terminal.commands import Commands, WrongUsage, refuse
-from netspec.terminal.options import above_zero, seed
-from netspec.terminal.progress import bar, warn
+from netspec.terminal.commands import Commands, WrongUsage, above_zero, refuse, seed
+from netspec.terminal.output import bar, warn
 
 SEQUENCES = ("", *LAYOUTS)
 KINDS = {

@@ -11,9 +11,8 @@ from lmdb_build.pairs.runs import folder_runs, index_runs, join_runs
 from lmdb_build.views import Batches, Changes, write_views
 from loopclosure.errors import InputError
 from loopclosure.places.source import Source, read_source
-from netspec.terminal.commands import Commands, refuse
-from netspec.terminal.options import above_zero, seed
-from netspec.terminal.progress import bar
+from netspec.terminal.commands import Commands, above_zero, refuse, seed
+from netspec.terminal.output import bar
 
 
 def add_to(commands: Commands) -> None:

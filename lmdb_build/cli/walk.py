@@ -7,9 +7,8 @@ from pathlib import Path
 
 from lmdb_build.cli.arguments import size
 from lmdb_build.walk.sequence import Walk, write_walk
-from netspec.terminal.commands import Commands, WrongUsage
-from netspec.terminal.options import seed
-from netspec.terminal.progress import bar
+from netspec.terminal.commands import Commands, WrongUsage, seed
+from netspec.terminal.output import bar
 
 SEASON_S = 1_000_000.0  # between the time stamps of two seasons of one walk
 

@@ -20,9 +20,8 @@ from loopclosure.places.pose_files import pose_form, read_poses
 from loopclosure.places.sequences import ImageSequence
 from loopclosure.places.source import FRAMES, POSES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, write_closed_paths
-from netspec.terminal.commands import Commands, WrongUsage
-from netspec.terminal.options import seed
-from netspec.terminal.progress import bar, warn
+from netspec.terminal.commands import Commands, WrongUsage, seed
+from netspec.terminal.output import bar, warn
 
 # What belongs to frames, and means nothing to --graph.
 OF_FRAMES = (

@@ -16,9 +16,8 @@ from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import ImageSequence, benchmark_parts, layout_of, read_sequence
 from loopclosure.places.source import FRAMES, POSES, TOPICS, Kinds, Source, read_source
 from loopclosure.places.truth import Exclusion
-from netspec.terminal.commands import WrongUsage, refuse
-from netspec.terminal.options import above_zero
-from netspec.terminal.progress import bar, warn
+from netspec.terminal.commands import WrongUsage, above_zero, refuse
+from netspec.terminal.output import bar, warn
 
 SEQUENCE = (*FRAMES, *POSES, "references")
 KINDS = {

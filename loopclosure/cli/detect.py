@@ -26,7 +26,7 @@ from loopclosure.places.source import FRAMES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
 from netspec.files.whole_file import write_whole
 from netspec.terminal.commands import Commands, WrongUsage
-from netspec.terminal.progress import bar, warn
+from netspec.terminal.output import bar, warn
 
 # The detector's settings that --resume takes from the saved one.
 SETTINGS = (

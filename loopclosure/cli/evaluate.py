@@ -11,9 +11,8 @@ from loopclosure.errors import InputError
 from loopclosure.methods.base import METHODS, MethodContext
 from loopclosure.places.frames import image_paths
 from loopclosure.places.source import FRAMES, Source, read_source
-from netspec.terminal.commands import Commands
-from netspec.terminal.options import seed
-from netspec.terminal.progress import bar
+from netspec.terminal.commands import Commands, seed
+from netspec.terminal.output import bar
 
 
 def add_to(commands: Commands) -> None:

@@ -15,7 +15,7 @@ from loopclosure.detector.visitor import Visitor
 from loopclosure.index.index import INDEXES
 from loopclosure.methods.drive import last_session
 from netspec.terminal.commands import Commands
-from netspec.terminal.progress import bar
+from netspec.terminal.output import bar
 
 INDEX = "exact, faiss, or Milvus: FILE.db or http://HOST:PORT (default: exact)"
 

@@ -9,7 +9,7 @@ from loopclosure.descriptors.similarity import METRICS, top_k, write_similarity,
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion
 from netspec.terminal.commands import Commands, WrongUsage
-from netspec.terminal.progress import bar
+from netspec.terminal.output import bar
 
 
 def add_to(commands: Commands) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 
 from loopclosure.errors import InputError
 from netspec.files.image_list import list_images
+from netspec.files.kinds import is_cut_png
 from netspec.files.opencv import cv2
-from netspec.files.png import is_cut_png
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 

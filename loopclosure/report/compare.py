@@ -21,7 +21,7 @@ from loopclosure.report.page import png, rendered
 from loopclosure.report.plots import COLORS, STYLE, draw_curve, frame_curves, legends_below
 from netspec.errors import printable
 from netspec.files.whole_file import write_whole
-from netspec.terminal.columns import in_columns
+from netspec.terminal.output import in_columns
 
 EXPECTED = "a report.json that loopclosure evaluate wrote"
 BY_CONVENTION = ("average precision", "recall at 100 % precision", "best F1")

@@ -13,7 +13,7 @@ import numpy as np
 from loopclosure.evaluate import RECALL_AT, SOFT_ZONE, Evaluation, Outcome
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, BestMatches, PrecisionRecall
 from netspec.files.whole_file import write_csv, write_whole
-from netspec.terminal.columns import in_columns
+from netspec.terminal.output import in_columns
 
 # A curve in report.json has at most so many points; curve_*.csv has them all.
 POINTS = 400

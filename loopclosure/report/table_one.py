@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from loopclosure.errors import InputError
 from loopclosure.report.pair_metrics import PairMetrics, judge_pairs, pair_distances
 from netspec.files.whole_file import whole_file, write_csv
-from netspec.terminal.columns import in_columns
+from netspec.terminal.output import in_columns
 
 # Qiu et al., IEEE IV 2018, Table I. The paper gives neither the threshold nor the recall.
 PAPER = (

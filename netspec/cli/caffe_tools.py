@@ -44,7 +44,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _extract_features(arguments: argparse.Namespace) -> None:
-    from netspec.inspect.features.databases import extract_features as write_features
+    from netspec.inspect.features.records import extract_features as write_features
     from netspec.net.build import load_net
 
     number = arguments.device.rpartition("=")[2]

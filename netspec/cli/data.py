@@ -12,7 +12,7 @@ from netspec.cli.arguments import positive
 from netspec.cli.run import Commands
 from netspec.errors import printable
 from netspec.terminal.commands import DONE, FAULT, WrongUsage, refuse
-from netspec.terminal.progress import bar
+from netspec.terminal.output import bar
 
 if TYPE_CHECKING:
     from netspec.data.records import Records

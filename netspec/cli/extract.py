@@ -33,11 +33,10 @@ from netspec.cli.arguments import (
 from netspec.cli.run import BUILT, Commands
 from netspec.errors import SpecError
 from netspec.files.whole_file import whole_file, why_unwritable
-from netspec.inspect.features.views import read_zooms
 from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
 from netspec.terminal.commands import WrongUsage, refuse
-from netspec.terminal.progress import bar
+from netspec.terminal.output import bar
 
 
 def add_to(commands: Commands) -> None:
@@ -76,7 +75,7 @@ def add_to(commands: Commands) -> None:
 def _extract(arguments: argparse.Namespace) -> None:
     import numpy as np
 
-    from netspec.inspect.features.finite import rows_not_finite
+    from netspec.inspect.features.records import rows_not_finite
 
     model(arguments)
     out = Path(arguments.out)
@@ -158,6 +157,8 @@ def _tell(out: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def _zooms(text: str) -> tuple[float, ...]:
+    from netspec.inspect.features.scaling import read_zooms
+
     try:
         return read_zooms(text)
     except SpecError as fault:

@@ -124,8 +124,7 @@ def _saliency(arguments: argparse.Namespace) -> None:
 def _embedding(arguments: argparse.Namespace) -> None:
     from netspec.inspect.draw.learned import embedding_figure
     from netspec.inspect.draw.style import ending_of, write_figure
-    from netspec.inspect.features.embedding import in_plane, read_features
-    from netspec.inspect.features.thumbnails import thumbnails
+    from netspec.inspect.features.embedding import in_plane, read_features, thumbnails
 
     ending_of(arguments.out, PICTURES)
     features = read_features(arguments.features, arguments.array)

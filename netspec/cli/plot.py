@@ -26,8 +26,7 @@ def _plot(arguments: argparse.Namespace) -> None:
     from netspec.inspect.draw.style import ending_of, write_figure
     from netspec.inspect.draw.training import Look, training_figure
     from netspec.inspect.draw.training_page import training_page
-    from netspec.inspect.logs.run import read_log
-    from netspec.inspect.logs.summary import summary
+    from netspec.inspect.logs.run import read_log, summary
 
     names = [printable(name) for name in (arguments.names.split(",") if arguments.names else _names(arguments.logs))]
     if len(names) != len(arguments.logs):

@@ -109,8 +109,7 @@ def _follow(follower: Follower, every: float, training: subprocess.Popen[bytes] 
 
 
 def _lines(follower: Follower) -> list[str]:
-    from netspec.inspect.logs.process import is_alive, memory_of
-    from netspec.inspect.logs.screen import screen
+    from netspec.inspect.logs.screen import is_alive, memory_of, screen
 
     run, now = follower.run, time.time()
     alive = is_alive(run.process) if run.process is not None else None

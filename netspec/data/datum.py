@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from netspec.files.kinds import pointer_fault
+from netspec.files.kinds import is_cut_png, pointer_fault
 from netspec.files.opencv import cv2
-from netspec.files.png import is_cut_png
 from netspec.proto.schema import Datum
 
 

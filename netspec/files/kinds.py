@@ -1,4 +1,4 @@
-"""What a file is that was taken for another: by its first bytes.
+"""What a file is that was taken for another, by its first bytes; and whether a PNG file is cut.
 
 A Git LFS pointer is the few lines of text that a clone without Git LFS has in the place of each large file.
 """
@@ -62,3 +62,14 @@ def unreadable(path: object, fault: OSError) -> str:
     if "://" in text or text.startswith(("http:/", "https:/")):
         return "is a web address; download the file, and give its path"
     return f"cannot be read: {fault.strerror or fault}"
+
+
+def is_cut_png(data: bytes) -> bool:
+    """Return whether data is that of a PNG file with a part that announces more than there is.
+
+    OpenCV makes room for the 4 GiB that a part may announce before it looks at how much there is.
+    """
+    at = 8 if data.startswith(b"\x89PNG\r\n\x1a\n") else len(data)
+    while at < len(data):
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    return at > len(data)

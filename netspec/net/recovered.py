@@ -10,7 +10,7 @@ from pathlib import Path
 
 from netspec import log
 from netspec.errors import SpecError, Where, did_you_mean
-from netspec.graph.inputs import add_input, is_input, shapes_of_input
+from netspec.graph.filter import add_input, is_input, shapes_of_input
 from netspec.graph.splits import without_splits
 from netspec.layers import layer_class
 from netspec.layers.contract.base import Shape

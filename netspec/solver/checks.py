@@ -1,13 +1,23 @@
-"""Checks of a solver's settings before anything is built. In Caffe some of these errors appear only after days."""
+"""Checks of a training: its settings before anything is built, its threads, and where a NaN comes from.
+
+In Caffe some of these errors appear only after days.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from netspec.errors import Report, SpecError, raise_fault
+from netspec.exact import ALL, NONE
 from netspec.files.whole_file import whole_file, why_unwritable
+from netspec.graph.plan import Node
+from netspec.layers.contract.reading import resume, running_state
+from netspec.net.net import Net
 from netspec.proto.schema import added_fields
 from netspec.proto.source_map import Place
 from netspec.solver.lr_policy import policy_faults
@@ -62,3 +72,70 @@ def check_prefix(param: Any, node: Place, report: Report = raise_fault, *, try_i
         advice = f"make sure that the directory exists and is writeable{begins}"
         message = f'cannot write to snapshot prefix "{param.snapshot_prefix}": {reason}; {advice}'
         report(SpecError(message, node.find("snapshot_prefix")))
+
+
+def divided_sums(net: Net) -> list[str]:
+    """Return the layers on the CPU whose sums torch divides among its threads: those not computed in Caffe's order."""
+    if net.options.exact == ALL or net.device.type != "cpu":
+        return []
+    return [
+        node.name
+        for node, layer in zip(net.plan.nodes, net.layers, strict=True)
+        if layer.small is not None and (net.options.exact == NONE or not layer.small)
+    ]
+
+
+def dependence(net: Net, threads: int) -> str:
+    """Return what to say of a net whose bits depend on the number of threads; "" if they do not."""
+    layers = divided_sums(net) if threads > 1 else []
+    if not layers:
+        return ""
+    others = f" and {len(layers) - 1} more" if len(layers) > 1 else ""
+    return (
+        f"{threads} threads share the sums of {layers[0]}{others}: another number of threads changes the last bits of "
+        "the weights. To prevent it, set --exact all (slower), or OMP_NUM_THREADS=1"
+    )
+
+
+def bad_parameter(net: Net) -> str:
+    """Return the first learnable blob that has a NaN or an infinity, in words; "" if none has."""
+    for layer in net.layers:
+        for j, blob in enumerate(layer.blobs):
+            if not _is_finite(blob):
+                return f'blob {j} of layer "{layer.param.name}"'
+    return ""
+
+
+@torch.no_grad()
+def bad_top(net: Net, passes: int, part: str) -> str:
+    """Run the last passes again, on the same data with the same draws; return the first bad top, in words.
+
+    ``part`` is what :meth:`Random.begin` got for them. "" if no top is bad: what layers remember has changed.
+    """
+    for layer in net.layers:
+        state = running_state(layer)
+        if "iteration" in state:
+            resume(layer, {"iteration": max(0, int(state["iteration"]) - passes)})  # pyright: ignore[reportArgumentType]
+    net.random.begin(part)
+    found: list[str] = []
+    hooks = [
+        layer.register_forward_hook(partial(_look, node, net.plan.blobs, found))
+        for node, layer in zip(net.plan.nodes, net.layers, strict=True)
+    ]
+    try:
+        for _ in range(passes):
+            net.forward_loss()
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return found[0] if found else ""
+
+
+def _look(node: Node, names: Sequence[str], found: list[str], layer: Any, bottoms: Any, tops: Any) -> None:
+    for v, top in zip(node.tops, tops if isinstance(tops, tuple) else (tops,), strict=False):
+        if not _is_finite(top):
+            found.append(f'top "{names[v]}" of layer "{node.name}"')
+
+
+def _is_finite(values: torch.Tensor) -> bool:
+    return bool(torch.isfinite(values.detach()).all())

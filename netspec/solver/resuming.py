@@ -17,12 +17,21 @@ from netspec.net.stamp import Stamp
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import SolverParameter
 from netspec.solver import nets
-from netspec.solver.extra import Extra, check_pair, path_beside, read_extra, resume, running_state, write_extra
-from netspec.solver.nan import bad_parameter
-from netspec.solver.settings import Settings, changes, settings_of
+from netspec.solver.checks import bad_parameter, divided_sums
+from netspec.solver.extra import (
+    Extra,
+    Settings,
+    changes,
+    check_pair,
+    path_beside,
+    read_extra,
+    resume,
+    running_state,
+    settings_of,
+    write_extra,
+)
 from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
 from netspec.solver.testing import Tests
-from netspec.solver.threads import divided_sums
 from netspec.solver.training import Training
 
 

@@ -23,14 +23,13 @@ from netspec.graph.options import BuildOptions
 from netspec.layers.contract.context import device_of
 from netspec.proto.text import parse_solver
 from netspec.solver.checks import check_prefix
-from netspec.solver.display import Display
 from netspec.solver.extra import read_extra
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.options import TrainingOptions, choose_device
 from netspec.solver.precision import FP32
 from netspec.solver.processes import own_device
 from netspec.solver.resuming import Snapshots
-from netspec.solver.testing import Tests
+from netspec.solver.testing import Display, Tests
 from netspec.solver.training import Blobs, Training
 from netspec.solver.updating import Updates
 

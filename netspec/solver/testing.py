@@ -1,19 +1,83 @@
-"""Tests of a training: the test nets with its weights.
+"""What a training shows: the tests of its weights, and a display every ``display`` iterations.
 
-Caffe: Solver::TestAll, Solver::Test (src/caffe/solver.cpp)
+Caffe: Solver::TestAll, Solver::Test, Solver::Step (src/caffe/solver.cpp), test() (tools/caffe.cpp)
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from functools import partial
+from typing import Any
 
 import torch
 
 from netspec import log
+from netspec.layers.contract.reading import Scores, Waits, reads_data
+from netspec.log import number
+from netspec.net.net import Net
 from netspec.solver.extra import Remembered, running_state
-from netspec.solver.tally import Outputs, Tally, score_lines, scorers
-from netspec.solver.training import Training
+from netspec.solver.training import Blobs, Outputs, Training
+
+Scorer = Callable[[Sequence[torch.Tensor]], list[float]]
+
+
+def scorers(net: Net, solver: Any = None) -> dict[str, Scorer]:
+    """Return, by output, how its score follows from all batches, where its layer scores by itself."""
+    makers = {v: layer for node, layer in zip(net.plan.nodes, net.layers, strict=True) for v in node.tops}
+    found = [(name, makers.get(v)) for name, v in net.plan.outputs.items()]
+    return {name: partial(layer.score, solver=solver) for name, layer in found if isinstance(layer, Scores)}
+
+
+class Tally:
+    """Sums up the losses and outputs of batches; ``loss`` and ``scores`` are their means so far.
+
+    Outputs in ``scorers`` are kept instead, and scored together.
+    """
+
+    def __init__(self, scorers: Mapping[str, Scorer] | None = None) -> None:
+        self.batches = 0
+        self._loss = 0.0
+        self._sums: Outputs = {}
+        self._scorers = dict(scorers or {})
+        self._gathered: dict[str, list[torch.Tensor]] = {name: [] for name in self._scorers}
+
+    def add(self, loss: torch.Tensor, outputs: Mapping[str, torch.Tensor]) -> Outputs:
+        """Add what ``Net.forward_loss`` returned for a batch; return the batch's own scores."""
+        self.batches += 1
+        self._loss += loss.item()
+        for name, gathered in self._gathered.items():
+            gathered.append(outputs[name].detach())
+        batch = as_scores({name: blob for name, blob in outputs.items() if name not in self._scorers})
+        for name, values in batch.items():
+            sums = self._sums.setdefault(name, [0.0] * len(values))
+            self._sums[name] = [a + b for a, b in zip(sums, values, strict=True)]
+        return batch
+
+    @property
+    def loss(self) -> float:
+        """The mean loss."""
+        return self._loss / self.batches
+
+    @property
+    def scores(self) -> Outputs:
+        """The mean of each element of each output blob, then the scores of those that are gathered."""
+        means = {name: [value / self.batches for value in values] for name, values in self._sums.items()}
+        return means | {name: score(self._gathered[name]) for name, score in self._scorers.items()}
+
+
+def as_scores(outputs: Mapping[str, torch.Tensor]) -> Outputs:
+    """Return the elements of each output blob, in order."""
+    return {name: blob.detach().reshape(-1).tolist() for name, blob in outputs.items()}
+
+
+def score_lines(scores: Outputs, weights: Mapping[str, float]) -> Iterator[str]:
+    """Yield ``name = value`` of each element, with its contribution to the loss if its output has a loss weight."""
+    for name, values in scores.items():
+        weight = weights[name]
+        for value in values:
+            ending = f" (* {number(weight)} = {number(weight * value)} loss)" if weight else ""
+            yield f"{name} = {number(value)}{ending}"
 
 
 class Tests:
@@ -54,7 +118,7 @@ class Tests:
             with training.debugged(net) if param.debug_info else nullcontext():
                 tally.add(*training.forward(net))
         if param.test_compute_loss and batches:
-            log.info("solver.cpp:401", f"Test loss: {log.number(tally.loss)}")
+            log.info("solver.cpp:401", f"Test loss: {number(tally.loss)}")
         training.scores[i] = tally.scores
         log_scores("solver.cpp:414", "Test", tally.scores, net.output_loss_weights)
         training.on_test(i)
@@ -64,3 +128,34 @@ def log_scores(site: str, phase: str, scores: Outputs, weights: dict[str, float]
     """Log the outputs of a net as Caffe does; ``phase`` is the word before them."""
     for i, line in enumerate(score_lines(scores, weights)):
         log.info(site, f"    {phase} net output #{i}: {line}")
+
+
+class Display:
+    """Logs the pace, the loss, the outputs, and how long the training waited for data."""
+
+    def __init__(self, training: Training) -> None:
+        self._training = training
+        self._reads = any(reads_data(layer) for layer in training.net.layers)
+        self._waiting = [layer for layer in training.net.layers if isinstance(layer, Waits)]
+
+    def begin(self) -> None:
+        """Start the clock."""
+        self._time, self._iteration = self._training.options.clock(), self._training.iteration
+        self._waited = self._seconds_waited()
+
+    def show(self, outputs: Blobs) -> None:
+        """Log one display, since the last one."""
+        training = self._training
+        now, waited = training.options.clock(), self._seconds_waited()
+        seconds = now - self._time
+        speed = (training.iteration - self._iteration) / (seconds or 1)
+        pace = f"{number(speed)} iter/s, {number(seconds)}s/{training.param.display} iters"
+        log.info("solver.cpp:239", f"Iteration {training.iteration} ({pace}), loss = {number(training.loss)}")
+        log_scores("solver.cpp:258", "Train", as_scores(outputs), training.net.output_loss_weights)
+        if self._reads:
+            share = 100 * (waited - self._waited) / (seconds or 1)
+            log.info("blocking_queue.cpp:49", f"Waiting for data: {share:.1f} % of the time")
+        self._time, self._iteration, self._waited = now, training.iteration, waited
+
+    def _seconds_waited(self) -> float:
+        return sum(layer.waited for layer in self._waiting)

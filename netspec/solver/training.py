@@ -27,16 +27,21 @@ from netspec.proto.source_map import Place
 from netspec.proto.text import write_text
 from netspec.solver import nets, update
 from netspec.solver.blocks import Blocks
-from netspec.solver.checks import check_prefix, check_settings, fields_without_effect
+from netspec.solver.checks import (
+    bad_parameter,
+    bad_top,
+    check_prefix,
+    check_settings,
+    dependence,
+    fields_without_effect,
+)
 from netspec.solver.debug import debug_info
-from netspec.solver.nan import bad_parameter, bad_top
 from netspec.solver.options import TrainingOptions, choose_device
 from netspec.solver.precision import BF16, FP16, FP32, LossScale, computing
 from netspec.solver.replicas import Replicas
-from netspec.solver.tally import Outputs
-from netspec.solver.threads import dependence
 
 Blobs = dict[str, torch.Tensor]  # the outputs of a run, by name
+Outputs = dict[str, list[float]]  # the elements of each output
 
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),

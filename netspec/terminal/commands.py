@@ -294,11 +294,9 @@ class _Overview(argparse.RawDescriptionHelpFormatter):
 
 
 class _Version(argparse.Action):
-    """Show the version, which takes a while to find."""
+    """Show the version."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object, **__: object) -> None:
-        from netspec.terminal.version import version
-
         print(f"{parser.prog} {version()}")
         parser.exit()
 
@@ -385,3 +383,33 @@ class _BarAware:
 
     def flush(self) -> None:
         sys.stderr.flush()
+
+
+def seed(text: str) -> int:
+    """Read a seed of random numbers, from 0."""
+    value = int(text)
+    if not 0 <= value < 2**31:
+        raise argparse.ArgumentTypeError(f"found {text}, expected a number from 0 to {2**31 - 1}")
+    return value
+
+
+def above_zero(text: str) -> float:
+    """Read a number above 0."""
+    value = float(text)
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"found {text}, expected a number above 0")
+    return value
+
+
+DISTRIBUTION = "netspec-caffe"
+UNKNOWN = "unknown"
+
+
+def version(distribution: str = DISTRIBUTION) -> str:
+    """Return the version of an installed distribution, "unknown" where it is not installed."""
+    from importlib import metadata  # which takes a while
+
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:  # the source is used without being installed
+        return UNKNOWN

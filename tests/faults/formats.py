@@ -49,8 +49,7 @@ from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text, parse_solver_text
 from netspec.solver.checks import check_settings
-from netspec.solver.extra import Extra, read_extra, resume, write_extra
-from netspec.solver.settings import changes
+from netspec.solver.extra import Extra, changes, read_extra, resume, write_extra
 from netspec.solver.snapshot import State, read_state, write_state
 
 NET = """

@@ -19,9 +19,8 @@ from netspec.export.formats.torch import torch_source
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.diagram import diagram_of
-from netspec.inspect.draw.html import html_of
 from netspec.inspect.draw.picture import picture_of
-from netspec.inspect.draw.svg import svg_of
+from netspec.inspect.draw.svg import html_of, svg_of
 from netspec.inspect.editor.messages import Messages
 from netspec.inspect.editor.server import make_server
 from netspec.net.build import build_net

@@ -16,8 +16,7 @@ from typing import Any
 from netspec.compat.dnn.errors import DnnError
 from netspec.compat.dnn.models import ClassificationModel, DetectionModel, Model, SegmentationModel
 from netspec.compat.dnn.net import Layer, Net
-from netspec.compat.dnn.read import readNet, readNetFromCaffe
-from netspec.compat.dnn.shrink import shrinkCaffeModel
+from netspec.compat.dnn.read import readNet, readNetFromCaffe, shrinkCaffeModel
 from netspec.files.opencv import cv2
 from netspec.files.opencv import dnn as _opencv  # held here, so that a program may say ``cv2.dnn = dnn``
 

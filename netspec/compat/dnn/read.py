@@ -1,15 +1,20 @@
-"""Reading nets: Caffe's files here, all others by cv2.dnn."""
+"""Reading nets, Caffe's files here and all others by cv2.dnn; and weights in half precision."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import PurePath
 from typing import Any
 
 from netspec.compat.dnn.caffe_files import FileOrBytes, read_files
 from netspec.compat.dnn.errors import as_dnn_error
 from netspec.compat.dnn.net import Net
+from netspec.data.blobs import in_half_precision, to_array
+from netspec.errors import SpecError, Where
 from netspec.files.opencv import dnn as opencv
+from netspec.files.whole_file import write_whole
+from netspec.proto.binary import parse_net_binary
 
 _CAFFE = (".prototxt", ".caffemodel", ".caffemodel.h5")
 
@@ -41,3 +46,22 @@ def readNet(model: Any, config: Any = "", framework: Any = "", **others: Any) ->
     swapped = names[0].endswith(_CAFFE[0]) or names[1].endswith(_CAFFE[1:])
     prototxt, weights = (model, config) if swapped else (config, model)
     return readNetFromCaffe(prototxt, os.fspath(weights))
+
+
+def shrinkCaffeModel(
+    src: str | os.PathLike[str],
+    dst: str | os.PathLike[str],
+    layersTypes: Sequence[str] = ("Convolution", "InnerProduct"),
+) -> None:
+    """Write a .caffemodel to ``dst`` with the blobs of layers of these types in half precision. Raises DnnError."""
+    with as_dnn_error("shrinkCaffeModel"):
+        net, _ = parse_net_binary(os.fspath(src))
+        for layer in net.layer:
+            for i, blob in enumerate(layer.blobs if layer.type in layersTypes else ()):
+                try:
+                    small = in_half_precision(to_array(blob))
+                except ValueError as fault:
+                    message = f'blob {i} of layer "{layer.name}": {fault}'
+                    raise SpecError(message, Where(os.fspath(src))) from None
+                blob.CopyFrom(small)
+        write_whole(os.fspath(dst), net.SerializeToString())

@@ -10,7 +10,7 @@ from typing import Any
 
 from google.protobuf import text_format
 
-from netspec.compat.pycaffe import extras
+from netspec.compat.pycaffe import errors
 from netspec.compat.pycaffe.proto import caffe_pb2
 from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
@@ -80,7 +80,7 @@ def get_pydot_graph(
 
     With a phase only the layers that its rules include are there; ``display_lrm`` adds the learning rates' multipliers.
     """
-    pydot = extras.load("pydot", "pycaffe", "caffe.draw")
+    pydot = errors.load("pydot", "pycaffe", "caffe.draw")
     graph = pydot.Dot(caffe_net.name or "Net", graph_type="digraph", rankdir=rankdir)
     nodes: dict[str, Any] = {}
     edges = []

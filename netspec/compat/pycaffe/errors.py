@@ -5,9 +5,11 @@ What the code of a Python layer raises while a net is built passes through as it
 
 from __future__ import annotations
 
+import importlib
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from netspec.errors import SpecError
 
@@ -71,3 +73,16 @@ def _caffes_words(fault: SpecError) -> str | None:
             if found := re.search(pattern, fault.message):
                 return prefix + words.format(*found.groups(), **known) + end
     return None
+
+
+DISTRIBUTIONS = {"skimage": "scikit-image", "pydot": "pydot", "fissix": "fissix"}
+
+
+def load(module: str, extra: str, purpose: str) -> Any:
+    """Import a module of an extra. Raises ImportError with one line that says what to install."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as fault:
+        name = DISTRIBUTIONS[module.partition(".")[0]]
+        message = f"{purpose} needs {name}: pip install {name}, or pip install 'netspec-caffe[{extra}]'"
+        raise ImportError(message) from fault

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from netspec.compat.pycaffe import extras
+from netspec.compat.pycaffe import errors
 from netspec.compat.pycaffe.proto import caffe_pb2
 
 Array = np.ndarray
@@ -197,8 +197,8 @@ def load_image(filename: Any, color: bool = True) -> Array:
 
     Needs the extra ``pycaffe``.
     """
-    skimage = extras.load("skimage", "pycaffe", "caffe.io.load_image")
-    reading = extras.load("skimage.io", "pycaffe", "caffe.io.load_image")
+    skimage = errors.load("skimage", "pycaffe", "caffe.io.load_image")
+    reading = errors.load("skimage.io", "pycaffe", "caffe.io.load_image")
     image = skimage.img_as_float(reading.imread(filename, as_gray=not color)).astype(np.float32)
     if image.ndim == 2:
         image = image[:, :, np.newaxis]
@@ -220,7 +220,7 @@ def resize_image(im: Array, new_dims: Extents, interp_order: int = 1) -> Array:
     low, high = im.min(), im.max()
     if not high > low:
         return np.full((height, width, im.shape[-1]), low, np.float32)
-    transform = extras.load("skimage.transform", "pycaffe", "caffe.io.resize_image")
+    transform = errors.load("skimage.transform", "pycaffe", "caffe.io.resize_image")
     unit = (im - low) / (high - low)  # scikit-image takes values from 0 to 1
     resized = transform.resize(unit, (height, width), order=interp_order, mode="constant", anti_aliasing=False)
     return (resized * (high - low) + low).astype(np.float32)
@@ -248,8 +248,8 @@ def __getattr__(name: str) -> Any:
 
         return zoom
     if name == "resize":
-        return extras.load("skimage.transform", "pycaffe", "caffe.io.resize").resize
+        return errors.load("skimage.transform", "pycaffe", "caffe.io.resize").resize
     if name == "skimage":
-        extras.load("skimage.io", "pycaffe", "caffe.io.skimage")
-        return extras.load("skimage", "pycaffe", "caffe.io.skimage")
+        errors.load("skimage.io", "pycaffe", "caffe.io.skimage")
+        return errors.load("skimage", "pycaffe", "caffe.io.skimage")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,12 +1,70 @@
-"""A folder of models: a folder for each key, there whole or not at all. Nothing in it is ever removed."""
+"""Where exported models are kept: a folder for each key, whole or not at all; a key is all that decides a model.
+
+Nothing in it is ever removed.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import platform
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
+from typing import Any
+
+from netspec.errors import SpecError, Where
+from netspec.proto.dialect.registry import active_dialects
+
+_EXPORTING = ("dialects", "exact", "export", "graph", "layers", "net", "proto")  # the rooms that decide
+
+
+def key_of(files: Sequence[str | Path], options: Mapping[str, Any]) -> str:
+    """Return a key, 64 hexadecimal digits, by the content of files, by options, and by netspec's own code.
+
+    Raises SpecError for a file that cannot be read.
+    """
+    digests = [_digest(path) for path in files]
+    dialects = [[d.name, _digest(d.file) if d.file else d.source] for d in active_dialects()]
+    said = {"code": _code(), "files": digests, "dialects": dialects, "options": options}
+    return hashlib.sha256(json.dumps(said, sort_keys=True, default=str).encode()).hexdigest()
+
+
+@cache
+def processor() -> str:
+    """Return what is known of the processor, for models that were optimized for one."""
+    told = platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
+    except OSError:
+        return f"{told} {platform.processor()}"
+    return " ".join([told, *(line for line in lines if line.startswith(("model", "flags", "Features", "CPU part")))])
+
+
+@cache
+def _code() -> str:
+    """Return a digest of the source of netspec that exports."""
+    folder = Path(__file__).parents[2]
+    found = hashlib.sha256()
+    for room in _EXPORTING:
+        for path in sorted((folder / room).rglob("*.py")):
+            found.update(f"{path.relative_to(folder)}\0".encode())
+            found.update(path.read_bytes())
+    return found.hexdigest()
+
+
+def _digest(path: str | Path) -> str:
+    try:
+        with open(path, "rb") as file:
+            found = hashlib.sha256()
+            while part := file.read(2**20):
+                found.update(part)
+    except OSError as fault:
+        raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
+    return found.hexdigest()
 
 
 def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, bool]:

@@ -14,9 +14,8 @@ import numpy as np
 
 from netspec import log
 from netspec.errors import SpecError
-from netspec.export.engines.cache import entry
+from netspec.export.engines.cache import entry, key_of
 from netspec.export.engines.choice import FP32, Choice
-from netspec.export.engines.key import key_of
 from netspec.export.engines.runners import MODEL, RUNNERS, Arrays, Runner, Unable, open_runner, reason
 from netspec.files.whole_file import write_whole
 

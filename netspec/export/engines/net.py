@@ -13,10 +13,10 @@ import torch
 
 from netspec.data.blobs import Shape
 from netspec.export.engines.choice import TORCH, Choice
-from netspec.export.engines.export import write_model
 from netspec.export.engines.model import Model, Origin
 from netspec.export.engines.runners import Unable, tell_unable
 from netspec.export.formats.convert import Source
+from netspec.export.formats.onnx import export_onnx
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Node
 from netspec.layers.contract.learned import Stamp, is_lent, stamp
@@ -25,6 +25,27 @@ from netspec.net.net import Net
 from netspec.proto.schema import PHASE_NAMES, TEST
 from netspec.run.shapes import fitted
 from netspec.run.walk import Result, losses_of, walk, weighted_sum
+
+
+def write_model(net: Net, path: Path, blobs: Iterable[str] = ()) -> None:
+    """Write a net; besides its outputs the model has those of ``blobs`` that are not inputs.
+
+    Raises SpecError where a layer cannot be exported, and Unable for a blob that the model does not have.
+    """
+    import onnx
+
+    export_onnx(net, path, largest=0)
+    model = onnx.load(str(path), load_external_data=False)
+    there = {output.name for output in model.graph.output} | {given.name for given in model.graph.input}
+    made = {name for node in model.graph.node for name in node.output}
+    for blob in blobs:
+        if blob in there:
+            continue
+        if blob not in made:
+            raise Unable(f'blob "{blob}" is not in the exported net')
+        model.graph.output.append(onnx.helper.make_tensor_value_info(blob, onnx.TensorProto.FLOAT, None))
+    path.write_bytes(model.SerializeToString())
+
 
 Write = Callable[[Path, Sequence[str]], None]  # exports the net to a path, with these blobs besides its outputs
 

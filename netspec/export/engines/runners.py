@@ -5,6 +5,7 @@ The weights are in a file beside the model, which both libraries map into memory
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 from collections import OrderedDict
@@ -17,9 +18,31 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from netspec import log
+from netspec.export.engines.cache import processor
 from netspec.export.engines.choice import BF16, FP32, ONNXRUNTIME, OPENVINO, Choice
-from netspec.export.engines.key import processor
-from netspec.export.engines.signal_stack import signal_stack_kept
+
+_ENOUGH = 64  # bytes: a stack_t has 24
+
+
+@contextmanager
+def signal_stack_kept() -> Iterator[None]:
+    """Give the thread its alternate signal stack back after the block, on Linux; elsewhere do nothing.
+
+    Each ``openvino.Core`` sets one when it loads its CPU plugin, and frees it when it is deleted. If the thread still
+    has that stack then, it gets the one from before, which may be that of a Core deleted earlier: freed memory, and the
+    next signal that Python handles ends the process.
+    """
+    if not sys.platform.startswith("linux"):
+        yield
+        return
+    library = ctypes.CDLL(None)
+    before = ctypes.create_string_buffer(_ENOUGH)
+    library.sigaltstack(None, before)
+    try:
+        yield
+    finally:
+        library.sigaltstack(before, None)
+
 
 MODEL, OPTIMIZED = "net.onnx", "optimized.onnx"
 MOST_SHAPES = 4  # for which a model stays compiled

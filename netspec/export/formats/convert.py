@@ -15,16 +15,15 @@ from netspec.export.formats.onnx import export_onnx
 from netspec.export.formats.preprocess import Preprocess
 from netspec.export.formats.pt2 import export_pt2
 from netspec.export.formats.torch import export_torch, write_tensors
-from netspec.graph.filter import with_state
+from netspec.graph.filter import prune, with_state
 from netspec.graph.options import BuildOptions
-from netspec.graph.prune import prune
 from netspec.layers.contract.folding import folds_of
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights
 from netspec.proto.schema import PHASES
 from netspec.proto.text import parse_net
-from netspec.terminal.version import version
+from netspec.terminal.commands import version
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,8 @@ import torch
 
 from netspec.data import blobs
 from netspec.files.whole_file import whole_file
-from netspec.graph.filter import filter_net
+from netspec.graph.filter import add_input, filter_net
 from netspec.graph.fold import origins
-from netspec.graph.inputs import add_input
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.folding import folds_of
 from netspec.layers.contract.reading import reads_data

@@ -16,7 +16,7 @@ from netspec.exact.blas import kernels
 from netspec.files.limits import amount, memory
 from netspec.inspect.check.check import check_file
 from netspec.proto.binary import is_net_binary
-from netspec.terminal.version import UNKNOWN, version
+from netspec.terminal.commands import UNKNOWN, version
 
 PACKAGES = ("netspec-caffe", "protobuf", "scipy", "lmdb", "opencv-python-headless", "h5py", "onnxruntime", "openvino")
 VARIABLES = re.compile(r"(OMP|GOMP|KMP|MKL|OPENBLAS|CUDA|GLOG|NETSPEC|OPENCV)_\w*")

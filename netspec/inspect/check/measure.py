@@ -10,7 +10,7 @@ import torch
 from netspec.log import info, number
 from netspec.net.net import Net
 from netspec.run.timed import timed
-from netspec.solver.tally import Outputs, Tally, score_lines, scorers
+from netspec.solver.testing import Outputs, Tally, score_lines, scorers
 
 
 def test_net(net: Net, iterations: int) -> Outputs:

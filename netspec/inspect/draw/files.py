@@ -9,9 +9,8 @@ from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
 from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.diagram import Diagram, diagram_of
-from netspec.inspect.draw.html import html_of
 from netspec.inspect.draw.picture import picture_of
-from netspec.inspect.draw.svg import svg_of
+from netspec.inspect.draw.svg import html_of, svg_of
 from netspec.net.recovered import recover_net
 from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import NetParameter, PhaseValue

@@ -15,8 +15,7 @@ from matplotlib.offsetbox import AnnotationBbox, OffsetImage
 
 from netspec.data.datum import times
 from netspec.files.opencv import cv2
-from netspec.inspect.draw.style import COLORS, PALE, STYLE
-from netspec.inspect.draw.tiles import split
+from netspec.inspect.draw.style import COLORS, PALE, STYLE, split
 from netspec.log import number
 
 WIDTH = 9.0  # inches

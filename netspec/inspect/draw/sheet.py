@@ -15,8 +15,18 @@ from matplotlib.ticker import MaxNLocator
 
 from netspec.data.records import Record
 from netspec.data.survey import Survey, as_lines
-from netspec.inspect.draw.style import COLORS, FAULT, PALE, STYLE, text_at
-from netspec.inspect.draw.tiles import as_picture, draw_tile, images_in, split, what_is_shown
+from netspec.inspect.draw.style import (
+    COLORS,
+    FAULT,
+    PALE,
+    STYLE,
+    as_picture,
+    draw_tile,
+    images_in,
+    split,
+    text_at,
+    what_is_shown,
+)
 
 WIDTH, HEAD = 12.0, 2.1  # inches
 LONGER, CAPTION, GAP = 1.4, 0.44, 0.14  # inches: a tile's longer side, the two lines below it, between tiles

@@ -16,8 +16,7 @@ from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from netspec import log
 from netspec.inspect.draw.style import COLORS, FAULT, GRID, STYLE
-from netspec.inspect.logs.curve import Curve, shown_range, smoothed, thinned
-from netspec.inspect.logs.run import Run
+from netspec.inspect.logs.run import Curve, Run, shown_range, smoothed, thinned
 
 WIDTH, LOSS_HEIGHT, HEIGHT = 9.0, 3.4, 2.3  # inches
 MOST_POINTS = 2000  # of a curve, of which more cannot be seen

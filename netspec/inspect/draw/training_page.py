@@ -8,12 +8,10 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from netspec.inspect.draw.html import page
 from netspec.inspect.draw.style import COLORS, svg
+from netspec.inspect.draw.svg import page
 from netspec.inspect.draw.training import MOST_POINTS
-from netspec.inspect.logs.curve import Curve, thinned
-from netspec.inspect.logs.run import Run
-from netspec.inspect.logs.summary import summary
+from netspec.inspect.logs.run import Curve, Run, summary, thinned
 
 _PARTS = (("raw", "training, as logged"), ("smooth", "training, smoothed"), ("test", "tests"), ("rate", "rate"))
 _FEW = 6  # test outputs that the cursor reads

@@ -10,8 +10,7 @@ import numpy as np
 from netspec.export.engines.choice import Choice
 from netspec.graph.options import BuildOptions
 from netspec.inspect.features.images import ImageNet
-from netspec.inspect.features.scaling import Steps
-from netspec.inspect.features.views import read_zooms
+from netspec.inspect.features.scaling import Steps, read_zooms
 from netspec.proto.binary import split_paths
 
 

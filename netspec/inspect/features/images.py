@@ -19,12 +19,9 @@ from netspec.export.engines.model import Model, Origin
 from netspec.export.engines.runners import Unable, tell_unable
 from netspec.files.image_list import ImageList
 from netspec.files.opencv import cv2
-from netspec.graph.filter import filter_net, with_state
-from netspec.graph.inputs import is_input, shapes_of_input
+from netspec.graph.filter import filter_net, is_input, prune, shapes_of_input, with_state
 from netspec.graph.options import BuildOptions
-from netspec.graph.prune import prune
-from netspec.inspect.features.scaling import Steps, scaling_of
-from netspec.inspect.features.views import middle
+from netspec.inspect.features.scaling import Steps, middle, scaling_of
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap
@@ -107,7 +104,7 @@ class ImageNet:
         self._net.keep = [self.blob]
 
     def _export(self, path: Path) -> None:
-        from netspec.export.engines.export import write_model
+        from netspec.export.engines.net import write_model
 
         write_model(self._build(), path)
 

@@ -116,3 +116,25 @@ def _fitted(mean: np.ndarray, shape: Shape, name: str, where: Where) -> np.ndarr
     if mean.ndim != 3 or mean.shape[0] != channels or mean.shape[1] < height or mean.shape[2] < width:
         raise SpecError(f"the mean of {name} is {mean.shape}, expected at least {shape}", where)
     return center(mean, height, width)
+
+
+def read_zooms(zooms: str | float) -> tuple[float, ...]:
+    """Return the zooms of ``"1,0.7"``: each is the share of the image's height and width that the view shows.
+
+    Raises SpecError unless each is more than 0 and at most 1.
+    """
+    try:
+        found = tuple(float(text) for text in str(zooms).split(","))
+    except ValueError:
+        raise SpecError(f'found zooms "{zooms}", expected numbers separated by commas, e.g. "1,0.7"') from None
+    for zoom in found:
+        if not 0 < zoom <= 1:
+            raise SpecError(f"found zoom {zoom:g}, expected more than 0 and at most 1 (the whole image)")
+    return found
+
+
+def middle(image: np.ndarray, zoom: float) -> np.ndarray:
+    """Return the middle part of an image, ``zoom`` of its height and width; 1 is the whole image."""
+    height, width = image.shape[:2]
+    top, left = round(height * (1 - zoom) / 2), round(width * (1 - zoom) / 2)
+    return image[top : max(height - top, top + 1), left : max(width - left, left + 1)]

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from netspec.solver.tally import Tally, score_lines
+from netspec.solver.testing import Tally, score_lines
 
 
 def test_a_tally_is_the_mean_of_each_element_over_the_batches():

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from netspec.net.net import Net
-from netspec.solver.threads import dependence
+from netspec.solver.checks import dependence
 
 NET = """
 layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 1024 } } }

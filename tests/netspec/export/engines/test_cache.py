@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 
 from netspec.errors import SpecError
-from netspec.export.engines.cache import entry
+from netspec.export.engines.cache import entry, key_of
 from netspec.export.engines.choice import Choice, user_folder
-from netspec.export.engines.key import key_of
 
 
 class Maker:

@@ -9,7 +9,7 @@ import pytest
 
 import netspec
 from netspec.inspect.check.bug_report import bug_report
-from netspec.terminal.version import UNKNOWN, version
+from netspec.terminal.commands import UNKNOWN, version
 from paths import GOLDEN
 
 WEIGHTS = GOLDEN / "snapshot" / "ref_iter_40.caffemodel"

@@ -17,12 +17,10 @@ from netspec.errors import SpecError, Where
 from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.blocks import find_blocks
 from netspec.inspect.draw.box import COLORS, color_of
-from netspec.inspect.draw.diagram import Box, Diagram, diagram_of, kind_of
-from netspec.inspect.draw.html import html_of
+from netspec.inspect.draw.diagram import Box, Diagram, diagram_of, kind_of, settings_text
 from netspec.inspect.draw.marks import Rect
 from netspec.inspect.draw.picture import picture_of
-from netspec.inspect.draw.settings import settings_text
-from netspec.inspect.draw.svg import svg_of
+from netspec.inspect.draw.svg import html_of, svg_of
 from netspec.layers import layer_types
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_net_text

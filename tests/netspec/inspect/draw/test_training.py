@@ -11,8 +11,7 @@ import cv2
 import pytest
 
 from netspec.inspect.draw.training import Look, training_figure
-from netspec.inspect.logs.curve import Curve
-from netspec.inspect.logs.run import Run, read_log
+from netspec.inspect.logs.run import Curve, Run, read_log
 from paths import GOLDEN
 
 CAFFES = GOLDEN / "log" / "caffe_train.log"

@@ -7,9 +7,18 @@ import numpy as np
 import pytest
 
 from netspec.errors import SpecError
-from netspec.inspect.logs.curve import Curve, shown_range, smoothed, thinned
-from netspec.inspect.logs.run import Follower, LogReader, Run, read_log
-from netspec.inspect.logs.summary import iterations_per_second, summary
+from netspec.inspect.logs.run import (
+    Curve,
+    Follower,
+    LogReader,
+    Run,
+    iterations_per_second,
+    read_log,
+    shown_range,
+    smoothed,
+    summary,
+    thinned,
+)
 from paths import GOLDEN
 
 CAFFES = GOLDEN / "log" / "caffe_train.log"

@@ -10,11 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netspec.inspect.logs.canvas import bar, plot_lines
-from netspec.inspect.logs.curve import Curve
-from netspec.inspect.logs.process import is_alive, memory_of
-from netspec.inspect.logs.run import Run, read_log
-from netspec.inspect.logs.screen import duration, screen, seconds_left
+from netspec.inspect.logs.run import Curve, Run, read_log
+from netspec.inspect.logs.screen import bar, duration, is_alive, memory_of, plot_lines, screen, seconds_left
 from paths import GOLDEN
 
 CAFFES = GOLDEN / "log" / "caffe_train.log"

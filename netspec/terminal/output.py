@@ -1,8 +1,26 @@
-"""Tables in a terminal."""
+"""What a command shows: bars while it works, doubts about the user's files, tables."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
+
+from netspec.errors import printable
+
+Item = TypeVar("Item")
+
+
+def bar(items: Iterable[Item], stage: str, total: int | None = None, unit: str = "") -> Iterable[Item]:
+    """Return the items; on a terminal, a bar named ``stage`` shows how far the caller is in them."""
+    from tqdm import tqdm  # commands that show no bar do not load it
+
+    return tqdm(items, desc=stage, total=total, disable=None, leave=False, unit=unit)
+
+
+def warn(doubt: str) -> None:
+    """Print a doubt about the user's files."""
+    print(printable(f"warning: {doubt}"), file=sys.stderr)
 
 
 def in_columns(rows: Sequence[Sequence[str]], left: int = 1, spans: Sequence[tuple[str, int]] = ()) -> list[str]:
