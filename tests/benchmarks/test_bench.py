@@ -139,14 +139,7 @@ def test_an_environment_that_cannot_be_installed_is_a_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(environment, "FOLDER", tmp_path / "bench")
-    monkeypatch.setattr(
-        environment,
-        "PACKAGES",
-        (
-            "--no-index",
-            "no-such-package",
-        ),
-    )
+    monkeypatch.setattr(environment, "PACKAGES", ("--no-index", "no-such-package"))
 
     def create(folder: Path, **_: object) -> None:
         (folder / "bin").mkdir(parents=True)

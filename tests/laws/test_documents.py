@@ -1,4 +1,4 @@
-"""The Markdown files: the real parsers take every command in them, and every link leads to a file."""
+"""The pages, and what a release says of itself: parsers take every command, links lead to files, versions agree."""
 
 import argparse
 import ast
@@ -168,10 +168,7 @@ ROWS = [
 @pytest.mark.parametrize(
     ("marker", "shown"),
     [
-        (
-            "table: x; net, ms, CPU / pytorch as / P; run by=netspec",
-            "| net | ms | / P |\n| a | 12.3 | 0.73 |",
-        ),
+        ("table: x; net, ms, CPU / pytorch as / P; run by=netspec", "| net | ms | / P |\n| a | 12.3 | 0.73 |"),
         ("table: x; net, run by: ms", "| net | netspec | pytorch |\n| a | 12.3 | 0.5 |"),
         ("table: x; n", "| n |\n| 12,000 |\n| 1 |"),
         ("figure: x; CPU / pytorch; run by=netspec", "0.73"),
@@ -187,3 +184,55 @@ def test_a_marker_becomes_figures_or_is_refused(marker: str, shown: str, tmp_pat
     except SpecError as fault:
         text = str(fault)
     assert shown in re.sub(r"\|( --- \|)+\n", "", text)
+
+
+# Every difference from Caffe that the documentation names is shown by a test that is there
+CAFFE_PAGE = ROOT / "docs" / "coming-from-caffe.md"
+DIFFERENCES = [
+    line for line in CAFFE_PAGE.read_text().splitlines() if line.startswith("| ") and not line.startswith("| Caffe ")
+]
+TESTS = {
+    name
+    for path in ROOT.glob("tests/**/test_*.py")
+    for name in re.findall(r"^def (test_\w+)\(", path.read_text(), re.MULTILINE)
+}
+
+
+@pytest.mark.parametrize("row", DIFFERENCES, ids=lambda row: row.split("|")[1].strip()[:50])
+def test_each_difference_is_shown_by_a_test(row: str) -> None:
+    assert len(re.findall(r"(?<!\\)\|", row)) == 4, "expected three columns"
+    named = re.findall(r"\btest_\w+", row[row.index("<!--") :])
+    assert named
+    assert set(named) <= TESTS
+
+
+def test_the_readme_leads_to_the_page() -> None:
+    assert "docs/coming-from-caffe.md" in (ROOT / "README.md").read_text()
+
+
+# What a release says of itself agrees: version, changelog, citation, the form for faults
+VERSION = re.search(r'^version = "(.+?)"', (ROOT / "pyproject.toml").read_text(), re.M)
+
+
+def test_changelog_and_citation_are_of_this_version() -> None:
+    assert VERSION is not None
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    citation = (ROOT / "CITATION.cff").read_text()
+    newest = re.search(r"^## (\S+) \((\d{4}-\d\d-\d\d)\)$", changes, re.M)
+    assert newest is not None
+    assert newest[1] == VERSION[1]
+    assert f"\nversion: {VERSION[1]}\n" in citation
+    assert f'\ndate-released: "{newest[2]}"\n' in citation
+
+
+def test_the_paper_is_cited() -> None:
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert re.findall(r"family-names: (\w+)", citation) == ["Qiu", "Ai", "Tian", "Wang", "Cao"]
+
+
+def test_the_form_for_faults_asks_for_what_is_needed() -> None:
+    form = (ROOT / ".github" / "ISSUE_TEMPLATE" / "fault.yml").read_text()
+    fields = re.findall(r"id: (\w+)\n(.*?)(?=\n  - type|\Z)", form, re.S)
+    assert [name for name, _ in fields] == ["what", "prototxt", "command", "log", "report"]
+    assert all("required: true" in text for _, text in fields)
+    assert "netspec bug-report" in form

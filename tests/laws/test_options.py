@@ -102,11 +102,7 @@ NOT_STARTED = {
         "lsp": "serves standard input; it has no options of its own",
         "run": "the script ends the process; tests/netspec/compat/scripts",
     },
-    "lmdb_build": {
-        "pairs": "tests/lmdb_build/test_cli.py",
-        "mnist": "needs MNIST",
-        "cifar": "needs CIFAR-10",
-    },
+    "lmdb_build": {"pairs": "tests/lmdb_build/test_cli.py", "mnist": "needs MNIST", "cifar": "needs CIFAR-10"},
     "loopclosure": {},
 }
 SHARED = {"verbose", "plugin", "limit"}  # read before the command itself

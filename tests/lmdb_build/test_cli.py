@@ -160,11 +160,7 @@ def test_wrong_usage_is_status_2(arguments: list[str], tmp_path: Path, monkeypat
 @pytest.mark.slow
 def test_python_m_lmdb_build() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "lmdb_build", "--help"],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=ROOT,
+        [sys.executable, "-m", "lmdb_build", "--help"], capture_output=True, text=True, check=False, cwd=ROOT
     )
     assert done.returncode == 0
     assert "walk" in done.stdout

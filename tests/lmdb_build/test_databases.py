@@ -168,10 +168,7 @@ def test_gray_encoded_images_are_gray(tmp_path: Path) -> None:  # Caffe stores t
 
 def test_quoted_names_may_hold_blanks(tmp_path: Path) -> None:
     (tmp_path / "l").write_text('"a place.png" b.png 1\nc.png "d e.png" 0\n')
-    assert [entry.images for entry in read_pairs(f"{tmp_path}/l")] == [
-        ("a place.png", "b.png"),
-        ("c.png", "d e.png"),
-    ]
+    assert [entry.images for entry in read_pairs(f"{tmp_path}/l")] == [("a place.png", "b.png"), ("c.png", "d e.png")]
 
 
 def test_leveldb_is_written_too(tmp_path: Path, pair_list: str) -> None:

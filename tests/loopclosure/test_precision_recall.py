@@ -6,12 +6,7 @@ from sklearn.metrics import average_precision_score, precision_recall_curve
 
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion, sequence_truth, traverse_truth
-from loopclosure.precision_recall import (
-    ALL_PAIRS,
-    BEST_MATCH,
-    JudgedScores,
-    curve,
-)
+from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, JudgedScores, curve
 
 # The worked example: rows are the data base's five places, columns the four queries.
 SCORES = np.array(

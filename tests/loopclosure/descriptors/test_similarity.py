@@ -28,9 +28,7 @@ def test_matrix(features, metric):
         similarity_matrix(features, references, metric), brute_force(features, references, metric), rtol=1e-9
     )
     np.testing.assert_allclose(
-        similarity_matrix(features.astype(np.float32), None, metric),
-        brute_force(features, features, metric),
-        atol=5e-3,
+        similarity_matrix(features.astype(np.float32), None, metric), brute_force(features, features, metric), atol=5e-3
     )
 
 

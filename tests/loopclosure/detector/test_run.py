@@ -9,14 +9,7 @@ import pytest
 from loopclosure.descriptors.feature_file import Features, read_features
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.run import (
-    Recording,
-    from_poses,
-    judged_by_poses,
-    load_describe,
-    open_recording,
-    run_detector,
-)
+from loopclosure.detector.run import Recording, from_poses, judged_by_poses, load_describe, open_recording, run_detector
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.frames import Selection
@@ -101,11 +94,7 @@ def test_describe_by_name(tmp_path, monkeypatch):
     assert load_describe("my_describe.py:Row", {"row": "1"})(image).tolist() == [5] * 3
     for specification, options, sentence in (
         ("my_describe.py", {}, "expected module:function or FILE.py:function"),
-        (
-            "my_describe:flat",
-            {},
-            "lies in the working directory, not in an installed package; .* ./my_describe.py",
-        ),
+        ("my_describe:flat", {}, "lies in the working directory, not in an installed package; .* ./my_describe.py"),
         ("gone.py:f", {}, "cannot import"),
         ("no_such_module:f", {}, "cannot import"),
         ("my_describe.py:g", {}, 'has no "g"'),

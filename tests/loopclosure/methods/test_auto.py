@@ -348,10 +348,7 @@ def test_as_a_method(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("spec", "message"),
-    [
-        ("auto", r"write auto\+METHOD"),
-        ("auto:length=3+thumbnails", 'auto has no setting "length=3"'),
-    ],
+    [("auto", r"write auto\+METHOD"), ("auto:length=3+thumbnails", 'auto has no setting "length=3"')],
 )
 def test_settings_that_make_no_sense(spec, message):
     with pytest.raises(InputError, match=message):

@@ -102,3 +102,88 @@ def test_two_traverses_are_compared_in_full(spec, two_laps):
 def test_settings_that_make_no_sense(spec, message):
     with pytest.raises(InputError, match=message):
         make_method(spec)
+
+
+# A function of the user's as a method
+MEANS = """
+import cv2
+
+def describe(image):
+    return cv2.resize(image, (8, 6), interpolation=cv2.INTER_AREA).reshape(-1) / 255.0
+
+def growing(image, sizes=[]):
+    sizes.append(1)
+    return sizes
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "means.py"
+    path.write_text(MEANS)
+    return path
+
+
+def test_a_function_describes_the_images(file, two_laps):
+    data = load_tum(two_laps)
+    methods = [named_method(f"describe:{file}:describe{metric}", MethodContext()) for metric in ("", ":cosine")]
+    euclidean, cosine = evaluate(data, methods).outcomes
+    assert euclidean.name == f"{file}:describe (euclidean)"
+    assert euclidean.recall_at[1] == cosine.recall_at[1] == 1.0
+    assert euclidean.notes[0] == "144 dimensions, euclidean"
+    assert set(euclidean.seconds) == {"loading", "descriptors", "similarity"}
+
+
+def test_descriptors_of_different_lengths_are_refused(file, two_laps):
+    method = named_method(f"describe:{file}:growing", MethodContext())
+    with pytest.raises(InputError, match="growing gave 2 numbers, and 1 before"):
+        evaluate(load_tum(two_laps), [method])
+
+
+@pytest.mark.parametrize("spec", ["describe", "describe:cosine", "describe:net.py", "describe:net.py:cosine"])
+def test_a_function_must_be_named(spec):
+    with pytest.raises(InputError, match="expected describe:"):
+        make_method(spec)
+
+
+# The online detector judged as a method
+def test_it_scores_only_what_it_accepts(two_laps, two_laps_features):
+    data = load_tum(two_laps)
+    context = MethodContext(data.exclude_frames)
+    spec = f"detector:{two_laps_features}:threshold=-0.3,consistency=2"
+    (outcome,) = evaluate(data, [named_method(spec, context)]).outcomes
+    assert np.argwhere(np.isfinite(outcome.scores)).tolist() == [[i, i - 20] for i in range(22, 40)]
+    assert outcome.best.precision.tolist() == [1.0] * len(outcome.best.precision)
+    assert outcome.measures["best match of each query"]["recall at 100 % precision"] == pytest.approx(18 / 20)
+    assert outcome.answer.startswith("frames: 10 no candidate")
+    assert "best score" in outcome.answer
+    assert "precision 1.000, recall 0.900" in outcome.answer
+
+
+@pytest.mark.slow
+def test_without_a_threshold_its_candidates_are_verified(two_laps, two_laps_features):
+    method = make_method(f"detector:{two_laps_features}:verify=yes,min_inliers=500", MethodContext(9))
+    result = method.score(Images(load_tum(two_laps).query_images), silent)
+    assert not np.isfinite(result.scores).any()
+    assert "30 not verified" in result.answer
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("detector", "expected detector:FILE.npz, or"),
+        ("detector:a.npz:calibrate=b", 'has no setting "calibrate=b"'),
+        ("detector:a.npz:threshold=-1,top_k=0", "top_k is 0"),
+        ("detector+thumbnails", "works on images, not on the scores"),
+    ],
+)
+def test_what_makes_no_sense_is_said(spec, message):
+    with pytest.raises(InputError, match=message):
+        make_method(spec)
+
+
+def test_two_traverses_are_refused(two_laps, two_laps_features):
+    images = load_tum(two_laps).query_images
+    method = make_method(f"detector:{two_laps_features}:threshold=-1")
+    with pytest.raises(InputError, match="finds loops in one sequence"):
+        method.score(Images(images, images), silent)

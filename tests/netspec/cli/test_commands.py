@@ -16,6 +16,7 @@ import pytest
 import torch
 
 import netspec
+from netspec.files import whole_file
 from netspec.graph.options import BuildOptions
 from netspec.layers import layer_types
 from netspec.net.net import Net
@@ -412,3 +413,14 @@ def test_weights_that_lack_a_layer_get_one_warning_and_with_strict_a_fault(run: 
         assert result.status == 0, result.err
         assert result.err.count(f"{lacks}; they stay as they were filled") == 1
         assert run(*command, "--strict").fault == f"{lacks}; leave strict out to keep their fillers' values"
+
+
+# What other systems lack is said once, and the command goes on
+def test_a_training_without_file_locks(
+    run: Callable[..., Any], edited: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(whole_file, "fcntl", None)
+    changes = ("max_iter: 60", "max_iter: 1", "snapshot_after_train: false", "snapshot_after_train: true")
+    result = run("train", edited("sgd_step/solver.prototxt", *changes))
+    assert result.status == 0
+    assert result.err.count("no file locks here: nothing stops another training") == 1

@@ -8,6 +8,7 @@ import pytest
 
 from netspec.data.database import Writer, open_reader
 from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
+from netspec.data.random_words import permutation, words
 from netspec.data.sources import Cursor, DatabaseSource, Draws, batches, draw_skip
 from netspec.data.stacked import Stacker
 from netspec.data.transformer import Transformer
@@ -225,3 +226,32 @@ def test_records_of_another_form_than_those_before_are_read_too() -> None:
     assert read([b"\xff\xff\xff"] * 2) is None
     assert read([record[:-3] for record in datums(1, 2)]) is None
     assert read([b""]) is None
+
+
+def test_a_record_draws_the_same_in_any_batch() -> None:
+    whole = words(7, "data/TRAIN", 0, 100)
+    parts = np.concatenate([words(7, "data/TRAIN", first, 20) for first in range(0, 100, 20)])
+    assert (whole == parts).all()
+
+
+def test_the_draws_are_what_they_have_always_been() -> None:
+    # A resumed run must draw what the first one would have drawn, whatever the versions of numpy.
+    assert words(1, "a", 0, 1).tolist() == [
+        [16125938745833911740, 11915995768183236433, 13288515000938474924, 528424593193280505]
+    ]
+    assert permutation(1, "a", 9).tolist() == [3, 5, 6, 1, 7, 2, 0, 4, 8]
+
+
+def test_seed_and_stream_matter() -> None:
+    drawn = [words(seed, stream, 0, 4).tolist() for seed in (0, 1) for stream in ("data/TRAIN", "data/TEST")]
+    assert all(drawn[i] != drawn[j] for i in range(4) for j in range(i))
+
+
+def test_draws_are_spread_evenly() -> None:
+    quarters = np.bincount((words(0, "x", 0, 25_000).ravel() % 4).astype(int))
+    assert np.abs(quarters / 25_000 - 1).max() < 0.03
+
+
+def test_a_permutation_holds_each_number_once() -> None:
+    assert sorted(permutation(3, "x", 1001)) == list(range(1001))
+    assert permutation(3, "x", 0).tolist() == []

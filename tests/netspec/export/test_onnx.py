@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 import netspec
+from each import each
 from exported import (
     ONNX_EXTRA,
     assert_same,
+    golden_net,
     here,
     in_onnxruntime,
     in_opencv,
+    other_inputs,
     random_inputs,
     run_module,
     source_module,
@@ -24,8 +27,9 @@ from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.export.formats.onnx import export_onnx, onnx_model
 from netspec.export.formats.preprocess import Preprocess
+from netspec.export.formats.shapes import find_shapes
 from netspec.net.net import Net
-from paths import ROOT, shared
+from paths import GOLDEN, ROOT, shared
 
 pytestmark = pytest.mark.slow
 
@@ -261,3 +265,27 @@ def test_real_models_compute_what_caffe_or_opencv_computed(name: str) -> None:
             np.testing.assert_allclose(found[blob], wanted, rtol=1e-3, atol=2e-5)
         if OPENCV_5:
             assert_same(in_opencv(model, inputs), here(net, inputs))
+
+
+# Every layer in ONNX: the same numbers in onnxruntime and in OpenCV 5, at other batches and sizes too
+CASES = sorted((GOLDEN / "layers").iterdir())
+pytest.importorskip("onnx", reason=ONNX_EXTRA)
+
+
+@pytest.mark.slow
+@each("case", CASES, lambda path: path.name)
+def test_golden_layer_computes_the_same_in_onnxruntime_and_opencv_and_at_other_sizes(case: Path) -> None:
+    net, inputs = golden_net(case)
+    model, _ = onnx_model(net)
+    expected = here(net, inputs)
+    assert_same(in_onnxruntime(model, inputs), expected)
+    if OPENCV_5 and expected:
+        assert_same(in_opencv(model, inputs), expected, scalars_have_an_axis=True)
+    names = {size.dim_param for value in model.graph.input for size in value.type.tensor_type.shape.dim}
+    net, inputs = golden_net(case)  # a recurrent net remembers what it saw
+    shapes = find_shapes(net)
+    for free in shapes.free:
+        if free.name not in names:
+            shapes = shapes.without(free, "")
+    inputs = other_inputs(net, shapes, inputs)
+    assert_same(in_onnxruntime(model, inputs), here(net, inputs))

@@ -90,8 +90,7 @@ def test_clip_passes_gradients_at_both_ends(build) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "value"),
-    [("power: 0 shift: -2", 1), ("power: 3 scale: 0 shift: 2", 8), ("power: 0 scale: 0", 1)],
+    ("text", "value"), [("power: 0 shift: -2", 1), ("power: 3 scale: 0 shift: 2", 8), ("power: 0 scale: 0", 1)]
 )
 def test_power_ignores_the_bottom_where_scale_or_power_is_zero(build, text: str, value: float) -> None:
     layer = build(f'type: "Power" power_param {{ {text} }}', (3,))

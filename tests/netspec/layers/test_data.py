@@ -198,11 +198,7 @@ def test_a_batch_of_one_takes_the_shape_of_its_image(tmp_path: Path) -> None:
     [
         ('source: "x" backend: LMDB', "batch_size", "batch_size must be above 0, found 0"),
         ("batch_size: 1 backend: LMDB", "source", "source is missing"),
-        (
-            f'batch_size: 1 backend: LMDB rand_skip: 9999999 source: "{PAIRS}"',
-            "rand_skip",
-            "cannot skip",
-        ),
+        (f'batch_size: 1 backend: LMDB rand_skip: 9999999 source: "{PAIRS}"', "rand_skip", "cannot skip"),
     ],
 )
 def test_bad_data_params_are_refused_where_they_stand(param: str, place: str, message: str) -> None:
@@ -227,11 +223,7 @@ IMAGE_BATCH, GREY_BATCH, LABELS = [(8, 3, 6, 6), (8,)], [(8, 1, 5, 4), (8,)], [(
         (DATA, {"data": (2, 5), "label": (2, 1)}, [(2, 5), (2, 1)]),
         (DATA + CUT, {}, IMAGE_BATCH),
         (LIST % "batch_size: 8 new_height: 5 new_width: 4 is_color: false", {}, GREY_BATCH),
-        (
-            LIST % "batch_size: 8 new_height: 5 new_width: 4" + "transform_param { crop_size: 6 }",
-            {},
-            IMAGE_BATCH,
-        ),
+        (LIST % "batch_size: 8 new_height: 5 new_width: 4" + "transform_param { crop_size: 6 }", {}, IMAGE_BATCH),
         (ROWS, {"data": (2, 5), "label": (2,)}, LABELS),
         (WINDOWS + "transform_param { crop_size: 6 }", {}, IMAGE_BATCH),
     ],
@@ -242,11 +234,7 @@ def test_shapes_are_known_without_data(text: str, given: Mapping[str, tuple[int,
 
 @pytest.mark.parametrize(
     ("text", "wanted"),
-    [
-        (DATA, "--shape data=8,C,H,W"),
-        (LIST % "batch_size: 8", "--shape data=8,C,H,W"),
-        (ROWS, "--shape data=8,..."),
-    ],
+    [(DATA, "--shape data=8,C,H,W"), (LIST % "batch_size: 8", "--shape data=8,C,H,W"), (ROWS, "--shape data=8,...")],
 )
 def test_a_shape_that_only_the_data_knows_is_asked_for(text: str, wanted: str) -> None:
     with pytest.raises(SpecError, match=f'the shape of "data" is known only from its data; give {wanted}, or --data$'):

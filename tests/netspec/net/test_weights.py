@@ -283,8 +283,7 @@ def field(number: int, contents: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "kind",
-    ["current", "V1", "V0", "floats with tags", "two runs", "numbers before the shape", "the field of a place"],
+    "kind", ["current", "V1", "V0", "floats with tags", "two runs", "numbers before the shape", "the field of a place"]
 )
 @pytest.mark.parametrize("turned", [False, True])
 def test_numbers_are_read_where_they_lie_in_a_file(kind: str, turned: bool, tmp_path: Path) -> None:

@@ -14,15 +14,7 @@ from each import each, last_parts
 from netspec.errors import SpecError
 from netspec.proto.lexer import FLOAT, INTEGER, NAME, STRING, Lexer
 from netspec.proto.reader import read_text
-from netspec.proto.schema import (
-    BlobProto,
-    Datum,
-    LayerParameter,
-    NetParameter,
-    SolverParameter,
-    SolverState,
-    fields_of,
-)
+from netspec.proto.schema import BlobProto, Datum, LayerParameter, NetParameter, SolverParameter, SolverState, fields_of
 from netspec.proto.text import parse_net, parse_net_text, parse_solver, read_net, read_solver, write_text
 from paths import GOLDEN, SHARED
 

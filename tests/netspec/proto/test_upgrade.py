@@ -109,9 +109,7 @@ def test_places_of_a_v1_net() -> None:
 def test_weights_are_upgraded_without_places() -> None:
     v1 = net_of('input: "data" layers { name: "c" type: CONVOLUTION blobs { num: 1 data: [1, 2] } blobs_lr: 2 }')
     net, source = upgrade.upgrade_net(v1, SourceMap.unknown("w.caffemodel", 1))
-    expected = net_of(
-        'layer { name: "c" type: "Convolution" blobs { num: 1 data: [1, 2] } param { lr_mult: 2 } }',
-    )
+    expected = net_of('layer { name: "c" type: "Convolution" blobs { num: 1 data: [1, 2] } param { lr_mult: 2 } }')
     assert net == expected
     assert str(source.at(0, "param", 0)) == "w.caffemodel"
     v0 = net_of('layers { layer { name: "c" type: "innerproduct" num_output: 2 blobs { data: 3 } } }')

@@ -167,21 +167,10 @@ def load_other_weights(net: Net) -> None:
 
 
 @pytest.mark.parametrize(
-    "write",
-    [
-        write_in_place,
-        write_to_data,
-        write_by_numpy,
-        give_other_data,
-        replace_the_parameter,
-        load_other_weights,
-    ],
+    "write", [write_in_place, write_to_data, write_by_numpy, give_other_data, replace_the_parameter, load_other_weights]
 )
 def test_what_is_written_to_parameters_counts_in_the_next_run(
-    write: Callable[[Net], None],
-    net_of: Callable[..., Net],
-    tmp_path: object,
-    monkeypatch: pytest.MonkeyPatch,
+    write: Callable[[Net], None], net_of: Callable[..., Net], tmp_path: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(str(tmp_path))
     net = trained(net_of(BLOCK))

@@ -1,5 +1,6 @@
 """Training on several devices: each takes its share of the records, and together they are one larger batch."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 import torch
 
 from netspec.data.sources import Cursor, Draws
+from netspec.net.net import Net
+from netspec.solver.checks import dependence
 from netspec.solver.solver import load_solver
 from paths import GOLDEN
 
@@ -46,3 +49,28 @@ def test_devices_with_a_share_of_the_batch_train_as_one_with_all_of_it(
         for mine, theirs in zip(blobs, together.net.params[name], strict=True):
             scale = mine.detach().abs().max().item()
             assert np.allclose(mine.detach(), theirs.detach(), rtol=0, atol=1e-3 * scale + rounding)
+
+
+# A training whose last bits depend on the number of threads says so, once, and offers the remedy
+NET = """
+layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 1024 } } }
+layer { name: "small" type: "InnerProduct" bottom: "data" top: "small" inner_product_param { num_output: 10 } }
+layer { name: "large" type: "InnerProduct" bottom: "data" top: "large" inner_product_param { num_output: 1000 } }
+layer { name: "relu" type: "ReLU" bottom: "large" top: "relu" }
+"""
+
+
+@pytest.mark.parametrize(
+    ("exact", "threads", "said"),
+    [
+        ("small", 2, "2 threads share the sums of large: "),
+        ("none", 4, "4 threads share the sums of small and 1 more: "),
+        ("small", 1, ""),
+        ("all", 2, ""),
+    ],
+)
+def test_threads_that_change_bits(net_of: Callable[..., Net], exact: str, threads: int, said: str) -> None:
+    found = dependence(net_of(NET, exact=exact), threads)
+    assert found.startswith(said)
+    assert bool(found) == bool(said)
+    assert ("--exact all" in found and "OMP_NUM_THREADS=1" in found) == bool(said)

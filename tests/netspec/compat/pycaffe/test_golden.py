@@ -89,11 +89,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize("run", EXAMPLES)
 def test_caffes_examples(
-    run: str,
-    folder: Path,
-    exact: Callable[[str], None],
-    same_blas: bool,
-    monkeypatch: pytest.MonkeyPatch,
+    run: str, folder: Path, exact: Callable[[str], None], same_blas: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """LeNet, the autoencoder and the Siamese net: outputs, and what was subtracted from the weights first."""
     monkeypatch.chdir(folder)

@@ -128,12 +128,7 @@ def test_levels(write: Callable[..., str], level: int | None, expected: list[str
 
 @pytest.mark.parametrize(
     ("stages", "expected"),
-    [
-        (None, ["always"]),
-        (["B"], ["always", "B"]),
-        (["A", "B"], ["always", "A", "B", "A and B"]),
-        (["C"], ["always"]),
-    ],
+    [(None, ["always"]), (["B"], ["always", "B"]), (["A", "B"], ["always", "A", "B", "A and B"]), (["C"], ["always"])],
 )
 def test_stages(write: Callable[..., str], stages: list[str] | None, expected: list[str]) -> None:
     path = write(

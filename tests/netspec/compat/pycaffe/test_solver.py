@@ -170,8 +170,7 @@ def test_callbacks(solver: caffe.SGDSolver) -> None:
     weights = solver.net.params["scores"][0].data
     before = weights.copy()
     solver.add_callback(
-        lambda: told.append("start"),
-        lambda: told.append(("ready", solver.iter, bool((weights == before).all()))),
+        lambda: told.append("start"), lambda: told.append(("ready", solver.iter, bool((weights == before).all())))
     )
     solver.step(1)
     assert told == ["start", ("ready", 0, True)]

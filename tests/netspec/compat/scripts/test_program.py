@@ -158,10 +158,7 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize(
     ("shown", "half", "kinds"),
-    [
-        ("print pool.map(phases, [0])", 1, ["spawn", "fork"]),
-        ("print(pool.map(phases, [0]))", 1.5, ["forkserver"]),
-    ],
+    [("print pool.map(phases, [0])", 1, ["spawn", "fork"]), ("print(pool.map(phases, [0]))", 1.5, ["forkserver"])],
 )
 def test_workers_that_are_started_anew_see_what_the_program_sees(
     run: Run, shown: str, half: float, kinds: list[str]

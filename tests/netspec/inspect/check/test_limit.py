@@ -15,6 +15,7 @@ from netspec.cli import main
 from netspec.data.images import read_image
 from netspec.errors import SpecError
 from netspec.files import limits
+from netspec.graph import splits
 from netspec.layers.contract import fillers
 from netspec.layers.contract.base import Shape
 from netspec.net.need import limit_on
@@ -260,3 +261,35 @@ def test_a_container_has_less_memory(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_a_training_that_fits_goes_on() -> None:
     Path("net.prototxt").write_text(DUMMY)
     assert load_solver("solver.prototxt", limit=600 * MIB).net.need.tops == 4 * 64_000_000 + 4
+
+
+# A text that describes too much, or is too long, is checked soon
+INPUT = 'input: "data" input_dim: 1 input_dim: 3 input_dim: 8 input_dim: 8\n'
+
+
+def unknown(count: int) -> str:
+    layers = (f'layer {{ name: "r{i}" type: "ReLU" bottom: "b{i}" top: "r{i}" }}\n' for i in range(count))
+    return INPUT + "".join(layers)
+
+
+def test_an_error_in_a_large_net_names_the_last_blobs(net_of: Callable[..., Net]) -> None:
+    faults: list[SpecError] = []
+    net_of(unknown(100), report=faults.append)
+    assert "unknown bottom blob" in str(faults[99])
+    assert f"available: {100 - splits.MOST_NAMES} more, r{99 - splits.MOST_NAMES}, " in str(faults[99])
+
+
+def test_similar_names_are_looked_for_only_so_often(
+    net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each search takes time for each blob there is: for 10,000 unknown blobs, minutes."""
+    asked: list[str] = []
+    monkeypatch.setattr(splits, "did_you_mean", lambda blob, known: asked.append(blob) or "")
+    net_of(unknown(100), report=lambda fault: None)
+    assert len(asked) == splits.MOST_HINTS
+
+
+def test_a_pyramid_of_more_windows_than_can_be_counted(net_of: Callable[..., Net]) -> None:
+    spp = 'layer { name: "s" type: "SPP" bottom: "data" top: "s" spp_param { pyramid_height: 4000000000 } }'
+    with pytest.raises(SpecError, match="pyramid_height must be at most 16: more windows than an int counts"):
+        net_of(INPUT + spp)

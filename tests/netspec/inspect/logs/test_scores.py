@@ -8,11 +8,7 @@ from netspec.errors import SpecError
 from netspec.inspect.logs.scores import Score, Scores, Snapshot, read_scores
 
 SCORES = Scores(
-    [
-        Score(0, 0, {"loss": [0.5], "accuracy": [0.1, 0.2]}),
-        Score(5, 0, {"loss": [0.25]}),
-        Score(5, 1, {"loss": [1.0]}),
-    ],
+    [Score(0, 0, {"loss": [0.5], "accuracy": [0.1, 0.2]}), Score(5, 0, {"loss": [0.25]}), Score(5, 1, {"loss": [1.0]})],
     [Snapshot(5, "a/b_iter_5.caffemodel"), Snapshot(8, "a/b_iter_8.caffemodel")],
 )
 
