@@ -1,52 +1,38 @@
-"""``netspec run``: scripts and modules run as Python runs them, and ``import caffe`` finds netspec."""
+"""``netspec run``: scripts and modules run as Python runs them, and ``import caffe`` finds netspec.
 
+Programs in the form of those that people have stand in programs.txt, three of them in Python 2.
+"""
+
+import shutil
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
+import cv2
+import numpy as np
 import pytest
+
+import netspec
+from case_files import read_cases
+from dnn_program import HERE
+from netspec.data.database import Writer
+from netspec.data.datum import array_to_datum
+from netspec.dialects import use_dialect
+from netspec.net.weights import write_binary
 
 pytestmark = pytest.mark.slow
 
-Run = Callable[..., subprocess.CompletedProcess[str]]
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> Run:
-    """``run(*words, rc=0, files={path: text}, s=text)``: netspec run, in a folder with these files and s.py."""
-
-    def command(*words: str, rc: int = 0, files: dict[str, str] | None = None, s: str = "") -> Any:
-        for name, text in {**(files or {}), "s.py": s}.items():
-            path = tmp_path / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text)
-        done = subprocess.run(
-            [sys.executable, "-m", "netspec", "run", *words], cwd=tmp_path, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == rc, done.stderr
-        return done
-
-    return command
-
-
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
+CASES = read_cases("netspec/compat/scripts/programs.txt")
+PROGRAMS = {name: case["program"] for name, case in CASES.items()}
 WHO = "import sys; print(sys.argv, __name__, __file__, sys.path[0], __package__, __spec__ is None)"
 
 
-def test_a_script_sees_what_python_gives_it(run: Run, tmp_path: Path) -> None:
-    words = ["sub/who.py", "-x", "--gpu=1", "-minloglevel", "--plugin", "-m"]
-    got = run(*words, files={"sub/who.py": WHO}).stdout
-    plain = subprocess.run([sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-    assert got == plain
-
-
-def test_a_module_sees_what_python_gives_it(run: Run, tmp_path: Path) -> None:
-    files = {"pack/__init__.py": "", "pack/who.py": WHO, "pack/__main__.py": WHO}
-    for module in ("pack.who", "pack"):
-        got = run("-m", module, "-m", "--x", files=files).stdout
-        plain = [sys.executable, "-m", module, "-m", "--x"]
-        assert got == subprocess.run(plain, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+def test_a_script_or_module_sees_what_python_gives_it(run: Run, python: Run) -> None:
+    files = dict.fromkeys(("sub/who.py", "pack/who.py", "pack/__main__.py"), WHO) | {"pack/__init__.py": ""}
+    words = ("-x", "--gpu=1", "-minloglevel", "--plugin", "-m")
+    for command in (("sub/who.py", *words), ("-m", "pack.who", *words), ("-m", "pack", *words)):
+        assert run(*command, files=files).stdout == python(*command).stdout
 
 
 def test_the_exit_status_is_the_scripts(run: Run) -> None:
@@ -55,11 +41,10 @@ def test_the_exit_status_is_the_scripts(run: Run) -> None:
     run("s.py", rc=130, s="raise KeyboardInterrupt")
 
 
-def test_the_traceback_is_the_scripts(run: Run, tmp_path: Path) -> None:
+def test_the_traceback_is_the_scripts(run: Run, python: Run) -> None:
     source = "def f(x):\n    return 1 / x\n\ntry:\n    open('nowhere')\nexcept OSError:\n    pass\nf(0)\n"
     got = run("s.py", rc=1, s=source).stderr
-    plain = subprocess.run([sys.executable, "s.py"], cwd=tmp_path, capture_output=True, text=True, check=False).stderr
-    assert got == plain
+    assert got == python("s.py", rc=1).stderr
     assert "OSError" not in got
     assert run("s.py", rc=1, s="open('nowhere')").stderr.startswith("Traceback (most recent call last):\n")
     assert run("s.py", rc=1, s="def f(:\n").stderr.endswith("SyntaxError: invalid syntax\n")
@@ -76,26 +61,8 @@ def test_wrong_usage_and_what_is_not_there_are_one_line(run: Run) -> None:
     assert run("-m", "nothing.here", rc=1).stderr.startswith("-m nothing.here: ")
 
 
-IMPORTS = """
-import caffe
-import caffe.io, caffe.draw, caffe.classifier, caffe.detector, caffe.net_spec, caffe.coord_map
-import caffe.proto.caffe_pb2
-from caffe._caffe import RawBlobVec
-from caffe import layers as L, params as P, to_proto, NetSpec
-from caffe.proto import caffe_pb2
-from caffe.proto.caffe_pb2 import NetParameter, LayerParameter
-import netspec.pycaffe
-assert caffe is netspec.pycaffe
-assert caffe.io is netspec.pycaffe.io
-assert caffe.proto.caffe_pb2 is caffe_pb2 is netspec.pycaffe.proto.caffe_pb2
-assert caffe.__spec__.name == caffe.__name__ == "netspec.compat.pycaffe"
-assert (caffe.TRAIN, caffe.TEST) == (0, 1)
-print(L.Pooling(L.Input(), pool=P.Pooling.MAX).to_proto().layer[1].name)
-"""
-
-
 def test_caffe_and_its_submodules_are_found(run: Run) -> None:
-    assert run("s.py", s=IMPORTS).stdout == "Pooling1\n"
+    assert run("s.py", s=PROGRAMS["imports"]).stdout == "Pooling1\n"
 
 
 def test_a_module_that_caffe_has_not(run: Run) -> None:
@@ -127,33 +94,8 @@ SOURCES = {
 TREE = "import sys\nsys.path.insert(0, 'python')\n"
 
 
-IN_A_TREE = """
-from caffe import of_a_fork
-import caffe.of_a_fork, caffe.old, caffe.proto.more, caffe.test.test_it
-assert of_a_fork is caffe.of_a_fork and of_a_fork.value == 3
-assert (caffe.old.value, caffe.proto.more.value, caffe.test.test_it.value) == (3, 4, 5)
-assert not hasattr(caffe, "nothing") and caffe.io.__name__ == "netspec.compat.pycaffe.io"
-"""
-
-
 def test_python_files_of_a_caffe_tree_are_found_below_caffe(run: Run) -> None:
-    assert run("s.py", s=TREE + IN_A_TREE, files=SOURCES).stdout == "two\n"
-
-
-SPAWN = """
-import multiprocessing as mp, sys
-import caffe
-
-def phases(_):
-    import helper
-    return len({caffe.TRAIN, caffe.TEST}), helper.half(3), 3 / 2
-
-if __name__ == "__main__":
-    for kind in sys.argv[1:]:
-        pool = mp.get_context(kind).Pool(1)
-        %s
-        pool.terminate()
-"""
+    assert run("s.py", s=TREE + PROGRAMS["in a tree"], files=SOURCES).stdout == "two\n"
 
 
 @pytest.mark.parametrize(
@@ -163,30 +105,15 @@ if __name__ == "__main__":
 def test_workers_that_are_started_anew_see_what_the_program_sees(
     run: Run, shown: str, half: float, kinds: list[str]
 ) -> None:
-    files = {"helper.py": "def half(n):\n    return n / 2", "of.a.pool.py": SPAWN % shown}
+    files = {"helper.py": "def half(n):\n    return n / 2", "of.a.pool.py": PROGRAMS["workers"] % shown}
     done = run("of.a.pool.py", *kinds, files=files)
     assert done.stdout == f"[(2, {half}, {half})]\n" * len(kinds)
     assert done.stderr.count("of.a.pool.py is Python 2") == (half == 1)
     assert "Traceback" not in done.stderr  # of a worker that the pool ends
 
 
-ONE = """
-import sys, math
-import numpy as np
-w = np.ones((3, 1), np.float32)
-print("%.2f %s %d" % (w[0], "a", w[1]), "%.1f" % w[2], float(w[0]) + int(w[1]), math.sqrt(w[0]))
-np.set_printoptions(threshold="nan")
-print(len(str(np.zeros(2000))) > 2000)
-for fault in (lambda: "%d" % "a", lambda: float([1]), lambda: "%.2f" % np.ones(2)):
-    try:
-        fault()
-    except TypeError as e:
-        print(e)
-"""
-
-
 def test_arrays_of_one_element_are_numbers(run: Run) -> None:
-    *printed, first, second, third = run("s.py", s=ONE).stdout.splitlines()
+    *printed, first, second, third = run("s.py", s=PROGRAMS["arrays of one element"]).stdout.splitlines()
     assert printed == ["1.00 a 1 1.0 2.0 1.0", "True"]
     assert first.startswith("%d format")
     assert second.startswith("float() argument must be")
@@ -194,8 +121,6 @@ def test_arrays_of_one_element_are_numbers(run: Run) -> None:
 
 
 def test_a_numpy_that_is_too_new_is_named(run: Run) -> None:
-    import numpy as np
-
     if tuple(map(int, np.__version__.split(".")[:2])) < (2, 4):
         pytest.skip("this NumPy takes arrays of one element for numbers")
     said = f"NumPy {np.__version__} takes no array of one element for a number, as old programs expect: pip install "
@@ -228,62 +153,18 @@ def test_the_log_is_shown_once_and_as_the_environment_wants_it(run: Run) -> None
 
 
 def test_names_that_were_dropped_are_given_back_in_the_script_only(run: Run) -> None:
-    script = """
-import collections, time, unittest
-import numpy as np
-from scipy.misc import imread, imresize, imsave, factorial
-import scipy.ndimage
-assert (np.float, np.int, np.object, np.bool(1), np.Inf) == (float, int, object, True, float("inf"))
-image = np.zeros((4, 6, 3)); image[:2] = 1
-imsave("a.png", image)
-assert imread("a.png").dtype == np.uint8 and imread("a.png").max() == 255
-assert imread("a.png", flatten=True).shape == (4, 6)
-assert imresize(imread("a.png"), (8, 12)).shape == (8, 12, 3)
-assert imresize(imread("a.png"), 50).shape == imresize(imread("a.png"), 0.5).shape == (2, 3, 3)
-assert scipy.ndimage.imread("a.png").shape == (4, 6, 3)
-assert np.fromstring(np.arange(3).tostring(), dtype=int).tolist() == [0, 1, 2]
-assert np.fromstring("1 2", sep=" ").tolist() == [1, 2]
-assert set(np.random.random_integers(1, 2, 50)) == {1, 2}
-assert isinstance({}, collections.Mapping) and time.clock() >= 0
-unittest.TestCase().assertEquals(1, 1)
-print("fine")
-"""
-    assert run("s.py", s=script).stdout == "fine\n"
-    import numpy as np
-
+    assert run("s.py", s=PROGRAMS["dropped names"]).stdout == "fine\n"
     assert not hasattr(np, "float")
     assert not hasattr(np, "asscalar")
 
 
 def test_scikit_images_old_names(run: Run) -> None:
     pytest.importorskip("skimage")
-    script = """
-import numpy as np, skimage.io, skimage.color
-skimage.io.imsave("a.png", np.full((2, 3, 3), 255, np.uint8), check_contrast=False)
-print(skimage.io.imread("a.png", as_grey=True).shape, skimage.color.rgb2grey is skimage.color.rgb2gray)
-"""
-    assert run("s.py", s=script).stdout == "(2, 3) True\n"
+    assert run("s.py", s=PROGRAMS["old names of scikit-image"]).stdout == "(2, 3) True\n"
 
 
-def test_keys_of_databases_may_be_text(run: Run, tmp_path: Path) -> None:
-    script = """
-import lmdb, numpy as np, caffe
-env = lmdb.open("old_lmdb", map_size=1 << 20)
-with env.begin(write=True) as txn:
-    for i in range(3):
-        txn.put("{:0>10d}".format(i), caffe.io.array_to_datum(np.full((1, 2, 2), i, np.uint8), i).SerializeToString())
-txn = lmdb.Transaction(env=env, write=True)
-txn.delete("0000000002")
-txn.commit()
-with env.begin() as txn:
-    print([caffe.proto.caffe_pb2.Datum.FromString(value).label for key, value in txn.cursor()], txn.stat()["entries"])
-    print(txn.get("0000000001") == txn.get(b"0000000001"), txn.get("none"))
-env.close()
-data = 'name: "d" type: "Data" top: "d" top: "l" data_param { source: "old_lmdb" backend: LMDB batch_size: 2 }'
-open("net.prototxt", "w").write("layer {" + data + "}")
-print(caffe.Net("net.prototxt", caffe.TRAIN).forward()["l"])
-"""
-    assert run("-minloglevel", "2", "s.py", s=script).stdout == "[0, 1] 2\nTrue None\n[0. 1.]\n"
+def test_keys_of_databases_may_be_text(run: Run) -> None:
+    assert run("-minloglevel", "2", "s.py", s=PROGRAMS["keys as text"]).stdout == "[0, 1] 2\nTrue None\n[0. 1.]\n"
 
 
 def test_nothing_is_loaded_that_the_script_does_not_ask_for(run: Run) -> None:
@@ -294,26 +175,11 @@ def test_nothing_is_loaded_that_the_script_does_not_ask_for(run: Run) -> None:
     assert run("s.py", s=light + script).stdout == "[]\n"
 
 
-def test_in_a_notebook() -> None:
-    code = """
-import netspec
-netspec.load_ipython_extension(None)
-import caffe
-from caffe import layers
-assert caffe.__name__ == "netspec.compat.pycaffe"
-import sys
-del sys.modules["caffe"]
-netspec.unload_ipython_extension(None)
-try:
-    import caffe
-except ImportError:
-    print("gone")
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout == "gone\n", done.stderr
+def test_in_a_notebook(python: Run) -> None:
+    assert python("-c", PROGRAMS["notebook"]).stdout == "gone\n"
 
 
-def test_a_numpy_that_pip_put_beside_the_program_gets_its_names(run: Run, tmp_path: Path) -> None:
+def test_a_numpy_that_pip_put_beside_the_program_gets_its_names(run: Run) -> None:
     files = {
         "lib/numpy/__init__.py": "__version__, inf, float64 = '1.0', 1e999, 0\ndef fromstring(): pass\n"
         "set_printoptions = fromstring\n",
@@ -322,3 +188,58 @@ def test_a_numpy_that_pip_put_beside_the_program_gets_its_names(run: Run, tmp_pa
     }
     script = "import sys; sys.path.insert(0, 'lib')\nimport numpy, other\nprint numpy.float, other.half(3)"
     assert run("s.py", s=script, files=files).stdout == "<class 'float'> 1.5\n"
+
+
+def lines_of(run: Run, name: str) -> list[str]:
+    return run("--minloglevel", "2", "s.py", s=PROGRAMS[name]).stdout.splitlines()
+
+
+def test_a_program_for_ssd_in_python_2(run: Run, tmp_path: Path) -> None:
+    for ending, name in (("prototxt", "deploy.prototxt"), ("caffemodel", "x.caffemodel")):
+        shutil.copy(HERE / f"detect.{ending}", tmp_path / name)
+    image = np.random.RandomState(0).rand(32, 32, 3).astype(np.float32)
+    np.save(tmp_path / "image.npy", image)
+    (tmp_path / "labelmap.prototxt").write_text(
+        "".join(f'item {{ name: "{i}" label: {i} display_name: "thing {i}" }}\n' for i in range(3))
+    )
+    use_dialect("ssd")
+    net = netspec.load_net(tmp_path / "deploy.prototxt", weights=tmp_path / "x.caffemodel")
+    data = image[:, :, ::-1].transpose(2, 0, 1) * 255 - np.array([104, 117, 123])[:, None, None]
+    rows = net(data=data[None].astype(np.float32))["detections"][0, 0]
+    expected = [f"thing {int(row[1])} {row[2]:.5f} {row[3]:.5f}" for row in rows.tolist() if row[2] >= 0.85]
+    assert len(expected) > 2
+    assert lines_of(run, "detector") == expected
+
+
+def test_a_cascade_over_an_image_pyramid_in_python_2(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "det1.prototxt").write_text(CASES["cascade"]["net"])
+    net = netspec.load_net(tmp_path / "det1.prototxt", seed=1)
+    write_binary(net, tmp_path / "det1.caffemodel")
+    image = np.random.RandomState(3).randint(0, 256, (60, 80, 3)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "image.png"), image)
+    scores: list[float] = []
+    lines, scale = [], 12 / 20
+    while 60 * scale >= 12:
+        width, height = int(np.ceil(80 * scale)), int(np.ceil(60 * scale))
+        data = (cv2.resize(image.astype(float), (width, height)) - 127.5) * 0.0078125
+        prob = net(data=data.swapaxes(0, 2)[None].astype(np.float32))["prob1"].detach().numpy()
+        scores += prob[0, 1][prob[0, 1] >= 0.5].tolist()
+        lines.append(f"{width} {height} {prob.shape} conv4-2 prob1")
+        scale *= 0.709
+    *found, summary, mean = lines_of(run, "cascade")
+    assert found == lines
+    assert summary == "True True True"
+    assert float(mean) == pytest.approx(np.mean(scores), abs=1e-4)
+
+
+def test_a_program_that_reads_a_database_in_python_2(run: Run, tmp_path: Path) -> None:
+    images = np.random.RandomState(0).randint(0, 256, (6, 3, 4, 4)).astype(np.uint8)
+    with Writer(str(tmp_path / "db")) as writer:
+        for i, image in enumerate(images):
+            writer.put(b"%04d" % i, array_to_datum(image, i % 2).SerializeToString())
+    assert lines_of(run, "database") == [
+        f"0 3 {images[::2].mean():.3f}",
+        f"1 3 {images[1::2].mean():.3f}",
+        "(1, 3, 2, 2)",
+        str(["layer", "{", "name:", '"a"', "type:", '"ReLU"', "bottom:", '"a"', "top:", '"a"', "}"]),
+    ]
