@@ -1,155 +1,36 @@
-"""Every way in which public scripts use nets, blobs, solvers and modes: each a few lines of code that must run.
+"""Every way in which public scripts use pycaffe: each a few lines of code that must run.
 
-The names are those of a count over 493 public scripts. What they use of caffe.io, NetSpec, caffe_pb2, Classifier and
-drawing is tested with those.
+The names in usage.txt are those of a count over 493 public scripts. Not there is what single forks have in modules of
+their own (caffe.tools, caffe.mpi_init and the like).
 """
 
-from collections.abc import Callable
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
+from case_files import read_cases
 from each import each
+from netspec.compat.scripts import finder
+from netspec.dialects import use_dialect
 
 pytestmark = pytest.mark.slow
 
-NET = """
-name: "usage" force_backward: true
-input: "data" input_shape { dim: 2 dim: 3 dim: 12 dim: 12 }
-layer { name: "conv1" type: "Convolution" bottom: "data" top: "conv1"
-  convolution_param { num_output: 4 kernel_size: 3 weight_filler { type: "xavier" } } }
-layer { name: "relu1" type: "ReLU" bottom: "conv1" top: "conv1" }
-layer { name: "pool1" type: "Pooling" bottom: "conv1" top: "pool1"
-  pooling_param { pool: MAX global_pooling: true } }
-layer { name: "fc2" type: "InnerProduct" bottom: "pool1" top: "fc2"
-  inner_product_param { num_output: 5 weight_filler { type: "xavier" } } }
-layer { name: "prob" type: "Softmax" bottom: "fc2" top: "prob" }
-"""
-MEMORY = """
-layer { name: "data" type: "MemoryData" top: "data" top: "label"
-  memory_data_param { batch_size: 2 channels: 1 height: 2 width: 3 } }
-layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc"
-  inner_product_param { num_output: 3 weight_filler { type: "xavier" } } }
-layer { name: "loss" type: "SoftmaxWithLoss" bottom: "fc" bottom: "label" top: "loss" }
-"""
-TRAINED = """
-layer { name: "data" type: "DummyData" top: "data" top: "label" dummy_data_param {
-  shape { dim: 4 dim: 6 } shape { dim: 4 } data_filler { type: "gaussian" std: 1 } data_filler { } } }
-layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc"
-  inner_product_param { num_output: 3 weight_filler { type: "xavier" } } }
-layer { name: "loss" type: "SoftmaxWithLoss" bottom: "fc" bottom: "label" top: "loss" }
-layer { name: "accuracy" type: "Accuracy" bottom: "fc" bottom: "label" top: "accuracy" include { phase: TEST } }
-"""
-SOLVER = """
-net: "train.prototxt" base_lr: 0.1 lr_policy: "fixed" momentum: 0.9 max_iter: 3 test_iter: 2 test_interval: 2
-snapshot_prefix: "usage"
-"""
-USES = {
-    "import caffe": "import netspec.pycaffe as caffe",
-    "caffe.Net": "assert isinstance(net, caffe.Net)",
-    "caffe.TEST": "assert caffe.TEST == 1",
-    "caffe.TRAIN": "assert caffe.TRAIN == 0",
-    "Net(str,str,phase)": "caffe.Net('deploy.prototxt', 'usage.caffemodel', caffe.TEST)",
-    "Net(str,phase)": "caffe.Net('deploy.prototxt', caffe.TEST)",
-    "Net(str,phase,weights=)": "caffe.Net('deploy.prototxt', caffe.TEST, weights='usage.caffemodel')",
-    "Net(str,int,weights=)": "caffe.Net('deploy.prototxt', 1, weights='usage.caffemodel')",
-    ".forward()": "out = net.forward(); assert out['prob'].shape == (2, 5); assert out['prob'].argmax() >= 0",
-    "caffe.set_mode_gpu": "caffe.set_mode_gpu(); caffe.set_mode_cpu()",
-    "caffe.set_mode_cpu": "caffe.set_mode_cpu()",
-    "caffe.set_device": "caffe.set_device(0)",
-    "net.blobs[..].data[...] = ": "net.blobs['data'].data[...] = image; assert (net.blobs['data'].data == image).all()",
-    "net.blobs[..].reshape(..)": "net.blobs['data'].reshape(1, 3, 20, 20); assert net.blobs['data'].shape[2] == 20",
-    "net.blobs[..].reshape": "f = net.blobs['data'].reshape; f(1, 3, 9, 9); assert net.blobs['data'].height == 9",
-    "net.params[..][i].data read": "assert net.params['conv1'][0].data.shape == (4, 3, 3, 3)",
-    "net.blobs[..].data.shape": "assert net.blobs['data'].data.shape[1:] == (3, 12, 12)",
-    "net.blobs[..].data[index]": "net.forward(); assert net.blobs['prob'].data[0].sum() > 0.99",
-    "net.params[..][i].data[..] = ": "net.params['fc2'][1].data[2] = 50; assert net.forward()['prob'][0].argmax() == 2",
-    "net.blobs[..].data read": "assert net.blobs['prob'].data.dtype == np.float32",
-    ".save(..)": "net.save('again.caffemodel')",
-    "net.params.keys()": "assert list(net.params.keys()) == ['conv1', 'fc2']",
-    "class X(caffe.Layer): setup/reshape/forward/backward": "class X(caffe.Layer):\n  def setup(self, b, t): pass",
-    "caffe.Layer": "assert issubclass(type(net.layers[1]), caffe.Layer)",
-    "net.params[..] itself": "w, b = net.params['conv1']; assert len(net.params['conv1']) == 2; assert b.count == 4",
-    "solver.net": "assert solver.net.blobs['loss'].data.shape == ()",
-    ".step(..)": "solver.step(2); assert solver.iter == 2",
-    ".copy_from(..)": "net.copy_from('usage.caffemodel')",
-    "net.params.items()": "assert [(k, v[0].data.ndim) for k, v in net.params.items()] == [('conv1', 4), ('fc2', 2)]",
-    "caffe.SGDSolver": "assert isinstance(solver, caffe.SGDSolver)",
-    ".inputs[i]": "assert net.inputs[0] == 'data'",
-    "net.blobs[..].data[index] = ": "net.blobs['data'].data[1] = 1; assert net.blobs['data'].data[1].mean() == 1",
-    "for/in net.params": "assert 'fc2' in net.params; assert [p for p in net.params] == ['conv1', 'fc2']",
-    ".layers[i]": "assert net.layers[1].type == 'Convolution'; assert net.layers[1].blobs[0].data.ndim == 4",
-    ".outputs[i]": "assert net.outputs[0] == 'prob'",
-    ".forward_all(<blob>=)": "assert net.forward_all(data=images)['prob'].shape == (5, 5)",
-    "caffe.get_solver": "assert caffe.get_solver('solver.prototxt').iter == 0",
-    "net.blobs[..] itself": "blob = net.blobs['data']; assert blob.num == 2",
-    ".test_nets[i]": "assert 'accuracy' in solver.test_nets[0].forward()",
-    ".test_nets": "assert len(solver.test_nets) == 1",
-    "._layer_names": "assert list(net._layer_names).index('fc2') == 4",
-    "net.blobs.items()": "assert dict(net.blobs.items())['prob'] is net.blobs['prob']",
-    "net.blobs.keys()": "assert list(net.blobs.keys()) == ['data', 'conv1', 'pool1', 'fc2', 'prob']",
-    "net.outputs": "assert net.outputs == ['prob']",
-    "net.inputs": "assert net.inputs == ['data']",
-    ".top_names": "assert net.top_names['pool1'] == ['pool1']",
-    "net.params.has_key()": "assert net.params.has_key('conv1') and not net.params.has_key('conv9')",
-    ".solve(..)": "solver.solve(); assert solver.iter == 3",
-    "solver.iter": "assert solver.iter == 0",
-    "net.params.iteritems()": "assert [name for name, _ in net.params.iteritems()] == ['conv1', 'fc2']",
-    ".set_input_arrays(..)": (
-        "memory = caffe.Net('memory.prototxt', caffe.TRAIN)\n"
-        "memory.set_input_arrays(np.ones((4, 1, 2, 3), np.float32), np.float32([0, 1, 2, 0]))\n"
-        "assert memory.forward()['loss'] > 0\n"
-        "assert memory.blobs['label'].data.tolist() == [0, 1]\n"
-        "memory.forward()\n"
-        "assert memory.blobs['label'].data.tolist() == [2, 0]"
-    ),
-    "net.blobs[..].data.copy": "a = net.blobs['data'].data.copy(); a += 1; assert not net.blobs['data'].data.any()",
-    ".forward_all(**)": "assert net.forward_all(**{net.inputs[0]: images})['prob'].shape == (5, 5)",
-    ".forward(**)": "assert net.forward(**{net.inputs[0]: image})['prob'].shape == (2, 5)",
-    "net.blobs.iteritems()": "assert [name for name, _ in net.blobs.iteritems()][0] == 'data'",
-    "net.params[..][i].data.flat": (
-        "net.params['fc2'][0].data.flat = np.arange(20); assert net.params['fc2'][0].data[1, 0] == 4"
-    ),
-    ".bottom_names": "assert net.bottom_names['fc2'] == ['pool1']",
-    ".forward(<blob>=)": "net.forward(data=image); assert (net.blobs['data'].data == image).all()",
-    "caffe.set_random_seed": "caffe.set_random_seed(0)",
-    "net.blobs[..].data[...]": "assert net.blobs['data'].data[...].shape == (2, 3, 12, 12)",
-    "net.blobs[..].shape": "n, c, h, w = net.blobs['data'].shape; assert (n, c, h, w) == (2, 3, 12, 12)",
-    "caffe._caffe.BlobVec": (
-        "import netspec.compat.pycaffe._caffe as _caffe; assert isinstance(net.params['fc2'], _caffe.BlobVec)"
-    ),
-    "net.params.iterkeys()": "assert list(net.params.iterkeys()) == ['conv1', 'fc2']",
-    "net.blobs[..].num": "b = net.blobs['data']; assert (b.num, b.channels, b.height, b.width) == (2, 3, 12, 12)",
-    ".forward(pos)": "assert sorted(net.forward(['pool1'])) == ['pool1', 'prob']",
-    "net.blobs[..].diff read": "net.forward(); net.backward(prob=ones); net.blobs['data'].diff.reshape(2, -1)",
-    ".set_phase_test(..)": "net.set_phase_test()",
-    ".set_mode_gpu(..)": "net.set_mode_gpu()",
-    ".set_mode_cpu(..)": "net.set_mode_cpu()",
-    ".restore(..)": "solver.snapshot(); solver.step(1); solver.restore('usage_iter_0.solverstate')",
-    "caffe.init_log": "caffe.init_log()",
-    "net.reshape()": "net.blobs['data'].reshape(7, 3, 12, 12); net.reshape(); assert net.blobs['prob'].shape == (7, 5)",
-    ".forward(pos,pos,pos)": "assert list(net.forward(None, 'conv1', 'pool1')) == ['pool1']",
-    ".backward(pos,pos)": "net.forward(); net.blobs['fc2'].diff[...] = 1; assert 'data' in net.backward(None, 'fc2')",
-    "net.blobs[..].size": "assert net.blobs['data'].data.size == net.blobs['data'].count == 864",
-    "net.blobs.values()": "assert len(net.blobs.values()) == 5",
-    ".forward_all(**,blobs)": "assert net.forward_all(blobs=['pool1'], data=images)['pool1'].shape == (5, 4, 1, 1)",
-    "net.params[..][i].shape": "assert tuple(net.params['fc2'][0].shape) == (5, 4)",
-    "net.blobs[..].data.flat = ": "net.blobs['data'].data.flat = image.flat; assert net.blobs['data'].data.any()",
-    ".backward()": "net.forward(); assert list(net.backward()) == ['data']",
-    ".add_callback(..)": "solver.add_callback(lambda: None, lambda: None); solver.step(1)",
-    "for/in net.blobs": "assert [name for name in net.blobs if 'conv' in name] == ['conv1']",
-    ".forward(start)": "net.forward(start='pool1')",
-    "._blob_names": "assert list(net._blob_names)[0] == 'data'",
-    "._layer_names[i]": "assert net._layer_names[1] == 'conv1'",
-    "._blob_names[i]": "assert net._blob_names[4] == 'prob'",
-}
+CASES = read_cases("netspec/compat/pycaffe/usage.txt")
+USES, AROUND = (
+    dict(re.findall(r"^# (.*)\n((?:(?!# ).*\n)*)", CASES[part]["uses"] + "\n", re.M))
+    for part in ("nets and solvers", "around nets")
+)
 
 
 @each("use", USES)
-def test_what_scripts_do(use: str, write: Callable[..., str]) -> None:
-    for name, text in (("deploy", NET), ("memory", MEMORY), ("train", TRAINED), ("solver", SOLVER)):
-        write(text, f"{name}.prototxt")
+def test_what_scripts_do_with_nets_and_solvers(use: str, write: Callable[..., str]) -> None:
+    for name in ("deploy", "memory", "train", "solver"):
+        write(CASES[f"{name}.prototxt"]["text"], f"{name}.prototxt")
     net = caffe.Net("deploy.prototxt", caffe.TEST)
     net.save("usage.caffemodel")
     random = np.random.default_rng(0)
@@ -162,4 +43,29 @@ def test_what_scripts_do(use: str, write: Callable[..., str]) -> None:
         "images": random.random((5, 3, 12, 12), np.float32),
         "ones": np.ones((2, 5), np.float32),
     }
-    exec(use and USES[use], names)
+    exec(USES[use], names)
+
+
+@pytest.fixture
+def as_in_netspec_run(write: Callable[..., str]) -> Iterator[None]:
+    """Let ``import caffe`` find netspec, in a folder with a net, its weights and an image."""
+    cv2 = pytest.importorskip("cv2")
+    write(CASES["pool.prototxt"]["text"], "deploy.prototxt")
+    caffe.Net("deploy.prototxt", caffe.TEST).save("net.caffemodel")
+    cv2.imwrite("image.png", np.zeros((8, 6, 3), np.uint8))
+    use_dialect("ssd")
+    use_dialect("blocks")
+    finder.install()
+    yield
+    finder.uninstall()
+    for name in [name for name in sys.modules if name == "caffe" or name.startswith("caffe.")]:
+        del sys.modules[name]
+
+
+@each("use", AROUND)
+def test_what_scripts_do_around_nets(use: str, as_in_netspec_run: None) -> None:
+    if "draw" in use:
+        pytest.importorskip("pydot")
+    if any(word in AROUND[use] for word in ("load_image", "resize", "Classifier")):
+        pytest.importorskip("skimage")
+    exec(f"{CASES['around nets']['before']}\n{AROUND[use]}", {})
