@@ -8,97 +8,7 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
-
-CODE = '''
-import caffe
-import numpy as np
-
-
-class Tenfold(caffe.Layer):
-    def setup(self, bottom, top):
-        pass
-
-    def reshape(self, bottom, top):
-        top[0].reshape(*bottom[0].data.shape)
-
-    def forward(self, bottom, top):
-        top[0].data[...] = 10 * bottom[0].data
-
-    def backward(self, top, propagate_down, bottom):
-        bottom[0].diff[...] = 10 * top[0].diff
-
-
-class Scaled(Tenfold):
-    def setup(self, bottom, top):
-        self.factor = float(self.param_str)
-
-    def forward(self, bottom, top):
-        top[0].data[...] = self.factor * bottom[0].data
-
-    def backward(self, top, propagate_down, bottom):
-        bottom[0].diff[...] = self.factor * top[0].diff
-
-
-class Broken(caffe.Layer):
-    def setup(self, bottom, top):
-        raise RuntimeError("setup of a broken layer")
-
-
-class Breaks(Tenfold):
-    def forward(self, bottom, top):
-        raise ZeroDivisionError("forward of a broken layer")
-
-
-class Learned(caffe.Layer):
-    def setup(self, bottom, top):
-        self.blobs.add_blob(1)
-        self.blobs[0].data[0] = 0
-
-    def reshape(self, bottom, top):
-        top[0].reshape(1)
-
-    def forward(self, bottom, top):
-        top[0].data[0] = self.blobs[0].data[0]
-
-    def backward(self, top, propagate_down, bottom):
-        self.blobs[0].diff[0] = 1
-
-
-class Phase(caffe.Layer):
-    def setup(self, bottom, top):
-        pass
-
-    def reshape(self, bottom, top):
-        top[0].reshape()
-
-    def forward(self, bottom, top):
-        top[0].data[()] = self.phase
-
-
-class Rows(caffe.Layer):
-    """A data layer as Fast R-CNN has it: the script hands it its records."""
-
-    def setup(self, bottom, top):
-        self.kept = top
-        top[0].reshape(1, 2)
-        top[1].reshape(1)
-        top[1].data[...] = 7
-
-    def set_rows(self, rows):
-        self.rows, self.next = rows, 0
-
-    def reshape(self, bottom, top):
-        pass
-
-    def forward(self, bottom, top):
-        row = self.rows[self.next]
-        self.next = (self.next + 1) % len(self.rows)
-        top[0].reshape(1, len(row))
-        top[0].data[...] = row
-
-    def backward(self, top, propagate_down, bottom):
-        pass
-'''
+from paths import PYTHON_LAYERS
 
 
 def layer(kind: str, name: str, bottom: str, more: str = "") -> str:
@@ -115,7 +25,7 @@ def python_net(
 ) -> Callable[..., caffe.Net]:
     """``python_net(text, phase)``: its module is found on sys.path, not in the working directory."""
     (tmp_path / "modules").mkdir()
-    (tmp_path / "modules" / "mine.py").write_text(CODE)
+    (tmp_path / "modules" / "mine.py").write_text(PYTHON_LAYERS.read_text())
     monkeypatch.syspath_prepend(tmp_path / "modules")
     monkeypatch.delitem(__import__("sys").modules, "mine", raising=False)
     return net_of
@@ -123,9 +33,9 @@ def python_net(
 
 THREE = (
     'force_backward: true input: "data" input_shape { dim: 10 dim: 9 dim: 8 }\n'
-    + layer("Tenfold", "one", "data")
-    + layer("Tenfold", "two", "one")
-    + layer("Tenfold", "three", "two")
+    + layer("TimesTen", "one", "data")
+    + layer("TimesTen", "two", "one")
+    + layer("TimesTen", "three", "two")
 )
 
 
@@ -162,7 +72,7 @@ def test_exceptions_are_the_codes_own(python_net: Callable[..., caffe.Net]) -> N
 
 
 def test_learnable_blobs(python_net: Callable[..., caffe.Net]) -> None:
-    text = "force_backward: true\n" + layer("Learned", "layer", "")
+    text = "force_backward: true\n" + layer("One", "layer", "")
     net = python_net(text, caffe.TRAIN)
     net.forward()
     net.backward()
@@ -213,20 +123,7 @@ def test_the_script_reaches_the_layers_own_object(python_net: Callable[..., Any]
     assert net.layers[0].kept[0] is net.blobs["row"]
 
 
-def test_a_python_loss_among_other_layers(python_net: Callable[..., caffe.Net], tmp_path: Path) -> None:
-    (tmp_path / "modules" / "loss_of_mine.py").write_text(
-        "import caffe\n"
-        "class Squares(caffe.Layer):\n"
-        "    def setup(self, bottom, top): top[0].reshape(1)\n"
-        "    def reshape(self, bottom, top): self.apart = None\n"
-        "    def forward(self, bottom, top):\n"
-        "        self.apart = bottom[0].data - bottom[1].data\n"
-        "        top[0].data[...] = (self.apart ** 2).sum() / bottom[0].num / 2.\n"
-        "    def backward(self, top, propagate_down, bottom):\n"
-        "        for i, sign in enumerate((1, -1)):\n"
-        "            if propagate_down[i]:\n"
-        "                bottom[i].diff[...] = sign * self.apart / bottom[i].num\n"
-    )
+def test_a_python_loss_among_other_layers(python_net: Callable[..., caffe.Net]) -> None:
     head = """
     input: "data" input_shape { dim: 6 dim: 5 } input: "wanted" input_shape { dim: 6 dim: 3 }
     layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc"
@@ -234,7 +131,7 @@ def test_a_python_loss_among_other_layers(python_net: Callable[..., caffe.Net], 
     """
     own = head + (
         'layer { name: "loss" type: "Python" bottom: "fc" bottom: "wanted" top: "loss" loss_weight: 1 '
-        'python_param { module: "loss_of_mine" layer: "Squares" } }'
+        'python_param { module: "mine" layer: "Euclidean" } }'
     )
     caffes = head + 'layer { name: "loss" type: "EuclideanLoss" bottom: "fc" bottom: "wanted" top: "loss" }'
     nets = [python_net(text, caffe.TRAIN) for text in (own, caffes)]

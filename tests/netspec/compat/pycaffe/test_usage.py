@@ -7,7 +7,6 @@ their own (caffe.tools, caffe.mpi_init and the like).
 import re
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
