@@ -81,6 +81,9 @@ def _train(arguments: argparse.Namespace) -> int:
             with suppress(Lost):  # the root reports it; torchrun ends all processes as soon as one has ended
                 processes.gather(None)
             return FAULT
+    if status == FAULT:  # another process is lost: leaving the group, and Python's own end, could wait for it
+        sys.stderr.flush()
+        os._exit(FAULT)
     processes.leave()
     return status
 
@@ -99,6 +102,7 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
     if hasattr(signal, "SIGHUP"):  # Windows has none
         effects[signal.SIGHUP] = arguments.sighup_effect
     with signals(effects) as action:
+        processes.is_ending = lambda: bool(action.stopped_by)
         solver = processes.together(lambda: _load(arguments, path, action, processes))
         log.info("caffe.cpp:239", "Starting Optimization")
         total, first = solver.param.max_iter, solver.iteration

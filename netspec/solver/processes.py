@@ -1,7 +1,8 @@
 """The processes that train one net together, as torchrun starts them: each is a rank with one net on one device.
 
 Tensors of the CPU travel by gloo, those of GPUs by NCCL. Every collective call ends: where a process is gone, or has
-not answered for ``TIMEOUT``, it raises :class:`Lost`.
+not answered for ``TIMEOUT``, it raises :class:`Lost`; a process that was asked to end waits ``GRACE`` only, since gloo
+can miss the death of another.
 
 Caffe: src/caffe/parallel.cpp
 """
@@ -9,9 +10,10 @@ Caffe: src/caffe/parallel.cpp
 from __future__ import annotations
 
 import os
+import pickle
 import re
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Iterable
 from datetime import timedelta
 from typing import Any, TypeVar
 
@@ -21,6 +23,8 @@ from torch import distributed
 from netspec.errors import SpecError
 
 TIMEOUT = timedelta(minutes=30)  # a test, which only the root runs, must take less
+GRACE = 15.0  # seconds; torchrun kills what has not ended 30 s after its SIGTERM
+_LOOK = timedelta(seconds=1)  # how often a waiting process looks whether it was asked to end
 _REQUESTS = (None, "snapshot", "stop")  # a later one wins
 T = TypeVar("T")
 
@@ -36,11 +40,13 @@ class FaultOfAll(SpecError):
 class Processes:
     """This process, number ``rank`` of ``count``; the root is 0. By default there is one.
 
-    ``seed`` is the same in all, for a solver without random_seed; None in a single process.
+    ``seed`` is the same in all, for a solver without random_seed; None in a single process. ``is_ending`` says whether
+    this process was asked to end.
     """
 
     def __init__(self, rank: int = 0, count: int = 1, seed: int | None = None) -> None:
         self.rank, self.count, self.seed = rank, count, seed
+        self.is_ending: Callable[[], bool] = lambda: False
 
     @property
     def is_root(self) -> bool:
@@ -50,25 +56,27 @@ class Processes:
     def sum(self, tensors: Iterable[torch.Tensor]) -> None:
         """Replace each tensor by its sum over all processes."""
         if self.count > 1:
-            with self._answered():
-                for work in [distributed.all_reduce(tensor, async_op=True) for tensor in tensors]:
-                    if work is not None:
-                        work.wait()
+            self._wait(lambda: [(distributed.all_reduce(tensor, async_op=True), tensor) for tensor in tensors])
 
     def copy_root(self, tensors: Iterable[torch.Tensor]) -> None:
         """Replace each tensor by the root's."""
         if self.count > 1:
-            with self._answered():
-                for tensor in tensors:
-                    distributed.broadcast(tensor, 0)
+            self._wait(lambda: [(distributed.broadcast(tensor, 0, async_op=True), tensor) for tensor in tensors])
 
     def gather(self, value: T) -> list[T]:
         """Return what each process gave, in every process."""
         if self.count == 1:
             return [value]
-        found: list[Any] = [None] * self.count
-        with self._answered():
-            distributed.all_gather_object(found, value)
+        own = torch.frombuffer(bytearray(pickle.dumps(value)), dtype=torch.uint8)
+        sizes = [size.item() for size in self._all(torch.tensor([own.numel()]))]
+        padded = torch.nn.functional.pad(own, (0, int(max(sizes)) - own.numel()))
+        found = [row[: int(size)] for row, size in zip(self._all(padded), sizes, strict=True)]
+        return [pickle.loads(row.numpy().tobytes()) for row in found]
+
+    def _all(self, own: torch.Tensor) -> list[torch.Tensor]:
+        """Return the tensor of each process; all have one shape."""
+        found = [torch.empty_like(own) for _ in range(self.count)]
+        self._wait(lambda: [(distributed.all_gather(found, own, async_op=True), own)])
         return found
 
     def agree(self, request: str | None) -> str | None:
@@ -76,8 +84,7 @@ class Processes:
         if self.count == 1:
             return request
         code = torch.tensor(_REQUESTS.index(request))
-        with self._answered():
-            distributed.all_reduce(code, distributed.ReduceOp.MAX)
+        self._wait(lambda: [(distributed.all_reduce(code, distributed.ReduceOp.MAX, async_op=True), code)])
         return _REQUESTS[int(code)]
 
     def together(self, function: Callable[[], T]) -> T:
@@ -99,12 +106,31 @@ class Processes:
         if distributed.is_available() and distributed.is_initialized():
             distributed.destroy_process_group()
 
-    @contextmanager
-    def _answered(self) -> Iterator[None]:
+    def _wait(self, begin: Callable[[], list[tuple[Any, torch.Tensor]]]) -> None:
+        """Begin operations, each with its tensor, and wait for all. Raises Lost."""
         try:
-            yield
+            for work, tensor in begin():
+                if tensor.is_cuda:  # NCCL would give up the operation after the first look
+                    work.wait()
+                else:
+                    self._look_and_wait(work)
         except (RuntimeError, ValueError) as fault:
-            raise _lost(f"rank {self.rank} of {self.count}", fault) from None
+            raise fault if isinstance(fault, Lost) else _lost(f"rank {self.rank} of {self.count}", fault) from None
+
+    def _look_and_wait(self, work: Any) -> None:
+        """Wait for an operation of gloo, and after a request to end no longer than GRACE."""
+        end = float("inf")
+        while True:
+            try:
+                work.wait(_LOOK)
+                return
+            except RuntimeError:
+                if work.is_completed():
+                    raise
+            if time.monotonic() > end:
+                raise _lost(f"rank {self.rank} of {self.count}", None)
+            if self.is_ending():
+                end = min(end, time.monotonic() + GRACE)
 
 
 def join(count: int | None = None, rank: int | None = None, store: str | None = None) -> Processes:
@@ -123,7 +149,10 @@ def join(count: int | None = None, rank: int | None = None, store: str | None = 
     return joined
 
 
-def _lost(who: str, fault: Exception) -> Lost:
+def _lost(who: str, fault: Exception | None) -> Lost:
+    """Return the fault of an operation that failed, or of one that was given up."""
+    if fault is None:
+        return Lost(f"{who}: another process ended, or has not answered for {GRACE:.0f} seconds")
     reason = re.sub(r"^\[\S+\] ", "", str(fault)).partition("\n")[0].partition(". ")[0]
     minutes = TIMEOUT.seconds // 60
     return Lost(f"{who}: another process ended, or has not answered for {minutes} minutes ({reason})")

@@ -170,6 +170,24 @@ def test_a_killed_process_ends_the_training_and_the_last_snapshot_is_whole() -> 
     assert newest_pair("x") == state
 
 
+def test_who_is_asked_to_end_does_not_wait_for_a_process_that_stands_still() -> None:
+    """Gloo can miss the death of a process: one that is stopped is as silent."""
+    write(batch=2, iterations=10**7, after="false")
+    started = start()
+    try:
+        wait_for_training(started)
+        other = process_of_rank(1, started.pid)
+        os.kill(other, signal.SIGSTOP)
+        os.kill(process_of_rank(0, started.pid), signal.SIGTERM)
+        assert started.stderr is not None
+        told = next(line for line in started.stderr if line.startswith("rank 0 of 2"))
+        assert "another process ended, or has not answered for 15 seconds" in told
+        assert any(f"Sending process {other} closing signal" in line for line in started.stderr), "it ended by itself"
+    finally:
+        if started.poll() is None:
+            os.killpg(started.pid, signal.SIGKILL)
+
+
 def test_a_fault_of_the_files_is_told_once() -> None:
     write(batch=8, iterations=10)
     Path("net.prototxt").write_text(Path("net.prototxt").read_text().replace("Convolution", "Convolutoin", 1))
