@@ -18,7 +18,7 @@ from netspec.errors import SpecError
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-PAGES = (ROOT / "README.md", ROOT / "loopclosure" / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = tuple(page for pattern in ("README.md", "*/README.md", "docs/*.md") for page in sorted(ROOT.glob(pattern)))
 MARKED = re.compile(r"(<!-- (table|figure): (.+?) -->)(.*?)<!-- end -->", re.DOTALL)
 
 

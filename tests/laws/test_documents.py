@@ -20,7 +20,7 @@ from documents import DOCUMENTS, PROGRAMS, blocks, commands
 from each import each
 from netspec.cli import run_script
 from netspec.errors import SpecError
-from paths import ROOT
+from paths import GOLDEN, ROOT
 
 PARSERS = {
     "netspec": netspec.cli.parser,
@@ -157,6 +157,13 @@ def test_links_lead_to_files(document: str) -> None:
 def test_figures_are_those_of_their_files(page: str) -> None:
     text = (ROOT / page).read_text()
     assert benchmarks.pages.made(text) == text, "tools/bench pages writes them"
+
+
+def test_as_many_results_of_caffe_are_repeated_as_there_are() -> None:
+    rows = json.loads((benchmarks.pages.RESULTS / "faithful.json").read_text())["rows"]
+    folders = {"layers": "layers", "trainings": "train", "examples": "examples/runs"}
+    counts = {what: len(list((GOLDEN / folder).iterdir())) for what, folder in folders.items()}
+    assert {row["what"]: row["to the last bit"] for row in rows} == {what: f"{n} of {n}" for what, n in counts.items()}
 
 
 ROWS = [
