@@ -92,8 +92,8 @@ def answer(
     verdicts = np.where(loops, "accepted", np.where(matches.there, rejected, "no candidate"))
     results = _results(given, matches, verdicts.tolist(), np.full(len(scores), np.nan) if stamps is None else stamps)
     unknown = int(np.count_nonzero(matches.few & (matches.inliers <= 0)))
-    reasons = [*filter(None, [given.said]), _sequences_said(lines, precision, given.others)]
-    reasons.append(said + (f"; {unknown} cannot be" if unknown else ""))
+    reasons = [*filter(None, [given.said]), _sequences_said(lines, given.others)]
+    reasons.append(said + (f"; {unknown} frames cannot be verified" if unknown else ""))
     there = sum(bool(result.candidates) for result in results)
     reasons.append(_total_said(sum(map(bool, results)), there, given))
     return Answer(results, reasons)
@@ -119,19 +119,15 @@ def _results(given: Candidates, matches: Matches, verdicts: list[str], stamps: n
     return results
 
 
-def _sequences_said(lines: Lines | None, precision: float, others: str) -> str:
+def _sequences_said(lines: Lines | None, others: str) -> str:
     if lines is None:
-        return f"sequences: none is better than those {others}, so that images are compared one by one"
-    decoys = lines.decoys[np.isfinite(lines.decoys)]
-    return (
-        f"{lines.setting}: better than all but a few {others} (a score of {lines.threshold(precision):.4g} or more; "
-        f"{others} {np.median(decoys):.4g} in the middle, {decoys.max():.4g} at most)"
-    )
+        return f"sequences: none is more alike than what is seen {others}, so images are compared one by one"
+    return f"{lines.setting}: a match counts if it is more alike than what is seen {others}"
 
 
 def _total_said(loops: int, queries: int, given: Candidates) -> str:
     if loops:
-        return f"{loops} of {queries} queries with a candidate close a loop"
+        return f"{loops} of the {queries} frames that have a candidate close a loop"
     if not queries:
         return "no frame has a candidate: the camera did not come back, or the drive is too short to tell"
     known = given.known

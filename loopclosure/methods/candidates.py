@@ -44,7 +44,7 @@ class Candidates:
     @property
     def others(self) -> str:
         """What shows how different places score."""
-        return "backwards" if self.different is None else "far apart in odometry"
+        return "where the drive is read backwards" if self.different is None else "far apart in the odometry"
 
 
 def candidates(
@@ -66,11 +66,11 @@ def candidates(
         if np.count_nonzero(different.any(axis=1)) < ENOUGH * np.count_nonzero(allowed.any(axis=1)):
             different = None
     if visit is not None:
-        said = f"a visit to a place lasts {visit} frames, as was said"
+        said = f"one visit to a place lasts {visit} frames, as was said"
     elif not two:
         back, lasted = _returned(scores, allowed, queries)
         allowed &= back
-        said = f"a visit to a place lasts {np.median(lasted):.0f} frames in the middle, {lasted.max()} at most"
+        said = f"one visit to a place lasts {np.median(lasted):.0f} frames as a rule, {lasted.max()} at most"
     return Candidates(scores, allowed, two, queries, references, different, said)
 
 

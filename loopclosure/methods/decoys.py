@@ -53,7 +53,7 @@ class Setting:
         if s is None:
             return "single images"
         scaled = ", rows and columns standardized" if self.standardized else ""
-        return f"sequences of {s.length} frames at {s.slowest:.3g} to {s.fastest:.3g} references a query{scaled}"
+        return f"sequences of {s.length} frames, at {s.slowest:.3g} to {s.fastest:.3g} times the speed{scaled}"
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ def try_geometry(given: Candidates, matches: Matches, check: GeometricCheck, agr
     if isinstance(agree, Between) and pairs:
         agree = agree.without_fixed([(int(given.queries[q]), int(given.references[r])) for q, r in pairs])
         if agree.hidden:
-            hidden = f" ({100 * agree.hidden:.1f} % of the image is the same over the drive, and left out)"
+            hidden = f" ({100 * agree.hidden:.1f} % of the image never changes, and is left out)"
 
     def of_part(query: int, reference: int) -> Agreement:
         return agree(int(given.queries[query]), int(given.references[reference]))
@@ -65,19 +65,20 @@ def try_geometry(given: Candidates, matches: Matches, check: GeometricCheck, agr
     same = sum(check.enough(of_part(int(query), int(match[query]))) > 0 for query in likely)
     against = np.array([check.evidence(of_part(query, reference)) for query, reference in pairs])
     unlike = np.count_nonzero(against >= 1)
-    tried = f"verification: {same} of {len(likely)} matches, {unlike} of {len(against)} unlike pairs{hidden}"
+    found = f"{same} of {len(likely)} matches and {unlike} of {len(against)} unlike pairs"
+    tried = f"verification: {found} show the same points{hidden}"
     if accepted.any() and LEAST_FOUND <= same < LEAST_SHARE * len(likely) and unlike <= RARELY * len(against):
-        said = f"{tried}: few are verified, and a stretch without any is none"
+        said = f"{tried}, so a stretch of matches counts if one of it does"
         return Geometry(check, of_part, against, said, seldom=True)
     if same < (LEAST_SHARE * len(likely) if accepted.any() else LEAST_FOUND):
-        said = f"{tried}: these images cannot be verified, so that nothing is rejected for it"
+        said = f"{tried}: these images cannot be verified, so it rejects nothing"
         return Geometry(check, of_part, None, said)
     # Unlike pairs of a small place, a desk, do show the same things, and so does a dashboard in all images.
     if unlike > LEAST_SHARE * len(against):
-        what = "something is the same in all images, so that only what has far more in common is verified"
+        what = ": something is the same in all images, so a match needs far more points"
     else:
-        what = "what is verified is a loop, and what has no verified pair near it is none"
-    return Geometry(check, of_part, against, f"{tried}: {what}")
+        what = ", so a match counts if it does, or lies between two that do"
+    return Geometry(check, of_part, against, tried + what)
 
 
 def _sample(numbers: np.ndarray) -> np.ndarray:
