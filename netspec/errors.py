@@ -120,17 +120,26 @@ def several(given: Any) -> tuple[Any, ...]:
     return tuple(given) if isinstance(given, Iterable) and not isinstance(given, (str, bytes)) else (given,)
 
 
-def did_you_mean(word: str, known: list[str] | tuple[str, ...]) -> str:
-    """Return ``; did you mean "x"?`` for the closest known word, or an empty string."""
+_ENDINGS = ("_param", "parameter", "loss", "data")  # what many names have in common says nothing
+
+
+def did_you_mean(word: str, known: Iterable[str], near: bool = False) -> str:
+    """Return ``; did you mean "x"?`` for the closest known word, or an empty string.
+
+    ``near``: only for a slip of the pen. A layer type that has another first letter, or other digits, looks alike but
+    means something else; so does a name with an ending that many have.
+    """
     import difflib
 
-    for ending in ("_param", "Parameter"):  # what all of them have in common says nothing
-        if word.endswith(ending):
-            stems = {name.removesuffix(ending): name for name in known if name.endswith(ending)}
-            close = difflib.get_close_matches(word.removesuffix(ending), list(stems), n=1, cutoff=0.6)
-            return f'; did you mean "{stems[close[0]]}"?' if close else ""
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
-    if not close:
-        lowered = {k.lower(): k for k in known}
-        close = [lowered[word.lower()]] if word.lower() in lowered else []
-    return f'; did you mean "{close[0]}"?' if close else ""
+    word = word.lower()
+    ending = next((each for each in _ENDINGS if word.endswith(each) and word != each), "")
+    stems = {name.lower().removesuffix(ending): name for name in known if name.lower().endswith(ending)}
+    stem = word.removesuffix(ending)
+    for close in difflib.get_close_matches(stem, stems, n=3, cutoff=0.75 if near else 0.7 if ending else 0.6):
+        if not (near or ending) or (close[:1], _digits(close)) == (stem[:1], _digits(stem)):
+            return f'; did you mean "{stems[close]}"?'
+    return ""
+
+
+def _digits(word: str) -> str:
+    return "".join(filter(str.isdigit, word))

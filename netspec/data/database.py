@@ -25,7 +25,7 @@ import lmdb
 from netspec import log
 from netspec.data.lmdb_file import LmdbFile, Record
 from netspec.errors import SpecError, Where
-from netspec.files.kinds import pointer_fault_at
+from netspec.files.kinds import head_of, pointer_fault
 from netspec.files.limits import amount
 from netspec.files.whole_file import whole_folder
 
@@ -119,7 +119,7 @@ class _LmdbReader(Reader):
         path = os.path.join(source, "data.mdb")
         if not os.path.getsize(path):
             raise ValueError("has an empty data.mdb, so it was never written")
-        if fault := pointer_fault_at(path):
+        if fault := pointer_fault(head_of(path)):
             raise ValueError(f"has a data.mdb that {fault}")
         self._source = source
         self._file = LmdbFile(path)

@@ -22,7 +22,7 @@ import numpy as np
 from h5py import h5o, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from netspec.errors import SpecError, Where
-from netspec.files.kinds import pointer_fault_at
+from netspec.files.kinds import head_of, pointer_fault
 from netspec.files.limits import ALWAYS, amount, bomb
 from netspec.files.whole_file import whole_file
 
@@ -47,7 +47,7 @@ def open_hdf5(path: str | Path, where: Where | None = None) -> Iterator[Hdf5Grou
     except SpecError as fault:
         raise fault if fault.where else SpecError(named + fault.message, place) from None
     except LIBRARY_FAULTS as fault:
-        reason = pointer_fault_at(path) or f"cannot be read: {_one_line(fault)}"
+        reason = pointer_fault(head_of(path)) or f"cannot be read: {_one_line(fault)}"
         raise SpecError(named + reason, place) from None
 
 

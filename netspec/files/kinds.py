@@ -21,15 +21,16 @@ def pointer_fault(data: bytes) -> str:
     return f"is a Git LFS pointer to a file of {int(match[1]):,} bytes, not that file; {remedy}"
 
 
-def pointer_fault_at(path: str | os.PathLike[str]) -> str:
-    """Return :func:`pointer_fault` of a file, and "" where it cannot be read."""
+def head_of(path: str | os.PathLike[str]) -> bytes:
+    """Return the first bytes of a file; b"" of what is none, or cannot be read."""
     try:
-        with open(path, "rb") as file:
-            return pointer_fault(file.read(_LONGEST))
+        with open(path if os.path.isfile(path) else os.devnull, "rb") as file:
+            return file.read(_LONGEST)
     except (OSError, ValueError):  # a path with a NUL
-        return ""
+        return b""
 
 
+HDF5 = b"\x89HDF\r\n\x1a\n"
 _COPY = "copy its arrays into net.params[LAYER], then netspec.save_weights"
 _KINDS = {
     b"\x1f\x8b": "a file packed by gzip",
@@ -37,7 +38,7 @@ _KINDS = {
     b"\x89PNG": "a PNG image",
     b"PK\x03\x04": f"a ZIP archive, as .npz and PyTorch's .pth are; {_COPY}",
     b"\x80\x02": f"a pickle, as old .pth files are; {_COPY}",
-    b"\x89HDF\r\n\x1a\n": "an HDF5 file; its name should end in .h5",
+    HDF5: "an HDF5 file; its name should end in .h5",
     b"<!doctype html": "a web page: the download failed; look at it in a browser",
     b"<html": "a web page: the download failed; look at it in a browser",
 }

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from netspec import log
 from netspec.errors import SpecError, several
 from netspec.graph import check_blobs
-from netspec.proto.schema import LayerParameter, NetParameter, NetState, NetStateRule, PhaseValue, SolverParameter
+from netspec.proto.schema import (
+    PHASE_NAMES,
+    LayerParameter,
+    NetParameter,
+    NetState,
+    NetStateRule,
+    PhaseValue,
+    SolverParameter,
+)
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.rewrite import copy_without
 
@@ -40,7 +49,7 @@ def with_train_state(solver: SolverParameter, level: int | None, stages: Iterabl
 def filter_net(net: NetParameter, source: SourceMap) -> tuple[NetParameter, SourceMap]:
     """Return the net with only the layers that its ``state`` includes."""
     filtered = copy_without(net, {"layer"})
-    kept = []
+    kept, left_out = [], dict[str, tuple[str, str]]()
     for index, layer in enumerate(net.layer):
         if layer.include and layer.exclude:
             where = source.at(index, "exclude", layer=layer.name, type=layer.type)
@@ -50,7 +59,19 @@ def filter_net(net: NetParameter, source: SourceMap) -> tuple[NetParameter, Sour
         if _included(net.state, layer):
             filtered.layer.add().CopyFrom(layer)
             kept.append(source.layers[index])
-    return filtered, source.with_layers(kept)
+        else:
+            line = source.layers[index].where.line
+            maker = f'layer "{layer.name}"{f" of line {line}" if line else ""}'
+            left_out.update(dict.fromkeys(layer.top, (maker, _remedy(net.state, layer))))
+    return filtered, replace(source.with_layers(kept), left_out=left_out)
+
+
+def _remedy(state: NetState, layer: LayerParameter) -> str:
+    """Return what to do where a layer is missed that the net's state leaves out."""
+    here, there = PHASE_NAMES[state.phase], PHASE_NAMES[1 - state.phase]
+    if any(rule.HasField("phase") and rule.phase != state.phase for rule in layer.include):
+        return f"in phase {there}; say --phase {there}, or give phase {here} a layer that does"
+    return "in another stage or level; see --stage and --level"
 
 
 def _included(state: NetState, layer: LayerParameter) -> bool:

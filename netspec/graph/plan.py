@@ -14,6 +14,7 @@ from netspec.errors import SpecError
 from netspec.proto.schema import LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
 
+AUTOMATIC = "(automatic)"  # the name of the top of a loss that has none
 PERMISSIVE = 1  # caffe.proto: ParamSpec.DimCheckMode
 
 
@@ -171,7 +172,7 @@ def plan_backward(
     for i in reversed(range(len(plan.nodes))):
         node = plan.nodes[i]
         names = [plan.blobs[v] for v in node.tops]
-        names += ["(automatic)"] * (len(has_loss[i]) - len(names))
+        names += [AUTOMATIC] * (len(has_loss[i]) - len(names))
         contributes = any(has_loss[i]) or any(name in under_loss for name in names)
         if layer_needs[i] and all(name in skipped for name in names):
             layer_needs[i] = False

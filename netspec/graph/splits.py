@@ -89,16 +89,17 @@ def _count_uses(
     producer: dict[tuple[int, int], Top] = {}
     uses: Counter[Top] = Counter()
     weights: dict[Top, float] = {}
-    unknown = 0
+    told: set[str] = set()
     for i, layer in enumerate(net.layer):
         for j, blob in enumerate(layer.bottom):
             if blob not in latest:
-                where = source.at(i, "bottom", j, layer=layer.name, type=layer.type)
-                unknown += 1
-                hint = did_you_mean(blob, list(latest)) if unknown <= MOST_HINTS else ""
-                source.report(
-                    SpecError(f'unknown bottom blob "{blob}"{hint or ";"} available: {_names(latest)}', where)
-                )
+                maker, remedy = source.left_out.get(blob, ("", ""))
+                if (remedy or blob) not in told:
+                    told.add(remedy or blob)
+                    hint = "" if maker or len(told) > MOST_HINTS else did_you_mean(blob, list(latest))
+                    known = f": {maker} makes it {remedy}" if maker else f"{hint or ';'} available: {_names(latest)}"
+                    where = source.at(i, "bottom", j, layer=layer.name, type=layer.type)
+                    source.report(SpecError(f'unknown bottom blob "{blob}"{known}', where))
                 continue
             producer[i, j] = latest[blob]
             uses[latest[blob]] += 1

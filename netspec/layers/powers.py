@@ -23,6 +23,7 @@ class AbsVal(Activation):
     """
 
     onnx_op, torch_call = "Abs", "torch.abs({x})"
+    never_in_place = True
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.abs()

@@ -19,7 +19,7 @@ from netspec.files.limits import amount, is_out_of_memory
 from netspec.files.limits import memory as memory_of_machine
 from netspec.graph.alignment import align_crops
 from netspec.graph.options import BuildOptions
-from netspec.graph.plan import Backward, Node, Param, Plan, plan_backward
+from netspec.graph.plan import AUTOMATIC, Backward, Node, Param, Plan, plan_backward
 from netspec.layers import class_of, unknown_type
 from netspec.layers.contract.base import Layer, Shape, shape_string
 from netspec.layers.contract.context import Context, Random, device_of
@@ -227,8 +227,8 @@ class _Tie:
         if self.take_from:
             self.take_from(size)
 
-    def created(self) -> None:
-        """Log what the layer reads and writes."""
+    def created(self, tops: int) -> None:
+        """Log what the layer reads, and its ``tops``: a loss may have one more than the prototxt names."""
         node, blobs = self._plan.nodes[self._i], self._plan.blobs
         log.info("net.cpp:86", f"Creating Layer {node.name}")
         for v in node.bottoms:
@@ -238,6 +238,8 @@ class _Tie:
                 log.info("net.cpp:369", f"{node.name} -> {blobs[v]} (in-place)")
             else:
                 log.info("net.cpp:382", f"{node.name} -> {blobs[v]}")
+        for _ in range(len(node.tops), tops):
+            log.info("net.cpp:382", f"{node.name} -> {AUTOMATIC}")
 
 
 def _spec(node: Node, layer: Layer, j: int) -> Param:

@@ -20,16 +20,16 @@ from netspec import log
 from netspec.data import blobs
 from netspec.errors import Report, SpecError, Where, several
 from netspec.files.hdf5 import layer_groups, new_hdf5, open_hdf5
+from netspec.files.kinds import head_of, is_safetensors
 from netspec.files.whole_file import write_whole
 from netspec.layers.contract.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.net.stamp import check_weights
 from netspec.process.heap import give_back_freed_memory
-from netspec.proto.binary import net_beside_numbers
+from netspec.proto.binary import MOST_BYTES, net_beside_numbers
 from netspec.proto.schema import NetParameter
 
 MOST_NAMES = 20  # layers that a warning names
-MOST_BYTES = 2**31 - 1  # of a protobuf message
 Copies = list[tuple[Layer, int, np.ndarray | blobs.Elsewhere]]  # the layer, the blob's number in it, the values
 
 
@@ -56,7 +56,7 @@ def load_weights(
             check_weights(each)
             if h5py.is_hdf5(each):
                 loaded |= _copy(partial(_from_hdf5, net, each), faults.append)
-            elif each.suffix == ".safetensors" and each.is_file():
+            elif is_safetensors(head_of(each)):
                 loaded |= _copy(partial(_from_safetensors, net, each), faults.append)
             else:
                 with net_beside_numbers(each) as (message, file):
@@ -258,7 +258,7 @@ def _from_safetensors(net: Net, path: Path, report: Report) -> Copies:
             if layer and number.isdigit():
                 layers.setdefault(layer, {})[number] = tensor.float().numpy()
     except (SafetensorError, OSError) as fault:
-        raise SpecError(f"cannot be read: {fault}", Where(str(path))) from None
+        raise SpecError(f"is a .safetensors file that cannot be read: {fault}", Where(str(path))) from None
     if not layers:
         raise SpecError("has no tensor named LAYER.NUMBER, as netspec export --to safetensors writes", Where(str(path)))
     return _from_arrays(net, layers.items(), path, report)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
@@ -16,9 +16,10 @@ from netspec.files.limits import read_bytes
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.current import upgrade_net
-from netspec.proto.wire import without_numbers
+from netspec.proto.wire import fields, without_numbers
 
 M = TypeVar("M", bound=Message)
+MOST_BYTES = 2**31 - 1  # of a message
 
 
 def read_binary(path: str | Path, message_class: type[M]) -> M:
@@ -49,7 +50,7 @@ def parse_binary(data: bytes, file: str, message_class: type[M]) -> M:
     except DecodeError:
         known = False
     if not known:
-        raise SpecError(f"expected a binary {name}, found {_guess(data)}", where)
+        raise SpecError(f"expected a binary {name}, found {_guess(data, message_class)}", where)
     _escape_names(message)
     return message
 
@@ -135,9 +136,6 @@ def check_readable(paths: Iterable[str]) -> None:
             raise SpecError(f"cannot be read: {getattr(fault, 'strerror', None) or fault}", Where(path)) from None
 
 
-_HDF5 = b"\x89HDF\r\n\x1a\n"
-
-
 def is_net_binary(path: str | Path) -> bool:
     """Say whether a file is a .caffemodel, by what it holds: the layers of a net in protobuf's binary form."""
     try:
@@ -150,16 +148,17 @@ def is_net_binary(path: str | Path) -> bool:
     return bool(net.layer or net.layers)
 
 
-def is_hdf5(path: str | Path) -> bool:
-    """Say whether a file begins as HDF5's do, without loading the library."""
-    with open(path, "rb") as file:
-        return file.read(len(_HDF5)) == _HDF5
-
-
-def _guess(data: bytes) -> str:
-    """Return a guess at what a file is."""
+def _guess(data: bytes, message_class: type[Message]) -> str:
+    """Return a guess at what a file is that is no such message."""
     if kind := kind_of(data):
         return kind
     if all(32 <= byte < 127 or byte in b"\t\r\n" for byte in data[:1000]):
         return "text"
+    known = message_class.DESCRIPTOR.fields_by_number
+    with suppress(ValueError):
+        for field in fields(data, 0, len(data) + MOST_BYTES):
+            if field.number not in known:
+                break
+            if field.end > len(data):
+                return f"the beginning of one, {len(data):,} bytes: it was cut; copy or download it again"
     return "another kind of data, or a truncated file"

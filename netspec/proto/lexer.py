@@ -29,6 +29,7 @@ _TOKEN = re.compile(
     re.VERBOSE | re.DOTALL,
 )
 _ESCAPE = re.compile(r"\\(?:([0-7]{1,3})|[xX]([0-9a-fA-F]{1,2})|u([0-9a-fA-F]{4})|U([0-9a-fA-F]{8})|(.))", re.DOTALL)
+_PLACEHOLDER = re.compile(r"\$?\{+ *[A-Za-z_][\w.]* *\}+|\$[A-Za-z_]\w*|@[A-Za-z_]\w*@|%(?:\([A-Za-z_]\w*\))?[dfrs]\b")
 _SIMPLE_ESCAPES = {"a": 7, "b": 8, "f": 12, "n": 10, "r": 13, "t": 9, "v": 11, "\\": 92, "?": 63, "'": 39, '"': 34}
 
 
@@ -75,10 +76,12 @@ class Lexer:
         return Where(self.file, line, start - self._lines[line - 1] + 1)
 
     def suspicion(self, start: int) -> str:
-        """Return a hint for an error at a character right after a string over several lines, else an empty string.
+        """Return a hint for an error at a placeholder, or right after a string over several lines; or an empty string.
 
         If a closing quote is missing, the string continues to the next opening quote, and the error appears there.
         """
+        if found := _PLACEHOLDER.match(self.text, start):
+            return f"; is this file a template? put a value in the place of {found[0]}"
         for token in reversed(self._long_strings):
             end = token.start + len(token.text)
             if token.start < start and self.where(start).line <= self.where(end).line + 1:
@@ -133,4 +136,5 @@ class Lexer:
             return self._not_utf8(position)
         if not character.isprintable():
             return SpecError(f"unexpected character 0x{ord(character):02x}; is this a text file?", self.where(position))
-        return SpecError(f'unexpected character "{character}"', self.where(position))
+        fault = f'unexpected character "{character}"{self.suspicion(position)}'
+        return SpecError(fault, self.where(position))

@@ -42,6 +42,8 @@ _OTHER_FILE: dict[str, tuple[Any, str]] = {
     "caffe.SolverParameter": (NetParameter, "net"),
 }
 
+_LABEL_MAP = "item"  # the one field of a LabelMap of SSD
+
 _CLOSING = {"{": "}", "<": ">", "[": "]"}
 
 Children = dict[str, list[Place]]
@@ -365,7 +367,10 @@ class _Reader:
         error = self._error(fault + (elsewhere or hint), token)
         if elsewhere or self.lexer.suspicion(token.start):
             return error
-        return ForkFault(error.message, error.where, "field", name, dialects, descriptor.name)
+        own = f"{'' if hint else ';'} {dialect.OWN_FIELD}"
+        if hint[-1:] not in ("", "?") or all(outer.DESCRIPTOR.full_name not in _LAYERS for outer, _ in self._open):
+            own = ""
+        return ForkFault(error.message + own, error.where, "field", name, dialects, descriptor.name)
 
     def _elsewhere(self, message: Message, name: str) -> str:
         """Return the sentence that a field belongs into another message or file; or an empty string."""
@@ -377,19 +382,20 @@ class _Reader:
         other, kind = _OTHER_FILE.get(message.DESCRIPTOR.full_name, (message, ""))
         if kind and name in fields_of(other.DESCRIPTOR):
             return f", but {other.DESCRIPTOR.name} has; is this file a {kind}?"
+        if kind and name == _LABEL_MAP:
+            return ": this file is a label map, a list of classes; name the net's own file"
         return ""
 
     def _meant(self, message: Message, name: str) -> str:
         """Return the field that may be meant, or where this one belongs; or an empty string."""
         known = fields_of(message.DESCRIPTOR)
-        if close := did_you_mean(name, list(known)):
+        if close := did_you_mean(name, known):
             return close
         messages = {n: f.descriptor.message_type for n, f in known.items() if f.type == Declared.TYPE_MESSAGE}
         inside = [n for n, message_type in messages.items() if name in fields_of(message_type)]
         if inside:
             return f"; it belongs in {' or '.join(inside)}"
-        is_of_a_layer = message.DESCRIPTOR.full_name == "caffe.LayerParameter" and name.endswith("_param")
-        return f"; if it is of a layer of your own, {dialect.OWN_LAYER}" if is_of_a_layer else ""
+        return ""
 
 
 def _frozen(children: Children) -> dict[str, tuple[Place, ...]]:

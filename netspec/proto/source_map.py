@@ -40,6 +40,7 @@ class SourceMap:
 
     ``report`` gets each fault that is found in the net, from its first pass until it is built and has its weights. It
     raises the first one; with another, work goes on where it can. ``dialects`` are those that a comment names.
+    ``left_out`` has the blobs that a layer makes which the net's state leaves out: that layer, and what to do.
     """
 
     file: str
@@ -47,6 +48,7 @@ class SourceMap:
     layers: tuple[Place, ...] = ()
     report: Report = field(default=raise_fault, compare=False)
     dialects: tuple[str, ...] = ()
+    left_out: Mapping[str, tuple[str, str]] = field(default_factory=lambda: {}, compare=False)
 
     @staticmethod
     def of(net: Place) -> SourceMap:

@@ -31,6 +31,7 @@ from netspec.compat.pycaffe.tapes import (
     undisturbed,
 )
 from netspec.exact.blas import one_thread
+from netspec.graph.plan import AUTOMATIC
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
 from netspec.layers.contract.kernels import Preparation, learns_alone, own_kernels, recorded
@@ -42,7 +43,6 @@ from netspec.layers.utility.python import Python
 from netspec.net.net import Net
 from netspec.run.walk import Step, walk
 
-AUTOMATIC = "(automatic)"  # the name of the top of a loss that has none
 Hook = Callable[[int], object]
 
 

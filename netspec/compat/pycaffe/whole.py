@@ -10,8 +10,9 @@ from collections.abc import Iterator
 
 import torch
 
-from netspec.compat.pycaffe.passes import AUTOMATIC, Passes
+from netspec.compat.pycaffe.passes import Passes
 from netspec.compat.pycaffe.tapes import overwrites_shared
+from netspec.graph.plan import AUTOMATIC
 from netspec.layers.contract.gradients import gradient_reads
 from netspec.layers.utility.live_blobs import Blob
 from netspec.run.training import LARGEST

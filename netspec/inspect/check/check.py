@@ -66,7 +66,7 @@ def check_file(
     :func:`netspec.inspect.check.plan.plan_text` can tell how it runs.
     """
     given = [weights] if weights else []
-    if is_net_binary(path):
+    if Path(path).suffix == ".caffemodel" or is_net_binary(path):  # a damaged one too: its reader tells
         return [_check_weights(path, options)]
     unknown: list[SpecError] = []
     try:

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from netspec.errors import SpecError, Where
+from netspec.files.kinds import HDF5, head_of
 from netspec.inspect.check.compare_nets import compare_in_state, compare_nets
 from netspec.inspect.check.difference import Difference, Differences, differences
-from netspec.proto.binary import is_hdf5, is_net_binary
+from netspec.proto.binary import is_net_binary
 from netspec.proto.source_map import Place
 from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.nets import SolverNet, solver_nets
@@ -36,7 +37,7 @@ def compare_files(first: str | Path, second: str | Path, tolerance: float = 0.0)
 def _read(path: str | Path) -> tuple[Any, ...]:
     """Return the kind of a file; of a net and a solver also the message and its places."""
     named = Path(path).suffix in (".caffemodel", ".h5")  # a damaged one too: its own reader says what is wrong
-    if Path(path).is_file() and (named or is_net_binary(path) or is_hdf5(path)):
+    if Path(path).is_file() and (named or is_net_binary(path) or head_of(path).startswith(HDF5)):
         return (WEIGHTS,)
     try:
         return (NET, *parse_net(path))

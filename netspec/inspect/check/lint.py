@@ -12,8 +12,6 @@ from netspec.inspect.check.findings import Finding
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN, PhaseValue
 
-MISSING_DATA = "missing-data"
-
 
 @dataclass
 class Linted:
@@ -54,4 +52,6 @@ def lint_file(path: str | Path, options: BuildOptions = ON_META) -> Linted:
 
 
 def _lacks_data(part: Checked) -> bool:
-    return any(found.rule == MISSING_DATA for found in part.advice)
+    """Say whether each layer that is left in a phase reads what another makes."""
+    nodes = part.net.plan.nodes if part.net else ()
+    return bool(nodes) and all(node.bottoms for node in nodes)

@@ -39,16 +39,6 @@ def _transforms(net: NetParameter, source: SourceMap) -> Said:
                 )
 
 
-@rule("missing-data", PLAN)
-def _missing_data(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
-    """A phase whose data layers are all left out computes nothing."""
-    readers = [i for i, layer in enumerate(net.layer) if not layer.bottom and layer.type != "Input"]
-    if readers and plan.nodes and all(node.bottoms for node in plan.nodes):
-        layer = net.layer[readers[0]]
-        place = source.at(readers[0], layer=layer.name, type=layer.type)
-        yield place, "no data layer is left in this phase; add one with include { phase: ... }"
-
-
 @rule("unused-blob", PLAN)
 def _unused(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
     """In a net with a loss, a blob that no layer reads costs time, and its reader may be missing.
@@ -194,16 +184,11 @@ def _losses(net: Net) -> Said:
 
 @rule("caffe-stops", NET)
 def _caffe_stops(net: Net) -> Said:
-    """Caffe ends the program at layers that compute no gradient where one is asked for, or may not work in place.
+    """Caffe ends the program at layers that compute no gradient where one is asked for.
 
     Here such a net runs: no gradient passes.
     """
     for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
-        if node.type in ("AbsVal", "Flatten", "Reshape") and any(node.in_place):
-            yield (
-                _place(net.plan, i, "top"),
-                f"Caffe stops here: {node.type} may not work in place; give its top another name",
-            )
         asked = net.backward_plan.bottoms[i] if net.phase == TRAIN and net.backward_plan.layers[i] else ()
         for j, wanted in enumerate(asked):
             if wanted and (node.type in WITHOUT_GRADIENT or j in layer.label_bottoms):

@@ -52,6 +52,7 @@ class Layer(torch.nn.Module):
     bottoms: ClassVar[tuple[int, int | None]] = (1, 1)  # fewest and most (None: any number)
     tops: ClassVar[tuple[int, int | None]] = (1, 1)
     same_tops: ClassVar[bool] = False  # as many tops as bottoms
+    never_in_place: ClassVar[bool] = False  # Caffe refuses its bottom as its top
     is_loss: ClassVar[bool] = False  # loss_weight 1 on the first top unless given; a missing top is made
     counts: bool = True  # of a loss: whether it has that loss_weight of 1; in some forks only a given one counts
     forks: ClassVar[Mapping[str, str]] = {}  # where several forks have the type: dialects, and what their layers do
@@ -77,7 +78,7 @@ class Layer(torch.nn.Module):
         self.blobs = _NO_BLOBS
         self.blob_shapes: list[Shape] = []
         self.construct()
-        self.context.created()
+        self.context.created(self.num_tops)
         self.refuse(self._wrong_counts())
         self.setup()
         self.top_shapes: list[Shape] = self._reshaped(self.bottom_shapes)
@@ -250,3 +251,5 @@ class Layer(torch.nn.Module):
                 f"found {self.num_tops} top blob(s) for {len(self.bottom_shapes)} bottom blob(s), expected as many",
                 "top",
             )
+        if self.never_in_place and self.param.top[:1] == self.param.bottom[:1]:
+            yield self.error("may not work in place, as in Caffe; give its top another name", "top")

@@ -91,7 +91,7 @@ class Context:
     random: Random = field(default_factory=lambda: Random(0))
     at: Callable[..., Where] = nowhere
     report: Report = raise_fault
-    created: Callable[[], None] = lambda: None  # called when ``construct`` has run: for the order of the log
+    created: Callable[[int], None] = lambda tops: None  # called when ``construct`` has run: for the order of the log
     take: Callable[[int], None] = lambda size: None  # called before memory is taken, in bytes: it may refuse
 
     @property

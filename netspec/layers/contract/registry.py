@@ -13,7 +13,7 @@ from netspec.errors import SpecError, Where, did_you_mean
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.base import Layer
 from netspec.proto.dialect.files import DialectFile, announce_known, find_file, known_files, switch_on, waiting
-from netspec.proto.dialect.registry import OWN_LAYER, advice_for, deactivate, dialects_with_type
+from netspec.proto.dialect.registry import OWN_LAYER, advice_for, deactivate, dialects_with_type, known
 from netspec.proto.dialect.used import dialects_in
 from netspec.proto.schema import LayerParameter, NetParameter
 
@@ -150,5 +150,7 @@ def unknown_type(type_name: str) -> str:
     """Return the sentence that says that a type is unknown, and what may be meant or which dialect has it."""
     announce_known()
     advice = advice_for(type_name, dialects_with_type(type_name))
-    hint = f"; {advice}" if advice else did_you_mean(type_name, layer_types())
-    return f'unknown layer type "{type_name}"{hint or f"; `netspec layers` lists the known ones, {OWN_LAYER}"}'
+    types = {*layer_types(), *(each for dialect in known() for each in dialect.layer_types)}
+    close = did_you_mean(type_name, sorted(types), near=True) or ";"
+    hint = f"; {advice}" if advice else f"{close} `netspec layers` lists the known ones, {OWN_LAYER}"
+    return f'unknown layer type "{type_name}"{hint}'

@@ -20,6 +20,7 @@ class _OtherShape(Layer):
     """A layer whose top has its bottom's numbers in another shape."""
 
     shares = frozenset({"data", "diff"})
+    never_in_place = True
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.reshape(self.top_shapes[0])

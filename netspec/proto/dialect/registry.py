@@ -97,6 +97,7 @@ def is_enum_of_caffe(message: str, field: str) -> bool:
 
 
 OWN_LAYER = "docs/layer.md shows how to add one with --plugin FILE.py"
+OWN_FIELD = "docs/layer.md shows how to add a fork's with --plugin FILE.py"
 _known: dict[str, Dialect] = {}
 _active: dict[str, Dialect] = {}
 

@@ -76,7 +76,7 @@ def test_the_phase_of_a_layer_wins_over_the_nets(build) -> None:
 @pytest.mark.parametrize("ratio", [-0.1, 1, 1.5])
 def test_an_impossible_dropout_ratio_is_refused(build, ratio: float) -> None:
     with pytest.raises(SpecError, match=r"^dropout_param\.dropout_ratio: dropout_ratio must be at least 0 and less"):
-        build(f'type: "Dropout" dropout_param {{ dropout_ratio: {ratio} }}', (2, 3))
+        build(f'type: "Dropout" dropout_param {{ dropout_ratio: {ratio} }}', (2, 3), phase=TRAIN)
 
 
 def test_embed_looks_rows_up_and_adds_up_their_gradients(build) -> None:

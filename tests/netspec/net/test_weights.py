@@ -310,7 +310,9 @@ def test_what_is_cut_or_has_too_few_numbers_is_refused(tmp_path: Path) -> None:
     before = blobs_of(net)["ip"][0]
     for size in (len(whole) - 1, len(whole) // 2, 30):
         (tmp_path / "cut.caffemodel").write_bytes(whole[:size])
-        with pytest.raises(SpecError, match=r"cut\.caffemodel: expected a binary NetParameter, found another kind"):
+        with pytest.raises(
+            SpecError, match=r"cut\.caffemodel: expected a binary NetParameter, found the beginning of one"
+        ):
             load_weights(net, tmp_path / "cut.caffemodel")
     short = NetParameter.FromString(whole)
     del short.layer[0].blobs[0].data[-1]

@@ -93,7 +93,7 @@ def test_fields_of_an_active_dialect_are_read_and_written() -> None:
 
 @pytest.mark.usefixtures("fork")
 def test_faults_in_a_dialects_fields_have_places() -> None:
-    with pytest.raises(SpecError, match=r'^f:1:22: WarpParameter has no field "scal"; did you mean "scale"\?$'):
+    with pytest.raises(SpecError, match=r'^f:1:22: WarpParameter has no field "scal"; did you mean "scale"\? docs/'):
         parse_net_text("layer { warp_param { scal: 3 } }", "f")
     with pytest.raises(SpecError, match=r'^f:1:22: Corner lacks the required field "x"$'):
         parse_net_text("layer { warp_param { corner {} } }", "f")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from netspec import log
+from netspec import load_net, log
 from netspec.solver.solver import load_solver
 from netspec.solver.testing import Tally, score_lines
 
@@ -104,3 +104,14 @@ def test_a_tally_is_the_mean_of_each_element_over_the_batches():
 def test_scores_are_printed_with_their_part_of_the_loss():
     lines = score_lines({"acc": [0.5, 1 / 3], "loss": [2.0]}, {"acc": 0.0, "loss": 0.3})
     assert list(lines) == ["acc = 0.5", "acc = 0.333333", "loss = 2 (* 0.3 = 0.6 loss)"]
+
+
+def test_a_loss_without_a_top_gets_caffes(tmp_path: Path, lines: Callable[[], list[str]]):
+    path = tmp_path / "net.prototxt"
+    path.write_text(
+        'input: "a" input_shape { dim: 2 } input: "b" input_shape { dim: 2 }\n'
+        'layer { name: "loss" type: "EuclideanLoss" bottom: "a" bottom: "b" }'
+    )
+    net = load_net(path)
+    assert "net.cpp:382] loss -> (automatic)" in " ".join(lines())
+    assert net.outputs == []

@@ -45,6 +45,35 @@ CASES = read_cases("netspec/inspect/check/cases/faults.txt")
 FOUND_IN_DATA = read_cases("netspec/inspect/check/cases/faults_in_data.txt")
 
 
+NAMED = read_cases("netspec/inspect/check/cases/named.txt")  # of a net in phase TEST, each line whole
+
+
+@pytest.mark.parametrize("case", NAMED.values(), ids=NAMED)
+def test_what_is_wrong_is_named_once(run: Run, case: dict[str, str]) -> None:
+    faults = write_case(case)
+    assert without_warnings(run("check", "net.prototxt").err) == faults
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        (b" <!DOCTYPE html><html>", "found a web page: the download failed; look at it in a browser"),
+        (b"", "the file is empty, expected a binary NetParameter"),
+        (
+            b"\x0a\x03net\xa2\x06\xff\x7f cut",
+            "found the beginning of one, 13 bytes: it was cut; copy or download it again",
+        ),
+        (b"\x0a\x03net\xa8\x1f\xff\x7f cut", "found another kind of data, or a truncated file"),
+        (b'layer { name: "a" }', "expected a binary NetParameter, found text"),
+    ],
+)
+def test_weights_that_are_none_are_named_as_what_they_are(run: Run, content: bytes, kind: str) -> None:
+    Path("net.caffemodel").write_bytes(content)
+    (line,) = run("check", "net.caffemodel").err.splitlines()
+    assert line.startswith("net.caffemodel: ")
+    assert line.endswith(kind)
+
+
 @pytest.fixture
 def files(run: Run) -> None:
     """Small data, sound and unsound, in the working directory."""

@@ -15,6 +15,7 @@ NORM = """layer { name: "n" type: "Normalize" bottom: "a" top: "n"
 """
 SHUFFLE = 'layer { name: "s" type: "ShuffleChannel" bottom: "a" top: "s" shuffle_channel_param { group: 2 } }\n'
 STRANGE = 'layer { name: "s" type: "Strange" bottom: "a" top: "s" strange_param { group: 2 } }\n'
+OWN = " docs/layer.md shows how to add a fork's with --plugin FILE.py"
 POOL = (
     'layer { name: "k" type: "Pooling" bottom: "a" top: "k" pooling_param { kernal: -3, pool: MAX kernel_size: 2 } }\n'
 )
@@ -31,16 +32,19 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_faults_in_the_fields_of_forks_are_found():
     Path("net.prototxt").write_text(INPUT + PERMUTE % (1, 1) + NORM + SHUFFLE)
-    assert lines("net.prototxt") == ['net.prototxt:3:51: layer "p1" (Permute): PermuteParameter has no field "deeper"']
+    assert lines("net.prototxt") == [
+        'net.prototxt:3:51: layer "p1" (Permute): PermuteParameter has no field "deeper";' + OWN,
+    ]
 
 
 def test_a_field_of_no_dialect_is_named_once_with_its_lines():
     layer = 'layer { name: "c" type: "ReLU" bottom: "a" top: "a" quantize: true }\n'
     Path("net.prototxt").write_text(INPUT + POOL + layer * 12)
     assert lines("net.prototxt") == [
-        'net.prototxt:2:72: layer "k" (Pooling): PoolingParameter has no field "kernal"; did you mean "kernel_w"?',
-        'net.prototxt:3:53: layer "c" (ReLU): LayerParameter has no field "quantize" '
-        "(also in lines 4, 5, 6, 7, 8, 9, 10, 11 and more)",
+        'net.prototxt:2:72: layer "k" (Pooling): PoolingParameter has no field "kernal"; did you mean "kernel_w"?'
+        + OWN,
+        'net.prototxt:3:53: layer "c" (ReLU): LayerParameter has no field "quantize";'
+        f"{OWN} (also in lines 4, 5, 6, 7, 8, 9, 10, 11 and more)",
     ]
 
 
@@ -63,8 +67,7 @@ def test_a_solver_and_its_nets_are_read_to_the_end():
     found = [line.partition(": ")[2] for line in lines("solver.prototxt")]
     assert found == [
         "no lr_policy, expected one of fixed, step, exp, inv, multistep, poly, sigmoid",
-        'layer "s" (Strange): LayerParameter has no field "strange_param"; if it is of a layer of your own, '
-        "docs/layer.md shows how to add one with --plugin FILE.py",
+        'layer "s" (Strange): LayerParameter has no field "strange_param";' + OWN,
         'layer "s" (Strange): unknown layer type "Strange"; `netspec layers` lists the known ones, '
         "docs/layer.md shows how to add one with --plugin FILE.py",
         'layer "in" (Input): nothing fills "a" during training; use a layer that reads data '

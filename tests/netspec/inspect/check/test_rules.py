@@ -90,13 +90,6 @@ BN_TRUE = "batch_norm_param { use_global_stats: true }"
             + 'layer { name: "hush" type: "Silence" bottom: "e" }',
             ["never-learns 8:1"],
         ),
-        (SOUND.replace(LOSS, "") + 'layer { name: "a" type: "AbsVal" bottom: "f" top: "f" }\n' + LOSS,
-         ["caffe-stops 7:46"]),
-        (SOUND.replace(LOSS, "") + 'layer { name: "a" type: "Flatten" bottom: "f" top: "f" }\n' + LOSS,
-         ["caffe-stops 7:47"]),
-        (SOUND.replace(LOSS, "") + 'layer { name: "a" type: "Reshape" bottom: "f" top: "f" '
-         + "reshape_param { num_axes: 0 } }\n" + LOSS,
-         ["caffe-stops 7:47"]),
         (SOUND.replace(LOSS, "") + 'layer { name: "a" type: "Threshold" bottom: "f" top: "g" }\n'
          + LOSS.replace('bottom: "f"', 'bottom: "g"'), ["caffe-stops 7:37"]),
         (SOUND.replace("top: \"c\"\n", f'top: "c" param {{ {FREE} }} param {{ {FREE} }}\n')
