@@ -14,7 +14,7 @@ import pytest
 
 PRELOADED = [
     *("torch", "cv2", "scipy.optimize", "scipy.stats", "matplotlib.pyplot", "sklearn.cluster", "torch.distributed.run"),
-    *("netspec", "netspec.cli", "netspec.cli.train", "lmdb_build.cli", "loopclosure.cli"),
+    *("netspec", "netspec.cli", "netspec.cli.caffe", "lmdb_build.cli", "loopclosure.cli"),
 ]
 
 

@@ -1,4 +1,4 @@
-"""The command line: one module for each command or family of commands; it computes nothing."""
+"""The command line: a module for each group of commands, with the table of its commands; it computes nothing."""
 
 from __future__ import annotations
 
@@ -6,32 +6,18 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from netspec.cli import (
-    caffe_tools,
-    check,
-    data,
-    export,
-    extract,
-    look,
-    measure,
-    nets,
-    plot,
-    run_script,
-    shell,
-    train,
-    watch,
-)
-from netspec.cli.run import Commands
+from netspec.cli import caffe, data, export, nets, run_script, shell
+from netspec.cli.arguments import Commands
 from netspec.terminal.commands import program, run
 
-# The headings of ``netspec --help``, and the modules whose commands stand below each.
+# The modules of the commands, and the headings in ``netspec --help`` that these stand below.
 _GROUPS = {
-    "Caffe's programs": (train, measure, caffe_tools),
-    "look at nets": (check, nets, look),
-    "look at data and trainings": (data, plot, watch),
-    "use a net elsewhere": (extract, export),
-    "old programs": (run_script,),
-    "editor, shell, help": (shell,),
+    "Caffe's programs": caffe,
+    "look at nets": nets,
+    "look at data and trainings": data,
+    "use a net elsewhere": export,
+    "old programs": run_script,
+    "editor, shell, help": shell,
 }
 
 
@@ -49,7 +35,8 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
     made = program("netspec", "Run Caffe's prototxt in PyTorch, with Caffe's numbers.")
     commands = Commands(made)
-    for commands.heading, modules in _GROUPS.items():
-        for module in modules:
-            module.add_to(commands)
+    for commands.heading, module in _GROUPS.items():
+        added = commands.read(module.TABLE, vars(module))
+        if module is run_script:
+            added[run_script.NAME].usage = run_script.USAGE
     return made

@@ -1,26 +1,199 @@
-"""Options that several commands share, and how their values are read."""
+"""What the commands of netspec share: their dialects, the options of several of them, and how values are read."""
 
 from __future__ import annotations
 
 import argparse
+import logging
 import re
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from netspec import log
+from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
-from netspec.export.engines.choice import ENGINES, FP32, PRECISIONS, TORCH, Choice
+from netspec.export.engines.choice import BF16, ENGINES, FP32, OPENVINO, PRECISIONS, TORCH, Choice
+from netspec.files.limits import read_amount
 from netspec.graph.options import BuildOptions
 from netspec.graph.steps import PASSES
 from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
+from netspec.terminal import commands
 from netspec.terminal.commands import WrongUsage, refuse
 
+_WARNINGS = logging.Formatter("warning: %(message)s")
+_HOW: dict[str, dict[str, Any]] = {  # words that a table has behind the name of a command
+    "quiet": {"log_level": logging.WARNING, "log_form": _WARNINGS},
+    "warnings": {"log_level": logging.WARNING},  # Caffe's, in the form of its log
+    "silent": {"log_form": None},
+    "compares": {"fault_status": commands.UNREADABLE},
+    "read": {},  # it reads the files of nets
+    "built": {},  # it makes nets, which takes memory
+}
+_PLUGIN = "a dialect (the layers of a Caffe fork): its name, or a Python file of your own; may be repeated"
+_LIMIT = "memory that a net may need, e.g. 64GiB; more is refused (default: this machine's)"
 
-def add_model(parser: argparse.ArgumentParser) -> None:
-    """Add NET, and Caffe's name for it, ``--model``; :func:`model` returns the one that was given."""
-    parser.add_argument("net", nargs="?", metavar="NET", help="the net's prototxt")
-    parser.add_argument("--model", help="the same, as Caffe's programs name it")
+
+def _passes(text: str) -> tuple[str, ...]:
+    names = () if text == "none" else tuple(text.split(","))
+    for name in names:
+        if name not in PASSES:
+            raise argparse.ArgumentTypeError(f"found {name!r}, expected none, or some of {','.join(PASSES)}")
+    return names
+
+
+def _int32(text: str) -> int:
+    value = int(text)
+    if not -(2**31) <= value < 2**31:
+        raise argparse.ArgumentTypeError(f"found {text}, expected {-(2**31)} to {2**31 - 1}")
+    return value
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"found {text}, expected a positive number")
+    return value
+
+
+def _tolerance(text: str) -> float:
+    value = float(text)
+    if not value >= 0:
+        raise argparse.ArgumentTypeError(f"found {text}, expected a number of at least 0")
+    return value
+
+
+def _shape(text: str) -> tuple[str, tuple[int, ...]]:
+    match = re.fullmatch(r"([^=]+)=(\d+(?:,\d+)*)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected BLOB=N,C,H,W, e.g. data=32,3,224,224")
+    return match[1], tuple(int(d) for d in match[2].split(","))
+
+
+def _source(text: str) -> tuple[str, str]:
+    name, equals, path = text.partition("=")
+    if not (name and equals and path):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected LAYER=DB")
+    return name, path
+
+
+def _zooms(text: str) -> tuple[float, ...]:
+    from netspec.inspect.features.scaling import read_zooms
+
+    try:
+        return read_zooms(text)
+    except SpecError as fault:
+        raise argparse.ArgumentTypeError(str(fault)) from None
+
+
+def _amount(text: str) -> int:
+    try:
+        return read_amount(text)
+    except ValueError as fault:
+        raise argparse.ArgumentTypeError(str(fault)) from None
+
+
+_TYPES: dict[str, Callable[[str], Any]] = {  # by the word for a value
+    "N": _positive,
+    "K": int,
+    "S": float,
+    "SECONDS": float,
+    "X": _tolerance,
+    "LEVEL": _int32,
+    "NAMES": _passes,
+    "BLOB=N,C,H,W": _shape,
+    "LAYER=DB": _source,
+    "1,0.7": _zooms,
+    "{TEST|TRAIN}": str.upper,
+    **dict.fromkeys(("OUT", "PREFIX", "F.svg|F.png|F.html", "F.py", "FOLDER"), Path),
+}
+_SHARED = {
+    "net": """
+  [net] NET                        the net's prototxt
+  --model MODEL                    the same, as Caffe's programs name it""",
+    "gpu": """
+  --gpu= GPU                       the GPU's number; for training also several: 0,1 or all (default: the solver's
+                                   choice)""",
+    "files": """
+  input IN                         the file to read
+  output OUT                       the file to write""",
+    "phase": """
+  --phase=TEST {TEST|TRAIN}        default: TEST""",
+    "part": """
+  --blob+ BLOB                     only the layers that compute these blobs
+  --shape... BLOB=N,C,H,W          the shape of an input or a data layer's top
+  @phase @state @python""",
+    "picture": """
+  --out! F.png|svg                 the picture to write""",
+    "described": """
+  net NET                          the net's prototxt
+  --weights! WEIGHTS               the trained weights, several separated by commas
+  --blob! BLOB                     the blob
+  --input=data BLOB                the blob that the image goes into (default: data)
+  --shape BLOB=N,C,H,W             its shape, if its data is not available
+  @steps""",
+    "state": """
+  --level=0 LEVEL                  the NetState's level (default: 0)
+  --stage= STAGE                   the NetState's stages, separated by commas""",
+    "strict": """
+  --strict                         refuse weights that lack a layer of the net""",
+    "python": """
+  --allow-python-layers            allow the net's Python layers to run their code""",
+    "exact": f"""
+  --exact={SMALL} {{{"|".join(CHOICES)}}}   which sums equal Caffe's in every bit, on the CPU; all is slower
+                                   (default: {SMALL})""",
+    "passes": f"""
+  --passes={",".join(PASSES)} NAMES   what may speed up a net of phase TEST: {",".join(PASSES)} (the default), some of
+                                   these, or none""",
+    "engine": f"""
+  --engine={TORCH} {{{"|".join(ENGINES)}|{OPENVINO},{BF16}}}   what runs the net (default: {TORCH}); with
+                                   ,{BF16} it computes in bfloat16
+  --precision {{{"|".join(PRECISIONS)}}}
+  --cache DIR|none                 keep nets exported for an engine here, or do not keep them (default: the user's
+                                   cache folder)""",
+    "steps": """
+  --swap                           images: reverse the channels, to RGB
+  --raw-scale=1 S                  then multiply pixels, 0 to 255, by this
+  --mean A,B,C|FILE                then subtract this: numbers in the net's order, or a .binaryproto or .npy
+  --scale=1 S                      then multiply by this; these four replace the data layer's transform_param""",
+}
+
+
+class Commands(commands.Commands):
+    """Commands of netspec: ``--plugin``, ``--limit`` and ``-v`` are of those that read or make nets."""
+
+    types, shared = _TYPES, _SHARED
+
+    def add(self, name: str, function: commands.Function, summary: str, *how: str) -> argparse.ArgumentParser:
+        """Return the parser of a new command that runs ``function``.
+
+        A command of Caffe shows Caffe's log. A ``quiet`` command shows only warnings and, if it makes nets (``built``),
+        the log with ``-v``; a ``silent`` one shows none.
+        """
+        added = super().add(name, function, summary)
+        added.set_defaults(plugin=[], limit=None, begin=_use_dialects)
+        for word in how:
+            added.set_defaults(**_HOW[word])
+        if "quiet" in how and "built" in how:
+            added.add_argument("-v", "--verbose", nargs=0, action=_Verbose, help="show Caffe's log")
+        if "read" in how or "built" in how:
+            added.add_argument("--plugin", action="append", default=[], metavar="NAME|FILE.py", help=_PLUGIN)
+        if "built" in how:
+            added.add_argument("--limit", type=_amount, metavar="SIZE", help=_LIMIT)
+        return added
+
+
+def _use_dialects(arguments: argparse.Namespace) -> None:
+    for plugin in arguments.plugin:
+        use_dialect(plugin)
+
+
+class _Verbose(argparse.Action):
+    """Show the whole log, like the commands that Caffe has."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        namespace.log_level, namespace.log_form = logging.INFO, log.GlogFormatter()
 
 
 def model(arguments: argparse.Namespace) -> str:
@@ -31,133 +204,13 @@ def model(arguments: argparse.Namespace) -> str:
     return named
 
 
-def add_device(parser: argparse.ArgumentParser) -> None:
-    """Add ``--gpu``."""
-    parser.add_argument(
-        "--gpu",
-        default="",
-        help="the GPU's number; for training also several: 0,1 or all (default: the solver's choice)",
-    )
-
-
-def add_strict(parser: argparse.ArgumentParser) -> None:
-    """Add ``--strict``."""
-    parser.add_argument("--strict", action="store_true", help="refuse weights that lack a layer of the net")
-
-
-def add_exact(parser: argparse.ArgumentParser) -> None:
-    """Add ``--exact``."""
-    parser.add_argument(
-        "--exact",
-        choices=CHOICES,
-        default=SMALL,
-        help=f"which sums equal Caffe's in every bit, on the CPU; all is slower (default: {SMALL})",
-    )
-
-
-def add_passes(parser: argparse.ArgumentParser) -> None:
-    """Add ``--passes``."""
-    parser.add_argument(
-        "--passes",
-        type=_passes,
-        default=PASSES,
-        metavar="NAMES",
-        help=f"what may speed up a net of phase TEST: {','.join(PASSES)} (the default), some of these, or none",
-    )
-
-
-def _passes(text: str) -> tuple[str, ...]:
-    """Read the names of passes."""
-    names = () if text == "none" else tuple(text.split(","))
-    for name in names:
-        if name not in PASSES:
-            raise argparse.ArgumentTypeError(f"found {name!r}, expected none, or some of {','.join(PASSES)}")
-    return names
-
-
-def add_engine(parser: argparse.ArgumentParser) -> None:
-    """Add ``--engine``, ``--precision`` and ``--cache``."""
-    parser.add_argument("--engine", choices=ENGINES, default=TORCH, help=f"what runs the net (default: {TORCH})")
-    parser.add_argument(
-        "--precision", choices=PRECISIONS, default=FP32, help=f"of the engine's arithmetic (default: {FP32})"
-    )
-    parser.add_argument(
-        "--cache",
-        metavar="DIR|none",
-        help="keep nets exported for an engine here, or do not keep them (default: the user's cache folder)",
-    )
-
-
 def choice(arguments: argparse.Namespace) -> Choice:
     """Return the engine that is asked for."""
-    if arguments.engine == TORCH:
+    engine, _, precision = arguments.engine.partition(",")
+    if engine == TORCH:
         refuse(arguments, ("cache",), f"is for engines that run exported nets; {TORCH} does not")
-    return Choice.of(arguments.engine, arguments.precision, False if arguments.cache == "none" else arguments.cache)
-
-
-def add_state(parser: argparse.ArgumentParser, phase: str | None) -> None:
-    """Add ``--level``, ``--stage`` and, with a default, ``--phase``."""
-    if phase:
-        parser.add_argument(
-            "--phase", default=phase, choices=("TEST", "TRAIN"), type=str.upper, help=f"default: {phase}"
-        )
-    parser.add_argument("--level", type=_int32, default=0, help="the NetState's level (default: 0)")
-    parser.add_argument("--stage", default="", help="the NetState's stages, separated by commas")
-
-
-def _int32(text: str) -> int:
-    value = int(text)
-    if not -(2**31) <= value < 2**31:
-        raise argparse.ArgumentTypeError(f"found {text}, expected {-(2**31)} to {2**31 - 1}")
-    return value
-
-
-def add_shapes(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add ``--shape``, which may be repeated; ``what`` is its help."""
-    parser.add_argument("--shape", action="append", default=[], type=shape, metavar="BLOB=N,C,H,W", help=what)
-
-
-def add_python(parser: argparse.ArgumentParser) -> None:
-    """Add ``--allow-python-layers``."""
-    parser.add_argument(
-        "--allow-python-layers", action="store_true", help="allow the net's Python layers to run their code"
-    )
-
-
-def add_steps(parser: argparse.ArgumentParser) -> None:
-    """Add ``--swap``, ``--raw-scale``, ``--mean`` and ``--scale``: what is done to the pixels of image files."""
-    parser.add_argument("--swap", action="store_true", help="images: reverse the channels, to RGB")
-    parser.add_argument(
-        "--raw-scale", type=float, default=1.0, metavar="S", help="then multiply pixels, 0 to 255, by this"
-    )
-    parser.add_argument(
-        "--mean",
-        metavar="A,B,C|FILE",
-        help="then subtract this: numbers in the net's order, or a .binaryproto or .npy",
-    )
-    parser.add_argument(
-        "--scale",
-        type=float,
-        default=1.0,
-        metavar="S",
-        help="then multiply by this; these four replace the data layer's transform_param",
-    )
-
-
-def positive(text: str) -> int:
-    """Read a whole number above 0."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"found {text}, expected a positive number")
-    return value
-
-
-def shape(text: str) -> tuple[str, tuple[int, ...]]:
-    """Read ``BLOB=N,C,H,W``."""
-    match = re.fullmatch(r"([^=]+)=(\d+(?:,\d+)*)", text)
-    if not match:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected BLOB=N,C,H,W, e.g. data=32,3,224,224")
-    return match[1], tuple(int(d) for d in match[2].split(","))
+    cache = False if arguments.cache == "none" else arguments.cache
+    return Choice.of(engine, precision or arguments.precision or FP32, cache)
 
 
 _CHOSEN = {name: name for name in ("level", "exact", "strict", "passes", "limit")}

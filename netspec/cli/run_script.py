@@ -5,32 +5,25 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from pathlib import Path
 
-from netspec.cli.run import BUILT, Commands
 from netspec.terminal.commands import VARIABLE, WrongUsage, refuse
 
-NAME = "run"
+NAME, USAGE = "run", "netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]"
 _WITH_VALUE = ("--plugin", "--write-py3", "--minloglevel", "--limit")
 
 
-def add_to(commands: Commands) -> None:
-    """Add the command."""
-    p = commands.add(NAME, _run, "run a Python script; in it `import caffe` finds netspec", net=BUILT)
-    p.set_defaults(log_form=None)  # pycaffe shows its log, and the script has its own
-    p.usage = "netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]"
-    p.add_argument("--shadow-caffe", action="store_true", help="use netspec also where a real Caffe is installed")
-    p.add_argument("--python2", action="store_true", help="translate from Python 2, also what runs as Python 3")
-    p.add_argument("--write-py3", type=Path, metavar="FILE", help="only write a script of Python 2 as Python 3")
-    p.add_argument("-m", dest="module", action="store_true", help="run a module, as python -m does")
-
-    p = commands.add(
-        "install-caffe", _install, "put a package `caffe` and Caffe's commands into this Python environment"
-    )
-    p.add_argument("--replace", action="store_true", help="move a real Caffe that is in the way aside")
-    p.add_argument("--build", type=Path, metavar="FOLDER", help="only make FOLDER/tools/caffe and so on, for scripts")
-    p = commands.add("remove-caffe", _remove, "undo install-caffe")
-    p.add_argument("--build", type=Path, metavar="FOLDER", help="undo install-caffe --build FOLDER")
+TABLE = """
+run silent built                   run a Python script; in it `import caffe` finds netspec
+  --shadow-caffe                   use netspec also where a real Caffe is installed
+  --python2                        translate from Python 2, also what runs as Python 3
+  --write-py3 F.py                 only write a script of Python 2 as Python 3
+  -m                               run a module, as python -m does
+install-caffe                      put a package `caffe` and Caffe's commands into this Python environment
+  --replace                        move a real Caffe that is in the way aside
+  --build FOLDER                   only make FOLDER/tools/caffe and so on, for scripts
+remove-caffe                       undo install-caffe
+  --build FOLDER                   undo install-caffe --build FOLDER
+"""
 
 
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -59,16 +52,16 @@ def _run(arguments: argparse.Namespace) -> None:
     options = Options(arguments.shadow_caffe, arguments.python2)
     name, *own = arguments.program
     if arguments.write_py3:
-        if arguments.module or arguments.shadow_caffe or own:
+        if arguments.m or arguments.shadow_caffe or own:
             raise WrongUsage("--write-py3 takes a script, and nothing runs")
         write_translation(name, arguments.write_py3, arguments.python2)
         return
-    if arguments.module:
+    if arguments.m:
         run_module(name, own, options)
     run_script(name, own, options)
 
 
-def _install(arguments: argparse.Namespace) -> None:
+def _install_caffe(arguments: argparse.Namespace) -> None:
     from netspec.compat.scripts.environment import install_caffe, make_build_folder
 
     if arguments.build:
@@ -82,7 +75,7 @@ def _install(arguments: argparse.Namespace) -> None:
         print("import caffe and Caffe's commands are netspec's now; netspec remove-caffe undoes this")
 
 
-def _remove(arguments: argparse.Namespace) -> None:
+def _remove_caffe(arguments: argparse.Namespace) -> None:
     from netspec.compat.scripts.environment import remove_build_folder, remove_caffe
 
     removed = remove_build_folder(arguments.build) if arguments.build else remove_caffe()

@@ -7,34 +7,23 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from netspec.cli.run import Commands
 from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
 
-SHELLS = ("bash", "zsh", "fish")
 WORDS = (None, str, Path)  # the types of values that may be names of files
 
 
-def add_to(commands: Commands) -> None:
-    """Add the commands."""
-    summary = "a language server for editors, on standard input and output"
-    commands.add("lsp", _serve, summary, quiet=True).set_defaults(log_form=None)
-
-    p = commands.add("completion", _complete, "print a shell's completion")
-    p.description = """Print what makes a shell complete the commands of netspec.
-    bash: netspec completion bash > ~/.local/share/bash-completion/completions/netspec;
-    zsh: netspec completion zsh > a file _netspec in a folder of $fpath;
-    fish: netspec completion fish > ~/.config/fish/completions/netspec.fish"""
-    p.add_argument("shell", choices=SHELLS, help="the shell")
-    p.set_defaults(log_form=None)
-
-    summary = "collect versions, and files' shapes without weights or images, for a report of a fault"
-    p = commands.add("bug-report", _bug_report, summary, quiet=True)
-    p.add_argument("files", nargs="*", metavar="FILE", help="prototxt, weights, database, log: what the fault is about")
-    p.add_argument("--out", metavar="F.md", help="write the report here (default: print it)")
+TABLE = """
+lsp quiet silent                   a language server for editors, on standard input and output
+completion silent                  print a shell's completion
+  shell {bash|zsh|fish}            the shell
+bug-report quiet                  collect versions, and files' shapes without weights or images, for a report of a fault
+  [files...] FILE                  prototxt, weights, database, log: what the fault is about
+  --out F.md                       write the report here (default: print it)
+"""
 
 
-def _serve(arguments: argparse.Namespace) -> None:
+def _lsp(arguments: argparse.Namespace) -> None:
     try:
         from netspec.inspect.editor.server import make_server
     except ImportError as fault:
@@ -48,7 +37,13 @@ def _serve(arguments: argparse.Namespace) -> None:
     make_server(version("netspec-caffe")).start_io(Messages(sys.stdin.buffer))  # type: ignore[arg-type]
 
 
-def _complete(arguments: argparse.Namespace) -> None:
+def _completion(arguments: argparse.Namespace) -> None:
+    """Print what makes a shell complete the commands of netspec.
+
+    bash: netspec completion bash > ~/.local/share/bash-completion/completions/netspec
+    zsh:  netspec completion zsh > a file _netspec in a folder of $fpath
+    fish: netspec completion fish > ~/.config/fish/completions/netspec.fish
+    """
     from netspec.cli import parser  # which makes the parser of all commands, this one among them
 
     try:

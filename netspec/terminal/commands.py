@@ -9,25 +9,24 @@ one line.
 from __future__ import annotations
 
 import argparse
-import getpass
+import inspect
 import logging
 import os
-import platform
 import re
 import shlex
 import signal
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from netspec import log
 from netspec.errors import SpecError, did_you_mean
 from netspec.files.limits import amount, is_out_of_memory, memory
+from netspec.terminal.output import logging_to
 
 DONE, FAULT, WRONG_USAGE = 0, 1, 2  # exit statuses; a signal's is 128 + its number: 130, 143
 SOMETHING, UNREADABLE = 1, 2  # of commands that compare or advise: there is something to say; a file cannot be read
@@ -50,6 +49,14 @@ _GLOGS_FLAGS = (
 )
 _GLOGS_SWITCHES = ("colorlogtostderr", "log_prefix", "stop_logging_if_full_disk", "log_backtrace_at")
 TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
+Function = Callable[[argparse.Namespace], "int | None"]  # a command
+# Lines of a table of commands (Commands.read).
+_COMMAND = re.compile(r"(\S+)((?: \S+)*) {2,}(.*)")
+_ARGUMENT = re.compile(r"  (\[?)([\w-]+)(?:=(\S*?))?(\.\.\.|\+)?(!?)\]?(?: (\S+))?(?: {2,}(.*))?")
+_SEVERAL: dict[str, dict[str, Any]] = {
+    "...": {"action": "append", "default": []},
+    "+": {"action": "extend", "nargs": "+", "default": []},
+}
 
 
 class WrongUsage(Exception):
@@ -74,8 +81,12 @@ def program(name: str, description: str) -> argparse.ArgumentParser:
 class Commands:
     """The commands of a parser, each with the options that all of them share; ``quiet`` ones show only warnings.
 
-    ``heading`` is that of the commands to come in the program's help.
+    ``heading`` is that of the commands to come in the program's help. ``types`` reads the values of options by the word
+    that stands for them in a table, ``shared`` has lines of tables by name.
     """
+
+    types: ClassVar[Mapping[str, Callable[[str], Any]]] = {}
+    shared: ClassVar[Mapping[str, str]] = {}
 
     def __init__(self, parser: argparse.ArgumentParser, quiet: bool = False) -> None:
         self.heading = "commands"
@@ -97,10 +108,63 @@ class Commands:
         groups = ("\n".join((f"{heading}:", *lines)) for heading, lines in self._groups.items())
         self._parser.epilog = "\n\n".join([*groups, "Every command takes -q, for warnings and errors only."])
 
-    def add(
-        self, name: str, function: Callable[[argparse.Namespace], int | None], summary: str
-    ) -> argparse.ArgumentParser:
-        """Return the parser of a new command that runs ``function``, to add its own arguments to.
+    def read(self, table: str, functions: Mapping[str, Any]) -> dict[str, argparse.ArgumentParser]:
+        """Add the commands of a table, and return them: ``bug-report`` is run by the function ``_bug_report``.
+
+        The docstring of that function, where it has one, is the command's description. A table looks like this::
+
+            check quiet         a command: its name, words for :meth:`add`, its summary
+              file FILE         an argument: its name, a word for its value, its help; ``[file]`` may be left out,
+                                ``file...`` is several, ``[file...]`` any number; a line may go on like this
+              --weights! FILE   an option that must be given
+              --level=0 LEVEL   one with a default; ``--nan=stop {stop|warn}`` has these choices
+              --shape... BLOB   one that may be repeated; ``--blob+ BLOB`` takes several values too
+              --json            a Boolean flag
+              @device @state    the lines of these names in ``shared``
+            look:               the commands behind it are those of the group ``look``
+        """
+        added: dict[str, argparse.ArgumentParser] = {}
+        group = self
+        for line in re.sub(r"\n {8,}", " ", self._with_shared(table)).splitlines():
+            if command := _COMMAND.fullmatch(line):
+                name, how, summary = command.groups()
+                if name.endswith(":"):
+                    group = type(self)(self.group(name[:-1], summary))
+                    continue
+                function = functions[f"_{name.replace('-', '_')}"]
+                added[name] = group.add(name, function, summary, *how.split())
+                if function.__doc__:
+                    added[name].description = inspect.cleandoc(function.__doc__)
+                    added[name].formatter_class = argparse.RawDescriptionHelpFormatter
+            else:
+                self._add_argument(added[name], line)
+        return added
+
+    def _with_shared(self, table: str) -> str:
+        """Return a table with the shared lines that it names."""
+
+        def lines(match: re.Match[str]) -> str:
+            return "\n".join(self._with_shared(self.shared[name[1:]]) for name in match[0].split())
+
+        return re.sub(r"^  @.*$", lines, table.strip("\n"), flags=re.MULTILINE)
+
+    def _add_argument(self, parser: argparse.ArgumentParser, line: str) -> None:
+        match = _ARGUMENT.fullmatch(line)
+        assert match, line
+        optional, name, default, several, required, value, text = match.groups()
+        if value is None:
+            parser.add_argument(name, action="store_true", help=text)
+            return
+        options: dict[str, Any] = {"help": text or argparse.SUPPRESS, "type": self.types.get(value), "default": default}
+        options |= {"choices": value[1:-1].split("|")} if value.startswith("{") else {"metavar": value}
+        if name.startswith("-"):
+            options |= {"required": bool(required), **_SEVERAL.get(several, {})}
+        elif optional or several:
+            options["nargs"] = ("*" if optional else "+") if several else "?"
+        parser.add_argument(name, **options)
+
+    def add(self, name: str, function: Function, summary: str, *how: str) -> argparse.ArgumentParser:
+        """Return the parser of a new command that runs ``function``, to add its own arguments to; ``how`` is unused.
 
         An argument with ``action="store_true"`` is a Boolean flag in all spellings of gflags. A command that shows no
         log itself sets the default ``log_form`` to None, one whose faults are no FAULT sets ``fault_status``.
@@ -132,7 +196,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
     arguments.command_line = shlex.join([parser.prog, *words])
     try:
         form, folder = arguments.log_form, arguments.log_dir
-        shown = _logging(_level(arguments), form, folder) if form else nullcontext()
+        shown = logging_to(_level(arguments), form, folder) if form else nullcontext()
         with interruptible(), shown:
             arguments.begin(arguments)
             return arguments.run(arguments) or DONE
@@ -323,66 +387,6 @@ def _level(arguments: argparse.Namespace) -> int:
         variable = os.environ.get(VARIABLE, "")
         minimum = int(variable) if variable.isdigit() else 0
     return max(arguments.log_level, SEVERITIES[min(minimum, len(SEVERITIES) - 1)])
-
-
-@contextmanager
-def _logging(level: int, form: logging.Formatter, folder: str | None) -> Iterator[None]:
-    """Show Caffe's log on stderr, above the progress bar if there is one; or write it into a folder, as glog does.
-
-    A warning is shown once, even if several nets of a solver give it.
-    """
-    handlers: list[logging.Handler] = [logging.StreamHandler(_BarAware())]
-    if folder:
-        handlers[0].setLevel(logging.WARNING)
-        moment = time.strftime("%Y%m%d-%H%M%S")
-        name = f"caffe.{platform.node()}.{getpass.getuser()}.log.INFO.{moment}.{os.getpid()}"
-        handlers.append(logging.FileHandler(os.path.join(folder, name), encoding="utf-8"))
-    for handler in handlers:
-        handler.setFormatter(form)
-        handler.addFilter(_WarnOnce())
-    before = log.logger.level, log.logger.propagate
-    for handler in handlers:
-        log.logger.addHandler(handler)
-    log.logger.setLevel(level)
-    log.logger.propagate = False
-    try:
-        yield
-    finally:
-        for handler in handlers:
-            log.logger.removeHandler(handler)
-            handler.close()
-        level, log.logger.propagate = before
-        log.logger.setLevel(level)
-
-
-class _WarnOnce(logging.Filter):
-    """Lets each warning through only the first time."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: set[str] = set()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        message = record.getMessage()
-        if record.levelno != logging.WARNING:
-            return True
-        new = message not in self.seen
-        self.seen.add(message)
-        return new
-
-
-class _BarAware:
-    """A stream that writes to stderr above a tqdm bar, if one is shown."""
-
-    def write(self, text: str) -> None:
-        tqdm = sys.modules.get("tqdm")
-        if tqdm is None or not sys.stderr.isatty():
-            sys.stderr.write(text)
-        elif text.rstrip("\n"):
-            tqdm.tqdm.write(text.rstrip("\n"), file=sys.stderr)
-
-    def flush(self) -> None:
-        sys.stderr.flush()
 
 
 def seed(text: str) -> int:

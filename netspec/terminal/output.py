@@ -1,11 +1,18 @@
-"""What a command shows: bars while it works, doubts about the user's files, tables."""
+"""What a command shows: its log, bars while it works, doubts about the user's files, tables."""
 
 from __future__ import annotations
 
+import getpass
+import logging
+import os
+import platform
 import sys
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
+from netspec import log
 from netspec.errors import printable
 
 Item = TypeVar("Item")
@@ -40,3 +47,63 @@ def in_columns(rows: Sequence[Sequence[str]], left: int = 1, spans: Sequence[tup
         cells = zip(row, widths, strict=True)
         lines.append("  ".join(c.ljust(w) if k < left else c.rjust(w) for k, (c, w) in enumerate(cells)))
     return lines
+
+
+@contextmanager
+def logging_to(level: int, form: logging.Formatter, folder: str | None) -> Iterator[None]:
+    """Show Caffe's log on stderr, above the progress bar if there is one; or write it into a folder, as glog does.
+
+    A warning is shown once, even if several nets of a solver give it.
+    """
+    handlers: list[logging.Handler] = [logging.StreamHandler(_BarAware())]
+    if folder:
+        handlers[0].setLevel(logging.WARNING)
+        moment = time.strftime("%Y%m%d-%H%M%S")
+        name = f"caffe.{platform.node()}.{getpass.getuser()}.log.INFO.{moment}.{os.getpid()}"
+        handlers.append(logging.FileHandler(os.path.join(folder, name), encoding="utf-8"))
+    for handler in handlers:
+        handler.setFormatter(form)
+        handler.addFilter(_WarnOnce())
+    before = log.logger.level, log.logger.propagate
+    for handler in handlers:
+        log.logger.addHandler(handler)
+    log.logger.setLevel(level)
+    log.logger.propagate = False
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            log.logger.removeHandler(handler)
+            handler.close()
+        level, log.logger.propagate = before
+        log.logger.setLevel(level)
+
+
+class _WarnOnce(logging.Filter):
+    """Lets each warning through only the first time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        message = record.getMessage()
+        if record.levelno != logging.WARNING:
+            return True
+        new = message not in self.seen
+        self.seen.add(message)
+        return new
+
+
+class _BarAware:
+    """A stream that writes to stderr above a tqdm bar, if one is shown."""
+
+    def write(self, text: str) -> None:
+        tqdm = sys.modules.get("tqdm")
+        if tqdm is None or not sys.stderr.isatty():
+            sys.stderr.write(text)
+        elif text.rstrip("\n"):
+            tqdm.tqdm.write(text.rstrip("\n"), file=sys.stderr)
+
+    def flush(self) -> None:
+        sys.stderr.flush()

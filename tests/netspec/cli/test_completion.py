@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from netspec.cli import main, parser
-from netspec.cli.shell import SHELLS
 
 pytest.importorskip("shtab")
+SHELLS = ("bash", "zsh", "fish")
 
 
 @pytest.fixture

@@ -1,0 +1,360 @@
+"""``netspec train``, ``test``, ``time``, and Caffe's smaller tools under their own names."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from netspec import log
+from netspec.cli.arguments import device, devices, load, load_weights, options, run_by
+from netspec.errors import SpecError
+from netspec.files.whole_file import write_whole
+from netspec.inspect.logs.scores import Score, Scores, Snapshot, read_scores
+from netspec.proto.binary import check_readable, split_paths
+from netspec.terminal.commands import DONE, FAULT, WrongUsage
+
+if TYPE_CHECKING:
+    from netspec.solver.processes import Processes
+    from netspec.solver.solver import Solver
+
+TABLE = """
+train built                        train or fine-tune a model (caffe train)
+  [path] SOLVER                    the solver's prototxt
+  --solver SOLVER                  the solver's prototxt
+  --snapshot SNAPSHOT              a .solverstate to resume from
+  --resume                         resume from the newest whole snapshot, if there is any
+  --weights WEIGHTS                weights to start from, several separated by commas
+  --scores F.json                  write the scores of each test and the snapshots taken to this file
+  --tensorboard DIR                write losses, rates and test outputs here for TensorBoard
+  --nan=stop {stop|warn}           what a loss of NaN or infinity does (default: stop)
+  @gpu @state
+  --sigint_effect=stop {stop|snapshot|none}       what Ctrl-C does (default: stop); SIGTERM stops
+  --sighup_effect=snapshot {stop|snapshot|none}   what SIGHUP does (default: snapshot)
+  @python @exact
+  --precision=fp32 {fp32|tf32|bf16|fp16}          of the training net's passes; bf16 is faster on CPUs and GPUs that
+                                   have it, fp16 on GPUs; both round more (default: fp32)
+  @strict
+test built                         score a model on its TEST-phase data (caffe test)
+  @net
+  --weights! WEIGHTS               the trained weights
+  --iterations=50 N                batches to run (default: 50)
+  --scores F.json                  also write the mean scores to this file
+  @gpu @state @python @exact @passes @strict @engine
+time built                         measure the forward and backward time of each layer (caffe time)
+  @net
+  --iterations=50 N                passes to time (default: 50)
+  @gpu
+  --phase=TRAIN {TEST|TRAIN}       default: TRAIN
+  @state @python @exact @engine
+extract_features warnings built    write blobs to databases of float Datums (extract_features)
+  weights WEIGHTS                  the trained weights
+  model MODEL                      the net's prototxt, with a data layer
+  blobs BLOBS                      blob names, separated by commas
+  databases DATABASES              the databases to write, one per blob, separated by commas
+  batches N                        mini-batches to run
+  db_type {lmdb|leveldb}           the form of the databases
+  [mode=CPU] {CPU|GPU}             where the net runs (default: CPU)
+  [device=0] DEVICE_ID=0           the GPU's number
+device_query                       show the GPUs (caffe device_query)
+  --gpu=all GPU                    one number, several separated by commas, or all (the default)
+upgrade_net_proto_text read        write a net's prototxt, or the net inside a .caffemodel, in the current format
+  @files
+  --shape... BLOB=N,C,H,W          of a .caffemodel, whose net is written as a deploy prototxt: the shape of an input
+upgrade_net_proto_binary           write a .caffemodel in the current format
+  @files
+upgrade_solver_proto_text          write a solver's prototxt in the current format
+  @files
+"""
+
+
+BAR = "{n_fmt} of {total_fmt} |{bar}| {elapsed}, {remaining} left{postfix}"
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    path = arguments.solver or arguments.path
+    if not path or (arguments.solver and arguments.path):
+        raise WrongUsage("need one solver definition: netspec train solver.prototxt")
+    if arguments.snapshot and arguments.weights:
+        raise WrongUsage("give a snapshot to resume training or weights to fine-tune, not both")
+    if arguments.resume and arguments.snapshot:
+        raise WrongUsage("--resume looks for the snapshot; leave out --snapshot")
+    from netspec.solver.processes import FaultOfAll, Lost, Processes, join, started_by_torchrun
+
+    if arguments.gpu and started_by_torchrun():
+        raise WrongUsage("under torchrun each process takes the GPU of its number; leave out --gpu")
+    processes = join() if started_by_torchrun() else Processes()
+    status = DONE
+    with nullcontext() if processes.is_root else log.silent():
+        try:
+            status = _solve(arguments, path, processes)
+        except FaultOfAll:
+            if processes.is_root:
+                raise
+            with suppress(Lost):  # the root reports it; torchrun ends all processes as soon as one has ended
+                processes.gather(None)
+            return FAULT
+    if status == FAULT:  # another process is lost: leaving the group, and Python's own end, could wait for it
+        sys.stderr.flush()
+        os._exit(FAULT)
+    processes.leave()
+    return status
+
+
+def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> int:
+    """Train, and return the exit status."""
+    from tqdm import tqdm
+
+    from netspec.solver.board import writer_class
+    from netspec.solver.processes import Lost
+
+    if arguments.tensorboard and processes.is_root:
+        writer_class()  # a missing package is reported before the log of the nets
+
+    effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGTERM: "stop"}
+    if hasattr(signal, "SIGHUP"):  # Windows has none
+        effects[signal.SIGHUP] = arguments.sighup_effect
+    with _signals(effects) as action:
+        processes.is_ending = lambda: bool(action.stopped_by)
+        solver = processes.together(lambda: _load(arguments, path, action, processes))
+        log.info("caffe.cpp:239", "Starting Optimization")
+        total, first = solver.param.max_iter, solver.iteration
+        hidden = not sys.stderr.isatty() or not processes.is_root
+        bar = tqdm(total=total, initial=first, bar_format=BAR, disable=hidden, leave=False)
+        with _sole_writer(solver) if processes.is_root else nullcontext(), bar:
+            solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
+            board = _board(solver, arguments.tensorboard) if processes.is_root else nullcontext()
+            try:
+                with board:
+                    solver.solve()
+            except Lost as fault:  # reported here: torchrun ends this process as soon as signals work again
+                kept = (
+                    f"the last snapshot is {solver.last_snapshot}" if solver.last_snapshot else "no snapshot was taken"
+                )
+                print(f"{fault}; {kept}; start all processes again with --resume", file=sys.stderr)
+                return FAULT
+        solver.close()
+    log.info("caffe.cpp:250", "Optimization Done.")
+    return 128 + action.stopped_by if solver.stopped and action.stopped_by and not _as_caffe() else DONE
+
+
+def _as_caffe() -> bool:
+    """Say whether a training that a signal stopped is done, as in Caffe: for who calls it by a name of Caffe's.
+
+    Under torchrun too, which answers any other status with a traceback.
+    """
+    from netspec.solver.processes import started_by_torchrun
+
+    return Path(sys.argv[0]).stem in ("caffe", "train") or started_by_torchrun()
+
+
+def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | None], processes: Processes) -> Solver:
+    """Return the solver, resumed where that is asked for."""
+    from netspec.process.heap import keep_freed_memory
+    from netspec.proto.text import parse_solver
+    from netspec.solver.options import TrainingOptions
+    from netspec.solver.solver import make_solver
+
+    keep_freed_memory()
+    param, node = parse_solver(path)
+    if not param.HasField("max_iter"):
+        raise SpecError(
+            "has no max_iter, so there is nothing to train; add max_iter: N, the number of iterations", node.where
+        )
+    if arguments.resume and (found := _newest(param.snapshot_prefix)):
+        arguments.snapshot, arguments.weights = str(found), None
+    build = options(arguments, stages=arguments.stage.split(","))  # without --stage an empty one, as in Caffe
+    gpus = devices(arguments.gpu) if arguments.gpu else ()
+    chosen = TrainingOptions(build, gpus, arguments.nan, arguments.precision, processes, action)
+    solver = make_solver(path, chosen, arguments.weights, arguments.snapshot)
+    if arguments.scores and processes.is_root:
+        _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))
+    return solver
+
+
+def _newest(prefix: str) -> Path | None:
+    """Return the newest whole snapshot of a prefix; None, with a line in the log, where there is none."""
+    from netspec.solver.extra import newest_pair
+
+    found = newest_pair(prefix)
+    if found is None:
+        log.logger.info(f'no snapshot to resume from with the prefix "{prefix}": the training starts')
+    return found
+
+
+def _sole_writer(solver: Solver) -> AbstractContextManager[None]:
+    """Refuse a second training that would write snapshots of the same names."""
+    from netspec.files.whole_file import has_locks, only_one
+    from netspec.solver.checks import check_prefix
+
+    if not (solver.param.snapshot or solver.param.snapshot_after_train):
+        return nullcontext()
+    check_prefix(solver.param, solver.node)
+    prefix = solver.param.snapshot_prefix
+    if not has_locks():
+        log.logger.warning(f'no file locks here: nothing stops another training from writing over "{prefix}"')
+    folder, name = os.path.split(prefix)
+    lock = os.path.join(folder, f".{name}.lock")
+    return only_one(lock, f'give each training a snapshot_prefix of its own, not "{prefix}" to both')
+
+
+def _board(solver: Solver, folder: str | None) -> AbstractContextManager[object]:
+    """Write for TensorBoard within the block, if a folder is given."""
+    if not folder:
+        return nullcontext()
+    from netspec.solver.board import board
+
+    return board(solver, folder)
+
+
+def _keep_scores(solver: Solver, path: str, resumed: bool) -> None:
+    """Make the solver write its scores; a resumed training keeps the earlier ones."""
+    scores = read_scores(path).before(solver.iteration) if resumed and Path(path).exists() else Scores()
+    scores.write(path)
+
+    def tested(net: int) -> None:
+        scores.tests.append(Score(solver.iteration, net, solver.scores[net]))
+        scores.write(path)
+
+    def saved(model: str) -> None:
+        scores.snapshots.append(Snapshot(solver.iteration, model))
+        scores.write(path)
+
+    solver.on_test, solver.on_snapshot = tested, saved
+
+
+class _Signals:
+    """What signals ask of a training: called between iterations, it returns the effect of one that came, or None.
+
+    ``stopped_by`` is the number of the signal that asked to stop, 0 before. A second one that does ends the process at
+    once.
+    """
+
+    def __init__(self) -> None:
+        self.stopped_by = 0
+        self._came: deque[str] = deque()
+
+    def __call__(self) -> str | None:
+        """Return the effect of the signal that came first, once."""
+        return self._came.popleft() if self._came else None
+
+    def receive(self, effect: str, number: int) -> None:
+        """Note a signal that came."""
+        if effect == "stop":
+            if self.stopped_by:
+                os._exit(128 + number)
+            self.stopped_by = number
+        self._came.append(effect)
+
+
+@contextmanager
+def _signals(effects: Mapping[signal.Signals, str]) -> Iterator[_Signals]:
+    """Yield what receives the signals within the block, each with its effect: "stop", "snapshot" or "none"."""
+    received = _Signals()
+    before = {}
+    for number, effect in effects.items():
+        handler = signal.SIG_IGN if effect == "none" else lambda n, _, effect=effect: received.receive(effect, n)
+        before[number] = signal.signal(number, handler)
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _test(arguments: argparse.Namespace) -> None:
+    from netspec.inspect.check.measure import test_net
+
+    check_readable(split_paths(arguments.weights))
+    net = load(arguments, "TEST", "caffe.cpp:266", "caffe.cpp:275")
+    load_weights(net, arguments.weights, arguments.strict)
+    net = run_by(net, arguments, arguments.weights)
+    means = test_net(net, arguments.iterations)
+    net.close()
+    if arguments.scores:
+        Scores([Score(None, 0, means)]).write(arguments.scores)
+
+
+def _time(arguments: argparse.Namespace) -> None:
+    from netspec.inspect.check.measure import time_forward, time_net
+
+    arguments.passes = ()  # each layer is timed by itself
+    net = load(arguments, arguments.phase, "caffe.cpp:340", "caffe.cpp:343", write_files=False)
+    run_by(net, arguments, None)
+    if net.runners[0] in (net.prepared, net.eager):  # an engine's kernels are not by layer
+        time_net(net, arguments.iterations)
+    else:
+        time_forward(net, arguments.iterations)
+    net.close()
+
+
+def _extract_features(arguments: argparse.Namespace) -> None:
+    from netspec.inspect.features.records import extract_features as write_features
+    from netspec.net.build import load_net
+
+    number = arguments.device.rpartition("=")[2]
+    log.error("extract_features.cpp:62", "Using CPU" if arguments.mode == "CPU" else f"Using GPU {number}")
+    chosen = options(arguments, device=str(device(number if arguments.mode == "GPU" else "")))
+    net = load_net(arguments.model, options=chosen, weights=[arguments.weights])
+    write_features(
+        net, arguments.blobs.split(","), arguments.databases.split(","), arguments.batches, arguments.db_type
+    )
+    net.close()
+
+
+def _device_query(arguments: argparse.Namespace) -> None:
+    import torch
+
+    log.info("caffe.cpp:142", f"Querying GPUs {arguments.gpu}")
+    count = torch.cuda.device_count()
+    if not count:
+        log.info("common.cpp:178", "No GPU: torch finds none on this machine")
+        return
+    numbers = range(count) if arguments.gpu == "all" else [device(n).index for n in arguments.gpu.split(",")]
+    for number in numbers:
+        properties = torch.cuda.get_device_properties(number)
+        for title, value in (
+            ("Device id:", number),
+            ("Major revision number:", properties.major),
+            ("Minor revision number:", properties.minor),
+            ("Name:", properties.name),
+            ("Total global memory:", properties.total_memory),
+            ("Number of multiprocessors:", properties.multi_processor_count),
+        ):
+            log.info("common.cpp:178", f"{title:<31}{value}")
+
+
+def _upgrade_net_proto_text(arguments: argparse.Namespace) -> None:
+    from netspec.proto.binary import is_net_binary
+    from netspec.proto.text import read_net, write_text
+
+    if is_net_binary(arguments.input):
+        from netspec.net.recovered import recover_net
+
+        net, _ = recover_net(arguments.input, dict(arguments.shape))
+    elif arguments.shape:
+        raise WrongUsage("--shape is for the net inside a .caffemodel; a prototxt has its own shapes")
+    else:
+        net = read_net(arguments.input)
+    write_whole(arguments.output, write_text(net))
+    log.info("upgrade_net_proto_text.cpp:49", f"Wrote upgraded NetParameter text proto to {arguments.output}")
+
+
+def _upgrade_net_proto_binary(arguments: argparse.Namespace) -> None:
+    from netspec.proto.binary import read_net_binary
+
+    write_whole(arguments.output, read_net_binary(arguments.input).SerializeToString())
+    log.info("upgrade_net_proto_binary.cpp:49", f"Wrote upgraded NetParameter binary proto to {arguments.output}")
+
+
+def _upgrade_solver_proto_text(arguments: argparse.Namespace) -> None:
+    from netspec.proto.text import read_solver, write_text
+
+    write_whole(arguments.output, write_text(read_solver(arguments.input)))
+    log.info("upgrade_solver_proto_text.cpp:49", f"Wrote upgraded SolverParameter text proto to {arguments.output}")
