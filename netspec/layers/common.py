@@ -83,7 +83,9 @@ class InnerProduct(Layer):
             return lent(BoundVectors(self.bottom_shapes[0], top_shape, transposed, learned), how)
         weight = weight.t() if transposed else weight
         # A single vector is multiplied as fast as memory gives the weights, whatever their layout.
-        if rows > 1 and how.pack and fused.suits(weight) and rows * weight.numel() > SMALL_PRODUCT:
+        if rows == 1:
+            multiply = finished(fused.vector_product(weight, bias), how.finish).forward
+        elif how.pack and fused.suits(weight) and rows * weight.numel() > SMALL_PRODUCT:
             multiply = fused.product(weight, bias, how).forward
         else:
             multiply = finished(lambda vectors: F.linear(vectors, weight, bias), how.finish).forward

@@ -6,12 +6,13 @@ functions do the same.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 
 from netspec.exact.products import Filter
 from netspec.layers.contract.base import Shape
@@ -19,6 +20,7 @@ from netspec.layers.contract.kernels import Finish, Kernels, Preparation, finish
 from netspec.layers.contract.learned import values_of
 
 _NEEDED = ("_convolution_pointwise", "_linear_pointwise", "_convolution_transpose_pointwise")
+_DIVIDED, _ROWS = 2**20, 64  # numbers of a matrix whose product is divided, and rows of a part, at least
 
 
 def _ops() -> Any:
@@ -128,6 +130,35 @@ def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -
     bias = _kept(bias, how)
     call, (operation, rest) = _ops()._linear_pointwise.default, _within(how.finish)
     return finished(lambda vectors: call(vectors, weight, bias, *operation, ""), rest)
+
+
+def vector_product(weight: torch.Tensor, bias: torch.Tensor | None) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return the product of one vector (1, K) with weights (num_output, K), whose rows threads divide among themselves.
+
+    One thread does not read large weights as fast as memory gives them, and torch takes one. MKL sums up four rows at a
+    time, so parts that begin at multiples of four get the bits of the whole; whether they do is tried first.
+    """
+    count, length = weight.shape
+    same_bits: dict[int, bool] = {}  # by number of parts
+
+    def divided(vector: torch.Tensor, parts: int) -> torch.Tensor:
+        step = count // (4 * parts) * 4
+        most = count - (parts - 1) * step  # of the last part, and of all: what is beyond their own rows is dropped
+        rows = weight.as_strided((parts, length, most), (step * length, 1, length))
+        found = torch.bmm(vector.expand(parts, 1, length), rows)[:, 0]
+        top = torch.cat([found[:-1, :step].reshape(-1), found[-1]]).view(1, count)
+        return top if bias is None else top.add_(bias)
+
+    def kernel(vector: torch.Tensor) -> torch.Tensor:
+        threads = torch.get_num_threads()
+        parts = min(2 * threads, count // _ROWS) if threads > 1 else 1
+        if parts > 1 and parts not in same_bits:
+            probe = torch.linspace(-1, 1, length).view(1, length)
+            same_bits[parts] = torch.equal(divided(probe, parts), F.linear(probe, weight, bias))
+        return divided(vector, parts) if same_bits.get(parts) else F.linear(vector, weight, bias)
+
+    by_mkl = torch.backends.mkl.is_available() and suits(weight) and weight.is_contiguous()
+    return kernel if by_mkl and weight.numel() >= _DIVIDED else lambda vector: F.linear(vector, weight, bias)
 
 
 def _within(finish: Finish | None) -> tuple[tuple[str, list[float]], Finish | None]:

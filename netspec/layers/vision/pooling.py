@@ -31,7 +31,7 @@ from netspec.layers.vision.windows import (
 from netspec.proto.schema import TRAIN
 
 MAX, AVE, STOCHASTIC = 0, 1, 2  # caffe.proto: enum PoolingParameter.PoolMethod, and SPPParameter's
-SLICED = 2**12  # numbers in a bottom: of more the slices pay (netspec/layers/vision/windows.py, largest)
+SLICED, SLICED_BY_TWO = 2**12, 2**17  # numbers in a bottom: of more, slices pay (windows.py, largest)
 HIGHEST_PYRAMID = 16  # levels: 4^16 / 3 windows
 
 
@@ -201,10 +201,11 @@ class Pooling(_PoolingBase):
         if self.method == AVE:
             return finished(lambda maps: F.avg_pool2d(maps, *geometry, ceil, True), how.finish)
 
-        large = math.prod(self.bottom_shapes[0]) > SLICED and not any(windows.pad)
+        size = 0 if any(windows.pad) else math.prod(self.bottom_shapes[0])
+        small = size <= (SLICED_BY_TWO if max(windows.kernel) <= 2 else math.inf)  # where channels lie side by side
 
         def kernel(maps: torch.Tensor) -> torch.Tensor:
-            if large and maps.is_contiguous() and not self.is_exact(maps):
+            if size > SLICED and not (small and not maps.is_contiguous()) and not self.is_exact(maps):
                 values = largest(maps, windows)
             else:
                 values = torch.max_pool2d(maps, *geometry, 1, ceil)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from netspec.errors import SpecError
+from netspec.layers.contract.fused import vector_product
 from netspec.proto.schema import TEST, TRAIN
 
 FILL = 'weight_filler { type: "gaussian" } bias_filler { type: "gaussian" }'
@@ -40,6 +41,31 @@ def test_inner_product_takes_another_batch_but_no_other_length(build) -> None:
     assert layer.run(torch.randn(7, 4, 3))[0].shape == (7, 3)  # only the count matters
     with pytest.raises(SpecError, match=r"^bottom: .* has 15 values from axis 1 on, expected 12"):
         layer.run(torch.randn(2, 3, 5))
+
+
+@pytest.mark.parametrize(("rows", "length", "bias"), [(500, 4243, True), (1003, 1050, True), (130, 8070, False)])
+def test_one_vectors_product_has_the_same_bits_however_many_threads_share_it(
+    monkeypatch: pytest.MonkeyPatch, rows: int, length: int, bias: bool
+) -> None:
+    draw = torch.Generator().manual_seed(1)
+    vector, weight = (torch.randn(n, length, generator=draw) for n in (1, rows))
+    biases = torch.randn(rows, generator=draw) if bias else None
+    divisions, divide = [], torch.bmm
+    monkeypatch.setattr(torch, "bmm", lambda *given: divisions.append(1) or divide(*given))
+    multiply = vector_product(weight, biases)
+    for threads in (1, 2, 3, 7):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        assert torch.equal(multiply(vector), torch.nn.functional.linear(vector, weight, biases)), threads
+    assert bool(divisions) == torch.backends.mkl.is_available()
+
+
+def test_a_product_is_not_divided_where_that_changes_its_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    vector, weight = torch.randn(1, 4243), torch.randn(500, 4243)
+    divide = torch.bmm
+    monkeypatch.setattr(torch, "bmm", lambda *given: divide(*given) * (1 + 2**-20))
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    found = vector_product(weight, None)(vector)
+    assert torch.equal(found, torch.nn.functional.linear(vector, weight))
 
 
 @pytest.mark.parametrize("ratio", [0.1, 0.5, 0.8])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from netspec.layers.contract.kernels import Preparation, own_kernels
 from netspec.proto.schema import TRAIN
 
 LOWEST = np.finfo(np.float32).min  # -FLT_MAX
@@ -162,6 +163,16 @@ def test_global_pooling_follows_the_map(build, method: str) -> None:
         (top,) = layer.run(data)
         assert layer.top_shapes == [(*shape[:2], 1, 1)]
         torch.testing.assert_close(top[..., 0, 0], data.amax((2, 3)) if method == "MAX" else data.mean((2, 3)))
+
+
+@pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize("kernel", [2, 3])
+def test_large_maps_are_pooled_by_slices_in_any_order_in_memory(build, kernel: int, memory_format) -> None:
+    data = torch.randn(2, 19, 61, 62)
+    data[0, 0, :4, :4] = torch.nan  # which never wins
+    layer = build(pooling_text("MAX", (kernel, kernel), (2, 2), (0, 0), False), data.shape)
+    pool = own_kernels(layer, Preparation()).forward
+    assert torch.equal(pool(data.contiguous(memory_format=memory_format)), layer.run(data)[0])
 
 
 @pytest.mark.parametrize(
