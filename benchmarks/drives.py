@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -139,23 +139,20 @@ def _stood(images: list[Path], folder: Path) -> list[Path]:
 
 def _of_walk(seed: int, size: tuple[int, int], work: Path) -> Iterator[Drive]:
     name, end = f"walk_{seed}", "" if size != SMALL else ", small"
-    folders = [walked(work, seed, season, size) for season in (1, *SEASONS)]
-    first, *others = [read_sequence(folder, "tum") for folder in folders]
+    first = read_sequence(walked(work, seed, size), "tum")
     yield Drive(name, f"laps{end}", load_sequence(first, exclusion=Exclusion(seconds=10.0)))
-    for season, other in zip(SEASONS, others, strict=True):
-        yield Drive(name, f"season {season}{end}", load_sequence(other, references=first))
+    for season in SEASONS:
+        images = in_season(list(first.images), work / f"{name}_{size[0]}", season)
+        yield Drive(
+            name, f"season {season}{end}", load_sequence(replace(first, images=tuple(images)), references=first)
+        )
 
 
-def walked(
-    work: Path, seed: int, season: int, size: tuple[int, int], frames: int = 300, laps: int = 2, number: int = 0
-) -> Path:
-    """Return the folder of a synthetic walk in ``work``; with a number, that of ``lmdb-build walk --seed``."""
-    folder = work / f"walk_{seed}_{season}_{size[0]}"
+def walked(work: Path, seed: int, size: tuple[int, int], frames: int = 300, laps: int = 2) -> Path:
+    """Return the folder of a synthetic walk in ``work``."""
+    folder = work / f"walk_{seed}_{size[0]}"
     if not (folder / "rgb.txt").exists():
-        start_s = 10_000.0 * (number or season)
-        house = 1000 * seed + number if number else seed
-        walk = Walk(frames=frames, width=size[0], height=size[1], laps=laps, seed=house, season=season, start_s=start_s)
-        for _ in write_walk(folder, walk):
+        for _ in write_walk(folder, Walk(frames=frames, width=size[0], height=size[1], laps=laps, seed=seed)):
             pass
     return folder
 

@@ -19,7 +19,8 @@ from benchmarks.drives import walked
 from benchmarks.pages import RESULTS
 from benchmarks.settings import Kept
 from loopclosure.evaluate import Outcome, judge
-from loopclosure.methods.base import MethodContext, make_method
+from loopclosure.methods.base import MethodContext
+from loopclosure.methods.named import make_method
 from loopclosure.places.datasets import DataSet, load_folder, load_place_pairs, load_sequence
 from loopclosure.places.frames import Selection, image_paths
 from loopclosure.places.sequences import read_sequence
@@ -27,6 +28,7 @@ from loopclosure.places.truth import Exclusion
 
 SETS = ("fr1_rpy", "corridor_loop", "walk", "ESSEX3IN1", "SPED")
 PAIRS = SETS[3:]
+WALK = 900_001  # as lmdb-build walk --seed 900
 TITLES = {
     "fr1_rpy": "fr1_rpy, last 40 %",
     "corridor_loop": "corridor_loop",
@@ -65,7 +67,7 @@ def data_set(name: str, data: Path, work: Path) -> DataSet:
     if name == "corridor_loop":
         return load_folder(data / name / "samples", data / name / "samples_GT.bmp")
     if name == "walk":
-        sequence = read_sequence(walked(work, 900, 1, (160, 120), frames=400, laps=3, number=1), "tum")
+        sequence = read_sequence(walked(work, WALK, (160, 120), frames=400, laps=3), "tum")
         return load_sequence(sequence, exclusion=Exclusion(seconds=10.0))
     return load_place_pairs(data / "place_pairs" / {"SPED": "SPED_Test"}.get(name, name))
 
@@ -81,7 +83,8 @@ def measure(
     """Measure methods on sets, and write the figures over those that are kept; ``words`` are those of the command."""
     work.mkdir(parents=True, exist_ok=True)
     figures = {kind: _kept(kind) for kind in TABLES}
-    train = image_paths(data / "ie_tower")[::4] if any("W" in METHODS[name] for name in methods) else []
+    words_needed = any(METHODS[name][-1] in "WV" for name in methods or METHODS)
+    train = image_paths(data / "ie_tower")[::4] if words_needed else []
     for name in sets or SETS:
         held = data_set(name, data, work)
         kept = Kept(work / "kept" / f"{name}.pickle")

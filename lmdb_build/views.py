@@ -24,6 +24,10 @@ from loopclosure.places.frames import read_bgr
 from loopclosure.progress import Progress, silent
 from netspec.files.opencv import cv2
 
+# Of a batch: at most so many places of one run, more than so many seconds apart.
+PER_RUN, APART_S = 8, 4.0
+# In this share of the pairs the second image is another one, at most so many seconds from the first.
+OTHER, OTHER_S = 0.4, 1.0
 # What changes between two views, drawn for each view.
 ZOOM = 2.0  # the part that is seen has 1 to 1/2 of the image's height
 SHIFT = 0.2  # a pair's views have a common center; each is shifted by up to this share of its margin
@@ -36,43 +40,22 @@ SMOOTHING = 0.4  # standard deviation of the filter before a part is made smalle
 
 @dataclass(frozen=True)
 class Batches:
-    """How views are arranged.
+    """How many batches, the pairs in each, and the part of a run that a batch's places come from.
 
-    count      how many batches
-    size       pairs in a batch, all of different places
-    per_track  of them at most so many from one run
-    apart      places of one run are further apart than this (in units of the stamps)
-    window     and come from a part of the run of this length, at a random position
-    max_gap    a pair's second image may be another one, at most so far from the first
-    other      in this share of the pairs it is, where there is one
-    negatives  in this share of the pairs the second image shows another place of the batch, as ContrastiveLoss wants it
+    The part has the length ``window`` (in units of the stamps) and is at a random position.
     """
 
     count: int
     size: int = 48
-    per_track: int = 8
-    apart: float = 4.0
-    max_gap: float = 1.0
-    other: float = 0.4
-    negatives: float = 0.0
     window: float = float("inf")
 
     def check(self) -> None:
         """Raise InputError for numbers that cannot make a batch."""
-        for name in ("count", "size", "per_track"):
+        for name in ("count", "size"):
             if getattr(self, name) < 1:
-                raise InputError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
-        for name in ("other", "negatives"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"--{name} must be 0 to 1, not {getattr(self, name):g}")
-        if round(self.size * self.negatives) == 1:
-            raise InputError(f"--negatives {self.negatives:g} of --size {self.size} is one pair; expected none or two")
+                raise InputError(f"--{name} must be at least 1, not {getattr(self, name)}")
         if not self.window > 0:
             raise InputError(f"--window must be more than 0, not {self.window:g}")
-        if self.apart < self.max_gap:
-            raise InputError(
-                f"--apart {self.apart:g} is less than --max-gap {self.max_gap:g}: a batch could have one place twice"
-            )
 
 
 @dataclass(frozen=True)
@@ -94,8 +77,8 @@ class Changes:
             raise InputError(f"--calm must be 0 to 1, not {self.calm:g}")
 
 
-def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tuple[Indices, Indices, NDArray[np.bool_]]:
-    """Return first and second images of all pairs (count * size,), batch after batch, and whether both are one place.
+def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tuple[Indices, Indices]:
+    """Return first and second images of all pairs (count * size,), batch after batch.
 
     A batch draws its images from runs in random order; a run is as likely to come first as it is long.
     Raises InputError where all runs together have not enough places for a batch.
@@ -104,52 +87,43 @@ def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tupl
     of_track = [np.flatnonzero(runs.tracks == track) for track in np.unique(runs.tracks)]
     shares = np.array([len(images) for images in of_track]) / len(runs.tracks)
     first: list[int] = []
-    same = np.ones((batches.count, batches.size), bool)
     for _ in range(batches.count):
         batch: list[int] = []
         for track in rng.choice(len(of_track), len(of_track), replace=False, p=shares):
-            batch += _different_places(
-                runs.stamps, rng.permutation(_part(runs.stamps, of_track[track], batches, rng)), batches
-            )
+            part = rng.permutation(_part(runs.stamps, of_track[track], batches.window, rng))
+            batch += _different_places(runs.stamps, part)
             if len(batch) >= batches.size:
                 break
         else:
             raise InputError(
                 f"a batch of {batches.size} different places cannot be made: the {len(of_track)} runs gave "
-                f"{len(batch)}; lower --size or --apart, or raise --per-track"
+                f"{len(batch)}, at most {PER_RUN} of each, more than {APART_S:g} s apart; lower --size"
             )
         first += batch[: batches.size]
-    second = np.array([_partner(runs, image, batches, rng) for image in first])
-    for seconds, sames in zip(second.reshape(same.shape), same, strict=True):
-        exchanged = rng.permutation(batches.size)[: round(batches.size * batches.negatives)]
-        seconds[exchanged] = seconds[np.roll(exchanged, 1)]
-        sames[exchanged] = False
-    return np.array(first), second, same.ravel()
+    return np.array(first), np.array([_partner(runs, image, rng) for image in first])
 
 
-def _part(stamps: NDArray[np.float64], images: Indices, batches: Batches, rng: np.random.Generator) -> Indices:
+def _part(stamps: NDArray[np.float64], images: Indices, window: float, rng: np.random.Generator) -> Indices:
     """Return the images of a run that are in a window at a random position."""
-    if not np.isfinite(batches.window):
+    if not np.isfinite(window):
         return images
     of_run = stamps[images]
-    start = rng.uniform(of_run.min() - batches.window / 2, max(of_run.max() - batches.window / 2, of_run.min()))
-    return images[(of_run >= start) & (of_run <= start + batches.window)]
+    start = rng.uniform(of_run.min() - window / 2, max(of_run.max() - window / 2, of_run.min()))
+    return images[(of_run >= start) & (of_run <= start + window)]
 
 
-def _different_places(stamps: NDArray[np.float64], images: Indices, batches: Batches) -> list[int]:
-    """Return the first ``per_track`` images that are far enough from the earlier ones."""
+def _different_places(stamps: NDArray[np.float64], images: Indices) -> list[int]:
+    """Return the first images that are far enough from the earlier ones."""
     taken: list[int] = []
     for image in images.tolist():
-        if np.all(np.abs(stamps[taken] - stamps[image]) > batches.apart):
+        if len(taken) < PER_RUN and np.all(np.abs(stamps[taken] - stamps[image]) > APART_S):
             taken.append(image)
-            if len(taken) == batches.per_track:
-                break
     return taken
 
 
-def _partner(runs: Runs, image: int, batches: Batches, rng: np.random.Generator) -> int:
-    if rng.random() < batches.other:
-        near = (runs.tracks == runs.tracks[image]) & (np.abs(runs.stamps - runs.stamps[image]) <= batches.max_gap)
+def _partner(runs: Runs, image: int, rng: np.random.Generator) -> int:
+    if rng.random() < OTHER:
+        near = (runs.tracks == runs.tracks[image]) & (np.abs(runs.stamps - runs.stamps[image]) <= OTHER_S)
         others = np.flatnonzero(near & (np.arange(len(near)) != image))
         if len(others):
             return int(rng.choice(others))
@@ -195,7 +169,7 @@ def write_views(
     if seed < 0:
         raise InputError(f"a seed must be 0 or more, not {seed}")
     changes.check()
-    first, second, same = choose_views(runs, batches, np.random.default_rng([seed, 0]))
+    first, second = choose_views(runs, batches, np.random.default_rng([seed, 0]))
     folder.mkdir(parents=True, exist_ok=True)
     listed = []
     for number, pair in enumerate(progress(zip(first, second, strict=True), "views", len(first))):
@@ -209,16 +183,14 @@ def write_views(
             )
             other = partial(read_bgr, root / runs.names[rng.integers(len(runs.names))])  # few views need it
             write_jpeg(folder.parent / name, change_light(view, other, rng, changes.calm))
-        listed.append((*names, int(same[number])))
+        listed.append((*names, 1))
     out = folder.with_name(f"{folder.name}.txt")
     settings = {
         "source": f"{len(runs.names)} images of {len(np.unique(runs.tracks))} runs",
-        "batches": f"{batches.count} of {batches.size} places, up to {batches.per_track} of one run, "
-        f"more than {batches.apart:g} apart, in a part of {batches.window:g}",
-        "second image": f"a different one in {batches.other:g} of the pairs, up to {batches.max_gap:g} away",
+        "batches": f"{batches.count} of {batches.size} places, up to {PER_RUN} of one run, "
+        f"more than {APART_S:g} apart, in a part of {batches.window:g}",
         "point of view": f"{changes.viewpoint:g} times as different",
         "calm": f"{changes.calm:g} of the views",
-        "negatives": f"{batches.negatives:g} of the pairs",
         "seed": str(seed),
     }
     write_pair_list(out, listed, settings)

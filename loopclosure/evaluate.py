@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodContext, make_method
+from loopclosure.methods.base import Images, Method, MethodContext
+from loopclosure.methods.named import make_method
 from loopclosure.places.datasets import DataSet
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import ALL_PAIRS, BestMatches, JudgedScores, PrecisionRecall

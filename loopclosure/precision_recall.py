@@ -62,11 +62,6 @@ class PrecisionRecall:
             return float("nan")
         return float(np.max(self.recall[self.precision >= wanted], initial=0.0))
 
-    def threshold_for_precision(self, wanted: float) -> float | None:
-        """Return the highest threshold with the greatest recall among those with at least this precision."""
-        good = np.flatnonzero((self.precision >= wanted) & (self.recall > 0))
-        return float(self.thresholds[good[np.argmax(self.recall[good])]]) if len(good) else None
-
     @property
     def best_f1(self) -> float:
         """The greatest F1 of any threshold."""

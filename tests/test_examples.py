@@ -9,7 +9,8 @@ import pytest
 
 import forked
 from loopclosure.evaluate import judge
-from loopclosure.methods.base import MethodContext, make_method
+from loopclosure.methods.base import MethodContext
+from loopclosure.methods.named import make_method
 from loopclosure.places.datasets import load_traverses
 from loopclosure.places.frames import read_bgr
 from netspec.inspect.features.describer import Describer

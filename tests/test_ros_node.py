@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from lmdb_build.cli import main as lmdb_build
-from loopclosure.closing.drift import ate_rmse_m, drifted
+from loopclosure.closing.close import ate_rmse_m, drifted
 from loopclosure.places.sequences import read_sequence
 from paths import ROOT
 

@@ -1,4 +1,4 @@
-"""The command ``lmdb-build``: one module for each command or family of commands; it computes nothing."""
+"""The command ``lmdb-build``: one module for each group of commands; it computes nothing."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from lmdb_build.cli import compare, convert, lists, pairs, views, walk
+from lmdb_build.cli import databases, images, pairs
 from netspec.files.opencv import cv2
 from netspec.terminal.commands import Commands, program, run
-
-_FAMILIES = (walk, pairs, views, lists, convert, compare)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -25,6 +23,6 @@ def parser() -> argparse.ArgumentParser:
         "lmdb-build", "From image sequences to labeled pairs, to databases that Caffe reads, to a table of nets."
     )
     commands = Commands(made)
-    for family in _FAMILIES:
-        family.add_to(commands)
+    for group in (images, pairs, databases):
+        commands.table(group.COMMANDS)
     return made

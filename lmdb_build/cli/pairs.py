@@ -1,4 +1,4 @@
-"""``lmdb-build pairs``."""
+"""``lmdb-build pairs``, ``sheet`` and ``join``: lists of labeled pairs."""
 
 from __future__ import annotations
 
@@ -19,14 +19,25 @@ from lmdb_build.pairs.by_list import (
 )
 from lmdb_build.pairs.by_pose import NEGATIVES, PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import SPLITS, PairSource
+from lmdb_build.pairs.list_file import join_lists, root_of, write_contact_sheet
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.errors import InputError
-from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_posed
-from loopclosure.places.source import POSES, TOPICS, Source, read_source
+from loopclosure.places.source import (
+    LAYOUTS,
+    POSE_FORM_HELP,
+    POSES,
+    POSES_HELP,
+    RECORDED,
+    TOPICS,
+    Source,
+    extract,
+    is_recording,
+    read_source,
+)
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
-from netspec.terminal.commands import Commands, WrongUsage, above_zero, refuse, seed
+from netspec.terminal.commands import WrongUsage, above_zero, refuse, seed
 from netspec.terminal.output import bar, warn
 
 SEQUENCES = ("", *LAYOUTS)
@@ -69,55 +80,6 @@ POSED = (
 )
 
 
-def add_to(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add("pairs", _pairs, "choose labeled pairs and write their lists")
-    add = parser.add_argument
-    parser.epilog, parser.formatter_class = HELP, argparse.RawDescriptionHelpFormatter
-    add("sources", type=_source_text, nargs="+", metavar="SOURCE", help="sequences with poses, or one other, see below")
-    add("--out", type=Path, required=True, help="folder for train.txt, val.txt and test.txt")
-    add("--root", type=Path, help="folder that the lists' names are relative to (the sources' common parent)")
-
-    rule = parser.add_argument_group("what is the same place")
-    rule.add_argument("--max-distance", type=above_zero, default=MAX_DISTANCE_M, help="meters; less is a positive (2)")
-    rule.add_argument("--max-angle", type=above_zero, default=MAX_ANGLE_DEG, help="degrees; less is a positive (15)")
-    rule.add_argument("--min-gap", type=float, help="leave out pairs nearer in time: seconds (images: frames) (0)")
-    rule.add_argument("--negatives", choices=NEGATIVES, default="both", help="where negatives come from (both)")
-    rule.add_argument("--clear-distance", type=float, metavar="M", help="negatives by pose are at least this far apart")
-    rule.add_argument("--clear-view-angle", type=float, metavar="DEG", help="or their viewing axes are")
-    sets = {"type": _names, "action": "append", "default": [], "metavar": "A,B"}
-    rule.add_argument("--same-scene", **sets, help="sequences of one room: no pair is made across them")
-    rule.add_argument("--same-frame", **sets, help="sequences whose poses share a frame: labeled by pose across them")
-    rule.add_argument("--different-scenes", action="store_true", help="all other sequences show different rooms")
-    rule.add_argument(
-        "--max-difference", type=float, default=MAX_DIFFERENCE_S, help="longest time from image to pose, seconds (0.03)"
-    )
-
-    choice = parser.add_argument_group("the choice")
-    for split, number in zip(SPLITS, (30000, 6000, 6000), strict=True):
-        choice.add_argument(
-            f"--{split}", type=int, default=number, metavar="N", help=f"pairs, half positive ({number})"
-        )
-    choice.add_argument("--at-most", action="store_true", help="take fewer pairs if there are not enough")
-    choice.add_argument(
-        "--split", choices=("time", "sequence"), help="by stretches of time, or by whole sequences (places, groups)"
-    )
-    choice.add_argument(
-        "--shares", type=_shares, default=(0.6, 0.2, 0.2), help="shares of the images per split (0.6,0.2,0.2)"
-    )
-    choice.add_argument("--split-gap", type=float, default=0.0, help="seconds left out between two splits (0)")
-    for split in SPLITS:
-        choice.add_argument(f"--{split}-sequences", type=_names, metavar="A,B", help=f"sequences (groups) of {split}")
-    choice.add_argument(
-        "--hard-negatives", type=Path, metavar="NPZ", help="choose negatives that are near by these features"
-    )
-    choice.add_argument("--hard-share", type=float, default=0.5, help="share of such negatives (0.5)")
-    choice.add_argument(
-        "--warp-share", type=float, default=0.0, help="share of pairs in which one image is a warped copy (0)"
-    )
-    choice.add_argument("--seed", type=seed, default=1, help="seed of the random choice (1)")
-
-
 def _pairs(arguments: argparse.Namespace) -> None:
     named = {split: names for split in SPLITS if (names := getattr(arguments, f"{split}_sequences"))}
     source, root = _source(arguments)
@@ -135,7 +97,7 @@ def _pairs(arguments: argparse.Namespace) -> None:
         at_most=arguments.at_most,
         features=read_features(arguments.hard_negatives) if arguments.hard_negatives else None,
         hard_share=arguments.hard_share,
-        warp_share=1.0 if arguments.sources[0].kind == "singles" else arguments.warp_share,
+        warp_share=1.0 if arguments.source[0].kind == "singles" else arguments.warp_share,
     )
     lists = build_lists(source, plan, root, arguments.out, print, warn, bar)
     print(f"wrote {', '.join(map(str, lists.values()))}; the names of images in them are relative to {root}/")
@@ -157,7 +119,7 @@ def _source_text(text: str) -> Source:
 
 def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
     """Open the sources; return them as one, and the root folder."""
-    first, *others = arguments.sources
+    first, *others = arguments.source
     path, kind = first.path, first.kind
     if (kind not in SEQUENCES and others) or any(each.kind not in SEQUENCES for each in others):
         raise WrongUsage(f"{kind or 'sequences'}: only sequences may be several; name one source of another kind")
@@ -203,7 +165,7 @@ def _camera(source: Source) -> str:
 def _sequences(arguments: argparse.Namespace) -> list[tuple[str, Path, PoseChoice | None]]:
     """Return layout, folder and poses of every sequence; bags and videos are extracted below --out."""
     found = []
-    for source in arguments.sources:
+    for source in arguments.source:
         path, layout, poses = source.path, source.kind, source.pose_choice()
         if layout in RECORDED or (not layout and is_recording(path)):
             topics = source.get("topic", str) or "", source.get("pose-topic", str) or ""
@@ -248,3 +210,61 @@ def _shares(text: str) -> tuple[float, ...]:
     if len(shares) != len(SPLITS):
         raise argparse.ArgumentTypeError(f'expected three numbers for {", ".join(SPLITS)}, found "{text}"')
     return shares
+
+
+def _sheet(arguments: argparse.Namespace) -> None:
+    root = arguments.root or root_of(arguments.list)
+    write_contact_sheet(arguments.list, root, arguments.picture, arguments.rows, arguments.seed)
+    print(arguments.picture)
+
+
+def _join(arguments: argparse.Namespace) -> None:
+    number, root = join_lists(arguments.list, arguments.out, arguments.seed, arguments.root)
+    print(f"{arguments.out}: {number} pairs, images below {root}")
+
+
+PAIRS = (
+    ("SOURCE...", _source_text, None, "sequences with poses, or one other, see below"),
+    ("--out FOLDER", Path, ..., "folder for train.txt, val.txt and test.txt"),
+    ("--root FOLDER", Path, None, "folder that the lists' names are relative to (the sources' common parent)"),
+    "what is the same place",
+    ("--max-distance M", above_zero, MAX_DISTANCE_M, "less is a positive"),
+    ("--max-angle DEG", above_zero, MAX_ANGLE_DEG, "less is a positive"),
+    ("--min-gap S", float, None, "leave out pairs nearer in time: seconds (images: frames) (default: 0)"),
+    ("--negatives", NEGATIVES, "both", "where negatives come from"),
+    ("--clear-distance M", float, None, "negatives by pose are at least this far apart"),
+    ("--clear-view-angle DEG", float, None, "or their viewing axes are"),
+    ("--same-scene A,B", [_names], None, "sequences of one room: no pair is made across them"),
+    ("--same-frame A,B", [_names], None, "sequences whose poses share a frame: labeled by pose across them"),
+    ("--different-scenes", bool, False, "all other sequences show different rooms"),
+    ("--max-difference S", float, MAX_DIFFERENCE_S, "longest time from image to pose"),
+    "the choice",
+    *((f"--{split} N", int, n, "pairs, half positive") for split, n in zip(SPLITS, (30000, 6000, 6000), strict=True)),
+    ("--at-most", bool, False, "take fewer pairs if there are not enough"),
+    ("--split", ("time", "sequence"), None, "by stretches of time, or by whole sequences (places, groups)"),
+    ("--shares A,B,C", _shares, (0.6, 0.2, 0.2), "shares of the images per split (default: 0.6,0.2,0.2)"),
+    ("--split-gap S", float, 0.0, "time left out between two splits"),
+    *((f"--{split}-sequences A,B", _names, None, f"sequences (groups) of {split}") for split in SPLITS),
+    ("--hard-negatives NPZ", Path, None, "choose negatives that are near by these features"),
+    ("--hard-share SHARE", float, 0.5, "share of such negatives"),
+    ("--warp-share SHARE", float, 0.0, "share of pairs in which one image is a warped copy"),
+    ("--seed N", seed, 1, "seed of the random choice"),
+)
+SHEET = (
+    ("LIST", Path, None, "a list of pairs"),
+    ("PICTURE", Path, None, "the picture to write, such as sheet.png"),
+    ("--root FOLDER", Path, None, "folder of the images (default: as in the list's header)"),
+    ("--rows N", int, 6, "pairs of each label"),
+    ("--seed N", seed, 1, "seed of the random choice"),
+)
+JOIN = (
+    ("OUT", Path, None, "the list to write"),
+    ("LIST...", Path, None, "lists of pairs"),
+    ("--root FOLDER", Path, None, "folder that the names are relative to (the lists' roots' parent)"),
+    ("--seed N", seed, 1, "seed of the random order"),
+)
+COMMANDS = (
+    ("pairs", _pairs, "choose labeled pairs and write their lists", PAIRS, HELP),
+    ("sheet", _sheet, "draw sample pairs of a list as a picture", SHEET),
+    ("join", _join, "shuffle several lists into one", JOIN),
+)

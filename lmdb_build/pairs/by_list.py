@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, Indices
-from lmdb_build.pairs.table import as_number, cell, read_table, relative
+from lmdb_build.pairs.runs import as_number, cell, read_table, relative
 from loopclosure.errors import InputError
-from loopclosure.places import cameras
+from loopclosure.places import masks
 from loopclosure.places.frames import image_paths
 from loopclosure.places.masks import read_matches, read_truth_matrix
 
-CAMERAS = tuple(camera for camera in cameras.CAMERAS if camera != "joined")  # a pair is two files
+CAMERAS = tuple(camera for camera in masks.CAMERAS if camera != "joined")  # a pair is two files
 
 
 class MaskSource:
@@ -31,13 +31,13 @@ class MaskSource:
 
         A mask does not mark neighbors in time, though they show one place: pairs nearer than ``min_gap`` images are
         left out; by default pairs nearer than the nearest marked pair. Soft entries of the mask are left out too.
-        ``camera`` says which images are taken: see loopclosure.places.cameras.
+        ``camera`` says which images are taken: see loopclosure.places.masks.images_of_places.
         """
         hard, soft = read_truth_matrix(mask)
         paths = image_paths(images)
-        places = cameras.images_of_places(camera, len(paths))
-        hard, soft = (cameras.mask_of_places(camera, matrix, len(paths), mask) for matrix in (hard, soft))
-        self._judged = cameras.comparable(camera, places)
+        places = masks.images_of_places(camera, len(paths))
+        hard, soft = (masks.mask_of_places(camera, matrix, len(paths), mask) for matrix in (hard, soft))
+        self._judged = masks.comparable(camera, places)
         self._hard, self._soft = (hard | hard.T) & self._judged, soft | soft.T
         self.names = [relative(paths[image], root) for image in places[:, 0]]
         count = len(self.names)

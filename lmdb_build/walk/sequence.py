@@ -2,9 +2,8 @@
 
 The quick start and the tests use it instead of a data set to download. The camera is carried around a house
 (:mod:`lmdb_build.walk.house`) several times, so that places are seen again: each lap at another time of day, with small
-changes of position and direction. A walk in another season (:mod:`lmdb_build.walk.season`) takes the same path through
-the same house. Poses are exact and the geometry is correct, so the paper's rule of the same place means the same as
-with real images. Every picture follows from the seed.
+changes of position and direction. Poses are exact and the geometry is correct, so the paper's rule of the same place
+means the same as with real images. Every picture follows from the seed.
 """
 
 from __future__ import annotations
@@ -20,18 +19,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lmdb_build.picture import write_depth, write_jpeg
-from lmdb_build.walk.house import House, build_house
+from lmdb_build.walk.house import HEIGHT_M, House, build_house
 from lmdb_build.walk.render import Camera, Light, Renderer
-from lmdb_build.walk.season import redecorate, weather
 from lmdb_build.walk.textures import Image
 from loopclosure.errors import InputError
-from loopclosure.places.trajectory import (
-    Frame,
-    Poses,
-    Trajectory,
-    write_rgb_list,
-    write_trajectory,
-)
+from loopclosure.places.trajectory import Frame, Poses, Trajectory, write_rgb_list, write_trajectory
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import write_whole
 
@@ -51,8 +43,7 @@ NOISE = 3.0  # standard deviation of the sensor's noise, in gray levels
 class Walk:
     """A walk: ``frames`` pictures of ``width`` x ``height`` pixels over ``laps`` laps of a house.
 
-    ``start_s`` is the time of the first picture, in seconds. Walks that differ only in ``season`` are traverses of one
-    route. With ``depth``, each picture's depth is written too.
+    ``start_s`` is the time of the first picture, in seconds. With ``depth``, each picture's depth is written too.
     """
 
     frames: int = 400
@@ -62,18 +53,11 @@ class Walk:
     rooms: int = 4
     seed: int = 1
     start_s: float = 1000.0
-    season: int = 1
     depth: bool = False
 
     def check(self) -> None:
         """Raise InputError for numbers out of range."""
-        limits = {
-            "frames": (2, 1_000_000),
-            "width": (32, 4096),
-            "height": (32, 4096),
-            "laps": (1, 1000),
-            "season": (1, 999),
-        }
+        limits = {"frames": (2, 1_000_000), "width": (32, 4096), "height": (32, 4096), "laps": (1, 1000)}
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"a walk's {name} must be {low} to {high}, not {getattr(self, name)}")
@@ -98,7 +82,7 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     if (folder / "rgb.txt").exists():
         raise InputError("holds a sequence already; give another folder or remove this one", folder)
     (folder / "rgb").mkdir(parents=True, exist_ok=True)
-    house = redecorate(build_house(walk.seed, walk.rooms), walk.seed, walk.season)
+    house = build_house(walk.seed, walk.rooms)
     carrier = _Carrier(house, walk)
     step_s = float(carrier.duration_s) / walk.frames
     times = step_s * np.arange(walk.frames, dtype=np.float64)
@@ -130,38 +114,30 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
 
 def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iterator[tuple[Image, NDArray[np.float32]]]:
     """Yield each picture (H, W, 3), and its depth (H, W) in meters."""
-    rng = _generator(walk, 4)
-    outside = weather(walk.seed, walk.season)
-    noise = rng.normal(0, NOISE * outside.noise, (walk.height + 64, walk.width + 64, 3)).astype(np.int8)
+    rng = np.random.default_rng([walk.seed, 4])
+    noise = rng.normal(0, NOISE, (walk.height + 64, walk.width + 64, 3)).astype(np.int8)
     poses = carrier.poses(times)
     rotations = Rotation.from_quat(poses.quaternions).as_matrix()
     laps = np.minimum(carrier.walked_m(times) // house.way_length_m, walk.laps - 1).astype(int)
-    renderer: Renderer | None = None
+    renderer = Renderer(house, walk.camera, lap_light(walk, house, 0))
     for index, (position, rotation) in enumerate(zip(poses.positions, rotations, strict=True)):
-        if renderer is None:
-            renderer = Renderer(house, walk.camera, lap_light(walk, laps[index]))
-        elif laps[index] != laps[index - 1]:
-            renderer.relight(lap_light(walk, laps[index]))
-        picture = cv2.GaussianBlur(renderer.draw(position, rotation), (3, 3), outside.blur)
-        picture = cv2.convertScaleAbs(picture, alpha=1 - outside.veil, beta=128 * outside.veil)
+        if index and laps[index] != laps[index - 1]:
+            renderer.relight(lap_light(walk, house, laps[index]))
+        picture = cv2.GaussianBlur(renderer.draw(position, rotation), (3, 3), 0.5)
         y, x = rng.integers(0, 64, 2)
         yield cv2.add(picture, noise[y : y + walk.height, x : x + walk.width], dtype=cv2.CV_8U), renderer.depth
 
 
-def _generator(walk: Walk, *stream: int) -> np.random.Generator:
-    """Return the generator of one random quantity; season 1 draws what a walk without seasons draws."""
-    return np.random.default_rng([walk.seed, *stream, *([walk.season] if walk.season > 1 else [])])
-
-
-def lap_light(walk: Walk, lap: int) -> Light:
-    """Return the light of a lap: daylight on the first, a random time of day on later ones, with some lamps on."""
-    rng = _generator(walk, 3, lap)
-    day = (0.9 if lap == 0 else rng.uniform(0.25, 1.1)) * weather(walk.seed, walk.season).day
+def lap_light(walk: Walk, house: House, lap: int) -> Light:
+    """Return the light of a lap: bright on the first; later another time of day, and a lamp elsewhere in each room."""
+    rng = np.random.default_rng([walk.seed, 3, lap])
+    day = 0.9 if lap == 0 else rng.uniform(0.25, 1.1)
     warmth = rng.uniform(-0.12, 0.12)  # blue sky or evening sun
-    daylight = day * np.array([1 - warmth, 1, 1 + warmth])
-    on = rng.uniform(size=walk.rooms) < 0.4 + 0.5 * (day < 0.6)
-    lamps = np.where(on, rng.uniform(0.5, 1.0, walk.rooms), 0.05)[:, None] * np.array([0.78, 0.94, 1.05])
-    return Light(0.3 * daylight + 0.22, daylight, lamps)
+    ambient = 0.22 + 0.45 * day * np.array([1 - warmth, 1, 1 + warmth])
+    lamps = rng.uniform(0.3, 1.4, walk.rooms)[:, None] * np.array([0.78, 0.94, 1.05])
+    low, high = np.reshape([room.bounds for room in house.rooms], (-1, 2, 2)).swapaxes(0, 1)
+    places = np.column_stack([rng.uniform(low, high), rng.uniform(1, HEIGHT_M, walk.rooms)])
+    return Light(ambient, lamps, places)
 
 
 class _Carrier:
@@ -173,9 +149,6 @@ class _Carrier:
         rng = np.random.default_rng([walk.seed, 5])
         self._phases = rng.uniform(0, 2 * np.pi, 6)
         self._glances = int(rng.integers(7, 12))
-        self._again = walk.season > 1
-        if self._again:
-            self._phases = _generator(walk, 5).uniform(0, 2 * np.pi, 6)
         step = np.roll(house.way, -1, axis=0) - np.roll(house.way, 1, axis=0)
         self._yaw = _smooth_angles(np.arctan2(step[:, 1], step[:, 0]), 0.35 / house.step_m)
 
@@ -193,7 +166,7 @@ class _Carrier:
         # The direction of the path may make a full turn in a lap: interpolate it as a vector.
         along = np.arctan2(_periodic(at, np.sin(self._yaw)), _periodic(at, np.cos(self._yaw)))
         # 0 on the first lap of all, 1 on the others.
-        later = np.ones_like(walked) if self._again else np.clip(walked / lap_m - 0.9, 0, 0.1) / 0.1
+        later = np.clip(walked / lap_m - 0.9, 0, 0.1) / 0.1
         side = later * SIDE_STEP_M * _sway(walked, (7.3, 17.1), self._phases[1:3])
         turn = later * TURN_DEG * _sway(walked, (9.7, 23.9), self._phases[3:5])
         glance = GLANCE_DEG * np.sin(2 * np.pi * self._glances * walked / lap_m)

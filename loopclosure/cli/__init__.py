@@ -1,4 +1,4 @@
-"""The command line: one module for each command; it parses arguments, shows progress and computes nothing."""
+"""The command line: one module for each group of commands; it parses arguments, shows progress and computes nothing."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from loopclosure.cli import close, compare, detect, evaluate, map, similarity
+from loopclosure.cli import close, detect, evaluate
 from netspec.terminal.commands import Commands, program, run
-
-_COMMANDS = (evaluate, compare, detect, close, map, similarity)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -21,6 +19,8 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
     made = program("loopclosure", "Evaluate, detect and close loops.")
     commands = Commands(made, quiet=True)
-    for command in _COMMANDS:
-        command.add_to(commands)
+    for group in (evaluate, detect, close):
+        commands.table(group.COMMANDS)
+    maps = commands.group("map", "keep a map of several drives on disk: build it, add to it, query it")
+    Commands(maps, quiet=True).table(detect.MAP_COMMANDS)
     return made

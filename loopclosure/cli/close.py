@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.cli.data_set import sequence, typed
-from loopclosure.closing.close import Closed, close, summary, write_closed
-from loopclosure.closing.drift import drifted
+from loopclosure.closing.close import Closed, close, drifted, summary, write_closed
 from loopclosure.closing.g2o import read_pose_graph, solve_pose_graph, write_solution
 from loopclosure.closing.g2o import summary as graph_summary
 from loopclosure.closing.measure import measure, read_loops
@@ -20,46 +19,12 @@ from loopclosure.places.pose_files import pose_form, read_poses
 from loopclosure.places.sequences import ImageSequence
 from loopclosure.places.source import FRAMES, POSES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, write_closed_paths
-from netspec.terminal.commands import Commands, WrongUsage, seed
+from netspec.terminal.commands import WrongUsage, seed
 from netspec.terminal.output import bar, warn
 
 # What belongs to frames, and means nothing to --graph.
-OF_FRAMES = (
-    "loops",
-    "odometry",
-    "drift",
-    "odometry_form",
-    "seed",
-    "camera",
-    "rerun",
-)
+OF_FRAMES = ("loops", "odometry", "drift", "odometry_form", "seed", "camera", "rerun")
 ALL = "all"  # --loops of a graph in which none is false
-
-
-def add_to(commands: Commands) -> None:
-    """Add the command."""
-    p = commands.add("close", _close, "correct a path by the loops that detect found")
-    p.add_argument(
-        "source",
-        nargs="?",
-        metavar="SOURCE",
-        help="the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag; with "
-        f"{', '.join((*POSES, *TOPICS))} behind it, as in drive.mp4,poses=slam.txt",
-    )
-    p.add_argument("--graph", type=Path, metavar="IN.g2o", help="a pose graph to solve as it is, instead of frames")
-    p.add_argument(
-        "--loops", metavar="CSV", help="the loops.csv that detect wrote; with --graph: all, if no loop of it is false"
-    )
-    path = p.add_mutually_exclusive_group()
-    path.add_argument("--odometry", type=Path, metavar="FILE", help="the path to correct: poses of TUM, KITTI or EuRoC")
-    path.add_argument(
-        "--drift", type=float, metavar="PERCENT", help="simulate odometry that drifts, from the true poses"
-    )
-    p.add_argument("--odometry-form", metavar="WORDS", help="how --odometry is written, as pose-form")
-    p.add_argument("--seed", type=seed, metavar="N", help="of --drift (default: 1)")
-    p.add_argument("--camera", metavar="NUMBERS", help=f"{intrinsics.FORM}, if the source does not say")
-    p.add_argument("--rerun", metavar="F.rrd", help="write images, both paths and loops for the viewer of rerun.io")
-    p.add_argument("--out", required=True, metavar="FOLDER", help="where closed.g2o, closed.txt and paths.png go")
 
 
 def _close(a: argparse.Namespace) -> None:
@@ -88,7 +53,7 @@ def _close(a: argparse.Namespace) -> None:
     closed = close(odometry, loops, frames.poses)
     write_closed(out, closed, frames.stamps, frames.names)
     # Drawing takes seconds to import, which the other commands need not wait for.
-    from loopclosure.report.paths import draw_paths
+    from loopclosure.report.plots import draw_paths
 
     draw_paths(out / "paths.png", closed)
     if a.rerun:
@@ -108,7 +73,7 @@ def _close_graph(a: argparse.Namespace, out: Path) -> None:
     graph = read_pose_graph(a.graph)
     solution = solve_pose_graph(graph, a.loops == ALL)
     write_solution(out, graph, solution)
-    from loopclosure.report.paths import draw_paths
+    from loopclosure.report.plots import draw_paths
 
     ends = graph.poses, solution.poses, graph.steps, graph.loops
     draw_paths(out / "paths.png", Closed(graph.ids, *ends, [], solution.accepted, 0), ("before", "after"))
@@ -131,3 +96,24 @@ def _odometry(a: argparse.Namespace, frames: ImageSequence) -> np.ndarray:
     path = frames.poses.copy()
     path[known] = drifted(path[known], a.drift, 1 if a.seed is None else a.seed)
     return path
+
+
+SOURCE = (
+    "the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag; with "
+    f"{', '.join((*POSES, *TOPICS))} behind it, as in drive.mp4,poses=slam.txt"
+)
+CLOSE = (
+    ("[SOURCE]", str, None, SOURCE),
+    ("--graph IN.g2o", Path, None, "a pose graph to solve as it is, instead of frames"),
+    ("--loops CSV", str, None, "the loops.csv that detect wrote; with --graph: all, if no loop of it is false"),
+    [
+        ("--odometry FILE", Path, None, "the path to correct: poses of TUM, KITTI or EuRoC"),
+        ("--drift PERCENT", float, None, "simulate odometry that drifts, from the true poses"),
+    ],
+    ("--odometry-form WORDS", str, None, "how --odometry is written, as pose-form"),
+    ("--seed N", seed, None, "of --drift (default: 1)"),
+    ("--camera NUMBERS", str, None, f"{intrinsics.FORM}, if the source does not say"),
+    ("--rerun F.rrd", str, None, "write images, both paths and loops for the viewer of rerun.io"),
+    ("--out FOLDER", str, ..., "where closed.g2o, closed.txt and paths.png go"),
+)
+COMMANDS = (("close", _close, "correct a path by the loops that detect found", CLOSE),)

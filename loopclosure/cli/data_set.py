@@ -9,12 +9,24 @@ from loopclosure.detector.run import Recording, open_recording
 from loopclosure.errors import InputError
 from loopclosure.places import datasets
 from loopclosure.places.bags import is_bag
-from loopclosure.places.cameras import CAMERAS
-from loopclosure.places.extraction import LAYOUTS, POSE_FORM_HELP, POSES_HELP, RECORDED, extract, is_recording
+from loopclosure.places.masks import CAMERAS
 from loopclosure.places.overlap import FOV_DEG, ViewOverlap
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import ImageSequence, benchmark_parts, layout_of, read_sequence
-from loopclosure.places.source import FRAMES, POSES, TOPICS, Kinds, Source, read_source
+from loopclosure.places.source import (
+    FRAMES,
+    LAYOUTS,
+    POSE_FORM_HELP,
+    POSES,
+    POSES_HELP,
+    RECORDED,
+    TOPICS,
+    Kinds,
+    Source,
+    extract,
+    is_recording,
+    read_source,
+)
 from loopclosure.places.truth import Exclusion
 from netspec.terminal.commands import WrongUsage, above_zero, refuse
 from netspec.terminal.output import bar, warn
@@ -49,39 +61,24 @@ RULE = ("max_distance", "max_angle", "soft_distance", "soft_angle", "fov", "over
 TRAVERSES = ("tolerance", "soft_tolerance")
 
 
-def add_data_set(p: argparse.ArgumentParser) -> None:
-    """Add the arguments of :func:`data_set`."""
-    p.epilog, p.formatter_class = HELP, argparse.RawDescriptionHelpFormatter
-    p.add_argument("source", metavar="SOURCE", help="the data set, see below")
-    p.add_argument("--tolerance", type=int, metavar="FRAMES", help="of traverses (default: 0)")
-    p.add_argument("--soft-tolerance", type=int, metavar="FRAMES", help="a match up to here is ignored, not wrong")
-    p.add_argument("--max-distance", type=above_zero, metavar="M", help=f"of poses (default: {MAX_DISTANCE_M:g})")
-    p.add_argument("--max-angle", type=above_zero, metavar="DEG", help=f"of poses (default: {MAX_ANGLE_DEG:g})")
-    p.add_argument("--soft-distance", type=above_zero, metavar="M", help="a match up to here is ignored, not wrong")
-    p.add_argument("--soft-angle", type=above_zero, metavar="DEG", help="the same, for the angle")
-    p.add_argument(
-        "--fov", type=float, metavar="DEG", help=f"horizontal field of view (default: the camera's, or {FOV_DEG:g})"
-    )
-    p.add_argument(
-        "--overlap",
-        type=float,
-        metavar="SHARE",
-        help="the soft zone: a match is no mistake if so much of each view is visible in the other "
-        f"(default: {ViewOverlap().least:g})",
-    )
-    p.add_argument(
-        "--exclude-frames",
-        type=int,
-        metavar="N",
-        help=f"frames i and j with |i - j| <= N are no pair (default: fabmap {datasets.FABMAP_EXCLUSION.frames}, "
-        f"images {datasets.FOLDER_EXCLUSION.frames})",
-    )
-    p.add_argument(
-        "--exclude-seconds",
-        type=float,
-        metavar="S",
-        help=f"frames less than S seconds apart are no pair (default: with times {datasets.TUM_EXCLUSION.seconds:g})",
-    )
+EXCLUDED = f"fabmap {datasets.FABMAP_EXCLUSION.frames}, images {datasets.FOLDER_EXCLUSION.frames}"
+OVERLAP = "the soft zone: a match is no mistake if so much of each view is visible in the other"
+DATA_SET = (
+    ("SOURCE", str, None, "the data set, see below"),
+    ("--tolerance FRAMES", int, None, "of traverses (default: 0)"),
+    ("--soft-tolerance FRAMES", int, None, "a match up to here is ignored, not wrong"),
+    ("--max-distance M", above_zero, None, f"of poses (default: {MAX_DISTANCE_M:g})"),
+    ("--max-angle DEG", above_zero, None, f"of poses (default: {MAX_ANGLE_DEG:g})"),
+    ("--soft-distance M", above_zero, None, "a match up to here is ignored, not wrong"),
+    ("--soft-angle DEG", above_zero, None, "the same, for the angle"),
+    ("--fov DEG", float, None, f"horizontal field of view (default: the camera's, or {FOV_DEG:g})"),
+    ("--overlap SHARE", float, None, f"{OVERLAP} (default: {ViewOverlap().least:g})"),
+    ("--exclude-frames N", int, None, f"frames i and j with |i - j| <= N are no pair (default: {EXCLUDED})"),
+    (
+        *("--exclude-seconds S", float, None),
+        f"frames less than S seconds apart are no pair (default: with times {datasets.TUM_EXCLUSION.seconds:g})",
+    ),
+)
 
 
 def typed(text: str, kinds: Kinds) -> Source:

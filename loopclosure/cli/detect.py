@@ -1,9 +1,10 @@
-"""``loopclosure detect``."""
+"""``loopclosure detect``, and ``loopclosure map``: loops within a drive, and with those of earlier drives."""
 
 from __future__ import annotations
 
 import argparse
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,90 +17,26 @@ from loopclosure.detector import run
 from loopclosure.detector.decision import DetectorSettings, LoopResult
 from loopclosure.detector.detector import Describe, LoopDetector
 from loopclosure.detector.export import write_g2o, write_loops_csv
+from loopclosure.detector.map import Map, checked_name
 from loopclosure.detector.verification import GeometricCheck
+from loopclosure.detector.visitor import Visitor
+from loopclosure.index.index import INDEXES
 from loopclosure.methods.auto import PRECISION
 from loopclosure.methods.drive import last_session, whole_drive
 from loopclosure.methods.features import WhitenBy
-from loopclosure.places.live import live_frames
+from loopclosure.places.frames import live_frames
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.source import FRAMES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
 from netspec.files.whole_file import write_whole
-from netspec.terminal.commands import Commands, WrongUsage
+from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
 
 # The detector's settings that --resume takes from the saved one.
-SETTINGS = (
-    "metric",
-    "exclude_recent",
-    "exclude_seconds",
-    "top_k",
-    "threshold",
-    "consistency",
-    "consistency_window",
-)
+SETTINGS = ("metric", "exclude_recent", "exclude_seconds", "top_k", "threshold", "consistency", "consistency_window")
 RECENT_SECONDS = 10.0  # of --video: the present place does not count as seen again
 # Settings of the search frame by frame.
 ONLINE = ("top_k", "consistency", "consistency_window")
-
-
-def add_to(commands: Commands) -> None:
-    """Add the command."""
-    p = commands.add("detect", _detect, "find the loops in a folder of images or a video")
-    p.add_argument(
-        "source",
-        nargs="?",
-        metavar="SOURCE",
-        help="a folder or list of images, a sequence (TUM, EuRoC, KITTI), a video or a ROS bag; with "
-        f"{', '.join((*FRAMES, *TOPICS))} behind it, as in drive.bag,stride=2,topic=/cam0",
-    )
-    p.add_argument(
-        "--video", metavar="CAMERA|URL|FILE", help="decide as images come, of camera 0, rtsp://HOST/PATH or a file"
-    )
-    p.add_argument("--out", required=True, metavar="FOLDER", help="where loops.csv, and loops.g2o with poses, go")
-    how = p.add_mutually_exclusive_group()
-    how.add_argument(
-        "--describe",
-        default="default",
-        metavar="NAME|MODULE:FUNCTION|FILE.py:FUNCTION",
-        help="image (H, W, 3) BGR -> descriptor: default and small are nets that come with it (default: %(default)s)",
-    )
-    how.add_argument("--features", metavar="F.npz", help="descriptors computed beforehand (netspec extract --images)")
-    p.add_argument(
-        "--with", action="append", default=[], dest="options", metavar="KEY=VALUE", help="a keyword for --describe"
-    )
-    p.add_argument("--whiten", metavar="OTHER.npz", help="whiten the descriptors by these, of images of other places")
-    which = p.add_mutually_exclusive_group()
-    which.add_argument(
-        "--precision",
-        type=float,
-        metavar="P",
-        help=f"share of the loops that should be right, for which all else is chosen (default: {PRECISION:g})",
-    )
-    which.add_argument(
-        "--threshold", type=float, help="decide frame by frame, by this least score (euclidean: minus the distance)"
-    )
-    which.add_argument("--resume", metavar="F.npz", help="decide frame by frame, with a detector that --save wrote")
-    of = DetectorSettings()
-    p.add_argument("--metric", choices=METRICS, help=f"of the descriptors (default: {of.metric})")
-    p.add_argument(
-        "--exclude-recent",
-        type=int,
-        metavar="FRAMES",
-        help=f"not candidates (default: those of one visit to a place; frame by frame {of.exclude_recent})",
-    )
-    p.add_argument("--exclude-seconds", type=float, metavar="S", help="nor are frames less than S seconds old")
-    p.add_argument("--top-k", type=int, metavar="K", help=f"candidates examined (default: {of.top_k})")
-    p.add_argument("--consistency", type=int, metavar="K", help="previous frames that must have led to the candidate")
-    p.add_argument(
-        "--consistency-window", type=int, metavar="FRAMES", help=f"how near (default: {of.consistency_window})"
-    )
-    p.add_argument("--verify", action="store_true", help="verify candidates by SIFT matches and RANSAC")
-    p.add_argument(
-        "--odometry", metavar="FILE", help="poses (TUM, KITTI, EuRoC): frames that they put far apart are no loop"
-    )
-    p.add_argument("--save", metavar="F.npz", help="write the detector, to continue with --resume")
-    p.add_argument("--rerun", metavar="F.rrd", help="write images, scores and loops for the viewer of rerun.io")
 
 
 def _detect(a: argparse.Namespace) -> None:
@@ -127,7 +64,7 @@ def _detect(a: argparse.Namespace) -> None:
             results, said = found.results, [*found.reasons, run.verdicts_said(found.results)]
             detector.decided([result for result in results if result], None)
     elif a.threshold is None and not a.resume:
-        precision = PRECISION if a.precision is None else a.precision
+        precision = PRECISION if a.least_precision is None else a.least_precision
         odometry = _odometry(a.odometry, a.source, recording) if a.odometry else None
         found = whole_drive(detector, recording, features, precision, bar, odometry, a.exclude_recent)
         results = found.results
@@ -194,8 +131,10 @@ def _checked_options(a: argparse.Namespace) -> dict[str, str]:
     """Return the keywords of --with; refuse options that do not go together."""
     if bool(a.source) == bool(a.video):
         raise WrongUsage("expected the frames, or --video")
-    if a.video and (a.features or a.precision is not None):
-        raise WrongUsage(f"--{'features' if a.features else 'precision'} is for a drive that is over, not for --video")
+    if a.video and (a.features or a.least_precision is not None):
+        raise WrongUsage(
+            f"--{'features' if a.features else 'least-precision'} is for a drive that is over, not for --video"
+        )
     if a.rerun:
         check_rerun()
     if a.resume and (_changes(a) or a.verify):
@@ -206,10 +145,10 @@ def _checked_options(a: argparse.Namespace) -> dict[str, str]:
         raise WrongUsage(f"{given[0]} means nothing without --threshold")
     if a.odometry and (a.threshold is not None or a.resume or a.video):
         raise WrongUsage("--odometry means nothing to a search frame by frame, as with --threshold or --video")
-    if a.features and a.options:
+    if a.features and getattr(a, "with"):
         raise WrongUsage("--with belongs to --describe; --features has descriptors already")
     options = {}
-    for text in a.options:
+    for text in getattr(a, "with"):
         key, equals, value = text.partition("=")
         if not equals:
             raise WrongUsage(f"--with {text}: expected KEY=VALUE")
@@ -232,3 +171,88 @@ def _detector(a: argparse.Namespace, describe: Describe | None, views: int) -> L
     if a.verify or (a.video and a.threshold is None):
         check = GeometricCheck()
     return LoopDetector(describe, check=check, views=views, **changes)
+
+
+def _build(a: argparse.Namespace) -> None:
+    describe = run.load_describe(checked_name(a.describe))
+    _add_all(Map.create(a.map, a.describe), describe, a)
+
+
+def _add(a: argparse.Namespace) -> None:
+    into = Map(a.map)
+    _add_all(into, run.load_describe(into.describer), a)
+
+
+def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
+    for text in a.source:
+        before, number = len(into), len(into.sessions)
+        recording = recording_of(text, Path(a.map) / "frames" / f"{number:06d}")
+        results = into.add(recording, describe, a.index, bar, lambda *found: last_session(*found, progress=bar).results)
+        warn_of_unreadable(recording)
+        loops = [result.accepted for result in results if result.accepted is not None]
+        between = sum(frame < before for frame in loops)
+        said = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
+        print(f"session {number:06d}: {said}: {into.folder / f'{number:06d}' / 'loops.csv'}")
+    print(f"{len(into)} frames in {len(into.sessions)} sessions: {into.folder}")
+
+
+def _query(a: argparse.Namespace) -> None:
+    known, out = Map(a.map), Path(a.out)
+    recording = recording_of(a.source, out / "frames")
+    detector, before = known.detector(run.load_describe(known.describer), a.index), len(known)
+    if a.index in INDEXES:  # in memory: frames that are added are not in the map
+        found = last_session(detector, run.run_detector(detector, recording, progress=bar), progress=bar, own=False)
+        results = [replace(result, query_id=result.query_id - before) for result in found.results]
+    else:
+        results = run.run_detector(Visitor(detector), recording, progress=bar)
+    recording = warn_of_unreadable(recording)
+    loops = [result for result in results if result]
+    write_loops_csv(out / "loops.csv", loops, recording.stamps, recording.names, detector.stamps, known.names)
+    print(run.verdicts_said(results))
+    print(f"{len(loops)} of {len(results)} frames are in the map: {out / 'loops.csv'}")
+
+
+OF = DetectorSettings()
+SOURCE = (
+    "a folder or list of images, a sequence (TUM, EuRoC, KITTI), a video or a ROS bag; with "
+    f"{', '.join((*FRAMES, *TOPICS))} behind it, as in drive.bag,stride=2,topic=/cam0"
+)
+DESCRIBE = "image (H, W, 3) BGR -> descriptor: default and small are nets that come with it"
+RECENT = f"no candidates (default: those of one visit to a place; frame by frame {OF.exclude_recent})"
+DETECT = (
+    ("[SOURCE]", str, None, SOURCE),
+    ("--video CAMERA|URL|FILE", str, None, "decide as images come, of camera 0, rtsp://HOST/PATH or a file"),
+    ("--out FOLDER", str, ..., "where loops.csv, and loops.g2o with poses, go"),
+    [
+        ("--describe NAME|MODULE:FUNCTION|FILE.py:FUNCTION", str, "default", DESCRIBE),
+        ("--features F.npz", str, None, "descriptors computed beforehand (netspec extract --images)"),
+    ],
+    ("--with KEY=VALUE", [str], None, "a keyword for --describe"),
+    ("--whiten OTHER.npz", str, None, "whiten the descriptors by these, of images of other places"),
+    [
+        ("--least-precision P", float, None, f"share of the loops that should be right (default: {PRECISION:g})"),
+        ("--threshold S", float, None, "decide frame by frame, by this least score (euclidean: minus the distance)"),
+        ("--resume F.npz", str, None, "decide frame by frame, with a detector that --save wrote"),
+    ],
+    ("--metric", METRICS, None, f"of the descriptors (default: {OF.metric})"),
+    ("--exclude-recent FRAMES", int, None, RECENT),
+    ("--exclude-seconds S", float, None, "nor are frames less than S seconds old"),
+    ("--top-k K", int, None, f"candidates examined (default: {OF.top_k})"),
+    ("--consistency K", int, None, "previous frames that must have led to the candidate"),
+    ("--consistency-window FRAMES", int, None, f"how near (default: {OF.consistency_window})"),
+    ("--verify", bool, False, "verify candidates by SIFT matches and RANSAC"),
+    ("--odometry FILE", str, None, "poses (TUM, KITTI, EuRoC): frames that they put far apart are no loop"),
+    ("--save F.npz", str, None, "write the detector, to continue with --resume"),
+    ("--rerun F.rrd", str, None, "write images, scores and loops for the viewer of rerun.io"),
+)
+MAP = ("MAP", str, None, "the map's folder")
+INDEX = ("--index NAME", str, "exact", "exact, faiss, or Milvus: FILE.db or http://HOST:PORT")
+DRIVES, NET = ("SOURCE...", str, None, "frames, as those of detect"), "the net: default or small"
+BUILD = (MAP, DRIVES, INDEX, ("--describe NAME", str, "default", NET))
+QUERY = (MAP, ("SOURCE", *DRIVES[1:]), INDEX, ("--out FOLDER", str, ..., "where loops.csv goes"))
+COMMANDS = (("detect", _detect, "find the loops in a folder of images or a video", DETECT),)
+MAP_COMMANDS = (
+    ("build", _build, "make a map of one or several drives", BUILD),
+    ("add", _add, "add drives to a map, and find the loops between all of its drives", (MAP, DRIVES, INDEX)),
+    ("query", _query, "find the frames of a drive in a map, and add nothing to it", QUERY),
+)

@@ -6,12 +6,10 @@ A method gets the images of the queries and of the references and returns one ma
 
 from __future__ import annotations
 
-import importlib
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -20,7 +18,6 @@ from loopclosure.detector.verification import Pairs
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
-from netspec.errors import did_you_mean
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,10 @@ class MethodResult:
 class Method(Protocol):
     """A place-recognition method, for example a dataclass with its settings as fields."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What reports call it."""
+        ...
 
     def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score each query against each reference."""
@@ -87,47 +87,6 @@ class MethodContext:
     seed: int = 0
     stamps: np.ndarray | None = None
     pairs: Pairs = field(default_factory=lambda: Pairs(read_gray))
-
-
-# name -> "module:factory", a Factory. On the command line a method is written name[:argument], and one that refines the
-# scores of another name[:argument]+METHOD, where METHOD may refine a third one:
-# verified:k=20+seqslam+features:siamese.npz:cosine.
-METHODS: dict[str, str] = {
-    "fabmap": "loopclosure.methods.baselines:fabmap",
-    "bow": "loopclosure.methods.baselines:bag_of_words",
-    "vlad": "loopclosure.methods.references:vlad_method",
-    "hog": "loopclosure.methods.references:hog",
-    "cohog": "loopclosure.methods.references:cohog",
-    "thumbnails": "loopclosure.methods.baselines:thumbnails",
-    "seqslam": "loopclosure.methods.seqslam:seqslam",
-    "features": "loopclosure.methods.features:features",
-    "describe": "loopclosure.methods.described:described",
-    "verified": "loopclosure.methods.verified:verified",
-    "auto": "loopclosure.methods.auto:auto",
-    "detector": "loopclosure.methods.online:online",
-}
-REFINERS = ("seqslam", "verified", "auto")
-
-# The argument after the colon, the context, the inner method (None where it is no refiner).
-Factory = Callable[[str, MethodContext, "Method | None"], Method]
-
-
-def make_method(spec: str, context: MethodContext | None = None) -> Method:
-    """Build the method that a specification such as ``seqslam+features:siamese.npz`` names."""
-    context = context or MethodContext()
-    name = re.split("[:+]", spec, maxsplit=1)[0]
-    if name not in METHODS:
-        close = did_you_mean(name, list(METHODS)) or f"; known: {', '.join(METHODS)}"
-        raise InputError(f'unknown method "{name}" in "{spec}"{close}')
-    argument, inner = spec[len(name) :], None
-    if name in REFINERS or argument.startswith("+"):
-        argument, plus, inner_spec = argument.partition("+")
-        inner = make_method(inner_spec, context) if plus else None
-    if inner is not None and name not in REFINERS:
-        raise InputError(f"{name}+{inner.name}: {name} works on images, not on the scores of another method")
-    module_name, _, factory_name = METHODS[name].partition(":")
-    factory: Any = getattr(importlib.import_module(module_name), factory_name)
-    return factory(argument.removeprefix(":"), context, inner)
 
 
 def earlier(frames: int, exclude: int) -> np.ndarray:

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from loopclosure.descriptors.hog import Hog
+from loopclosure.descriptors.thumbnails import Hog
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, compared, describe_each
 from loopclosure.methods.baselines import WordModelSource, configure_words
 from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
-from loopclosure.words.vlad import vlad
+from loopclosure.words.bag_of_words import vlad
 from loopclosure.words.word_model import TRAINING_STAGES, Training
 
 # Few words, each with a whole vector: 64 x 128 numbers for SIFT.

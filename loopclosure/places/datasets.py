@@ -10,13 +10,19 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.cameras import comparable, images_of_places, mask_of_places
 from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_bgr
-from loopclosure.places.masks import read_coordinates, read_matches, read_place_pairs, read_truth_matrix
+from loopclosure.places.masks import (
+    comparable,
+    images_of_places,
+    mask_of_places,
+    read_coordinates,
+    read_matches,
+    read_place_pairs,
+    read_truth_matrix,
+)
 from loopclosure.places.overlap import ViewOverlap, Views, overlap_matrix, views
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
-from loopclosure.places.sequences import ImageSequence, posed, read_sequence
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S
+from loopclosure.places.sequences import ImageSequence, posed
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import write_whole
@@ -69,22 +75,6 @@ class DataSet:
             return None
         description = f"{self.truth.description}; no mistake where views overlap: {self.overlap_rule}"
         return replace(self.truth, soft=self.truth.soft | self.overlap, description=description)
-
-
-def load_tum(
-    folder: str | Path,
-    selection: Selection = ALL_FRAMES,
-    exclusion: Exclusion = TUM_EXCLUSION,
-    *,
-    max_difference_s: float = MAX_DIFFERENCE_S,
-    references: str | Path | None = None,
-    view_overlap: ViewOverlap | None = None,
-    **limits: float | None,
-) -> DataSet:
-    """Load a TUM RGB-D sequence; ``limits`` and the others are those of :func:`load_sequence`."""
-    sequence = read_sequence(folder, "tum", max_difference_s)
-    others = None if references is None else read_sequence(references, "tum", max_difference_s)
-    return load_sequence(sequence, selection, exclusion, references=others, view_overlap=view_overlap, **limits)
 
 
 def load_sequence(
@@ -191,7 +181,7 @@ def load_fabmap(
     Image 0001 is the left one of the first place, 0002 the right one, and so on. The mask (``*GroundTruth.mat``) and
     the coordinates (``*Coordinates.mat`` or ``.txt``) are searched for in the folder unless given.
 
-    camera     which images are taken: see loopclosure.places.cameras; "joined" images are written to ``joined_folder``
+    camera     which images are taken: see loopclosure.places.masks; "joined" images are written to ``joined_folder``
     selection  counts images of one camera, or joined images, or with "both" single images
     """
     folder = Path(folder)

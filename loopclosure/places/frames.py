@@ -1,9 +1,13 @@
-"""Where frames come from: folders and lists of images, TUM RGB-D sequences, videos; and which frames are taken."""
+"""Where frames come from: folders and lists of images, TUM RGB-D sequences, videos, cameras; which frames are taken."""
 
 from __future__ import annotations
 
+import queue
 import re
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Generator, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -149,3 +153,43 @@ def gray(image: np.ndarray) -> np.ndarray:
 def read_gray(path: Path) -> np.ndarray:
     """Read an image as (H, W) uint8 gray values; InputError if it cannot be read."""
     return gray(read_bgr(path))
+
+
+def live_frames(source: str) -> Generator[tuple[float, np.ndarray], None, None]:
+    """Yield (seconds from the start, image (H, W, 3) uint8 BGR) until the source ends, or the caller stops.
+
+    source  the number of a camera; the address of a stream, as in ``rtsp://HOST/PATH``; or a video file
+
+    Of cameras and streams the newest image is taken: those that come while one is looked at are dropped, so that what
+    is found is not late. Raises InputError where nothing can be opened.
+    """
+    if not source.isdigit() and "://" not in source:
+        yield from video_frames(Path(source))
+        return
+    capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+    if not capture.isOpened():
+        what = f"camera {source}" if source.isdigit() else f"stream {source}"
+        raise InputError(f"{what} cannot be opened; expected the number of a camera, a stream's address, or a file")
+    newest: queue.Queue[tuple[float, np.ndarray] | None] = queue.Queue(1)
+    stopped = threading.Event()
+
+    def read() -> None:
+        start = time.monotonic()
+        while not stopped.is_set():
+            there, image = capture.read()
+            with suppress(queue.Empty):
+                newest.get_nowait()
+            newest.put((time.monotonic() - start, image) if there else None)
+            if not there:
+                return
+
+    reader = threading.Thread(target=read, daemon=True, name="camera")
+    reader.start()
+    try:
+        while (taken := newest.get()) is not None:
+            yield taken
+    finally:
+        stopped.set()
+        reader.join(2)  # a stream that hangs is left to the end of the process
+        if not reader.is_alive():
+            capture.release()

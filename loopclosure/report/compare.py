@@ -177,6 +177,7 @@ def write_comparison(reports: Sequence[Report], path: str | Path, command: str =
     """Write table and curves as one self-contained HTML page."""
     page = rendered(
         "compare.html.jinja",
+        title=f"Comparison of {len(reports)} reports",
         reports=reports,
         warnings=warnings(reports),
         heads=[head for _, head in COLUMNS],

@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.run import Recording
 from loopclosure.report.page import Kind, Pair, png, rendered, side_by_side
-from loopclosure.report.paths import AXES
-from loopclosure.report.plots import COLORS, FOUND, MISSED, STYLE
+from loopclosure.report.plots import AXES, COLORS, FOUND, MISSED, STYLE
 from netspec.files.whole_file import write_whole
 
 BEST, WORST, REJECTED = 4, 3, 3  # pairs shown
@@ -36,7 +35,7 @@ def write_drive(
     picture = _path(recording.poses, results) if known and recording and recording.poses is not None else _dots(results)
     text = rendered(
         "drive.html.jinja",
-        verdict=verdict(loops, len(results)),
+        title=verdict(loops, len(results)),
         lead="" if recording is None else str(recording.source),
         picture=png(picture),
         caption=OF_PATH if known else OF_FRAMES,

@@ -341,16 +341,6 @@ class PlaceScores:
     new: np.ndarray
     log_odds: np.ndarray
 
-    def openfabmap_matrix(self) -> np.ndarray:
-        """Return the matrix (n, n) that openFABMAP's program writes for one sequence.
-
-        Row i has the posterior of the images before i, the probability of a new place on the diagonal, and 0 above it.
-        An image that was not made a place has a column of zeros below the diagonal.
-        """
-        matrix = np.nan_to_num(np.tril(self.posterior, -1), nan=0.0)
-        np.fill_diagonal(matrix, self.new)
-        return matrix
-
 
 def score_sets(model: FabMapModel, queries: np.ndarray, places: np.ndarray) -> PlaceScores:
     """Score the queries' words (Q, v) on a finished map with the words (P, v), for two traverses."""

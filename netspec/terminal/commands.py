@@ -182,6 +182,56 @@ class Commands:
         added.add_argument("--log_dir", help=argparse.SUPPRESS)
         return added
 
+    def table(self, commands: Iterable[Sequence[Any]]) -> None:
+        """Add commands: name, function, a line, rows of arguments (:func:`declare`), perhaps a text below its help."""
+        for name, function, summary, rows, *below in commands:
+            added = self.add(name, function, summary)
+            declare(added, rows)
+            if below:
+                added.epilog, added.formatter_class = below[0], argparse.RawDescriptionHelpFormatter
+
+
+def declare(to: Any, rows: Iterable[Any]) -> None:
+    """Add arguments to a parser or a group of it, one for each row: words, type, default, help.
+
+    words    as the help shows them: PLACE, [PLACE] that may be left out, PLACE... of which there are several, --flag,
+             --option VALUE. Their name is that in lower case
+    type     a function of the text; bool for a flag; a tuple of choices; [function] for what may be repeated
+    default  ``...`` for an option that must be given
+
+    A text among the rows is the heading of those after it; rows in a list exclude each other.
+    """
+    group = to
+    for row in rows:
+        if isinstance(row, str):
+            group = to.add_argument_group(row)
+        elif isinstance(row, list):
+            declare(group.add_mutually_exclusive_group(), row)
+        else:
+            _add_argument(group, *row)
+
+
+def _add_argument(group: Any, words: str, kind: Any, default: Any, text: str) -> None:
+    name, _, value = words.partition(" ")
+    if kind is bool:
+        group.add_argument(name, action="store_true", default=bool(default), help=text)
+        return
+    how: dict[str, Any] = {"choices": kind} if isinstance(kind, tuple) else {"type": kind}
+    if isinstance(kind, list):
+        how, default = {"type": kind[0], "action": "append", "required": default is ...}, []
+    elif default is ...:
+        how["required"], default = True, None
+    elif isinstance(default, str | int | float) and default not in ("", float("inf")):
+        text += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
+    if name.startswith("-"):
+        group.add_argument(name, default=default, metavar=value or None, help=text, **how)
+        return
+    place = name.strip("[]").removesuffix("...")
+    how["nargs"] = "?" if "[" in name else "+" if name.endswith("...") else None
+    group.add_argument(
+        place.lower().partition(".")[0], default=default, metavar=None if "choices" in how else place, help=text, **how
+    )
+
 
 def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
     """Parse a command line, run the command, and return its exit status.

@@ -346,7 +346,7 @@ def test_names_that_are_not_utf8_are_escaped(two_laps, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "line", ["", "evaluate", "detect x --threshold 1 --precision 0.9 --out y", "evaluate --camera front"]
+    "line", ["", "evaluate", "detect x --threshold 1 --least-precision 0.9 --out y", "evaluate --camera front"]
 )
 def test_wrong_usage_is_status_2(line, capsys):
     assert main(line.split()) == 2

@@ -9,16 +9,18 @@ import pytest
 from given_scores import GivenScores
 from loopclosure.errors import InputError
 from loopclosure.evaluate import SOFT_ZONE, evaluate, named_method
-from loopclosure.methods.base import METHODS, MethodContext, make_method
+from loopclosure.methods.base import MethodContext
 from loopclosure.methods.features import FeatureMethod
+from loopclosure.methods.named import METHODS, make_method
 from loopclosure.methods.seqslam import SeqSlam
 from loopclosure.methods.verified import Verified
-from loopclosure.places.datasets import load_tum
+from loopclosure.places.datasets import load_sequence
+from loopclosure.places.sequences import read_sequence
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 
 
 def test_perfect_features_find_every_loop(two_laps, two_laps_features):
-    data = load_tum(two_laps)
+    data = load_sequence(read_sequence(two_laps, "tum"))
     found = evaluate(data, [named_method(f"net=features:{two_laps_features}", MethodContext())])
     (outcome,) = found.outcomes
     assert outcome.name == "net"
@@ -32,7 +34,7 @@ def test_perfect_features_find_every_loop(two_laps, two_laps_features):
 
 
 def test_silence_is_said_and_costs_recall(two_laps):
-    data = load_tum(two_laps)
+    data = load_sequence(read_sequence(two_laps, "tum"))
     scores = np.where(data.truth.hard, 1.0, 0.0)
     scores[30:] = np.nan
     (outcome,) = evaluate(data, [("half", GivenScores(scores, {"looking": 1.0}, ["a note"]))]).outcomes
@@ -42,7 +44,7 @@ def test_silence_is_said_and_costs_recall(two_laps):
 
 
 def test_training_is_not_counted_a_frame(two_laps):
-    data = load_tum(two_laps)
+    data = load_sequence(read_sequence(two_laps, "tum"))
     method = GivenScores(np.zeros((40, 40)), {"training": 2.0, "looking": 1.0}, [], ("training",))
     (outcome,) = evaluate(data, [("x", method)]).outcomes
     assert outcome.seconds_on_frames == 1.0
@@ -50,12 +52,15 @@ def test_training_is_not_counted_a_frame(two_laps):
 
 def test_scores_of_another_size_are_refused(two_laps):
     with pytest.raises(InputError, match="the scores are 3 x 3, the truth is 40 x 40"):
-        evaluate(load_tum(two_laps), [("x", GivenScores(np.zeros((3, 3))))])
+        evaluate(load_sequence(read_sequence(two_laps, "tum")), [("x", GivenScores(np.zeros((3, 3))))])
 
 
 def test_two_methods_of_one_name_are_refused(two_laps):
     with pytest.raises(InputError, match='two methods are called "x"'):
-        evaluate(load_tum(two_laps), [("x", GivenScores(np.zeros((40, 40)))), ("x", GivenScores(np.zeros((40, 40))))])
+        evaluate(
+            load_sequence(read_sequence(two_laps, "tum")),
+            [("x", GivenScores(np.zeros((40, 40)))), ("x", GivenScores(np.zeros((40, 40))))],
+        )
 
 
 @pytest.mark.parametrize(
@@ -90,7 +95,7 @@ def test_methods_that_refine_one_that_refines_another():
 
 
 def test_the_soft_zone_excuses_overlapping_views(two_laps):
-    data = load_tum(two_laps)
+    data = load_sequence(read_sequence(two_laps, "tum"))
     assert data.overlap is not None
     neighbors = np.roll(data.truth.hard, 1, axis=1)
     overlapping = replace(data, overlap=neighbors | data.truth.hard, overlap_rule="they are neighbors")
@@ -111,7 +116,9 @@ def test_the_soft_zone_excuses_overlapping_views(two_laps):
 
 
 def test_a_method_that_accepts_nothing_scores_0(two_laps):
-    (outcome,) = evaluate(load_tum(two_laps), [("x", GivenScores(np.full((40, 40), np.nan)))]).outcomes
+    (outcome,) = evaluate(
+        load_sequence(read_sequence(two_laps, "tum")), [("x", GivenScores(np.full((40, 40), np.nan)))]
+    ).outcomes
     assert {value for table in outcome.measures.values() for value in table.values()} == {0.0}
 
 

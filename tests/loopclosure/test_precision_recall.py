@@ -126,12 +126,9 @@ def test_seconds_exclude_by_stamps():
         sequence_truth(np.ones((4, 4), bool), Exclusion(seconds=1.5), "x")
 
 
-def test_thresholds_for_a_wanted_precision():
+def test_recall_at_a_wanted_precision():
     found = JudgedScores(SCORES, example_truth()).all_pairs_curve()
-    assert found.threshold_for_precision(1.0) == 0.85
-    assert found.threshold_for_precision(0.8) == 0.7
     assert found.recall_at_precision(0.8) == 1.0
-    assert curve(np.array([0.9, 0.1]), np.array([False, True])).threshold_for_precision(0.9) is None
 
 
 def test_best_f1():

@@ -7,14 +7,19 @@ import cv2
 import numpy as np
 import pytest
 
-from lmdb_build.pairs.build import Plan, build_lists
+from lmdb_build.pairs.build import Plan, build_lists, report
 from lmdb_build.pairs.by_list import PlaceSource, singles_source
-from lmdb_build.pairs.choose import NEGATIVE, choose_pairs
-from lmdb_build.pairs.contact_sheet import contact_sheet, write_contact_sheet
-from lmdb_build.pairs.hard_negatives import hard_negatives
-from lmdb_build.pairs.list_file import join_lists, read_pair_list, read_settings, root_of, write_pair_list
-from lmdb_build.pairs.report import report
-from lmdb_build.pairs.warp import warp
+from lmdb_build.pairs.choose import NEGATIVE, choose_pairs, hard_negatives
+from lmdb_build.pairs.list_file import (
+    contact_sheet,
+    join_lists,
+    read_pair_list,
+    read_settings,
+    root_of,
+    write_contact_sheet,
+    write_pair_list,
+)
+from lmdb_build.picture import warp
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.errors import InputError
 

@@ -12,10 +12,10 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from loopclosure.cli import main
-from loopclosure.closing import graph, normal
-from loopclosure.closing.drift import ate_rmse_m, path_of, steps_between
+from loopclosure.closing import graph
+from loopclosure.closing.close import ate_rmse_m, path_of, steps_between
 from loopclosure.closing.g2o import read_pose_graph, solve_pose_graph
-from loopclosure.closing.graph import Edge, solve
+from loopclosure.closing.graph import Edge, least_squares_step, solve
 from loopclosure.detector.export import relative_pose, write_pose_graph
 from loopclosure.errors import InputError
 from paths import shared
@@ -88,7 +88,7 @@ def test_thousands_of_poses_take_few_steps_of_little_memory(monkeypatch: pytest.
 
     def step(derivatives: sparse.csr_matrix, errors: np.ndarray) -> np.ndarray:
         sizes.append(derivatives.nnz)
-        return normal.least_squares_step(derivatives, errors)
+        return least_squares_step(derivatives, errors)
 
     monkeypatch.setattr(graph, "least_squares_step", step)
     found = solve(path, odometry, loops)
@@ -104,7 +104,7 @@ def test_gtsam_takes_the_same_steps() -> None:
     _, path, odometry, loops = drive(600, 60, 12)
     graph_of = graph._Graph(len(path), [*odometry, *loops])
     state = graph.State(path[:, :3], Rotation.from_quat(path[:, 3:]))
-    a, b = (normal.least_squares_step(graph_of.derivatives(state), graph_of.errors(state), by) for by in (False, True))
+    a, b = (least_squares_step(graph_of.derivatives(state), graph_of.errors(state), by) for by in (False, True))
     np.testing.assert_allclose(a, b, atol=1e-6 * np.abs(a).max())
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from loopclosure.closing.drift import aligned, ate_rmse_m, drifted, path_of, steps_between, turn_rmse_deg
+from loopclosure.closing.close import aligned, ate_rmse_m, drifted, path_of, steps_between, turn_rmse_deg
 from loopclosure.closing.graph import Edge, State, _Graph, solve
 from loopclosure.detector.export import LOOP_SIGMAS, relative_pose
 from loopclosure.errors import InputError

@@ -7,8 +7,9 @@ import pytest
 
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, make_method
+from loopclosure.methods.base import Images
 from loopclosure.methods.features import FeatureMethod
+from loopclosure.methods.named import make_method
 from loopclosure.progress import silent
 
 ROWS = np.arange(8, dtype=np.float32).reshape(4, 2)

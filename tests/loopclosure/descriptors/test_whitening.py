@@ -15,8 +15,9 @@ from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.descriptors.whitening import learn_whitening
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, make_method
+from loopclosure.methods.base import Images
 from loopclosure.methods.features import FeatureMethod, WhitenBy
+from loopclosure.methods.named import make_method
 from loopclosure.places.frames import read_bgr
 from loopclosure.progress import silent
 

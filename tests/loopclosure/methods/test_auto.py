@@ -9,9 +9,10 @@ from loopclosure.detector.run import verdicts_said
 from loopclosure.detector.verification import Agreement, GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.methods.auto import answer
-from loopclosure.methods.base import Images, MethodContext, MethodResult, make_method
+from loopclosure.methods.base import Images, MethodContext, MethodResult
 from loopclosure.methods.candidates import candidates, far_apart
 from loopclosure.methods.decoys import threshold
+from loopclosure.methods.named import make_method
 from loopclosure.progress import silent
 
 SIZE = 64

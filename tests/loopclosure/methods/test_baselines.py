@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, MethodContext, make_method
+from loopclosure.methods.base import Images, MethodContext
 from loopclosure.methods.baselines import BagOfWordsMethod, FabMapMethod, ThumbnailMethod
+from loopclosure.methods.named import make_method
 from loopclosure.progress import silent
 from loopclosure.words.word_model import WordModel
 from paths import shared

@@ -4,13 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
-from loopclosure.descriptors.hog import Hog
+from loopclosure.descriptors.thumbnails import Hog
 from loopclosure.errors import InputError
 from loopclosure.evaluate import evaluate, named_method
-from loopclosure.methods.base import Images, MethodContext, make_method
-from loopclosure.places.datasets import load_tum
+from loopclosure.methods.base import Images, MethodContext
+from loopclosure.methods.named import make_method
+from loopclosure.places.datasets import load_sequence
+from loopclosure.places.sequences import read_sequence
 from loopclosure.progress import silent
-from loopclosure.words.vlad import vlad
+from loopclosure.words.bag_of_words import vlad
 from loopclosure.words.vocabulary import Extractor, Vocabulary
 from tests.loopclosure.conftest import blots
 
@@ -58,7 +60,7 @@ def test_vlad_sums_differences_to_the_nearest_word():
 @pytest.mark.slow
 @pytest.mark.parametrize("spec", ["hog", "cohog:side=128", "vlad:words=8"])
 def test_they_find_the_second_lap(spec, two_laps, tmp_path):
-    data = load_tum(two_laps)
+    data = load_sequence(read_sequence(two_laps, "tum"))
     train = []
     for i in range(10):
         train.append(tmp_path / f"{i}.png")
@@ -84,7 +86,7 @@ def test_vlad_of_orb_words(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("spec", ["hog", "cohog:side=128"])
 def test_two_traverses_are_compared_in_full(spec, two_laps):
-    images = load_tum(two_laps).query_images
+    images = load_sequence(read_sequence(two_laps, "tum")).query_images
     scores = make_method(spec).score(Images(images[20:], images[:20]), silent).scores
     assert scores.shape == (20, 20)
     np.testing.assert_array_equal(np.argmax(scores, axis=1), np.arange(20))
@@ -125,7 +127,7 @@ def file(tmp_path):
 
 
 def test_a_function_describes_the_images(file, two_laps):
-    data = load_tum(two_laps)
+    data = load_sequence(read_sequence(two_laps, "tum"))
     methods = [named_method(f"describe:{file}:describe{metric}", MethodContext()) for metric in ("", ":cosine")]
     euclidean, cosine = evaluate(data, methods).outcomes
     assert euclidean.name == f"{file}:describe (euclidean)"
@@ -137,7 +139,7 @@ def test_a_function_describes_the_images(file, two_laps):
 def test_descriptors_of_different_lengths_are_refused(file, two_laps):
     method = named_method(f"describe:{file}:growing", MethodContext())
     with pytest.raises(InputError, match="growing gave 2 numbers, and 1 before"):
-        evaluate(load_tum(two_laps), [method])
+        evaluate(load_sequence(read_sequence(two_laps, "tum")), [method])
 
 
 @pytest.mark.parametrize("spec", ["describe", "describe:cosine", "describe:net.py", "describe:net.py:cosine"])
@@ -148,7 +150,7 @@ def test_a_function_must_be_named(spec):
 
 # The online detector judged as a method
 def test_it_scores_only_what_it_accepts(two_laps, two_laps_features):
-    data = load_tum(two_laps)
+    data = load_sequence(read_sequence(two_laps, "tum"))
     context = MethodContext(data.exclude_frames)
     spec = f"detector:{two_laps_features}:threshold=-0.3,consistency=2"
     (outcome,) = evaluate(data, [named_method(spec, context)]).outcomes
@@ -163,7 +165,7 @@ def test_it_scores_only_what_it_accepts(two_laps, two_laps_features):
 @pytest.mark.slow
 def test_without_a_threshold_its_candidates_are_verified(two_laps, two_laps_features):
     method = make_method(f"detector:{two_laps_features}:verify=yes,min_inliers=500", MethodContext(9))
-    result = method.score(Images(load_tum(two_laps).query_images), silent)
+    result = method.score(Images(load_sequence(read_sequence(two_laps, "tum")).query_images), silent)
     assert not np.isfinite(result.scores).any()
     assert "30 not verified" in result.answer
 
@@ -183,7 +185,7 @@ def test_what_makes_no_sense_is_said(spec, message):
 
 
 def test_two_traverses_are_refused(two_laps, two_laps_features):
-    images = load_tum(two_laps).query_images
+    images = load_sequence(read_sequence(two_laps, "tum")).query_images
     method = make_method(f"detector:{two_laps_features}:threshold=-1")
     with pytest.raises(InputError, match="finds loops in one sequence"):
         method.score(Images(images, images), silent)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, MethodContext, MethodResult, earlier, make_method
+from loopclosure.methods.base import Images, MethodContext, MethodResult, earlier
+from loopclosure.methods.named import make_method
 from loopclosure.methods.seqslam import (
     SeqSlam,
     SequenceSettings,

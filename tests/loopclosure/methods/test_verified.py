@@ -8,7 +8,8 @@ import pytest
 
 from loopclosure.detector.verification import Agreement, GeometricCheck
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, MethodContext, MethodResult, make_method
+from loopclosure.methods.base import Images, MethodContext, MethodResult
+from loopclosure.methods.named import make_method
 from loopclosure.methods.seqslam import SeqSlam, SequenceSettings
 from loopclosure.methods.verified import Verified, on_trajectories
 from loopclosure.progress import silent

@@ -9,8 +9,8 @@ import pytest
 from loopclosure.cli import main
 from loopclosure.errors import InputError
 from loopclosure.places.bags import open_bag
-from loopclosure.places.extraction import extract
 from loopclosure.places.sequences import read_sequence
+from loopclosure.places.source import extract
 from places_layouts import COUNT, path, picture, quaternions
 
 pytest.importorskip("rosbags")

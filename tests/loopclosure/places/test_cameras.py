@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.places.cameras import CAMERAS, comparable, images_of_places, mask_of_places
+from loopclosure.places.masks import CAMERAS, comparable, images_of_places, mask_of_places
 
 PLACES = {
     "all": [[0], [1], [2], [3]],

@@ -9,8 +9,9 @@ import scipy.io
 from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
-from loopclosure.places.datasets import load_fabmap, load_folder, load_place_pairs, load_traverses, load_tum
+from loopclosure.places.datasets import load_fabmap, load_folder, load_place_pairs, load_sequence, load_traverses
 from loopclosure.places.frames import Selection
+from loopclosure.places.sequences import read_sequence
 from loopclosure.places.truth import Exclusion
 from paths import shared
 
@@ -37,7 +38,7 @@ def tum_folder(tmp_path):
 
 
 def test_tum_truth_is_the_papers_rule(tum_folder):
-    data = load_tum(tum_folder)
+    data = load_sequence(read_sequence(tum_folder, "tum"))
     assert len(data.query_images) == 72
     assert data.reference_images is None
     loops = {(int(i), int(j)) for i, j in np.argwhere(data.truth.hard & data.truth.judged)}
@@ -52,18 +53,18 @@ def test_tum_truth_is_the_papers_rule(tum_folder):
 
 
 def test_tum_soft_truth_and_selection(tum_folder):
-    data = load_tum(tum_folder, Selection(stride=2), soft_angle_deg=25)
+    data = load_sequence(read_sequence(tum_folder, "tum"), Selection(stride=2), soft_angle_deg=25)
     assert len(data.query_images) == 36
     only_soft = {(int(i), int(j)) for i, j in np.argwhere(data.truth.soft & ~data.truth.hard & data.truth.judged)}
     assert only_soft == {(i, j) for i in range(36) for j in range(36) if i - j in (17, 19, 35)}
     assert "every 2nd" in data.name
     with pytest.raises(InputError, match="narrower than hard truth"):
-        load_tum(tum_folder, soft_angle_deg=5)
+        load_sequence(read_sequence(tum_folder, "tum"), soft_angle_deg=5)
 
 
 def test_tum_without_a_revisit_is_refused(tum_folder):
     with pytest.raises(InputError, match="no judged pair shows the same place"):
-        load_tum(tum_folder, Selection(stop="40%"))
+        load_sequence(read_sequence(tum_folder, "tum"), Selection(stop="40%"))
 
 
 @pytest.fixture
@@ -238,6 +239,6 @@ def test_corridor_loop():
 
 @pytest.mark.slow
 def test_tum_fr1():
-    data = load_tum(shared("data/tum_fr1/rgbd_dataset_freiburg1_rpy"))
+    data = load_sequence(read_sequence(shared("data/tum_fr1/rgbd_dataset_freiburg1_rpy"), "tum"))
     assert len(data.query_images) == 721
     assert data.truth.positives > 0

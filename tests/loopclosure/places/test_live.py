@@ -9,7 +9,7 @@ import pytest
 
 from loopclosure.cli import main
 from loopclosure.errors import InputError
-from loopclosure.places.live import live_frames
+from loopclosure.places.frames import live_frames
 
 THUMBNAILS = ["--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]
 

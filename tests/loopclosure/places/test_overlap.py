@@ -6,9 +6,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
-from loopclosure.places.datasets import load_tum
+from loopclosure.places.datasets import load_sequence
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.overlap import ViewOverlap, overlap_matrix, views
+from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import Poses
 
 
@@ -84,11 +85,11 @@ def test_a_sequence_with_depth_says_so(two_laps, tmp_path):
     (folder / "rgb").symlink_to(two_laps / "rgb")
     for name in ("rgb.txt", "groundtruth.txt"):
         (folder / name).write_text((two_laps / name).read_text())
-    assert "measured" not in load_tum(folder).overlap_rule
+    assert "measured" not in load_sequence(read_sequence(folder, "tum")).overlap_rule
     (folder / "depth").mkdir()
     cv2.imwrite(str(folder / "depth" / "0.png"), np.full((48, 64), 15000, np.uint16))
     (folder / "depth.txt").write_text("\n".join(f"{i}.01 depth/0.png" for i in range(30)) + "\n")
-    data = load_tum(folder)
+    data = load_sequence(read_sequence(folder, "tum"))
     assert "by the poses and measured depth, or assumed distances of 2, 4, 8 m where it is missing" in data.overlap_rule
     assert data.soft_truth is not None
     assert (data.soft_truth.soft | ~data.truth.hard).all()
@@ -102,7 +103,7 @@ def test_the_field_of_view_is_the_cameras_where_it_is_known():
 
 
 def test_queries_in_another_recording_of_the_same_place(two_laps):
-    data = load_tum(two_laps, references=two_laps)
+    data = load_sequence(laps := read_sequence(two_laps, "tum"), references=laps)
     assert data.overlap is not None
     assert data.truth.hard.shape == data.overlap.shape == (40, 40)
     assert data.truth.judged.all()

@@ -8,11 +8,11 @@ import pytest
 
 from loopclosure.cli import main
 from loopclosure.errors import InputError
-from loopclosure.places.datasets import load_sequence, load_traverses, load_tum
-from loopclosure.places.extraction import extract
+from loopclosure.places.datasets import load_sequence, load_traverses
 from loopclosure.places.frames import Selection
 from loopclosure.places.masks import read_matches
 from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, posed, read_posed, read_sequence
+from loopclosure.places.source import extract
 from loopclosure.places.truth import Exclusion
 from places_layouts import (
     kitti_rows,
@@ -233,5 +233,5 @@ def test_a_selection_counts_frames_without_a_pose_too(two_laps, tmp_path):
     assert every_fourth.names[:3] == ("rgb/0.png", "rgb/4.png", "rgb/8.png")
     assert every_fourth.poses is not None
     assert np.isnan(every_fourth.poses[1]).all()
-    data = load_tum(tmp_path / "laps", Selection(stride=4), Exclusion(2))
+    data = load_sequence(read_sequence(tmp_path / "laps", "tum"), Selection(stride=4), Exclusion(2))
     assert [path.name for path in data.query_images[:2]] == ["0.png", "8.png"]

@@ -10,7 +10,8 @@ from given_scores import GivenScores
 from loopclosure.cli import main
 from loopclosure.errors import InputError
 from loopclosure.evaluate import evaluate
-from loopclosure.places.datasets import load_tum
+from loopclosure.places.datasets import load_sequence
+from loopclosure.places.sequences import read_sequence
 from loopclosure.report.compare import read_reports, table, text, warnings
 from loopclosure.report.files import write_files
 
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def reports(two_laps, tmp_path_factory):
     """Two runs: "net" is perfect in the second, "other" is in the first only."""
-    data = load_tum(two_laps)
+    data = load_sequence(read_sequence(two_laps, "tum"))
     perfect = np.where(data.truth.hard, 1.0, 0.0)
     noise = np.random.default_rng(0).normal(size=(40, 40))
     paths = []

@@ -13,7 +13,8 @@ import pytest
 from given_scores import GivenScores
 from loopclosure.evaluate import evaluate, named_method
 from loopclosure.methods.base import MethodContext
-from loopclosure.places.datasets import load_traverses, load_tum
+from loopclosure.places.datasets import load_sequence, load_traverses
+from loopclosure.places.sequences import read_sequence
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report.files import measures_text
 from loopclosure.report.page import write_report
@@ -48,7 +49,7 @@ def evaluation(two_laps, two_laps_features):
         ("<noise>", GivenScores(rng.normal(size=(40, 40)), *COSTS)),
         ("silent", GivenScores(np.full((40, 40), np.nan), *COSTS)),
     ]
-    return evaluate(load_tum(two_laps), methods, train="nothing")
+    return evaluate(load_sequence(read_sequence(two_laps, "tum")), methods, train="nothing")
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +77,7 @@ def test_the_page_stands_alone_and_says_what_it_judges_by(evaluation, folder):
 
 def test_what_is_named_maliciously_is_text(two_laps, tmp_path):
     evil = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7 * 7 }}{% raw %}$\\frac{"
-    data = load_tum(two_laps)
+    data = load_sequence(read_sequence(two_laps, "tum"))
     data = replace(data, name=evil, notes=[evil], truth=replace(data.truth, description=evil))
     scores = np.zeros((40, 40))
     methods = [(evil, GivenScores(scores, {evil: 1.0}, [evil])), (evil.upper(), GivenScores(scores, *COSTS))]

@@ -5,7 +5,7 @@ import pytest
 from sklearn.metrics import accuracy_score, f1_score, precision_score, recall_score, roc_auc_score
 
 from loopclosure.errors import InputError
-from loopclosure.report.pair_metrics import best_threshold, judge_pairs, metrics_at, pair_distances, roc_auc
+from loopclosure.report.table_one import best_threshold, judge_pairs, metrics_at, pair_distances, roc_auc
 
 
 def test_distances_of_pairs():

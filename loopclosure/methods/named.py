@@ -1,0 +1,49 @@
+"""The methods by name. On the command line a method is written name[:argument].
+
+One that refines the scores of another is written name[:argument]+METHOD, where METHOD may refine a third one:
+verified:k=20+seqslam+features:siamese.npz:cosine.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+from loopclosure.errors import InputError
+from loopclosure.methods import auto, baselines, described, features, online, references, seqslam, verified
+from loopclosure.methods.base import Method, MethodContext
+from netspec.errors import did_you_mean
+
+# The argument after the colon, the context, the inner method (None where it is no refiner).
+Factory = Callable[[str, MethodContext, Method | None], Method]
+METHODS: dict[str, Factory] = {
+    "fabmap": baselines.fabmap,
+    "bow": baselines.bag_of_words,
+    "vlad": references.vlad_method,
+    "hog": references.hog,
+    "cohog": references.cohog,
+    "thumbnails": baselines.thumbnails,
+    "seqslam": seqslam.seqslam,
+    "features": features.features,
+    "describe": described.described,
+    "verified": verified.verified,
+    "auto": auto.auto,
+    "detector": online.online,
+}
+REFINERS = ("seqslam", "verified", "auto")
+
+
+def make_method(spec: str, context: MethodContext | None = None) -> Method:
+    """Build the method that a specification such as ``seqslam+features:siamese.npz`` names."""
+    context = context or MethodContext()
+    name = re.split("[:+]", spec, maxsplit=1)[0]
+    if name not in METHODS:
+        close = did_you_mean(name, list(METHODS)) or f"; known: {', '.join(METHODS)}"
+        raise InputError(f'unknown method "{name}" in "{spec}"{close}')
+    argument, inner = spec[len(name) :], None
+    if name in REFINERS or argument.startswith("+"):
+        argument, plus, inner_spec = argument.partition("+")
+        inner = make_method(inner_spec, context) if plus else None
+    if inner is not None and name not in REFINERS:
+        raise InputError(f"{name}+{inner.name}: {name} works on images, not on the scores of another method")
+    return METHODS[name](argument.removeprefix(":"), context, inner)
