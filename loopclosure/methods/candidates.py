@@ -58,8 +58,9 @@ def candidates(
         allowed = allowed & earlier(len(scores), visit)
     queries = moved(scores)
     references = moved(scores.T) if two else queries
-    part = np.ix_(queries, references)
-    scores, allowed, far = scores[part], allowed[part], None if far is None else far[part]
+    if (len(queries), len(references)) != scores.shape:
+        part = np.ix_(queries, references)
+        scores, allowed, far = scores[part], allowed[part], None if far is None else far[part]
     allowed, different, said = allowed & np.isfinite(scores), None, ""
     if far is not None:
         different, allowed = allowed & far, allowed & ~far
@@ -80,12 +81,10 @@ def moved(scores: np.ndarray) -> np.ndarray:
     A frame is left out that is alike to all others as the last that was taken, within ``STILL`` of a usual step: of a
     robot that stands, one frame is taken. Lines through all of them would lead past the place.
     """
-    known = np.isfinite(scores)
-    rows = np.where(known, scores, 0.0)
 
     def step(a: int, b: int) -> float:
-        both = known[a] & known[b]
-        return float(np.abs(rows[a] - rows[b])[both].mean()) if both.any() else np.inf
+        both = np.isfinite(scores[a]) & np.isfinite(scores[b])
+        return float(np.abs(scores[a, both] - scores[b, both]).mean()) if both.any() else np.inf
 
     steps = np.array([step(i, i + 1) for i in range(len(scores) - 1)])
     usual = np.median(steps[np.isfinite(steps)]) if np.isfinite(steps).any() else 0.0

@@ -34,6 +34,7 @@ NEARLY = 0.95
 # Neighbors of a query, so many before and after, may fit its match better.
 REACH = 4
 MIDDLE = 4  # steps of a line
+BLOCK = 512  # queries that are searched at a time: memory is that of the scores, and little more
 
 
 @dataclass(frozen=True)
@@ -156,29 +157,43 @@ def settings(queries: int, references: int, two: bool) -> Iterator[Setting]:
 
 def search(given: Candidates, setting: Setting) -> Lines:
     """Search for lines through candidates; decoys are the lines backwards, or pairs known to be different."""
-    scores, allowed, different = given.scores, given.allowed, given.different
-
-    def along(distances: np.ndarray, sequence: SequenceSettings | None = setting.sequence) -> np.ndarray:
-        return distances if sequence is None else trajectory_costs(distances, sequence)
-
-    distances = np.where(allowed, -scores, np.nan)
-    if setting.standardized:
-        distances = standardize(distances)
-    forward = np.where(allowed, -along(distances), np.nan)
-    if different is None:
-        reverse = np.where(allowed, -along(distances[:, ::-1])[:, ::-1], np.nan)
-    else:
-        reverse = np.where(different, -along(np.where(different, -scores, np.nan)), np.nan)
-    best = np.where(np.isnan(forward), -np.inf, forward)
-    match, targets = best.argmax(axis=1), best.max(axis=1)
-    decoys = np.where(np.isnan(reverse), -np.inf, reverse).max(axis=1)
-    ratio = len(best[0]) / len(best) if given.two else 1.0
-    owner = _owner(best, match, setting.length)
-    near = np.abs(owner - np.arange(len(best))) <= max(REACH, 1 / ratio)
-    if setting.sequence is not None:
-        middle = np.where(allowed, -along(distances, replace(setting.sequence, length=MIDDLE)), np.nan)
-        near &= _fits(middle, match, targets)
+    count, sequence = len(given.scores), setting.sequence
+    reach = setting.length + 1  # of the queries before and after, that a line leads through
+    whole = _distances(given.scores, given.allowed) if setting.standardized else None
+    if whole is not None:
+        whole = standardize(whole)
+    forward = np.empty(given.scores.shape, np.float32)
+    match, targets = np.zeros(count, int), np.empty(count)
+    decoys, middle = np.empty(count), np.ones(count, bool)
+    for first in range(0, count, BLOCK):
+        here, around = slice(first, first + BLOCK), slice(max(0, first - reach), first + BLOCK + reach)
+        inner = slice(first - around.start, first - around.start + BLOCK)
+        allowed, different = given.allowed[here], given.different
+        distances = _distances(given.scores[around], given.allowed[around]) if whole is None else whole[around]
+        forward[here] = found = np.where(allowed, -_along(distances, sequence)[inner], np.nan)
+        if different is None:
+            reverse = np.where(allowed, -_along(distances[:, ::-1], sequence)[inner, ::-1], np.nan)
+        else:
+            known = _along(_distances(given.scores[around], different[around]), sequence)[inner]
+            reverse = np.where(different[here], -known, np.nan)
+        best = np.where(np.isnan(found), -np.inf, found)
+        match[here], targets[here] = best.argmax(axis=1), best.max(axis=1)
+        decoys[here] = np.where(np.isnan(reverse), -np.inf, reverse).max(axis=1)
+        if sequence is not None:
+            fits = np.where(allowed, -_along(distances, replace(sequence, length=MIDDLE))[inner], np.nan)
+            middle[here] = _fits(fits, match[here], targets[here])
+    ratio = forward.shape[1] / count if given.two else 1.0
+    owner = _owner(forward, match, setting.length)
+    near = middle & (np.abs(owner - np.arange(count)) <= max(REACH, 1 / ratio))
     return Lines(setting, forward, np.where(np.isneginf(targets), -1, match), targets, decoys, near)
+
+
+def _distances(scores: np.ndarray, which: np.ndarray) -> np.ndarray:
+    return np.where(which, -scores, np.nan)
+
+
+def _along(distances: np.ndarray, sequence: SequenceSettings | None) -> np.ndarray:
+    return distances if sequence is None else trajectory_costs(distances, sequence)
 
 
 def _fits(middle: np.ndarray, match: np.ndarray, targets: np.ndarray) -> np.ndarray:
@@ -187,16 +202,16 @@ def _fits(middle: np.ndarray, match: np.ndarray, targets: np.ndarray) -> np.ndar
     return middle[np.arange(len(match)), match] >= (chance + targets) / 2
 
 
-def _owner(best: np.ndarray, match: np.ndarray, length: int) -> np.ndarray:
+def _owner(scores: np.ndarray, match: np.ndarray, length: int) -> np.ndarray:
     """Return the query (Q,) that fits each query's match best, of those that are at most ``length`` away."""
-    owner = np.arange(len(best))
-    score = best[owner, match]
+    owner = np.arange(len(scores))
+    score = np.nan_to_num(scores[owner, match], nan=-np.inf)
     for step in (*range(-length, 0), *range(1, length + 1)):
-        other = np.arange(len(best)) + step
-        there = np.flatnonzero((other >= 0) & (other < len(best)))
-        value = best[other[there], match[there]]
+        other = np.arange(len(scores)) + step
+        there = np.flatnonzero((other >= 0) & (other < len(scores)))
+        value = scores[other[there], match[there]]
         better = there[value > score[there]]
-        owner[better], score[better] = other[better], best[other[better], match[better]]
+        owner[better], score[better] = other[better], scores[other[better], match[better]]
     return owner
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -21,7 +22,7 @@ from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
 
 NOTHING = np.zeros((8, 8), np.uint8)
-MOST_PAIRS = 16_000_000  # of frames that are compared at once, in about a gigabyte
+MOST_PAIRS = 16_000_000  # of frames that are compared at once, in half a gigabyte
 
 
 def whole_drive(
@@ -39,7 +40,7 @@ def whole_drive(
     :func:`loopclosure.methods.auto.answer`. The detector gets these loops, and for frames to come the
     least threshold that accepts none of this drive's others.
     """
-    run_detector(detector, recording, features, progress)
+    single = np.array([result.score for result in run_detector(detector, recording, features, progress)])
     if recording.unreadable and odometry is not None:
         odometry = np.delete(odometry, recording.unreadable, axis=0)
     recording = recording.readable()
@@ -47,12 +48,8 @@ def whole_drive(
     if recording.images is None:
         for number, image, _ in progress(recording.frames(), "local features", len(recording)):
             pairs.put(check, number, check.describe(gray(image)))
-    far = None if odometry is None else far_apart(odometry)
-    seconds = detector.settings.exclude_seconds
-    found = _among(detector, 0, len(detector), Between(check, pairs, (), ()), precision, progress, far, visit, seconds)
-    settings, rows = detector.settings, detector.descriptors
-    scores = similarity_matrix(rows, None, settings.metric, settings.views)
-    single = np.where(_earlier(detector, 0, seconds), scores, -np.inf).max(axis=1)
+    seconds, between = detector.settings.exclude_seconds, Between(check, pairs, (), ())
+    found = _among(detector, 0, len(detector), between, precision, progress, odometry, visit, seconds)
     others = float(np.max(single[~found.accepted], initial=-np.inf))
     above = single[found.accepted & (single > others)]
     detector.decided([result for result in found.results if result], above.min() if len(above) else None)
@@ -101,34 +98,45 @@ def _among(
     between: Between,
     precision: float,
     progress: Progress,
-    far: np.ndarray | None,
+    odometry: np.ndarray | None,
     visit: int | None,
     seconds: float,
 ) -> Answer:
-    """Decide on the last session among the frames ``first`` to ``end``, another session or this one."""
-    begin, rows, settings = detector.sessions[-1], detector.descriptors, detector.settings
-    queries, references = range(begin, len(detector)), range(first, end)
-    two = first != begin
-    scores = similarity_matrix(rows[begin:], rows[first:end] if two else None, settings.metric, settings.views)
-    allowed = np.ones(scores.shape, bool) if two else _earlier(detector, begin, seconds)
+    """Decide on the last session among the frames ``first`` to ``end``, another session or this one.
+
+    Where these are more than ``MOST_PAIRS``, every second or third frame is compared, and decides for those after it.
+    """
+    begin, settings, two = detector.sessions[-1], detector.settings, first != detector.sessions[-1]
+    count = len(detector) - begin
+    step = math.isqrt(max(0, count * (end - first) - 1) // MOST_PAIRS) + 1
+    queries, references = range(begin, len(detector), step), range(first, end, step)
+    rows, stamps = detector.descriptors, detector.stamps[begin:]
+    known = rows[first:end:step] if two else None
+    scores = similarity_matrix(rows[begin::step], known, settings.metric, settings.views)
+    allowed = np.ones(scores.shape, bool) if two else _earlier(stamps[::step], seconds)
     agree = replace(between, queries=queries, references=references)
-    stamps = detector.stamps[begin:]
-    answered = answer(scores, allowed, two, precision, between.check, agree, progress, far, stamps, visit)
-    moved = [
-        replace(
-            result,
-            query_id=begin + result.query_id,
-            candidates=[(first + number, score) for number, score in result.candidates],
-            accepted=None if result.accepted is None else first + result.accepted,
+    far = None if odometry is None else far_apart(odometry[::step])
+    visit = None if visit is None else visit // step
+    answered = answer(scores, allowed, two, precision, between.check, agree, progress, far, stamps[::step], visit)
+    results = []
+    for number in range(count):
+        result = answered.results[number // step]
+        results.append(
+            replace(
+                result,
+                query_id=begin + number,
+                candidates=[(references[match], score) for match, score in result.candidates],
+                accepted=None if result.accepted is None else references[result.accepted],
+                inliers=None if number % step else result.inliers,
+                stamp=None if np.isnan(stamps[number]) else float(stamps[number]),
+            )
         )
-        for result in answered.results
-    ]
-    return Answer(moved, answered.reasons)
+    thinned = f"{count} frames are more than are compared at once: one of {step} is, and decides for those after it"
+    return Answer(results, [*([thinned] if step > 1 else []), *answered.reasons])
 
 
-def _earlier(detector: LoopDetector, begin: int, seconds: float) -> np.ndarray:
-    """Return which pairs of frames from ``begin`` on are candidates: of each, those before that are old enough."""
-    stamps = detector.stamps[begin:]
+def _earlier(stamps: np.ndarray, seconds: float) -> np.ndarray:
+    """Return which pairs of frames are candidates: of each, those before that are old enough."""
     numbers = np.arange(len(stamps))
     return np.tri(len(stamps), k=-1, dtype=bool) & ~Exclusion(seconds=seconds).excludes(
         numbers, numbers, stamps, stamps

@@ -1,13 +1,18 @@
 """Loops without settings: what sequences, decoys and verification decide, on drives whose truth is known."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from loopclosure.detector.run import verdicts_said
+from loopclosure.descriptors.feature_file import Features
+from loopclosure.detector.detector import LoopDetector
+from loopclosure.detector.run import Recording, verdicts_said
 from loopclosure.detector.verification import Agreement, GeometricCheck
 from loopclosure.errors import InputError
+from loopclosure.methods import decoys
+from loopclosure.methods import drive as whole
 from loopclosure.methods.auto import answer
 from loopclosure.methods.base import Images, MethodContext, MethodResult
 from loopclosure.methods.candidates import candidates, far_apart
@@ -359,3 +364,26 @@ def test_settings_that_make_no_sense(spec, message):
 def test_a_precision_that_makes_no_sense():
     with pytest.raises(InputError, match="precision is 2"):
         answer(np.eye(3), np.ones((3, 3), bool), True, 2.0)
+
+
+def test_blocks_of_queries_change_nothing(monkeypatch):
+    road = drive(120, 5)
+    scores = alike(again(road, 1.0, 6), road)
+    at_once = answer(scores, everything(scores), two=True)
+    monkeypatch.setattr(decoys, "BLOCK", 7)
+    assert answer(scores, everything(scores), two=True) == at_once
+    assert np.count_nonzero(at_once.accepted) > 100
+
+
+def test_of_a_longer_drive_than_is_compared_at_once_every_second_frame_decides(monkeypatch):
+    road = drive(160, 7)
+    rows = np.concatenate([road, again(drive(60, 8), 0, 9), again(road, 0.3, 10)])
+    monkeypatch.setattr(whole, "MOST_PAIRS", len(rows) ** 2 // 2)
+    detector, paths = LoopDetector(), [Path(f"{number}.png") for number in range(len(rows))]
+    recording = Recording(Path("drive"), [path.name for path in paths], paths, np.arange(len(rows)))
+    found = whole.whole_drive(detector, recording, Features(Path("rows.npz"), rows.astype(np.float32)))
+    assert "one of 2 is" in found.reasons[0]
+    assert len(found.results) == len(rows)
+    assert np.count_nonzero(found.accepted[220:]) > 120
+    assert np.all(np.abs(found.match + 220 - np.arange(len(rows)))[found.accepted] <= 3)
+    assert [result.query_id for result in found.results] == list(range(len(rows)))
