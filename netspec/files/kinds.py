@@ -38,6 +38,7 @@ _KINDS = {
     b"\x89PNG": "a PNG image",
     b"PK\x03\x04": f"a ZIP archive, as .npz and PyTorch's .pth are; {_COPY}",
     b"\x80\x02": f"a pickle, as old .pth files are; {_COPY}",
+    b"\x93NUMPY": f"a NumPy array; {_COPY}",
     HDF5: "an HDF5 file; its name should end in .h5",
     b"<!doctype html": "a web page: the download failed; look at it in a browser",
     b"<html": "a web page: the download failed; look at it in a browser",

@@ -199,7 +199,7 @@ class Net(torch.nn.Module):
     def _as_input(self, value: Array) -> torch.Tensor:
         dtype = self.learnable[0].parameter.dtype if self.learnable else torch.float32
         if isinstance(value, torch.Tensor):
-            return value.to(self.device, dtype if self.learnable and value.is_floating_point() else None)
+            return value.to(self.device, dtype if self.learnable or not value.is_floating_point() else None)
         return torch.as_tensor(np.asarray(value)).to(self.device, dtype)
 
     def _kept(self) -> frozenset[int]:

@@ -6,6 +6,7 @@ Caffe: Net::CopyTrainedLayersFrom, Net::ToProto, Net::ToHDF5 (src/caffe/net.cpp)
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -47,13 +48,13 @@ def load_weights(
     SpecError, and with ``some`` it is one where nothing fits. Others are those of a file that cannot be read, or is not
     what its snapshot wrote, and of blobs of other number or shape than the net's; all go to ``net.plan.source.report``.
     """
-    paths = [Path(each) for each in several(path)]
+    paths: list[str] = [os.fspath(each) for each in several(path)]  # not a Path: of a web address that loses a slash
     loaded: set[int] = set()
     whole = True
     for each in paths:
         faults: list[SpecError] = []
         try:
-            check_weights(each)
+            check_weights(Path(each))
             if h5py.is_hdf5(each):
                 loaded |= _copy(partial(_from_hdf5, net, each), faults.append)
             elif is_safetensors(head_of(each)):
@@ -76,7 +77,7 @@ def copy_weights(net: Net, message: NetParameter, path: str | Path) -> None:
 
     Layers that only one side has are left alone. For SpecErrors see :func:`load_weights`.
     """
-    _copy(partial(_from_message, net, message, Path(path), None), net.plan.source.report)
+    _copy(partial(_from_message, net, message, str(path), None), net.plan.source.report)
 
 
 def _copy(find: Callable[[Report], Copies], report: Report) -> set[int]:
@@ -115,7 +116,7 @@ def _read_into(blob: torch.Tensor, values: blobs.Elsewhere) -> None:
         blob.copy_(target)
 
 
-def _tell_missing(net: Net, loaded: set[int], paths: list[Path], strict: bool, some: bool) -> None:
+def _tell_missing(net: Net, loaded: set[int], paths: list[str], strict: bool, some: bool) -> None:
     """Warn of the layers of which a blob was not loaded, or report them; weights in the prototxt itself count."""
     learning = [layer for layer in net.layers if len(layer.blobs)]
     missing = [
@@ -213,7 +214,7 @@ def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
 # Binary
 
 
-def _from_message(net: Net, message: Any, path: Path, file: BinaryIO | None, report: Report) -> Copies:
+def _from_message(net: Net, message: Any, path: str, file: BinaryIO | None, report: Report) -> Copies:
     targets = _layers_by_name(net)
     copies: Copies = []
     for source in message.layer:
@@ -238,7 +239,7 @@ def _from_message(net: Net, message: Any, path: Path, file: BinaryIO | None, rep
 # HDF5: /data/<layer>/<i>, and /diff/<layer>/<i>
 
 
-def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
+def _from_hdf5(net: Net, path: str, report: Report) -> Copies:
     with open_hdf5(path) as file:
         data = file.group("data")
         if data is None:
@@ -246,7 +247,7 @@ def _from_hdf5(net: Net, path: Path, report: Report) -> Copies:
         return _from_arrays(net, layer_groups(data), path, report)
 
 
-def _from_safetensors(net: Net, path: Path, report: Report) -> Copies:
+def _from_safetensors(net: Net, path: str, report: Report) -> Copies:
     """Find the weights in what ``netspec export --to safetensors`` writes: LAYER.INDEX."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -264,7 +265,7 @@ def _from_safetensors(net: Net, path: Path, report: Report) -> Copies:
     return _from_arrays(net, layers.items(), path, report)
 
 
-def _from_arrays(net: Net, layers: Iterable[tuple[str, Any]], path: Path, report: Report) -> Copies:
+def _from_arrays(net: Net, layers: Iterable[tuple[str, Any]], path: str, report: Report) -> Copies:
     targets = _layers_by_name(net)
     shared = _shared(net)
     copies: Copies = []
@@ -328,7 +329,7 @@ def _ignore(name: str) -> None:
     log.info("net.cpp:746", f"Ignoring source layer {name}")
 
 
-def _wrong_count(path: Path, name: str, found: int, expected: int) -> SpecError:
+def _wrong_count(path: str, name: str, found: int, expected: int) -> SpecError:
     message = f"incompatible number of blobs for layer '{name}': {found} in the file, {expected} in the net. "
     return SpecError(message + _RENAME, Where(str(path)))
 
@@ -338,7 +339,7 @@ def _fits_loosely(layer: Layer, j: int, shape: tuple[int, ...]) -> bool:
     return layer.loose and [n for n in shape if n != 1] == [n for n in layer.blob_shapes[j] if n != 1]
 
 
-def _wrong_shape(path: Path, name: str, j: int, found: tuple[int, ...], expected: tuple[int, ...]) -> SpecError:
+def _wrong_shape(path: str, name: str, j: int, found: tuple[int, ...], expected: tuple[int, ...]) -> SpecError:
     shapes = f"Source param shape is {shape_string(found)}; target param shape is {shape_string(expected)}."
     message = f"cannot copy param {j} weights from layer '{name}'; shape mismatch. {shapes} {_RENAME}"
     return SpecError(message, Where(str(path)))

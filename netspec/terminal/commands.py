@@ -17,6 +17,7 @@ import shlex
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from itertools import takewhile
@@ -24,7 +25,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from netspec import log
-from netspec.errors import SpecError, did_you_mean
+from netspec.errors import SpecError, did_you_mean, printable
 from netspec.files.limits import amount, is_out_of_memory, memory
 from netspec.terminal.output import logging_to
 
@@ -261,14 +262,26 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
     except OSError as fault:
         print(f"{fault.filename}: {fault.strerror}" if fault.filename else fault, file=sys.stderr)
         return arguments.fault_status
-    except (MemoryError, RuntimeError) as fault:
-        if not is_out_of_memory(fault):
+    except Exception as fault:
+        if is_out_of_memory(fault):
+            line = f"there is not enough memory: this machine has {amount(memory())}"
+        elif not (line := _fault_of_plugin(fault, getattr(arguments, "plugin", None) or ())):
             raise
-        print(f"there is not enough memory: this machine has {amount(memory())}", file=sys.stderr)
+        print(line, file=sys.stderr)
         return FAULT
     except KeyboardInterrupt as end:
         print("interrupted", file=sys.stderr)
         return 128 + int(end.args[0] if end.args else signal.SIGINT)
+
+
+def _fault_of_plugin(fault: Exception, plugins: Sequence[str]) -> str:
+    """Return a line for a fault that a user's file of layers raised, and "" for another."""
+    files = {os.path.abspath(plugin) for plugin in plugins}
+    for frame in reversed(traceback.extract_tb(fault.__traceback__)):
+        if frame.filename in files:
+            text = printable(" ".join(str(fault).split()))
+            return f"{os.path.relpath(frame.filename)}:{frame.lineno}: in {frame.name}: {type(fault).__name__}: {text}"
+    return ""
 
 
 class Interrupted(KeyboardInterrupt):

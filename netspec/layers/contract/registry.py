@@ -7,6 +7,7 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 from netspec.errors import SpecError, Where, did_you_mean
@@ -134,8 +135,8 @@ def _run(file: DialectFile, name: str) -> None:
         spec.loader.exec_module(module)
     except Exception as fault:
         sys.modules.pop(name, None)
-        frames = traceback.extract_tb(fault.__traceback__)
-        lines = [frame.lineno or 0 for frame in frames if frame.filename == str(file.path)]
+        frames, own = traceback.extract_tb(fault.__traceback__), str(Path(file.path).absolute())
+        lines = [frame.lineno or 0 for frame in frames if frame.filename == own]
         text = " ".join(str(fault).split())
         place = Where(str(file.path), lines[-1] if lines else 0, 1)
         raise SpecError(f"cannot be loaded: {type(fault).__name__}: {text}", place) from fault

@@ -1,6 +1,7 @@
 """A clone without Git LFS has pointers in the place of large files: every reader says so, and the remedy."""
 
 import gzip
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -87,6 +88,7 @@ layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc"
     [
         ("x.npz", b"PK\x03\x04...", "a ZIP archive"),
         ("x.pth", b"\x80\x02...", "a pickle"),
+        ("x.npy", b"\x93NUMPY\x01\x00", r"a NumPy array; copy its arrays into net\.params"),
         ("x.jpg", b"\xff\xd8\xff\xe0..", "a JPEG image"),
         ("x.html", b"\n<!DOCTYPE html>", "a web page: the download failed"),
         ("x.caffemodel", b"\x10\0\0\0\0\0\0\0{}", "a .safetensors file"),
@@ -103,7 +105,7 @@ def test_other_files_are_named(name: str, data: bytes, said: str, tmp_path: Path
 
 def test_a_web_address_is_no_file() -> None:
     for read in (read_net, lambda path: load_weights(EMPTY, path)):
-        with pytest.raises(SpecError, match="is a web address; download the file"):
+        with pytest.raises(SpecError, match=r"^https://example\.org/x\.prototxt: is a web address; download the file"):
             read("https://example.org/x.prototxt")
 
 
@@ -123,7 +125,33 @@ def test_packed_files_and_our_own_safetensors_are_read(tmp_path: Path, monkeypat
         assert all(map(torch.equal, found.params["fc"], net.params["fc"]))
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
-def test_numbers_of_another_precision_become_the_nets(dtype: torch.dtype, tmp_path: Path) -> None:
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.int64, torch.bool])
+def test_numbers_of_another_type_become_the_nets(dtype: torch.dtype, tmp_path: Path) -> None:
     (tmp_path / "n.prototxt").write_text(NET)
     assert netspec.load_net(tmp_path / "n.prototxt")(data=torch.ones(1, 4, dtype=dtype))["fc"].dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (
+            "    def reshape(self, shapes): return shape\n",
+            r"own\.py:5: in reshape: NameError: name 'shape' is not defined",
+        ),
+        (
+            "    def reshape(self, shapes): return shapes\n    def forward(self, x): return y\n",
+            r"own\.py:6: in forward: NameError: name 'y' is not defined",
+        ),
+    ],
+)
+def test_a_fault_in_a_file_of_layers_is_one_line(
+    body: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    kind = f"Broken{len(body)}"
+    Path("own.py").write_text(f'from netspec.layers import *\n\n@register("{kind}")\nclass A(Layer):\n{body}')
+    Path("n.prototxt").write_text(
+        f'input: "x" input_shape {{ dim: 1 }} layer {{ name: "a" type: "{kind}" bottom: "x" top: "a" }}'
+    )
+    assert main(["time", "n.prototxt", "--plugin", "own.py", "--iterations", "1", "-q"]) == 1
+    assert re.fullmatch(said, capsys.readouterr().err.splitlines()[-1])
