@@ -17,7 +17,7 @@ from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.vision.convolution import Convolution
-from netspec.proto.schema import value
+from netspec.proto.schema import LayerParameter, value
 
 DECLARATIONS = """
 message InterpParameter {
@@ -138,7 +138,7 @@ class ReLU6(Capped):
 
 @register("DepthwiseConvolution", "convolution_param")
 class DepthwiseConvolution(Convolution):
-    """A separate convolution of each channel: group must be the number of channels.
+    """A separate convolution of each channel: group, where it is given, must be the number of channels.
 
     bottom[i]  (N, C, H, W)
     top[i]     (N, num_output, H', W') as Convolution's
@@ -149,6 +149,11 @@ class DepthwiseConvolution(Convolution):
 
     def setup(self) -> None:
         """Set up as Convolution; refuse filters over more than one channel."""
+        if not self.param.convolution_param.HasField("group"):
+            param = LayerParameter()
+            param.CopyFrom(self.param)
+            param.convolution_param.group = self.bottom_shapes[0][1] if len(self.bottom_shapes[0]) > 1 else 1
+            self.param = param
         super().setup()
         if self.group != self.channels:
             message = f"group must be the number of channels, {self.channels}, found {self.group}"

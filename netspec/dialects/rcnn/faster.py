@@ -3,7 +3,7 @@
 A Python layer of these modules and classes runs here without running anybody's code. What the code reads from its
 configuration has the values of experiments/cfgs/faster_rcnn_end2end.yml. A box is (x1, y1, x2, y2) in pixels, both
 corners included. Random choices are the net's, not numpy's.
-Fork: rbgirshick/py-faster-rcnn, lib/rpn, lib/roi_data_layer
+Fork: rbgirshick/py-faster-rcnn, lib/rpn, lib/roi_data_layer; peteanderson80/bottom-up-attention, which has attributes
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import torch
 from netspec.data.images import read_image
 from netspec.dialects.boxes import Array, as_array
 from netspec.dialects.rcnn.proposals import all_anchors, base_anchors
+from netspec.errors import SpecError
 from netspec.files.opencv import cv2
 from netspec.layers.contract.base import Layer, Shape
 
@@ -25,12 +26,14 @@ RATIOS, SCALES = (0.5, 1, 2), (8, 16, 32)
 ANCHORS, OBJECTS = 256, 0.5  # a minibatch of the region proposals: its size, and the most that are objects
 OBJECT, BACKGROUND = 0.7, 0.3  # an anchor of at least, and of less than this overlap
 REGIONS, FOREGROUND = 128, 0.25  # a minibatch of the classifier: its size, and the most that are objects
+ATTRIBUTES, OF_ATTRIBUTES, WITH_ATTRIBUTES = 16, 64, 0.5  # of a region; with them REGIONS and FOREGROUND are these
 OVERLAP = 0.5  # a region of at least this overlap is an object
 DEVIATIONS = np.array([0.1, 0.1, 0.2, 0.2], np.float32)  # the classifier's targets are divided by them
 SHORTEST, LONGEST = 600, 1000  # sides to which images are scaled
 MEANS = np.array([102.9801, 115.9465, 122.7717], np.float32)  # blue, green, red
 
 
+OWN_CODE = "--allow-python-layers runs the fork's own code"
 _SETTING = r"""(\w+)['"]?\s*:\s*(?:[^\s\[(]*\s*[\[(]([^\])]*)[\])]|([-+.\w]+))"""  # a name; a list or a number
 
 
@@ -123,7 +126,7 @@ class AnchorTarget(_Sampling):
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         if len(bottom_shapes[0]) != 4 or bottom_shapes[0][0] != 1:
             raise self.error(f"found scores of shape {bottom_shapes[0]}, expected (1, C, H, W)", "bottom", 0)
-        if bottom_shapes[1][1:] not in ((4,), (5,)):
+        if bottom_shapes[1][1:] not in ((4,), (5,), (5 + ATTRIBUTES,)):
             raise self.error(f"found true boxes of shape {bottom_shapes[1]}, expected (n, 5)", "bottom", 1)
         count, (height, width) = len(self.anchors), bottom_shapes[0][2:]
         return [(1, 1, count * height, width), *[(1, 4 * count, height, width)] * 3]
@@ -159,44 +162,63 @@ class ProposalTarget(_Sampling):
     """Choose regions to learn from, and say what they show and where it lies beside them.
 
     128 of the proposals and the true boxes: at most a quarter that overlap a true box by half or more, the rest
-    background.
+    background. With num_attr_classes (bottom-up attention) 64, at most half of them objects.
 
     bottom[0]  proposals (R, 5): 0, x1, y1, x2, y2
-    bottom[1]  true boxes (n, 5): x1, y1, x2, y2, class
+    bottom[1]  true boxes (n, 5): x1, y1, x2, y2, class; with num_attr_classes (n, 21): and 16 attributes
     top[0]     the regions (r, 5), those with an object first
     top[1]     classes (r,), 0 background
     top[2]     targets (r, 4 num_classes), divided by (0.1, 0.1, 0.2, 0.2), at the region's class
     top[3]     inside weights, the same shape: 1 there
     top[4]     outside weights, the same shape: 1 there
-    Fork: py-faster-rcnn, lib/rpn/proposal_target_layer.py
+    top[5]     with num_attr_classes: attributes of the objects (32, 16), ignore_label (-1) where there is none
+    Fork: py-faster-rcnn and bottom-up-attention, lib/rpn/proposal_target_layer.py
     """
 
-    bottoms, tops = (2, 2), (5, 5)
+    bottoms, tops = (2, 2), (5, 6)
     label_bottoms = frozenset({0, 1})
     counted_axis = 0
 
     def setup(self) -> None:
-        self.classes = int(settings(self, num_classes=1)["num_classes"])
+        found = settings(self, "num_attr_classes", "num_rel_classes", "ignore_label", num_classes=1)
+        self.classes, self.nothing = int(found["num_classes"]), float(found.get("ignore_label", -1))
+        self.attributes = bool(found.get("num_attr_classes"))
+        if found.get("num_rel_classes"):
+            raise self.error(f"num_rel_classes is not known here; {OWN_CODE}", "python_param", "param_str")
+        if self.num_tops != 5 + self.attributes:
+            expected = "6, the last for attributes" if self.attributes else "5, or num_attr_classes in param_str"
+            raise self.error(f"found {self.num_tops} tops, expected {expected}; {OWN_CODE}", "top")
+        self.regions, share = (OF_ATTRIBUTES, WITH_ATTRIBUTES) if self.attributes else (REGIONS, FOREGROUND)
+        self.objects = round(share * self.regions)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         if bottom_shapes[0][1:] != (5,):
             raise self.error(f"found proposals of shape {bottom_shapes[0]}, expected (R, 5)", "bottom", 0)
-        if bottom_shapes[1][1:] not in ((4,), (5,)):  # the second until there are data, as in the fork
-            raise self.error(f"found true boxes of shape {bottom_shapes[1]}, expected (n, 5)", "bottom", 1)
-        return [(1, 5), (1,), *[(1, 4 * self.classes)] * 3]
+        if len(bottom_shapes[1]) != 2 or bottom_shapes[1][1] not in (4, 5, self.columns):  # 4 or 5: no data yet
+            raise self._wrong(bottom_shapes[1])
+        tops = [(1, 5), (1,), *[(1, 4 * self.classes)] * 3, (self.objects, ATTRIBUTES)]
+        return tops[: self.num_tops]
+
+    @property
+    def columns(self) -> int:
+        """The numbers of a true box."""
+        return 5 + ATTRIBUTES * self.attributes
+
+    def _wrong(self, shape: Shape) -> SpecError:
+        return self.error(f"found true boxes of shape {shape}, expected (n, {self.columns})", "bottom", 1)
 
     def forward(self, proposals: torch.Tensor, boxes: torch.Tensor) -> tuple[torch.Tensor, ...]:
         truth = as_array(boxes)
-        if truth.shape[1] != 5:
-            raise self.error(f"found true boxes of shape {truth.shape}, expected (n, 5)", "bottom", 1)
+        if truth.shape[1] != self.columns:
+            raise self._wrong(truth.shape)
         own = np.concatenate([np.zeros((len(truth), 1), np.float32), truth[:, :4]], axis=1)
         regions = np.concatenate([as_array(proposals), own])
         best, which = np.zeros(len(regions)), np.zeros(len(regions), int)
         if len(truth):
             table = overlaps(regions[:, 1:].astype(np.float64), truth[:, :4].astype(np.float64))
             best, which = table.max(axis=1), table.argmax(axis=1)
-        objects = self.choose(np.flatnonzero(best >= OVERLAP), round(FOREGROUND * REGIONS))
-        others = self.choose(np.flatnonzero(best < OVERLAP), REGIONS - len(objects))
+        objects = self.choose(np.flatnonzero(best >= OVERLAP), self.objects)
+        others = self.choose(np.flatnonzero(best < OVERLAP), self.regions - len(objects))
         regions, which = regions[[*objects, *others]], which[[*objects, *others]]
         labels = np.zeros(len(regions), int)
         rows = np.arange(len(objects))
@@ -207,7 +229,11 @@ class ProposalTarget(_Sampling):
         moves[rows, labels[rows]] = targets(regions[rows, 1:], truth[which[rows], :4]) / DEVIATIONS
         weights[rows, labels[rows]] = 1
         flat = [a.reshape(len(regions), -1) for a in (moves, weights, weights)]
-        return self.tops_of(proposals, [regions, labels, *flat])
+        traits = np.full((self.objects, ATTRIBUTES), self.nothing, np.float32)
+        if self.attributes:
+            traits[rows] = truth[which[rows], 5:]
+            traits[:, 1:][traits[:, 1:] == 0] = self.nothing  # the first stays, as in the fork
+        return self.tops_of(proposals, [regions, labels, *flat, traits][: self.num_tops])
 
 
 class RoIData(_Sampling):
@@ -215,18 +241,21 @@ class RoIData(_Sampling):
 
     The short side is scaled to 600 pixels, the long one at most to 1000. ``net.layers[0].set_roidb(entries)`` gives
     the images: each entry is a dict with "image" (a path), "boxes" (n, 4), "gt_classes" (n,) and, if it is mirrored,
-    "flipped": True, its boxes being mirrored already.
+    "flipped": True, its boxes being mirrored already; with "gt_attributes" (n, 16) these stand beside the boxes.
 
     top[0]     the image (1, 3, H, W): blue, green, red, minus their means
     top[1]     its height, width and scale (1, 3)
-    top[2]     the true boxes (n, 5), scaled: x1, y1, x2, y2, class
-    Fork: py-faster-rcnn, lib/roi_data_layer/layer.py, minibatch.py
+    top[2]     the true boxes (n, 5), scaled: x1, y1, x2, y2, class; (n, 21) with attributes
+    Fork: py-faster-rcnn and bottom-up-attention, lib/roi_data_layer/layer.py, minibatch.py
     """
 
-    bottoms, tops = (0, 0), (3, 3)
+    bottoms, tops = (0, 0), (3, None)
     promises = False  # images differ in size
 
     def setup(self) -> None:
+        if self.num_tops != 3:
+            found = f"found {self.num_tops} tops, expected 3 (data, im_info, gt_boxes)"
+            raise self.error(f"{found}: batches of Fast R-CNN's own regions are not here; {OWN_CODE}", "top")
         self.entries: Sequence[Mapping[str, Any]] = ()
         self.waiting: list[int] = []
 
@@ -265,7 +294,11 @@ class RoIData(_Sampling):
         if entry.get("flipped"):
             pixels = pixels[:, ::-1]
         image, scale = scaled(pixels.astype(np.float32) - MEANS)
-        rows = np.concatenate([np.array(entry["boxes"]) * scale, np.array(entry["gt_classes"])[:, None]], axis=1)
+        columns = [np.array(entry["boxes"]) * scale, np.array(entry["gt_classes"])[:, None]]
+        if "gt_attributes" in entry:
+            attributes = entry["gt_attributes"]
+            columns.append(attributes.toarray() if hasattr(attributes, "toarray") else np.array(attributes))
+        rows = np.concatenate(columns, axis=1)
         sizes = [[*image.shape[:2], scale]]
         like = torch.empty(0, device=self.context.device)
         return self.tops_of(like, [image.transpose(2, 0, 1)[None], np.array(sizes), rows[rows[:, 4] > 0]])

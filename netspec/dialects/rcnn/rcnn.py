@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from netspec.dialects.boxes import as_array
+from netspec.dialects.rcnn.align import ROIAlign
 from netspec.dialects.rcnn.faster import AnchorTarget, ProposalTarget, RoIData, anchors_of, settings
 from netspec.dialects.rcnn.proposals import all_anchors, base_anchors, moved, suppress
 from netspec.dialects.rcnn.regions import RegionPooling, whole
@@ -33,6 +34,12 @@ message ROIPoolingParameter {
   // MSCNN
   optional float pad_ratio = 4 [default = 0];
 }
+message ROIAlignParameter {
+  optional uint32 pooled_h = 1 [default = 0];
+  optional uint32 pooled_w = 2 [default = 0];
+  optional float spatial_scale = 3 [default = 1];
+  optional int32 sampling_ratio = 4 [default = -1];
+}
 message SmoothL1LossParameter {
   optional float sigma = 1 [default = 1];
 }
@@ -50,6 +57,7 @@ extend LayerParameter {
   optional ProposalParameter proposal_param = 10002;
   optional ROIPoolingParameter roi_pooling_param = 8266711;
   optional SmoothL1LossParameter smooth_l1_loss_param = 8266712;
+  optional ROIAlignParameter roi_align_param = 8266713;
 }
 """
 
@@ -252,4 +260,5 @@ class ProposalLayer(Proposal):
 register("rpn.anchor_target_layer.AnchorTargetLayer", "python_param")(AnchorTarget)
 register("rpn.proposal_target_layer.ProposalTargetLayer", "python_param")(ProposalTarget)
 register("roi_data_layer.layer.RoIDataLayer", "python_param")(RoIData)
+register("ROIAlign", "roi_pooling_param", "roi_align_param")(ROIAlign)
 register("SmoothL1Loss", "smooth_l1_loss_param", *NORMALIZED)(SmoothL1Loss)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from typing_extensions import override
@@ -17,6 +18,7 @@ from netspec.layers import register
 from netspec.layers.contract.base import Shape
 from netspec.layers.data.files import ReadingLayer
 from netspec.layers.loss import scores as losses
+from netspec.layers.loss.base import Loss
 from netspec.proto.schema import value
 
 DECLARATIONS = """
@@ -162,3 +164,54 @@ class SoftmaxWithLoss(losses.SoftmaxWithLoss):
     @override
     def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, exact: bool) -> torch.Tensor:
         return super().sum_up(losses * self._each, valid, exact)
+
+
+class _Dice(torch.autograd.Function):
+    """1 less the mean of r = (2 x.y + 1) / (x.x + y.y + 1); the gradient is that of the sum, as in the fork."""
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        below = x.square().sum(1, keepdim=True) + y.square().sum(1, keepdim=True) + 1
+        ratio = (2 * (x * y).sum(1, keepdim=True) + 1) / below
+        ctx.save_for_backward(x, y, ratio, below)
+        return 1 - ratio.abs().sum() / len(x)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        x, y, ratio, below = ctx.saved_tensors
+        factor = 2 * grads[0] / below
+        return factor * (x * ratio - y), factor * (y * ratio - x)
+
+
+@register("DiceCoefLoss")
+class DiceCoefLoss(Loss):
+    """1 less the mean, over the items, of (2 x.y + 1) / (x.x + y.y + 1).
+
+    The gradient is not divided by the number of items. Other forks' have other numbers: over the whole batch, with
+    sums in place of squares, or with dice_coef_loss_param, which is not known here.
+
+    bottom[0]  x (N, ...)
+    bottom[1]  y, as many
+    top[0]     the loss, ()
+    Fork: HolmesShuan/A-Variation-of-Dice-coefficient-Loss-Caffe-Layer, dice_coef_loss_layer.cpp
+    """
+
+    label_bottoms = frozenset()
+    not_exported = "it is for training"
+    unsure = (
+        "forks have other layers of this type, and nothing shows whose it is; it is computed of each image, with "
+        "squares (HolmesShuan's, for real values), not of the whole batch or with sums; to have those, write the "
+        "layer as docs/layer.md shows and pass --plugin FILE.py"
+    )
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the scalar top's shape; the bottoms must have as many numbers."""
+        x, y = (torch.Size(shape) for shape in bottom_shapes)
+        if x[:1] != y[:1] or x.numel() != y.numel():
+            raise self.error(
+                f"found bottoms of shapes {bottom_shapes}, expected as many numbers of each item", "bottom"
+            )
+        return [()]
+
+    def forward(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        return _Dice.apply(x.flatten(1), y.flatten(1))

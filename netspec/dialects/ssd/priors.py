@@ -15,6 +15,7 @@ from netspec.dialects.boxes import (
 )
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
+from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import value
 
@@ -24,12 +25,13 @@ class PriorBox(Layer):
 
     For each min_size: a square of it; with max_sizes a square of sqrt(min_size max_size); then for each aspect_ratio
     r, and 1 / r with ``flip``, min_size sqrt(r) by min_size / sqrt(r). Sizes are cut to whole pixels. Centers are at
-    (index + offset) step; where they are not given, the step is image / map and the image is bottom[1].
+    (index + offset) step; where they are not given, the step is image / map and the image is bottom[1]. With
+    denser_prior_boxes (TextBoxes++) each box is followed by one whose center is at (row + 1) step.
 
     bottom[0]  the map (N, C, H, W)
     bottom[1]  the image (N, C', H', W'); not needed where img_size, or img_h and img_w, are given
     top[0]     (1, 2, 4 H W K), K boxes a pixel: [0, 0] (xmin, ymin, xmax, ymax) in parts of the image, [0, 1] variances
-    Fork: src/caffe/layers/prior_box_layer.cpp
+    Fork: weiliu89/caffe (ssd), MhLiao/TextBoxes_plusplus, src/caffe/layers/prior_box_layer.cpp
     """
 
     bottoms = (1, 2)
@@ -110,6 +112,10 @@ class PriorBox(Layer):
         x = (np.arange(width, dtype=np.float32) + offset) * np.float32(step[1])
         center = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)[:, :, None].astype(float)
         half = self.sizes / 2.0
+        if param.denser_prior_boxes:
+            lower = center + np.array([0, (1 - float(offset)) * step[0]])
+            center = np.concatenate([center, lower] * len(half), axis=2)
+            half = half.repeat(2, axis=0)
         extent = np.array(image[::-1], float)
         boxes = np.concatenate([(center - half) / extent, (center + half) / extent], axis=-1).astype(np.float32)
         boxes = boxes.clip(0, 1) if param.clip else boxes
@@ -123,6 +129,8 @@ class PriorBox(Layer):
         image_is_free = self.image is None and None in graph.sizes(1)[2:]
         if None not in graph.sizes(0)[2:] and not image_is_free:
             return graph.node("Identity", graph.constant(self.boxes))
+        if value(self.param, "prior_box_param").denser_prior_boxes:
+            raise refusal(self, "ONNX", "denser_prior_boxes is exported for maps of one size")
         sides = []
         for k in (0, 1):  # vertical, horizontal
             count = graph.shape_of(bottoms[0], 2 + k, 3 + k)
@@ -156,6 +164,8 @@ class PriorBox(Layer):
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         param = value(self.param, "prior_box_param")
+        if param.denser_prior_boxes:
+            raise refusal(self, "PyTorch", "it has denser_prior_boxes")
         image = code.call("{image}", image=self.image) if self.image else code.call("{y}.shape[2:]", y=bottoms[1])
         sizes = [(rounded(float(width)), rounded(float(height))) for width, height in self.sizes]
         options = {

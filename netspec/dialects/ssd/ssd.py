@@ -43,6 +43,8 @@ message PriorBoxParameter {
   optional float step_h = 11;
   optional float step_w = 12;
   optional float offset = 13 [default = 0.5];
+  // TextBoxes++
+  optional bool denser_prior_boxes = 14 [default = false];
 }
 message NonMaximumSuppressionParameter {
   optional float nms_threshold = 1 [default = 0.3];

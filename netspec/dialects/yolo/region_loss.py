@@ -1,6 +1,6 @@
-"""The loss of YOLO v2, as Darknet's region layer has it.
+"""The losses of YOLO v2 and v3, as Darknet's region and yolo layers have them.
 
-Fork: eric612/MobileNet-YOLO, src/caffe/layers/region_loss_layer.cpp
+Fork: eric612/MobileNet-YOLO, src/caffe/layers/region_loss_layer.cpp, yolov3_layer.cpp
 """
 
 from __future__ import annotations
@@ -10,17 +10,65 @@ from typing import Any
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from netspec.dialects.boxes import Array, around, as_array, overlaps, sigmoid
 from netspec.layers.contract.base import Shape
 from netspec.layers.loss.base import Loss
 from netspec.proto.schema import value
 
-GROUP = "region_loss_param"
+MSE = 2  # Yolov3Parameter.IOU_LOSS
 OBJECT, CLASSES = 4, 5  # where they begin among the numbers of a box; x, y, width and height are before them
 
 
-class RegionLoss(Loss):
+class _DarknetLoss(Loss):
+    """Base of the losses: what each number of a map is to be moved by is told by ``_moves``."""
+
+    group: str
+    not_exported = "it is for training"
+
+    def setup(self) -> None:
+        self.settings = param = value(self.param, self.group)
+        if len(param.biases) % 2 or not param.biases:
+            raise self.error(f"found {len(param.biases)} biases, expected pairs", self.group, "biases")
+        self.anchors = np.array(param.biases, np.float32).reshape(-1, 2)
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        """Return the scalar top's shape; the map must have the channels of its boxes."""
+        maps, truth = bottom_shapes
+        channels = self.settings.num * (CLASSES + self.settings.num_class)
+        if len(maps) != 4 or maps[1] != channels:
+            raise self.error(f"found a map of shape {maps}, expected (N, {channels}, S, S)", "bottom", 0)
+        if truth[:1] != maps[:1] or truth[-1:] != (5,):
+            raise self.error(f"found true boxes of shape {truth}, expected ({maps[0]}, 1, n, 5)", "bottom", 1)
+        return [()]
+
+    def forward(self, maps: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+        items, height, width = (maps.shape[i] for i in (0, 2, 3))
+        cells = as_array(maps).reshape(items, self.settings.num, -1, height, width)
+        boxes = as_array(truth).reshape(items, -1, 5)
+        moves = np.stack([self._moves(*each) for each in zip(cells, boxes, strict=True)])
+        diff = self._gradient(moves, cells)
+        return _Moved.apply(maps, *(torch.from_numpy(a.reshape(maps.shape)).to(maps) for a in (moves, diff)))
+
+    def _moves(self, cells: Array, truth: Array) -> Array:
+        """Return what the numbers (num, 5 + num_class, H, W) of an image are to be moved by, the other way round.
+
+        Later true boxes replace what earlier ones said of the same anchor.
+        """
+        raise NotImplementedError
+
+    def _gradient(self, moves: Array, cells: Array) -> Array:
+        """Return the gradient of the loss, times N, of the numbers (N, num, 5 + num_class, H, W)."""
+        return moves
+
+
+def _until(column: Array) -> int:
+    """Return how many numbers stand before the first 0."""
+    return int(np.argmin(np.append(column != 0, False)))
+
+
+class RegionLoss(_DarknetLoss):
     """The sum of squares of what each number of YOLO's boxes is to be moved by, divided by N.
 
     A box that overlaps a true one by more than ``thresh`` may have any objectness, others shall have 0. Of the anchors
@@ -34,39 +82,27 @@ class RegionLoss(Loss):
     Fork: eric612/MobileNet-YOLO, src/caffe/layers/region_loss_layer.cpp
     """
 
-    not_exported = "it is for training"
+    group = "region_loss_param"
 
     def setup(self) -> None:
-        self.settings = param = value(self.param, GROUP)
-        if len(param.biases) != 2 * param.num or param.coords != OBJECT:
+        super().setup()
+        param = self.settings
+        if len(self.anchors) != param.num or param.coords != OBJECT:
             message = f"expected a pair of biases for each of num {param.num}, and coords 4"
-            raise self.error(f"{message}; found {len(param.biases)} and coords {param.coords}", GROUP, "biases")
+            found = f"found {len(param.biases)} and coords {param.coords}"
+            raise self.error(f"{message}; {found}", self.group, "biases")
         if param.softmax_tree or param.class_map:
-            raise self.error("a tree or map of classes is not known here", GROUP, "softmax_tree")
-        self.anchors = np.array(param.biases, np.float32).reshape(-1, 2)
+            raise self.error("a tree or map of classes is not known here", self.group, "softmax_tree")
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape; the map must be square, with the channels of its boxes."""
-        maps, truth = bottom_shapes
-        channels = self.settings.num * (CLASSES + self.settings.num_class)
-        if len(maps) != 4 or maps[1] != channels or maps[2] != maps[3]:
-            raise self.error(f"found a map of shape {maps}, expected (N, {channels}, S, S)", "bottom", 0)
-        if truth[:1] != maps[:1] or truth[-1:] != (5,):
-            raise self.error(f"found true boxes of shape {truth}, expected ({maps[0]}, 1, n, 5)", "bottom", 1)
-        return [()]
+        """Return the scalar top's shape; the map must be square."""
+        shapes = super().reshape(bottom_shapes)
+        if bottom_shapes[0][2] != bottom_shapes[0][3]:
+            raise self.error(f"found a map of shape {bottom_shapes[0]}, expected a square one", "bottom", 0)
+        return shapes
 
-    def forward(self, maps: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-        items, side = maps.shape[0], maps.shape[2]
-        cells = as_array(maps).reshape(items, self.settings.num, -1, side, side)
-        boxes = as_array(truth).reshape(items, -1, 5)
-        moves = np.stack([self._moves(*each) for each in zip(cells, boxes, strict=True)])
-        return _Moved.apply(maps, torch.from_numpy(moves.reshape(maps.shape)).to(maps))
-
+    @override
     def _moves(self, cells: Array, truth: Array) -> Array:
-        """Return what the numbers (num, 5 + num_class, S, S) of an image are to be moved by, in the opposite direction.
-
-        Later true boxes replace what earlier ones said of the same anchor.
-        """
         p, side = self.settings, np.float32(cells.shape[2])
         shares = np.exp(cells[:, CLASSES:] - cells[:, CLASSES:].max(axis=1, keepdims=True))
         shares /= shares.sum(axis=1, keepdims=True)
@@ -77,11 +113,11 @@ class RegionLoss(Loss):
         centers = np.stack([x + sigmoid(cells[:, 0]), y + sigmoid(cells[:, 1])], axis=-1) / side
         extents = np.exp(cells[:, 2:4].transpose(0, 2, 3, 1)) * self.anchors[:, None, None] / side
         found = around(centers, extents)
-        known = truth[: int(np.argmin(np.append(truth[:, 1] != 0, False)))]
+        known = truth[: _until(truth[:, 1])]
         if len(known):
             best = overlaps(found[..., None, :], around(known[:, 1:3], known[:, 3:5])).max(axis=-1)
             moves[:, OBJECT][best > np.float32(p.thresh)] = 0
-        for label, *place in truth[: int(np.argmin(np.append(truth[:, 3] != 0, False)))]:
+        for label, *place in truth[: _until(truth[:, 3])]:
             center, extent = np.array(place[:2], np.float32), np.array(place[2:], np.float32)
             column, row = (center * side).astype(int)
             like = self.anchors / side if p.bias_match else extents[:, row, column]
@@ -100,15 +136,109 @@ class RegionLoss(Loss):
         return moves
 
 
+class Yolov3(_DarknetLoss):
+    """The sum of squares of what each number of YOLO v3's boxes is to be moved by, divided by N.
+
+    A box that overlaps a true one by more than ``thresh`` may have any objectness, others shall have 0. The anchor
+    (``biases``, in pixels of an image of anchors_scale times the map's size) most like a true box in shape shall have
+    its place, size and class, and an objectness of 1, if ``mask`` names it; so shall others of ``mask`` that are like
+    it by more than iou_thresh. The class shall have 1, others 0, each brought nearer to a half by label_smooth_eps.
+    The moves, divided by N, are the gradient; with use_logic_gradient times the derivative of the sigmoid. The fork
+    does not read noobject_scale, and object_scale with use_logic_gradient only. iou_loss other than MSE is not here.
+
+    bottom[0]  (N, num (5 + num_class), H, W): x, y, width, height, objectness, classes of each anchor
+    bottom[1]  true boxes (N, 1, n, 5): class from 0, x, y, width, height, parts of the image; zeros end them
+    top[0]     the loss, ()
+    Fork: eric612/MobileNet-YOLO, src/caffe/layers/yolov3_layer.cpp
+    """
+
+    group = "yolov3_param"
+
+    def setup(self) -> None:
+        super().setup()
+        p = self.settings
+        if p.iou_loss != MSE:
+            raise self.error("only iou_loss: MSE is known", self.group, "iou_loss")
+        if len(p.mask) < p.num or max(p.mask[: p.num], default=0) >= len(self.anchors):
+            expected = f"num {p.num} numbers below {len(self.anchors)}, the pairs of biases"
+            raise self.error(f"found mask {list(p.mask)}, expected {expected}", self.group, "mask")
+        self.mask = list(p.mask)[: p.num]
+
+    @override
+    def _moves(self, cells: Array, truth: Array) -> Array:
+        p, map_size = self.settings, np.array(cells.shape[:1:-1], np.float32)
+        image = map_size * np.float32(p.anchors_scale)
+        shares = sigmoid(cells)
+        moves = np.zeros_like(cells)
+        moves[:, OBJECT] = shares[:, OBJECT]
+        y, x = np.mgrid[: cells.shape[2], : cells.shape[3]].astype(np.float32)
+        centers = (np.stack([x, y], axis=-1) + shares[:, :2].transpose(0, 2, 3, 1)) / map_size
+        extents = np.exp(cells[:, 2:4].transpose(0, 2, 3, 1)) * self.anchors[self.mask][:, None, None] / image
+        known = truth[: _until(truth[:, 1])]
+        if len(known):
+            found = around(centers, extents)[..., None, :]
+            best = overlaps(found, around(known[:, 1:3], known[:, 3:5])).max(axis=-1)
+            moves[:, OBJECT][best > np.float32(p.thresh)] = 0
+        zero = np.zeros_like(self.anchors)
+        for label, *place in truth[: _until(truth[:, 3])]:
+            extent = np.array(place[2:], np.float32)
+            like = overlaps(around(zero, self.anchors / image), around(zero[:1], extent[None]))
+            for n in self._like(like):
+                self._move(moves, cells, shares, n, int(label), np.array(place, np.float32))
+        return moves
+
+    def _like(self, like: Array) -> list[int]:
+        """Return which of ``mask`` a true box is for; the fork leaves out that of which the best one's index tells."""
+        best = int(like.argmax()) if like.max() > 0 else -1
+        first = [self.mask.index(best)] if best in self.mask else []
+        left_out = first[0] if first else best
+        if self.settings.iou_thresh >= 1:
+            return first
+        near = np.flatnonzero(like > np.float32(self.settings.iou_thresh)).tolist()
+        return first + [self.mask.index(n) for n in near if n in self.mask and n != left_out]
+
+    def _move(self, moves: Array, cells: Array, shares: Array, n: int, label: int, place: Array) -> None:
+        """Say of anchor ``n`` of the mask, in the cell of a true box, what it shall be."""
+        p, map_size = self.settings, np.array(cells.shape[:1:-1], np.float32)
+        column, row = (place[:2] * map_size).astype(int)
+        at = (n, slice(None), row, column)
+        number, share, move = cells[at], shares[at], moves[at]
+        scale = np.float32(p.coord_scale * (2 - place[2] * place[3]))
+        goal = np.log(place[2:] * map_size * np.float32(p.anchors_scale) / self.anchors[self.mask[n]])
+        move[:2] = -scale * (place[:2] * map_size - [column, row] - share[:2])
+        move[2:4] = -scale * (goal - number[2:4])
+        move[OBJECT] = -(1 - share[OBJECT]) * np.float32(p.object_scale if p.use_logic_gradient else 1)
+        wanted, classes, eps = np.zeros(p.num_class, np.float32), share[CLASSES:], p.label_smooth_eps
+        wanted[label] = 1
+        if move[CLASSES + label]:  # an earlier true box was for this anchor: its class stays beside
+            step = p.class_scale * ((1 - eps) + eps / 2 - classes[label])
+            move[CLASSES + label] = -step
+        elif p.use_focal_loss:
+            sure = classes[label] + np.float32(1e-15)
+            focus = -(1 - sure) * (2 * sure * np.log(sure) + sure - 1) / 2
+            move[CLASSES:] = -np.float32(p.class_scale) * (wanted - classes) * focus
+        else:
+            move[CLASSES:] = -np.float32(p.class_scale) * (wanted * (1 - eps) + eps / 2 - classes)
+
+    @override
+    def _gradient(self, moves: Array, cells: Array) -> Array:
+        if not self.settings.use_logic_gradient:
+            return moves
+        share = sigmoid(cells)
+        slope = share * (1 - share)
+        slope[:, :, 2:4] = 1
+        return moves * slope
+
+
 class _Moved(torch.autograd.Function):
-    """The sum of the squares of moves / N; its gradient is the moves / N, as in the fork, not their derivative."""
+    """The sum of the squares of moves / N; its gradient is given, as in the fork; it is not their derivative."""
 
     @staticmethod
-    def forward(ctx: Any, maps: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
-        ctx.save_for_backward(moves)
+    def forward(ctx: Any, maps: torch.Tensor, moves: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(diff)
         return moves.square().sum() / len(maps)
 
     @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
-        (moves,) = ctx.saved_tensors
-        return moves * (grads[0] / len(moves)), None
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        (diff,) = ctx.saved_tensors
+        return diff * (grads[0] / len(diff)), None, None

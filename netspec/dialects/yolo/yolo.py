@@ -1,4 +1,4 @@
-"""YOLO in Caffe, versions 2 and 3: eric612/MobileNet-YOLO and its kin. Of version 3 the loss is not here; nets run."""
+"""YOLO in Caffe, versions 2 and 3: eric612/MobileNet-YOLO and its kin."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from typing_extensions import override
 
 from netspec.dialects.boxes import Array, around, as_array, detections, overlaps, sigmoid
-from netspec.dialects.yolo.region_loss import RegionLoss
+from netspec.dialects.yolo.region_loss import CLASSES, OBJECT, RegionLoss, Yolov3
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import value
@@ -56,7 +56,30 @@ message RegionLossParameter {
   optional string softmax_tree = 17;
   optional string class_map = 18;
 }
+message Yolov3Parameter {
+  enum IOU_LOSS { IOU = 0; GIOU = 1; MSE = 2; DIOU = 3; CIOU = 4; }
+  optional uint32 side = 1 [default = 13];
+  optional uint32 num_class = 2 [default = 20];
+  optional uint32 num = 3 [default = 5];
+  optional float object_scale = 4 [default = 1.0];
+  optional float class_scale = 5 [default = 1.0];
+  optional float noobject_scale = 6 [default = 0.5];
+  optional float coord_scale = 7 [default = 5.0];
+  optional float thresh = 8 [default = 0.2];
+  optional uint32 anchors_scale = 9 [default = 32];
+  repeated float biases = 11;
+  repeated uint32 mask = 12;
+  optional bool use_logic_gradient = 13 [default = false];
+  optional bool use_focal_loss = 14 [default = false];
+  optional IOU_LOSS iou_loss = 15 [default = MSE];
+  optional float iou_normalizer = 16 [default = 0.25];
+  optional float iou_thresh = 17 [default = 0.5];
+  optional float max_delta = 18 [default = 10];
+  optional bool accumulate = 19 [default = true];
+  optional float label_smooth_eps = 20 [default = 0.1];
+}
 extend LayerParameter {
+  optional Yolov3Parameter yolov3_param = 1197;
   optional RegionLossParameter region_loss_param = 1200;
   optional YoloDetectionOutputParameter yolo_detection_output_param = 1198;
   optional Yolov3DetectionOutputParameter yolov3_detection_output_param = 1199;
@@ -64,8 +87,7 @@ extend LayerParameter {
 """
 
 register("RegionLoss", "region_loss_param")(RegionLoss)
-
-OBJECT, CLASSES = 4, 5  # where they begin among the numbers of a box; x, y, width and height are before them
+register("Yolov3", "yolov3_param")(Yolov3)
 
 
 class _YoloOutput(Layer):

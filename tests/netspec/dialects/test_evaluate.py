@@ -90,20 +90,6 @@ def test_a_resumed_training_goes_on_with_the_next_size(build: Build, tmp_path: P
         resume(second, {"image": -1})
 
 
-@pytest.mark.parametrize(
-    ("settings", "fault"),
-    [
-        ("num_classes: 0", "num_classes must be given"),
-        ("overlap_threshold: 0", "overlap_threshold must be above 0"),
-        ("name_size_file: 'none'", 'name_size_file "none" cannot be read'),
-        ("name_size_file: 'x' resize_param { resize_mode: FIT_SMALL_SIZE }", "only resize_mode WARP"),
-    ],
-)
-def test_detection_evaluate_refuses(build: Build, settings: str, fault: str) -> None:
-    with pytest.raises(SpecError, match=fault):
-        evaluate(build, settings)
-
-
 def test_average_precision() -> None:
     use_dialect("ssd")
     from netspec.dialects.ssd.evaluate import average_precision

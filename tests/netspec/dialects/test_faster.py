@@ -72,11 +72,6 @@ def test_ratios_make_other_anchors_and_another_name_is_refused(build: Build) -> 
         build("rcnn", text.replace("ratios", "ration"), (1, 18, 20, 30), (3, 5), (1, 3), tops=4)
 
 
-def test_a_stride_must_be_given(build: Build) -> None:
-    with pytest.raises(SpecError, match=r"param_str has no feat_stride of at least 1; found 'x'"):
-        build("rcnn", ANCHORS.replace("'feat_stride': 16", "x"), (1, 18, 20, 30), (3, 5), (1, 3), tops=4)
-
-
 def test_anchors_that_show_an_object_are_moved_onto_it(build: Build) -> None:
     scores = torch.zeros(1, 18, 20, 30)
     layer = build("rcnn", ANCHORS, scores.shape, TRUTH.shape, IMAGE.shape, phase=TRAIN, tops=4)

@@ -96,7 +96,7 @@ FAULTS = {
     "nothing like it": (
         None,
         "x" * 20,
-        f'unknown dialect "{"x" * 20}"; expected one of: blocks, faces, filters, flownet, happynear, hed, layout,',
+        f'unknown dialect "{"x" * 20}"; expected one of: blocks, c3d, densenet, faces, filters, flownet, happynear,',
     ),
     "no such file": (None, "{path}", "{path}: cannot be read: No such file or directory"),
     "not text": (b"\xff\xfe", "{path}", "{path}: cannot be read: 'utf-8' codec can't decode"),

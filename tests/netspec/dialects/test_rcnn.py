@@ -20,57 +20,6 @@ pytestmark = pytest.mark.slow
 Build = Callable[..., Layer]
 Gradcheck = Callable[..., None]
 
-REGIONS = [  # image, x1, y1, x2, y2 in pixels of the image; the map is half as large
-    [0, 0, 0, 11, 9],
-    [1, 2, 1, 6, 5],
-    [0, 3, 3, 3, 3],
-    [1, 8, 4, 30, 30],  # beyond the map
-    [1, 6, 6, 2, 2],  # turned inside out
-    [0, 40, 40, 50, 50],  # outside
-    [0, -9, -7, 4, 1],
-    [1, 0.9, 1, 4.9, 3.1],
-]
-
-
-def rounded(x: float) -> int:
-    return math.floor(abs(x) + 0.5) * (1 if x >= 0 else -1)
-
-
-def run(layer: Layer, *bottoms: torch.Tensor) -> np.ndarray:
-    (top,) = layer.run(*bottoms)
-    assert [tuple(top.shape)] == layer.top_shapes
-    return top.detach().numpy()
-
-
-@pytest.mark.parametrize("shape", [(8, 5), (8, 5, 1, 1)])
-def test_roi_pooling(build: Build, gradcheck: Gradcheck, shape: tuple[int, ...]) -> None:
-    maps, regions = torch.randn(2, 3, 5, 6), torch.tensor(REGIONS).reshape(shape)
-    layer = build(
-        "rcnn",
-        "type: 'ROIPooling' roi_pooling_param { pooled_h: 3 pooled_w: 2 spatial_scale: 0.5 }",
-        maps.shape,
-        regions.shape,
-    )
-    expected = np.zeros((8, 3, 3, 2), np.float32)
-    for r, (image, *corners) in enumerate(REGIONS):
-        left, top, right, bottom = (rounded(0.5 * v) for v in corners)
-        height, width = max(bottom - top + 1, 1), max(right - left + 1, 1)
-        for i, j in np.ndindex(3, 2):
-            rows = range(math.floor(i * height / 3) + top, math.ceil((i + 1) * height / 3) + top)
-            columns = range(math.floor(j * width / 2) + left, math.ceil((j + 1) * width / 2) + left)
-            for c in range(3):
-                inside = [maps[int(image), c, y, x] for y in rows for x in columns if 0 <= y < 5 and 0 <= x < 6]
-                expected[r, c, i, j] = max(inside, default=0)
-    np.testing.assert_array_equal(run(layer, maps, regions), expected)
-    assert not expected[5].any()
-    (backward,) = (np.flatnonzero((regions.reshape(8, 5)[:, 3:] < regions.reshape(8, 5)[:, 1:3]).any(1)),)
-    assert len(backward) == 1
-    layer.run(maps.requires_grad_(), regions)[0][backward].sum().backward()
-    assert maps.grad is not None
-    assert not maps.grad.any()  # a region that ends before it begins
-    forward = regions[np.delete(np.arange(8), backward)]
-    gradcheck(layer, maps.detach(), forward, fixed=(1,))
-
 
 def test_the_first_of_equal_pixels_gets_the_gradient_of_roi_pooling(build: Build) -> None:
     maps = torch.zeros(1, 1, 3, 4)
@@ -105,63 +54,6 @@ def test_a_region_must_lie_in_an_image_of_the_batch(build: Build, dialect: str, 
         build(dialect, f"type: '{kind}' {settings[kind]}", (2, 1, 3, 3), (1, 6))
     with pytest.raises(SpecError, match=r"expected 4 axes \(N, C, H, W\)"):
         build(dialect, f"type: '{kind}' {settings[kind]}", (2, 1, 3), (1, 5))
-
-
-def test_psroi_pooling(build: Build, gradcheck: Gradcheck) -> None:
-    group, channels, scale = 3, 2, 0.5
-    maps, regions = torch.randn(2, channels * group * group, 5, 6), torch.tensor(REGIONS)
-    layer = build(
-        "rfcn",
-        "type: 'PSROIPooling' psroi_pooling_param { spatial_scale: 0.5 output_dim: 2 group_size: 3 }",
-        maps.shape,
-        regions.shape,
-    )
-    expected = np.zeros((8, channels, group, group), np.float32)
-    for r, (image, *corners) in enumerate(REGIONS):
-        left, top, right, bottom = (rounded(v) for v in corners)
-        left, top, right, bottom = left * scale, top * scale, (right + 1) * scale, (bottom + 1) * scale
-        height, width = max(bottom - top, 0.1), max(right - left, 0.1)
-        for c, i, j in np.ndindex(channels, group, group):
-            rows = range(math.floor(i * height / group + top), math.ceil((i + 1) * height / group + top))
-            columns = range(math.floor(j * width / group + left), math.ceil((j + 1) * width / group + left))
-            channel = maps[int(image), (c * group + i) * group + j]
-            inside = [float(channel[y, x]) for y in rows for x in columns if 0 <= y < 5 and 0 <= x < 6]
-            expected[r, c, i, j] = np.mean(inside) if inside else 0
-    np.testing.assert_allclose(run(layer, maps, regions), expected, rtol=1e-5, atol=1e-6)
-    assert not expected[5].any()
-    gradcheck(layer, maps, regions, fixed=(1,))
-
-
-def test_psroi_pooling_needs_a_channel_for_each_bin(build: Build) -> None:
-    settings = "psroi_pooling_param { spatial_scale: 1 output_dim: 2 group_size: 3 }"
-    with pytest.raises(SpecError, match=r"found 17 channels, expected output_dim group_size\^2 = 18"):
-        build("rfcn", f"type: 'PSROIPooling' {settings}", (1, 17, 5, 5), (1, 5))
-    with pytest.raises(SpecError, match='PSROIPoolingParameter lacks the required field "group_size"'):
-        build("rfcn", "type: 'PSROIPooling' psroi_pooling_param { spatial_scale: 1 output_dim: 2 }", (1, 2), (1, 5))
-
-
-@pytest.mark.parametrize("weights", [0, 1, 2])
-@pytest.mark.parametrize("sigma", [1.0, 3.0])
-def test_smooth_l1_loss(build: Build, gradcheck: Gradcheck, weights: int, sigma: float) -> None:
-    bottoms = [torch.randn(3, 4, 2, 1) for _ in range(2 + weights)]
-    bottoms[1] = bottoms[1].reshape(3, 4, 2)
-    text = f"type: 'SmoothL1Loss' smooth_l1_loss_param {{ sigma: {sigma} }}"
-    layer = build("rcnn", text, *(b.shape for b in bottoms))
-    inside, outside = ([b.numpy() for b in bottoms[2:]] + [np.ones((3, 4, 2, 1))] * 2)[:2]
-    total = 0.0
-    for place in np.ndindex(3, 4, 2, 1):
-        d = inside[place] * float(bottoms[0][place] - bottoms[1][place[:3]])
-        small = abs(d) < 1 / sigma**2
-        total += outside[place] * (0.5 * (sigma * d) ** 2 if small else abs(d) - 0.5 / sigma**2)
-    np.testing.assert_allclose(run(layer, *bottoms), total / 3, rtol=1e-5)
-    gradcheck(layer, *bottoms, fixed=(2, 3))
-
-
-def test_smooth_l1_loss_refuses(build: Build) -> None:
-    with pytest.raises(SpecError, match=r"found bottoms of shapes \(3, 4\) and \(3, 5\), expected equal shapes"):
-        build("rcnn", "type: 'SmoothL1Loss'", (3, 4), (3, 4), (3, 5), (3, 4))
-    with pytest.raises(SpecError, match="sigma must be above 0, found 0"):
-        build("rcnn", "type: 'SmoothL1Loss' smooth_l1_loss_param { sigma: 0 }", (3, 4), (3, 4))
 
 
 def test_fields_that_a_dialects_layers_read_are_not_warned_of(caplog: pytest.LogCaptureFixture) -> None:
@@ -237,21 +129,6 @@ def test_of_overlapping_proposals_the_best_stays(build: Build) -> None:
 def test_small_proposals_have_no_score(build: Build) -> None:
     _, scores = proposals(build, [[1, 0.5]], dw=math.log(0.25))
     assert scores.tolist() == [0.5, 0]
-
-
-@pytest.mark.parametrize(
-    ("shapes", "fault"),
-    [
-        (((2, 2, 3, 3), (2, 4, 3, 3), (1, 3)), r"found scores of shape .*, expected \(1, 2, H, W\)"),
-        (((1, 2, 3, 3), (1, 4, 3, 2), (1, 3)), r"found boxes of shape .*, expected \(1, 4, 3, 3\)"),
-        (((1, 2, 3, 3), (1, 4, 3, 3), (1, 2)), r"expected \(1, 3\), \(1, 4\) or \(1, 6\)"),
-    ],
-)
-def test_proposal_refuses_other_shapes(build: Build, shapes: tuple, fault: str) -> None:
-    with pytest.raises(SpecError, match=fault):
-        build("rcnn", ONE % "", *shapes)
-    with pytest.raises(SpecError, match="scale must be above 0"):
-        build("rcnn", "type: 'Proposal' proposal_param { scale: -1 }", *shapes)
 
 
 def test_a_placeholder_of_regions_is_refused_when_the_net_runs(build: Build) -> None:

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.errors import SpecError
 from netspec.layers import Context, Layer
 from netspec.net.one_layer import make_layer
-from netspec.proto.schema import TRAIN
 
 Build = Callable[..., Layer]
 FIXED = "bw_layer_in: 6 fl_layer_in: 3 bw_layer_out: 8 fl_layer_out: 2 bw_params: 5 fl_params: 4"
@@ -59,18 +57,3 @@ def test_numbers_are_rounded(build: Build, kind: str, precision: str) -> None:
         expected = fixed(expected, 8, 2) if precision == "fixed" else expected
         (top,) = layer.run(data)
     np.testing.assert_allclose(top.numpy(), expected.numpy(), rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("setting", "fault"),
-    [("precision: MINIFLOAT", "MINIFLOAT is not supported"), ("rounding_scheme: STOCHASTIC", "only rounding_scheme N")],
-)
-def test_what_is_not_here_is_refused(build: Build, setting: str, fault: str) -> None:
-    text = f"type: 'FcRistretto' {KINDS['FcRistretto']} quantization_param {{ {setting} }}"
-    with pytest.raises(SpecError, match=fault):
-        build("ristretto", text, (1, 2))
-
-
-def test_training_is_refused(build: Build) -> None:
-    with pytest.raises(SpecError, match="runs in phase TEST only"):
-        build("ristretto", f"type: 'FcRistretto' {KINDS['FcRistretto']}", (1, 2), phase=TRAIN)

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 
 from netspec.dialects import use_dialect, use_dialects_of
 from netspec.errors import SpecError
@@ -88,19 +87,6 @@ def test_a_list_has_two_names_a_line(pairs: Path) -> None:
         dense(pairs)
 
 
-def test_a_loss_that_weighs_classes(build: Build, gradcheck: Gradcheck) -> None:
-    scores, labels = torch.randn(2, 3, 4), torch.tensor([[0.0, 1, 2, 5], [2, 2, 1, 5]])
-    given = "weight_by_label_freqs: true class_weighting: 0.5 class_weighting: 2 class_weighting: 3 ignore_label: 5"
-    layer = build("segmentation", f"type: 'SoftmaxWithLoss' loss_param {{ {given} }}", scores.shape, labels.shape)
-    each = F.cross_entropy(scores, labels.long(), reduction="none", ignore_index=5)
-    weights = torch.tensor([0.5, 2, 3, 0, 0, 0])[labels.long()]
-    torch.testing.assert_close(layer.run(scores, labels)[0], (each * weights).sum() / 6)
-    gradcheck(layer, scores, labels, fixed=(1,))
-    text = "type: 'SoftmaxWithLoss' loss_param { weight_by_label_freqs: true class_weighting: 1 }"
-    with pytest.raises(SpecError, match="found 1 class_weighting, expected one for each of 3 classes"):
-        build("segmentation", text, scores.shape, labels.shape)
-
-
 EDGES = """layer { name: "data" type: "ImageLabelmapData" top: "data" top: "label"
   image_data_param { source: "%s/list.txt" root_folder: "%s" batch_size: 2 }
   transform_param { mirror: true crop_size: 4 mean_value: 1 } }"""
@@ -123,21 +109,3 @@ def test_which_of_two_forks_is_meant_is_asked(pairs: Path) -> None:
     assert use_dialects_of(text, "net.prototxt") == []
     with pytest.raises(SpecError, match='dialects "hed" and "rcf" have "ImageLabelmapData"; add --plugin hed'):
         build_net(*parse_net_text(text, "net.prototxt"))
-
-
-@pytest.mark.parametrize(("dialect", "of_others"), [("hed", 1.0), ("rcf", 1.1)])
-def test_edges_weigh_as_much_as_all_else(build: Build, gradcheck: Gradcheck, dialect: str, of_others: float) -> None:
-    scores, edges = torch.randn(2, 1, 3, 4), torch.rand(2, 1, 3, 4).round()
-    edges[0, 0, 0, 0] = 0.25 if dialect == "rcf" else 0
-    layer = build(dialect, "type: 'SigmoidCrossEntropyLoss'", scores.shape, edges.shape)
-    expected = 0.0
-    for x, t in zip(scores.flatten(1).tolist(), edges.flatten(1).tolist(), strict=True):
-        ones, zeros = t.count(1.0), t.count(0.0)
-        for value, target in zip(x, t, strict=True):
-            p = 1 / (1 + np.exp(-value))
-            if target == 1:
-                expected -= np.log(p) * zeros / (ones + zeros)
-            elif target == 0:
-                expected -= of_others * np.log(1 - p) * ones / (ones + zeros)
-    np.testing.assert_allclose(layer.run(scores, edges)[0].item(), expected / 2, rtol=1e-5)
-    gradcheck(layer, scores, edges, fixed=(1,))

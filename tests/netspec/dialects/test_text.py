@@ -1,11 +1,8 @@
 """The layers that read text, beside the sum over all paths that the paper defines."""
 
-import itertools
-import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
 
@@ -16,39 +13,6 @@ from netspec.layers.contract.reading import resume, running_state
 Build = Callable[..., Layer]
 Gradcheck = Callable[..., None]
 STEPS, ITEMS, CLASSES = 4, 2, 3
-
-
-def cost(scores: np.ndarray, text: Sequence[int], blank: int) -> float:
-    """Return -log of the probability of a text: the sum over all paths that collapse to it (Graves, equation 3)."""
-    p = np.exp(scores) / np.exp(scores).sum(axis=1, keepdims=True)
-    total = 0.0
-    for path in itertools.product(range(scores.shape[1]), repeat=len(scores)):
-        short = [each for i, each in enumerate(path) if i == 0 or each != path[i - 1]]
-        if [each for each in short if each != blank] == list(text):
-            total += math.prod(p[t, each] for t, each in enumerate(path))
-    return -math.log(total) if total else 0.0
-
-
-@pytest.mark.parametrize("blank", [0, 2, -1])
-def test_the_loss_is_a_mean_and_its_gradient_that_of_the_sum(build: Build, blank: int) -> None:
-    scores = torch.randn(STEPS, ITEMS, CLASSES, requires_grad=True)
-    true = blank % CLASSES
-    a, b = (each for each in range(CLASSES) if each != true)
-    labels = torch.tensor([[a, b, true], [b, b, true]], dtype=torch.float32)
-    layer = build("text", f"type: 'CTCLoss' ctc_loss_param {{ blank_index: {blank} }}", scores.shape, labels.shape)
-    (loss,) = layer.run(scores, labels)
-    values = scores.detach().numpy().astype(float)
-
-    def total(values: np.ndarray) -> float:
-        return cost(values[:, 0], [a, b], true) + cost(values[:, 1], [b, b], true)
-
-    np.testing.assert_allclose(loss.item(), total(values) / ITEMS, rtol=1e-5)
-    (found,) = torch.autograd.grad(loss, scores)
-    for place in np.ndindex(*values.shape):
-        step = np.zeros_like(values)
-        step[place] = 1e-4
-        slope = (total(values + step) - total(values - step)) / 2e-4
-        np.testing.assert_allclose(found[place].item(), slope, atol=1e-4)
 
 
 def test_a_text_that_does_not_fit_costs_nothing(build: Build) -> None:
@@ -111,14 +75,6 @@ def test_sequences_begin_with_the_batch(build: Build) -> None:
     assert build("text", text).run()[0].tolist() == [[0, 0], [1, 1], [1, 1]]
 
 
-@pytest.mark.parametrize("axis", [0, 1, -1])
-def test_reverse(build: Build, gradcheck: Gradcheck, axis: int) -> None:
-    data = torch.randn(3, 2, 4)
-    layer = build("text", f"type: 'Reverse' reverse_param {{ axis: {axis} }}", data.shape)
-    assert torch.equal(layer.run(data)[0], data.flip(axis))
-    gradcheck(layer, data)
-
-
 @pytest.mark.parametrize(("copies", "rest"), [("true", [4, 5]), ("false", [0, 0])])
 def test_reverse_of_the_first_steps(build: Build, copies: str, rest: list[int]) -> None:
     data = torch.arange(10.0).reshape(5, 2, 1)
@@ -130,20 +86,6 @@ def test_reverse_of_the_first_steps(build: Build, copies: str, rest: list[int]) 
 
 
 LSTM = "type: 'Lstm' lstm_param { num_output: 3 weight_filler { type: 'uniform' min: -1 max: 1 } %s }"
-
-
-def test_lstm_beside_a_loop(build: Build, gradcheck: Gradcheck) -> None:
-    data = torch.randn(4, 2, 5)
-    layer = build("text", LSTM % "bias_filler { type: 'uniform' min: -1 max: 1 }", data.shape)
-    w, u, b = (blob.detach() for blob in layer.blobs)
-    h = c = torch.zeros(2, 3)
-    for t, x in enumerate(data):
-        gates = x @ w.T + h @ u.T + b
-        i, f, o, g = gates[:, :3].sigmoid(), gates[:, 3:6].sigmoid(), gates[:, 6:9].sigmoid(), gates[:, 9:].tanh()
-        c = f * c + i * g
-        h = o * c.tanh()
-        torch.testing.assert_close(layer.run(data)[0][t], h)
-    gradcheck(layer, data)
 
 
 def test_lstm_goes_on_where_a_second_bottom_says_so(build: Build) -> None:
@@ -161,21 +103,6 @@ def test_lstm_goes_on_where_a_second_bottom_says_so(build: Build) -> None:
     with pytest.raises(SpecError, match=r"found states of shapes \[\(3, 3\)\], expected 2 of \(2, 3\)"):
         resume(resumed, {"state": (torch.zeros(3, 3),)})
     assert running_state(whole) == {}
-
-
-@pytest.mark.parametrize(
-    ("text", "shapes", "fault"),
-    [
-        ("type: 'CTCLoss' ctc_loss_param { output_delay: 1 }", ((4, 2, 3), (2, 2)), "are not known"),
-        ("type: 'CTCLoss'", ((4, 2, 3), (3, 2)), "expected 2 sequences along axis 0"),
-        ("type: 'CtcLoss'", ((4, 2, 3), (2, 2)), "alphabet_size must be given"),
-        ("type: 'Lstm'", ((4, 2, 3),), "num_output must be given"),
-        ("type: 'ContinuationIndicator'", (), "time_step must be given"),
-    ],
-)
-def test_faults(build: Build, text: str, shapes: tuple[tuple[int, ...], ...], fault: str) -> None:
-    with pytest.raises(SpecError, match=fault):
-        build("text", text, *shapes)
 
 
 def test_a_label_that_is_no_class_is_refused(build: Build) -> None:
