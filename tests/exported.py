@@ -15,8 +15,8 @@ import torch
 import netspec
 from golden_cases import set_parameters
 from netspec.export.formats.shapes import NetShapes
-from netspec.export.formats.source import class_name
 from netspec.export.formats.torch import torch_source
+from netspec.export.formats.torch_code import class_name
 from netspec.net.net import Net
 from netspec.run.walk import Step, walk
 

@@ -19,10 +19,8 @@ import torch.nn.functional as F
 from torch import nn
 
 from netspec.errors import SpecError, Where
-from netspec.export.formats.inputs import check_shapes
 from netspec.export.formats.shapes import NetShapes, input_shapes, settled
-from netspec.export.formats.source import MARK, Program, joined, legal, unique
-from netspec.export.formats.torch_code import write_program
+from netspec.export.formats.torch_code import MARK, Definition, check_shapes, legal, unique, write_definition
 from netspec.files.whole_file import whole_file
 from netspec.net.net import Net
 
@@ -69,7 +67,7 @@ def export_pt2(net: Net, path: str | Path) -> list[str]:
             torch.export.save(program, buffer)
             unfinished.write_bytes(buffer.getvalue())
         fixed = [free.name for free in shapes.free if not free.counted and free.name not in names]
-        return [*notes, *([f"torch.export fixes the sizes {joined(fixed)}"] if fixed else [])]
+        return [*notes, *([f"torch.export fixes the sizes {' and '.join(fixed)}"] if fixed else [])]
     raise AssertionError("the last choice has no free size")
 
 
@@ -84,22 +82,22 @@ def torch_module(net: Net) -> nn.Module:
 
 
 def _made(net: Net) -> tuple[nn.Module, NetShapes]:
-    program, shapes = settled(net, lambda shapes: write_program(net, shapes))
-    return _ProgramModule(program, input_shapes(net, shapes)).eval(), shapes
+    definition, shapes = settled(net, lambda shapes: write_definition(net, shapes))
+    return _Defined(definition, input_shapes(net, shapes)).eval(), shapes
 
 
-class _ProgramModule(nn.Module):
-    """A program whose expressions are computed one by one."""
+class _Defined(nn.Module):
+    """A module by its definition, whose expressions are computed one by one."""
 
-    def __init__(self, program: Program, expected: Mapping[str, tuple[int | str, ...]]) -> None:
+    def __init__(self, definition: Definition, expected: Mapping[str, tuple[int | str, ...]]) -> None:
         super().__init__()
-        self.program, self.expected = program, expected
-        self.attributes = program.attributes()
+        self.definition, self.expected = definition, expected
+        self.attributes = definition.attributes()
         libraries = {"torch": torch, "nn": nn, "F": F, "math": math}
-        self.known = {**libraries, **program.functions}
+        self.known = {**libraries, **definition.functions}
         state = {}
         for m, attribute in self.attributes.items():
-            module = program.modules[m]
+            module = definition.modules[m]
             made = _value(_parsed(module.constructor()), libraries)
             if module.kind == "buffer":
                 self.register_buffer(attribute, made)
@@ -107,10 +105,10 @@ class _ProgramModule(nn.Module):
                 setattr(self, attribute, made)
             state.update(module.tensors(attribute))
         self.load_state_dict(state)
-        self.steps = [(statement.targets, _parsed(statement.expression)) for statement in program.statements]
+        self.steps = [(statement.targets, _parsed(statement.expression)) for statement in definition.statements]
 
-        taken = set(program.functions)
-        arguments = [unique(legal(program.names[v], "blob_"), taken) for v in program.inputs]
+        taken = set(definition.functions)
+        arguments = [unique(legal(definition.names[v], "blob_"), taken) for v in definition.inputs]
         kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
         self.signature = inspect.Signature([inspect.Parameter(name, kind) for name in arguments])
 
@@ -122,14 +120,14 @@ class _ProgramModule(nn.Module):
 
     def _outputs(self, *inputs: torch.Tensor) -> Any:
         """Return the output, or a dict of the outputs if there are several."""
-        program = self.program
-        check_shapes({program.names[v]: x.shape for v, x in zip(program.inputs, inputs, strict=True)}, self.expected)
-        names = {**self.known, "self": self, **{f"v{v}": x for v, x in zip(program.inputs, inputs, strict=True)}}
+        definition = self.definition
+        check_shapes(self.expected, *inputs)
+        names = {**self.known, "self": self, **{f"v{v}": x for v, x in zip(definition.inputs, inputs, strict=True)}}
         names.update({f"m{m}": getattr(self, attribute) for m, attribute in self.attributes.items()})
         for targets, expression in self.steps:
             made = _value(expression, names)
             names.update({f"v{v}": x for v, x in zip(targets, made if len(targets) > 1 else (made,), strict=True)})
-        outputs = {name: names[f"v{v}"] for name, v in program.outputs.items()}
+        outputs = {name: names[f"v{v}"] for name, v in definition.outputs.items()}
         return outputs if len(outputs) != 1 else next(iter(outputs.values()))
 
 

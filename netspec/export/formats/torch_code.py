@@ -1,15 +1,22 @@
-"""A net as the statements of a PyTorch program, layer by layer."""
+"""A net as a PyTorch module while it is written, layer by layer: statements, the modules they call, their text.
+
+An expression is text in which marks stand for values and modules: names are given when all is known.
+"""
 
 from __future__ import annotations
 
+import ast
+import builtins
+import keyword
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 
 from netspec.export.formats.shapes import Fixed, NetShapes
-from netspec.export.formats.source import MARK, Module, Program, Statement, mark, number
 from netspec.graph.fold import origins
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.exporting import export
@@ -17,21 +24,195 @@ from netspec.layers.contract.folding import folds_of
 from netspec.layers.contract.targets import Sizes
 from netspec.net.net import Net
 
+WIDTH = 88  # ruff's and black's line length where nothing else is configured
+MARK = re.compile("\x02([vm])(\\d+)\x03")  # a value, a module
+_TAKEN = {"self", "x", "torch", "nn", "F", "math", "Path", "load_file", "load", "forward", "main", "expected"}
+_TAKEN |= {name for name in dir(torch.nn.Module) if not name.startswith("__")} | {"training", "T_destination"}
+
+
+def mark(kind: str, number: int) -> str:
+    """Return the mark of a value (v) or a module (m)."""
+    return f"\x02{kind}{number}\x03"
+
+
+@dataclass(eq=False)
+class Module:
+    """A submodule, or a parameter or buffer of the module itself: its constructor's call, and its tensors by name.
+
+    ``numbers`` are the values of the fields of the template; those that are the ``usual`` ones are left out.
+    """
+
+    layer: str
+    template: str
+    numbers: dict[str, Any]
+    state: dict[str, torch.Tensor]
+    kind: str = "module"  # or "buffer"
+    usual: dict[str, Any] = field(default_factory=dict)
+
+    def constructor(self) -> str:
+        """Return the constructor's call."""
+        template = self.template
+        for name, value in self.usual.items():
+            if self.numbers[name] == value:
+                template = template.replace(f", {name}={{{name}}}", "")
+        return template.format(**{name: number(value) for name, value in self.numbers.items()})
+
+    def tensors(self, prefix: str) -> dict[str, torch.Tensor]:
+        """Return all tensors as they are named in a state_dict, for the attribute ``prefix``."""
+        return {f"{prefix}.{name}" if name else prefix: tensor for name, tensor in self.state.items()}
+
+
+@dataclass(eq=False)
+class Statement:
+    """Values from an expression."""
+
+    targets: tuple[int, ...]
+    expression: str
+
+    def values(self) -> list[int]:
+        """Return the values that it reads, in order, each as often as it does."""
+        return [int(number) for kind, number in MARK.findall(self.expression) if kind == "v"]
+
+    def modules(self) -> list[int]:
+        """Return the modules that it uses, in order."""
+        return [int(number) for kind, number in MARK.findall(self.expression) if kind == "m"]
+
+
+@dataclass
+class Definition:
+    """A whole module: what it takes and gives, and how it computes it.
+
+    ``names`` are the blobs' names of values; ``inputs`` and ``outputs`` are values; ``modules`` are what
+    marks stand for; ``functions`` are copied as they are.
+    """
+
+    statements: list[Statement] = field(default_factory=list)
+    modules: list[Module] = field(default_factory=list)
+    names: dict[int, str] = field(default_factory=dict)
+    inputs: list[int] = field(default_factory=list)
+    outputs: dict[str, int] = field(default_factory=dict)
+    functions: dict[str, Callable[..., Any]] = field(default_factory=dict)
+
+    def attributes(self) -> dict[int, str]:
+        """Return the attribute of each module that the net's class has, in the order in which they are used."""
+        taken: set[str] = set()
+        used = dict.fromkeys(m for statement in self.statements for m in statement.modules())
+        return {m: unique(legal(self.modules[m].layer), taken) for m in used}
+
+
+# Names: no text of a file enters source but as an identifier or quoted
+
+
+def legal(name: str, prefix: str = "layer_") -> str:
+    """Return a Python name made of a layer's or a blob's."""
+    text = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or prefix.rstrip("_")
+    return _free(prefix + text if text[0].isdigit() else text, "_")
+
+
+def _free(identifier: str, ending: str) -> str:
+    """Return an identifier, with the ending where Python or the file itself uses it."""
+    used = keyword.iskeyword(identifier) or identifier in _TAKEN or hasattr(builtins, identifier)
+    return identifier + ending if used else identifier
+
+
+def quoted(text: str) -> str:
+    """Return a text as a literal in double quotes; without its quotes it can stand in a docstring too."""
+    return '"' + repr('"' + text)[2:-1].replace('"', '\\"') + '"'
+
+
+def unique(name: str, taken: set[str]) -> str:
+    """Return a name that is not in ``taken``, and add it there."""
+    found, k = name, 2
+    while found in taken:
+        found, k = f"{name}_{k}", k + 1
+    taken.add(found)
+    return found
+
+
+def class_name(text: str) -> str:
+    """Return the name of a class made of words."""
+    words = [word for word in re.split(r"[^0-9A-Za-z]+", text) if word]
+    name = "".join(word[0].upper() + word[1:] for word in words) or "Net"
+    return _free(f"Net{name}" if name[0].isdigit() else name, "Net")
+
+
+def number(value: Any) -> str:
+    """Return a number, a bool or a tuple of them as a person writes it; floats as short as float32 allows.
+
+    A text, which is the name of a free size, is quoted.
+    """
+    if isinstance(value, (tuple, list)):
+        inner = ", ".join(number(v) for v in value)
+        return f"[{inner}]" if isinstance(value, list) else f"({inner},)" if len(value) == 1 else f"({inner})"
+    if isinstance(value, str):
+        return quoted(value)
+    if isinstance(value, float):
+        short = float(str(np.float32(value)))
+        return repr(short) if np.isfinite(short) else f"{'-' * (short < 0)}torch.{abs(short)}"
+    return repr(value)
+
+
+# Layout
+
+
+def lay_out(statement: str, indent: int) -> list[str]:
+    """Return a statement in lines: where it is longer than ``WIDTH``, its widest bracket has a line for each part."""
+    space = " " * indent
+    whole = [space + statement]
+    if indent + len(statement) <= WIDTH:
+        return whole
+    brackets = [found for node in ast.walk(ast.parse(statement)) if (found := _parts(node))]
+    if not brackets:
+        return whole
+    parts = max(brackets, key=lambda found: found[-1][1] - found[0][0])
+    text = statement.encode()  # ast counts bytes
+    lines = [space + text[: parts[0][0]].decode()]
+    for start, end in parts:
+        broken = lay_out(text[start:end].decode(), indent + 4)
+        lines += [*broken[:-1], f"{broken[-1]},"]
+    return [*lines, space + text[parts[-1][1] :].decode()]
+
+
+def _parts(node: ast.AST) -> list[tuple[int, int]]:
+    """Return where each part in the brackets of a call, a list or a tuple begins and ends; nothing for all else."""
+    if isinstance(node, ast.Call):
+        inside = [*node.args, *node.keywords]
+        if any(isinstance(part, ast.GeneratorExp) for part in inside):
+            return []  # a comma may not stand behind one
+    else:
+        inside = node.elts if isinstance(node, (ast.List, ast.Tuple)) else []
+        if inside and inside[0].col_offset == getattr(node, "col_offset", 0):
+            return []  # a tuple without brackets
+    return [(part.col_offset, part.end_col_offset or 0) for part in inside]
+
+
+def check_shapes(expected, *inputs):
+    """Refuse inputs of other shapes; a name is any size, the same wherever it stands."""
+    sizes = {}
+    for (name, shape), x in zip(expected.items(), inputs, strict=True):
+        for size, wanted in zip(x.shape, shape, strict=False):
+            if isinstance(wanted, str):
+                sizes.setdefault(wanted, size)
+        shape = tuple(sizes.get(wanted, wanted) for wanted in shape)
+        if tuple(x.shape) != shape:
+            raise ValueError(f"{name} has shape {tuple(x.shape)}, expected {shape}")
+
+
 _FIELD = re.compile(r"\{(\w+)\}")
 _ONE_MARK = re.compile(f"^{MARK.pattern}$")
 
 
-def write_program(net: Net, shapes: NetShapes) -> Program:
-    """Return the program of a net. Raises SpecError where a layer cannot be written."""
+def write_definition(net: Net, shapes: NetShapes) -> Definition:
+    """Return the definition of a net. Raises SpecError where a layer cannot be written."""
     collector = _Collector(net, shapes)
     plan = net.plan
     for i, node in enumerate(plan.nodes):
         bottoms = [mark("v", collector.value[v]) for v in node.bottoms]
         layer_code = _LayerCode(collector, i)
         tops = export(net.layers[i], layer_code, "PyTorch", *bottoms)
-        collector.add(i, node.tops, tops)
-    collector.program.outputs = {name: collector.value[v] for name, v in plan.outputs.items()}
-    return collector.program
+        collector.add(node.tops, tops)
+    collector.made.outputs = {name: collector.value[v] for name, v in plan.outputs.items()}
+    return collector.made
 
 
 class _Collector:
@@ -39,7 +220,7 @@ class _Collector:
 
     def __init__(self, net: Net, shapes: NetShapes) -> None:
         self.net, self.shapes = net, shapes
-        self.program = Program(names=dict(enumerate(net.plan.blobs)))
+        self.made = Definition(names=dict(enumerate(net.plan.blobs)))
         self.value = list(range(len(net.plan.blobs)))  # value of the Plan -> value of the program
         passes = [folds_of(layer).passes_on for layer in net.layers]
         origin = origins(net.plan, passes)
@@ -52,22 +233,19 @@ class _Collector:
         self.made_by: dict[int, Statement] = {}
         self.modules_of: list[tuple[frozenset[int], int]] = []  # the learned blobs of a module, and its number
 
-    def add(self, index: int, targets: Sequence[int], tops: str | Sequence[str]) -> None:
+    def add(self, targets: Sequence[int], tops: str | Sequence[str]) -> None:
         """Add the statements of a layer."""
-        node = self.net.plan.nodes[index]
         if isinstance(tops, str):
             groups = [(tuple(targets), tops)]
         else:
             groups = [((v,), top) for v, top in zip(targets, tops, strict=True)]
-        shape = self.net.layers[index].bottom_shapes[:1]
         for values, expression in groups:
             passed_on = _ONE_MARK.match(expression)
             if passed_on and passed_on[1] == "v" and len(values) == 1:
                 self.value[values[0]] = int(passed_on[2])
                 continue
-            keeps = len(values) == 1 and shape == self.net.layers[index].top_shapes
-            statement = Statement(values, expression, node.name, keeps)
-            self.program.statements.append(statement)
+            statement = Statement(values, expression)
+            self.made.statements.append(statement)
             self.made_by.update(dict.fromkeys(values, statement))
 
 
@@ -75,7 +253,7 @@ class _LayerCode:
     """See :class:`netspec.layers.contract.targets.TorchCode`."""
 
     def __init__(self, collector: _Collector, index: int) -> None:
-        self.collector, self.program = collector, collector.program
+        self.collector, self.made = collector, collector.made
         self.layer: Layer = collector.net.layers[index]
         self.plan_node = collector.net.plan.nodes[index]
 
@@ -91,7 +269,7 @@ class _LayerCode:
     ) -> str:
         own = frozenset(id(blob) for blob in self.layer.blobs)
         for blobs, known in self.collector.modules_of:
-            module = self.program.modules[known]
+            module = self.made.modules[known]
             if own and own == blobs and (module.template, module.numbers) == (template, values):
                 return mark("m", known)
         return self._add(Module(self.plan_node.name, template, values, _copies(state), usual=dict(usual or {})), own)
@@ -101,7 +279,7 @@ class _LayerCode:
         shaped = values if shape is None else values.reshape(tuple(shape))
         own = frozenset([id(self.layer.blobs[index])])
         for blobs, known in self.collector.modules_of:
-            if own == blobs and self.program.modules[known].numbers == {"shape": tuple(shaped.shape)}:
+            if own == blobs and self.made.modules[known].numbers == {"shape": tuple(shaped.shape)}:
                 return mark("m", known)
         return self._stored("nn.Parameter(torch.zeros({shape}))", shaped, own, name)
 
@@ -116,12 +294,12 @@ class _LayerCode:
         return self._add(Module(layer, template, numbers, _copies({"": values}), kind), blobs)
 
     def _add(self, module: Module, blobs: frozenset[int]) -> str:
-        self.program.modules.append(module)
-        self.collector.modules_of.append((blobs, len(self.program.modules) - 1))
-        return mark("m", len(self.program.modules) - 1)
+        self.made.modules.append(module)
+        self.collector.modules_of.append((blobs, len(self.made.modules) - 1))
+        return mark("m", len(self.made.modules) - 1)
 
     def function(self, function: Callable[..., Any]) -> str:
-        self.program.functions[function.__name__] = function
+        self.made.functions[function.__name__] = function
         return function.__name__
 
     def affine(self, value: str, scale: torch.Tensor, shift: torch.Tensor) -> bool:
@@ -132,8 +310,8 @@ class _LayerCode:
         if statement is None or len(statement.modules()) != 1 or not statement.expression.startswith("\x02m"):
             return False
         number = statement.modules()[0]
-        module = self.program.modules[number]
-        uses = sum(number in other.modules() for other in self.program.statements)
+        module = self.made.modules[number]
+        uses = sum(number in other.modules() for other in self.made.statements)
         affine = {"weight": scale, "bias": shift}
         if uses > 1 and not module.template.count("affine=False"):  # towers that share it
             return all(torch.equal(module.state[name], tensor) for name, tensor in affine.items())
@@ -180,7 +358,7 @@ class _LayerCode:
 
     def input(self, top: int) -> str:
         value = self.plan_node.tops[top]
-        self.program.inputs.append(value)
+        self.made.inputs.append(value)
         return mark("v", value)
 
 

@@ -70,8 +70,7 @@ class TorchCode(Protocol):
     """The PyTorch module that is being written, as one layer sees it. Values are expressions.
 
     A layer returns one expression for each top, or one for all of them, a tuple. In a template ``{name}`` stands for
-    what is given by that keyword: expressions that came from here, and numbers. Numbers that differ from one repeated
-    block to the next become arguments of the block.
+    what is given by that keyword: expressions that came from here, and numbers.
     """
 
     def call(self, template: str, **values: Any) -> str:

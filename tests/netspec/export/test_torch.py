@@ -18,7 +18,7 @@ from exported import assert_same, golden_net, here, other_inputs, random_inputs,
 from netspec.export.formats.pt2 import export_pt2, torch_module
 from netspec.export.formats.shapes import settled
 from netspec.export.formats.torch import export_torch, torch_source
-from netspec.export.formats.torch_code import write_program
+from netspec.export.formats.torch_code import write_definition
 from netspec.net.net import Net
 from paths import GOLDEN, ROOT
 
@@ -46,7 +46,7 @@ def test_golden_layer_computes_the_same(case: Path) -> None:
         again, _ = golden_net(case)  # a recurrent net remembers what it saw
         assert_same(run_module(module, net, inputs), here(again, inputs))
     assert formatted(torch_source(net)[0])
-    inputs = other_inputs(net, settled(net, lambda shapes: write_program(net, shapes))[1], inputs)
+    inputs = other_inputs(net, settled(net, lambda shapes: write_definition(net, shapes))[1], inputs)
     for module in modules:
         again, _ = golden_net(case)  # a recurrent net remembers what it saw
         assert_same(run_module(module, net, inputs), here(again, inputs))
