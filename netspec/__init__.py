@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
     from netspec.dialects import use_dialect
     from netspec.errors import SpecError
+    from netspec.load import load_net
     from netspec.net.net import Net
     from netspec.net.one_layer import layer
     from netspec.net.weights import load_weights, save_weights

@@ -171,8 +171,9 @@ def test_large_maps_are_pooled_by_slices_in_any_order_in_memory(build, kernel: i
     data = torch.randn(2, 19, 61, 62)
     data[0, 0, :4, :4] = torch.nan  # which never wins
     layer = build(pooling_text("MAX", (kernel, kernel), (2, 2), (0, 0), False), data.shape)
-    pool = own_kernels(layer, Preparation()).forward
-    assert torch.equal(pool(data.contiguous(memory_format=memory_format)), layer.run(data)[0])
+    kernels = own_kernels(layer, Preparation())
+    assert kernels is not None
+    assert torch.equal(kernels.forward(data.contiguous(memory_format=memory_format)), layer.run(data)[0])
 
 
 @pytest.mark.parametrize(
