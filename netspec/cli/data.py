@@ -21,7 +21,7 @@ from netspec.terminal.output import bar
 if TYPE_CHECKING:
     from netspec.data.records import Records
     from netspec.data.survey import Survey
-    from netspec.inspect.logs.run import Follower
+    from netspec.inspect.logs.training_log import Follower
 
 TABLE = """
 data quiet                         look at a database: a sheet of its records, or its statistics
@@ -36,7 +36,7 @@ data quiet                         look at a database: a sheet of its records, o
 plot quiet                         draw the curves of trainings from their logs, netspec's or Caffe's
   logs... LOG                      what a training wrote to stderr
   --out! F.png|svg|html            the picture, or a page, to write
-  --names NAMES,...                what the runs are called, separated by commas (default: the names of the files)
+  --names NAMES,...                what the logs are called, separated by commas (default: the names of the files)
   --smooth N                       average N points (default: a 25th of them)
   --log_scale                      draw losses on a logarithmic axis
 watch quiet read                   show a training in the terminal: curve, speed, time left, memory
@@ -105,20 +105,20 @@ def _plot(arguments: argparse.Namespace) -> None:
     from netspec.inspect.draw.style import ending_of, write_figure
     from netspec.inspect.draw.training import Look, training_figure
     from netspec.inspect.draw.training_page import training_page
-    from netspec.inspect.logs.run import read_log, summary
+    from netspec.inspect.logs.training_log import read_log, summary
 
     names = [printable(name) for name in (arguments.names.split(",") if arguments.names else _names(arguments.logs))]
     if len(names) != len(arguments.logs):
         raise WrongUsage(f"found {len(names)} --names and {len(arguments.logs)} logs, expected equal numbers")
     ending = ending_of(arguments.out)
-    runs = [read_log(path, name) for path, name in zip(arguments.logs, names, strict=True)]
-    figure = training_figure(runs, Look(arguments.smooth, arguments.log_scale))
+    logs = [read_log(path, name) for path, name in zip(arguments.logs, names, strict=True)]
+    figure = training_figure(logs, Look(arguments.smooth, arguments.log_scale))
     if ending == "html":
-        write_whole(arguments.out, training_page(runs, figure, ", ".join(names)))
+        write_whole(arguments.out, training_page(logs, figure, ", ".join(names)))
     else:
         write_figure(figure, arguments.out)
-    for run in runs:
-        print(f"{run.name}: " + ", ".join(f"{name} {value}" for name, value in summary(run).items()))
+    for log in logs:
+        print(f"{log.name}: " + ", ".join(f"{name} {value}" for name, value in summary(log).items()))
     print(arguments.out)
 
 
@@ -138,7 +138,7 @@ _NEW_SCREEN, _OLD_SCREEN = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
 
 
 def _watch(arguments: argparse.Namespace) -> int:
-    from netspec.inspect.logs.run import Follower
+    from netspec.inspect.logs.training_log import Follower
 
     if bool(arguments.log) == bool(arguments.solver):
         raise WrongUsage("give the log of a training, or --solver to start one")
@@ -160,7 +160,7 @@ def _watch(arguments: argparse.Namespace) -> int:
 
 def _watch_own(arguments: argparse.Namespace) -> int:
     """Train in a process of its own, whose log goes to a file, and watch that."""
-    from netspec.inspect.logs.run import Follower
+    from netspec.inspect.logs.training_log import Follower
     from netspec.proto.text import read_solver
 
     prefix = read_solver(arguments.solver).snapshot_prefix or str(Path(arguments.solver).with_suffix(""))
@@ -189,7 +189,7 @@ def _plugins(arguments: argparse.Namespace) -> list[str]:
 
 def _follow(follower: Follower, every: float, training: subprocess.Popen[bytes] | None = None) -> None:
     """Show a log as it grows, until the training ends, on a screen that is given back then."""
-    from netspec.inspect.logs.run import RUNNING
+    from netspec.inspect.logs.training_log import RUNNING
 
     shown = sys.stdout.isatty()
     if shown:
@@ -201,7 +201,7 @@ def _follow(follower: Follower, every: float, training: subprocess.Popen[bytes] 
                 text = "".join(f"{line}{_CLEAR_LINE}\n" for line in _lines(follower))
                 sys.stdout.write(_HOME + text.rstrip("\n") + _CLEAR_REST)
                 sys.stdout.flush()
-            if follower.run.state != RUNNING or (training is not None and training.poll() is not None):
+            if follower.log.state != RUNNING or (training is not None and training.poll() is not None):
                 return
             time.sleep(every)
     finally:
@@ -214,9 +214,9 @@ def _follow(follower: Follower, every: float, training: subprocess.Popen[bytes] 
 def _lines(follower: Follower) -> list[str]:
     from netspec.inspect.logs.screen import is_alive, memory_of, screen
 
-    run, now = follower.run, time.time()
-    alive = is_alive(run.process) if run.process is not None else None
+    log, now = follower.log, time.time()
+    alive = is_alive(log.process) if log.process is not None else None
     size = shutil.get_terminal_size((100, 40))
-    memory = memory_of(run.process) if alive and run.process is not None else None
+    memory = memory_of(log.process) if alive and log.process is not None else None
     lost = alive is False and now - follower.changed > QUIET  # else it may run on another machine
-    return screen(run, memory, lost, size.columns, size.lines, now)
+    return screen(log, memory, lost, size.columns, size.lines, now)

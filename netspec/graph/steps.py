@@ -20,7 +20,7 @@ PASSES = (FOLD, FUSE, SKIP, PACK)  # pack: weights laid out in advance (netspec/
 
 
 @dataclass(frozen=True)
-class Step:
+class PlannedStep:
     """One kernel of a run: layer ``node`` with its ``chain`` folded in, then layer ``finish`` in place on its top.
 
     ``bottoms`` and ``tops`` are values; ``reuse``: nobody else needs the memory of the first bottom; ``ends``: values
@@ -41,7 +41,7 @@ class Step:
 class Schedule:
     """Steps in running order; ``origin[v]`` is the value that stands for value v."""
 
-    steps: tuple[Step, ...]
+    steps: tuple[PlannedStep, ...]
     origin: tuple[int, ...]
 
 
@@ -67,7 +67,7 @@ def schedule(
     origin = origins(plan, passes_on)
     lasting = {origin[v] for v in kept}
     readers = _readers(plan, origin, passes_on)
-    steps: list[Step] = []
+    steps: list[PlannedStep] = []
     for i, node in enumerate(plan.nodes):
         if i in gone or passes_on[i] or (node.tops and set(node.tops) <= set(given)):
             continue
@@ -80,7 +80,7 @@ def schedule(
                 finish = after[0]
                 gone.add(finish)
                 tops = plan.nodes[finish].tops
-        steps.append(Step(i, tuple(origin[v] for v in plan.nodes[first].bottoms), tops, chain, finish))
+        steps.append(PlannedStep(i, tuple(origin[v] for v in plan.nodes[first].bottoms), tops, chain, finish))
     return Schedule(tuple(_with_ends(steps, fresh, lasting, FUSE in passes)), origin)
 
 
@@ -93,7 +93,9 @@ def _readers(plan: Plan, origin: Sequence[int], passes_on: Sequence[bool]) -> di
     return readers
 
 
-def _with_ends(steps: Sequence[Step], fresh: Sequence[bool], lasting: Collection[int], reusing: bool) -> list[Step]:
+def _with_ends(
+    steps: Sequence[PlannedStep], fresh: Sequence[bool], lasting: Collection[int], reusing: bool
+) -> list[PlannedStep]:
     """Return the steps with what ends with them, and what may be overwritten: memory that no view shows."""
     last = {v: s for s, step in enumerate(steps) for v in (*step.bottoms, *step.tops)}
     owned, shown = set[int](), set(lasting)

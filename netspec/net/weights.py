@@ -25,7 +25,7 @@ from netspec.files.kinds import head_of, is_safetensors
 from netspec.files.whole_file import write_whole
 from netspec.layers.contract.base import Layer, shape_string
 from netspec.net.net import Net
-from netspec.net.stamp import check_weights
+from netspec.net.sealed import check_weights
 from netspec.process.heap import give_back_freed_memory
 from netspec.proto.binary import MOST_BYTES, net_beside_numbers
 from netspec.proto.schema import NetParameter

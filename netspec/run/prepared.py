@@ -41,7 +41,7 @@ Given = tuple[int, Shape, torch.dtype]
 
 
 @dataclass
-class Program:
+class PreparedLine:
     """The kernels of a run in order, for one set of shapes of the inputs and of values to keep."""
 
     line: list[Step]
@@ -86,7 +86,7 @@ class Prepared:
             for i, (node, layer) in enumerate(zip(plan.nodes, self._layers, strict=True))
             if not node.bottoms and not layer.is_input
         ]
-        self.made: OrderedDict[Any, Program] = OrderedDict()
+        self.made: OrderedDict[Any, PreparedLine] = OrderedDict()
         self.memos: dict[Any, tuple[tuple[Stamp, ...], Any]] = {}  # what layers keep, by what they need it for
         self._seen: dict[int, Stamp] = {}
 
@@ -99,14 +99,14 @@ class Prepared:
             return None
         values: Values = dict(given)
         loss = walk(self._sources, values, self._exact) if self._sources else None
-        program = self.program(tuple([(v, x.shape, x.dtype) for v, x in values.items()]), kept)
+        program = self.line_for(tuple([(v, x.shape, x.dtype) for v, x in values.items()]), kept)
         with one_thread() if program.one_thread else nullcontext():
             term = walk(program.line, values, self._exact)
         origin = program.schedule.origin
         loss = term if loss is None else loss if term is None else loss + term
         return loss, {v: values[origin[v]].contiguous() for v in kept}
 
-    def program(self, given: tuple[Given, ...], kept: frozenset[int]) -> Program:
+    def line_for(self, given: tuple[Given, ...], kept: frozenset[int]) -> PreparedLine:
         """Return the program for values of these shapes and types, made now or before."""
         key = (given, kept)
         program = self.made.get(key)
@@ -137,7 +137,7 @@ class Prepared:
         own = sum(program.kept for program in self.made.values())
         return own + sum({id(tensor): tensor.nbytes for tensor in tensors}.values())
 
-    def _make(self, given: tuple[Given, ...], kept: frozenset[int]) -> Program:
+    def _make(self, given: tuple[Given, ...], kept: frozenset[int]) -> PreparedLine:
         plan = self._plan
         found, shapes = fitted(plan, self._layers, {v: tuple(shape) for v, shape, _ in given})
         layers = [fit or layer for fit, layer in zip(found, self._layers, strict=True)]
@@ -168,7 +168,7 @@ class Prepared:
             line.append(Step(step.node, kernel, step.bottoms, step.tops, self._losses[step.node], step.ends))
         owners: list[dict[str, Any]] = [layer.blobs._parameters for layer in self._layers]
         blobs = [(owner, name, blob) for owner in owners for name, blob in owner.items()]
-        return Program(
+        return PreparedLine(
             line,
             order,
             kinds,
@@ -182,7 +182,7 @@ class Prepared:
 
     def _kernel(
         self,
-        step: planned.Step,
+        step: planned.PlannedStep,
         layers: Sequence[Layer],
         unknown: bool,
         as_is: bool,
@@ -254,7 +254,7 @@ def _checked(kernel: Kernel, layer: Layer) -> Kernel:
     return checked
 
 
-def _most_alive(steps: Sequence[planned.Step], shapes: Mapping[int, Shape]) -> int:
+def _most_alive(steps: Sequence[planned.PlannedStep], shapes: Mapping[int, Shape]) -> int:
     """Return the bytes of the values that are alive at one time, as far as their shapes are known."""
     alive, most = dict[int, int](), 0
     for step in steps:

@@ -3,7 +3,7 @@
 Caffe keeps neither its place in the data nor its random numbers. Here all draws of an iteration follow from the seed
 and the iteration alone, so the file has the seeds, the places in the data, what layers remember from pass to pass, and
 the losses that ``average_loss`` still needs. It also has the settings that the numbers follow from, and the sizes and
-hashes of the weights and of the state that belong together (netspec/net/stamp.py). Caffe never reads it.
+hashes of the weights and of the state that belong together (netspec/net/sealed.py). Caffe never reads it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from netspec.files.whole_file import write_whole
 from netspec.layers.contract import reading
 from netspec.net.ignored_fields import HOW_NOT_WHAT
 from netspec.net.net import Net
-from netspec.net.stamp import FAULTS, Stamp, damaged, sealed, shown, unsealed, whole_number
+from netspec.net.sealed import FAULTS, Digest, damaged, sealed, shown, unsealed, whole_number
 from netspec.proto.schema import fields_of
 from netspec.solver.snapshot import find_learned_net, read_state
 
@@ -117,8 +117,8 @@ class Extra:
     losses: list[float]
     nets: list[Remembered]
     settings: Settings
-    weights: Stamp
-    state: Stamp
+    weights: Digest
+    state: Digest
 
 
 def path_beside(state: str | Path) -> Path:
@@ -155,8 +155,8 @@ def read_extra(state: str | Path) -> Extra | None:
             [_loss(loss) for loss in _list(found["losses"])],
             [_remembered(net) for net in _list(found["nets"])],
             {str(name): dict(settings) for name, settings in found["settings"].items()},
-            Stamp.read(found["weights"]),
-            Stamp.read(found["state"]),
+            Digest.read(found["weights"]),
+            Digest.read(found["state"]),
         )
     except FileNotFoundError:
         return None

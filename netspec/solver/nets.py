@@ -17,7 +17,7 @@ from netspec.proto.text import parse_net
 TRAIN_NET = "train net"
 TRAIN_FIELDS = ("net", "net_param", "train_net", "train_net_param")
 _GENERIC = ("net_param", "net")  # used for training, and for one test net per further test_iter
-_Found = tuple[str, NetParameter, SourceMap]
+_Read = tuple[str, NetParameter, SourceMap]
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def solver_nets(param: SolverParameter, node: Place, report: Report = raise_faul
     return described
 
 
-def _test_nets(param: SolverParameter, node: Place, read: _Reader, report: Report) -> list[_Found | None]:
+def _test_nets(param: SolverParameter, node: Place, read: _Reader, report: Report) -> list[_Read | None]:
     found = [read(name, i) for name in ("test_net_param", "test_net") for i in range(len(getattr(param, name)))]
     general = next((name for name in _GENERIC if param.HasField(name)), None)
     missing = len(param.test_iter) - len(found)
@@ -95,7 +95,7 @@ class _Reader:
         self._param, self._node, self._report = param, node, report
         self._files: dict[str, tuple[NetParameter, SourceMap] | None] = {}
 
-    def __call__(self, name: str, index: int | None = None) -> _Found | None:
+    def __call__(self, name: str, index: int | None = None) -> _Read | None:
         value = getattr(self._param, name) if index is None else getattr(self._param, name)[index]
         if not isinstance(value, str):
             nodes = self._node.fields.get(name, ())

@@ -13,7 +13,7 @@ import torch
 
 from netspec import log
 from netspec.errors import SpecError, Where
-from netspec.net.stamp import Stamp
+from netspec.net.sealed import Digest
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import SolverParameter
 from netspec.solver import nets
@@ -63,13 +63,13 @@ class Snapshots:
         site = "sgd_solver.cpp:296" if hdf5 else "sgd_solver.cpp:284"
         log.info(site, f"Snapshotting solver state to {form} file {state}")
         history = [values.cpu().numpy() for values in training.history]
-        weights, settings = Stamp.of(model), self._settings()
+        weights, settings = Digest.of(model), self._settings()
         write_state(
             state,
             State(training.iteration, model, training.current_step, history),
             before=lambda unfinished: write_extra(
                 path_beside(state),
-                Extra(training.seed, list(training.losses), states, settings, weights, Stamp.of(unfinished)),
+                Extra(training.seed, list(training.losses), states, settings, weights, Digest.of(unfinished)),
             ),
         )
         training.last_snapshot = state

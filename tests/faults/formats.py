@@ -45,7 +45,7 @@ from netspec.graph.options import BuildOptions
 from netspec.inspect.logs.scores import Score, Scores, Snapshot, read_scores
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.stamp import Stamp, sealed
+from netspec.net.sealed import Digest, sealed
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text, parse_solver_text
@@ -98,7 +98,7 @@ def extra(path: Path) -> None:
     arrays = [{"shape": [1, 2], "float32": "AACAPwAAAEA="}] * 2
     carried = {"0": {"next": 7}, "3": {"state": arrays}}
     settings = {"solver": {"base_lr": 0.5, "stepvalue": [3, 9]}, "train net": {"data_param.source": "db"}}
-    write_extra(path, Extra(1, [0.5, 0.25], [carried, {}], settings, Stamp(3, "ab"), Stamp(4, "cd")))
+    write_extra(path, Extra(1, [0.5, 0.25], [carried, {}], settings, Digest(3, "ab"), Digest(4, "cd")))
 
 
 def unhashed(data: bytes) -> bytes:

@@ -176,7 +176,7 @@ def _pycaffe(path: str) -> list[np.ndarray]:
         net.forward()
         net.backward()
     del views
-    blobs = [blob for layer in net.passes.net.layers for blob in layer.blobs]
+    blobs = [blob for layer in net.runner.net.layers for blob in layer.blobs]
     return _found(0, blobs, [b.requires_grad for b in blobs])
 
 

@@ -8,20 +8,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from netspec.compat.pycaffe.passes import Passes
+from netspec.compat.pycaffe.blob_runner import BlobRunner
 from netspec.solver.debug import log_all_params, log_bottom_diff, log_param_diffs, log_params, log_top
 
 
 @contextmanager
-def debug_info(passes: Passes) -> Iterator[None]:
+def debug_info(runner: BlobRunner) -> Iterator[None]:
     """Log the mean absolute values of what passes forward and backward within the block."""
-    net = passes.net
+    net = runner.net
     ran_backward = False
 
     def forward(i: int) -> None:
-        for b in passes.top_ids[i]:
-            blob = passes.blobs[b]
-            log_top(net.plan.nodes[i].name, passes.names[b], blob.data_memory.tensor(blob.shape))
+        for b in runner.top_ids[i]:
+            blob = runner.blobs[b]
+            log_top(net.plan.nodes[i].name, runner.names[b], blob.data_memory.tensor(blob.shape))
         log_params(net.plan.nodes[i], net.layers[i])
 
     def backward(i: int) -> None:
@@ -29,18 +29,18 @@ def debug_info(passes: Passes) -> Iterator[None]:
         ran_backward = True
         if not net.backward_plan.layers[i]:
             return
-        for b, wanted in zip(passes.bottom_ids[i], net.backward_plan.bottoms[i], strict=True):
+        for b, wanted in zip(runner.bottom_ids[i], net.backward_plan.bottoms[i], strict=True):
             if wanted:
-                blob = passes.blobs[b]
-                log_bottom_diff(net.plan.nodes[i].name, passes.names[b], blob.diff_memory.tensor(blob.shape))
+                blob = runner.blobs[b]
+                log_bottom_diff(net.plan.nodes[i].name, runner.names[b], blob.diff_memory.tensor(blob.shape))
         log_param_diffs(net.plan.nodes[i], net.layers[i])
 
-    passes.hooks["after_forward"].append(forward)
-    passes.hooks["after_backward"].append(backward)
+    runner.hooks["after_forward"].append(forward)
+    runner.hooks["after_backward"].append(backward)
     try:
         yield
     finally:
-        passes.hooks["after_forward"].remove(forward)
-        passes.hooks["after_backward"].remove(backward)
+        runner.hooks["after_forward"].remove(forward)
+        runner.hooks["after_backward"].remove(backward)
     if ran_backward:
         log_all_params(net)

@@ -16,9 +16,9 @@ import numpy as np
 
 from netspec import log
 from netspec.compat.pycaffe import mode
+from netspec.compat.pycaffe.blob_runner import BlobRunner
 from netspec.compat.pycaffe.errors import caffes_errors
 from netspec.compat.pycaffe.named import Named
-from netspec.compat.pycaffe.passes import Passes
 from netspec.errors import did_you_mean, several
 from netspec.graph.filter import with_state
 from netspec.layers.utility import pycaffe_shim
@@ -45,7 +45,7 @@ def _adding(which: str) -> Callable[[Net, Callable[[int], object]], None]:
     """Return a method that adds a function, to be called with each layer's number before or after it ran."""
 
     def add(self: Net, hook: Callable[[int], object]) -> None:
-        self.passes.hooks[which].append(hook)
+        self.runner.hooks[which].append(hook)
 
     return add
 
@@ -92,28 +92,28 @@ class Net:
     def _hold(self, net: core.Net) -> None:
         importlib.import_module("netspec.compat.pycaffe.interface")  # Python layers may import all of it as caffe
         mode.follow_seed(net.random)
-        self.passes = passes = Passes(net)
+        self.runner = runner = BlobRunner(net)
         names = [node.name for node in net.plan.nodes]
         self._layer_names = names
-        self._blob_names = list(passes.names)
-        self._blobs = list(passes.blobs)
-        self._blobs_dict: Named[Blob] = Named("blob", zip(passes.names, passes.blobs, strict=True))
+        self._blob_names = list(runner.names)
+        self._blobs = list(runner.blobs)
+        self._blobs_dict: Named[Blob] = Named("blob", zip(runner.names, runner.blobs, strict=True))
         self.layers: list[Any] = [
             getattr(layer, "code", None) or Layer(layer.type, blobs)
-            for layer, blobs in zip(net.layers, passes.params, strict=True)
+            for layer, blobs in zip(net.layers, runner.params, strict=True)
         ]
         self._layer_dict: Named[Any] = Named("layer", zip(names, self.layers, strict=True))
         self._params_dict: Named[BlobVec] = Named(
-            "layer with parameters", ((name, blobs) for name, blobs in zip(names, passes.params, strict=True) if blobs)
+            "layer with parameters", ((name, blobs) for name, blobs in zip(names, runner.params, strict=True) if blobs)
         )
-        self._top_names = self._names_of(passes.top_ids)
-        self._bottom_names = self._names_of(passes.bottom_ids)
+        self._top_names = self._names_of(runner.top_ids)
+        self._bottom_names = self._names_of(runner.bottom_ids)
         self._input_list, self._output_list = list(net.inputs), list(net.outputs)
         self._inputs = [self._blob_names.index(name) for name in net.inputs]
         self._outputs = [self._blob_names.index(name) for name in net.outputs]
         weights = {
             b: w
-            for ids, row in zip(passes.top_ids, net.loss_weights, strict=True)
+            for ids, row in zip(runner.top_ids, net.loss_weights, strict=True)
             for b, w in zip(ids, row, strict=True)
         }
         self._blob_loss_weights = [weights[b] for b in range(len(self._blobs))]
@@ -165,10 +165,10 @@ class Net:
         return Named("blob", zip(self._blob_names, self._blob_loss_weights, strict=True))
 
     def _top_ids(self, layer: int) -> list[int]:
-        return list(self.passes.top_ids[layer])
+        return list(self.runner.top_ids[layer])
 
     def _bottom_ids(self, layer: int) -> list[int]:
-        return list(self.passes.bottom_ids[layer])
+        return list(self.runner.bottom_ids[layer])
 
     # Running
 
@@ -181,7 +181,7 @@ class Net:
         first = 0 if start is None else self._index(start)
         last = len(self.layers) - 1 if end is None else self._index(end)
         wanted = [*(self.outputs if end is None else self.top_names[end]), *several(blobs)]
-        with self.passes.used():
+        with self.runner.used():
             self._fill(inputs, self.inputs, "data", "Input blob arguments do not match net inputs.")
             self._forward(first, last)
             return {name: self.blobs[name].data for name in dict.fromkeys(wanted)}
@@ -195,18 +195,18 @@ class Net:
         first = len(self.layers) - 1 if start is None else self._index(start)
         last = 0 if end is None else self._index(end)
         wanted = [*(self.inputs if end is None else self.bottom_names[end]), *several(diffs)]
-        with self.passes.used(forward=False):
+        with self.runner.used(forward=False):
             self._fill(tops, self.outputs, "diff", "Top diff arguments do not match net outputs.")
             self._backward(first, last)
             return {name: self.blobs[name].diff for name in dict.fromkeys(wanted)}
 
     def _forward(self, start: int, end: int) -> float:
-        with self.passes.used(), caffes_errors():
-            return self.passes.forward(start, end).item()
+        with self.runner.used(), caffes_errors():
+            return self.runner.forward(start, end).item()
 
     def _backward(self, start: int, end: int) -> None:
-        with self.passes.used(forward=False):
-            self.passes.backward(start, end)
+        with self.runner.used(forward=False):
+            self.runner.backward(start, end)
 
     def _index(self, layer: str) -> int:
         if layer not in self.layer_dict:
@@ -278,11 +278,11 @@ class Net:
     def reshape(self) -> None:
         """Give every blob the shape that follows from those of the inputs."""
         with caffes_errors():
-            self.passes.reshape()
+            self.runner.reshape()
 
     def clear_param_diffs(self) -> None:
         """Set the gradients of the learnable blobs to 0; :meth:`backward` adds to them."""
-        self.passes.clear_param_diffs()
+        self.runner.clear_param_diffs()
 
     before_forward, after_forward = _adding("before_forward"), _adding("after_forward")
     before_backward, after_backward = _adding("before_backward"), _adding("after_backward")
@@ -291,7 +291,7 @@ class Net:
 
     def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
         """Give the net's first layer, a MemoryData, images (n, C, H, W) and labels (n,), both float32."""
-        layer = self.passes.net.layers[0]
+        layer = self.runner.net.layers[0]
         if not hasattr(layer, "set_input_arrays"):
             kind = f'it is "{self._layer_names[0]}" ({layer.type})'
             raise RuntimeError(f"set_input_arrays may only be called if the first layer is a MemoryDataLayer; {kind}")
@@ -302,9 +302,9 @@ class Net:
     def copy_from(self, weights: FilePath) -> None:
         """Copy the weights of a .caffemodel, binary or HDF5, into the layers of the same names."""
         weights = file_of(weights)
-        self.passes.upload()
+        self.runner.upload()
         with caffes_errors():
-            load_weights(self.passes.net, weights)
+            load_weights(self.runner.net, weights)
 
     def load_hdf5(self, weights: FilePath) -> None:
         """Copy the weights of an HDF5 file into the layers of the same names."""
@@ -312,17 +312,17 @@ class Net:
 
     def share_with(self, other: Net) -> None:
         """Use the learnable blobs of another net, layer by layer of equal name."""
-        self.passes.share_with(other.passes)
+        self.runner.share_with(other.runner)
 
     def save(self, path: FilePath) -> None:
         """Write the layers and their weights in binary form, whatever the file's name ends with."""
-        self.passes.upload()
-        write_binary(self.passes.net, os.fsdecode(path))
+        self.runner.upload()
+        write_binary(self.runner.net, os.fsdecode(path))
 
     def save_hdf5(self, path: FilePath, write_diff: bool = False) -> None:
         """Write the weights as HDF5; with ``write_diff`` their gradients too."""
-        self.passes.upload()
-        write_hdf5(self.passes.net, os.fsdecode(path), write_diff)
+        self.runner.upload()
+        write_hdf5(self.runner.net, os.fsdecode(path), write_diff)
 
     # Of 2014, when phase and mode were a net's
 

@@ -19,7 +19,7 @@ from netspec.compat.pycaffe import mode
 from netspec.compat.pycaffe.debug import debug_info
 from netspec.compat.pycaffe.errors import caffes_errors
 from netspec.compat.pycaffe.net import FilePath, Net
-from netspec.compat.pycaffe.whole import WholePass
+from netspec.compat.pycaffe.whole import WholeRun
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.reading import Constant
 from netspec.layers.utility.python import Python
@@ -44,7 +44,7 @@ class _Training(core_solver.Solver):
         super().__init__(*arguments, **options)
         self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
         self.net.largest_trained = math.inf  # blobs keep all tops in any case
-        self._whole: WholePass | None = None  # which the first pass may show to be possible
+        self._whole: WholeRun | None = None  # which the first pass may show to be possible
         self.is_watched = bool(self.net.inputs) or any(
             isinstance(layer, Python)
             or (isinstance(layer, Constant) and any(top is not None for top in layer.filled_once()))
@@ -65,35 +65,35 @@ class _Training(core_solver.Solver):
     @override
     def clear_gradients(self) -> None:
         """Zero the gradients where they are: views of them stay valid."""
-        self.shown[self.net].passes.upload()
+        self.shown[self.net].runner.upload()
         super().clear_gradients()
 
     @override
     def forward_backward(self) -> tuple[torch.Tensor, Outputs]:
         """Run forward and backward; only the last pass of several, and one that somebody watches, fills the blobs."""
-        seen, passes = self.is_watched or self.param.debug_info, self.shown[self.net].passes
+        seen, runner = self.is_watched or self.param.debug_info, self.shown[self.net].runner
         if not seen and (passed := self._whole.run() if self._whole else self.to_come and self.net.forward_backward()):
             return passed
         loss, outputs = self.forward(self.net)
-        passes.backward(len(self.net.layers) - 1, 0)
-        self._whole = WholePass(passes) if WholePass.suits(passes) else None
+        runner.backward(len(self.net.layers) - 1, 0)
+        self._whole = WholeRun(runner) if WholeRun.suits(runner) else None
         return loss, outputs
 
     @override
     def forward(self, net: core.Net) -> tuple[torch.Tensor, Outputs]:
         shown = self.shown[net]
-        loss = shown.passes.forward(0, len(net.layers) - 1)
+        loss = shown.runner.forward(0, len(net.layers) - 1)
         blobs = {name: shown.blobs[name] for name in shown.outputs}
         return loss, {name: blob.data_memory.tensor(blob.shape) for name, blob in blobs.items()}
 
     @override
     def debugged(self, net: core.Net) -> AbstractContextManager[None]:
-        return debug_info(self.shown[net].passes)
+        return debug_info(self.shown[net].runner)
 
     @override
     def apply_update(self) -> None:
         """Move the weights, from the values and gradients that scripts may have written."""
-        self.shown[self.net].passes.upload()
+        self.shown[self.net].runner.upload()
         super().apply_update()
 
     @override
@@ -105,7 +105,7 @@ class _Training(core_solver.Solver):
     @override
     def snapshot(self) -> tuple[str, str]:
         """Take a snapshot, in the root's process."""
-        self.shown[self.net].passes.upload()
+        self.shown[self.net].runner.upload()
         return super().snapshot() if mode.root_solver() else ("", "")
 
 
@@ -175,7 +175,7 @@ class Solver:
 
     def restore(self, state_file: FilePath) -> None:
         """Go on from a .solverstate, and from its weights."""
-        self.net.passes.upload()
+        self.net.runner.upload()
         self._training.restore(os.fsdecode(state_file))
 
     def snapshot(self) -> None:
@@ -191,7 +191,7 @@ class Solver:
         self._training.apply_update()
 
     def add_callback(self, on_start: Any, on_gradients_ready: Callable[[], object] | None = None) -> None:
-        """Call two functions at each iteration: before its passes, and between them and the update.
+        """Call two functions at each iteration: before its runs, and between them and the update.
 
         An object that has ``on_start`` and ``on_gradients_ready`` may stand for both, as a :class:`NCCL` does.
         """

@@ -1,4 +1,4 @@
-"""What :class:`netspec.pycaffe.passes.Passes` keeps of a layer's run, and where tensors lie."""
+"""What :class:`netspec.pycaffe.blob_runner.BlobRunner` keeps of a layer's run, and where tensors lie."""
 
 from __future__ import annotations
 

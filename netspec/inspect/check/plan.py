@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from netspec.graph.steps import PASSES, Step
+from netspec.graph.steps import PASSES, PlannedStep
 from netspec.layers.contract.fused import has_bfloat16
 from netspec.net.net import Net
 from netspec.proto.schema import TRAIN
@@ -54,7 +54,7 @@ def plan_text(net: Net) -> str:
     )
 
 
-def _name(net: Net, step: Step) -> str:
+def _name(net: Net, step: PlannedStep) -> str:
     members = [step.node, *(step.chain.folded if step.chain else ())]
     members = sorted(members) + ([step.finish] if step.finish is not None else [])
     return " + ".join(net.plan.nodes[i].name for i in members)

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
-from netspec import log
 from netspec.inspect.draw.style import COLORS, FAULT, GRID, STYLE
-from netspec.inspect.logs.run import Curve, Run, shown_range, smoothed, thinned
+from netspec.inspect.logs.training_log import Curve, TrainingLog, shown_range, smoothed, thinned
+from netspec.log import logger
 
 WIDTH, LOSS_HEIGHT, HEIGHT = 9.0, 3.4, 2.3  # inches
 MOST_POINTS = 2000  # of a curve, of which more cannot be seen
@@ -39,15 +39,15 @@ class Look:
     apart: float = 0.0
 
 
-def training_figure(runs: Sequence[Run], look: Look | None = None) -> Figure:
-    """Draw runs, each in its color: a panel of losses, one for each other output, one for the rate.
+def training_figure(logs: Sequence[TrainingLog], look: Look | None = None) -> Figure:
+    """Draw trainings, each in its color: a panel of losses, one for each other output, one for the rate.
 
     The loss of training is pale as it is and strong smoothed; tests are dashed, with markers. The parts have ids, such
     as ``run0-raw``, so that a page can hide them.
     """
-    look = replace(look or Look(), apart=max((run.iteration for run in runs), default=0) / MOST_MARKERS)
-    others = other_outputs(runs)
-    rates = any(len(run.rate) for run in runs)
+    look = replace(look or Look(), apart=max((log.iteration for log in logs), default=0) / MOST_MARKERS)
+    others = other_outputs(logs)
+    rates = any(len(log.rate) for log in logs)
     heights = [LOSS_HEIGHT] + [HEIGHT] * (len(others) + rates)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
@@ -55,18 +55,18 @@ def training_figure(runs: Sequence[Run], look: Look | None = None) -> Figure:
             figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights).flat
         )
         panels[0].set_title("loss")
-        for number, run in enumerate(runs):
-            _draw_losses(panels[0], run, number, look)
-        _scale_losses(panels[0], runs, look)
+        for number, log in enumerate(logs):
+            _draw_losses(panels[0], log, number, look)
+        _scale_losses(panels[0], logs, look)
         for axis, name in zip(panels[1:], others, strict=False):
             axis.set_title(name, parse_math=False)
-            for number, run in enumerate(runs):
-                _draw_output(axis, run, name, number, look)
+            for number, log in enumerate(logs):
+                _draw_output(axis, log, name, number, look)
         if rates:
             panels[-1].set_title("learning rate")
-            for number, run in enumerate(runs):
-                _draw_rate(panels[-1], run, number)
-            _scale_rates(panels[-1], runs)
+            for number, log in enumerate(logs):
+                _draw_rate(panels[-1], log, number)
+            _scale_rates(panels[-1], logs)
         for axis in panels:
             axis.grid(color=GRID, linewidth=0.6)
             axis.set_axisbelow(True)
@@ -74,16 +74,16 @@ def training_figure(runs: Sequence[Run], look: Look | None = None) -> Figure:
         panels[-1].set_xlabel("iteration")
         panels[-1].xaxis.set_major_locator(MaxNLocator(9, integer=True, steps=[1, 2, 5, 10]))
         panels[-1].xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-        _legend(figure, runs)
+        _legend(figure, logs)
         return figure
 
 
-def other_outputs(runs: Sequence[Run]) -> list[str]:
+def other_outputs(logs: Sequence[TrainingLog]) -> list[str]:
     """Return the outputs that get a panel: no losses, and no single numbers of long blobs."""
     found: dict[str, None] = {}
-    for run in runs:
-        for curves in (run.train, *run.tests.values()):
-            names = [name for name in curves if name not in run.losses]
+    for log in logs:
+        for curves in (log.train, *log.tests.values()):
+            names = [name for name in curves if name not in log.losses]
             for name in names:
                 blob = name.partition("[")[0]
                 if sum(other.partition("[")[0] == blob for other in names) <= MOST_ELEMENTS:
@@ -91,29 +91,29 @@ def other_outputs(runs: Sequence[Run]) -> list[str]:
     return list(found)
 
 
-def _draw_losses(axis: Axes, run: Run, number: int, look: Look) -> None:
+def _draw_losses(axis: Axes, log: TrainingLog, number: int, look: Look) -> None:
     color = COLORS[number % len(COLORS)]
-    x, y = run.loss.arrays()
+    x, y = log.loss.arrays()
     _line(axis, x, y, f"run{number}-raw", color=color, linewidth=0.8, alpha=0.3)
     _line(axis, x, smoothed(y, look.smooth), f"run{number}-smooth", color=color, linewidth=1.6)
     bad = x[~np.isfinite(y)]
     if len(bad):
         marks = axis.plot(bad, np.full(len(bad), 0.02), "x", color=FAULT, transform=axis.get_xaxis_transform())
         marks[0].set_gid(f"run{number}-nan")
-    for net, curves in run.tests.items():
+    for net, curves in log.tests.items():
         for name, curve in curves.items():
-            if name in run.losses:
+            if name in log.losses:
                 _draw_test(axis, curve, number, net, look)
 
 
-def _draw_output(axis: Axes, run: Run, name: str, number: int, look: Look) -> None:
-    if name not in run.losses and name in run.train:
-        x, y = run.train[name].arrays()
+def _draw_output(axis: Axes, log: TrainingLog, name: str, number: int, look: Look) -> None:
+    if name not in log.losses and name in log.train:
+        x, y = log.train[name].arrays()
         color = COLORS[number % len(COLORS)]
         _line(axis, x, y, f"run{number}-raw", color=color, linewidth=0.8, alpha=0.3)
         _line(axis, x, smoothed(y, look.smooth), f"run{number}-smooth", color=color, linewidth=1.6)
-    for net, curves in run.tests.items():
-        if name in curves and name not in run.losses:
+    for net, curves in log.tests.items():
+        if name in curves and name not in log.losses:
             _draw_test(axis, curves[name], number, net, look)
 
 
@@ -124,9 +124,9 @@ def _draw_test(axis: Axes, curve: Curve, number: int, net: int, look: Look) -> N
     _line(axis, x, y, f"run{number}-test", color=color, linestyle=_DASHED, linewidth=1.1, marker=marker, markersize=4)
 
 
-def _draw_rate(axis: Axes, run: Run, number: int) -> None:
-    x, y = run.rate.arrays()
-    end = max(run.iteration, x[-1]) if len(x) else 0
+def _draw_rate(axis: Axes, log: TrainingLog, number: int) -> None:
+    x, y = log.rate.arrays()
+    end = max(log.iteration, x[-1]) if len(x) else 0
     color = COLORS[number % len(COLORS)]
     _line(
         axis,
@@ -144,43 +144,43 @@ def _line(axis: Axes, x: np.ndarray, y: np.ndarray, name: str, **options: object
     line.set_gid(name)
 
 
-def _scale_losses(axis: Axes, runs: Sequence[Run], look: Look) -> None:
+def _scale_losses(axis: Axes, logs: Sequence[TrainingLog], look: Look) -> None:
     """Show the whole range but for a few outliers."""
-    tests = [curves[name] for run in runs for curves in run.tests.values() for name in run.losses & set(curves)]
-    curves = [curve.arrays()[1] for curve in [*(run.loss for run in runs), *tests]]
+    tests = [curves[name] for log in logs for curves in log.tests.values() for name in log.losses & set(curves)]
+    curves = [curve.arrays()[1] for curve in [*(log.loss for log in logs), *tests]]
     if look.log and any((curve > 0).any() for curve in curves):
         axis.set_yscale("log")
         return
     if look.log:
-        log.logger.warning("no loss is above 0: its axis is not logarithmic")
+        logger.warning("no loss is above 0: its axis is not logarithmic")
     found = shown_range(curves)
     if found is not None and found[1] > found[0]:
         margin = 0.05 * (found[1] - found[0])
         axis.set_ylim(found[0] - margin, found[1] + margin)
 
 
-def _scale_rates(axis: Axes, runs: Sequence[Run]) -> None:
+def _scale_rates(axis: Axes, logs: Sequence[TrainingLog]) -> None:
     """Use a logarithmic axis where rates differ by more than ten times."""
-    rates = [rate for run in runs for rate in run.rate.values if math.isfinite(rate) and rate > 0]
+    rates = [rate for log in logs for rate in log.rate.values if math.isfinite(rate) and rate > 0]
     if rates and max(rates) > 10 * min(rates):
         axis.set_yscale("log")
     elif rates:
         axis.set_ylim(0, 1.15 * max(rates))
 
 
-def _legend(figure: Figure, runs: Sequence[Run]) -> None:
-    handles = [Line2D([], [], color=COLORS[k % len(COLORS)], linewidth=2, label=run.name) for k, run in enumerate(runs)]
+def _legend(figure: Figure, logs: Sequence[TrainingLog]) -> None:
+    handles = [Line2D([], [], color=COLORS[k % len(COLORS)], linewidth=2, label=log.name) for k, log in enumerate(logs)]
     gray = "#555555"
     handles.append(Line2D([], [], color=gray, linewidth=0.8, alpha=0.4, label="training, as logged"))
     handles.append(Line2D([], [], color=gray, linewidth=1.6, label="training, smoothed"))
-    nets = sorted({net for run in runs for net in run.tests})
+    nets = sorted({net for log in logs for net in log.tests})
     for net in nets:
         label = "test" if len(nets) == 1 else f"test net {net}"
         marker = MARKERS[net % len(MARKERS)]
         handles.append(
             Line2D([], [], color=gray, linestyle=_DASHED, linewidth=1.1, marker=marker, markersize=4, label=label)
         )
-    if any(not np.isfinite(run.loss.values).all() for run in runs if len(run.loss)):
+    if any(not np.isfinite(log.loss.values).all() for log in logs if len(log.loss)):
         handles.append(Line2D([], [], color=FAULT, linestyle="", marker="x", label="loss is NaN or infinite"))
     for handle in handles:
         handle.set_label(textwrap.shorten(str(handle.get_label()), LEGEND_WIDTH, placeholder="..."))

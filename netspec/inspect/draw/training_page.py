@@ -11,23 +11,23 @@ from matplotlib.figure import Figure
 from netspec.inspect.draw.style import COLORS, svg
 from netspec.inspect.draw.svg import page
 from netspec.inspect.draw.training import MOST_POINTS
-from netspec.inspect.logs.run import Curve, Run, summary, thinned
+from netspec.inspect.logs.training_log import Curve, TrainingLog, summary, thinned
 
 _PARTS = (("raw", "training, as logged"), ("smooth", "training, smoothed"), ("test", "tests"), ("rate", "rate"))
 _FEW = 6  # test outputs that the cursor reads
 
 
-def training_page(runs: Sequence[Run], figure: Figure, title: str) -> str:
+def training_page(logs: Sequence[TrainingLog], figure: Figure, title: str) -> str:
     """Return the page; ``figure`` is the picture of the runs. It needs nothing from elsewhere."""
-    told = [summary(run) for run in runs]
+    told = [summary(log) for log in logs]
     columns = list(dict.fromkeys(name for line in told for name in line))
     shown = [
         {
-            "name": run.name,
+            "name": log.name,
             "color": COLORS[number % len(COLORS)],
             "cells": [line.get(column, "") for column in columns],
         }
-        for number, (run, line) in enumerate(zip(runs, told, strict=True))
+        for number, (log, line) in enumerate(zip(logs, told, strict=True))
     ]
     drawing = svg(figure)
     return page(
@@ -37,8 +37,8 @@ def training_page(runs: Sequence[Run], figure: Figure, title: str) -> str:
         parts=_PARTS,
         columns=columns,
         svg=Markup(drawing[drawing.index("<svg") :]),
-        description=describe(runs),
-        curves={**_horizontal(figure), "runs": [_curves(run, k) for k, run in enumerate(runs)]},
+        description=describe(logs),
+        curves={**_horizontal(figure), "runs": [_curves(log, k) for k, log in enumerate(logs)]},
     )
 
 
@@ -49,13 +49,13 @@ def _horizontal(figure: Figure) -> dict[str, float]:
     return {"left": place.x0, "right": place.x1, "first": first, "last": last}
 
 
-def _curves(run: Run, number: int) -> dict[str, object]:
+def _curves(log: TrainingLog, number: int) -> dict[str, object]:
     """Return the curves that the cursor reads, as points (iteration, value); None is a value that is not finite."""
-    named = [("loss", run.loss), ("learning rate", run.rate)]
-    for net, curves in run.tests.items():
-        named += [(f"{run.test_label(net)} {name}", curve) for name, curve in list(curves.items())[:_FEW]]
+    named = [("loss", log.loss), ("learning rate", log.rate)]
+    for net, curves in log.tests.items():
+        named += [(f"{log.test_label(net)} {name}", curve) for name, curve in list(curves.items())[:_FEW]]
     return {
-        "name": run.name,
+        "name": log.name,
         "color": COLORS[number % len(COLORS)],
         "curves": [(name, _points(curve)) for name, curve in named],
     }
@@ -66,10 +66,10 @@ def _points(curve: Curve) -> list[tuple[int, float | None]]:
     return [(int(at), float(value) if np.isfinite(value) else None) for at, value in zip(x, y, strict=True)]
 
 
-def describe(runs: Sequence[Run]) -> str:
+def describe(logs: Sequence[TrainingLog]) -> str:
     """Return in words what the picture shows."""
     lines = []
-    for run in runs:
-        cells = ", ".join(f"{name} {value}" for name, value in summary(run).items())
-        lines.append(f"{run.name}: {cells}")
+    for log in logs:
+        cells = ", ".join(f"{name} {value}" for name, value in summary(log).items())
+        lines.append(f"{log.name}: {cells}")
     return "Curves over iterations. " + ". ".join(lines) + "."

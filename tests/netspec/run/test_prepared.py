@@ -67,7 +67,7 @@ def assert_same(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor
         assert float((found[name] - blob).abs().max()) <= 1e-5 * max(1.0, float(blob.abs().max()))
 
 
-def last_program(net: Net) -> programs.Program:
+def last_line(net: Net) -> programs.PreparedLine:
     assert net.prepared is not None
     return next(reversed(net.prepared.made.values()))
 
@@ -75,7 +75,7 @@ def last_program(net: Net) -> programs.Program:
 def test_norms_fold_into_the_convolution_and_the_activation_fuses(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK))
     assert_same(quickly(net, data=images()), slowly(net, data=images()))
-    program = last_program(net)
+    program = last_line(net)
     (step,) = program.schedule.steps
     assert step.chain is not None
     assert [net.plan.nodes[i].name for i in (step.node, *step.chain.folded)] == ["conv", "bn", "scale"]
@@ -87,7 +87,7 @@ def test_norms_fold_into_the_convolution_and_the_activation_fuses(net_of: Callab
 def test_what_only_hands_on_is_not_run_and_sums_are_made_in_place(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED))
     assert_same(quickly(net, data=images()), slowly(net, data=images()))
-    steps = last_program(net).schedule.steps
+    steps = last_line(net).schedule.steps
     assert [net.plan.nodes[step.node].name for step in steps] == ["conv", "left", "right", "sum"]
     assert steps[-1].reuse
 
@@ -99,7 +99,7 @@ def test_deconvolutions_are_laid_out_too(how: str, net_of: Callable[..., Net]) -
     net = trained(net_of(text.replace('type: "ReLU"', 'type: "ReLU" relu_param { negative_slope: 0.1 }')))
     x = images(1, 8, 80, 80)
     assert_same(quickly(net, data=x), slowly(net, data=x))
-    assert last_program(net).kinds == ["packed"]
+    assert last_line(net).kinds == ["packed"]
 
 
 @pytest.mark.parametrize("passes", [(), *((name,) for name in PASSES), PASSES], ids="-".join)
@@ -127,10 +127,10 @@ def test_small_layers_keep_caffes_order_of_sums(net_of: Callable[..., Net]) -> N
     net = trained(net_of(text))
     x = images(1, 8, 6, 6)
     np.testing.assert_array_equal(quickly(net, data=x)["scale"], slowly(net, data=x)["scale"])
-    assert last_program(net).kinds == ["exact", "exact", "exact"]
+    assert last_line(net).kinds == ["exact", "exact", "exact"]
     loose = trained(net_of(text, exact="none"))
     assert_same(quickly(loose, data=x), slowly(loose, data=x))
-    assert len(last_program(loose).kinds) == 1
+    assert len(last_line(loose).kinds) == 1
 
 
 def write_in_place(net: Net) -> None:
@@ -184,7 +184,7 @@ def test_what_is_written_to_parameters_counts_in_the_next_run(
     for _ in range(2):
         assert_same(quickly(net, data=images()), slowly(net, data=images()))
     if write is not replace_the_parameter:  # a parameter of another class does not say what is written to it
-        assert last_program(net).kinds == ["packed"]
+        assert last_line(net).kinds == ["packed"]
 
 
 def test_memory_that_somebody_holds_may_be_written_to_at_any_time(net_of: Callable[..., Net]) -> None:
@@ -194,11 +194,11 @@ def test_memory_that_somebody_holds_may_be_written_to_at_any_time(net_of: Callab
     for value in (0.1, 0.2, 0.3):
         held[...] = value
         assert_same(quickly(net, data=images()), slowly(net, data=images()))
-        assert last_program(net).kinds[0] == "as is"
+        assert last_line(net).kinds[0] == "as is"
     del held
     quickly(net, data=images())
     assert_same(quickly(net, data=images()), slowly(net, data=images()))
-    assert last_program(net).kinds == ["packed"]
+    assert last_line(net).kinds == ["packed"]
 
 
 def test_shapes_may_change_from_run_to_run(net_of: Callable[..., Net]) -> None:
@@ -368,7 +368,7 @@ layer {{ name: "{name}" type: "InnerProduct" bottom: "{bottom}" top: "{name}" pa
 """
     net, x = net_of(text, exact="none"), torch.randn(8, 300)
     assert_same(quickly(net, data=x), slowly(net, data=x))
-    assert last_program(net).kinds == ["packed"] * 3
+    assert last_line(net).kinds == ["packed"] * 3
 
 
 def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> None:
@@ -402,4 +402,4 @@ layer {{ name: "clip" type: "Clip" bottom: "c" top: "c" clip_param {{ min: {low}
 """
     net, x = net_of(text, exact="none"), torch.randn(2, 8, 20, 20)
     assert_same(quickly(net, data=x), slowly(net, data=x))
-    assert len(last_program(net).line) == steps
+    assert len(last_line(net).line) == steps

@@ -18,7 +18,7 @@ from netspec.cli import main
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
 from netspec.errors import SpecError
-from netspec.net.stamp import sealed
+from netspec.net.sealed import sealed
 from netspec.solver.extra import changes, newest_pair, path_beside, read_extra
 from netspec.solver.snapshot import State, read_state, write_state
 from netspec.solver.solver import Solver, load_solver

@@ -99,7 +99,7 @@ def test_caffes_examples(
     solver = caffe.get_solver(f"examples/runs/{run}/solver.prototxt")
     solver.param.test_initialization = False
     for name in meta["init"]:
-        set_parameters(solver.net.passes.net, np.load(f"examples/init/{name}.npz"))
+        set_parameters(solver.net.runner.net, np.load(f"examples/init/{name}.npz"))
     solver.step(1)
     updates = {key: sampled(solver, key, "diff") for key in golden.files if key.startswith("update/")}
     assert_same_layers(updates, golden, 1e-4)

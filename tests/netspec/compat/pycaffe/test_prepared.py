@@ -26,7 +26,7 @@ def by_layer(net: caffe.Net) -> dict[str, np.ndarray]:
     """Return copies of all blobs after a pass with a hook, which runs layer by layer."""
     net.before_forward(lambda _: None)
     net.forward()
-    net.passes.hooks["before_forward"].clear()
+    net.runner.hooks["before_forward"].clear()
     return {name: blob.data.copy() for name, blob in net.blobs.items()}
 
 
@@ -40,8 +40,8 @@ def test_all_blobs_are_there_after_a_prepared_pass(net: caffe.Net) -> None:
     for blob in net.blobs.values():
         blob.data[...] = 0 if blob is not net.blobs["data"] else blob.data
     net.forward()
-    assert net.passes.net.prepared is not None
-    assert net.passes.net.prepared.made
+    assert net.runner.net.prepared is not None
+    assert net.runner.net.prepared.made
     assert_same(net, expected)
 
 

@@ -11,7 +11,7 @@ import cv2
 import pytest
 
 from netspec.inspect.draw.training import Look, training_figure
-from netspec.inspect.logs.run import Curve, Run, read_log
+from netspec.inspect.logs.training_log import Curve, TrainingLog, read_log
 from paths import GOLDEN
 
 CAFFES = GOLDEN / "log" / "caffe_train.log"
@@ -36,24 +36,24 @@ def test_each_kind_of_output_has_a_panel_and_each_run_its_curves() -> None:
 
 
 def test_a_blob_of_many_numbers_gets_no_panels() -> None:
-    run = Run("x", Curve([0], [1]))
+    run = TrainingLog("x", Curve([0], [1]))
     run.tests[0] = {f"p[{k}]": Curve([0], [1]) for k in range(100)}
     assert titles(training_figure([run])) == ["loss"]
 
 
 def test_losses_that_are_no_numbers_are_marked() -> None:
-    figure = training_figure([Run("x", Curve([0, 1, 2], [1, float("nan"), float("inf")]))], Look(log=True))
+    figure = training_figure([TrainingLog("x", Curve([0, 1, 2], [1, float("nan"), float("inf")]))], Look(log=True))
     (marks,) = [line for line in figure.axes[0].lines if line.get_gid() == "run0-nan"]
     assert list(marks.get_xdata()) == [1, 2]  # pyright: ignore[reportArgumentType]
 
 
 def test_a_few_great_losses_do_not_hide_the_rest() -> None:
     curve = Curve(list(range(100)), [80.0] + [1 + 0.01 * (k % 10) for k in range(99)])
-    assert training_figure([Run("x", curve)]).axes[0].get_ylim()[1] < 2
+    assert training_figure([TrainingLog("x", curve)]).axes[0].get_ylim()[1] < 2
 
 
 def test_tests_far_above_the_training_are_in_the_picture() -> None:
-    run = Run("x", Curve(list(range(100)), [1 + 0.01 * (k % 10) for k in range(100)]), losses={"loss"})
+    run = TrainingLog("x", Curve(list(range(100)), [1 + 0.01 * (k % 10) for k in range(100)]), losses={"loss"})
     run.tests[0] = {"loss": Curve([50], [3.0])}
     assert training_figure([run]).axes[0].get_ylim()[1] > 3
 

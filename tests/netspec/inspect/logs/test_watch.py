@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netspec.inspect.logs.run import Curve, Run, read_log
 from netspec.inspect.logs.screen import bar, duration, is_alive, memory_of, plot_lines, screen, seconds_left
+from netspec.inspect.logs.training_log import Curve, TrainingLog, read_log
 from paths import GOLDEN
 
 CAFFES = GOLDEN / "log" / "caffe_train.log"
@@ -19,13 +19,13 @@ Run_ = Callable[..., Any]
 NONE = (np.zeros(0), np.zeros(0))
 
 
-def lines_of(run: Run, **options: Any) -> list[str]:
+def lines_of(run: TrainingLog, **options: Any) -> list[str]:
     given = {"memory": None, "lost": False, "width": 80, "height": 30, "now": 0.0, **options}
     return screen(run, **given)
 
 
-def half_done() -> Run:
-    run = Run("x.log", Curve([0, 10, 20], [3, 2, 1]), settings={"max_iter": "40"})
+def half_done() -> TrainingLog:
+    run = TrainingLog("x.log", Curve([0, 10, 20], [3, 2, 1]), settings={"max_iter": "40"})
     run.times = Curve([0, 10, 20], [0, 5, 10])
     return run
 

@@ -26,15 +26,15 @@ FAULTS = (ValueError, TypeError, LookupError, AttributeError, RecursionError, Ov
 
 
 @dataclass(frozen=True)
-class Stamp:
+class Digest:
     """The size and the hash of a file."""
 
     size: int
     hash: str
 
     @classmethod
-    def of(cls, path: str | Path) -> Stamp:
-        """Return the stamp of a file. Raises OSError if it cannot be read."""
+    def of(cls, path: str | Path) -> Digest:
+        """Return the digest of a file. Raises OSError if it cannot be read."""
         size, hashed = 0, hashlib.blake2b(digest_size=16)
         with open(path, "rb") as file:
             while block := file.read(_BLOCK):
@@ -43,8 +43,8 @@ class Stamp:
         return cls(size, hashed.hexdigest())
 
     @classmethod
-    def read(cls, value: Any) -> Stamp:
-        """Return the stamp that a value of JSON describes. Raises ValueError for any other value."""
+    def read(cls, value: Any) -> Digest:
+        """Return the digest that a value of JSON describes. Raises ValueError for any other value."""
         size, hashed = value["size"], value["hash"]
         if not isinstance(hashed, str):
             raise ValueError(f"found hash {shown(hashed)}, expected a text")
@@ -52,7 +52,7 @@ class Stamp:
 
     def check(self, path: Path, extra: Path) -> None:
         """Raise SpecError where a file is not the one that was written together with ``extra``."""
-        if Stamp.of(path) != self:
+        if Digest.of(path) != self:
             message = f"is not the file that was written with {extra.name}: it was cut or replaced"
             raise SpecError(f"{message}; if you replaced it yourself, remove {extra.name}", Where(str(path)))
 
@@ -109,13 +109,13 @@ def check_weights(path: Path) -> None:
     if extra is None or not extra.is_file() or not path.is_file():
         return
     try:
-        stamp = Stamp.read(unsealed(extra)["weights"])
+        digest = Digest.read(unsealed(extra)["weights"])
     except SpecError as fault:
         log.logger.warning(f"{fault.where}: {fault.message.partition(';')[0]}: {path.name} is not compared with it")
         return
     except FAULTS:
         return
-    stamp.check(path, extra)
+    digest.check(path, extra)
 
 
 def _hash(content: Mapping[str, Any]) -> str:

@@ -123,7 +123,7 @@ _GREATEST = float(np.finfo(np.float32).max)
 
 
 @dataclass
-class Run:
+class TrainingLog:
     """What a log tells of a training.
 
     ``loss`` is averaged over ``average_loss`` iterations; ``train`` and ``tests`` hold the outputs of the training net
@@ -174,7 +174,7 @@ class LogReader:
     """Reads a log line by line into ``run``; a training that is resumed in the same log replaces what it repeats."""
 
     def __init__(self, name: str) -> None:
-        self.run = Run(name)
+        self.log = TrainingLog(name)
         self._position = 0  # the iteration of the last line
         self._net = 0  # the test net that is tested
         self._first: float | None = None
@@ -188,7 +188,7 @@ class LogReader:
         prefix = _PREFIX.search(line)
         if not prefix:
             if self._in_settings and (found := _SETTING.match(line)):
-                self.run.settings[found[1]] = found[2].strip().strip('"')
+                self.log.settings[found[1]] = found[2].strip().strip('"')
             elif _FAULT.match(line):
                 self._end(FAILED, line)
             else:
@@ -197,24 +197,24 @@ class LogReader:
         message = prefix[10]
         self._in_settings = message.startswith("Initializing solver from parameters")
         if self._in_settings:
-            self.run.state, self.run.fault, self.run.process = RUNNING, "", int(prefix[8])
+            self.log.state, self.log.fault, self.log.process = RUNNING, "", int(prefix[8])
         self._read(message, self._seconds(prefix))
         if prefix[1] == "F":
             self._end(FAILED, message)
 
     def _read(self, message: str, seconds: float | None) -> None:
-        run = self.run
+        log = self.log
         if found := _LOSS.search(message):
             iteration = self._at(found[1])
-            run.loss.add(iteration, _number(found[3]))
+            log.loss.add(iteration, _number(found[3]))
             if seconds is not None:
-                run.times.add(iteration, seconds)
+                log.times.add(iteration, seconds)
             if found[2]:
-                run.speed.add(iteration, _number(found[2]))
+                log.speed.add(iteration, _number(found[2]))
         elif found := _OUTPUT.search(message):
             self._output(found[1], int(found[2]), found[3], found[4], "loss)" in message)
         elif found := _RATE.search(message):
-            run.rate.add(self._at(found[1]), _number(found[2]))
+            log.rate.add(self._at(found[1]), _number(found[2]))
         elif found := _TESTING.search(message):
             self._at(found[1])
             self._net = int(found[2] or 0)
@@ -223,19 +223,19 @@ class LogReader:
         elif found := _TEST_LOSS.match(message):
             self._output("Test", -1, "test loss", found[1], True)
         elif found := _WAITING.match(message):
-            run.waiting.add(self._position, _number(found[1]))
+            log.waiting.add(self._position, _number(found[1]))
         elif found := _SNAPSHOT.search(message):
-            run.snapshots.append((int(found[2]), found[1]))
+            log.snapshots.append((int(found[2]), found[1]))
         elif message.startswith("Optimization stopped early"):
             self._end(STOPPED)
-        elif message.startswith("Optimization Done") and run.state == RUNNING:
+        elif message.startswith("Optimization Done") and log.state == RUNNING:
             self._end(DONE)
 
     def _at(self, text: str) -> int:
         """Return the iteration of a line; where it is before that of the last line, the training was resumed."""
         iteration = int(text)
         if iteration < self._position:
-            for curve in self.run.curves():
+            for curve in self.log.curves():
                 curve.cut(iteration)
         self._position = iteration
         return iteration
@@ -247,10 +247,10 @@ class LogReader:
             before = sum(known[0] == blob for at, known in self._names.items() if at[:2] == place[:2] and at < place)
             self._names[place] = (blob, f"{blob}[{before}]" if before else blob)
         name = self._names[place][1]
-        curves = self.run.train if net < 0 else self.run.tests.setdefault(net, {})
+        curves = self.log.train if net < 0 else self.log.tests.setdefault(net, {})
         curves.setdefault(name, Curve()).add(self._position, _number(value))
         if is_loss:
-            self.run.losses.add(name)
+            self.log.losses.add(name)
 
     def _seconds(self, prefix: re.Match[str]) -> float:
         """Return the seconds since the first line; logs of Caffe's time have no year."""
@@ -268,7 +268,7 @@ class LogReader:
         return seconds
 
     def _end(self, state: str, fault: str = "") -> None:
-        self.run.state, self.run.fault = state, fault
+        self.log.state, self.log.fault = state, fault
 
 
 class Follower:
@@ -283,9 +283,9 @@ class Follower:
         self._reader, self._offset, self._rest, self._file = LogReader(self._name), 0, b"", 0
 
     @property
-    def run(self) -> Run:
+    def log(self) -> TrainingLog:
         """What was read so far."""
-        return self._reader.run
+        return self._reader.log
 
     def poll(self) -> bool:
         """Read what is new, and return whether there was any. Raises SpecError if the file cannot be read.
@@ -314,15 +314,15 @@ class Follower:
         self._reader.feed(self._rest.decode(errors="replace"))
 
 
-def read_log(path: str | Path, name: str = "") -> Run:
+def read_log(path: str | Path, name: str = "") -> TrainingLog:
     """Return the training of a log. Raises SpecError if the file cannot be read or holds no training."""
     follower = Follower(path, name)
     follower.poll()
     follower.end()
-    if not any(len(curve) for curve in follower.run.curves()):
+    if not any(len(curve) for curve in follower.log.curves()):
         advice = "expected what `netspec train` or `caffe train` writes to stderr (2> train.log), with display above 0"
         raise SpecError(f"holds no iteration of a training; {advice}", Where(str(path)))
-    return follower.run
+    return follower.log
 
 
 def _number(text: str) -> float:
@@ -337,29 +337,29 @@ def _number(text: str) -> float:
 _FEW = 6  # outputs of test nets that are told
 
 
-def summary(run: Run) -> dict[str, str]:
+def summary(log: TrainingLog) -> dict[str, str]:
     """Return, by name: state, iterations, the last losses and test outputs, the least test loss, iter/s."""
-    told = {"state": "unfinished" if run.state == RUNNING else run.state, "iterations": f"{run.iteration:,}"}
-    if run.loss.last is not None:
-        told["last loss"] = number(run.loss.last)
-    for net, curves in run.tests.items():
-        label = run.test_label(net)
+    told = {"state": "unfinished" if log.state == RUNNING else log.state, "iterations": f"{log.iteration:,}"}
+    if log.loss.last is not None:
+        told["last loss"] = number(log.loss.last)
+    for net, curves in log.tests.items():
+        label = log.test_label(net)
         for name, curve in list(curves.items())[:_FEW]:
             told[f"{label} {name}"] = number(curve.values[-1])
             finite = [value for value in curve.values if math.isfinite(value)]
-            if name in run.losses and finite:
+            if name in log.losses and finite:
                 least = min(finite)
                 told[f"least {label} {name}"] = f"{number(least)} at {curve.iterations[curve.values.index(least)]:,}"
-    speed = iterations_per_second(run)
+    speed = iterations_per_second(log)
     if speed:
         told["iter/s"] = number(float(f"{speed:.3g}"))
     return told
 
 
-def iterations_per_second(run: Run, last: int = 0) -> float | None:
+def iterations_per_second(log: TrainingLog, last: int = 0) -> float | None:
     """Return the speed by the stamps of the log's lines, tests included; over the ``last`` displays, or all (0)."""
     first = -last - 1 if last else 0
-    iterations, seconds = run.times.iterations[first:], run.times.values[first:]
+    iterations, seconds = log.times.iterations[first:], log.times.values[first:]
     if len(iterations) < 2 or seconds[-1] <= seconds[0]:
         return None
     return (iterations[-1] - iterations[0]) / (seconds[-1] - seconds[0])

@@ -1,7 +1,7 @@
 """Forward and backward passes through the memory of a net's blobs, layer by layer, as Caffe makes them.
 
 A net of netspec hands tensors from layer to layer, and autograd goes backward through all of them. Scripts of pycaffe
-read and write the blobs between two layers' passes: so here each layer reads its bottoms' memory and writes its tops',
+read and write the blobs between two layers' runs: so here each layer reads its bottoms' memory and writes its tops',
 and each layer's backward reads the diffs of its tops, and what it needs of the data, from that memory.
 
 Caffe: Net::ForwardFromTo, Net::BackwardFromTo, Net::Reshape (src/caffe/net.cpp)
@@ -46,11 +46,11 @@ from netspec.run.walk import Step, walk
 Hook = Callable[[int], object]
 
 
-class Passes:
+class BlobRunner:
     """The blobs of a net and the passes through them.
 
     ``names`` and ``blobs`` run in step, in Caffe's order; ``bottoms[i]`` and ``tops[i]`` are the blobs of layer i,
-    ``params[i]`` its learnable blobs. ``hooks`` are called with a layer's number, before and after its passes.
+    ``params[i]`` its learnable blobs. ``hooks`` are called with a layer's number, before and after its runs.
     """
 
     def __init__(self, net: Net) -> None:
@@ -273,7 +273,7 @@ class Passes:
         for i in range(len(self._layers)):
             self._reshape(i)
 
-    def share_with(self, other: Passes) -> None:
+    def share_with(self, other: BlobRunner) -> None:
         """Use the learnable blobs of another net (Caffe: ShareTrainedLayersWith); their gradients stay apart."""
         other.upload()
         mine = {layer.param.name: layer for layer in reversed(self._layers)}

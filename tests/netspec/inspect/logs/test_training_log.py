@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from netspec.errors import SpecError
-from netspec.inspect.logs.run import (
+from netspec.inspect.logs.training_log import (
     Curve,
     Follower,
     LogReader,
-    Run,
+    TrainingLog,
     iterations_per_second,
     read_log,
     shown_range,
@@ -25,11 +25,11 @@ CAFFES = GOLDEN / "log" / "caffe_train.log"
 OLD = "I0101 00:00:{:02d}.000000   77 solver.cpp:239] {}"
 
 
-def read(*messages: str) -> Run:
+def read(*messages: str) -> TrainingLog:
     reader = LogReader("log")
     for second, message in enumerate(messages):
         reader.feed(OLD.format(second, message))
-    return reader.run
+    return reader.log
 
 
 def test_a_log_of_caffe() -> None:
@@ -84,10 +84,10 @@ def test_a_log_without_prefixes_and_one_of_several_nodes() -> None:
                  "[n0.d0.r0] Iteration 20 (2.5 iter/s, 4s/10 iter), 0.1/90.1ep, loss = 0.75",
                  "[n0.d0.r0]     Test net output #0: top-1 = 0.5"):  # fmt: skip
         reader.feed(line)
-    assert reader.run.loss == Curve([10, 20], [0.5, 0.75])
-    assert reader.run.train == {"loss: a = b": Curve([10], [0.25])}
-    assert reader.run.tests == {0: {"top-1": Curve([20], [0.5])}}
-    assert not len(reader.run.times)
+    assert reader.log.loss == Curve([10, 20], [0.5, 0.75])
+    assert reader.log.train == {"loss: a = b": Curve([10], [0.25])}
+    assert reader.log.tests == {0: {"top-1": Curve([20], [0.5])}}
+    assert not len(reader.log.times)
 
 
 @pytest.mark.parametrize("text", ["nan", "-nan", "1.#QNAN", "-1.#IND"])
@@ -115,9 +115,9 @@ def test_the_years_end_does_not_turn_time_back() -> None:
     reader = LogReader("log")
     reader.feed("I1231 23:59:59.000000 1 solver.cpp:239] Iteration 0, loss = 1")
     reader.feed("I0101 00:00:01.000000 1 solver.cpp:239] Iteration 10, loss = 1")
-    assert reader.run.times.values[1] == pytest.approx(2, abs=86400.0)
-    assert reader.run.times.values[1] > 0
-    assert iterations_per_second(reader.run)
+    assert reader.log.times.values[1] == pytest.approx(2, abs=86400.0)
+    assert reader.log.times.values[1] > 0
+    assert iterations_per_second(reader.log)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_the_years_end_does_not_turn_time_back() -> None:
 def test_how_a_training_ended(line: str, state: str) -> None:
     reader = LogReader("log")
     reader.feed(line)
-    assert reader.run.state == state
+    assert reader.log.state == state
 
 
 def test_a_growing_log_gives_what_the_whole_log_gives(tmp_path: Path) -> None:
@@ -146,10 +146,10 @@ def test_a_growing_log_gives_what_the_whole_log_gives(tmp_path: Path) -> None:
             file.write(data[start : start + 997])
         assert follower.poll()
     assert not follower.poll()
-    assert follower.run == read_log(CAFFES)
+    assert follower.log == read_log(CAFFES)
     path.write_bytes(b"I0101 00:00:00.000000 1 solver.cpp:239] Iteration 7, loss = 1\n")
     follower.poll()
-    assert follower.run.loss == Curve([7], [1])
+    assert follower.log.loss == Curve([7], [1])
 
 
 @pytest.mark.parametrize(("data", "what"), [(b"\xff\x00 no log", "holds no iteration"), (None, "cannot be read")])
