@@ -24,12 +24,7 @@ CIFAR_SHAPE = (3, 32, 32)
 
 
 def convert_mnist(
-    images: str,
-    labels: str,
-    database: str,
-    backend: str = "lmdb",
-    progress: Progress = silent,
-    in_pairs: bool = False,
+    images: str, labels: str, database: str, backend: str = "lmdb", progress: Progress = silent, in_pairs: bool = False
 ) -> None:
     """Write the images and labels of two files of MNIST into a new database. Raises SpecError.
 

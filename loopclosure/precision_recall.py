@@ -98,8 +98,8 @@ def curve(
     if positives is None:
         positives = int(np.count_nonzero(right))
     samples = len(scores)
-    said = ~np.isnan(scores) & ~np.isneginf(scores)
-    scores, right = scores[said], right[said]
+    named = ~np.isnan(scores) & ~np.isneginf(scores)
+    scores, right = scores[named], right[named]
     order = np.argsort(-scores, kind="stable")
     scores, right = scores[order], right[order]
     last_of_tie = np.flatnonzero(np.append(scores[1:] != scores[:-1], True)) if len(scores) else np.zeros(0, int)

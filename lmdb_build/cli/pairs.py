@@ -169,8 +169,8 @@ def _sequences(arguments: argparse.Namespace) -> list[tuple[str, Path, PoseChoic
         path, layout, poses = source.path, source.kind, source.pose_choice()
         if layout in RECORDED or (not layout and is_recording(path)):
             topics = source.get("topic", str) or "", source.get("pose-topic", str) or ""
-            path, said = extract(path, arguments.out / path.stem, *topics, bar)
-            print(said)
+            path, summary = extract(path, arguments.out / path.stem, *topics, bar)
+            print(summary)
             layout = "images" if poses else "tum"
         found.append((layout or layout_of(path, "images" if poses else "tum"), path, poses))
     return found

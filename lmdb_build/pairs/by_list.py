@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, Indices
+from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, Indices, PairSource
 from lmdb_build.pairs.runs import as_number, cell, read_table, relative
 from loopclosure.errors import InputError
 from loopclosure.places import masks
@@ -18,13 +18,8 @@ from loopclosure.places.masks import read_matches, read_truth_matrix
 CAMERAS = tuple(camera for camera in masks.CAMERAS if camera != "joined")  # a pair is two files
 
 
-class MaskSource:
-    """One run of images and a mask of loops, as of the FAB-MAP sets.
-
-    See :class:`lmdb_build.pairs.choose.PairSource`.
-    """
-
-    group_word = "run"
+class MaskSource(PairSource):
+    """One run of images and a mask of loops, as of the FAB-MAP sets."""
 
     def __init__(self, mask: Path, images: Path, root: Path, min_gap: int | None = None, camera: str = "all") -> None:
         """Read the mask (Q, Q) and the Q images of a folder, in natural order.
@@ -70,16 +65,12 @@ class MaskSource:
         """The gap in images."""
         return {"gap [images]": np.abs(self.stamps[first] - self.stamps[second])}
 
-    def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
-        """Nothing: there is no other information than the mask."""
-        return []
-
 
 class TraverseSource(MaskSource):
     """Two traverses of one route, and which images of one show the places of the other.
 
     A pair is a query and a reference: negatives of one traverse would teach a net to tell traverses apart. The images
-    of both are one run, in the order of the references that they show. See :class:`lmdb_build.pairs.choose.PairSource`.
+    of both are one run, in the order of the references that they show.
     """
 
     def __init__(self, truth: Path, queries: Path, references: Path, root: Path) -> None:
@@ -113,11 +104,10 @@ def _both_ways(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.block([[nothing[0], mask], [mask.T, nothing[1]]])
 
 
-class PlaceSource:
+class PlaceSource(PairSource):
     """Images, each in a group, and a list of positives: folders with equal names, tables, single images.
 
     Two images of different groups are a negative pair; two images of one group that are not listed are left out.
-    See :class:`lmdb_build.pairs.choose.PairSource`.
     """
 
     def __init__(
@@ -161,14 +151,6 @@ class PlaceSource:
     def positives(self) -> Indices:
         """All listed pairs (K, 2)."""
         return np.column_stack(np.divmod(self._codes, len(self.names)))
-
-    def measures(self, first: Indices, second: Indices) -> dict[str, NDArray[np.float64]]:
-        """No measures."""
-        return {}
-
-    def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
-        """Nothing: there is no other information than the list."""
-        return []
 
 
 def folders_source(folder_a: Path, folder_b: Path, root: Path, min_gap: int = 0) -> PlaceSource:

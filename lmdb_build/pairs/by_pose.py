@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, Indices
+from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, Indices, PairSource
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import (
     MAX_ANGLE_DEG,
@@ -75,8 +75,8 @@ class Scenes:
         return table
 
 
-class PoseSource:
-    """Sequences with poses: the paper's rule. See :class:`lmdb_build.pairs.choose.PairSource`."""
+class PoseSource(PairSource):
+    """Sequences with poses: the paper's rule."""
 
     group_word = "sequence"
 
@@ -144,10 +144,6 @@ class PoseSource:
         neighbors = np.abs(self.stamps[first] - self.stamps[second]) < rule.min_gap_s
         labels[(relation == SAME_SEQUENCE) & neighbors] = LEFT_OUT
         return labels
-
-    def positives(self) -> None:
-        """None: positive pairs are not listed and have to be searched."""
-        return None
 
     def measures(self, first: Indices, second: Indices) -> dict[str, NDArray[np.float64]]:
         """Distance and angle if the poses can be compared, time gap within a sequence."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ ALL_PAIRS = 4_000_000
 DRAWN_AT_ONCE = 1 << 18
 
 
-class PairSource(Protocol):
+class PairSource:
     """M images and what is known about pairs of them; index i is the image ``names[i]`` below the root folder.
 
     tracks       (M,) which run of the camera an image is from; along a run, ``stamps`` ascend
@@ -43,24 +42,24 @@ class PairSource(Protocol):
     stamps: NDArray[np.float64]
     groups: Indices
     group_names: list[str]
-    group_word: str
+    group_word = "run"
     settings: dict[str, str]
 
     def judge(self, first: Indices, second: Indices) -> NDArray[np.int8]:
         """Label pairs (N,) POSITIVE, NEGATIVE or LEFT_OUT."""
-        ...
+        raise NotImplementedError
 
     def positives(self) -> Indices | None:
         """All positive pairs (K, 2), if the source has a list of them; None if they have to be searched."""
-        ...
+        return None
 
     def measures(self, first: Indices, second: Indices) -> dict[str, NDArray[np.float64]]:
         """Quantities of pairs (N,) by name and unit, NaN if undefined for a pair: for the report."""
-        ...
+        return {}
 
     def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
         """What may make labels of these chosen pairs wrong, one sentence each."""
-        ...
+        return []
 
 
 @dataclass(frozen=True)

@@ -94,8 +94,8 @@ def sequence(source: Source, out: str | Path, layout: str = "") -> ImageSequence
     poses, path = source.pose_choice(), source.path
     if layout in RECORDED or (not layout and is_recording(path)):
         topics = source.get("topic", str) or "", source.get("pose-topic", str) or ""
-        path, said = extract(path, Path(out) / "frames", *topics, bar)
-        print(said)
+        path, summary = extract(path, Path(out) / "frames", *topics, bar)
+        print(summary)
         layout = "images"
     read = read_sequence(path, layout, poses=poses)
     for doubt in read.doubts:
@@ -175,8 +175,8 @@ def _layout(source: Source, path: Path) -> str:
 
 def warn_of_unreadable(recording: Recording) -> Recording:
     """Name the images that could not be read; return the recording without them."""
-    if said := recording.left_out():
-        warn(said)
+    if unreadable := recording.left_out():
+        warn(unreadable)
     return recording.readable()
 
 
@@ -185,8 +185,8 @@ def recording_of(text: str, frames: Path) -> Recording:
     source = typed(text, {"": (*FRAMES, *TOPICS)})
     path, (topic, pose_topic) = source.path, (source.get(name, str) or "" for name in TOPICS)
     if is_bag(path):
-        path, said = extract(path, frames, topic, pose_topic, bar)
-        print(said)
+        path, summary = extract(path, frames, topic, pose_topic, bar)
+        print(summary)
     elif topic or pose_topic:
         raise WrongUsage(f"{source}: topics belong to bags")
     recording = open_recording(path, source.selection())

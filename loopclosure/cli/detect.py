@@ -57,35 +57,35 @@ def _detect(a: argparse.Namespace) -> None:
     if recording is None:
         results, ended = _watch(a, detector)
         names += [f"frame {number}" for number in range(len(results))]
-        said = [run.verdicts_said(results)]
+        reasons = [run.verdicts_said(results)]
         if a.threshold is None and not a.resume:
             seconds = a.exclude_seconds or 0.0
             found = last_session(detector, results, progress=bar, visit=a.exclude_recent, seconds=seconds)
-            results, said = found.results, [*found.reasons, run.verdicts_said(found.results)]
+            results, reasons = found.results, [*found.reasons, run.verdicts_said(found.results)]
             detector.decided([result for result in results if result], None)
     elif a.threshold is None and not a.resume:
         precision = PRECISION if a.least_precision is None else a.least_precision
         odometry = _odometry(a.odometry, a.source, recording) if a.odometry else None
         found = whole_drive(detector, recording, features, precision, bar, odometry, a.exclude_recent)
         results = found.results
-        said = [*found.reasons, run.verdicts_said(results)]
+        reasons = [*found.reasons, run.verdicts_said(results)]
     else:
         results = run.run_detector(detector, recording, features, bar)
-        said = [run.verdicts_said(results)]
+        reasons = [run.verdicts_said(results)]
     if recording is not None:
         recording = warn_of_unreadable(recording)
         names += recording.names
         if a.rerun:
             write_detected(Path(a.rerun), recording, results, bar)
     write_loops_csv(out / "loops.csv", detector.loops, detector.stamps, names)
-    write_whole(out / "chosen.txt", "\n".join(said) + "\n")
+    write_whole(out / "chosen.txt", "\n".join(reasons) + "\n")
     # Drawing takes a second to import.
     from loopclosure.report.drive import write_drive
 
-    write_drive(out / "report.html", results, said, recording, a.command_line)
+    write_drive(out / "report.html", results, reasons, recording, a.command_line)
     loops = sum(result.accepted is not None for result in results)
     print(f"{loops} loops in {len(results)} frames: {out / 'loops.csv'}; to be looked at: {out / 'report.html'}")
-    print("\n".join(said))
+    print("\n".join(reasons))
     if np.isfinite(detector.poses).any():
         left_out = write_g2o(out / "loops.g2o", detector.poses, detector.loops, run.from_poses(detector))
         note = f", {left_out} loops without a pose left out" if left_out else ""
@@ -105,8 +105,8 @@ def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResu
             for stamp, image in live_frames(a.video):
                 results.append(detector.add(image, stamp))
                 if results[-1]:
-                    said = f"shows the place of frame {results[-1].accepted}"
-                    print(f"frame {results[-1].query_id}, {stamp:.1f} s: {said}", flush=True)
+                    match = f"shows the place of frame {results[-1].accepted}"
+                    print(f"frame {results[-1].query_id}, {stamp:.1f} s: {match}", flush=True)
                 if made is not None:
                     made.frame(results[-1].query_id, stamp, small_jpeg(image), results[-1])
         except KeyboardInterrupt as end:
@@ -191,8 +191,8 @@ def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
         warn_of_unreadable(recording)
         loops = [result.accepted for result in results if result.accepted is not None]
         between = sum(frame < before for frame in loops)
-        said = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
-        print(f"session {number:06d}: {said}: {into.folder / f'{number:06d}' / 'loops.csv'}")
+        summary = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
+        print(f"session {number:06d}: {summary}: {into.folder / f'{number:06d}' / 'loops.csv'}")
     print(f"{len(into)} frames in {len(into.sessions)} sessions: {into.folder}")
 
 

@@ -144,12 +144,12 @@ def summary(closed: Closed) -> list[str]:
     lines = [f"{used} of {len(closed.loops)} loops used, {len(closed.loops) - used} contradict the others"]
     if closed.not_measured:
         lines.append(f"{closed.not_measured} more left out: fewer than 20 points agree with one relative pose")
-    said = {
+    meanings = {
         METRIC: "measured in meters, from depth",
         UP_TO_SCALE: "measured from color alone: a rotation, and the direction of the translation (up to scale)",
         ROTATION_ONLY: "give a rotation only: the camera turned and hardly moved, so the translation is undetermined",
     }
-    lines += [f"{count} loops {words}" for kind, words in said.items() if (count := closed.count(kind))]
+    lines += [f"{count} loops {words}" for kind, words in meanings.items() if (count := closed.count(kind))]
     errors = closed.errors()
     if errors is None:
         lines.append("error: not known without true poses")

@@ -75,12 +75,7 @@ def write_loops_csv(
     write_csv(path, LOOPS, rows, "surrogateescape")
 
 
-def write_g2o(
-    path: str | Path,
-    poses: np.ndarray,
-    loops: Sequence[LoopResult],
-    relative: RelativePose,
-) -> int:
+def write_g2o(path: str | Path, poses: np.ndarray, loops: Sequence[LoopResult], relative: RelativePose) -> int:
     """Write a pose graph; return how many loops were left out because their relative pose is not known.
 
     poses     (N, 7) of the frames, tx ty tz qx qy qz qw, as the robot estimates them; NaN if not known. They are the

@@ -21,14 +21,7 @@ from loopclosure.detector.detector import Describe, LoopDetector
 from loopclosure.detector.export import RelativePose, relative_pose
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
-from loopclosure.places.frames import (
-    ALL_FRAMES,
-    VIDEO_SUFFIXES,
-    Selection,
-    read_bgr,
-    video_frames,
-    video_length,
-)
+from loopclosure.places.frames import ALL_FRAMES, VIDEO_SUFFIXES, Selection, read_bgr, video_frames, video_length
 from loopclosure.places.same_place import same_place
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import Poses

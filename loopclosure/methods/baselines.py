@@ -15,14 +15,7 @@ import numpy as np
 
 from loopclosure.descriptors.thumbnails import Thumbnailer, differences
 from loopclosure.errors import InputError
-from loopclosure.methods.base import (
-    Images,
-    Method,
-    MethodContext,
-    MethodResult,
-    describe_each,
-    refuse_overlap,
-)
+from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, describe_each, refuse_overlap
 from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed

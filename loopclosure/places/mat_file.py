@@ -22,8 +22,8 @@ def read_mat(path: str | Path) -> dict[str, Any]:
 
     done = subprocess.run([sys.executable, __file__, str(path)], capture_output=True, check=False)
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        reason = said[-1] if said and done.returncode == 1 else "the reader crashed"
+        messages = done.stderr.decode(errors="replace").strip().splitlines()
+        reason = messages[-1] if messages and done.returncode == 1 else "the reader crashed"
         raise InputError(f"cannot be read as .mat ({reason})", path)
     return unpack(io.BytesIO(done.stdout), len(done.stdout))
 

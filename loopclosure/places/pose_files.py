@@ -239,7 +239,7 @@ def _rows(path: str | os.PathLike[str], kind: str, count: int) -> np.ndarray:
 
 
 def _rotation_fault(row: Sequence[float], kind: str) -> str:
-    """Say why the rotation of a row is none; empty if it is one."""
+    """Say why a row holds no valid rotation; empty if it does."""
     if kind == "euroc":
         length = float(np.linalg.norm(row[4:8]))
         wrong = abs(length - 1) > NORM_TOLERANCE
@@ -248,7 +248,7 @@ def _rotation_fault(row: Sequence[float], kind: str) -> str:
 
 
 def matrix_fault(matrix: np.ndarray) -> str:
-    """Say why the first three columns (3, 3) of a pose are no rotation; empty if they are one."""
+    """Say why the first three columns (3, 3) of a pose are not a rotation; empty if they are."""
     apart = float(np.abs(matrix.T @ matrix - np.eye(3)).max()) if np.abs(matrix).max() < 2 else np.inf
     if not apart <= MATRIX_TOLERANCE:
         return f"its first three columns are no rotation: M^T M differs from the identity by {apart:.3g}"

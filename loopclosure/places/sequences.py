@@ -18,14 +18,7 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import Selection
 from loopclosure.places.intrinsics import Intrinsics, kitti_projection, read_intrinsics, yaml_numbers
 from loopclosure.places.pose_files import PoseForm, matrix_fault, moved, read_poses
-from loopclosure.places.trajectory import (
-    MAX_DIFFERENCE_S,
-    Frame,
-    PosedSequence,
-    content_lines,
-    number,
-    read_rgb_list,
-)
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Frame, PosedSequence, content_lines, number, read_rgb_list
 from netspec.files.image_list import list_images
 
 QUERIES = ("query", "queries", "Query", "Queries")
@@ -90,10 +83,7 @@ class PoseChoice:
 
 
 def read_sequence(
-    source: str | Path,
-    layout: str = "",
-    max_difference: float = MAX_DIFFERENCE_S,
-    poses: PoseChoice | None = None,
+    source: str | Path, layout: str = "", max_difference: float = MAX_DIFFERENCE_S, poses: PoseChoice | None = None
 ) -> ImageSequence:
     """Read a sequence; without a ``layout`` ("tum", "euroc", "kitti" or "images") it is found out.
 
@@ -135,18 +125,12 @@ def benchmark_parts(folder: Path) -> tuple[Path, Path, Path]:
     newest = [path for path in truths if path.stem.endswith("_new")] or truths
     if len(newest) != 1:
         names = ", ".join(path.name for path in truths) or "none"
-        raise InputError(
-            f"expected one ground_truth*.json or .npy, found {names}; traverses: names the parts",
-            folder,
-        )
+        raise InputError(f"expected one ground_truth*.json or .npy, found {names}; traverses: names the parts", folder)
     return parts[0], parts[1], newest[0]
 
 
 def read_posed(
-    source: str | Path,
-    layout: str = "",
-    max_difference: float = MAX_DIFFERENCE_S,
-    poses: PoseChoice | None = None,
+    source: str | Path, layout: str = "", max_difference: float = MAX_DIFFERENCE_S, poses: PoseChoice | None = None
 ) -> PosedSequence:
     """Read a sequence with poses; frames without one are counted and left out.
 

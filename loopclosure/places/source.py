@@ -143,12 +143,12 @@ def _bag(source: Path, folder: Path, topic: str, pose_topic: str, progress: Prog
         if camera is not None:
             write_calibration(folder / "calibration.txt", camera)
         if bag.pose_topic:
-            stamps, poses, said = bag.poses()
+            stamps, poses, note = bag.poses()
             if len(poses):
                 order = np.argsort(stamps, kind="stable")
                 trajectory = Trajectory(stamps[order], poses[order, :3], poses[order, 3:])
                 write_trajectory(folder / "groundtruth.txt", trajectory)
-                about += f", {said}"
+                about += f", {note}"
     return frames, about
 
 

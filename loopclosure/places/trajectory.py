@@ -13,7 +13,6 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,20 +24,6 @@ from netspec.files.whole_file import write_whole
 MAX_DIFFERENCE_S = 0.03
 # Four printed decimals give a norm within 1e-3 of 1. Much further off, the four numbers are not a quaternion.
 NORM_TOLERANCE = 0.05
-
-
-class Posed(Protocol):
-    """Anything with poses: ``positions`` (..., 3) in meters and ``quaternions`` (..., 4), xyzw, of unit length."""
-
-    @property
-    def positions(self) -> NDArray[np.float64]:
-        """Optical centers (..., 3) in meters."""
-        ...
-
-    @property
-    def quaternions(self) -> NDArray[np.float64]:
-        """Camera-to-world rotations (..., 4), xyzw, of unit length."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -106,6 +91,9 @@ class PosedSequence:
         return Poses(self.positions, self.quaternions)
 
 
+Posed = Poses | Trajectory | PosedSequence
+
+
 def read_rgb_list(path: str | os.PathLike[str]) -> list[Frame]:
     """Read ``rgb.txt``: the frames in order of time. Raises InputError (file:line:column) for a broken line."""
     frames = []
@@ -165,11 +153,7 @@ def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame], what: 
 
 def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory, what: str = "ground truth") -> None:
     """Write poses in TUM's form with its three comment lines; meters and quaternions with six decimals."""
-    lines = [
-        f"# {what} trajectory",
-        f"# file: '{Path(path).parent.name}'",
-        "# timestamp tx ty tz qx qy qz qw",
-    ]
+    lines = [f"# {what} trajectory", f"# file: '{Path(path).parent.name}'", "# timestamp tx ty tz qx qy qz qw"]
     for stamp, position, quaternion in zip(
         trajectory.stamps, trajectory.positions, trajectory.quaternions, strict=True
     ):
@@ -205,9 +189,8 @@ def content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple
 
 
 def number(field: re.Match[str], name: str, path: str | os.PathLike[str], line: int) -> float:
-    """Return a matched field as a number; InputError (file:line:column), which calls it ``name``, for what is none.
-
-    What is too great for distances to be numbers is none either.
+    """Return a matched field as a number. Raises InputError (file:line:column), which calls it ``name``, if it is not
+    one, or if it is too large to compute distances with.
     """
     try:
         value = float(field.group())

@@ -111,16 +111,16 @@ def _curves(found: dict[str, dict[str, list[float]]]) -> dict[str, dict[str, np.
 
 def warnings(reports: Sequence[Report]) -> list[str]:
     """Say where reports judge different things, so that their figures do not compare; and which have no curves."""
-    said = []
+    found = []
     for kind, name in (("data_set", "data"), ("truth", "truth")):
         values = {getattr(report, kind) for report in reports}
         if len(values) > 1:
             each = "; ".join(f"{report.label}: {getattr(report, kind)}" for report in reports)
-            said.append(f"the reports are of different {name}, and their figures do not compare. {each}")
+            found.append(f"the reports are of different {name}, and their figures do not compare. {each}")
     for report in reports:
         if not any(report.curves.values()):
-            said.append(f"{report.label} has no curves: it is of an earlier version; evaluate again")
-    return said
+            found.append(f"{report.label} has no curves: it is of an earlier version; evaluate again")
+    return found
 
 
 def table(reports: Sequence[Report]) -> list[Row]:

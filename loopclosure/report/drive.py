@@ -27,7 +27,7 @@ OF_FRAMES = (
 
 
 def write_drive(
-    path: Path, results: Sequence[LoopResult], said: Sequence[str], recording: Recording | None, command: str
+    path: Path, results: Sequence[LoopResult], reasons: Sequence[str], recording: Recording | None, command: str
 ) -> None:
     """Write the page; ``recording`` is None where the images are gone, those of a camera."""
     loops = sum(1 for result in results if result)
@@ -40,7 +40,7 @@ def write_drive(
         picture=png(picture),
         caption=OF_PATH if known else OF_FRAMES,
         kinds=[] if recording is None else _kinds(results, recording),
-        said=said,
+        reasons=reasons,
         command=command,
     )
     write_whole(path, text, "backslashreplace")

@@ -103,12 +103,12 @@ def measures_text(evaluation: Evaluation) -> str:
         rows.append([outcome.name, *cells, f"{1e3 * outcome.seconds_on_frames / evaluation.image_count:.2f}"])
     spans = [(ALL_PAIRS, 3), (BEST_MATCH, 3 + len(RECALL_AT))]
     data = evaluation.data
-    said = [f"{data.name}: {data.truth.description}"]
+    lines = [f"{data.name}: {data.truth.description}"]
     if soft:
         spans.append(("soft zone", len(SOFT_MEASURES)))
-        said.append(f"soft zone, best match of each query: a match is no mistake if {data.overlap_rule}")
+        lines.append(f"soft zone, best match of each query: a match is no mistake if {data.overlap_rule}")
     answers = [f"{outcome.name}: {outcome.answer}" for outcome in evaluation.outcomes if outcome.answer]
-    return "\n".join([*said, *in_columns([heads, *rows], spans=spans), *answers])
+    return "\n".join([*lines, *in_columns([heads, *rows], spans=spans), *answers])
 
 
 def _write_measures_csv(evaluation: Evaluation, path: Path) -> None:

@@ -125,8 +125,8 @@ def verdict(evaluation: Evaluation) -> str:
             f"{which}{accepted} of {len(matches.reference)} frames close a loop; {right} are right, {loops} could be."
         )
     before = round(outcome.best.recall_at_full_precision * loops) if loops else 0
-    said = f"{right} of the {loops} frames that have a loop find it with their best match"
-    return f"{which}{said}, {before} of them before the first mistake."
+    best = f"{right} of the {loops} frames that have a loop find it with their best match"
+    return f"{which}{best}, {before} of them before the first mistake."
 
 
 def _measures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, bool]]]]:

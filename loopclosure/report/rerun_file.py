@@ -39,7 +39,7 @@ class RerunFile:
         self._stream.save(str(path))
 
     def frame(self, number: int, stamp: float | None, jpeg: bytes, result: LoopResult | None = None) -> None:
-        """Write an image and what the detector said of it; what follows belongs to this frame."""
+        """Write an image and the detector's result for it; what follows belongs to this frame."""
         self._stream.set_time("frame", sequence=number)
         if stamp is not None and np.isfinite(stamp):
             self._stream.set_time("seconds", duration=stamp)
@@ -47,8 +47,8 @@ class RerunFile:
         if result is not None and result.candidates:
             self._stream.log("score", self._rr.Scalars(float(result.score)))
         if result:
-            said = f"frame {result.query_id} shows the place of frame {result.accepted}"
-            self._stream.log("loop", self._rr.TextLog(said))
+            text = f"frame {result.query_id} shows the place of frame {result.accepted}"
+            self._stream.log("loop", self._rr.TextLog(text))
 
     def image(self, name: str, jpeg: bytes) -> None:
         """Write an image of the current frame."""

@@ -145,9 +145,7 @@ def _draw_losses(runs: Sequence[Run], path: Path) -> None:
             if chosen:
                 axes.plot(run.iteration, chosen[0], "o", markersize=9, markerfacecolor="none", color=line.get_color())
     axes.set(
-        xlabel="iteration",
-        ylabel="contrastive loss of the validation pairs",
-        title="Validation loss (circle: judged)",
+        xlabel="iteration", ylabel="contrastive loss of the validation pairs", title="Validation loss (circle: judged)"
     )
     losses = [loss for run in runs for _, loss in run.losses if math.isfinite(loss) and loss > 0]
     if losses and max(losses) > 10 * min(losses):  # a diverging start would flatten all that follows

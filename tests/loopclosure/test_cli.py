@@ -18,11 +18,10 @@ from paths import ROOT
 
 @pytest.mark.slow
 def test_evaluate(two_laps, two_laps_features, tmp_path, capsys):
-    line = f"evaluate tum:{two_laps} --method thumbnails --method net=features:{two_laps_features}"
-    more = f"--soft-distance 3 --soft-angle 30 --out {tmp_path}/r --title".split()
-    code = main([*line.split(), *more, "Round trip"])
+    line = f"evaluate tum:{two_laps} --method thumbnails --method net=features:{two_laps_features} --soft-distance 3"
+    line += f" --soft-angle 30 --out {tmp_path / 'r'}"
+    assert main([*line.split(), "--title", "Round trip"]) == 0
     printed = capsys.readouterr().out
-    assert code == 0
     assert "thumbnails" in printed
     assert "less than 10 s apart excluded" in printed
     assert f"report: {tmp_path / 'r' / 'report.html'}" in printed
@@ -50,7 +49,7 @@ def test_evaluate_the_whole_system_on_another_recording(two_laps, two_laps_featu
 @pytest.mark.slow
 def test_evaluate_trains_on_other_images(two_laps, tmp_path, capsys):
     line = f"evaluate {two_laps},start=20 --exclude-seconds 0 --max-angle 19 --train {two_laps},stop=50%,stride=2"
-    assert main(f"{line} --method bow:words=20 --out {tmp_path}".split()) == 0
+    assert main([*line.split(), "--method", "bow:words=20", "--out", str(tmp_path)]) == 0
     summary = json.loads((tmp_path / "report.json").read_text())
     assert summary["training"] == "10 images of two_laps"
     assert "vocabulary" not in summary["methods"][0]["milliseconds_a_frame"]
@@ -58,17 +57,16 @@ def test_evaluate_trains_on_other_images(two_laps, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_door(two_laps, two_laps_features, tmp_path):
-    words = [two_laps, "--out", tmp_path, "--method", f"features:{two_laps_features}"]
-    command = [sys.executable, ROOT / "tools" / "evaluate_loops.py", *words]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    line = [sys.executable, ROOT / "tools" / "evaluate_loops.py", two_laps, "--out", tmp_path]
+    line += ["--method", f"features:{two_laps_features}"]
+    done = subprocess.run(line, capture_output=True, text=True, cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "report.html").is_file()
 
 
 def test_detect_writes_loops_and_a_pose_graph(two_laps, tmp_path, capsys):
-    line = f"detect {two_laps} --metric cosine --threshold 0.9 --exclude-recent 10 --consistency 2"
-    describe = "--describe loopclosure.descriptors.thumbnails:Thumbnailer"
-    assert main(f"{line} {describe} --out {tmp_path}".split()) == 0
+    line = f"detect {two_laps} --metric cosine --threshold 0.9 --exclude-recent 10 --consistency 2 --out {tmp_path}"
+    assert main([*line.split(), "--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]) == 0
     with (tmp_path / "loops.csv").open() as stream:
         loops = list(csv.DictReader(stream))
     assert [(int(r["query_id"]), int(r["match_id"])) for r in loops] == [(i, i - 20) for i in range(22, 40)]
@@ -149,12 +147,12 @@ def loops_in(path):
 def test_each_door_gives_the_same_answer(tmp_path, capsys):
     """A camera passes a wall, and a part of it once more: a folder, a list, videos, two traverses, a map."""
     rng = np.random.default_rng(1)
-    wall = np.full((128, 1600, 3), 128, np.uint8)
-    for _ in range(1600):
-        center = tuple(int(c) for c in rng.integers(0, (1600, 128)))
+    wall = np.full((128, 2600, 3), 128, np.uint8)
+    for _ in range(2600):
+        center = tuple(int(c) for c in rng.integers(0, (2600, 128)))
         cv2.circle(wall, center, int(rng.integers(2, 14)), rng.integers(0, 256, 3).tolist(), -1)
     wall = cv2.GaussianBlur(wall, (0, 0), 1.0)
-    places = [(20 * i, 0) for i in range(70)] + [(20 * i + 5, 6) for i in range(20, 60)]
+    places = [(20 * i, 0) for i in range(110)] + [(20 * i + 5, 6) for i in range(30, 90)]
     (tmp_path / "drive").mkdir()
     film = cv2.VideoWriter(str(tmp_path / "drive.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 2, (160, 112))
     for number, (x, y) in enumerate(places):
@@ -164,7 +162,7 @@ def test_each_door_gives_the_same_answer(tmp_path, capsys):
     film.release()
     names = sorted(str(path) for path in (tmp_path / "drive").iterdir())
     (tmp_path / "list.txt").write_text("\n".join(names) + "\n")
-    for part, lines in (("first", names[:70]), ("second", names[70:])):
+    for part, lines in (("first", names[:110]), ("second", names[110:])):
         (tmp_path / part).mkdir()
         for name in lines:
             shutil.copy(name, tmp_path / part)
@@ -183,11 +181,11 @@ def test_each_door_gives_the_same_answer(tmp_path, capsys):
     found["map"] = loops_in(tmp_path / "M" / "000000" / "loops.csv")
     assert main(["map", "build", str(tmp_path / "N"), str(tmp_path / "first"), *small]) == 0
     assert main(["map", "query", str(tmp_path / "N"), str(tmp_path / "second"), "--out", str(tmp_path / "query")]) == 0
-    found["query"] = {query + 70: match for query, match in loops_in(tmp_path / "query" / "loops.csv").items()}
+    found["query"] = {query + 110: match for query, match in loops_in(tmp_path / "query" / "loops.csv").items()}
     capsys.readouterr()
     for loops in found.values():
         assert all(abs(places[query][0] - places[match][0]) <= 45 for query, match in loops.items())
-        assert len(loops) >= 36
+        assert len(loops) >= 55
     for door, loops in found.items():
         assert len(set(loops) & set(found["folder"])) >= 0.95 * len(set(loops) | set(found["folder"])), door
     assert found["folder"] == found["list"]
@@ -248,10 +246,7 @@ def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_fea
         ("evaluate LAPS,camera=left --method thumbnails --out OUT", 'a sequence has no setting "camera"'),
         ("evaluate images:LAPS --method thumbnails --out OUT", "needs ,truth=MASK"),
         ("evaluate pairs:LAPS --fov 60 --method thumbnails --out OUT", "--fov is for sequences with poses, not for "),
-        (
-            "evaluate LAPS,references=LAPS --exclude-seconds 3 --method thumbnails --out OUT",
-            "nothing is near in time",
-        ),
+        ("evaluate LAPS,references=LAPS --exclude-seconds 3 --method thumbnails --out OUT", "nothing is near in time"),
         ("detect LAPS --threshold 1 --with width --out OUT", "expected KEY=VALUE"),
         ("detect LAPS --threshold 1 --features FEATURES --with width=8 --out OUT", "--with belongs to --describe"),
         ("detect LAPS --resume OUT --metric cosine --out OUT", "leave out others"),
@@ -324,6 +319,6 @@ sys.exit(main(["similarity", "features.npz", "--out", "out.npy"]))
     process = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=paths)
     with process, open(tmp_path / "features.npz", "wb"):  # open waits until it is opened for reading
         process.send_signal(signal.SIGINT)
-        _, printed = process.communicate(timeout=300)
+        _, printed = process.communicate(timeout=60)
     assert process.returncode == 130
     assert printed == "interrupted\n"
