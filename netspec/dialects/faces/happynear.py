@@ -7,7 +7,7 @@ domain-guided-dropout. Where no field shows whose a layer is, the dialect has to
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +16,7 @@ from typing_extensions import override
 from netspec.dialects.faces.margins import MarginProduct
 from netspec.layers import Layer, common, register
 from netspec.layers.contract.base import Shape
+from netspec.layers.contract.whose import whose
 from netspec.layers.loss.base import VALID, Classified, Loss, ignore_label, normalization_mode, normalizer
 from netspec.layers.loss.scores import FLT_MIN
 from netspec.proto.schema import TEST, value
@@ -210,16 +211,19 @@ class TripletLoss(Loss):
         return F.relu(value(self.param, "triplet_loss_param").margin + near - far).sum() / (2 * len(a))
 
 
+ONEADDP = 2  # FocalLossParameter.Type
+
+
 class _Focal(torch.autograd.Function):
-    """-(alpha -+ p)^gamma log(p) of each label's p; the gradient is the fork's, right where alpha is 1."""
+    """-(base -+ p)^gamma log(p) of each label's p; the gradient is the fork's, right where base is 1."""
 
     @staticmethod
     def forward(
-        ctx: Any, x: torch.Tensor, labels: torch.Tensor, alpha: float, gamma: float, sign: int
+        ctx: Any, x: torch.Tensor, labels: torch.Tensor, base: float, gamma: float, sign: int
     ) -> tuple[torch.Tensor, torch.Tensor]:
         softmax = x.softmax(1)
         p = softmax.gather(1, labels)
-        factor, log = (alpha + sign * p) ** gamma, p.clamp(min=FLT_MIN).log()
+        factor, log = (base + sign * p) ** gamma, p.clamp(min=FLT_MIN).log()
         along = sign * gamma * (factor / (1 + sign * p).clamp(min=1e-10)) * log * p + factor
         ctx.save_for_backward(softmax, labels, along)
         ctx.mark_non_differentiable(softmax)
@@ -236,16 +240,23 @@ class _Focal(torch.autograd.Function):
 class FocalLoss(Loss, Classified):
     """-(alpha - p)^gamma log(p), p the softmax of the label; (alpha + p)^gamma with type: ONEADDP.
 
+    In nets of detectors (rcnn, ssd) it is zimenglan's: -alpha (1 - p)^gamma log(p), alpha 0.25 unless it is given.
+
     bottom[0]  scores (N, C, ...), C at softmax_param.axis
     bottom[1]  labels, one per prediction
     top[0]     the loss, (): the sum, normalized as loss_param says (default VALID)
     top[1]     optional: the softmax, bottom[0]'s shape; brings no gradient
-    Fork: happynear/caffe-windows, src/caffe/layers/focal_loss_layer.cpp. Paper: Lin et al., ICCV 2017, where alpha is a
-    factor
+    Fork: happynear/caffe-windows, src/caffe/layers/focal_loss_layer.cpp; zimenglan-sysu-512/Focal-Loss, that of the
+    paper (Lin et al., ICCV 2017)
     """
 
     tops = (1, 2)
     not_exported = "it is for training"
+    forks: ClassVar[Mapping[str, str]] = {
+        "happynear": "(alpha - p)^gamma",
+        "ssd": "",
+        "rcnn": "of zimenglan, as the paper's: alpha (1 - p)^gamma",
+    }
 
     def setup(self) -> None:
         self.settings = p = value(self.param, "focal_loss_param")
@@ -253,6 +264,10 @@ class FocalLoss(Loss, Classified):
             if wrong:
                 message = f"{name} must be {expected}, found {getattr(p, name):g}"
                 raise self.error(message, "focal_loss_param", name)
+        alike = p.HasField("alpha") and p.alpha == 1
+        self.base, self.factor = p.alpha, 1.0
+        if p.type != ONEADDP and not alike and whose(self) != "happynear":
+            self.base, self.factor = 1.0, p.alpha if p.HasField("alpha") else 0.25
         self.ignored = ignore_label(self.param.loss_param)
         self.normalization = normalization_mode(self.param.loss_param, VALID)
 
@@ -264,9 +279,9 @@ class FocalLoss(Loss, Classified):
         x, labels = self.scores_and_labels(scores, labels)
         valid, p = self.valid(labels, self.ignored), self.settings
         used = (labels if valid is None else labels * valid).unsqueeze(1)
-        losses, softmax = _Focal.apply(x, used, p.alpha, p.gamma, 1 if p.type == 2 else -1)
+        losses, softmax = _Focal.apply(x, used, self.base, p.gamma, 1 if p.type == ONEADDP else -1)
         losses = losses.squeeze(1) if valid is None else losses.squeeze(1) * valid
-        loss = losses.sum() / normalizer(self.normalization, self.outer, self.inner, valid)
+        loss = self.factor * losses.sum() / normalizer(self.normalization, self.outer, self.inner, valid)
         return loss if self.num_tops == 1 else (loss, softmax.reshape(scores.shape))
 
 

@@ -140,6 +140,19 @@ def test_regions_that_show_an_object_are_moved_onto_it(build: Build) -> None:
         assert (outer[k] == weights).all()
 
 
+def test_regions_have_the_attributes_of_what_they_show(build: Build) -> None:
+    attributes = torch.zeros(3, 16)
+    attributes[:, 0], attributes[1, 1:3] = torch.tensor([5.0, 0, 7]), torch.tensor([9.0, 8])
+    truth = torch.cat([TRUTH, attributes], dim=1)
+    proposals = torch.cat([torch.zeros(3, 1), TRUTH[:, :4] + 1], dim=1)
+    text = REGIONS.replace('4"', "4, 'num_attr_classes': 10, 'ignore_label': -1\"")
+    *_, labels, _, _, _, found = build("rcnn", text, (3, 5), (3, 21), phase=TRAIN, tops=6).run(proposals, truth)
+    assert found.shape == (32, 16)
+    rows = {2: [5.0] + [-1] * 15, 3: [0.0, 9, 8] + [-1] * 13, 1: [7.0] + [-1] * 15}
+    assert found[:6].tolist() == [rows[int(label)] for label in labels[:6]]
+    assert (found[6:] == -1).all()
+
+
 @pytest.mark.slow
 def test_proposals_of_the_python_layer_are_the_dialects(build: Build) -> None:
     text = PYTHON.format("rpn.proposal_layer", "ProposalLayer", "'feat_stride': 16")
@@ -170,7 +183,11 @@ def test_a_program_gives_the_images_as_it_did(tmp_path: Path) -> None:
     (tmp_path / "net.prototxt").write_text(f'layer {{ name: "d" top: "data" top: "im_info" top: "gt_boxes" {text} }}')
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((60, 80, 3)))
     net = caffe.Net(str(tmp_path / "net.prototxt"), caffe.TRAIN)
-    net.layers[0].set_roidb([{"image": tmp_path / "0.png", "boxes": [[1, 2, 30, 40]], "gt_classes": [2]}])
+    entry = {"image": tmp_path / "0.png", "boxes": [[1, 2, 30, 40]], "gt_classes": [2]}
+    net.layers[0].set_roidb([{**entry, "gt_attributes": np.ones((1, 16))}])
+    net.forward()
+    assert net.blobs["gt_boxes"].data.tolist() == [[10, 20, 300, 400, 2] + [1] * 16]
+    net.layers[0].set_roidb([entry])
     net.forward()
     assert net.blobs["data"].data.shape == (1, 3, 600, 800)
     assert net.blobs["gt_boxes"].data.tolist() == [[10, 20, 300, 400, 2]]

@@ -48,6 +48,8 @@ NORMALIZE = 'layer { name: "n" type: "Normalize" bottom: "data" top: "n" }'
 INTERP = 'layer { name: "v" type: "Interp" bottom: "n" top: "v" interp_param { zoom_factor: 2 } }'
 BN = 'layer { name: "n" type: "BN" bottom: "data" top: "n" }'
 SMOOTH = 'layer { name: "n" type: "SmoothL1Loss" bottom: "data" bottom: "data" top: "n" %s }'
+FOCAL = """layer { name: "l" type: "DummyData" top: "l" dummy_data_param { shape { dim: [1, 7, 7] } } }
+layer { name: "n" type: "FocalLoss" bottom: "conv" bottom: "l" top: "n" focal_loss_param { %s } }"""
 TWO_TOPS = NORMALIZE.replace('top: "n"', 'top: "n" top: "l"')
 
 
@@ -62,6 +64,9 @@ TWO_TOPS = NORMALIZE.replace('top: "n"', 'top: "n" top: "l"')
         (BN + INTERP, ""),
         (BN.replace("}", "bn_param { bn_mode: LEARN } }"), ""),
         (SMOOTH % "loss_weight: 1", '"rcnn" (divided by N;'),
+        (FOCAL % "alpha: 0.25", '"happynear" ((alpha - p)^gamma), not of "rcnn"'),
+        (FOCAL % "alpha: 1", ""),
+        ("# dialect: rcnn\n" + FOCAL % "alpha: 0.25", ""),
         (SMOOTH % "loss_weight: 1 smooth_l1_loss_param { sigma: 1 }", ""),
         (SMOOTH % "loss_weight: 1 loss_param { normalization: NONE }", ""),
     ],

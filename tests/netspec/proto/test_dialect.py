@@ -140,7 +140,10 @@ REFUSED = {
         "extend LayerParameter { optional int32 name = 990; }",
         'bad.proto: caffe.LayerParameter already has a field "name"',
     ),
-    "a number that Caffe has": ("extend LayerParameter { optional int32 x = 100; }", "do not fit Caffe's schema"),
+    "a number that Caffe has": (
+        "extend LayerParameter { optional int32 x = 100; }",
+        'number 100 of caffe.LayerParameter is that of Caffe\'s "transform_param"; give "x" another, say 2000: files',
+    ),
     "an unknown type": ("extend LayerParameter { optional Thing x = 991; }", "do not fit Caffe's schema"),
     "an unknown message": (
         "extend LayersParameter { optional int32 x = 991; }",
@@ -210,3 +213,10 @@ def test_declarations_mean_what_protoc_makes_of_them(tmp_path: Path) -> None:
         extensions: list[Any] = [pool.FindExtensionByName(f"caffe.fork.{e.name}") for e in file.extension]
         resolved.append((message, [(e.containing_type.full_name, e.number, e.type) for e in extensions]))
     assert resolved[0] == resolved[1]
+
+
+def test_layers_of_a_fork_are_read_that_has_a_number_of_caffes_for_its_own() -> None:
+    """caffe-face's center_loss_param has the number of Caffe's swish_param."""
+    binary = LayerParameter(name="c", type="CenterLoss", blobs=[{"data": [1]}]).SerializeToString()
+    layer = LayerParameter.FromString(binary + b"\x9a\x09\x02\x08\x0a")  # 147 { 1: 10 }
+    assert (layer.name, layer.type, list(layer.blobs[0].data)) == ("c", "CenterLoss", [1])
