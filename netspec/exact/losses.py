@@ -26,28 +26,36 @@ def softmax(scores: torch.Tensor) -> torch.Tensor:
 
 def bound_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torch.Tensor]:
     """Return what computes :func:`softmax` of float32 scores of one shape, in memory of its own, with one thread."""
-    p = torch.empty(shape)
-    largest, sums = torch.empty(2, shape[0], 1, shape[2])
-    values, greatest, totals = p.numpy(), largest.numpy(), sums.numpy()[:, 0]
+    p, largest = torch.empty(shape), np.empty((shape[0], 1, shape[2]), np.float32)
+    values, exponents, powers = p.numpy(), np.zeros(shape, np.complex64), np.empty(shape, np.complex64)
 
     def run(scores: torch.Tensor) -> torch.Tensor:
-        np.maximum.reduce(scores.numpy(), 1, out=greatest, keepdims=True)
-        torch.sub(scores, largest, out=p)  # never above 0: see libm.exp
-        np.copyto(values, np.real(np.exp(values.astype(np.complex64))))
-        totals[:] = class_sums(values)
-        return p.div_(sums)
+        given = scores.numpy()
+        np.maximum.reduce(given, 1, out=largest, keepdims=True)
+        np.subtract(given, largest, exponents.real)  # never above 0: see libm.exp
+        np.exp(exponents, powers)
+        np.divide(powers.real, class_sums(powers.real)[:, None], values)
+        return p
 
     return run
 
 
-def bound_cross_entropy(count: int, divisor: float) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return what computes the sum of -log p of so many float32 numbers, one after the other, by ``divisor``, ()."""
-    one, logs, loss = torch.ones(()), torch.empty(count), torch.empty(())
-    values, result = logs.numpy(), loss.numpy()
+def bound_cross_entropy(
+    shape: tuple[int, int, int], least: float, divisor: float
+) -> Callable[[torch.Tensor, np.ndarray], torch.Tensor]:
+    """Return what computes the sum of -log p, one after the other, by ``divisor``, ().
 
-    def run(p: torch.Tensor) -> torch.Tensor:
-        torch.special.xlogy(one, p.view(-1), out=logs)  # see libm.log
-        np.divide(-np.add.accumulate(values)[-1], np.float32(divisor), out=result)
+    Of p, float32 of this shape, it takes the numbers at the given places, and of these none less than ``least``.
+    """
+    one, loss = torch.ones(()), torch.empty(())
+    chosen, logs = torch.empty(2, shape[0] * shape[2])
+    few, values, result, by = chosen.numpy(), logs.numpy(), loss.numpy(), np.float32(divisor)
+
+    def run(p: torch.Tensor, places: np.ndarray) -> torch.Tensor:
+        p.numpy().reshape(-1).take(places, out=few, mode="clip")
+        chosen.clamp_(min=least)
+        torch.special.xlogy(one, chosen, out=logs)  # see libm.log
+        result[()] = -np.add.accumulate(values)[-1] / by
         return loss
 
     return run

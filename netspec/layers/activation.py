@@ -24,6 +24,8 @@ from netspec.layers.contract.learned import values_of
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
+_VECTORS = 2**12  # numbers: for fewer, one call of torch is faster than several
+
 
 class Activation(Layer):
     """Base of the layers whose top has its bottom's shape."""
@@ -189,10 +191,38 @@ class PReLU(Activation):
         return F.prelu(x, slopes.reshape(-1))
 
     def kernels(self, how: Preparation) -> Kernels | None:
-        if how.learns or self.context.options.exact == ALL:
+        if self.context.options.exact == ALL:
             return None
-        slopes = values_of(self.blob(0)).clone().reshape(-1)
+        slopes = values_of(self.blob(0))
+        if how.learns:
+            return self._learning_kernels(slopes, how)
+        slopes = slopes.clone().reshape(-1)
         return finished(lambda x: torch.prelu(x, slopes), how.finish)
+
+    def _learning_kernels(self, slopes: torch.Tensor, how: Preparation) -> Kernels | None:
+        """Return what autograd computes."""
+        shape = self.bottom_shapes[0]
+        if math.prod(shape) == 0:
+            return None
+        gradients, given, total = torch.ops.aten._prelu_kernel_backward.default, slopes, how.sums[0]
+        flat, by_channel = slopes.reshape(-1), slopes.view(1, -1, *(1,) * (len(shape) - 2))
+
+        def forward(x: torch.Tensor) -> torch.Tensor:
+            nonlocal given
+            given = x
+            return torch.prelu(x, flat)
+
+        def backward(diff: torch.Tensor) -> torch.Tensor:
+            if diff.numel() > _VECTORS and diff.stride() == given.stride():  # torch takes number by number
+                above = given > 0
+                found, terms = torch.where(above, diff, diff * by_channel), torch.where(above, 0, given * diff)
+            else:
+                found, terms = gradients(diff, given, by_channel)
+            if total is not None:
+                total.add_(terms.sum_to_size(by_channel.shape).view(total.shape))
+            return found
+
+        return Kernels(forward, backward)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         slopes = math.prod(self.blob_shapes[0])

@@ -109,7 +109,10 @@ def move(rule: Rule, param: Any, piece: Piece, iteration: int) -> None:
     normalize(piece.diffs, param.iter_size)
     regularize(piece.diffs, piece.weights, piece.decays, param.regularization_type)
     rule.compute(param, piece.diffs, piece.rates, piece.history, iteration)
-    torch._foreach_sub_(piece.weights, piece.diffs)
+    if len(piece.weights) == 1:
+        piece.weights[0].sub_(piece.diffs[0])
+    else:
+        torch._foreach_sub_(piece.weights, piece.diffs)
 
 
 def cut(piece: Piece) -> Iterator[Piece]:
@@ -150,7 +153,10 @@ def _blocks(tensors: Tensors) -> Iterator[list[tuple[int, slice]]]:
 def sgd(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
     """Momentum with the rate inside the history: after the rate changes, the old velocity keeps its old rate."""
     _accelerate(diffs, rates, history, param.momentum)
-    torch._foreach_copy_(diffs, history)
+    if len(diffs) == 1:
+        diffs[0].copy_(history[0])
+    else:
+        torch._foreach_copy_(diffs, history)
 
 
 def nesterov(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, iteration: int) -> None:
@@ -229,12 +235,18 @@ def rule_faults(param: Any, node: Place) -> Iterator[SpecError]:
 
 def _accelerate(diffs: Tensors, rates: Sequence[float], history: Tensors, momentum: float) -> None:
     """History = momentum * history + rate * diff."""
-    torch._foreach_mul_(history, momentum)
+    if len(history) == 1:  # of one tensor, the call for lists takes longer than what it does
+        history[0].mul_(momentum)
+    else:
+        torch._foreach_mul_(history, momentum)
     _add_scaled(history, diffs, rates)
 
 
 def _add_scaled(sums: Tensors, terms: Tensors, factors: Sequence[float]) -> None:
     """Sum = sum + factor * term, rounded once, as BLAS' axpy does."""
+    if len(sums) == 1:
+        sums[0].add_(terms[0], alpha=factors[0])
+        return
     kinds = set(factors)
     if len(kinds) == 1:
         torch._foreach_add_(sums, terms, alpha=factors[0])

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from google.protobuf.message import DecodeError
@@ -17,7 +18,7 @@ from netspec.exact.losses import Infogain, bound_cross_entropy, bound_softmax, l
 from netspec.files.limits import read_bytes
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.kernels import Kernels, Preparation, Room
+from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.loss.base import (
@@ -114,30 +115,39 @@ class SoftmaxWithLoss(SoftmaxLoss):
         """Return the kernels of a net that learns, where every label counts."""
         if not how.learns or self.ignore_label is not None or math.prod(self.bottom_shapes[0]) == 0:
             return None
-        shape, tops, room = self.bottom_shapes[0], self.num_tops, Room()
+        shape, tops = self.bottom_shapes[0], self.num_tops
         split, flat = (self.outer, self.classes, self.inner), (self.outer, 1, self.inner)
         divisor = float(normalizer(self.normalization, self.outer, self.inner, None))
         exact = self.is_exact(torch.empty(1), small=math.prod(split[1:]) <= SMALL_ITEM)
-        minus_one = torch.tensor(-1.0).expand(flat)
+        label, diff = torch.empty(flat, dtype=torch.long), torch.empty(split)
         normalize = bound_softmax(split) if exact else partial(F.softmax, dim=1)
-        sum_up = bound_cross_entropy(math.prod(flat), divisor) if exact else lambda p: (-p.log()).sum() / divisor
-        label = torch.empty(flat, dtype=torch.long)
-        p, classes = torch.empty(0), label.numpy()
+        sum_up = bound_cross_entropy(split, FLT_MIN, divisor) if exact else lambda p, _: self._mean(p, label, divisor)
+        # Of p and its gradient, as arrays: the calls of torch take longer than what they compute.
+        p, classes, found = torch.empty(0), label.numpy().reshape(-1), diff.numpy()
+        unsigned, starts = classes.view(np.uint64), np.arange(self.outer * self.inner)
+        starts += (self.classes - 1) * self.inner * (starts // self.inner)  # where the first class is
+        places, diffs, by = np.empty_like(starts), found.reshape(-1), np.float32(divisor)
 
         def forward(scores: torch.Tensor, labels: torch.Tensor) -> Any:
             nonlocal p
             label.copy_(labels.reshape(flat))
-            if classes.min() < 0 or classes.max() >= split[1]:
+            if np.maximum.reduce(unsigned) >= split[1]:
                 self.valid(label, None)
             p = normalize(scores.reshape(split))
-            loss = sum_up(p.gather(1, label).clamp_(min=FLT_MIN))
-            return (loss, p.reshape(shape))[:tops]
+            np.add(starts, classes if split[2] == 1 else classes * split[2], places)
+            return (sum_up(p, places), p.reshape(shape))[:tops]
 
-        def backward(diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
-            found = room.like(p).copy_(p).scatter_add_(1, label, minus_one)
-            return found.mul_(diff / divisor).view(shape), None
+        def backward(top_diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
+            np.copyto(found, p.numpy())
+            diffs[places] -= 1
+            np.multiply(found, np.float32(top_diff.item()) / by, found)
+            return diff.view(shape), None
 
         return Kernels(forward, backward)
+
+    @staticmethod
+    def _mean(p: torch.Tensor, label: torch.Tensor, divisor: float) -> torch.Tensor:
+        return (-p.gather(1, label).clamp_(min=FLT_MIN).log()).sum() / divisor
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         scores, labels = self.onnx_scores_and_labels(graph, *bottoms)

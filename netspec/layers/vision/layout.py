@@ -27,7 +27,7 @@ def channels_side_by_side(maps: torch.Tensor) -> torch.Tensor:
         return of_one_channel(maps)
     if maps.is_contiguous(memory_format=torch.channels_last):
         return maps
-    if is_recorded():
+    if not torch.is_grad_enabled() or is_recorded():
         return maps.contiguous(memory_format=torch.channels_last)
     return _SideBySide.apply(maps)
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from netspec.errors import SpecError
+from netspec.layers.contract.kernels import Preparation, own_kernels
 
 X = torch.tensor([-70.0, -3.0, -0.4, 0.0, 0.2, 1.0, 2.5, 70.0])
 
@@ -107,6 +108,26 @@ def test_exp_with_a_large_shift_overflows_to_infinity_only_where_the_result_does
     layer = build('type: "Exp" exp_param { shift: 1000 }', (2,))
     top = layer.run(torch.tensor([-1000.0, 0.0]))[0]
     assert top.tolist() == [1, math.inf]
+
+
+@pytest.mark.parametrize("shared", ["false", "true"])
+@pytest.mark.parametrize("shape", [(2, 3, 5, 4), (3, 7), (4, 6, 20, 21), (2, 3, 40, 40, 2), (5, 9, 1, 1)])
+@pytest.mark.parametrize("turned", [False, True])
+def test_kernels_of_prelu_give_the_bits_of_autograd(build, shape: tuple[int, ...], shared: str, turned: bool) -> None:
+    layer = build(f'type: "PReLU" prelu_param {{ channel_shared: {shared} }}', shape, exact="small")
+    x, diff = torch.randn(shape), torch.randn(shape)
+    if turned and len(shape) == 4:
+        x, diff = x.contiguous(memory_format=torch.channels_last), diff.contiguous(memory_format=torch.channels_last)
+    x[(0,) * len(shape)] = math.nan if not turned else 0.0
+    leaf, (slopes,) = x.clone().requires_grad_(), layer.blobs
+    (top,) = layer.run(leaf)
+    expected = torch.autograd.grad(top, [leaf, slopes], diff)
+    total = torch.zeros_like(slopes)
+    forward, backward = own_kernels(layer, Preparation((True,), (total,)))
+    with torch.no_grad():
+        assert torch.equal(forward(x).nan_to_num(), top.nan_to_num())
+        for found, wanted in zip((backward(diff), total), expected, strict=True):
+            assert torch.equal(found.nan_to_num(), wanted.nan_to_num())
 
 
 def test_prelu_learns_one_slope_a_channel_or_one_for_all(build, gradcheck) -> None:

@@ -104,7 +104,7 @@ def test_follows_what_is_done_to_the_weights(tmp_path: Path) -> None:
 
 def test_says_why_it_is_not_prepared(tmp_path: Path) -> None:
     rows = "".join(
-        f'layer {{ name: "b{i}" type: "PReLU" bottom: "x" top: "x" param {{ name: "w" }} }}\n' for i in (0, 1)
+        f'layer {{ name: "b{i}" type: "Bias" bottom: "x" top: "x" param {{ name: "w" }} }}\n' for i in (0, 1)
     )
     solver = made(tmp_path, NETS["typical"].replace('layer { name: "c"', f'{rows}layer {{ name: "c"'))
     solver.step(1)
