@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +17,14 @@ from fresh_dialects import fresh_dialects
 LIBRARIES = ("PYTEST", "TORCH", "_TORCH", "TRITON", "KMP", "OPENCV", "QT")  # set variables of theirs once they are used
 LOGGERS = [logging.getLogger(name) for name in ("", "netspec", "loopclosure", "lmdb_build")]
 SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)]  # Windows has no SIGHUP
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of pages, site, wheel and examples take the longest and come first.
+
+    In a parallel run, what one process takes from another's end is then short, and none builds the site once more.
+    """
+    items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
 
 
 def pytest_collection_finish() -> None:

@@ -15,51 +15,14 @@ import torch
 
 import documents
 import places_layouts
+from case_files import read_texts
 from paths import GOLDEN, ROOT
 
 FRAMES = 60
-NET = """name: "tiny"
-%s
-layer {
-  name: "conv1" type: "Convolution" bottom: "data" top: "conv1"
-  convolution_param { num_output: 8 kernel_size: 5 stride: 4 bias_term: false weight_filler { type: "msra" } }
-}
-layer { name: "bn1" type: "BatchNorm" bottom: "conv1" top: "conv1" }
-layer { name: "scale1" type: "Scale" bottom: "conv1" top: "conv1" scale_param { bias_term: true } }
-layer { name: "relu1" type: "ReLU" bottom: "conv1" top: "conv1" }
-layer { name: "pool1" type: "Pooling" bottom: "conv1" top: "pool1" pooling_param { pool: AVE global_pooling: true } }
-layer {
-  name: "feat" type: "InnerProduct" bottom: "pool1" top: "feat"
-  inner_product_param { num_output: 4 weight_filler { type: "xavier" } }
-}
-%s
-"""
-DATA = """layer {
-  name: "data" type: "Data" top: "data" top: "label"
-  transform_param { mean_value: 128 scale: 0.0078125 crop_size: 32 }
-  data_param { source: "train_lmdb" batch_size: 4 backend: LMDB }
-}"""
+NET, DATA, SOLVER, SCRIPT = read_texts("playground.txt").values()
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 dim: 32 dim: 32 } } }'
 LOSS = 'layer { name: "loss" type: "SoftmaxWithLoss" bottom: "feat" bottom: "label" top: "loss" }'
 PROB = 'layer { name: "prob" type: "Softmax" bottom: "feat" top: "prob" }'
-SOLVER = """net: "train_val.prototxt"
-test_iter: 1
-test_interval: 4
-base_lr: 0.01
-lr_policy: "fixed"
-momentum: 0.9
-max_iter: 4
-display: 1
-snapshot: 2
-snapshot_prefix: "x"
-random_seed: 1
-solver_mode: CPU
-"""
-SCRIPT = """import caffe
-
-net = caffe.Net("deploy.prototxt", "x.caffemodel", caffe.TEST)
-print(net.forward()["prob"].shape)
-"""
 # Sequences that the trained nets are trained on.
 SEQUENCES = (
     "bridge_highway",

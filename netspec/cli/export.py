@@ -58,8 +58,6 @@ fold quiet built                   write the deploy net with BatchNorm and Scale
 def _extract(arguments: argparse.Namespace) -> None:
     import numpy as np
 
-    from netspec.inspect.features.records import rows_not_finite
-
     model(arguments)
     out = arguments.out
     if reason := why_unwritable(out):
@@ -67,10 +65,10 @@ def _extract(arguments: argparse.Namespace) -> None:
     if not arguments.weights:
         log.logger.warning("no --weights given: the weights are random")
     arrays = _over_images(arguments) if arguments.images else _over_records(arguments)
-    for line in rows_not_finite(
-        {name: arrays[name] for name in (("features",) if arguments.images else arguments.blob)}
-    ):
-        log.logger.warning(f"{line} (from 0); did the net diverge?")
+    for name in ("features",) if arguments.images else arguments.blob:
+        if len(rows := np.flatnonzero(~np.all(np.isfinite(arrays[name]), axis=1))):
+            said = f"{len(rows)} of {len(arrays[name])} rows have a NaN or an infinity, the first is row {rows[0]}"
+            log.logger.warning(f"{name}: {said} (from 0); did the net diverge?")
     if os.environ.get("SOURCE_DATE_EPOCH"):  # the same bytes are wanted each time: no time that was measured
         arrays.update({name: np.array(np.nan) for name in arrays if name.startswith("seconds_per_")})
     with whole_file(out) as unfinished, unfinished.open("wb") as file:

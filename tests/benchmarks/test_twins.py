@@ -70,7 +70,7 @@ def test_a_twin_is_that_of_the_public_file_too(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TRAINED)
 def test_a_twin_learns_the_same(name: str) -> None:
-    with training_case(name, 4) as case:
+    with training_case(name, 2) as case:
         solver = netspec.load_solver(case.solver, case.caffemodel, device="cpu")
         twin = twins.net(name).train()
         twins.load(twin, case.caffemodel)

@@ -20,6 +20,7 @@ import lmdb
 import numpy as np
 import scipy.io
 
+from case_files import read_texts
 from faults import recordings, written
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.descriptors.feature_file import read_features
@@ -52,14 +53,7 @@ from netspec.solver.checks import check_settings
 from netspec.solver.extra import Extra, changes, read_extra, resume, write_extra
 from netspec.solver.snapshot import State, read_state, write_state
 
-NET = """
-name: "small"
-input: "data" input_dim: 1 input_dim: 2 input_dim: 5 input_dim: 5
-layer { name: "conv" type: "Convolution" bottom: "data" top: "conv"
-  convolution_param { num_output: 3 kernel_size: 3 weight_filler { type: "xavier" } } }
-layer { name: "ip" type: "InnerProduct" bottom: "conv" top: "ip"
-  inner_product_param { num_output: 4 weight_filler { type: "xavier" } } }
-"""
+NET, LAYERS, SOLVER = read_texts("faults/formats.txt").values()
 
 
 @dataclass(frozen=True)
@@ -202,32 +196,6 @@ def all_rows(path: Path) -> None:
             source.batch(i)
 
 
-LAYERS = """
-name: "many" force_backward: true
-layer { name: "data" type: "Input" top: "data" top: "label"
-  input_param { shape { dim: 4 dim: 3 dim: 16 dim: 16 } shape { dim: 4 } } }
-layer { name: "conv" type: "Convolution" bottom: "data" top: "conv" param { name: "w" lr_mult: 1 } param { lr_mult: 2 }
-  convolution_param { num_output: 4 kernel_size: 3 pad: 1 group: 1 dilation: 2 weight_filler { type: "msra" } } }
-layer { name: "norm" type: "LRN" bottom: "conv" top: "norm" lrn_param { local_size: 3 alpha: 1e-4 } }
-layer { name: "pool" type: "Pooling" bottom: "norm" top: "pool" pooling_param { pool: AVE kernel_size: 3 stride: 2 } }
-layer { name: "up" type: "Deconvolution" bottom: "pool" top: "up"
-  convolution_param { num_output: 2 kernel_size: 4 stride: 2 bias_term: false weight_filler { type: "bilinear" } } }
-layer { name: "crop" type: "Crop" bottom: "up" bottom: "data" top: "crop" crop_param { axis: 2 offset: 0 } }
-layer { name: "both" type: "Concat" bottom: "crop" bottom: "data" top: "both" concat_param { axis: 1 } }
-layer { name: "parts" type: "Slice" bottom: "both" top: "p" top: "q" slice_param { axis: 1 slice_point: 2 } }
-layer { name: "bn" type: "BatchNorm" bottom: "p" top: "p" batch_norm_param { eps: 1e-5 } }
-layer { name: "scale" type: "Scale" bottom: "p" top: "p" scale_param { axis: 1 bias_term: true } }
-layer { name: "relu" type: "ReLU" bottom: "p" top: "p" relu_param { negative_slope: 0.1 } exclude { phase: TRAIN } }
-layer { name: "sum" type: "Eltwise" bottom: "p" bottom: "crop" top: "s" eltwise_param { coeff: 1 coeff: -1 } }
-layer { name: "flat" type: "Reshape" bottom: "s" top: "f" reshape_param { shape { dim: 0 dim: -1 } } }
-layer { name: "tile" type: "Tile" bottom: "f" top: "t" tile_param { tiles: 2 } }
-layer { name: "spp" type: "SPP" bottom: "q" top: "spp" spp_param { pyramid_height: 2 } include { stage: "x" } }
-layer { name: "ip" type: "InnerProduct" bottom: "t" top: "ip" inner_product_param { num_output: 3 } }
-layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" loss_weight: 0.5
-  loss_param { ignore_label: 0 normalization: VALID } }
-"""
-
-
 def built(path: Path) -> None:
     """Build a net without memory, data or files, and what it says."""
     message, source = parse_net_text(path.read_bytes().decode(errors="surrogateescape"), "net.prototxt")
@@ -273,12 +241,6 @@ def archive(parts: bytes) -> bytes:
 POSES = "".join(f"{i}.5 {i} 0 1 0 0 0 1\n" for i in range(6))
 WINDOWS = "# 0\na.png\n3\n48\n64\n2\n4 0.9 0 0 20 20\n0 0.1 10 10 40 40\n# 1\nb.png\n3\n48\n64\n0\n"
 PARAM = SimpleNamespace(fg_threshold=0.5, bg_threshold=0.5, root_folder="")
-
-SOLVER = """
-net: "net.prototxt" test_iter: 3 test_interval: 10 base_lr: 0.1 lr_policy: "multistep" stepvalue: 5 stepvalue: 9
-gamma: 0.1 momentum: 0.9 weight_decay: 0.0005 regularization_type: "L2" max_iter: 20 snapshot: 10
-snapshot_prefix: "x" solver_mode: CPU type: "SGD" random_seed: 1 iter_size: 2 train_state { level: 1 stage: "a" }
-"""
 
 
 def solved(path: Path) -> None:

@@ -74,7 +74,7 @@ def unfinished() -> list[str]:
     return [path.name for path in Path("out").glob(".*.unfinished")]
 
 
-def orphans(session: int, patience: float = 5.0) -> int:
+def orphans(session: int, patience: float = 60.0) -> int:
     """Count the processes that are left of a session after a while."""
     end = time.monotonic() + patience
     while True:

@@ -8,27 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from case_files import read_texts
 from paths import ROOT
 
 pytestmark = pytest.mark.slow
 
-CODE = """
-import argparse, sys, time
-from netspec.terminal.commands import Commands, run
-
-def endless(arguments):
-    try:
-        print("begun", flush=True)
-        while True:
-            time.sleep(0.01)
-    finally:
-        print("ending", flush=True)
-        time.sleep({cleaning})
-
-parser = argparse.ArgumentParser()
-Commands(parser).add("endless", endless, "")
-sys.exit(run(parser, ["endless"]))
-"""
+CODE, IMPORTED, MANGLED, THROUGH_C, LATE = read_texts("faults/signals.txt").values()
 
 
 def start(*words: str) -> subprocess.Popen[str]:
@@ -48,24 +33,8 @@ def line_of(process: subprocess.Popen[str]) -> str:
 def test_one_line_and_its_status(number: int) -> None:
     process = start(CODE.format(cleaning=0))
     process.send_signal(number)
-    _, said = process.communicate(timeout=30)
+    _, said = process.communicate(timeout=300)
     assert (process.returncode, said) == (128 + number, "interrupted\n")
-
-
-IMPORTED = """
-import sys
-
-class Slow:
-    def find_spec(self, name, path, target=None):
-        if name == "{package}.cli":
-            import time
-            print("begun", flush=True)
-            time.sleep(60)
-
-sys.meta_path.insert(0, Slow())
-from {package}.__main__ import main
-sys.exit(main())
-"""
 
 
 @pytest.mark.parametrize("package", ["netspec", "loopclosure", "lmdb_build"])
@@ -73,40 +42,8 @@ sys.exit(main())
 def test_one_line_while_modules_are_imported(package: str, number: int) -> None:
     process = start(IMPORTED.format(package=package))
     process.send_signal(number)
-    _, said = process.communicate(timeout=30)
+    _, said = process.communicate(timeout=300)
     assert (process.returncode, said) == (128 + number, "interrupted\n")
-
-
-MANGLED = """
-import argparse, sys, time
-from netspec.terminal.commands import Commands, run
-
-def loading(arguments):
-    try:
-        print("begun", flush=True)
-        time.sleep(60)
-    except BaseException:
-        raise ImportError("initialization failed")
-
-parser = argparse.ArgumentParser()
-Commands(parser).add("loading", loading, "")
-sys.exit(run(parser, ["loading"]))
-"""
-
-
-THROUGH_C = """
-import argparse, ctypes, sys, time
-from netspec.terminal.commands import Commands, run
-
-def loading(arguments):
-    names = ctypes.py_object({"print": print, "time": time})
-    ctypes.pythonapi.PyRun_String(b"print('begun', flush=True)\\nwhile True: time.sleep(0.01)", 257, names, names)
-
-ctypes.pythonapi.PyRun_String.restype = ctypes.py_object
-parser = argparse.ArgumentParser()
-Commands(parser).add("loading", loading, "")
-sys.exit(run(parser, ["loading"]))
-"""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -117,7 +54,7 @@ def test_the_status_where_c_code_runs_python(
     Path("through_c.py").write_text(THROUGH_C)
     process = start("-m", "through_c")
     process.send_signal(number)
-    _, said = process.communicate(timeout=30)
+    _, said = process.communicate(timeout=300)
     assert (process.returncode, said) == (128 + number, "interrupted\n")
 
 
@@ -125,7 +62,7 @@ def test_one_line_where_an_import_makes_another_error_of_it() -> None:
     """Modules in C do: they know only that they could not be loaded."""
     process = start(MANGLED)
     process.send_signal(signal.SIGTERM)
-    _, said = process.communicate(timeout=30)
+    _, said = process.communicate(timeout=300)
     assert (process.returncode, said) == (143, "interrupted\n")
 
 
@@ -143,20 +80,6 @@ def test_one_line_from_the_first_line_of_the_program(package: str) -> None:
         words = [sys.executable, "-c", code, "--help", str(0.002 + tenth / 20)]
         done = subprocess.run(words, capture_output=True, text=True, env=environment)
         assert done.returncode == 0 or (done.returncode, done.stderr) == (143, "interrupted\n")
-
-
-LATE = """
-import atexit, os, signal, sys
-from netspec.__main__ import main
-
-def kill(*_):
-    os.kill(os.getpid(), {number})
-
-{before}
-status = main()
-{after}
-sys.exit(status)
-"""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -182,7 +105,7 @@ def test_a_second_one_ends_at_once(number: int) -> None:
     process.send_signal(signal.SIGINT)
     assert line_of(process) == "ending"
     process.send_signal(number)
-    assert process.wait(10) == 128 + number
+    assert process.wait(300) == 128 + number
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks for processes in /proc")
@@ -200,7 +123,7 @@ def test_the_processes_that_read_images_end_with_a_killed_writer(tmp_path: Path)
     assert len(workers) == 3
     process.kill()
     process.wait()
-    for _ in range(500):
+    for _ in range(5000):
         alive = [number for number in workers if _is_alive(number)]
         if not alive:
             return

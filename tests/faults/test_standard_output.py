@@ -7,21 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from case_files import read_texts
 from paths import ROOT
 
-CODE = """
-import argparse, sys, types
-from netspec.terminal.main import program
-from netspec.terminal.commands import Commands, run
-
-def main(words):
-    parser = argparse.ArgumentParser()
-    Commands(parser).add("say", lambda arguments: print(*words), "")
-    return run(parser, ["say"])
-
-sys.modules["commands"] = types.SimpleNamespace(main=main)
-sys.exit(program("commands", sys.argv[1:]))
-"""
+(CODE,) = read_texts("faults/standard_output.txt").values()
 
 
 def printed(text: str, stdout: int, **variables: str) -> subprocess.CompletedProcess[bytes]:

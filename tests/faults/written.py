@@ -10,6 +10,7 @@ import traceback
 from pathlib import Path
 from xml.etree import ElementTree
 
+from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.export.formats.convert import blob_tensors
 from netspec.export.formats.deploy import fold
@@ -29,41 +30,7 @@ from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text, write_text
 
 MOST = 1 << 22  # bytes of a net: large ones show nothing more
-SENT = [
-    {"id": 1, "method": "initialize", "params": {"capabilities": {}, "processId": None, "rootUri": None}},
-    {
-        "method": "textDocument/didOpen",
-        "params": {
-            "textDocument": {
-                "uri": "file:///no/x.prototxt",
-                "languageId": "prototxt",
-                "version": 1,
-                "text": 'layer { name: "in" type: "Input" top: "x" input_param { shape { dim: 1 } } }\n',
-            }
-        },
-    },
-    *(
-        {
-            "id": 2 + k,
-            "method": f"textDocument/{method}",
-            "params": {
-                "textDocument": {"uri": "file:///no/x.prototxt"},
-                "position": {"line": 0, "character": 28},
-                **more,
-            },
-        }
-        for k, (method, more) in enumerate(
-            [
-                ("hover", {}),
-                ("definition", {}),
-                ("completion", {}),
-                ("formatting", {"options": {"tabSize": 2, "insertSpaces": True}}),
-            ]
-        )
-    ),
-    {"id": 9, "method": "shutdown", "params": None},
-    {"method": "exit", "params": None},
-]
+(SENT,) = (list(map(json.loads, text.splitlines())) for text in read_texts("faults/talk.txt").values())
 
 
 def _net(path: Path) -> Net:

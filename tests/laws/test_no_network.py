@@ -9,6 +9,7 @@ from typing import NoReturn
 
 import pytest
 
+from case_files import read_texts
 from faults.commands import CASES
 from paths import ROOT
 
@@ -30,18 +31,7 @@ def test_a_command_opens_no_connection(name: str, tmp_path: Path, monkeypatch: p
     assert CASES[name].main(CASES[name].words) == 0
 
 
-ENGINE = """
-import socket, sys
-def refuse(*arguments, **options):
-    print("looked up", arguments, flush=True)
-    raise OSError
-socket.getaddrinfo = socket.create_connection = socket.gethostbyname = socket.socket.connect = refuse
-import netspec
-net = netspec.load_net(sys.argv[1], engine=sys.argv[2], cache=sys.argv[3])
-net(__import__("numpy").zeros((1, 1, 4, 4), "float32"))
-assert sys.argv[2] in sys.modules and "openvino_telemetry" not in sys.modules
-assert "ORT_DISABLE_TELEMETRY" not in __import__("os").environ
-"""
+(ENGINE,) = read_texts("laws/no_network.txt").values()
 
 
 @pytest.mark.parametrize("engine", ["onnxruntime", "openvino"])

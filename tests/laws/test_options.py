@@ -16,86 +16,15 @@ import cv2
 import numpy as np
 import pytest
 
+from case_files import read_texts
 from lmdb_build.cli import main as lmdb_build_main
 from loopclosure.cli import main as loopclosure_main
 from paths import GOLDEN, ROOT
 
 NET, SOLVER, WEIGHTS = "train_val.prototxt", "solver.prototxt", "init.caffemodel"
-FEATURES = f"--model {NET} --weights {WEIGHTS} --blob feat"
 THUMBNAILS = "loopclosure.descriptors.thumbnails:Thumbnailer"
-SHOWN = f"{NET} --weights {WEIGHTS} --blob feat"
 # A command line of each way in which a command works; those of one command have the same options.
-WAYS = {
-    "netspec": (
-        f"check {NET}",
-        f"check {SOLVER}",
-        f"check {WEIGHTS}",
-        f"train {SOLVER}",
-        f"test --model {NET} --weights {WEIGHTS} --iterations 1",
-        f"time --model {NET} --iterations 1",
-        f"extract {FEATURES} --out f.npz",
-        f"extract {FEATURES} --out f.npz --images images",
-        f"export {NET} --to safetensors --out x.safetensors",
-        f"export {NET} --to torch --out x.py",
-        f"export {NET} --to onnx --out x.onnx",
-        f"fold {NET} --weights {WEIGHTS} --out folded",
-        f"draw {NET} --out net.svg",
-        f"draw {NET} --out net.html",
-        f"diff {NET} {NET}",
-        f"fmt --check {NET}",
-        f"fmt {NET}",
-        f"lint {NET}",
-        "lint --rules",
-        "plot train.log --out p.png",
-        "plot train.log --out p.html",
-        "watch train.log",
-        "watch train.log --once",
-        "data stat pairs/test_lmdb",
-        "data show pairs/test_lmdb --out s.png",
-        f"look filters {WEIGHTS} --out f.png",
-        f"look maps {SHOWN} --image images/0.png --out m.png",
-        f"look saliency {SHOWN} --image images/0.png --out s.png",
-        f"look saliency {SHOWN} --image images/0.png --to images/1.png --out s.png",
-        "look embedding features.npz --out e.png",
-        f"bug-report {NET}",
-        f"extract_features {WEIGHTS} {NET} feat features_lmdb 1 lmdb",
-        "device_query",
-        f"upgrade_net_proto_text {NET} new.prototxt",
-        f"upgrade_net_proto_text {WEIGHTS} new.prototxt",
-        f"upgrade_net_proto_binary {WEIGHTS} new.caffemodel",
-        f"upgrade_solver_proto_text {SOLVER} new.prototxt",
-        "layers",
-        "completion bash",
-        "install-caffe --build tree",
-        "remove-caffe --build tree",
-    ),
-    "lmdb_build": (
-        "walk walk --frames 3 --size 32x24",
-        "views images --out views --batches 1 --size 1 --view-size 16x12",
-        "sheet pairs.txt sheet.png",
-        "join joined.txt pairs.txt pairs.txt",
-        "convert ./ pairs.txt db",
-        "imageset ./ images.txt db",
-        "mean pairs/test_lmdb mean.binaryproto",
-        f"compare {SOLVER} --no-train --out out",
-    ),
-    "loopclosure": (
-        "evaluate tum:walk/walk_1 --method thumbnails --exclude-frames 3 --out report",
-        "evaluate images:images,truth=truth.png --method thumbnails --exclude-frames 1 --out report",
-        "evaluate traverses:images,references=images --method thumbnails --out report",
-        "compare report/report.json reports/other/report.json --out both",
-        f"detect walk/walk_1 --describe {THUMBNAILS} --exclude-recent 3 --out found",
-        f"detect walk/walk_1 --describe {THUMBNAILS} --threshold -1 --exclude-recent 3 --out found",
-        "detect walk/walk_1 --features walk.npz --threshold -1 --exclude-recent 1 --out found",
-        f"detect --video walk.avi --describe {THUMBNAILS} --out found",
-        "close walk/walk_1 --loops loops.csv --drift 2 --out closed",
-        "close --graph loops.g2o --out closed",
-        "map build new walk/walk_1,limit=2",
-        "map add map walk/walk_1,limit=2",
-        "map query map walk/walk_1,limit=2 --out found",
-        "similarity features.npz --out s.npz",
-    ),
-}
+WAYS = {program: text.splitlines() for program, text in read_texts("laws/ways.txt").items()}
 # Commands that this test does not start, and why.
 NOT_STARTED = {
     "netspec": {

@@ -133,27 +133,17 @@ def test_a_broken_line_of_groundtruth_is_named(walks: Path, tmp_path: Path, caps
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    "line",
     [
-        [],
-        ["pairs", "--out", "x"],
-        ["pairs", "a", "folders:b,references=c", "--out", "x"],
-        ["pairs", "images:m", "--out", "x"],
-        ["walk", "x", "--size", "320"],
-        ["walk", "x", "--sequences", "0"],
-        ["pairs", "a", "--out", "x", "--shares", "1,2"],
-        ["pairs", "a", "--out", "x", "--max-distance", "nan"],
-        ["pairs", "a", "--out", "x", "--max-angle", "-1"],
-        ["walk", "x", "--seed", "-1"],
-        ["pairs", "a", "--out", "x", "--seed", "-1"],
-        ["views", "a", "--out", "x", "--seed", "-1"],
-        ["join", "x", "a", "--seed", "-1"],
-        ["sheet", "a", "x.png", "--seed", "-1"],
+        *("", "pairs --out x", "pairs a folders:b,references=c --out x", "pairs images:m --out x"),
+        *("walk x --size 320", "walk x --sequences 0", "walk x --seed -1", "views a --out x --seed -1"),
+        *("pairs a --out x --shares 1,2", "pairs a --out x --max-distance nan", "pairs a --out x --max-angle -1"),
+        *("pairs a --out x --seed -1", "join x a --seed -1", "sheet a x.png --seed -1"),
     ],
 )
-def test_wrong_usage_is_status_2(arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_usage_is_status_2(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
+    assert main(line.split()) == 2
     assert not list(tmp_path.iterdir())
 
 

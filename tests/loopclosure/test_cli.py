@@ -147,12 +147,12 @@ def loops_in(path):
 def test_each_door_gives_the_same_answer(tmp_path, capsys):
     """A camera passes a wall, and a part of it once more: a folder, a list, videos, two traverses, a map."""
     rng = np.random.default_rng(1)
-    wall = np.full((128, 2600, 3), 128, np.uint8)
-    for _ in range(2600):
-        center = tuple(int(c) for c in rng.integers(0, (2600, 128)))
+    wall = np.full((128, 1600, 3), 128, np.uint8)
+    for _ in range(1600):
+        center = tuple(int(c) for c in rng.integers(0, (1600, 128)))
         cv2.circle(wall, center, int(rng.integers(2, 14)), rng.integers(0, 256, 3).tolist(), -1)
     wall = cv2.GaussianBlur(wall, (0, 0), 1.0)
-    places = [(20 * i, 0) for i in range(110)] + [(20 * i + 5, 6) for i in range(30, 90)]
+    places = [(20 * i, 0) for i in range(70)] + [(20 * i + 5, 6) for i in range(20, 60)]
     (tmp_path / "drive").mkdir()
     film = cv2.VideoWriter(str(tmp_path / "drive.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 2, (160, 112))
     for number, (x, y) in enumerate(places):
@@ -162,7 +162,7 @@ def test_each_door_gives_the_same_answer(tmp_path, capsys):
     film.release()
     names = sorted(str(path) for path in (tmp_path / "drive").iterdir())
     (tmp_path / "list.txt").write_text("\n".join(names) + "\n")
-    for part, lines in (("first", names[:110]), ("second", names[110:])):
+    for part, lines in (("first", names[:70]), ("second", names[70:])):
         (tmp_path / part).mkdir()
         for name in lines:
             shutil.copy(name, tmp_path / part)
@@ -181,11 +181,11 @@ def test_each_door_gives_the_same_answer(tmp_path, capsys):
     found["map"] = loops_in(tmp_path / "M" / "000000" / "loops.csv")
     assert main(["map", "build", str(tmp_path / "N"), str(tmp_path / "first"), *small]) == 0
     assert main(["map", "query", str(tmp_path / "N"), str(tmp_path / "second"), "--out", str(tmp_path / "query")]) == 0
-    found["query"] = {query + 110: match for query, match in loops_in(tmp_path / "query" / "loops.csv").items()}
+    found["query"] = {query + 70: match for query, match in loops_in(tmp_path / "query" / "loops.csv").items()}
     capsys.readouterr()
     for loops in found.values():
         assert all(abs(places[query][0] - places[match][0]) <= 45 for query, match in loops.items())
-        assert len(loops) >= 55
+        assert len(loops) >= 36
     for door, loops in found.items():
         assert len(set(loops) & set(found["folder"])) >= 0.95 * len(set(loops) | set(found["folder"])), door
     assert found["folder"] == found["list"]
@@ -319,6 +319,6 @@ sys.exit(main(["similarity", "features.npz", "--out", "out.npy"]))
     process = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=paths)
     with process, open(tmp_path / "features.npz", "wb"):  # open waits until it is opened for reading
         process.send_signal(signal.SIGINT)
-        _, printed = process.communicate(timeout=60)
+        _, printed = process.communicate(timeout=300)
     assert process.returncode == 130
     assert printed == "interrupted\n"

@@ -6,7 +6,7 @@ Caffe: tools/extract_features.cpp
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -77,14 +77,6 @@ def extract_records(
     keys = [key for i in range(first, first + rounds) for key in reader.keys(i)]
     arrays["keys"] = np.array(keys[:rows])
     return arrays
-
-
-def rows_not_finite(arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
-    """Yield one line for each of these arrays (N, D), by name, that has a NaN or an infinity."""
-    for name, values in arrays.items():
-        rows = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
-        if len(rows):
-            yield f"{name}: {len(rows)} of {len(values)} rows have a NaN or an infinity, the first is row {rows[0]}"
 
 
 COMMITTED = 1000  # records between two commits; each commit is logged

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from case_files import read_texts
 from loopclosure.cli import main
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.detector import map as maps
@@ -115,19 +116,7 @@ def test_long_descriptors_are_projected(drives: Path, tmp_path: Path, monkeypatc
     assert [result.accepted for result in results] == list(range(PLACES))
 
 
-DYING = """
-import os, signal, sys
-import numpy as np
-from loopclosure.descriptors.thumbnails import Thumbnailer
-from loopclosure.detector.map import Map
-from loopclosure.detector.run import open_recording, run_detector
-save = np.savez
-def dying(*arrays, **named):
-    save(*arrays, **named)
-    os.kill(os.getpid(), signal.SIGKILL)
-np.savez = dying
-Map(sys.argv[1]).add(open_recording(sys.argv[2]), Thumbnailer())
-"""
+(DYING,) = read_texts("loopclosure/detector/map.txt").values()
 
 
 @pytest.mark.slow

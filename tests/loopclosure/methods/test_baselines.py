@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from case_files import read_texts
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, MethodContext
 from loopclosure.methods.baselines import BagOfWordsMethod, FabMapMethod, ThumbnailMethod
@@ -114,23 +115,10 @@ def test_settings_reach_the_part_they_belong_to() -> None:
     assert (small.thumbnailer.width, small.thumbnailer.normalize) == (16, "none")
 
 
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("fabmap:wrods=5", r'fabmap has no setting "wrods=5"; write setting=value with .*words'),
-        ("fabmap:words", r'fabmap has no setting "words"'),
-        ("fabmap:words=many", r'fabmap: words is a whole number, not "many"'),
-        ("fabmap:hit=high", r'fabmap: hit is a number, not "high"'),
-        ("fabmap:motion=2", r'fabmap: motion is yes or no, not "2"'),
-        ("fabmap:scored=odds", r'"log_odds" or "posterior", not "odds"'),
-        ("fabmap:name=x", r"fabmap has no setting"),
-        ("bow:metric=chi2", r'unknown metric "chi2"'),
-        ("bow+thumbnails", r"bow\+thumbnails: bow works on images"),
-    ],
-)
-def test_arguments_that_make_no_sense(spec: str, message: str) -> None:
+@pytest.mark.parametrize(("message", "spec"), read_texts("loopclosure/methods/refused.txt").items())
+def test_a_method_or_setting_that_makes_no_sense_is_refused(spec: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        make_method(spec)
+        make_method(spec.strip())
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from case_files import read_texts
 from loopclosure.descriptors.thumbnails import Hog
 from loopclosure.errors import InputError
 from loopclosure.evaluate import evaluate, named_method
@@ -92,31 +93,8 @@ def test_two_traverses_are_compared_in_full(spec, two_laps):
     np.testing.assert_array_equal(np.argmax(scores, axis=1), np.arange(20))
 
 
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("hog:side=100", "expected at least 2 x 2 whole cells"),
-        ("cohog:least_entropy=2", "expected 0..1"),
-        ("vlad:kind=surf", "unknown kind of features"),
-        ("hog+thumbnails", "works on images"),
-    ],
-)
-def test_settings_that_make_no_sense(spec, message):
-    with pytest.raises(InputError, match=message):
-        make_method(spec)
-
-
 # A function of the user's as a method
-MEANS = """
-import cv2
-
-def describe(image):
-    return cv2.resize(image, (8, 6), interpolation=cv2.INTER_AREA).reshape(-1) / 255.0
-
-def growing(image, sizes=[]):
-    sizes.append(1)
-    return sizes
-"""
+(MEANS,) = read_texts("loopclosure/methods/references.txt").values()
 
 
 @pytest.fixture
@@ -168,20 +146,6 @@ def test_without_a_threshold_its_candidates_are_verified(two_laps, two_laps_feat
     result = method.score(Images(load_sequence(read_sequence(two_laps, "tum")).query_images), silent)
     assert not np.isfinite(result.scores).any()
     assert "30 not verified" in result.answer
-
-
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("detector", "expected detector:FILE.npz, or"),
-        ("detector:a.npz:calibrate=b", 'has no setting "calibrate=b"'),
-        ("detector:a.npz:threshold=-1,top_k=0", "top_k is 0"),
-        ("detector+thumbnails", "works on images, not on the scores"),
-    ],
-)
-def test_what_makes_no_sense_is_said(spec, message):
-    with pytest.raises(InputError, match=message):
-        make_method(spec)
 
 
 def test_two_traverses_are_refused(two_laps, two_laps_features):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from loopclosure.detector.verification import Agreement, GeometricCheck
-from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, MethodContext, MethodResult
 from loopclosure.methods.named import make_method
 from loopclosure.methods.seqslam import SeqSlam, SequenceSettings
@@ -153,19 +152,3 @@ def test_a_known_camera(walls):
     method = make_method(f"verified:{camera},k=12,min_inliers=25+thumbnails", MethodContext())
     found = first(method.score(Images(walls), silent).scores, np.zeros(1))
     assert found == [(i, i - WALLS) for i in range(WALLS, 2 * WALLS)]
-
-
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("verified", "write verified\\+METHOD"),
-        ("verified:k=0+thumbnails", "k = 0; expected 1 or more"),
-        ("verified:min_inliers=3+thumbnails", "expected at least 8"),
-        ("verified:focal_px=300+thumbnails", "needs focal_px, center_x_px and center_y_px"),
-        ("verified:order=size+thumbnails", 'order of verified is "size"; expected score or inliers'),
-        ("verified:depth=3+thumbnails", 'verified has no setting "depth=3"'),
-    ],
-)
-def test_settings_that_make_no_sense(spec, message):
-    with pytest.raises(InputError, match=message):
-        make_method(spec)

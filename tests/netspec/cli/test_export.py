@@ -15,6 +15,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 
 import netspec
+from case_files import read_texts
 from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, random_inputs, run_module
 from netspec.net.net import Net
 
@@ -115,16 +116,8 @@ def test_fold(net: Net, run: Run) -> None:
 
 
 def test_a_training_net_folds_to_a_deploy_net(run: Run) -> None:
-    result = run(
-        "fold",
-        "sgd_step/train_val.prototxt",
-        "--weights",
-        "sgd_step/init.caffemodel",
-        "--out",
-        "small",
-        "--shape",
-        "pair_data=2,2,28,28",
-    )
+    words = "sgd_step/train_val.prototxt --weights sgd_step/init.caffemodel --out small --shape pair_data=2,2,28,28"
+    result = run("fold", *words.split())
     assert result.status == 0
     small = netspec.load_net("small.prototxt", weights="small.caffemodel")
     assert small.inputs == ["pair_data"]
@@ -132,16 +125,7 @@ def test_a_training_net_folds_to_a_deploy_net(run: Run) -> None:
 
 
 def test_a_training_net_is_exported_with_its_loss(onnx: Any, run: Run) -> None:
-    words = (
-        "export",
-        "sgd_step/train_val.prototxt",
-        "--weights",
-        "sgd_step/init.caffemodel",
-        "--to",
-        "onnx",
-        "--out",
-        "net.onnx",
-    )
+    words = "export sgd_step/train_val.prototxt --weights sgd_step/init.caffemodel --to onnx --out net.onnx".split()
     assert "known only from its data; give --shape pair_data=" in run(*words).fault
     assert run(*words, "--shape", "pair_data=2,2,28,28").status == 0
     model = onnx.load("net.onnx")
@@ -165,21 +149,9 @@ def test_images_steps(onnx: Any, net: Net, run: Run) -> None:
     assert_same(in_onnxruntime(onnx.load("net.onnx"), inputs), expected)
 
 
-@pytest.mark.parametrize(
-    ("words", "fault"),
-    [
-        (("--to", "onnx", "--out", "no/net.onnx"), "no/net.onnx: there is no folder no; make it first"),
-        (("--to", "torch", "--out", "net.txt"), "--out net.txt: expected a name that ends in .py"),
-        (
-            ("--to", "onnx", "--out", "n.onnx", "--shape", "dat=1,3,8,8"),
-            'no data layer has a top "dat"; did you mean "data"?',
-        ),
-        (("--to", "onnx", "--out", "n.onnx", "--mean", "no.npy"), "no.npy: cannot be read as an array"),
-        (("--to", "onnx", "--out", "n.onnx", "--swap", "--input", "x"), 'no input "x" in this net; it has: data'),
-    ],
-)
-def test_faults_are_one_line(words: tuple[str, ...], fault: str, onnx: Any, net: Net, run: Run) -> None:
-    assert fault in run("export", MODEL, "--weights", WEIGHTS, *words).fault
+@pytest.mark.parametrize(("fault", "words"), read_texts("netspec/cli/cases/export.txt").items())
+def test_faults_are_one_line(words: str, fault: str, onnx: Any, net: Net, run: Run) -> None:
+    assert fault in run("export", MODEL, "--weights", WEIGHTS, *words.split()).fault
     assert not list(Path().glob("n.onnx"))
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import netspec
+from case_files import read_texts
 from netspec.data.database import open_reader
 from netspec.data.datum import datum_to_array, parse_datum
 from paths import GOLDEN, ROOT
@@ -52,18 +53,7 @@ def test_the_same_bytes_are_written_twice_where_no_time_is_wanted(run: Run, monk
 
 @pytest.mark.slow
 def test_extract_reads_another_database_and_as_many_batches_as_asked(run: Run) -> None:
-    words = [
-        "--model",
-        NET,
-        "--weights",
-        INIT,
-        "--blob",
-        "sim",
-        "--out",
-        "f.npz",
-        "--source",
-        "pair_data=pairs/train_lmdb",
-    ]
+    words = f"--model {NET} --weights {INIT} --blob sim --out f.npz --source pair_data=pairs/train_lmdb".split()
     assert run("extract", *words, "--iterations", "13").status == 0
     found = np.load("f.npz")
     labels = [parse_datum(open_reader("pairs/train_lmdb").record(i % 640)).label for i in range(650)]
@@ -159,61 +149,16 @@ def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run,
     assert run("extract", *words, "--shape", "data=1,1,28,28").status == 0
 
 
-@pytest.mark.parametrize(
-    ("words", "fault"),
-    [
-        (["--images", "nowhere"], "nowhere: cannot be read: No such file or directory; expected a folder of images"),
-        (["--images", "list.txt"], 'list.txt:2:1: no such image "b.png" in .'),
-        (["--images", "empty"], "empty: contains no images; expected files that end in .png, "),
-        (
-            ["--images", "walk/rgb", "--input", "dat"],
-            f'{NET}: no blob "dat" in this net; did you mean "data"? it has: ',
-        ),
-        (
-            ["--images", "walk/rgb", "--input", "sim"],
-            f'{NET}: input blob "sim" has shape (50,), expected N x 1 or 3 x ',
-        ),
-        (["--source", "pair=pairs/train_lmdb"], f'{NET}: no data layer "pair" in this net; its data layers: pair_data'),
-        (["--source", "pair_data=nowhere"], 'database "nowhere" does not exist'),
-        (["--out", "nowhere/f.npz"], "--out nowhere/f.npz: cannot be written: No such file or directory"),
-        (["--weights", "nowhere.caffemodel"], "nowhere.caffemodel: cannot be read: No such file or directory"),
-    ],
-)
-def test_extract_says_in_one_line_what_is_wrong(run: Run, images: Path, words: list[str], fault: str) -> None:
+@pytest.mark.parametrize(("fault", "words"), read_texts("netspec/cli/cases/extract.txt").items())
+def test_extract_says_in_one_line_what_is_wrong(run: Run, images: Path, words: str, fault: str) -> None:
     Path("empty").mkdir()
     Path("list.txt").write_text("walk/rgb/1.png\nb.png\n")
-    assert fault in run("extract", *IMAGES, *words).fault
+    assert fault in run("extract", *IMAGES, *words.split()).fault
 
 
-@pytest.mark.parametrize(
-    ("words", "fault"),
-    [
-        (["--images", "walk/rgb", "--zooms", "1,2"], "found zoom 2, expected more than 0 and at most 1"),
-        (["--images", "walk/rgb", "--zooms", "1,x"], 'found zooms "1,x", expected numbers separated by commas'),
-        (["--images", "walk/rgb", "--blob", "sim"], "--images needs exactly one --blob, found 2"),
-        (["--images", "walk/rgb", "--shape", "x=1,1,9,9"], "--shape names x, expected the input blob data"),
-        (
-            ["--zooms", "1,0.5"],
-            "--zooms is for --images; a data layer's records have its shape and its transform_param",
-        ),
-        (["--input", "x"], "--input is for --images"),
-        (["--shape", "data=1,1,9,9"], "--shape is for --images"),
-        (["--mean", "1"], "--mean is for --images"),
-        *(
-            (["--images", "walk/rgb", *words], f"{words[0]} is for records; --images are read, and run in phase TEST")
-            for words in (
-                ["--phase", "TRAIN"],
-                ["--level", "7"],
-                ["--stage", "x"],
-                ["--iterations", "99"],
-                ["--source", "no=/nowhere"],
-                ["--allow-python-layers"],
-            )
-        ),
-    ],
-)
-def test_extract_refuses_words_that_do_not_go_together(run: Run, images: Path, words: list[str], fault: str) -> None:
-    result = run("extract", *IMAGES, *words)
+@pytest.mark.parametrize(("fault", "words"), read_texts("netspec/cli/cases/extract_usage.txt").items())
+def test_extract_refuses_words_that_do_not_go_together(run: Run, images: Path, words: str, fault: str) -> None:
+    result = run("extract", *IMAGES, *words.split())
     assert result.status == 2
     assert fault in result.err.splitlines()[-1]
     assert not Path("f.npz").exists()

@@ -52,17 +52,8 @@ def test_says_how_a_net_is_trained(run: Callable[..., Any]) -> None:
 
 
 def test_extract_takes_passes(run: Callable[..., Any]) -> None:
-    words = (
-        "extract",
-        "--model",
-        "sgd_step/train_val.prototxt",
-        "--weights",
-        "sgd_step/init.caffemodel",
-        "--blob",
-        "feat",
-        "--iterations",
-        1,
-    )
+    files = "--model sgd_step/train_val.prototxt --weights sgd_step/init.caffemodel"
+    words = f"extract {files} --blob feat --iterations 1".split()
     found = []
     for passes in ("none", "fold,pack"):
         result = run(*words, "--out", "f.npz", "--passes", passes)

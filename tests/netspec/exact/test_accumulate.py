@@ -4,22 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from case_files import read_texts
 from netspec.exact import products
 from netspec.exact.products import rounded_weight, weights_rounded_once
 
-SIAMESE = """
-    layer { name: "data" type: "Input" top: "a" top: "b"
-            input_param { shape { dim: 2 dim: 1 dim: 4 dim: 4 } shape { dim: 2 dim: 1 dim: 4 dim: 4 } } }
-    layer { name: "conv" type: "Convolution" bottom: "a" top: "conv" param { name: "w" } param { name: "v" }
-            convolution_param { num_output: 2 kernel_size: 3 weight_filler { type: "gaussian" } } }
-    layer { name: "ip" type: "InnerProduct" bottom: "conv" top: "ip" param { name: "x" } param { name: "y" }
-            inner_product_param { num_output: 3 weight_filler { type: "gaussian" } } }
-    layer { name: "conv_p" type: "Convolution" bottom: "b" top: "conv_p" param { name: "w" } param { name: "v" }
-            convolution_param { num_output: 2 kernel_size: 3 } }
-    layer { name: "ip_p" type: "InnerProduct" bottom: "conv_p" top: "ip_p" param { name: "x" } param { name: "y" }
-            inner_product_param { num_output: 3 } }
-    layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "ip_p" top: "loss" }
-"""
+(SIAMESE,) = read_texts("netspec/exact/accumulate.txt").values()
 
 
 def images() -> dict[str, torch.Tensor]:

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from case_files import read_texts
 from netspec.exact import blas
 from netspec.exact.blas import CAFFES, CORE_TYPE
 from netspec.net.net import Net
@@ -16,13 +17,7 @@ from paths import ROOT
 
 OWN = "import scipy.linalg"  # OpenBLAS' own choice
 CHOSEN = "from netspec.exact.blas import kernels; kernels()"
-KERNELS = f"""
-import os, threadpoolctl
-{{load}}
-found = [library for library in threadpoolctl.threadpool_info() if "scipy.libs" in library["filepath"]]
-print(found[0]["architecture"])
-print(os.environ.get("{CORE_TYPE}"))
-"""
+KERNELS, AFTERWARDS = read_texts("netspec/exact/caffes_cpu.txt").values()
 
 
 @pytest.mark.slow
@@ -43,14 +38,6 @@ def test_the_kernels_are_caffes_unless_the_user_chose_others(wanted: str | None)
     )  # fmt: skip
     for_caffe = not wanted and torch.backends.cpu.get_cpu_capability() == "AVX512"
     assert chosen == [CAFFES if for_caffe else own[0], str(wanted)]
-
-
-AFTERWARDS = """
-from netspec.exact.blas import kernels
-kernels()
-import scipy.linalg.cython_blas
-print(scipy.linalg.cython_blas.__name__, scipy.linalg._fblas.__name__)
-"""
 
 
 @pytest.mark.slow

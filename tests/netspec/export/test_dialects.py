@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from case_files import read_texts
 from exported import (
     ONNX_EXTRA,
     assert_same,
@@ -29,7 +30,6 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("onnx", reason=ONNX_EXTRA)
 OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 Shape = tuple[int, ...]
-MAP = (2, 4, 6, 5)
 
 
 def net_text(layer: str, shapes: Mapping[str, Shape], tops: int = 1) -> str:
@@ -43,79 +43,10 @@ def net_text(layer: str, shapes: Mapping[str, Shape], tops: int = 1) -> str:
     return f'{inputs}layer {{ name: "it" {layer} {bottoms} {made} }}'
 
 
-CASES: dict[str, tuple[str, str, dict[str, Shape]]] = {
-    "Permute": ("ssd", "type: 'Permute' permute_param { order: 0 order: 2 order: 3 order: 1 }", {"x": MAP}),
-    "Normalize": ("ssd", "type: 'Normalize' norm_param { across_spatial: false channel_shared: false }", {"x": MAP}),
-    "Normalize across": ("ssd", "type: 'Normalize' norm_param { eps: 0.01 }", {"x": MAP}),
-    "PriorBox": (
-        "ssd",
-        "type: 'PriorBox' prior_box_param { min_size: 3 max_size: 7 aspect_ratio: 2 variance: 0.1 variance: 0.1 "
-        "variance: 0.2 variance: 0.2 }",
-        {"x": MAP, "image": (2, 3, 24, 20)},
-    ),
-    "PriorBox with step": (
-        "ssd",
-        "type: 'PriorBox' prior_box_param { min_size: 3 min_size: 5 flip: false clip: true img_size: 40 step: 8 }",
-        {"x": MAP},
-    ),
-    "Axpy": ("blocks", "type: 'Axpy'", {"a": (2, 4), "x": MAP, "y": MAP}),
-    "ReLU6": ("blocks", "type: 'ReLU6'", {"x": MAP}),
-    "ReLU6 with slope": ("blocks", "type: 'ReLU6' relu6_param { negative_slope: 0.25 }", {"x": MAP}),
-    "DepthwiseConvolution": (
-        "blocks",
-        "type: 'DepthwiseConvolution' convolution_param { num_output: 8 group: 4 kernel_size: 3 pad: 1 stride: 2 }",
-        {"x": MAP},
-    ),
-    "ConvolutionDepthwise": (
-        "blocks",
-        "type: 'ConvolutionDepthwise' convolution_param { kernel_size: 3 bias_term: false }",
-        {"x": MAP},
-    ),
-    "ShuffleChannel": ("blocks", "type: 'ShuffleChannel' shuffle_channel_param { group: 2 }", {"x": MAP}),
-    "Interp by zoom": (
-        "blocks",
-        "type: 'Interp' interp_param { zoom_factor: 3 shrink_factor: 2 pad_beg: 0 pad_end: -1 }",
-        {"x": MAP},
-    ),
-    "Interp to a size": ("blocks", "type: 'Interp' interp_param { height: 11 width: 4 }", {"x": MAP}),
-    "Interp like another": ("blocks", "type: 'Interp'", {"x": MAP, "y": (2, 1, 9, 13)}),
-    "DeephiResize": ("blocks", "type: 'DeephiResize' deephi_resize_param { scale_h: 2 scale_w: 3 }", {"x": MAP}),
-    "DeephiResize to a size": (
-        "blocks",
-        "type: 'DeephiResize' deephi_resize_param { new_height: 11 new_width: 4 resize_type: NEAREST }",
-        {"x": MAP},
-    ),
-    "Upsample": ("blocks", "type: 'Upsample' upsample_param { scale: 3 }", {"x": MAP}),
-    "BN of PSPNet": ("blocks", "type: 'BN' bn_param { frozen: true }", {"x": MAP}),
-    "BN of SegNet": ("blocks", "type: 'BN' bn_param { bn_mode: INFERENCE }", {"x": MAP}),
-    "BN by the batch": ("blocks", "type: 'BN' bn_param { bn_mode: LEARN }", {"x": MAP}),
-    "Transpose": ("layout", "type: 'Transpose' transpose_param { dim: [0, 2, 3, 1] }", {"x": MAP}),
-    "CropCenter": ("layout", "type: 'CropCenter' crop_center_param { crop_size: [0, 0, 2, 1] }", {"x": MAP}),
-    "Convolution with holes": (
-        "filters",
-        "type: 'Convolution' convolution_param { num_output: 3 kernel_size: 2 hole: 2 }",
-        {"x": MAP},
-    ),
-    "Convolution with sides": (
-        "filters",
-        "type: 'Convolution' convolution_param { num_output: 3 kernel_size: 3 stride: 2 pad_l: 1 pad_b: 2 }",
-        {"x": MAP},
-    ),
-    "BatchNorm of NVIDIA": ("nvidia", "type: 'BatchNorm' batch_norm_param { scale_bias: true }", {"x": MAP}),
-    "Dropout": ("filters", "type: 'Dropout' dropout_param { dropout_ratio: 0.25 scale_train: false }", {"x": MAP}),
-    "SmoothL1Loss": (
-        "rcnn",
-        "type: 'SmoothL1Loss' smooth_l1_loss_param { sigma: 2 }",
-        {"x": (5, 8), "y": (5, 8), "inside": (5, 8), "outside": (5, 8)},
-    ),
-}
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_layer_computes_the_same(name: str, net_of: Callable[..., Net]) -> None:
-    dialect, layer, shapes = CASES[name]
-    use_dialect(dialect)
-    net = trained(net_of(net_text(layer, shapes)))
+@pytest.mark.parametrize(("name", "text"), read_texts("netspec/export/dialects.txt").items())
+def test_layer_computes_the_same(name: str, text: str, net_of: Callable[..., Net]) -> None:
+    use_dialect(name.rpartition(" ")[2])
+    net = trained(net_of(text))
     inputs = random_inputs(net)
     model, _ = onnx_model(net)
     module = source_module(net)

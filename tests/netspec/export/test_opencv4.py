@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import netspec
+from case_files import read_texts
 from exported import assert_same, here, random_inputs, trained
 from netspec.export.formats.deploy import fold, write_caffe
 from netspec.graph.options import BuildOptions
@@ -25,38 +26,7 @@ from paths import GOLDEN
 FOLDER = GOLDEN / "export" / "opencv4"
 PYTHON = os.environ.get("NETSPEC_OPENCV4", "")
 
-TEXT = """name: "Residual"
-layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 3 dim: 12 dim: 12 } } }
-layer { name: "conv1" type: "Convolution" bottom: "data" top: "conv1"
-  convolution_param { num_output: 4 kernel_size: 3 pad: 1 stride: 2 bias_term: false } }
-layer { name: "bn1" type: "BatchNorm" bottom: "conv1" top: "conv1" }
-layer { name: "scale1" type: "Scale" bottom: "conv1" top: "conv1" scale_param { bias_term: true } }
-layer { name: "relu1" type: "ReLU" bottom: "conv1" top: "conv1" }
-layer { name: "conv2" type: "Convolution" bottom: "conv1" top: "conv2"
-  convolution_param { num_output: 4 kernel_size: 3 pad: 2 dilation: 2 group: 2 } }
-layer { name: "bn2" type: "BatchNorm" bottom: "conv2" top: "bn2" batch_norm_param { eps: 0.001 } }
-layer { name: "scale2" type: "Scale" bottom: "bn2" top: "scale2" scale_param { bias_term: true } }
-layer { name: "sum" type: "Eltwise" bottom: "conv1" bottom: "scale2" top: "sum" }
-layer { name: "bn3" type: "BatchNorm" bottom: "sum" top: "bn3" }
-layer { name: "scale3" type: "Scale" bottom: "bn3" top: "bn3" scale_param { bias_term: true } }
-layer { name: "prelu" type: "PReLU" bottom: "bn3" top: "bn3" }
-layer { name: "pool" type: "Pooling" bottom: "bn3" top: "pool" pooling_param { pool: MAX kernel_size: 3 stride: 2 } }
-layer { name: "deconv" type: "Deconvolution" bottom: "pool" top: "deconv"
-  convolution_param { num_output: 6 group: 2 kernel_size: 2 stride: 2 } }
-layer { name: "bn4" type: "BatchNorm" bottom: "deconv" top: "bn4" }
-layer { name: "drop" type: "Dropout" bottom: "bn4" top: "drop" }
-layer { name: "ip" type: "InnerProduct" bottom: "drop" top: "ip" inner_product_param { num_output: 5 } }
-layer { name: "prob" type: "Softmax" bottom: "ip" top: "prob" }
-"""
-
-READ = """
-import sys, cv2, numpy as np
-prototxt, weights, data, out = sys.argv[1:]
-net = cv2.dnn.readNetFromCaffe(prototxt, weights)
-net.enableFusion("folded" in prototxt)  # its own folding gets grouped deconvolutions wrong
-net.setInput(np.load(data))
-np.save(out, net.forward())
-"""
+TEXT, READ = read_texts("netspec/export/opencv4.txt").values()
 
 
 def residual_net() -> Net:

@@ -2,23 +2,14 @@
 
 import pytest
 
+from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.graph.filter import filter_net, in_state, with_state
 from netspec.graph.splits import insert_splits
 from netspec.proto.schema import TRAIN, NetParameter, NetState, PhaseValue
 from netspec.proto.text import parse_net_text
 
-RULES = """
-layer { name: "always" type: "Silence" }
-layer { name: "train" type: "Silence" include { phase: TRAIN } }
-layer { name: "test" type: "Silence" include { phase: TEST } }
-layer { name: "deep" type: "Silence" include { min_level: 2 } }
-layer { name: "shallow" type: "Silence" include { max_level: 1 } }
-layer { name: "deploy" type: "Silence" include { stage: "deploy" stage: "fast" } }
-layer { name: "not_deploy" type: "Silence" exclude { stage: "deploy" } }
-layer { name: "no_val" type: "Silence" include { not_stage: "val" } }
-layer { name: "either" type: "Silence" include { stage: "val" } include { phase: TRAIN } }
-"""
+(RULES,) = read_texts("netspec/graph/filter_splits.txt").values()
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import pytest
 
+from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.graph.plan import make_plan, plan_backward
 from netspec.graph.splits import insert_splits
@@ -48,25 +49,7 @@ def test_the_first_of_a_name_owns_and_multipliers_may_be_given_once() -> None:
     assert made.nodes[2].params[0].owner == (1, 0)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (
-            'layer { name: "a" type: "InnerProduct" param { name: "w" lr_mult: 1 } }\n'
-            'layer { name: "b" type: "InnerProduct" param { name: "w" lr_mult: 2 } }',
-            r'net:2:\d+: layer "b" \(InnerProduct\): shared param "w" has lr_mult 2 here and 1 before',
-        ),
-        (
-            'layer { name: "a" type: "Input" top: "x" }\nlayer { name: "b" type: "Input" top: "x" }',
-            r'net:2:\d+: layer "b" \(Input\): top blob "x" is produced by multiple sources \(first by layer "a"\)',
-        ),
-        (
-            'layer { name: "a" type: "Input" top: "x" top: "y" }\n'
-            'layer { name: "b" type: "Eltwise" bottom: "x" bottom: "y" top: "z" propagate_down: true }',
-            r"net:2:\d+: .* found 1 propagate_down, expected 0 or 2",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("message", "text"), read_texts("netspec/graph/cases/faults.txt").items())
 def test_faults_name_their_place(text: str, message: str) -> None:
     with pytest.raises(SpecError, match=message):
         plan(text)

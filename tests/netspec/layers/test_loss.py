@@ -353,39 +353,6 @@ def test_accuracy_of_each_class_along_another_axis(build) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "bottoms"),
-    [
-        ('type: "SoftmaxWithLoss" loss_param { ignore_label: 1 }', [(3, 4, 2), (3, 2)]),
-        ('type: "InfogainLoss"', [(3, 4, 2), (3, 2), (4, 4)]),
-        ('type: "MultinomialLogisticLoss"', [(6, 4), (6,)]),
-        ('type: "HingeLoss"', [(6, 4), (6,)]),
-        ('type: "HingeLoss" hinge_loss_param { norm: L2 }', [(6, 4), (6,)]),
-        ('type: "SigmoidCrossEntropyLoss" loss_param { ignore_label: 1 }', [(3, 4), (3, 4)]),
-    ],
-)
-def test_gradient_of_the_scores_is_the_derivative(build, gradcheck, text: str, bottoms: list) -> None:
-    layer = build(text, *bottoms)
-    labels = torch.arange(math.prod(bottoms[1])).remainder(4).reshape(bottoms[1])
-    rest = [torch.rand(shape) for shape in bottoms[2:]]
-    gradcheck(layer, torch.rand(bottoms[0]) + 0.1, labels, *rest, fixed=[1, 2])
-
-
-def test_euclidean_gradients_are_the_derivatives(build, gradcheck) -> None:
-    gradcheck(build('type: "EuclideanLoss"', (3, 4), (3, 4)), torch.randn(3, 4), torch.randn(3, 4))
-
-
-@pytest.mark.parametrize("legacy", ["true", "false"])
-def test_contrastive_gradients_are_nearly_the_derivatives(build, legacy: str) -> None:
-    layer = build(
-        f'type: "ContrastiveLoss" contrastive_loss_param {{ margin: 5 legacy_version: {legacy} }}', (4, 3), (4, 3), (4,)
-    )
-    a, b = torch.randn(4, 3).double().requires_grad_(), torch.randn(4, 3).double().requires_grad_()
-    labels = torch.tensor([0.0, 1.0, 0.0, 1.0])
-    # atol: what the 1e-4 beside the distance makes
-    torch.autograd.gradcheck(lambda a, b: layer.run(a, b, labels)[0], (a, b), atol=3e-4)
-
-
-@pytest.mark.parametrize(
     ("kind", "shapes"),
     [
         ("SoftmaxWithLoss", [(4, 3), (4,)]),

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.layers import Layer, layer_class, layer_types
 from netspec.proto.schema import LayerParameter
@@ -18,49 +19,15 @@ def layer(kind: str, rest: str = "", name: str = "a") -> str:
     return f'layer {{ name: "{name}" type: "{kind}" bottom: "x" top: "{name}" {rest} }}\n'
 
 
-@pytest.mark.parametrize(
-    ("text", "field", "reason"),
-    [
-        (layer("ReLU", "pooling_param { pool: MAX }"), "pooling_param", "a layer of type ReLU does not read it"),
-        (
-            layer(
-                "Convolution", 'convolution_param { num_output: 1 kernel_size: 1 bias_filler { type: "msra" std: 1 }}'
-            ),
-            "convolution_param.bias_filler.std",
-            'filler "msra" does not read it',
-        ),
-        (
-            layer("Eltwise", 'bottom: "x" eltwise_param { operation: MAX coeff: 2 coeff: 1 }'),
-            "eltwise_param.coeff",
-            "a layer of type Eltwise does not read it",
-        ),
-        (
-            layer("LRN", "lrn_param { norm_region: WITHIN_CHANNEL k: 2 }"),
-            "lrn_param.k",
-            "a layer of type LRN does not read it",
-        ),
-        (
-            layer("DummyData", "dummy_data_param { shape { dim: 1 } data_filler { std: 2 }}").replace(
-                'bottom: "x"', ""
-            ),
-            "dummy_data_param.data_filler.std",
-            'filler "constant" does not read it',
-        ),
-        (
-            layer("EuclideanLoss", 'bottom: "x" loss_param { normalization: NONE }'),
-            "loss_param",
-            "a layer of type EuclideanLoss does not read it",
-        ),
-    ],
-)
-def test_a_field_without_effect_is_named(net_of, warnings, text: str, field: str, reason: str) -> None:
+@pytest.mark.parametrize(("said", "text"), read_texts("netspec/net/cases/ignored_fields.txt").items())
+def test_a_field_without_effect_is_named(net_of, warnings, text: str, said: str) -> None:
     net_of(INPUT + text)
-    name = field.split(".")[-1]
+    name = said.partition(" ")[0].split(".")[-1]
     place = re.search(rf"\b{name}(:| \{{)", text)
     assert place is not None
     kind = text.split('"')[3]
     where = f'net.prototxt:2:{place.start() + 1}: layer "a" ({kind})'
-    assert warnings() == [f"{where}: {field} has no effect: {reason}"]
+    assert warnings() == [f"{where}: {said}"]
 
 
 def test_debug_info_of_a_net_is_named(net_of, warnings) -> None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import netspec
+from case_files import read_texts
 from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
@@ -21,16 +22,7 @@ from paths import GOLDEN
 
 CASES = sorted(path.name for path in (GOLDEN / "train").iterdir())
 
-TOWERS = """
-name: "towers" state { phase: TRAIN }
-layer { name: "in" type: "Input" top: "a" top: "b" input_param { shape { dim: 2 dim: 3 } } }
-layer { name: "ip" type: "InnerProduct" bottom: "a" top: "x" inner_product_param { num_output: 4 }
-  param { name: "w" } param { name: "v" } }
-layer { name: "ip/p" type: "InnerProduct" bottom: "b" top: "y" inner_product_param { num_output: 4 }
-  param { name: "w" } param { name: "v" } }
-layer { name: "sum" type: "Eltwise" bottom: "x" bottom: "y" top: "z" }
-layer { name: "twice" type: "Eltwise" bottom: "x" bottom: "z" top: "out" }
-"""
+TOWERS, WIDE, TWO = read_texts("netspec/net/weights.txt").values()
 
 
 def net_of(text: str, seed: int = 1) -> Net:
@@ -228,13 +220,6 @@ def test_weights_of_v1_nets_are_upgraded(tmp_path: Path):
     assert blobs_of(net)["ip"][0][3].tolist() == [9, 10, 11]
 
 
-WIDE = """
-name: "wide" state { phase: TRAIN }
-layer { name: "in" type: "Input" top: "a" input_param { shape { dim: 2 dim: 30 } } }
-layer { name: "ip" type: "InnerProduct" bottom: "a" top: "x" inner_product_param { num_output: 40 } }
-"""
-
-
 def wide(kind: str) -> bytes:
     """A file of weights 0 to 1199 and biases 0 to 39, as long as those whose numbers are read where they lie."""
     weights, biases = np.arange(1200, dtype="<f4"), np.arange(40, dtype="<f4")
@@ -394,13 +379,6 @@ def test_a_folder_that_is_not_there(tmp_path: Path):
         save_weights(net_of(TOWERS), tmp_path / "gone" / "w.caffemodel")
     with pytest.raises(SpecError, match=r"gone/w\.h5: cannot be written: No such file or directory$"):
         save_weights(net_of(TOWERS), tmp_path / "gone" / "w.h5")
-
-
-TWO = """
-layer { name: "in" type: "Input" top: "a" input_param { shape { dim: 2 dim: 3 } } }
-layer { name: "one" type: "InnerProduct" bottom: "a" top: "x" inner_product_param { num_output: 4 } }
-layer { name: "two" type: "InnerProduct" bottom: "x" top: "y" inner_product_param { num_output: 4 } }
-"""
 
 
 def holding(tmp_path: Path, *layers: str, name: str = "w.caffemodel") -> Path:

@@ -8,6 +8,7 @@ import pytest
 from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto, FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 
+from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.proto import schema
 from netspec.proto.dialect import registry as dialect
@@ -18,48 +19,7 @@ from netspec.proto.text import parse_net_text, write_text
 
 PROTO = Path(schema.__file__).parent
 
-SOURCE = """
-// A fictional fork.
-message WarpParameter {
-  enum Border { ZERO = 0; EDGE = -1; }  /* two
-                                           lines */
-  message Corner { required double x = 1; optional uint64 id = 2 [default = 0x10]; }
-  optional Border border = 1 [default = EDGE];
-  repeated float scale = 2 [packed = true];
-  optional FillerParameter filler = 3;
-  repeated Corner corner = 4;
-  optional string note = 5 [default = "a b"];
-  optional float tiny = 6 [default = -1.5e-3];
-  optional bool on = 7 [default = true];
-}
-enum Sort { UP = 1; DOWN = 2; }
-extend LayerParameter {
-  optional WarpParameter warp_param = 900;
-  repeated int32 ages = 901;
-}
-extend caffe.PoolingParameter { optional Sort sort = 20; }
-extend V1LayerParameter { optional WarpParameter warp_param2 = 2000; }
-"""
-NET = """layer {
-  name: "w"
-  pooling_param {
-    sort: DOWN
-  }
-  warp_param {
-    border: ZERO
-    scale: 0.5
-    scale: 2
-    filler {
-      type: "xavier"
-    }
-    corner {
-      x: 3
-    }
-  }
-  ages: 4
-  ages: 5
-}
-"""
+SOURCE, NET = read_texts("netspec/proto/dialect.txt").values()
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from case_files import read_texts
 from each import each, last_parts
 from netspec.cli import main
 from netspec.errors import SpecError
@@ -19,43 +20,8 @@ OWN = sorted((ROOT / "prototxt").rglob("*.prototxt"))
 
 
 def test_the_form() -> None:
-    text = """
-
-# About the net.
-name:'x' ; input : "data"
-
-
-layer{name:"a" # why
-  type: "Convolution",  bottom: "data"
-  # its settings
-  convolution_param <num_output:4  kernel_size:[3,3]>  # both
-
-  # the end
-}
-layer { name: "r"   type: "ReLU" bottom: "a" top: "a" }
-state {
-}
-"""
-    assert (
-        format_text(text, "f")
-        == """# About the net.
-name: "x"
-input: "data"
-
-layer {
-  name: "a"  # why
-  type: "Convolution"
-  bottom: "data"
-  # its settings
-  convolution_param { num_output: 4 kernel_size: [3, 3] }  # both
-
-  # the end
-}
-layer { name: "r" type: "ReLU" bottom: "a" top: "a" }
-state {
-}
-"""
-    )
+    typed, formed = read_texts("netspec/proto/cases/format.txt").values()
+    assert format_text(typed, "f") == formed
 
 
 @pytest.mark.parametrize(

@@ -6,18 +6,10 @@ from contextlib import contextmanager
 import pytest
 import torch
 
+from case_files import read_texts
 from netspec.net.net import Net
 
-NET = """
-    layer { name: "data" type: "Input" top: "x" input_param { shape { dim: 4 dim: 3 dim: 40 dim: 40 } } }
-    layer { name: "conv" type: "Convolution" bottom: "x" top: "c"
-            convolution_param { num_output: 4 kernel_size: 3 bias_term: false weight_filler { type: "gaussian" } } }
-    layer { name: "bn" type: "BatchNorm" bottom: "c" top: "c" }
-    layer { name: "scale" type: "Scale" bottom: "c" top: "c"
-            scale_param { filler { type: "gaussian" std: 1 } bias_term: true bias_filler { type: "gaussian" std: 1 } } }
-    layer { name: "relu" type: "ReLU" bottom: "c" top: "c" }
-    layer { name: "loss" type: "Reduction" bottom: "c" top: "loss" reduction_param { operation: SUMSQ }
-            loss_weight: 0.01 }"""
+NET, APART = read_texts("netspec/run/joined.txt").values()
 
 
 @contextmanager
@@ -56,14 +48,6 @@ def test_together_they_compute_what_each_computes(net_of, text: str) -> None:
     alone.eager._apart = [True] * len(alone.layers)
     for mine, theirs in zip(passed(together, data), passed(alone, data), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-3)
-
-
-APART = (
-    NET.replace('"BatchNorm" bottom: "c" top: "c"', '"BatchNorm" bottom: "c" top: "n"')
-    .replace('"Scale" bottom: "c" top: "c"', '"Scale" bottom: "n" top: "s"')
-    .replace('"ReLU" bottom: "c" top: "c"', '"ReLU" bottom: "s" top: "r"')
-    .replace('"Reduction" bottom: "c"', '"Reduction" bottom: "r"')
-)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import pytest
 import torch
 from typing_extensions import override
 
+from case_files import read_texts
 from exported import trained
 from netspec.exact.blas import one_thread
 from netspec.graph.steps import PASSES
@@ -34,6 +35,7 @@ layer { name: "scale" type: "Scale" bottom: "bn" top: "scale" scale_param { bias
 layer { name: "relu" type: "ReLU" bottom: "scale" top: "scale" }
 """
 BLOCK = INPUT + f'layer {{ name: "conv" bottom: "data" top: "conv" {CONV} }}' + NORM
+NETS = read_texts("netspec/run/prepared.txt")
 SHARED = f"""
 layer {{ name: "drop" type: "Dropout" bottom: "scale" top: "scale" }}
 layer {{ name: "left" bottom: "scale" top: "left" {CONV} }}
@@ -264,7 +266,7 @@ def test_exact_programs_share_copies_of_blobs_and_count_what_they_keep(net_of: C
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_runs_of_many_sizes_take_little_more_memory_than_one(tmp_path: Path) -> None:
     """Six small convolutions, 24 batch sizes: the process grows by a few runs of the largest."""
-    text = 'layer { name: "c0" type: "Input" top: "c0" input_param { shape { dim: 1 dim: 32 dim: 64 dim: 64 } } }'
+    text = 'layer { name: "c0" type: "Input" top: "c0" input_param { shape { dim: 1 dim: 32 dim: 40 dim: 40 } } }'
     for k in range(6):
         text += f"""layer {{ name: "c{k + 1}" type: "Convolution" bottom: "c{k}" top: "c{k + 1}"
             convolution_param {{ num_output: 32 kernel_size: 3 pad: 1 weight_filler {{ type: "xavier" }} }} }}"""
@@ -278,11 +280,11 @@ def test_runs_of_many_sizes_take_little_more_memory_than_one(tmp_path: Path) -> 
         grown = []
         for size in range(1, 71, 3):
             with torch.no_grad():
-                net(c0=torch.ones(size, 32, 64, 64))
+                net(c0=torch.ones(size, 32, 40, 40))
             grown.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
         print(max(grown) - grown[0])"""
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=True)
-    one_run = 3 * 4 * 70 * 32 * 64 * 64  # bytes: the input, a bottom and a top
+    one_run = 3 * 4 * 70 * 32 * 40 * 40  # bytes: the input, a bottom and a top
     assert int(told.stdout) < 3 * one_run
 
 
@@ -291,20 +293,7 @@ def test_nets_that_train_are_not_prepared(net_of: Callable[..., Net]) -> None:
 
 
 def test_inputs_and_earlier_outputs_are_never_overwritten(net_of: Callable[..., Net]) -> None:
-    text = (
-        INPUT
-        + """
-layer { name: "flat" type: "Flatten" bottom: "data" top: "flat" }
-layer { name: "double" type: "Eltwise" bottom: "data" bottom: "data" top: "double" }
-layer { name: "seen" type: "Flatten" bottom: "double" top: "seen" }
-layer { name: "more" type: "Eltwise" bottom: "double" bottom: "data" top: "more" }
-layer { name: "relu" type: "ReLU" bottom: "more" top: "more" }
-layer { name: "same" type: "Power" bottom: "more" top: "same" }
-layer { name: "end" type: "ReLU" bottom: "same" top: "same" }
-layer { name: "join" type: "Concat" bottom: "seen" bottom: "flat" top: "join" }
-"""
-    )
-    net, x = net_of(text), images()
+    net, x = net_of(NETS["earlier outputs"]), images()
     expected = slowly(net, data=x)
     first = quickly(net, data=x)
     assert torch.equal(x, images())
@@ -318,20 +307,7 @@ layer { name: "join" type: "Concat" bottom: "seen" bottom: "flat" top: "join" }
 def test_products_lend_memory_only_where_nobody_looks_afterwards(
     exact: str, keep: str | tuple[str, ...], net_of: Callable[..., Net]
 ) -> None:
-    text = (
-        INPUT.replace("dim: 40 dim: 40", "dim: 5 dim: 4")
-        + f"""
-layer {{ name: "conv" bottom: "data" top: "conv" {CONV.replace("pad: 1", "group: 2")} }}
-layer {{ name: "flat" type: "Flatten" bottom: "conv" top: "flat" }}
-layer {{ name: "parts" type: "Slice" bottom: "flat" top: "left" top: "right" slice_param {{ axis: 1 }} }}
-layer {{ name: "ip" bottom: "left" top: "ip" {PRODUCT} }}
-layer {{ name: "relu" type: "ReLU" bottom: "ip" top: "ip" }}
-layer {{ name: "shape" type: "Reshape" bottom: "ip" top: "shape" reshape_param {{ shape {{ dim: 0 dim: 2 dim: 3 }} }} }}
-layer {{ name: "inner" bottom: "ip" top: "inner" {PRODUCT} }}
-layer {{ name: "end" bottom: "inner" top: "end" {PRODUCT} }}
-"""
-    )
-    net = net_of(text, exact=exact)
+    net = net_of(NETS["lent memory"], exact=exact)
     net.keep = keep
     given = [images(n, 8, 5, 4) * k for k, n in enumerate((3, 3, 1, 0, 3))]
     with one_thread():
@@ -343,14 +319,7 @@ layer {{ name: "end" bottom: "inner" top: "end" {PRODUCT} }}
 
 
 def test_what_follows_on_a_count_of_items_is_run_by_its_values(net_of: Callable[..., Net]) -> None:
-    text = INPUT.replace("dim: 1 dim: 8", "dim: 4 dim: 8").replace("} }", "} shape { dim: 4 } }")
-    text = text.replace('top: "data"', 'top: "data" top: "which"')
-    text += f"""
-layer {{ name: "some" type: "Filter" bottom: "data" bottom: "which" top: "some" }}
-layer {{ name: "conv" bottom: "some" top: "conv" {CONV} }}
-{NORM}
-"""
-    net, x = trained(net_of(text)), images(4, 8, 40, 40)
+    net, x = trained(net_of(NETS["a count of items"])), images(4, 8, 40, 40)
     for which in ([1, 0, 1, 1], [0, 1, 0, 0], [1, 1, 1, 1]):
         inputs = {"data": x, "which": torch.tensor(which, dtype=torch.float32)}
         assert_same(quickly(net, **inputs), slowly(net, **inputs))

@@ -4,6 +4,7 @@ from typing import Any
 import pytest
 from google.protobuf.message import Message
 
+from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.graph.filter import with_train_state
 from netspec.proto.reader import read_text
@@ -84,37 +85,7 @@ def test_a_net_within_the_solver_keeps_its_places():
     assert str(train.source.at(0, "type")).startswith("s.prototxt:3:5")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", r"^s\.prototxt: the solver has no net to train"),
-        (
-            'net: "a.prototxt"\ntrain_net: "b.prototxt"',
-            r"^s\.prototxt:2:1: found net and train_net, expected exactly one of",
-        ),
-        ('net: "gone.prototxt"', r'^s\.prototxt:1:1: net "gone\.prototxt" is not a file; paths are relative to'),
-        (
-            'net: "a.prototxt"\ntest_net: "b.prototxt"\ntest_net: "gone" test_iter: 1 test_iter: 1 test_interval: 1',
-            r'^s\.prototxt:3:1: test_net "gone" is not a file',
-        ),
-        (
-            'net: "a.prototxt" test_net: "b.prototxt"\ntest_interval: 1',
-            r"found 0 test_iter, expected 1, one for each test_net and test_net_param \(or more\)",
-        ),
-        (
-            'train_net: "a.prototxt" test_net: "b.prototxt"\ntest_iter: 1\ntest_iter: 1 test_interval: 1',
-            r"^s\.prototxt:2:1: found 2 test_iter, expected 1, one for each test_net and test_net_param$",
-        ),
-        (
-            'net: "a.prototxt" test_iter: 1 test_interval: 1\ntest_state { } test_state { }',
-            r"^s\.prototxt:2:1: found 2 test_state, expected none or one for each of the 1 test nets",
-        ),
-        (
-            'net: "a.prototxt"\ntest_iter: 1',
-            r"found test_interval 0, expected more than 0, since there is a net to test",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("message", "text"), read_texts("netspec/solver/cases/nets.txt").items())
 def test_what_caffe_refuses(text: str, message: str):
     with pytest.raises(SpecError, match=message):
         nets(text)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import netspec
+from case_files import read_texts
 from netspec.cli import main
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
@@ -57,14 +58,7 @@ CLASSIFY = """layer { name: "ip" type: "InnerProduct" bottom: "{bottom}" top: "i
   inner_product_param { num_output: 4 weight_filler { type: "xavier" } } }
 layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" }"""
 DROPOUT = 'layer { name: "drop" type: "Dropout" bottom: "data" top: "drop" }'
-LSTM = """layer { name: "x" type: "DummyData" top: "x" top: "cont" top: "label" dummy_data_param {
-  shape { dim: 3 dim: 2 dim: 5 } shape { dim: 3 dim: 2 } shape { dim: 3 dim: 2 }
-  data_filler { type: "gaussian" } data_filler { type: "constant" value: 1 } data_filler { type: "constant" } } }
-layer { name: "data" type: "LSTM" bottom: "x" bottom: "cont" top: "data"
-  recurrent_param { num_output: 6 weight_filler { type: "gaussian" std: 0.3 } } }
-layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip"
-  inner_product_param { num_output: 4 axis: 2 weight_filler { type: "xavier" } } }
-layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" softmax_param { axis: 2 } }"""
+LSTM, SOLVER, COUNTER, HOOKS = read_texts("netspec/solver/resume.txt").values()
 POOL = """layer { name: "pool" type: "Pooling" bottom: "data" top: "pool"
   pooling_param { pool: STOCHASTIC kernel_size: 2 stride: 2 } }"""
 
@@ -89,10 +83,6 @@ NETS = {
     "LSTM": LSTM,
     "stochastic pooling": CROP + POOL + classify("pool"),
 }
-SOLVER = """net: "net.prototxt" base_lr: 0.05 lr_policy: "step" gamma: 0.5 stepsize: 4 max_iter: 13 display: 1
-average_loss: 4 test_iter: 2 test_interval: 4 snapshot_prefix: "x" solver_mode: CPU weight_decay: 0.001
-snapshot_after_train: false
-"""
 
 
 def write(net: str, more: str = "momentum: 0.9", solver: str = SOLVER) -> None:
@@ -256,30 +246,6 @@ def test_what_changes_no_number_is_not_said(
     assert "the training goes on as if it had never stopped" in caplog.text
 
 
-COUNTER = """
-import caffe
-
-class Counter(caffe.Layer):
-    def setup(self, bottom, top):
-        self.passes = 0
-
-    def reshape(self, bottom, top):
-        top[0].reshape(*bottom[0].data.shape)
-
-    def forward(self, bottom, top):
-        self.passes += 1
-        top[0].data[...] = bottom[0].data * self.passes
-
-    def backward(self, top, propagate_down, bottom):
-        pass
-"""
-HOOKS = """
-    def running_state(self):
-        return {"passes": self.passes}
-
-    def resume(self, state):
-        self.passes = state["passes"]
-"""
 COUNTED = """layer { name: "c" type: "Python" bottom: "data" top: "c"
   python_param { module: "MODULE" layer: "Counter" } }"""
 

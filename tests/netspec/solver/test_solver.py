@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.layers.contract.reading import Fed
 from netspec.net.weights import save_weights
@@ -262,31 +263,7 @@ def test_weights_and_a_snapshot_exclude_each_other(make):
 # What is refused before the first iteration
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (
-            'base_lr: 0.1\nlr_policy: "fixed"',
-            r"^s\.prototxt: the solver has no net to train, expected exactly one of net",
-        ),
-        (SETTINGS.replace('"fixed"', '"stp"'), r'^s\.prototxt:3:1: unknown lr_policy "stp"'),
-        (SETTINGS + 'type: "Adan"', r'^s\.prototxt:6:1: unknown solver type "Adan"'),
-        (
-            SETTINGS + 'regularization_type: "L3"',
-            r'^s\.prototxt:6:1: unknown regularization_type "L3", expected L2 or L1',
-        ),
-        (SETTINGS + "average_loss: 0", r"^s\.prototxt:6:1: found average_loss 0, expected at least 1"),
-        (SETTINGS + "iter_size: 0", r"^s\.prototxt:6:1: found iter_size 0, expected at least 1"),
-        (SETTINGS + "max_iter: -1", r"^s\.prototxt:6:1: found max_iter -1, expected at least 0"),
-        (SETTINGS + "test_iter: 1\ntest_iter: -1", r"^s\.prototxt:7:1: found test_iter -1, expected at least 0"),
-        (SETTINGS + 'snapshot: 1 snapshot_prefix: ""', r"snapshot is given but snapshot_prefix is not"),
-        (
-            SETTINGS + 'snapshot: 1\nsnapshot_prefix: "gone/p"',
-            r'^s\.prototxt:7:1: cannot write to snapshot prefix "gone/p"',
-        ),
-        (SETTINGS + 'weights: "gone.caffemodel"', r"^gone\.caffemodel: cannot be read: No such file"),
-    ],
-)
+@pytest.mark.parametrize(("message", "settings"), read_texts("netspec/solver/cases/settings.txt").items())
 def test_faults_are_found_before_the_first_iteration(settings: str, message: str, make):
     with pytest.raises(SpecError, match=message):
         make(settings=settings)

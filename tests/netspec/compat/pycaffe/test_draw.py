@@ -8,6 +8,7 @@ import pytest
 from google.protobuf import text_format
 
 import netspec.compat.pycaffe.draw as draw
+from case_files import read_texts
 from each import each, last_parts
 from netspec.compat.pycaffe.proto import caffe_pb2
 from netspec.errors import SpecError
@@ -15,17 +16,7 @@ from paths import ROOT
 
 pydot = pytest.importorskip("pydot")
 
-NET = """
-name: "small"
-layer { name: "mnist" type: "Data" top: "data" top: "label" data_param { batch_size: 64 } include { phase: TRAIN } }
-layer { name: "input" type: "Input" top: "data" include { phase: TEST } }
-layer { name: "conv/1" type: "Convolution" bottom: "data" top: "conv" param { lr_mult: 2 }
-  convolution_param { num_output: 20 kernel_size: 5 pad: 1 } }
-layer { name: "relu" type: "ReLU" bottom: "conv" top: "conv" }
-layer { name: "pool" type: "Pooling" bottom: "conv" top: "pool" pooling_param { pool: AVE kernel_size: 3 stride: 2 } }
-layer { name: "ip" type: "InnerProduct" bottom: "pool" top: "ip" inner_product_param { num_output: 10 } }
-layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" exclude { phase: TEST } }
-"""
+(NET,) = read_texts("netspec/compat/pycaffe/draw.txt").values()
 
 
 @pytest.fixture

@@ -12,24 +12,12 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
+from case_files import read_texts
 from paths import ROOT
 
 INPUT = 'force_backward: true input: "data" input_shape { dim: 1 dim: 3 dim: 12 dim: 12 }\n'
 # The shape of MTCNN's first net: fully convolutional, run on an image pyramid.
-PYRAMID = (
-    INPUT
-    + """
-layer { name: "conv1" type: "Convolution" bottom: "data" top: "conv1"
-  convolution_param { num_output: 10 kernel_size: 3 weight_filler { type: "xavier" } } }
-layer { name: "PReLU1" type: "PReLU" bottom: "conv1" top: "conv1" }
-layer { name: "pool1" type: "Pooling" bottom: "conv1" top: "pool1" pooling_param { kernel_size: 2 stride: 2 } }
-layer { name: "conv4-1" type: "Convolution" bottom: "pool1" top: "conv4-1"
-  convolution_param { num_output: 2 kernel_size: 1 weight_filler { type: "xavier" } } }
-layer { name: "conv4-2" type: "Convolution" bottom: "pool1" top: "conv4-2"
-  convolution_param { num_output: 4 kernel_size: 1 weight_filler { type: "xavier" } } }
-layer { name: "prob1" type: "Softmax" bottom: "conv4-1" top: "prob1" }
-"""
-)
+PYRAMID, ROUNDS = read_texts("netspec/compat/pycaffe/memory.txt").values()
 
 
 def image(*shape: int) -> np.ndarray:
@@ -471,36 +459,11 @@ X = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 
 FOUR = 'layer { name: "ip" type: "InnerProduct" bottom: "x" top: "ip" inner_product_param { num_output: 4 } }\n'
 
 
-@pytest.mark.parametrize(
-    ("layers", "place", "check"),
-    [
-        ('layer { name: "a" type: "Foo" bottom: "x" top: "a" }', "2:19", "== 1 (0 vs. 1) Unknown layer type: Foo"),
-        ('layer { name: "a" type: "ReLU" bottom: "b" top: "a" }', "2:32", "(Unknown bottom blob 'b' (layer 'a'))"),
-        (
-            'layer { name: "c" type: "Convolution" bottom: "x" top: "c" convolution_param { num_output: 1 } }',
-            "2:60",
-            "Check failed: kernel_shape_data[i] > 0 Filter dimensions must be nonzero.",
-        ),
-        (
-            FOUR + 'layer { name: "c" type: "Concat" bottom: "x" bottom: "ip" top: "c" concat_param { axis: 0 } }',
-            "3:46",
-            "All inputs must have the same shape, except at concat_axis.",
-        ),
-        (
-            FOUR + 'layer { name: "e" type: "Eltwise" bottom: "x" bottom: "ip" top: "e" }',
-            "3:47",
-            "Check failed: bottom[0]->shape() == bottom[i]->shape()",
-        ),
-        (
-            FOUR + 'layer { name: "l" type: "SoftmaxWithLoss" bottom: "ip" bottom: "x" top: "l" }',
-            "3:56",
-            "(2 vs. 384) Number of labels must match number of predictions; e.g., if softmax axis == 1 and prediction",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("said", "layers"), read_texts("netspec/compat/pycaffe/cases/checks.txt").items())
 def test_a_failed_check_has_caffes_words_and_the_place(
-    net_of: Callable[..., caffe.Net], layers: str, place: str, check: str
+    net_of: Callable[..., caffe.Net], layers: str, said: str
 ) -> None:
+    place, _, check = said.partition(" ")
     with pytest.raises(ValueError, match=rf"net\.prototxt:{place}: ") as fault:
         net_of(X + layers)
     assert check in str(fault.value)
@@ -516,32 +479,6 @@ def test_a_failed_check_of_a_pass_has_caffes_words(net_of: Callable[..., caffe.N
     (tmp_path / "bad.caffemodel").write_text("words")
     with pytest.raises(ValueError, match=r"bad\.caffemodel: .*Failed to parse NetParameter file: .*bad\.caffemodel"):
         net.copy_from(tmp_path / "bad.caffemodel")
-
-
-ROUNDS = """
-import netspec.pycaffe as caffe
-net = caffe.Net("net.prototxt", caffe.TRAIN)
-solver = None
-
-def resident():
-    return int(open("/proc/self/statm").read().split()[1]) * 4096
-
-def rounds(count):
-    for i in range(count):
-        size = 12 + 4 * (i % 5)
-        net.blobs["data"].reshape(1 + i % 2, 3, size, size)
-        net.blobs["data"].data[...] = i % 7
-        out = net.forward()
-        if i % 3:
-            net.backward()
-        if i % 50 == 0:
-            held = [blob.data for blob in net.blobs.values()]
-
-rounds(300)
-before = resident()
-rounds(2000)
-print(resident() - before)
-"""
 
 
 @pytest.mark.slow

@@ -6,21 +6,11 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
+from case_files import read_texts
 
 FILLERS = 'weight_filler { type: "gaussian" std: 0.2 } bias_filler { type: "uniform" min: -1 max: 1 }'
 RELU = 'layer { name: "relu" type: "ReLU" bottom: "data" top: "relu" }'
-NET = f"""
-layer {{ name: "data" type: "Input" top: "data" input_param {{ shape {{ dim: 2 dim: 8 dim: 40 dim: 40 }} }} }}
-layer {{ name: "conv" type: "Convolution" bottom: "data" top: "conv"
-  convolution_param {{ num_output: 16 kernel_size: 3 {FILLERS} }} }}
-layer {{ name: "bn" type: "BatchNorm" bottom: "conv" top: "conv" }}
-layer {{ name: "scale" type: "Scale" bottom: "conv" top: "conv" scale_param {{ bias_term: true }} }}
-layer {{ name: "relu" type: "ReLU" bottom: "conv" top: "conv" }}
-layer {{ name: "drop" type: "Dropout" bottom: "conv" top: "kept" }}
-layer {{ name: "flat" type: "Flatten" bottom: "conv" top: "flat" }}
-layer {{ name: "ip" type: "InnerProduct" bottom: "flat" top: "ip" inner_product_param {{ num_output: 5 {FILLERS} }} }}
-layer {{ name: "prob" type: "Softmax" bottom: "ip" top: "prob" }}
-"""
+(NET,) = read_texts("netspec/compat/pycaffe/prepared.txt").values()
 
 
 @pytest.fixture

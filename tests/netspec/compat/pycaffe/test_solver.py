@@ -11,14 +11,11 @@ import netspec
 import netspec.pycaffe as caffe
 from benchmarks.case import training_case
 from benchmarks.zoo import ZOO
+from case_files import read_texts
 from netspec.compat.pycaffe import mode
 from pycaffe_nets import CLASSES, SMALL
 
-SETTINGS = """
-net: "net.prototxt" test_iter: 10 test_interval: 10 base_lr: 0.01 momentum: 0.9 weight_decay: 0.0005
-lr_policy: "inv" gamma: 0.0001 power: 0.75 display: 100 max_iter: 100 snapshot_after_train: false
-snapshot_prefix: "model"
-"""
+SETTINGS, MEMORY = read_texts("netspec/compat/pycaffe/solver.txt").values()
 
 
 @pytest.fixture
@@ -103,19 +100,6 @@ def test_blobs_show_each_iteration(solver: caffe.SGDSolver) -> None:
         seen.append(float(kept))
         assert solver.net.blobs["maps"].diff.any()
     assert len(set(seen)) == 5
-
-
-MEMORY = """
-layer { name: "data" type: "MemoryData" top: "data" top: "label"
-        memory_data_param { batch_size: 4 channels: 2 height: 6 width: 6 } }
-layer { name: "filters" type: "Convolution" bottom: "data" top: "maps"
-        convolution_param { num_output: 3 kernel_size: 3 weight_filler { type: "xavier" } } }
-layer { name: "relu" type: "ReLU" bottom: "maps" top: "maps" }
-layer { name: "drop" type: "Dropout" bottom: "maps" top: "maps" }
-layer { name: "scores" type: "InnerProduct" bottom: "maps" top: "scores"
-        inner_product_param { num_output: 5 weight_filler { type: "xavier" } } }
-layer { name: "loss" type: "SoftmaxWithLoss" bottom: "scores" bottom: "label" top: "loss" }
-"""
 
 
 @pytest.mark.parametrize("net", [SMALL, MEMORY], ids=["constant labels", "data in memory"])

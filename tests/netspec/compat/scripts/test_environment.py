@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from case_files import read_texts
 from paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -106,25 +107,7 @@ def test_a_real_caffe_elsewhere_on_the_path_is_refused(environment: Path, monkey
     assert "caffe.py: is there already" in run(environment, "python", "-m", "netspec", "install-caffe", rc=1).stderr
 
 
-CREATE = """#!/usr/bin/env sh
-# Make a database, its mean and a net, as Caffe's own shell scripts do.
-set -e
-
-EXAMPLE=examples/mnist
-DATA=data/mnist
-BUILD=build/examples/mnist
-TOOLS=./build/tools
-BACKEND="lmdb"
-
-rm -rf $EXAMPLE/mnist_train_${BACKEND}
-$BUILD/convert_mnist_data.bin $DATA/train-images-idx3-ubyte \\
-  $DATA/train-labels-idx1-ubyte $EXAMPLE/mnist_train_${BACKEND} --backend=${BACKEND}
-$TOOLS/compute_image_mean -backend=$BACKEND $EXAMPLE/mnist_train_$BACKEND $EXAMPLE/mean.binaryproto
-GLOG_logtostderr=1 $TOOLS/convert_imageset --resize_height=4 --resize_width=4 --gray \\
-  $DATA/ $DATA/list.txt $EXAMPLE/images_lmdb
-$TOOLS/caffe train --solver=$EXAMPLE/lenet_solver.prototxt $@
-$TOOLS/caffe.bin test -model $EXAMPLE/net.prototxt -weights $EXAMPLE/lenet_iter_2.caffemodel -iterations 1
-"""
+(CREATE,) = read_texts("netspec/compat/scripts/environment.txt").values()
 
 
 def test_shell_scripts_find_the_commands_where_caffe_is_built(environment: Path) -> None:

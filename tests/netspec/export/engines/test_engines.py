@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import netspec
+from case_files import read_texts
 from netspec.cli import main
 from netspec.errors import SpecError
 from netspec.export.engines import choice, runners
@@ -21,16 +22,7 @@ from netspec.inspect.features.describer import Describer
 from netspec.inspect.features.records import extract_records
 
 ENGINES = ["onnxruntime", "openvino"]
-NET = """
-name: "small"
-layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 3 dim: 12 dim: 12 } } }
-layer { name: "conv" type: "Convolution" bottom: "data" top: "conv"
-  convolution_param { num_output: 4 kernel_size: 3 weight_filler { type: "gaussian" std: 0.3 } } }
-layer { name: "relu" type: "ReLU" bottom: "conv" top: "conv" }
-layer { name: "pool" type: "Pooling" bottom: "conv" top: "pool" pooling_param { kernel_size: 3 stride: 2 } }
-layer { name: "feat" type: "InnerProduct" bottom: "pool" top: "feat"
-  inner_product_param { num_output: 5 weight_filler { type: "gaussian" std: 0.3 } } }
-"""
+NET, FIRST_GOES_FIRST = read_texts("netspec/export/engines/engines.txt").values()
 
 
 @pytest.fixture(params=ENGINES)
@@ -316,17 +308,7 @@ def test_a_kept_net_describes_images_without_torch(engine: str, files: Path) -> 
     (files / "images").mkdir()
     for k in range(17):  # more than a batch
         cv2.imwrite(f"images/{k}.png", np.random.default_rng(k).integers(0, 256, (20, 20, 3), np.uint8))
-    words = [
-        "extract",
-        "--model",
-        "net.prototxt",
-        "--weights",
-        "net.caffemodel",
-        "--blob",
-        "feat",
-        "--images",
-        "images",
-    ]
+    words = "extract --model net.prototxt --weights net.caffemodel --blob feat --images images".split()
     assert main([*words, "--out", "expected.npz"]) == 0
     assert main([*words, "--out", "first.npz", "--engine", engine]) == 0
     code = "import sys; from netspec.cli import main; sys.exit(main(sys.argv[1:]) or 10 * ('torch' in sys.modules))"
@@ -350,27 +332,6 @@ def test_warnings_of_the_files_are_given_at_every_start(
         (line,) = caplog.messages
         assert "lacks weights for 1 of the net's 2 layers that have any: conv_renamed" in line
     assert len(entries(files)) == 1
-
-
-FIRST_GOES_FIRST = """
-import gc, signal, sys
-import netspec, numpy as np
-
-def load():
-    net = netspec.load_net("net.prototxt", weights="net.caffemodel", engine="openvino", precision=sys.argv[1])
-    net(data=np.zeros((2, 3, 12, 12), np.float32))
-    return net
-
-heard = []
-first, second = load(), load()
-del first
-gc.collect()
-del second
-gc.collect()
-signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
-signal.raise_signal(signal.SIGTERM)
-assert heard == [signal.SIGTERM]
-"""
 
 
 @pytest.mark.slow

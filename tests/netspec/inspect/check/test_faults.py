@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import netspec
-from case_files import read_cases
+from case_files import read_cases, read_texts
 from netspec.data.blobs import from_array
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
@@ -20,26 +20,8 @@ from netspec.data.mean import write_mean
 
 Run = Callable[..., Any]  # the fixture of conftest.py
 
-SOLVER = """net: "net.prototxt"
-base_lr: 0.1
-lr_policy: "fixed"
-max_iter: 1
-snapshot_after_train: false
-solver_mode: CPU
-"""
-NET = """layer { name: "data" type: "DummyData" top: "data" top: "label"
-  dummy_data_param { shape { dim: 4 dim: 3 } shape { dim: 4 dim: 2 } } }
-layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip" param { lr_mult: 1 }
-  inner_product_param { num_output: 2
-    weight_filler { type: "xavier" }
-    bias_filler { type: "constant" } } }
-layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "label" top: "loss" }
-"""
+SOLVER, NET, READS = read_texts("netspec/inspect/check/faults.txt").values()
 #: A net that reads from the database ``%s``.
-READS = """layer { name: "d" type: "Data" top: "data" top: "label"
-  data_param { source: "%s" backend: LMDB batch_size: 2 } }
-layer { name: "hush" type: "Silence" bottom: "data" bottom: "label" }
-"""
 # The files of each, where they are not the two above, and how each line begins that says what is wrong with them.
 CASES = read_cases("netspec/inspect/check/cases/faults.txt")
 FOUND_IN_DATA = read_cases("netspec/inspect/check/cases/faults_in_data.txt")

@@ -11,6 +11,7 @@ import pytest
 import torch
 from google.protobuf import text_format
 
+from case_files import read_texts
 from netspec.cli import main
 from netspec.data.images import read_image
 from netspec.errors import SpecError
@@ -24,19 +25,7 @@ from netspec.proto.schema import TEST, TRAIN, LayerParameter
 from netspec.solver.solver import load_solver
 
 MIB = 1 << 20
-PARAMETERS = """
-layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 1024 } } }
-layer { name: "one" type: "InnerProduct" bottom: "data" top: "one" inner_product_param { num_output: 1024 } }
-layer { name: "two" type: "InnerProduct" bottom: "one" top: "two" inner_product_param { num_output: 60000 } }
-"""
-DUMMY = """
-layer { name: "first" type: "DummyData" top: "data" dummy_data_param { shape { dim: 64 dim: 1000 dim: 1000 } } }
-layer { name: "loss" type: "EuclideanLoss" bottom: "data" bottom: "data" top: "loss" }
-"""
-HUGE = """
-layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1000000 } } }
-layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip" inner_product_param { num_output: 4000000 } }
-"""
+PARAMETERS, DUMMY, HUGE = read_texts("netspec/inspect/check/limit.txt").values()
 CHAIN = 'layer { name: "data" type: "Input" top: "0" input_param { shape { dim: 1 dim: 1048576 } } }\n' + "".join(
     f'layer {{ name: "r{i}" type: "AbsVal" bottom: "{i}" top: "{i + 1}" }}\n' for i in range(10)
 )

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from case_files import read_texts
 from netspec.cli import main
 from netspec.inspect.check.check import ON_META
 from netspec.inspect.check.findings import RULES
@@ -13,9 +14,6 @@ from netspec.inspect.check.lint import Linted, lint_file
 from netspec.proto.text import parse_net
 from paths import ROOT
 
-INPUT = (
-    'layer { name: "in" type: "Input" top: "x" top: "t" input_param { shape { dim: 2 dim: 3 } shape { dim: 2 } } }\n'
-)
 DUMMY = """layer { name: "d" type: "DummyData" top: "x" top: "t"
   dummy_data_param { shape { dim: 2 dim: 3 dim: 4 dim: 4 } shape { dim: 2 } } }
 """
@@ -58,52 +56,14 @@ def test_nothing_is_found_in_a_sound_net_and_solver() -> None:
     assert found(DUMMY + CONV.replace("num_output", "bias_term: false num_output") + NORM + IP + LOSS) == []
 
 
-FREE = "lr_mult: 0"
-BN_TRUE = "batch_norm_param { use_global_stats: true }"
-
-
-@pytest.mark.parametrize(
-    ("net", "lines"),
-    [
-        (DUMMY + CONV + NORM + IP + LOSS, ["bias-before-batchnorm 4:3"]),
-        (SOUND.replace(f"num_output: 2 kernel_size: 1 {FILLED}", "num_output: 2 kernel_size: 1"), ["zero-weights 4:3"]),
-        (SOUND + 'layer { name: "r" type: "ReLU" bottom: "f" top: "r" }', ["unused-blob 8:1"]),
-        (
-            DUMMY + CONV + IP + LOSS.replace('top: "l" }', 'top: "l"\n  loss_weight: 0 }')
-            + LOSS.replace('name: "l"', 'name: "m"').replace('top: "l"', 'top: "m"'),
-            ["loss-without-weight 8:3"],
-        ),
-        (
-            DUMMY + CONV.replace("num_output", "bias_term: false num_output")
-            + NORM.replace('top: "c" }\n', f'top: "c"\n  {BN_TRUE} }}\n', 1) + IP + LOSS,
-            ["global-stats-in-training 6:22"],
-        ),
-        (INPUT.replace("dim: 3", "dim: 3 dim: 4 dim: 4") + CONV
-         + NORM.replace('top: "c" }\n', f'top: "c" {BN_TRUE.replace("true", "false")} }}\n', 1),
-         ["batch-stats-in-test 4:77"]),
-        (DUMMY + CONV + IP.replace('"f"', '"e"') + 'layer { name: "p" type: "Softmax" bottom: "e" top: "f" }\n' + LOSS,
-         ["softmax-twice 8:1"]),
-        (INPUT.replace("dim: 3", "dim: 3 dim: 4 dim: 4") + CONV + NORM.splitlines()[0],
-         ["batchnorm-without-scale 4:1"]),
-        (
-            DUMMY + CONV + IP + LOSS + CONV.replace('"c"', '"e"')
-            + 'layer { name: "hush" type: "Silence" bottom: "e" }',
-            ["never-learns 8:1"],
-        ),
-        (SOUND.replace(LOSS, "") + 'layer { name: "a" type: "Threshold" bottom: "f" top: "g" }\n'
-         + LOSS.replace('bottom: "f"', 'bottom: "g"'), ["caffe-stops 7:37"]),
-        (SOUND.replace("top: \"c\"\n", f'top: "c" param {{ {FREE} }} param {{ {FREE} }}\n')
-         .replace("top: \"f\"\n", f'top: "f" param {{ {FREE} }} param {{ {FREE} }}\n'), ["loss-learns-nothing 7:1"]),
-    ],
-    ids=lambda value: value[0].split()[0] if isinstance(value, list) else "",
-)  # fmt: skip
-def test_rules_for_nets(net: str, lines: list[str]) -> None:
-    assert found(net) == lines
+@pytest.mark.parametrize(("rule", "net"), read_texts("netspec/inspect/check/cases/rules.txt").items())
+def test_rules_for_nets(rule: str, net: str) -> None:
+    name, place = rule.split()[:2]
+    assert found(net) == [f"{name} {place}"]
     (first, *_) = lint(net).found
-    line, name = lines[0].split()[1].split(":")[0], lines[0].split()[0]
     with_comment = net.split("\n")
-    with_comment.insert(int(line) - 1, f"# lint: ignore={name}")
-    assert found("\n".join(with_comment)) == lines[1:]
+    with_comment.insert(int(place.split(":")[0]) - 1, f"# lint: ignore={name}")
+    assert found("\n".join(with_comment)) == []
     assert first.rule in RULES
     assert ";" in first.message or "does not" in first.message
 

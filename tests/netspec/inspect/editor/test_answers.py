@@ -4,23 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from case_files import read_texts
 from netspec.inspect.editor.answers import ERROR, HINT, WARNING, completion, definition, file_faults, hover, text_faults
 
-NET = """name: "n"  # a net
-layer { name: "in" type: "Input" top: "x" input_param { shape { dim: 1 dim: 3 dim: 8 dim: 8 } } }
-layer {
-  name: "c"
-  type: "Convolution"
-  bottom: "x"
-  top: "c"
-  param { name: "w" }
-  convolution_param { num_output: 2 kernel_size: 3 weight_filler { type: "xavier" } }
-}
-layer { name: "r" type: "ReLU" bottom: "c" top: "c" }
-layer { name: "p" type: "Pooling" bottom: "c" top: "p" pooling_param { pool: MAX kernel_size: 2 } }
-layer { name: "d" type: "Convolution" bottom: "x" top: "d" param { name: "w" }
-  convolution_param { num_output: 2 kernel_size: 3 } }
-"""
+(NET,) = read_texts("netspec/inspect/editor/answers.txt").values()
 
 
 def at(mark: str, text: str = NET) -> tuple[str, int]:
