@@ -85,8 +85,9 @@ def said_once(found: Iterable[Finding]) -> list[str]:
             alike.append(each)
     lines = []
     for first, *others in places.values():
-        also = ", ".join(str(each.where.line) for each in others)
-        lines.append(f"{first}{f' (also in {len(others)} more places, lines {also})' if others else ''}")
+        also = ", ".join(str(each.where.line) for each in others if each.where.line)  # a binary file has no lines
+        more = f" (also in {len(others)} more places{also and f', lines {also}'})" if others else ""
+        lines.append(f"{first}{more}")
     return lines
 
 

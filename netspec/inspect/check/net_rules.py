@@ -13,7 +13,18 @@ from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN, NetParameter, fields_of
 from netspec.proto.source_map import SourceMap
 
-WITHOUT_GRADIENT = frozenset({"Threshold", "ArgMax"})
+WITHOUT_GRADIENT = frozenset({"Accuracy", "ArgMax", "Threshold"})
+OLD_ACCESSORS = 4  # axes: more are a fault of num(), channels(), height() and width() of Caffe's blobs
+AXES = {  # how many axes the bottoms of a layer may have in Caffe, where it has more or fewer here
+    "BatchReindex": (1, 32),
+    "ContrastiveLoss": (1, OLD_ACCESSORS),
+    "EuclideanLoss": (1, OLD_ACCESSORS),
+    "HingeLoss": (1, OLD_ACCESSORS),
+    "MultinomialLogisticLoss": (1, OLD_ACCESSORS),
+    "PReLU": (2, OLD_ACCESSORS),
+    "SigmoidCrossEntropyLoss": (1, 32),
+}
+STOCHASTIC = 2  # caffe.proto: PoolingParameter.PoolMethod
 BEFORE_NET = ("mean_value", "mean_file", "scale")  # of transform_param: what changes all images alike
 
 
@@ -184,11 +195,20 @@ def _losses(net: Net) -> Said:
 
 @rule("caffe-stops", NET)
 def _caffe_stops(net: Net) -> Said:
-    """Caffe ends the program at layers that compute no gradient where one is asked for.
+    """Caffe ends the program at blobs of more axes than some layers can name, and where a gradient is asked for that
+    a layer does not compute.
 
-    Here such a net runs: no gradient passes.
+    Here such a net runs; no gradient passes there.
     """
     for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
+        for j, shape in enumerate(layer.bottom_shapes):
+            fewest, most = AXES.get(node.type, (0, 32))
+            if not fewest <= len(shape) <= most:
+                message = f"Caffe stops here: {node.type} takes {fewest} to {most} axes, bottom {j} has {len(shape)}"
+                yield _place(net.plan, i, "bottom", j), f"{message}; put a Reshape before it"
+        if node.type == "Pooling" and net.plan.net.layer[i].pooling_param.pool == STOCHASTIC:
+            message = "Caffe stops here without a GPU: STOCHASTIC pooling is written for CUDA alone; set another pool"
+            yield _place(net.plan, i, "pooling_param", "pool"), message
         asked = net.backward_plan.bottoms[i] if net.phase == TRAIN and net.backward_plan.layers[i] else ()
         for j, wanted in enumerate(asked):
             if wanted and (node.type in WITHOUT_GRADIENT or j in layer.label_bottoms):

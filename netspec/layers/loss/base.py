@@ -106,6 +106,7 @@ class ClassLoss(Loss, Classified):
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shapes = super().reshape(bottom_shapes)
         data, labels = bottom_shapes
+        self.canonical_axis(0, data, "bottom")
         self.reshape_scores([(data[0], math.prod(data[1:])), labels], 1)
         return shapes
 
