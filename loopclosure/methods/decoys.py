@@ -182,7 +182,7 @@ def search(given: Candidates, setting: Setting) -> Lines:
         if sequence is not None:
             fits = np.where(allowed, -_along(distances, replace(sequence, length=MIDDLE))[inner], np.nan)
             middle[here] = _fits(fits, match[here], targets[here])
-    ratio = forward.shape[1] / count if given.two else 1.0
+    ratio = len(forward[0]) / count if given.two else 1.0
     owner = _owner(forward, match, setting.length)
     near = middle & (np.abs(owner - np.arange(count)) <= max(REACH, 1 / ratio))
     return Lines(setting, forward, np.where(np.isneginf(targets), -1, match), targets, decoys, near)

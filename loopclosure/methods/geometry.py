@@ -51,7 +51,8 @@ def try_geometry(given: Candidates, matches: Matches, check: GeometricCheck, agr
     accepted, match = matches.accepted, matches.match
     pairs, hidden = _unlike(given), ""
     if isinstance(agree, Between) and pairs:
-        agree = agree.without_fixed([(int(given.queries[q]), int(given.references[r])) for q, r in pairs])
+        fixed = pairs + _left(given)
+        agree = agree.without_fixed([(int(given.queries[q]), int(given.references[r])) for q, r in fixed])
         if agree.hidden:
             hidden = f" ({100 * agree.hidden:.1f} % of the image never changes, and is left out)"
 
@@ -97,6 +98,14 @@ def _unlike(given: Candidates) -> list[tuple[int, int]]:
         # One of the least alike quarter, another quarter of them each time.
         pairs.append((int(query), int(candidates[int(query) % max(1, len(candidates) // 4)])))
     return pairs
+
+
+def _left(given: Candidates) -> list[tuple[int, int]]:
+    """Return pairs of one drive whose second place was left just before: other places in the same light."""
+    if given.two:
+        return []
+    queries = _sample(np.flatnonzero(given.allowed.any(axis=1)))
+    return [(int(query), int(np.flatnonzero(given.allowed[query])[-1])) for query in queries]
 
 
 def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: Geometry, progress: Progress) -> None:

@@ -1,15 +1,17 @@
 """Loops without settings: what sequences, decoys and verification decide, on drives whose truth is known."""
 
+import re
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import Recording, verdicts_said
-from loopclosure.detector.verification import Agreement, GeometricCheck
+from loopclosure.detector.verification import Agreement, Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods import decoys
 from loopclosure.methods import drive as whole
@@ -17,6 +19,7 @@ from loopclosure.methods.auto import answer
 from loopclosure.methods.base import Images, MethodContext, MethodResult
 from loopclosure.methods.candidates import candidates, far_apart
 from loopclosure.methods.decoys import threshold
+from loopclosure.methods.geometry import try_geometry
 from loopclosure.methods.named import make_method
 from loopclosure.progress import silent
 
@@ -193,6 +196,22 @@ def test_a_desk_of_which_all_images_show_something():
     alike_ones = rows[np.arange(200)] @ rows.T > 0.7
     assert alike_ones[np.arange(200), found.match][found.accepted].all()
     assert np.count_nonzero(found.accepted) > 150
+
+
+@pytest.mark.slow
+def test_what_is_fixed_in_one_pass_alone_is_left_out():
+    """A hood that the sun lights in the second pass; the least alike frames of it are those of the first."""
+    rng, passes = np.random.default_rng(4), np.arange(80) // 40
+    images = [cv2.resize(rng.integers(0, 256, (15, 20)).astype(np.uint8), (160, 120)) for _ in passes]
+    hood = cv2.resize(rng.integers(0, 256, (8, 40)).astype(np.uint8), (160, 32), interpolation=cv2.INTER_CUBIC)
+    for image in images[40:]:
+        image[:32] = hood
+    scores = rng.random((80, 80)) + (passes[:, None] == passes)
+    given = candidates(scores, np.ones((80, 80), bool), False, None, 10)
+    check = GeometricCheck()
+    between = Between(check, Pairs(lambda number: images[number]), range(80), range(80))
+    said = try_geometry(given, decoys.Matches.of(given, None, 0.99), check, between).said
+    assert re.search(r"(2\d|3\d)[.]\d % of the image", said), said
 
 
 @pytest.mark.slow
