@@ -2,13 +2,15 @@
 
 ``map.json`` says which net describes the frames. A session is a folder ``000000``, ``000001``, ... that appears when it
 is complete and never changes: whoever reads a map meanwhile reads the sessions before. ``projection.npz`` has the
-principal directions of all sessions, by which long descriptors are shortened when the map is opened.
+principal directions of all sessions, by which long descriptors are shortened, and ``projected-N`` the descriptors that
+the one learned from N frames shortened.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,13 +50,26 @@ class Session:
     arrays: dict[str, Any]
     points: Points
 
-    def blocks(self, start: int = 0) -> Iterator[np.ndarray]:
-        """Yield the descriptors (n, views D) float32 from frame ``start`` on."""
+    def blocks(self, start: int = 0, projection: Whitening | None = None, views: int = 1) -> Iterator[np.ndarray]:
+        """Yield the descriptors (n, views D) float32 from frame ``start`` on, each view projected by itself."""
+        kept = None if projection is None else self._projected(projection, views)
         for first in range(start, len(self.names), BLOCK):
-            rows = self.arrays["rows"][first : first + BLOCK].astype(np.float32)
+            rows = (self.arrays["rows"] if kept is None else kept)[first : first + BLOCK].astype(np.float32)
             if not np.all(np.isfinite(rows)):
                 raise InputError(f"has a number that is not finite; expected {SESSION}", self.folder / "rows.npy")
-            yield rows
+            yield rows if projection is None or kept is not None else shortened(rows, projection, views)
+
+    def _projected(self, projection: Whitening, views: int) -> Rows | None:
+        """Return the descriptors that this projection shortened before; None where they are not there."""
+        try:
+            kept = Rows(self.projected(projection), SESSION)
+        except (ValueError, OSError):
+            return None
+        return kept if kept.shape == (len(self.names), views * COMPONENTS) and kept.dtype == np.float32 else None
+
+    def projected(self, projection: Whitening) -> Path:
+        """Return the file of what a projection shortens."""
+        return self.folder.with_name(f"projected-{projection.images}") / f"{self.folder.name}.npy"
 
 
 class Map:
@@ -121,7 +136,7 @@ class Map:
         for session in self.sessions:
             skipped = min(there, len(session.names))
             there -= skipped
-            blocks = (described.shortened(rows) for rows in session.blocks(skipped))
+            blocks = session.blocks(skipped, described.projection, views)
             detector.take_session(blocks, session.arrays, session.points)
         detector.begin_session()
         return detector
@@ -159,6 +174,7 @@ class Map:
                 write_loops_csv(unfinished / "loops.csv", [r for r in results if r], detector.stamps, every)
             self._read_sessions()
             self._learn_projection(described.views)
+            self._project(described.views)
         return results
 
     def _projection(self, index: str) -> Whitening | None:
@@ -171,13 +187,16 @@ class Map:
             size = len(arrays["mean"])
             check_array(arrays, "mean", "f", (size,))
             check_array(arrays, "projection", "f", (size, COMPONENTS))
+            images = int(arrays.get("images", 0))  # files from before it do not have it
         except (ValueError, LookupError, TypeError) as error:
             raise InputError(f"{error}; remove it, and loopclosure map add makes it again", path) from None
-        return Whitening(arrays["mean"], arrays["projection"], 0, 0, str(path))
+        return Whitening(arrays["mean"], arrays["projection"], images, 0, str(path))
 
     def _learn_projection(self, views: int) -> None:
+        """Learn the projection, and again once there are twice as many frames."""
         count, size = len(self), self.sessions[-1].arrays["rows"].shape[1] // views
-        if count < LEARNED_FROM or size <= COMPONENTS:
+        before = self._projection("exact")
+        if count < max(LEARNED_FROM, 2 * before.images if before else 0) or size <= COMPONENTS:
             return
         wanted = np.linspace(0, count - 1, LEARNED_FROM).round().astype(int)
         parts, first = [], 0
@@ -191,7 +210,23 @@ class Map:
         if learned.projection.shape[1] < COMPONENTS:
             return
         with whole_file(self.folder / "projection.npz") as unfinished, unfinished.open("wb") as stream:
-            np.savez(stream, mean=learned.mean, projection=learned.projection)
+            np.savez(stream, mean=learned.mean, projection=learned.projection, images=np.array(count))
+
+    def _project(self, views: int) -> None:
+        """Write what the projection shortens, where it is not there, so that opening need not compute it."""
+        projection = self._projection("exact")
+        if projection is None:
+            return
+        for session in self.sessions:
+            path = session.projected(projection)
+            if not path.exists():
+                path.parent.mkdir(exist_ok=True)
+                rows = np.concatenate([*session.blocks(0, projection, views)])
+                with whole_file(path) as unfinished, unfinished.open("wb") as stream:
+                    np.save(stream, rows)
+        for folder in self.folder.glob("projected-*"):
+            if folder != path.parent:
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 class _Described:
@@ -200,7 +235,7 @@ class _Described:
     def __init__(self, describe: Describe, projection: Whitening | None) -> None:
         self.views = views_of(describe, None)
         self.kept: list[np.ndarray] = []
-        self._describe, self._projection = describe, projection
+        self._describe, self.projection = describe, projection
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):
@@ -208,15 +243,16 @@ class _Described:
         if not np.all(np.isfinite(row)):
             raise InputError("a descriptor has a number that is not finite in half precision, which ends at 65,504")
         self.kept.append(row[0])
-        return self.shortened(row.astype(np.float32))[0]
+        return shortened(row.astype(np.float32), self.projection, self.views)[0]
 
-    def shortened(self, rows: np.ndarray) -> np.ndarray:
-        """Return descriptors (n, views D) projected, each view by itself: (n, views 256)."""
-        if self._projection is None:
-            return rows
-        if rows.shape[1] % self.views:
-            raise InputError(f"descriptors of {rows.shape[1]} numbers are not of {self.views} views")
-        return np.hstack([self._projection.project(view) for view in np.split(rows, self.views, axis=1)])
+
+def shortened(rows: np.ndarray, projection: Whitening | None, views: int) -> np.ndarray:
+    """Return descriptors (n, views D) projected, each view by itself: (n, views 256)."""
+    if projection is None:
+        return rows
+    if rows.shape[1] % views:
+        raise InputError(f"descriptors of {rows.shape[1]} numbers are not of {views} views")
+    return np.hstack([projection.project(view) for view in np.split(rows, views, axis=1)])
 
 
 def checked_name(describer: str) -> str:

@@ -116,6 +116,24 @@ def test_long_descriptors_are_projected(drives: Path, tmp_path: Path, monkeypatc
     assert [result.accepted for result in results] == list(range(PLACES))
 
 
+@pytest.mark.slow
+def test_what_is_projected_is_kept(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(maps, "LEARNED_FROM", 9)
+    monkeypatch.setattr(maps, "COMPONENTS", 8)
+    opened, folder = Map.create(tmp_path / "M", "thumbnails"), tmp_path / "M"
+    opened.add(open_recording(drives / "a"), Thumbnailer())
+    assert [path.name for path in folder.glob("projected-*/*")] == ["000000.npy"]
+    expected = opened.detector(Thumbnailer()).descriptors
+    path = folder / "projected-10" / "000000.npy"
+    np.save(path, expected + 1)
+    np.testing.assert_array_equal(Map(folder).detector(Thumbnailer()).descriptors, expected + 1)  # not computed again
+    np.save(path, expected[:3])
+    np.testing.assert_allclose(Map(folder).detector(Thumbnailer()).descriptors, expected, rtol=1e-4)
+    opened.add(open_recording(drives / "b"), Thumbnailer())  # twice the frames, another projection
+    frames = len(opened)
+    assert {path.parent.name for path in folder.glob("projected-*/*")} == {f"projected-{frames}"}
+
+
 (DYING,) = read_texts("loopclosure/detector/map.txt").values()
 
 
