@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.run import Recording
-from loopclosure.report.page import Kind, Pair, png, rendered, side_by_side
+from loopclosure.report.page import Kind, Pair, png, rendered, side_by_side, spread
 from loopclosure.report.plots import AXES, COLORS, FOUND, MISSED, STYLE
 from netspec.files.whole_file import write_whole
 
@@ -126,10 +126,4 @@ def _pair(result: LoopResult, images: dict[int, np.ndarray], first: int) -> Pair
 
 
 def _spread(results: Sequence[LoopResult], count: int, frames: int) -> list[LoopResult]:
-    """Return the first results, without neighbors of those already taken, which look the same."""
-    taken: list[LoopResult] = []
-    for result in results:
-        apart = all(abs(result.query_id - other.query_id) >= frames / APART for other in taken)
-        if apart and len(taken) < count:
-            taken.append(result)
-    return taken
+    return [results[i] for i in spread([result.query_id for result in results], count, frames / APART)]

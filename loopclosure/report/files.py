@@ -147,17 +147,7 @@ def _rises(curve: PrecisionRecall) -> np.ndarray:
 def _write_matches_csv(evaluation: Evaluation, outcome: Outcome, path: Path) -> None:
     data, matches = evaluation.data, outcome.matches
     loops = data.truth.queries_with_a_loop
-    heads = [
-        "query",
-        "reference",
-        "score",
-        "verdict",
-        "soft zone",
-        "query has a loop",
-        "query image",
-        "reference image",
-        "truth and exclusion",
-    ]
+    heads = "query,reference,score,verdict,soft zone,query has a loop,query image,reference image,truth and exclusion"
     rows = []
     for query in np.flatnonzero(matches.reference >= 0):
         reference = int(matches.reference[query])
@@ -166,7 +156,7 @@ def _write_matches_csv(evaluation: Evaluation, outcome: Outcome, path: Path) -> 
         numbers = [str(query), str(reference), f"{matches.score[query]:.9g}", *verdicts, str(int(loops[query]))]
         images = [str(data.query_images[query]), str(data.references[reference])]
         rows.append([*numbers, *images, data.truth.description])
-    write_csv(path, heads, rows, "backslashreplace")
+    write_csv(path, heads.split(","), rows, "backslashreplace")
 
 
 def verdict(matches: BestMatches, query: int | np.intp) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import io
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -165,8 +166,12 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[Kind]:
     excused = plots.overlapping(outcome, wrong)
     lowest = np.argsort(true_scores, kind="stable")
 
+    alone = evaluation.data.reference_images is None
+    apart = max(1, len(evaluation.data.query_images) // 30) if alone else 1
+
     def pairs(queries: np.ndarray, references: np.ndarray) -> list[Pair]:
-        return [_pair(evaluation, outcome, queries[i], references[i]) for i in _spread(queries, evaluation)]
+        shown = spread(queries.tolist(), PAIRS_SHOWN, apart)
+        return [_pair(evaluation, outcome, queries[i], references[i]) for i in shown]
 
     both = "" if outcome.soft is None else " in both zones"
     kinds = [
@@ -178,12 +183,11 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[Kind]:
     return kinds if outcome.soft is not None else [kind for kind in kinds if kind.name != "excused"]
 
 
-def _spread(queries: np.ndarray, evaluation: Evaluation) -> list[int]:
-    """Return the indices of the first few queries, without neighbors of those already taken, which look the same."""
-    apart = max(1, len(evaluation.data.query_images) // 30) if evaluation.data.reference_images is None else 1
+def spread(frames: Sequence[int], count: int, apart: float) -> list[int]:
+    """Return the indices of the first ``count`` frames, without neighbors of those taken, which look the same."""
     taken: list[int] = []
-    for i, query in enumerate(queries):
-        if len(taken) < PAIRS_SHOWN and all(abs(int(query) - int(queries[other])) >= apart for other in taken):
+    for i, frame in enumerate(frames):
+        if len(taken) < count and all(abs(frame - frames[other]) >= apart for other in taken):
             taken.append(i)
     return taken
 
