@@ -21,6 +21,7 @@ _BOLD = (
     365, 712, 838,
 )  # fmt: skip
 _OTHERS = {"×": 838, "·": 318, "…": 1000, "\u00a0": 318}
+_NARROWEST = min(*_PLAIN, *_BOLD, *_OTHERS.values())
 
 
 def text_width(text: str, size: float, bold: bool = False) -> float:
@@ -33,7 +34,7 @@ def shortened(text: str, size: float, most: float, bold: bool = False) -> str:
     """Return a text that is at most so wide: its middle is left out where it must be."""
     if text_width(text, size, bold) <= most:
         return text
-    for kept in range(len(text) - 1, 1, -1):
+    for kept in range(min(len(text) - 1, int(most / size * 1000 / _NARROWEST)), 1, -1):
         short = text[: (kept + 1) // 2] + "…" + text[len(text) - kept // 2 :]
         if text_width(short, size, bold) <= most:
             return short
