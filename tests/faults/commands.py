@@ -92,7 +92,8 @@ def extract_inputs() -> None:
     images(12)
     Path("net.prototxt").write_text(
         'input: "data" input_dim: 1 input_dim: 3 input_dim: 48 input_dim: 64\n'
-        'layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip" inner_product_param { num_output: 5000\n'
+        'layer { name: "p" type: "Pooling" bottom: "data" top: "p" pooling_param { pool: AVE global_pooling: true } }\n'
+        'layer { name: "ip" type: "InnerProduct" bottom: "p" top: "ip" inner_product_param { num_output: 5000\n'
         'weight_filler { type: "constant" value: 0.01 } } }\n'
     )
 
