@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from case_files import read_texts
 from loopclosure.cli import main
 from paths import ROOT
 
@@ -213,26 +214,7 @@ def expanded(line: str, **names: object) -> list[str]:
     return parts
 
 
-@pytest.mark.parametrize(
-    ("line", "sentence"),
-    [
-        ("evaluate NOWHERE --method thumbnails --out OUT", "NOWHERE: no such folder"),
-        ("evaluate LAPS --method magic --out OUT", 'unknown method "magic"'),
-        ("evaluate LAPS/rgb --method thumbnails --out OUT", "has no truth, which says what frames show the same place"),
-        ("evaluate LAPS,start=50% --method thumbnails --out OUT", "no judged pair shows the same place"),
-        ("evaluate LAPS --method bow --train LAPS --out OUT", "test images are training images"),
-        ("evaluate LAPS --method features:NOWHERE.npz --out OUT", "NOWHERE.npz: no such file"),
-        ("detect NOWHERE --threshold 1 --out OUT", "cannot be read"),
-        ("detect LAPS --threshold 1 --describe nothing --out OUT", "expected module:function"),
-        ("similarity NOWHERE.npz --out OUT", "no such file"),
-        ("similarity FEATURES --out OUT/no/folder.npy", "cannot be written"),
-        ("detect LAPS --threshold 0.5 --out FEATURES", "FEATURES: File exists"),
-        (
-            "evaluate LAPS --exclude-seconds nan --method thumbnails --out OUT",
-            "cannot exclude 0 frames, nan s; expected 0 or more",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("sentence", "line"), read_texts("loopclosure/cases/faults.txt").items())
 def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_features, tmp_path, capsys):
     names = {"LAPS": two_laps, "OUT": tmp_path / "out", "FEATURES": two_laps_features}
     assert main(expanded(line, **names)) == 1
@@ -240,23 +222,7 @@ def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_fea
     assert sentence.replace("FEATURES", str(two_laps_features)) in printed
 
 
-@pytest.mark.parametrize(
-    ("line", "sentence"),
-    [
-        ("evaluate LAPS,camera=left --method thumbnails --out OUT", 'a sequence has no setting "camera"'),
-        ("evaluate images:LAPS --method thumbnails --out OUT", "needs ,truth=MASK"),
-        ("evaluate pairs:LAPS --fov 60 --method thumbnails --out OUT", "--fov is for sequences with poses, not for "),
-        ("evaluate LAPS,references=LAPS --exclude-seconds 3 --method thumbnails --out OUT", "nothing is near in time"),
-        ("detect LAPS --threshold 1 --with width --out OUT", "expected KEY=VALUE"),
-        ("detect LAPS --threshold 1 --features FEATURES --with width=8 --out OUT", "--with belongs to --describe"),
-        ("detect LAPS --resume OUT --metric cosine --out OUT", "leave out others"),
-        ("detect LAPS --top-k 3 --out OUT", "--top-k means nothing without --threshold"),
-        ("detect LAPS --verify --out OUT", "--verify means nothing without --threshold"),
-        ("detect LAPS --threshold 1 --odometry O --out OUT", "--odometry means nothing to a search frame by frame"),
-        ("similarity FEATURES --exclude-frames 3 --out OUT", "belongs to --top-k"),
-        ("similarity FEATURES --references FEATURES --top-k 1 --exclude-frames 3 --out OUT", "one sequence"),
-    ],
-)
+@pytest.mark.parametrize(("sentence", "line"), read_texts("loopclosure/cases/usage.txt").items())
 def test_options_that_do_not_go_together_are_one_line_and_status_2(
     line, sentence, two_laps, two_laps_features, tmp_path, capsys
 ):
@@ -290,17 +256,7 @@ def test_wrong_usage_is_status_2(line, capsys):
     assert "usage: loopclosure" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("evaluate --seed -1", "argument --seed: found -1, expected a number from 0 to 2147483647"),
-        ("close x --seed 99999999999", "argument --seed: found 99999999999, expected a number from 0 to"),
-        ("evaluate --max-distance nan", "argument --max-distance: found nan, expected a number above 0"),
-        ("evaluate --max-angle nan", "argument --max-angle: found nan, expected a number above 0"),
-        ("evaluate --soft-distance -1", "argument --soft-distance: found -1, expected a number above 0"),
-        ("evaluate --soft-angle 0", "argument --soft-angle: found 0, expected a number above 0"),
-    ],
-)
+@pytest.mark.parametrize(("said", "words"), read_texts("loopclosure/cases/numbers.txt").items())
 def test_numbers_that_mean_nothing_are_wrong_usage(words, said, capsys):
     assert main(words.split()) == 2
     assert said in capsys.readouterr().err
