@@ -1,13 +1,8 @@
 """All names of Caffe's Python interface; with them torch is loaded. Caffe: python/caffe/__init__.py."""
 
-import sys
-
 from netspec.compat.pycaffe import _caffe, classifier, coord_map, detector, draw, io, logs, net_spec, proto, pycaffe
 from netspec.compat.pycaffe._caffe import *  # noqa: F403, the compiled module's names, as in Caffe
 from netspec.compat.pycaffe.classifier import Classifier
 from netspec.compat.pycaffe.detector import Detector
 from netspec.compat.pycaffe.net_spec import NetSpec, layers, params, to_proto
-from netspec.layers.utility import pycaffe_shim
 from netspec.layers.utility.pycaffe_shim import TEST, TRAIN
-
-pycaffe_shim.offer(sys.modules[__name__.rpartition(".")[0]])

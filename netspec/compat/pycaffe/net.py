@@ -5,7 +5,6 @@ Caffe: python/caffe/_caffe.cpp, python/caffe/pycaffe.py
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import zip_longest
@@ -28,6 +27,8 @@ from netspec.net.build import build_net
 from netspec.net.weights import load_weights, write_binary, write_hdf5
 from netspec.proto.schema import PhaseValue
 from netspec.proto.text import parse_net
+
+pycaffe_shim.offer(__name__.rpartition(".")[0])  # Python layers may import all of it as caffe
 
 FilePath = str | bytes | Path
 Arrays = dict[str, np.ndarray]
@@ -90,7 +91,6 @@ class Net:
         return made
 
     def _hold(self, net: core.Net) -> None:
-        importlib.import_module("netspec.compat.pycaffe.interface")  # Python layers may import all of it as caffe
         mode.follow_seed(net.random)
         self.runner = runner = BlobRunner(net)
         names = [node.name for node in net.plan.nodes]

@@ -5,16 +5,17 @@ Caffe: python/caffe/_caffe.cpp
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from types import ModuleType
 from typing import Any, NoReturn
 
 from netspec.layers.utility.live_blobs import Blob, BlobVec
+from netspec.process.alias import AliasFinder
 
 TRAIN, TEST = 0, 1
 
@@ -41,15 +42,13 @@ def __getattr__(name: str) -> NoReturn:
     raise AttributeError(f"netspec's replacement for pycaffe has no {name}; it has Layer, TRAIN and TEST")
 
 
-_offered: dict[str, ModuleType] = {"caffe": sys.modules[__name__]}  # the modules that ``import caffe...`` gives
+_home = __name__  # of what ``import caffe`` gives
 
 
-def offer(package: ModuleType) -> None:
-    """Let the code of Python layers import ``package``, with what is in it, as ``caffe`` in place of this module."""
-    inside = f"{package.__name__}."
-    for name, module in list(sys.modules.items()):
-        if name == package.__name__ or name.startswith(inside):
-            _offered["caffe" + name[len(package.__name__) :]] = module
+def offer(package: str) -> None:
+    """Let the code of Python layers import a package, with what is in it, as ``caffe`` in place of this module."""
+    global _home
+    _home = package
 
 
 @contextmanager
@@ -58,15 +57,18 @@ def importable() -> Iterator[None]:
     directory = os.getcwd()
     sys.path.insert(0, directory)
     stand_in = "caffe" not in sys.modules and not _is_installed(directory)
+    finder = AliasFinder("caffe", _home)
     if stand_in:
-        sys.modules.update(_offered)
+        sys.modules["caffe"] = importlib.import_module(_home)
+        sys.meta_path.insert(0, finder)
     try:
         yield
     finally:
         sys.path.remove(directory)
         if stand_in:
-            for name in _offered:
-                sys.modules.pop(name, None)
+            sys.meta_path.remove(finder)
+            for name in [name for name in sys.modules if name == "caffe" or name.startswith("caffe.")]:
+                del sys.modules[name]
 
 
 def can_import(module: str) -> bool:

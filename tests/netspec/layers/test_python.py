@@ -183,9 +183,7 @@ def test_a_folder_of_caffes_sources_is_no_caffe(python, tmp_path: Path) -> None:
 def test_what_the_stand_in_lacks_is_named(python, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from netspec.layers.utility import pycaffe_shim
 
-    monkeypatch.setattr(
-        pycaffe_shim, "_offered", {"caffe": pycaffe_shim}
-    )  # as long as nobody has imported netspec.pycaffe
+    monkeypatch.setattr(pycaffe_shim, "_home", pycaffe_shim.__name__)  # as if nobody had imported netspec.pycaffe
     (tmp_path / "wants_more.py").write_text("import caffe\nnet = caffe.Net('a', 'b', caffe.TEST)\n")
     with pytest.raises(SpecError, match=r"netspec's replacement for pycaffe has no Net; it has Layer, TRAIN and TEST"):
         python("Mine", (2,), module="wants_more")

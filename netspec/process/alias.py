@@ -1,4 +1,4 @@
-"""A package that lies in this folder, under the shorter name that programs import."""
+"""A package under another name too, the one that programs import."""
 
 from __future__ import annotations
 
@@ -28,11 +28,14 @@ class Alias(importlib.abc.Loader):
         module.__spec__ = self.spec
 
 
-class _Finder(importlib.abc.MetaPathFinder):
+class AliasFinder(importlib.abc.MetaPathFinder):
+    """Finds what is in a package under its other name."""
+
     def __init__(self, name: str, home: str) -> None:
         self.name, self.home = name, home
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        """Return the spec of such a module, None for all others."""
         home = self.home + name.removeprefix(self.name)
         inside = name.startswith(f"{self.name}.") and importlib.util.find_spec(home)
         return ModuleSpec(name, Alias(home)) if inside else None
@@ -41,4 +44,4 @@ class _Finder(importlib.abc.MetaPathFinder):
 def alias(name: str, home: str) -> None:
     """Let ``name``, with all that lies in it, be the package ``home``: the same modules, each loaded once."""
     sys.modules[name] = importlib.import_module(home)
-    sys.meta_path.insert(0, _Finder(name, home))
+    sys.meta_path.insert(0, AliasFinder(name, home))
