@@ -22,16 +22,16 @@ from netspec.graph.filter import with_train_state
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.context import device_of
 from netspec.proto.text import parse_solver
+from netspec.solver import update
 from netspec.solver.checks import check_prefix
 from netspec.solver.extra import read_extra
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.options import TrainingOptions, choose_device
-from netspec.solver.precision import FP32
+from netspec.solver.precision import FP16, FP32
 from netspec.solver.processes import own_device
 from netspec.solver.resuming import Snapshots
 from netspec.solver.testing import Display, Tests
 from netspec.solver.training import Blobs, Training
-from netspec.solver.updating import Updates
 
 
 def load_solver(
@@ -109,11 +109,13 @@ def make_solver(
 
 
 class Solver(Training):
-    """A training: the loop, and its parts: tests, snapshots, updates, display (see Training for what they share)."""
+    """A training: the loop and its updates; tests, snapshots and display are its parts and share what Training has."""
+
+    _overflowed = False
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
-        self._tests, self._updates, self._display = Tests(self), Updates(self), Display(self)
+        self._tests, self._display = Tests(self), Display(self)
         self._snapshots = Snapshots(self, self._tests)
         log.info("solver.cpp:57", "Solver scaffolding done.")
 
@@ -190,17 +192,52 @@ class Solver(Training):
                 loss, outputs = self.forward_backward()
             self.replicas.backward(self.options.precision, self.scale)
             total += np.float32(loss.item())
-        self._updates.reduce()
+        self._reduce()
         return float(total / np.float32(self.param.iter_size)), outputs
 
     def clear_gradients(self) -> None:
         """Clear the gradients, before an iteration sums them up."""
         self.blocks.clear()
 
-    @torch.no_grad()
+    def _reduce(self) -> None:
+        """Make the gradients the mean over all devices, without the loss scale.
+
+        Where one has overflowed float16, this iteration will update nothing.
+        """
+        self.replicas.reduce()
+        if self.options.precision != FP16:
+            return
+        gradients = [item.parameter.grad for item in self.net.learnable if item.parameter.grad is not None]
+        self._overflowed = not self.scale.remove(gradients)
+        if self._overflowed:
+            factor = log.number(self.scale.factor)
+            log.info("sgd_solver.cpp:99", f"Iteration {self.iteration}: float16 overflowed; loss scale {factor}")
+            if self.scale.factor < 1:
+                self.tell_nan("the gradients overflow float16")
+
     def apply_update(self) -> None:
-        """Update the weights and count the iteration; the gradients then contain the subtracted values, as in Caffe."""
-        self._updates.apply()
+        """Update the weights and count the iteration; the gradients then contain the subtracted values, as in Caffe.
+
+        An iteration whose gradients overflowed is counted only.
+        Caffe: SGDSolver::ApplyUpdate, SGDSolver::GetLearningRate (src/caffe/solvers/sgd_solver.cpp)
+        """
+        param, step = self.param, next_step(self.param, self.iteration, self.current_step)
+        if step != self.current_step and param.lr_policy == "multistep":
+            log.info("sgd_solver.cpp:50", f"MultiStep Status: Iteration {self.iteration}, step = {step}")
+        rate, self.current_step = learning_rate(param, self.iteration, step), step
+        if self.is_due(param.display):
+            log.info("sgd_solver.cpp:112", f"Iteration {self.iteration}, lr = {log.number(rate)}")
+        if not self._overflowed:
+            with torch.no_grad():
+                if param.clip_gradients >= 0 and (clipped := update.clip(self.blocks.diffs(), param.clip_gradients)):
+                    norm, factor = map(log.number, clipped)
+                    found = f"L2 norm {norm} > {log.number(param.clip_gradients)}"
+                    message = f"Gradient clipping: scaling down gradients ({found}) by scale factor {factor}"
+                    log.info("sgd_solver.cpp:99", message)
+                for piece in self.blocks.pieces(rate, param.weight_decay):
+                    update.move(self.rule, param, piece, self.iteration)
+                self.replicas.update()
+        self.iteration += 1
 
     def test_all(self) -> None:
         """Run every test net for its test_iter batches with the current weights."""
