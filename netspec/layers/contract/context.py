@@ -18,7 +18,8 @@ def device_of(name: str | torch.device) -> torch.device:
     """Return torch's device of a name. Raises SpecError for a name that is none, and for a GPU that is not here."""
     try:
         device = torch.device(name)
-        if device.type not in ("cpu", "cuda", "meta"):
+        own = torch._C._get_privateuse1_backend_name()  # a device that another package adds to torch
+        if device.type not in ("cpu", "cuda", "meta", *([own] if hasattr(torch, own) else [])):
             raise RuntimeError
     except RuntimeError:
         raise SpecError(f'found device "{name}", expected cpu, cuda or cuda:NUMBER') from None
