@@ -89,20 +89,43 @@ class Tiny(nn.Module):
         return self.ip3(torch.tanh(self.ip2(F.relu(self.ip1(x.flatten(1))))))
 
 
-class PNet(nn.Module):
-    """MTCNN's first net, for windows (N, 3, 12, 12)."""
+class _Windows(nn.Module):
+    """A net of MTCNN's, for windows (N, 3, side, side); it returns scores, (N, 2) or (N, 2, 1, 1)."""
 
-    def __init__(self) -> None:
+    def __init__(self, *layers: nn.Module) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            *(nn.Conv2d(3, 10, 3), nn.PReLU(10), nn.MaxPool2d(2)),
-            *(nn.Conv2d(10, 16, 3), nn.PReLU(16), nn.Conv2d(16, 32, 3), nn.PReLU(32)),
-            nn.Conv2d(32, 2, 1),
-        )
+        self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the scores (N, 2, 1, 1)."""
+        """Return the scores."""
         return self.layers(x)
+
+
+def _conv_prelu(inputs: int, outputs: int, size: int) -> tuple[nn.Module, nn.Module]:
+    return nn.Conv2d(inputs, outputs, size), nn.PReLU(outputs)
+
+
+def _pool_ceil(size: int) -> nn.Module:
+    return nn.MaxPool2d(size, 2, ceil_mode=True)
+
+
+def pnet() -> nn.Module:
+    """MTCNN's first net, for windows of 12 pixels."""
+    first = (*_conv_prelu(3, 10, 3), _pool_ceil(2))
+    return _Windows(*first, *_conv_prelu(10, 16, 3), *_conv_prelu(16, 32, 3), nn.Conv2d(32, 2, 1))
+
+
+def rnet() -> nn.Module:
+    """Its second, for windows of 24 pixels."""
+    maps = (*_conv_prelu(3, 28, 3), _pool_ceil(3), *_conv_prelu(28, 48, 3), _pool_ceil(3), *_conv_prelu(48, 64, 2))
+    return _Windows(*maps, nn.Flatten(), nn.Linear(576, 128), nn.PReLU(128), nn.Linear(128, 2))
+
+
+def onet() -> nn.Module:
+    """Its third, for windows of 48 pixels."""
+    maps = (*_conv_prelu(3, 32, 3), _pool_ceil(3), *_conv_prelu(32, 64, 3), _pool_ceil(3))
+    maps = (*maps, *_conv_prelu(64, 64, 3), _pool_ceil(2), *_conv_prelu(64, 128, 2))
+    return _Windows(*maps, nn.Flatten(), nn.Linear(1152, 256), nn.PReLU(256), nn.Linear(256, 2))
 
 
 class LeNet(nn.Module):
@@ -330,7 +353,9 @@ class SqueezeNet(nn.Module):
 
 CLASSIFIERS = {
     "tiny": Tiny,
-    "pnet": PNet,
+    "pnet": pnet,
+    "rnet": rnet,
+    "onet": onet,
     "lenet": LeNet,
     "cifar10_quick": Cifar10Quick,
     "cifar10_full": Cifar10Full,

@@ -37,6 +37,23 @@ def pnet(n: Any) -> str:
     return _conv(n, "conv4", top, 2, 1)
 
 
+def rnet(n: Any) -> str:
+    """MTCNN's second net, on one window; whether it shows a face."""
+    top = _pool(n, "pool1", _prelu(n, "prelu1", _conv(n, "conv1", "data", 28, 3)), 3)
+    top = _pool(n, "pool2", _prelu(n, "prelu2", _conv(n, "conv2", top, 48, 3)), 3)
+    top = _prelu(n, "prelu4", _full(n, "conv4", _prelu(n, "prelu3", _conv(n, "conv3", top, 64, 2)), 128))
+    return _full(n, "conv5-1", top, 2)
+
+
+def onet(n: Any) -> str:
+    """MTCNN's third net, on one window; whether it shows a face."""
+    top = _pool(n, "pool1", _prelu(n, "prelu1", _conv(n, "conv1", "data", 32, 3)), 3)
+    top = _pool(n, "pool2", _prelu(n, "prelu2", _conv(n, "conv2", top, 64, 3)), 3)
+    top = _pool(n, "pool3", _prelu(n, "prelu3", _conv(n, "conv3", top, 64, 3)), 2)
+    top = _prelu(n, "prelu5", _full(n, "conv5", _prelu(n, "prelu4", _conv(n, "conv4", top, 128, 2)), 256))
+    return _full(n, "conv6-1", top, 2)
+
+
 def cifar10_quick(n: Any) -> str:
     """Caffe's quick net for CIFAR-10."""
     top = _relu(n, "relu1", _pool(n, "pool1", _conv(n, "conv1", "data", 32, 5, pad=2), 3))
@@ -165,6 +182,8 @@ SQUEEZENET = ((16, 64), (16, 64), (32, 128), (32, 128), (48, 192), (48, 192), (6
 ZOO: dict[str, tuple[Callable[[Any], str], tuple[int, int, int]]] = {  # the layers, and the image (C, H, W)
     "tiny": (tiny, (10, 1, 1)),
     "pnet": (pnet, (3, 12, 12)),
+    "rnet": (rnet, (3, 24, 24)),
+    "onet": (onet, (3, 48, 48)),
     "lenet": (lenet, (1, 28, 28)),
     "cifar10_quick": (cifar10_quick, (3, 32, 32)),
     "cifar10_full": (cifar10_full, (3, 32, 32)),

@@ -18,7 +18,6 @@ from netspec.export.engines.runners import Unable, tell_unable
 from netspec.export.formats.convert import Source
 from netspec.export.formats.onnx import export_onnx
 from netspec.graph.options import BuildOptions
-from netspec.graph.plan import Node
 from netspec.layers.contract.learned import Stamp, is_lent, stamp
 from netspec.layers.contract.reading import reads_data
 from netspec.net.net import Net
@@ -84,7 +83,10 @@ class Engine:
     def __init__(self, net: Net, choice: Choice, origin: Origin | None, write: Write) -> None:
         self._plan, self._layers, self._exact = net.plan, list(net.layers), net.options.exact
         self._choice, self._from, self._write = choice, origin, write
-        self._losses = losses_of(net.loss_weights)
+        self._blobs_of = [layer.blobs._parameters for layer in net.layers if len(layer.blobs)]
+        losses = zip(net.plan.nodes, losses_of(net.loss_weights), strict=True)
+        # The values that are losses with a name, and their weights.
+        self._weighted = [(node.tops[j], w) for node, own in losses for j, w in own if j < len(node.tops)]
         self._readers = [step for step in net.eager.one_by_one() if reads_data(self._layers[step.node])]
         layers = zip(net.plan.nodes, net.layers, strict=True)
         ends = [node for node, layer in layers if layer.is_input or reads_data(layer)]
@@ -109,7 +111,7 @@ class Engine:
 
     def _are_lent(self) -> bool:
         """Return whether an alias could change the parameters; warn once."""
-        lent = any(is_lent(blob) for layer in self._layers for blob in layer.blobs)
+        lent = any(map(is_lent, self._blobs()))
         if lent and not self._told:
             self._told = True
             tell_unable(self._choice, "parameters may change unseen while their memory is held, by .data or an array")
@@ -117,8 +119,7 @@ class Engine:
 
     def _pass(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
         names = self._plan.blobs
-        weighted = [(node.tops[j], w) for node, losses in self._losses_by_node() for j, w in losses]
-        wanted = (*sorted(kept), *(v for v, _ in weighted))
+        wanted = (*sorted(kept), *(v for v, _ in self._weighted))
         model = self._current(tuple(dict.fromkeys(names[v] for v in wanted)))
         values = dict(given)
         walk(self._readers, values, self._exact)
@@ -130,14 +131,9 @@ class Engine:
                 raise Unable(f"{names[v]} has shape {found[names[v]].shape} there, expected {shapes[v]}")
         values = {v: torch.from_numpy(found[names[v]]) for v in wanted}
         loss = torch.zeros(())
-        for v, weight in weighted:
+        for v, weight in self._weighted:
             loss = loss + weighted_sum(values[v], weight, self._exact)
         return loss, values
-
-    def _losses_by_node(self) -> list[tuple[Node, list[tuple[int, float]]]]:
-        """Return the nodes whose tops are losses with a name, and which of them with what weight."""
-        nodes = zip(self._plan.nodes, self._losses, strict=True)
-        return [(node, [(j, w) for j, w in losses if j < len(node.tops)]) for node, losses in nodes]
 
     def _shapes(self, given: dict[int, Shape]) -> dict[int, Shape]:
         """Return the shapes of the values for inputs of these. Raises SpecError where a layer cannot take them."""
@@ -145,8 +141,12 @@ class Engine:
             self._fits = given, fitted(self._plan, self._layers, given)[1]
         return self._fits[1]
 
+    def _blobs(self) -> list[Any]:
+        """Return the learned blobs as they are now; to iterate over ParameterLists takes longer than a small net."""
+        return [blob for owner in self._blobs_of for blob in owner.values()]
+
     def _stamps(self) -> tuple[Stamp, ...]:
-        return tuple(stamp(blob) for layer in self._layers for blob in layer.blobs)
+        return tuple(map(stamp, self._blobs()))
 
     def _current(self, blobs: tuple[str, ...]) -> Model:
         """Return the model of the net as it is, with these blobs."""
