@@ -134,7 +134,7 @@ def training_differences() -> dict[str, float]:
     return {"loss": difference(losses, golden["loss"], "loss"), **layer_distances(final, golden)}
 
 
-STEPS = (1e-6, 1e-5, 1e-4)  # differences are stated as the least of these that they do not exceed
+STEPS = (1e-6, 1e-5, 1e-4)  # stated is the least of these that twice a difference does not exceed: CPUs round
 OLDER = {"segnet": "TimoSaemann/caffe-enet", "": "senlinuc/caffe_ocr"}  # of cases without a prefix
 TABLE = ROOT / "benchmarks" / "results" / "forks.json"
 COLUMNS = ("layers", "dialect", "compared with", "largest difference")
@@ -146,12 +146,12 @@ def test_the_table_of_the_page_is_current(monkeypatch: pytest.MonkeyPatch) -> No
     found = table(monkeypatch)
     assert [row[:3] for row in stated] == [row[:3] for row in found]
     for (layers, *_, most), (*_, now) in zip(stated, found, strict=True):
-        assert most == now or float(now) <= float(most), f"{layers} is off by {now}"  # CPUs round in several ways
+        assert not now or float(now) <= float(most), f"{layers} is off by {now}"
     page = " ".join((ROOT / "docs" / "forks.md").read_text().split())
     assert not [why for why in FAULTS.values() if why not in page]
 
 
-def table(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
+def table(monkeypatch: pytest.MonkeyPatch, margin: float = 1) -> list[tuple[str, ...]]:
     """Return the rows: layers compared with the same forks, or with loops only, and the largest difference of any."""
     worst: dict[str, float] = {}
     forks: dict[str, list[str]] = {}
@@ -178,7 +178,7 @@ def table(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
         off = max((worst.get(kind, 0.0) for kind in kinds), default=0.0)
         count = sum(len(forks.get(kind, ())) for kind in kinds)
         layers = ", ".join(f"`{kind.rpartition('.')[2]}`" for kind in kinds)
-        stated = f"{next(step for step in STEPS if off <= step):g}" if count else ""
+        stated = f"{next(step for step in STEPS if margin * off <= step):g}" if count else ""
         rows.append((layers, dialect, f"{how}: {count}" if count else how, stated))
     return sorted(rows, key=lambda row: (row[1], not row[3], row[0]))
 
@@ -209,7 +209,7 @@ def golden_cases() -> Iterator[tuple[Path, str]]:
 
 if __name__ == "__main__":
     announce_known()
-    rows = [dict(zip(COLUMNS, row, strict=True)) for row in table(pytest.MonkeyPatch())]
+    rows = [dict(zip(COLUMNS, row, strict=True)) for row in table(pytest.MonkeyPatch(), margin=2)]
     note = {"note": "differences are rounded up, so that those of other processors are not larger"}
     command = "PYTHONPATH=.:tests python tests/netspec/dialects/test_forks_golden.py"
     made = {"machine": note, "date": date.today().isoformat(), "command": command, "rows": rows}
