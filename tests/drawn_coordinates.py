@@ -1,7 +1,7 @@
 """What must hold of every picture, checked on the coordinates of its marks."""
 
 from collections.abc import Iterator
-from itertools import combinations, pairwise
+from itertools import pairwise, takewhile
 
 from netspec.inspect.draw.marks import Curve, Rect, Text
 from netspec.inspect.draw.picture import Drawing, Picture
@@ -16,10 +16,12 @@ def faults(picture: Picture, unfolded: bool = False) -> Iterator[str]:
     drawing = picture.marks(unfolded)
     boxes = {f"box {mark.layer}": area(mark) for mark in drawing.marks if isinstance(mark, Rect) and mark.layer >= 0}
     texts = {f"text {k} {mark.text!r}": area(mark) for k, mark in enumerate(texts_of(drawing))}
-    for (one, a), (other, b) in combinations(sorted({**boxes, **texts}.items(), key=lambda item: item[1][1]), 2):
-        inside = one.startswith("box") != other.startswith("box") and (within(a, b) or within(b, a))
-        if overlap(a, b) and not inside:
-            yield f"{one} and {other} overlap"
+    placed = sorted({**boxes, **texts}.items(), key=lambda item: item[1][1])
+    for i, (one, a) in enumerate(placed):
+        for other, b in takewhile(lambda item, bottom=a[3]: item[1][1] < bottom, placed[i + 1 :]):
+            inside = one.startswith("box") != other.startswith("box") and (within(a, b) or within(b, a))
+            if overlap(a, b) and not inside:
+                yield f"{one} and {other} overlap"
     for name, (left, top, right, bottom) in {**boxes, **texts}.items():
         if left < 0 or top < 0 or right > picture.width or bottom > drawing.height:
             yield f"{name} leaves the picture"
