@@ -123,7 +123,9 @@ def test_kernels_of_prelu_give_the_bits_of_autograd(build, shape: tuple[int, ...
     (top,) = layer.run(leaf)
     expected = torch.autograd.grad(top, [leaf, slopes], diff)
     total = torch.zeros_like(slopes)
-    forward, backward = own_kernels(layer, Preparation((True,), (total,)))
+    kernels = own_kernels(layer, Preparation((True,), (total,)))
+    assert kernels is not None
+    forward, backward = kernels
     with torch.no_grad():
         assert torch.equal(forward(x).nan_to_num(), top.nan_to_num())
         for found, wanted in zip((backward(diff), total), expected, strict=True):

@@ -14,7 +14,7 @@ from netspec.proto import schema
 from netspec.proto.dialect import registry as dialect
 from netspec.proto.dialect.declarations import read_declarations
 from netspec.proto.dialect.registry import Dialect
-from netspec.proto.schema import LayerParameter, NetParameter
+from netspec.proto.schema import BlobProto, LayerParameter, NetParameter
 from netspec.proto.text import parse_net_text, write_text
 
 PROTO = Path(schema.__file__).parent
@@ -177,6 +177,6 @@ def test_declarations_mean_what_protoc_makes_of_them(tmp_path: Path) -> None:
 
 def test_layers_of_a_fork_are_read_that_has_a_number_of_caffes_for_its_own() -> None:
     """caffe-face's center_loss_param has the number of Caffe's swish_param."""
-    binary = LayerParameter(name="c", type="CenterLoss", blobs=[{"data": [1]}]).SerializeToString()
+    binary = LayerParameter(name="c", type="CenterLoss", blobs=[BlobProto(data=[1])]).SerializeToString()
     layer = LayerParameter.FromString(binary + b"\x9a\x09\x02\x08\x0a")  # 147 { 1: 10 }
     assert (layer.name, layer.type, list(layer.blobs[0].data)) == ("c", "CenterLoss", [1])
