@@ -5,23 +5,27 @@ OpenCV: modules/dnn/src/net_impl.cpp (4.12)
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
 
 from netspec.compat.dnn.caffe_files import CaffeFiles
-from netspec.compat.dnn.described import Described
-from netspec.compat.dnn.errors import BAD_ARGUMENT, NOT_FOUND, DnnError, as_dnn_error
-from netspec.compat.dnn.table import INPUT, Entry
+from netspec.compat.dnn.errors import BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED, UNSPECIFIED, DnnError, as_dnn_error
+from netspec.compat.dnn.file_net import FileNet
+from netspec.compat.dnn.table import INPUT, Entry, graph_of, unconnected
 from netspec.files.opencv import cv2
+from netspec.files.whole_file import write_whole
+from netspec.layers.contract.base import Shape
 from netspec.net.net import Net as CaffeNet
 from netspec.run.walk import Step, walk
 
 Array = np.ndarray
+AS_WRITTEN = "{} cannot change a net of Caffe's files; write the layer into the prototxt"
 
 
 class Layer:
@@ -39,7 +43,16 @@ class Layer:
         return self._tops.index(outputName) if outputName in self._tops else -1
 
 
-class Net(Described):
+def _refused(func: str, message: str, code: int = NOT_IMPLEMENTED) -> Callable[..., NoReturn]:
+    """Return a method that refuses, whatever it gets."""
+
+    def refuse(self: Net, *arguments: Any, **named: Any) -> NoReturn:
+        raise DnnError(message.format(func), self._caffe.where(), code, func)
+
+    return refuse
+
+
+class Net:
     """A net that was read from Caffe's files; without files, an empty one.
 
     Names and numbers of layers are OpenCV's (netspec/compat/dnn/table.py), arrays are float32 in Caffe's axes.
@@ -47,28 +60,102 @@ class Net(Described):
     """
 
     def __init__(self, files: CaffeFiles | None = None) -> None:
-        super().__init__(files)
+        self._caffe = FileNet(files)
         self._runnable = files is None or files.weights is not None or not any(_learns(files))
+
+    # Its layers
+
+    def empty(self) -> bool:
+        """Return whether it has no layers."""
+        return len(self._caffe.table) < 2
+
+    def getLayerNames(self) -> tuple[str, ...]:
+        """Return the names of all layers but the input layer."""
+        return tuple(entry.name for entry in self._caffe.table[1:])
+
+    def getLayerId(self, layer: str) -> int:
+        """Return the number of a layer, -1 where there is none of that name."""
+        return self._caffe.numbers.get(layer, -1)
+
+    def getLayerTypes(self) -> tuple[str, ...]:
+        """Return the types of its layers, each once, in alphabetical order."""
+        return tuple(sorted({entry.type or "__NetInputLayer__" for entry in self._caffe.table}))
+
+    def getLayersCount(self, layerType: str) -> int:
+        """Return how many layers are of a type."""
+        return sum((entry.type or "__NetInputLayer__") == layerType for entry in self._caffe.table)
+
+    def getUnconnectedOutLayers(self) -> Array:
+        """Return the numbers of the layers whose tops no layer reads: (n,) int32."""
+        return np.array(unconnected(self._caffe.files.net, self._caffe.table) if self._caffe.files else [], np.int32)
+
+    def getUnconnectedOutLayersNames(self) -> tuple[str, ...]:
+        """Return the names of the layers whose tops no layer reads."""
+        return tuple(self._caffe.table[number].name for number in self.getUnconnectedOutLayers())
+
+    def dump(self) -> str:
+        """Return the layers, with the shapes of their tops, and what they read, in Graphviz's language."""
+        self._caffe.check_not_empty("dump")
+        assert self._caffe.files is not None
+        given = {key: value.shape for key, value in self._caffe.values.items()}
+        with as_dnn_error("dump"):
+            net = self._caffe.files.build(given, "meta")
+        return graph_of(
+            self._caffe.files.net, self._caffe.table, [self._caffe.shapes(net, entry)[1] for entry in self._caffe.table]
+        )
+
+    def dumpToFile(self, path: str) -> None:
+        """Write :meth:`dump` to a file."""
+        with as_dnn_error("dumpToFile"):
+            write_whole(path, self.dump())
+
+    # Shapes and costs
+
+    def getLayersShapes(self, netInputShapes: Any) -> tuple[Array, tuple[Any, ...], tuple[Any, ...]]:
+        """Return the numbers of all layers and the shapes of their bottoms and tops, for inputs of these shapes."""
+        net = self._caffe.shaped(netInputShapes, "getLayersShapes")
+        shapes = [self._caffe.shapes(net, entry) for entry in self._caffe.table]
+        ids = np.arange(len(self._caffe.table), dtype=np.int32)
+        return ids, tuple(_arrays(ins) for ins, _ in shapes), tuple(_arrays(outs) for _, outs in shapes)
+
+    def getLayerShapes(self, netInputShape: Any, layerId: int | str) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        """Return the shapes of the bottoms and of the tops of one layer."""
+        net = self._caffe.shaped(netInputShape, "getLayerShapes")
+        bottoms, tops = self._caffe.shapes(net, self._caffe.entry(layerId, "getLayerShapes"))
+        return _arrays(bottoms), _arrays(tops)
+
+    def getFLOPS(self, *arguments: Any, **named: Any) -> int:
+        """Return the operations of a pass: ``getFLOPS(shapes)``, or of one layer: ``getFLOPS(number, shapes)``."""
+        net, entries = self._caffe.asked("getFLOPS", arguments, named)
+        return sum(self._caffe.operations(net, entry) for entry in entries)
+
+    def getMemoryConsumption(self, *arguments: Any, **named: Any) -> tuple[int, int]:
+        """Return bytes of weights and of tops, of all layers or of one; arguments as :meth:`getFLOPS`."""
+        net, entries = self._caffe.asked("getMemoryConsumption", arguments, named)
+        owners = [entry for entry in entries if entry.name != INPUT and entry.top <= 0]
+        weights = sum(blob.numel() for entry in owners for blob in self._caffe.layer(net, entry).blobs)
+        tops = [shape for entry in entries for shape in self._caffe.shapes(net, entry)[1]]
+        return 4 * weights, 4 * sum(map(math.prod, tops))
 
     # Its parameters
 
     def getLayer(self, layerId: int | str) -> Layer:
         """Return a layer, by number or name."""
-        entry = self._entry(layerId, "getLayer")
+        entry = self._caffe.entry(layerId, "getLayer")
         if entry.name == INPUT:
-            return Layer(INPUT, "", (), list(self._shown.values()))
-        count = len(self._layer(self._net, entry).blobs)
+            return Layer(INPUT, "", (), list(self._caffe.shown.values()))
+        count = len(self._caffe.layer(self._caffe.net, entry).blobs)
         return Layer(entry.name, entry.type, [self._parameter(entry, j) for j in range(count)], ())
 
     def getParam(self, layer: int | str, numParam: int = 0) -> Array:
         """Return a copy of a learnable blob of a layer."""
-        entry = self._entry(layer, "getParam")
+        entry = self._caffe.entry(layer, "getParam")
         self._blob(entry, numParam, "getParam")
         return self._parameter(entry, numParam)
 
     def setParam(self, layer: int | str, numParam: int, blob: Array | Sequence[float]) -> None:
         """Write a learnable blob of a layer; the array must have as many numbers."""
-        target = self._blob(self._entry(layer, "setParam"), numParam, "setParam")
+        target = self._blob(self._caffe.entry(layer, "setParam"), numParam, "setParam")
         values = np.asarray(blob, np.float32)
         if values.size != target.numel():
             message = f"found an array of shape {values.shape}, expected {tuple(target.shape)}"
@@ -79,11 +166,11 @@ class Net(Described):
 
     def _parameter(self, entry: Entry, index: int) -> Array:
         """Return a copy of a learnable blob; vectors are columns, but the bias of an InnerProduct is a row."""
-        array = _array(self._layer(self._net, entry).blobs[index])
+        array = _array(self._caffe.layer(self._caffe.net, entry).blobs[index])
         return array.reshape(1, -1) if entry.type == "InnerProduct" and index == 1 else array
 
     def _blob(self, entry: Entry, index: int, func: str) -> torch.Tensor:
-        blobs = () if entry.name == INPUT else self._layer(self._net, entry).blobs
+        blobs = () if entry.name == INPUT else self._caffe.layer(self._caffe.net, entry).blobs
         if not 0 <= index < len(blobs):
             message = f'layer "{entry.name}" has {len(blobs)} learnable blobs, there is no number {index}'
             raise DnnError(message, code=BAD_ARGUMENT, func=func)
@@ -93,11 +180,11 @@ class Net(Described):
 
     def setInputsNames(self, inputBlobNames: Sequence[str]) -> None:
         """Give the inputs other names, in their order."""
-        self._shown = dict(zip(self._declared, inputBlobNames, strict=False))
+        self._caffe.shown = dict(zip(self._caffe.declared, inputBlobNames, strict=False))
 
     def setInputShape(self, inputName: str, shape: Sequence[int]) -> None:
         """Declare the shape of an input."""
-        self._declared[self._input(inputName, "setInputShape")] = tuple(int(size) for size in shape)
+        self._caffe.declared[self._input(inputName, "setInputShape")] = tuple(int(size) for size in shape)
 
     # Running
 
@@ -106,19 +193,19 @@ class Net(Described):
 
         The shape may differ from the prototxt's wherever the layers can follow. None takes the input away.
         """
-        if self._files is None:
+        if self._caffe.files is None:
             return
         key = self._input(name, "setInput")
         if blob is None:
-            self._values.pop(key, None)
+            self._caffe.values.pop(key, None)
             return
         blob = blob.get() if isinstance(blob, cv2.UMat) else blob
         try:
             values = np.array(blob, np.float32)
         except (TypeError, ValueError):
-            message = f'found {type(blob).__name__} for input "{self._shown[key]}", expected an array of numbers'
+            message = f'found {type(blob).__name__} for input "{self._caffe.shown[key]}", expected an array of numbers'
             raise DnnError(message, code=BAD_ARGUMENT, func="setInput") from None
-        self._values[key] = _normalized(values, float(scalefactor), np.atleast_1d(np.asarray(mean, np.float32)))
+        self._caffe.values[key] = _normalized(values, float(scalefactor), np.atleast_1d(np.asarray(mean, np.float32)))
 
     def forward(self, outputName: Any = "", *more: Any, outputBlobs: Any = None, outBlobNames: Any = None) -> Any:
         """Run the net; return the first top of a layer, by default the last one's, or of a list of layers: a tuple.
@@ -136,51 +223,51 @@ class Net(Described):
 
     def forwardAndRetrieve(self, outBlobNames: Sequence[str]) -> tuple[tuple[Array, ...], ...]:
         """Run the net; return all tops of each of these layers."""
-        entries = [self._entry(name, "forwardAndRetrieve") for name in outBlobNames]
-        net = self._net
+        entries = [self._caffe.entry(name, "forwardAndRetrieve") for name in outBlobNames]
+        net = self._caffe.net
         pins = [[(entry, top) for top in range(self._tops(net, entry))] for entry in entries]
         found = iter(self._run([pin for row in pins for pin in row], "forwardAndRetrieve"))
         return tuple(tuple(_array(next(found)) for _ in row) for row in pins)
 
     def getPerfProfile(self) -> tuple[int, Array]:
         """Return ticks (cv2.getTickFrequency) in all and by layer, (n,): of one more run, on the inputs given last."""
-        ticks = np.zeros(len(self._table) - 1)
+        ticks = np.zeros(len(self._caffe.table) - 1)
         self._check_inputs("getPerfProfile")
         with as_dnn_error("getPerfProfile"), torch.inference_mode():
             seconds = dict[int, float]()
-            self._walk(len(self._net.plan.nodes) - 1, seconds)
-        for number, entry in enumerate(self._table[1:]):
+            self._walk(len(self._caffe.net.plan.nodes) - 1, seconds)
+        for number, entry in enumerate(self._caffe.table[1:]):
             if entry.top in (-1, 0):
-                ticks[number] = seconds[self._nodes[entry.layer]] * cv2.getTickFrequency()
+                ticks[number] = seconds[self._caffe.nodes[entry.layer]] * cv2.getTickFrequency()
         return int(ticks.sum()), ticks
 
     @cached_property
     def _makers(self) -> dict[int, int]:
         """The node that makes each value."""
-        return {v: i for i, node in enumerate(self._net.plan.nodes) for v in node.tops}
+        return {v: i for i, node in enumerate(self._caffe.net.plan.nodes) for v in node.tops}
 
     @cached_property
     def _lasting(self) -> frozenset[int]:
         """The values that no later one of the same name replaces."""
-        return frozenset({name: v for v, name in enumerate(self._net.plan.blobs)}.values())
+        return frozenset({name: v for v, name in enumerate(self._caffe.net.plan.blobs)}.values())
 
     def _tops(self, net: CaffeNet, entry: Entry) -> int:
-        return len(self._declared) if entry.name == INPUT else len(self._node(net, entry).tops)
+        return len(self._caffe.declared) if entry.name == INPUT else len(self._caffe.node(net, entry).tops)
 
     def _last(self) -> str:
-        self._check_not_empty("forward")
-        return self._table[-1].name
+        self._caffe.check_not_empty("forward")
+        return self._caffe.table[-1].name
 
     def _forward(self, names: list[str]) -> tuple[Array, ...]:
-        self._check_not_empty("forward")
-        entries = [self._entry(name, "forward") for name in names]
+        self._caffe.check_not_empty("forward")
+        entries = [self._caffe.entry(name, "forward") for name in names]
         return tuple(map(_array, self._run([(entry, entry.top) for entry in entries], "forward")))
 
     def _run(self, pins: Sequence[tuple[Entry, int]], func: str) -> list[torch.Tensor]:
         """Run what the tops need, and return them; each is given as a layer and the number of its top."""
         self._check_inputs(func)
         with as_dnn_error(func), torch.inference_mode():
-            net = self._net
+            net = self._caffe.net
             self._check_weights(func)
             wanted = [self._value(net, entry, top, func) for entry, top in pins if entry.name != INPUT]
             try:
@@ -188,13 +275,13 @@ class Net(Described):
             except ValueError as fault:
                 raise self._with_shapes(fault, func) from None
         found = iter(wanted)
-        given = [torch.from_numpy(self._values[blob]) for blob in self._declared]
+        given = [torch.from_numpy(self._caffe.values[blob]) for blob in self._caffe.declared]
         return [given[max(top, 0)] if entry.name == INPUT else values[next(found)] for entry, top in pins]
 
     def _value(self, net: CaffeNet, entry: Entry, top: int, func: str) -> int:
         if top < 0:
             raise DnnError(f'layer "{entry.name}" ({entry.type}) has no top', code=NOT_FOUND, func=func)
-        return self._node(net, entry).tops[top]
+        return self._caffe.node(net, entry).tops[top]
 
     def _compute(self, net: CaffeNet, wanted: Sequence[int]) -> Mapping[int, torch.Tensor]:
         """Return the values of these numbers: of the whole net, or layer by layer up to the last that is needed."""
@@ -203,14 +290,14 @@ class Net(Described):
         end, names, lasting = max(self._makers[v] for v in wanted), net.plan.blobs, self._lasting
         if end == len(net.plan.nodes) - 1 and all(v in lasting for v in wanted):
             net.keep = [names[v] for v in wanted]
-            net(**self._values)
+            net(**self._caffe.values)
             return {v: net.blobs[names[v]] for v in wanted}
         return self._walk(end)
 
     def _walk(self, end: int, seconds: dict[int, float] | None = None) -> dict[int, torch.Tensor]:
         """Run the nodes up to ``end`` one by one; return all values, and note in ``seconds`` what each takes."""
-        net = self._net
-        values = net.given(self._values)
+        net = self._caffe.net
+        values = net.given(self._caffe.values)
 
         def visit(step: Step, bottoms: list[torch.Tensor]) -> Any:
             begin = time.perf_counter()
@@ -222,35 +309,57 @@ class Net(Described):
         walk([step for step in net.eager.one_by_one() if step.node <= end], values, net.options.exact, visit)
         return values
 
+    # What changes nothing, and what it refuses
+
+    def _accept(self, *settings: Any, **named: Any) -> None:
+        """Accept a setting: there is one backend, torch, nets run on the CPU, and no switch changes a result."""
+
+    setPreferableBackend = setPreferableTarget = enableFusion = enableWinograd = setHalideScheduler = _accept
+
+    addLayer = _refused("addLayer", AS_WRITTEN)
+    addLayerToPrev = _refused("addLayerToPrev", AS_WRITTEN)
+    connect = _refused("connect", AS_WRITTEN)
+    registerOutput = _refused("registerOutput", AS_WRITTEN)
+    quantize = _refused(
+        "quantize",
+        "nets of Caffe's files are not quantized here; export the net to ONNX (netspec export) and quantize that",
+    )
+    forwardAsync = _refused("forwardAsync", "forwardAsync needs a backend that is not here; use forward")
+    getInputDetails = _refused("getInputDetails", "the net is not quantized", UNSPECIFIED)
+    getOutputDetails = _refused("getOutputDetails", "the net is not quantized", UNSPECIFIED)
+
     # What can be wrong
 
     def _input(self, name: str, func: str) -> str:
         """Return the blob of an input that is called ``name``; "" is the first."""
-        for blob, shown in self._shown.items():
+        for blob, shown in self._caffe.shown.items():
             if name in ("", shown):
                 return blob
         found = f'no input "{name}" in this net' if name else "this net takes no input"
-        known = ", ".join(self._shown.values()) or "none"
-        raise DnnError(f"{found}; its inputs: {known}", self._file(), NOT_FOUND, func)
+        known = ", ".join(self._caffe.shown.values()) or "none"
+        raise DnnError(f"{found}; its inputs: {known}", self._caffe.where(), NOT_FOUND, func)
 
     def _check_inputs(self, func: str) -> None:
-        self._check_not_empty(func)
-        for blob, shown in self._shown.items():
-            if blob not in self._values:
-                known = ", ".join(self._shown.values())
-                raise DnnError(f'no value for input "{shown}"; this net\'s inputs: {known}', self._file(), func=func)
+        self._caffe.check_not_empty(func)
+        for blob, shown in self._caffe.shown.items():
+            if blob not in self._caffe.values:
+                known = ", ".join(self._caffe.shown.values())
+                raise DnnError(
+                    f'no value for input "{shown}"; this net\'s inputs: {known}', self._caffe.where(), func=func
+                )
 
     def _check_weights(self, func: str) -> None:
         if not self._runnable:
             message = "this net was read without weights; give the .caffemodel as well, or call setParam"
-            raise DnnError(message, self._file(), func=func)
+            raise DnnError(message, self._caffe.where(), func=func)
 
     def _with_shapes(self, fault: ValueError, func: str) -> DnnError:
         """Return a fault of a run with the shapes of the inputs that are not as the prototxt has them."""
+        caffe = self._caffe
         changed = [
-            f'input "{self._shown[key]}" has shape {value.shape}, the prototxt declares {self._declared[key]}'
-            for key, value in self._values.items()
-            if value.shape != self._declared[key]
+            f'input "{caffe.shown[key]}" has shape {value.shape}, the prototxt declares {caffe.declared[key]}'
+            for key, value in caffe.values.items()
+            if value.shape != caffe.declared[key]
         ]
         message = "; ".join([getattr(fault, "message", str(fault)), *changed])
         return DnnError(message, getattr(fault, "where", None), BAD_ARGUMENT, func)
@@ -278,3 +387,7 @@ def _array(values: torch.Tensor) -> Array:
     """Return a copy as OpenCV gives arrays: at least two axes, (n, 1) for a vector."""
     array = np.array(values.detach().numpy(), np.float32, order="C")
     return array if array.ndim > 1 else array.reshape(-1, 1)
+
+
+def _arrays(shapes: Iterable[Shape]) -> tuple[Array, ...]:
+    return tuple(np.array(shape, np.int32) for shape in shapes)

@@ -1,0 +1,133 @@
+"""What a net tells of itself without running: its layers, their shapes and costs, and what it does not do.
+
+OpenCV: modules/dnn/src/net_impl.cpp (4.12)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from netspec.compat.dnn.caffe_files import CaffeFiles
+from netspec.compat.dnn.costs import operations
+from netspec.compat.dnn.errors import BAD_ARGUMENT, NOT_FOUND, DnnError, as_dnn_error
+from netspec.compat.dnn.table import INPUT, Entry, make_table, nodes_of
+from netspec.errors import Where, did_you_mean
+from netspec.layers.contract.base import Layer as CaffeLayer
+from netspec.layers.contract.base import Shape
+from netspec.net.net import Net as CaffeNet
+
+Array = np.ndarray
+Shapes = list[Shape]
+
+
+class FileNet:
+    """The net of Caffe's files behind a Net: its layers under OpenCV's names and numbers, and what is built of them.
+
+    Without files there are no layers. ``declared`` are the shapes of its inputs, ``shown`` their names, which
+    setInputsNames may change, and ``values`` what they were given.
+    """
+
+    def __init__(self, files: CaffeFiles | None = None) -> None:
+        self.files = files
+        self.table: list[Entry] = make_table(files.net) if files else []
+        self.numbers = {entry.name: number for number, entry in enumerate(self.table)}
+        self.declared: dict[str, Shape | None] = files.inputs if files else {}
+        self.shown = {blob: blob for blob in self.declared}
+        self.values: dict[str, Array] = {}
+        self.of_shapes: tuple[dict[str, Shape], CaffeNet] | None = None
+        if files is not None and None not in self.declared.values():
+            with as_dnn_error("readNetFromCaffe"):
+                _ = self.net
+
+    def asked(self, func: str, arguments: Sequence[Any], named: Mapping[str, Any]) -> tuple[CaffeNet, list[Entry]]:
+        """Return the net for the shapes among the arguments of a method, and the layer among them, or all layers."""
+        shapes = named.get("netInputShapes", named.get("netInputShape", arguments[-1] if arguments else None))
+        layer = named.get("layerId", arguments[0] if len(arguments) > 1 else None)
+        return self.shaped(shapes, func), self.table if layer is None else [self.entry(layer, func)]
+
+    def shaped(self, given: Any, func: str) -> CaffeNet:
+        """Return the net built without values for inputs of these shapes: one shape, or one for each input."""
+        self.check_not_empty(func)
+        assert self.files is not None
+        rows = [given] if len(given) and np.isscalar(given[0]) else given
+        if len(rows) > len(self.declared):
+            message = f"found {len(rows)} shapes, expected {len(self.declared)}: {', '.join(self.shown.values())}"
+            raise DnnError(message, code=BAD_ARGUMENT, func=func)
+        shapes = {key: tuple(int(n) for n in row) for key, row in zip(self.declared, rows, strict=False)}
+        if self.of_shapes is None or self.of_shapes[0] != shapes:
+            with as_dnn_error(func):
+                self.of_shapes = shapes, self.files.build(shapes, "meta")
+        return self.of_shapes[1]
+
+    def shapes(self, net: CaffeNet, entry: Entry) -> tuple[Shapes, Shapes]:
+        """Return the shapes of the bottoms and of the tops of a layer."""
+        if entry.name == INPUT:
+            inputs = [shape for layer in net.layers if layer.is_input for shape in layer.top_shapes]
+            return inputs, inputs
+        layer = self.layer(net, entry)
+        if layer.type == "Axpy":
+            a, x, y = layer.bottom_shapes
+            return ([x, a] if entry.top < 0 else [x, y]), [x]
+        if entry.type == "Convolution":
+            return [layer.bottom_shapes[entry.top]], [layer.top_shapes[entry.top]]
+        return layer.bottom_shapes, layer.top_shapes
+
+    def operations(self, net: CaffeNet, entry: Entry) -> int:
+        """Return the operations of a layer in a forward pass."""
+        if entry.name == INPUT or entry.top > 0:
+            return 0
+        layer = self.layer(net, entry)
+        if layer.type == "Axpy":
+            return (2 if entry.top < 0 else 1) * sum(math.prod(shape) for shape in self.shapes(net, entry)[0])
+        return operations(layer)
+
+    # The net behind it
+
+    @cached_property
+    def net(self) -> CaffeNet:
+        """The net, built when it is first needed: inputs without a shape in the prototxt get theirs from setInput."""
+        assert self.files is not None
+        given = {key: value.shape for key, value in self.values.items() if self.declared[key] is None}
+        return self.files.build(given)
+
+    @cached_property
+    def nodes(self) -> list[int]:
+        """The node of each layer in the plan."""
+        assert self.files is not None
+        return nodes_of(self.net.plan, self.files.net)
+
+    def node(self, net: CaffeNet, entry: Entry) -> Any:
+        """Return the node of a layer."""
+        return net.plan.nodes[self.nodes[entry.layer]]
+
+    def layer(self, net: CaffeNet, entry: Entry) -> CaffeLayer:
+        """Return the layer of netspec behind one of OpenCV's."""
+        return net.layers[self.nodes[entry.layer]]
+
+    def entry(self, layer: int | str, func: str) -> Entry:
+        """Return a layer by number or name. Raises DnnError where there is none."""
+        number = self.numbers.get(layer, -1) if isinstance(layer, str) else int(layer)
+        if 0 <= number < len(self.table):
+            return self.table[number]
+        if isinstance(layer, str):
+            names = list(self.numbers)
+            message = (
+                f'no layer "{layer}" in this net{did_you_mean(layer, names) or ";"} it has: {", ".join(names[1:])}'
+            )
+        else:
+            message = f"no layer of number {layer} in this net; it has 0 to {len(self.table) - 1}"
+        raise DnnError(message, self.where(), NOT_FOUND, func)
+
+    def check_not_empty(self, func: str) -> None:
+        """Raise DnnError for a net without layers."""
+        if len(self.table) < 2:
+            raise DnnError("the net is empty", code=BAD_ARGUMENT, func=func)
+
+    def where(self) -> Where | None:
+        """Return the place of the prototxt."""
+        return Where(self.files.source.file) if self.files else None
