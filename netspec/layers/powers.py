@@ -9,6 +9,7 @@ from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.layers.activation import Activation, Rounded, scaled_and_shifted, torch_scaled_and_shifted
+from netspec.layers.contract.base import refuse_in_place
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
@@ -23,7 +24,9 @@ class AbsVal(Activation):
     """
 
     onnx_op, torch_call = "Abs", "torch.abs({x})"
-    never_in_place = True
+
+    def setup(self) -> None:
+        refuse_in_place(self)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.abs()

@@ -52,7 +52,6 @@ class Layer(torch.nn.Module):
     bottoms: ClassVar[tuple[int, int | None]] = (1, 1)  # fewest and most (None: any number)
     tops: ClassVar[tuple[int, int | None]] = (1, 1)
     same_tops: ClassVar[bool] = False  # as many tops as bottoms
-    never_in_place: ClassVar[bool] = False  # Caffe refuses its bottom as its top
     is_loss: ClassVar[bool] = False  # loss_weight 1 on the first top unless given; a missing top is made
     counts: bool = True  # of a loss: whether it has that loss_weight of 1; in some forks only a given one counts
     forks: ClassVar[Mapping[str, str]] = {}  # where several forks have the type: dialects, and what their layers do
@@ -251,5 +250,9 @@ class Layer(torch.nn.Module):
                 f"found {self.num_tops} top blob(s) for {len(self.bottom_shapes)} bottom blob(s), expected as many",
                 "top",
             )
-        if self.never_in_place and self.param.top[:1] == self.param.bottom[:1]:
-            yield self.error("may not work in place, as in Caffe; give its top another name", "top")
+
+
+def refuse_in_place(layer: Layer) -> None:
+    """Raise a SpecError where a layer's first top is its first bottom; called by the layers for which Caffe does so."""
+    if layer.param.top[:1] == layer.param.bottom[:1]:
+        raise layer.error("may not work in place, as in Caffe; give its top another name", "top")

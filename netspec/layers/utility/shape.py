@@ -9,7 +9,7 @@ import torch
 
 from netspec.exact import switch
 from netspec.exact.sums import Copies, tiles
-from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.base import Layer, Shape, refuse_in_place
 from netspec.layers.contract.folding import Folds
 from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.registry import register
@@ -20,7 +20,9 @@ class _OtherShape(Layer):
     """A layer whose top has its bottom's numbers in another shape."""
 
     shares = frozenset({"data", "diff"})
-    never_in_place = True
+
+    def setup(self) -> None:
+        refuse_in_place(self)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.reshape(self.top_shapes[0])
@@ -65,6 +67,7 @@ class Reshape(_OtherShape):
     """
 
     def setup(self) -> None:
+        super().setup()
         self.new_axes = list(self.param.reshape_param.shape.dim)
         if self.new_axes.count(-1) > 1 or min(self.new_axes, default=0) < -1:
             message = f"found shape {self.new_axes}, expected at most one -1 (inferred) and nothing below it"
