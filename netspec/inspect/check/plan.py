@@ -38,7 +38,7 @@ def plan_text(net: Net) -> str:
         if not node.bottoms
         for v, shape in zip(node.tops, layer.top_shapes, strict=False)
     )
-    program = net.prepared.program(given, frozenset(net.plan.outputs.values()))
+    program = net.prepared.line_for(given, frozenset(net.plan.outputs.values()))
     steps = program.schedule.steps
     used = [kind for kind in KINDS if kind in program.kinds]
     names = [_name(net, step) for step in steps]
