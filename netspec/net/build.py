@@ -6,14 +6,18 @@ Caffe: Net::Init (src/caffe/net.cpp)
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from netspec import log
+from netspec.data.blobs import Shape
+from netspec.errors import SpecError, Where, did_you_mean
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits
+from netspec.layers import class_of
+from netspec.layers.contract.reading import takes_shapes
 from netspec.net.net import Net
 from netspec.net.weights import copy_weights, load_weights
 from netspec.process.garbage import no_collection
@@ -57,3 +61,19 @@ def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOpti
     if written.layer:  # weights in the prototxt itself
         copy_weights(built, written, source.file)
     return built
+
+
+def not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
+    """Return an error for each given shape whose blob is not a top of a data layer (or Python layer)."""
+    layers = [layer for net in nets for layer in net.layer]
+    makers = [layer for layer in layers if not layer.bottom or ((cls := class_of(layer)) and takes_shapes(cls))]
+    blobs = list(dict.fromkeys(top for layer in makers for top in layer.top))
+    known = ", ".join(blobs) or "none"
+    return [
+        SpecError(
+            f'--shape: no data layer has a top "{name}"{did_you_mean(name, blobs) or ";"} their tops: {known}',
+            Where(str(path)),
+        )
+        for name in shapes
+        if name not in blobs
+    ]

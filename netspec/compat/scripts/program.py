@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType, TracebackType
-from typing import NoReturn
+from typing import Any, NoReturn
 
-from netspec.compat.scripts import old_names, sources, workers
+from netspec.compat.scripts import finder, old_names, sources
 from netspec.errors import SpecError
 
 
@@ -68,7 +68,7 @@ def _prepare(folder: str, options: Options) -> sources.Reader:
     of_program = [os.path.dirname(os.path.abspath(sys.argv[0]))]
     sys.path[: int(sys.path[:1] == of_program)] = [folder]
     reader = sources.Reader(folder, options.python2)
-    workers.prepare(reader, options.shadow)
+    _make_ready(reader, options.shadow)
     for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
         if callable(signal.getsignal(number)):  # netspec's own; a program's workers are ended by SIGTERM
             signal.signal(number, usual)
@@ -112,3 +112,41 @@ def _show(fault: BaseException, trace: TracebackType | None) -> None:
         traceback.print_exception(type(fault), fault, trace)
     if remedy := old_names.remedy(fault):
         print(f"netspec run: {remedy}", file=sys.stderr)
+
+
+# Processes that a program starts by spawn or forkserver: Python starts them anew, and they import the program
+
+
+def _make_ready(reader: sources.Reader, shadow: bool, quiet: bool = False) -> None:
+    """Make this process, and those that it starts, one in which old programs run."""
+    old_names.install({"multiprocessing.spawn": lambda spawn: _hand_on(spawn, reader, shadow)}, quiet)
+    reader.install()
+    finder.install(shadow)  # the last is asked first
+
+
+def _hand_on(spawn: Any, reader: sources.Reader, shadow: bool) -> None:
+    own = spawn.get_preparation_data
+
+    def get_preparation_data(name: str) -> dict[str, Any]:
+        data = own(name)
+        if data.get("init_main_from_path") == reader.main:
+            del data["init_main_from_path"]  # as Python reads it
+            data["init_main_from_name"] = sources.MAIN
+        return {"netspec": _Prepared(reader, shadow), **data}
+
+    spawn.get_preparation_data = get_preparation_data
+
+
+class _Prepared:
+    """Prepares the process that unpickles it, which happens before that imports the program."""
+
+    def __init__(self, reader: sources.Reader, shadow: bool) -> None:
+        self._arguments = reader, shadow
+
+    def __reduce__(self) -> Any:
+        return _prepare_worker, self._arguments
+
+
+def _prepare_worker(reader: sources.Reader, shadow: bool) -> None:
+    reader.quiet = True  # the program's own process has said it
+    _make_ready(reader, shadow, quiet=True)

@@ -19,8 +19,7 @@ from netspec.graph.fold import origins
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.folding import folds_of
 from netspec.layers.contract.reading import reads_data
-from netspec.net.build import build_net
-from netspec.net.given_shapes import not_to_be_given
+from netspec.net.build import build_net, not_to_be_given
 from netspec.net.net import Net
 from netspec.proto.schema import NetParameter, ParamSpec
 from netspec.proto.source_map import SourceMap

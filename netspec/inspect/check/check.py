@@ -21,8 +21,7 @@ from netspec.graph.options import BuildOptions
 from netspec.inspect.check import net_rules, solver_rules  # noqa: F401, they register their rules
 from netspec.inspect.check.findings import NET, PLAN, SETTINGS, SOLVER, TEXT, Finding, findings, not_ignored
 from netspec.inspect.check.forks import gathered, others, python_layers, unknown_types
-from netspec.net.build import build_net
-from netspec.net.given_shapes import not_to_be_given
+from netspec.net.build import build_net, not_to_be_given
 from netspec.net.net import Net
 from netspec.net.recovered import recover_net
 from netspec.net.weights import load_weights
