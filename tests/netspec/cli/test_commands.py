@@ -253,10 +253,11 @@ def test_a_typo_in_a_field_a_type_or_a_blob(run: Run, edited: Edit) -> None:
 
     assert fault("num_output: 6", "num_outputs: 6") == (
         'net.prototxt:35:23: layer "conv1" (Convolution): ConvolutionParameter has no field "num_outputs"; '
-        'did you mean "num_output"?'
+        'did you mean "num_output"? docs/layer.md shows how to add a fork\'s with --plugin FILE.py'
     )
     assert fault('type: "ReLU"', 'type: "Relu"') == (
-        'net.prototxt:71:3: layer "relu1" (Relu): unknown layer type "Relu"; did you mean "ReLU"?'
+        'net.prototxt:71:3: layer "relu1" (Relu): unknown layer type "Relu"; did you mean "ReLU"? '
+        "`netspec layers` lists the known ones, docs/layer.md shows how to add one with --plugin FILE.py"
     )
     assert fault('bottom: "pool1"', 'bottom: "pol1"') == (
         'net.prototxt:47:3: layer "conv2" (Convolution): unknown bottom blob "pol1"; did you mean "pool1"? '
