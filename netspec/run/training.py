@@ -92,7 +92,7 @@ class TrainingStep:
     """Forward and backward passes of a net that trains.
 
     ``loss_weights[i][j]`` is the loss weight of layer i's top j, ``weighted(top, weight)`` its part of the loss.
-    ``overwritten[i]``: layer i's gradient reads memory that is overwritten in place (netspec/run/in_place.py).
+    ``overwritten[i]``: layer i's gradient reads memory that is overwritten in place (netspec/run/eager.py).
     """
 
     def __init__(

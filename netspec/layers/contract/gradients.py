@@ -13,7 +13,7 @@ NOTHING: frozenset[str] = frozenset()
 
 
 class OwnGradient(Protocol):
-    """A layer of one bottom and top whose gradient reads memory: see netspec/run/in_place.py."""
+    """A layer of one bottom and top whose gradient reads memory: see netspec/run/eager.py."""
 
     gradient_reads: frozenset[str]  # of "bottom", "sign" (of it), "top", "kept" (the bottom of the forward pass)
 

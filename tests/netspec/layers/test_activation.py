@@ -159,7 +159,7 @@ def test_clip_without_both_ends_is_refused(build) -> None:
         clip(param, [(3,)])
 
 
-# What Caffe's backward makes of memory that was written over (run/in_place.py): bottom and top are any data.
+# What Caffe's backward makes of memory that was written over (run/eager.py): bottom and top are any data.
 
 
 @pytest.mark.parametrize(
