@@ -87,7 +87,7 @@ def test_kernels_are_what_autograd_computes(
         blob.grad = torch.zeros_like(blob)
     how = Preparation(wanted, tuple(blob.grad for blob in mine.blobs))
     forward, backward = own_kernels(mine, how) or recorded(mine.run, wanted, list(mine.blobs))
-    expected_forward, expected_backward = recorded(watched.log, wanted, list(watched.blobs))
+    expected_forward, expected_backward = recorded(watched.run, wanted, list(watched.blobs))
     generator = torch.Generator().manual_seed(1)
 
     def bottom(i: int, shape: tuple[int, ...]) -> torch.Tensor:
