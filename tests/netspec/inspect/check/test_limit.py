@@ -27,7 +27,7 @@ from netspec.solver.solver import load_solver
 MIB = 1 << 20
 PARAMETERS, DUMMY, HUGE = read_texts("netspec/inspect/check/limit.txt").values()
 CHAIN = 'layer { name: "data" type: "Input" top: "0" input_param { shape { dim: 1 dim: 1048576 } } }\n' + "".join(
-    f'layer {{ name: "r{i}" type: "AbsVal" bottom: "{i}" top: "{i + 1}" }}\n' for i in range(10)
+    f'layer {{ name: "r{i}" type: "TanH" bottom: "{i}" top: "{i + 1}" }}\n' for i in range(10)
 )
 COMMANDS = {
     "check": ["check", "net.prototxt"],
