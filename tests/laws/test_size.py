@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from paths import ROOT
 
 PRODUCT = ("netspec/*.py", "loopclosure/*.py", "lmdb_build/*.py")
-PRODUCT_LINES, TEST_LINES, WORDS_OF_PAGES = 62600, 41000, 27600
+PRODUCT_LINES, TEST_LINES, WORDS_OF_PAGES = 62600, 41000, 27700
 LONGEST_FUNCTION = 60  # lines
 LONGER = {"make_server"}  # one inner function for each message of the protocol
 
