@@ -193,7 +193,8 @@ def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
         between = sum(frame < before for frame in loops)
         summary = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
         print(f"session {number:06d}: {summary}: {into.folder / f'{number:06d}' / 'loops.csv'}")
-    print(f"{len(into)} frames in {len(into.sessions)} sessions: {into.folder}")
+    sessions = len(into.sessions)
+    print(f"{len(into)} frames in {sessions} session{'s' * (sessions != 1)}: {into.folder}")
 
 
 def _query(a: argparse.Namespace) -> None:
