@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -225,8 +225,11 @@ class Map:
                 with whole_file(path) as unfinished, unfinished.open("wb") as stream:
                     np.save(stream, rows)
         for folder in self.folder.glob("projected-*"):
-            if folder != path.parent:
-                shutil.rmtree(folder, ignore_errors=True)
+            if folder != path.parent and re.fullmatch(r"projected-\d+", folder.name):
+                with suppress(OSError):  # what is not of a map's own making stays
+                    for session in self.sessions:
+                        (folder / f"{session.folder.name}.npy").unlink(missing_ok=True)
+                    folder.rmdir()
 
 
 class _Described:

@@ -134,6 +134,25 @@ def test_what_is_projected_is_kept(drives: Path, tmp_path: Path, monkeypatch: py
     assert {path.parent.name for path in folder.glob("projected-*/*")} == {f"projected-{frames}"}
 
 
+@pytest.mark.slow
+def test_of_what_was_projected_before_only_a_maps_own_files_go(
+    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(maps, "LEARNED_FROM", 9)
+    monkeypatch.setattr(maps, "COMPONENTS", 8)
+    opened, folder = Map.create(tmp_path / "M", "thumbnails"), tmp_path / "M"
+    opened.add(open_recording(drives / "a"), Thumbnailer())
+    own = folder / "projected-10" / "000000.npy"
+    strange = [own.with_name("notes.txt"), folder / "projected-photos" / "000000.npy", folder / "projected-3"]
+    strange[1].parent.mkdir()
+    for path in strange:
+        path.touch()
+    assert own.exists()
+    opened.add(open_recording(drives / "b"), Thumbnailer())
+    assert not own.exists()
+    assert all(path.exists() for path in strange)
+
+
 (DYING,) = read_texts("loopclosure/detector/map.txt").values()
 
 
