@@ -114,8 +114,10 @@ class Processes:
                     work.wait()
                 else:
                     self._look_and_wait(work)
+        except Lost:
+            raise
         except (RuntimeError, ValueError) as fault:
-            raise fault if isinstance(fault, Lost) else _lost(f"rank {self.rank} of {self.count}", fault) from None
+            raise _lost(f"rank {self.rank} of {self.count}", fault) from None
 
     def _look_and_wait(self, work: Any) -> None:
         """Wait for an operation of gloo, and after a request to end no longer than GRACE."""
