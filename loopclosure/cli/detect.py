@@ -163,7 +163,10 @@ def _changes(a: argparse.Namespace) -> dict[str, Any]:
 
 def _detector(a: argparse.Namespace, describe: Describe | None, views: int) -> LoopDetector:
     if a.resume:
-        return LoopDetector.load(a.resume, describe)
+        detector = LoopDetector.load(a.resume, describe)
+        if detector.fingerprint is None:
+            warn(f"{a.resume} does not say what net described its frames; it has to be the same one")
+        return detector
     check = None
     changes = _changes(a)
     if a.video:

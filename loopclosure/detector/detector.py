@@ -70,6 +70,7 @@ class LoopDetector:
         if unknown:
             raise TypeError(f"LoopDetector has no setting {', '.join(sorted(unknown))}; known: {', '.join(given)}")
         self.describe = describe
+        self.fingerprint: str | None = fingerprint_of(describe)  # of what described the frames; None: an older file's
         self.settings = DetectorSettings(**{**given, **changes})
         self.check = check
         self.loops: list[LoopResult] = []
@@ -182,6 +183,7 @@ class LoopDetector:
         """Write everything except ``describe`` to an .npz file, from which ``load`` continues."""
         about = {
             "format": FORMAT,
+            "fingerprint": self.fingerprint,
             "settings": asdict(self.settings),
             "check": None if self.check is None else asdict(self.check),
             "runs": self._runs,
@@ -196,7 +198,7 @@ class LoopDetector:
     def load(cls, path: str | Path, describe: Describe | None = None, index: Index | str = "exact") -> LoopDetector:
         """Read what ``save`` wrote; ``describe`` must be the one that the detector was made with.
 
-        Raises InputError for any other file.
+        Raises InputError for any other file, and where both have a ``fingerprint``, as nets do, that differs.
         """
         arrays = read_npz(path, SAVED)
         try:
@@ -207,6 +209,8 @@ class LoopDetector:
             if about["check"] is not None:  # files from before a setting was added do not have it
                 check = from_json(GeometricCheck, {**asdict(GeometricCheck()), **about["check"]})
             detector = cls(describe, from_json(DetectorSettings, about["settings"]), check=check, index=index)
+            detector.fingerprint = about.get("fingerprint")
+            refuse_another(fingerprint_of(describe), detector.fingerprint, "or begin anew", path)
             detector._take(arrays)
             detector._sessions = _starts(about.get("sessions", [0]), len(detector))
             detector._steps = detector._all_steps()
@@ -358,6 +362,18 @@ class LoopDetector:
                 return result("accepted", number, value, inliers)
             most = max(most, found.inliers)
         return result("not verified", inliers=most)
+
+
+def fingerprint_of(describe: Describe | None) -> str:
+    """Return the ``fingerprint`` of what describes, which a net has; "" where there is none."""
+    return str(getattr(describe, "fingerprint", ""))
+
+
+def refuse_another(describes: str, described: str | None, instead: str, path: str | Path) -> None:
+    """Raise InputError for fingerprints that differ; ``instead`` says what else to do than take the other net."""
+    if describes and described and describes != described:
+        told = f"its frames were described by another net ({described}, this is {describes})"
+        raise InputError(f"{told}; take the version of the package that has it, {instead}", path)
 
 
 def _checked_pose(pose: Sequence[float] | np.ndarray | None) -> np.ndarray | None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from loopclosure.descriptors.whitening import Whitening, learn_whitening
 from loopclosure.detector.decision import LoopResult
-from loopclosure.detector.detector import Describe, LoopDetector
+from loopclosure.detector.detector import Describe, LoopDetector, fingerprint_of, refuse_another
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.frames import Points, points_of
 from loopclosure.detector.run import NAME, Recording, run_detector, views_of
@@ -38,6 +38,8 @@ COMPONENTS = 256  # of a projected descriptor
 LEARNED_FROM = 2048  # frames, evenly spread; fewer are compared as they are
 BLOCK = 4096  # frames that are read at a time
 Decide = Callable[[LoopDetector, list[LoopResult]], list[LoopResult]]
+# Of the nets of version 0.3.0, whose maps do not say it.
+OLDER = {"default": "73e9d500b1c7d365", "small": "f937a16fd380f70e"}
 MAPPED = ("rows", "points", "descriptors")  # arrays in files of their own, read where they are used
 
 
@@ -94,6 +96,7 @@ class Map:
     def _read_sessions(self) -> None:
         while (self.folder / f"{len(self.sessions):06d}").is_dir():
             session = _read_session(self.folder / f"{len(self.sessions):06d}")
+            session.arrays.setdefault("fingerprint", OLDER.get(self.describer, ""))
             first = [*self.sessions, session][0]
             width, expected = (each.arrays["rows"].shape[1] for each in (session, first))
             if width != expected:
@@ -124,12 +127,15 @@ class Map:
 
         index  for :func:`loopclosure.index.index.open_index`; a database keeps what it has of the map already
 
-        Raises InputError where descriptors of the net and of the map do not have the same size.
+        Raises InputError where descriptors of the net and of the map do not have the same size, or fingerprint.
         """
         return self._detector(_Described(describe, self._projection(index)), index)
 
     def _detector(self, described: _Described, index: str) -> LoopDetector:
         views = described.views
+        for session in self.sessions:
+            known = str(session.arrays["fingerprint"])
+            refuse_another(described.fingerprint, known, "or build the map again from its drives", self.folder)
         opened = open_index(index, METRIC, len(self) * views)
         there = len(opened) // views
         detector = LoopDetector(described, check=GeometricCheck(), index=opened, metric=METRIC, views=views)
@@ -168,8 +174,8 @@ class Map:
                 np.save(unfinished / "rows.npy", rows)
                 np.save(unfinished / "points.npy", arrays.pop("points"))
                 np.save(unfinished / "descriptors.npy", arrays.pop("descriptors"))
-                names = np.array(recording.names)
-                np.savez(unfinished / "frames.npz", names=names, source=np.array(str(recording.source)), **arrays)
+                said = {"source": np.array(str(recording.source)), "fingerprint": np.array(described.fingerprint)}
+                np.savez(unfinished / "frames.npz", names=np.array(recording.names), **said, **arrays)
                 every = [*self.names, *(f"{folder.name}/{name}" for name in recording.names)]
                 write_loops_csv(unfinished / "loops.csv", [r for r in results if r], detector.stamps, every)
             self._read_sessions()
@@ -236,7 +242,7 @@ class _Described:
     """Describes images for a map: ``kept`` has what the net said, in half precision, as files keep it."""
 
     def __init__(self, describe: Describe, projection: Whitening | None) -> None:
-        self.views = views_of(describe, None)
+        self.views, self.fingerprint = views_of(describe, None), fingerprint_of(describe)
         self.kept: list[np.ndarray] = []
         self._describe, self.projection = describe, projection
 

@@ -54,6 +54,11 @@ class Describer:
         )
         self.views = len(self.image_net.zooms)
 
+    @property
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits: those of another net, of other weights or scaling differ; those of engines do not."""
+        return self.image_net.fingerprint
+
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the descriptor (views D,) float32 of an image (H, W, 3) or (H, W), uint8, BGR, of any size."""
         return self.image_net([image])[0]

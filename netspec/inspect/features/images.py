@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -83,6 +85,7 @@ class ImageNet:
             return built
 
         self._build, self._net, self._model = build, None, None
+        self._after, self._weights = after, weights
         self._choice = choice or Choice()
         made_of = {"blob": blob, "input": input_blob, "shape": shape, "strict": options.strict, "scaled": bool(steps)}
         self._open(Origin([model, *weights], made_of), options.device)
@@ -107,6 +110,16 @@ class ImageNet:
         from netspec.export.engines.net import write_model
 
         write_model(self._build(), path)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """A hash of what decides the blob: the net, its weights, what is done to images; not what engine runs it."""
+        s = self.scaling
+        done = f"{self.shape} {self.zooms} {s.mean.tolist()} {s.scale} {s.raw_scale} {s.swap}"
+        digest = hashlib.sha256(self._after.SerializeToString(deterministic=True) + done.encode())
+        for path in self._weights:
+            digest.update(Path(path).read_bytes())
+        return digest.hexdigest()[:16]
 
     def __call__(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """Return the blob (N, V D) float32, views in order, of images (H, W, 3) or (H, W), uint8, BGR, of any size."""

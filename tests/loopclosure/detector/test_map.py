@@ -17,6 +17,7 @@ import pytest
 from case_files import read_texts
 from loopclosure.cli import main
 from loopclosure.descriptors.thumbnails import Thumbnailer
+from loopclosure.detector import LoopDetector
 from loopclosure.detector import map as maps
 from loopclosure.detector.map import Map
 from loopclosure.detector.run import open_recording, run_detector
@@ -180,6 +181,35 @@ def test_one_adds_at_a_time_and_others_read(a_map: Map, drives: Path, tmp_path: 
     other.add(open_recording(drives / "b"), Thumbnailer())
     a_map.add(open_recording(drives / "c"), Thumbnailer())  # sees what the other has added
     assert [len(session.names) for session in a_map.sessions] == [10, 10, 15]
+
+
+class Net(Thumbnailer):
+    """As a net, it says what describes."""
+
+    fingerprint = "a net"
+
+
+@pytest.mark.parametrize(("older", "described"), [(False, "a net"), (True, "73e9d500b1c7d365")])
+def test_a_map_that_another_net_described_is_refused(
+    older: bool, described: str, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Map.create(tmp_path / "M", "default").add(open_recording(drives / "a"), Net())
+    if older:
+        with np.load(tmp_path / "M" / "000000" / "frames.npz") as arrays:
+            kept = {key: arrays[key] for key in arrays.files if key != "fingerprint"}
+        np.savez(tmp_path / "M" / "000000" / "frames.npz", **kept)
+    monkeypatch.setattr(Net, "fingerprint", described)
+    Map(tmp_path / "M").detector(Net()).save(tmp_path / "d.npz")
+    LoopDetector.load(tmp_path / "d.npz", Net())
+    monkeypatch.setattr(Net, "fingerprint", "another")
+    told = rf"described by another net \({described}, this is another\); take the version of the package that has it, "
+    with pytest.raises(InputError, match=f"M: its frames were {told}or build the map again from its drives"):
+        Map(tmp_path / "M").detector(Net())
+    with pytest.raises(InputError, match=told):
+        Map(tmp_path / "M").add(open_recording(drives / "b"), Net())
+    with pytest.raises(InputError, match=f"d.npz: its frames were {told}or begin anew"):
+        LoopDetector.load(tmp_path / "d.npz", Net())
+    Map(tmp_path / "M").add(open_recording(drives / "b"), Thumbnailer())  # of a function nothing is known
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,15 @@ def test_weights_come_from_several_files(describe: Describer) -> None:
         Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel, gone.caffemodel")
 
 
+def test_another_net_has_another_fingerprint(describe: Describer, tmp_path: Path) -> None:
+    prototxt, weights = Path("sgd_step/train_val.prototxt"), Path("sgd_step/init.caffemodel")
+    (tmp_path / "same.prototxt").write_text(f"# a comment\n{prototxt.read_text()}")
+    assert Describer("same.prototxt", weights, engine="onnxruntime", cache=tmp_path).fingerprint == describe.fingerprint
+    others = [Describer(prototxt, weights, scale=2), Describer(prototxt, weights, zooms="1,0.5")]
+    others.append(Describer(prototxt, f"{weights},{weights}"))
+    assert len({describe.fingerprint, *(other.fingerprint for other in others)}) == 4
+
+
 def test_images_of_any_size_are_resized(describe: Describer) -> None:
     image = np.random.default_rng(0).integers(0, 256, (60, 90, 3), dtype=np.uint8)
     small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (28, 28))
