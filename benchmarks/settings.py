@@ -150,7 +150,8 @@ def _best(scores: np.ndarray, drive: Drive, pairs: Pairs) -> tuple[float, str]:
     if not two:
         allowed &= earlier(len(scores), data.exclude_frames)
     tried = {"single images": np.where(allowed, scores, np.nan)}
-    given = Candidates(scores, allowed, two, *(np.arange(size) for size in scores.shape))
+    rows, columns = map(np.arange, scores.shape)
+    given = Candidates(scores, allowed, two, rows, columns, rows)
     tried |= {str(s): search(given, s).scores for s in settings(scores.shape[0], scores.shape[1], two)}
     recalls = {name: _recall(matrix, truth) for name, matrix in tried.items()}
     check = GeometricCheck()

@@ -100,9 +100,9 @@ def answer(
 
 
 def _results(given: Candidates, matches: Matches, verdicts: list[str], stamps: np.ndarray) -> list[LoopResult]:
-    """Return the result of each query of the whole drive: that of the last one in which the camera had moved."""
+    """Return the result of each query of the whole drive: that of the frame that stands for it."""
     results = []
-    for query, row in enumerate(np.searchsorted(given.queries, np.arange(len(stamps)), side="right") - 1):
+    for query, row in enumerate(given.stands):
         match = int(given.references[matches.match[row]]) if matches.there[row] else -1
         score, inliers, verdict = float(matches.score[row]), int(matches.inliers[row]), verdicts[row]
         results.append(

@@ -13,6 +13,8 @@ DRIFT = 0.1  # of the way: more than odometry is usually off
 FAR_M = 2 * MAX_DISTANCE_M  # from there on two frames show different places
 AWAY = 2  # frames in a row
 STILL = 0.5  # of a usual step from frame to frame
+STOP = 6  # steps
+MOVES = 0.95  # the quantile of steps at which the search for a usual one begins
 ENOUGH = 0.5  # of the queries with a candidate must have frames far apart, for these to show how others score
 
 
@@ -24,6 +26,7 @@ class Candidates:
     allowed    which pairs are candidates
     two        two traverses, or one sequence with itself
     queries, references  the numbers of the frames that these are, in the whole drive
+    stands     (N,) for each query of the whole drive, the row of the frame that shows the same, or is it
     different  pairs that are known to show different places; None: not known of enough queries
     said       how long a visit to a place lasts, in a sentence; empty for two traverses
     """
@@ -33,6 +36,7 @@ class Candidates:
     two: bool
     queries: np.ndarray
     references: np.ndarray
+    stands: np.ndarray
     different: np.ndarray | None = None
     said: str = ""
 
@@ -56,8 +60,8 @@ def candidates(
     """
     if not two and visit is not None:
         allowed = allowed & earlier(len(scores), visit)
-    queries = moved(scores)
-    references = moved(scores.T) if two else queries
+    queries, stands = moved(scores)
+    references = moved(scores.T)[0] if two else queries
     if (len(queries), len(references)) != scores.shape:
         part = np.ix_(queries, references)
         scores, allowed, far = scores[part], allowed[part], None if far is None else far[part]
@@ -72,27 +76,41 @@ def candidates(
         back, lasted = _returned(scores, allowed, queries)
         allowed &= back
         said = f"one visit to a place lasts {np.median(lasted):.0f} frames as a rule, {lasted.max()} at most"
-    return Candidates(scores, allowed, two, queries, references, different, said)
+    return Candidates(scores, allowed, two, queries, references, stands, different, said)
 
 
-def moved(scores: np.ndarray) -> np.ndarray:
-    """Return the numbers of the frames, rows of scores (N, M), in which the camera has moved since the one before.
+def moved(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frames, rows of scores (N, M), in which the camera has moved, and which of them each frame (N,) shows.
 
-    A frame is left out that is alike to all others as the last that was taken, within ``STILL`` of a usual step: of a
-    robot that stands, one frame is taken. Lines through all of them would lead past the place.
+    Where a robot stands, for ``STOP`` steps or more that are on average less than ``STILL`` of a usual step, one frame
+    is taken while the others are within that of it: lines through all of them would lead past the place. They show the
+    same as that one, or as the next where that is more alike. The usual step is one of a robot that moves, though it
+    may stand for most of the time: the median of those that are no stop.
     """
 
     def step(a: int, b: int) -> float:
         both = np.isfinite(scores[a]) & np.isfinite(scores[b])
-        return float(np.abs(scores[a, both] - scores[b, both]).mean()) if both.any() else np.inf
+        return float(np.sqrt(np.mean((scores[a, both] - scores[b, both]) ** 2))) if both.any() else np.inf
 
     steps = np.array([step(i, i + 1) for i in range(len(scores) - 1)])
-    usual = np.median(steps[np.isfinite(steps)]) if np.isfinite(steps).any() else 0.0
-    taken = [0]
-    for number in range(1, len(scores)):
-        if step(taken[-1], number) >= STILL * usual:
-            taken.append(number)
-    return np.array(taken)
+    means = np.convolve(steps, np.full(STOP, 1 / STOP), "valid") if len(steps) >= STOP else np.zeros(0)
+    known = np.append(0.0, means[np.isfinite(means)])
+    usual, before = np.quantile(known, MOVES), np.inf
+    while usual < before:
+        usual, before = np.median(known[known >= STILL * usual]), usual
+    still = np.convolve(means < STILL * usual, np.ones(STOP)) > 0
+    taken, stands, first = list[int](), list[int](), 0
+    while first < len(scores):
+        end = first + 1
+        while end < len(scores) and still[end - 1] and step(first, end) < STILL * usual:
+            end += 1
+        if end - first <= STOP:
+            end = first + 1
+        following = [end < len(scores) and step(i, end) < step(first, i) for i in range(first + 1, end)]
+        stands += [len(taken), *(len(taken) + later for later in following)]
+        taken.append(first)
+        first = end
+    return np.array(taken), np.array(stands)
 
 
 def _returned(scores: np.ndarray, allowed: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

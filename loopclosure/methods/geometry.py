@@ -16,7 +16,7 @@ from loopclosure.progress import Progress
 SAMPLE = 40  # matches, and unlike pairs, that tell whether verification works
 # The share of what sequences accept, or without sequences the number of matches, that verification must find.
 LEAST_SHARE, LEAST_FOUND = 0.5, 3
-# Where at most this share of unlike pairs are verified, a verified match beside a loop is one as well.
+# At most this share of unlike pairs has the evidence by which a match is verified.
 RARELY = 0.05
 WINDOW = 5  # references beside a line, and at least so many queries along it, that a verified pair vouches for
 BESIDE = SequenceSettings(2 * WINDOW, *UNEVEN)  # the line through a single image that is a loop by itself
@@ -39,6 +39,11 @@ class Geometry:
     unlike: np.ndarray | None
     said: str
     seldom: bool = False
+
+    def rare(self, evidence: np.ndarray) -> np.ndarray:
+        """Return which evidence (Q,) is enough, and more than nearly all unlike pairs have."""
+        assert self.unlike is not None
+        return (evidence >= 1) & (evidence > np.quantile(np.append(0.0, self.unlike), 1 - RARELY))
 
     def common(self, evidence: float) -> bool:
         """Whether more than half of the unlike pairs have this evidence."""
@@ -143,12 +148,11 @@ def kept(matches: Matches, geometry: Geometry, lines: Lines | None, precision: f
     # From afar a place is seen before the camera is there: other queries fit it better.
     near = np.ones(len(accepted), bool) if lines is None else lines.near
     sure = near & (evidence >= least)
-    verified = sure | accepted if geometry.common(1) else matches.inliers > 0
+    verified = sure | accepted if geometry.common(1) else geometry.rare(evidence)
     before, after = _beside(matches.match, verified, lines)
     # Past the last verified match a loop has ended, though the line through it goes on.
     loops = sure | (accepted & (verified | (before & after)))
-    rare = np.count_nonzero(unlike >= 1) <= RARELY * len(unlike)
-    while rare and np.any(more := verified & near & np.any(_beside(matches.match, loops, lines), axis=0) & ~loops):
+    while np.any(more := verified & near & np.any(_beside(matches.match, loops, lines), axis=0) & ~loops):
         loops |= more
     return loops
 

@@ -17,7 +17,7 @@ from loopclosure.methods import decoys
 from loopclosure.methods import drive as whole
 from loopclosure.methods.auto import answer
 from loopclosure.methods.base import Images, MethodContext, MethodResult
-from loopclosure.methods.candidates import candidates, far_apart
+from loopclosure.methods.candidates import candidates, far_apart, moved
 from loopclosure.methods.decoys import threshold
 from loopclosure.methods.geometry import try_geometry
 from loopclosure.methods.named import make_method
@@ -258,15 +258,43 @@ def test_a_visit_to_a_place_has_an_end(length):
 
 
 @pytest.mark.parametrize("stands", ["query", "reference"])
-def test_a_robot_that_stands_adds_no_frames_to_a_sequence(stands):
+@pytest.mark.parametrize(("times", "noise"), [(40, 0.03), (150, 0.1)])
+def test_a_robot_that_stands_adds_no_frames_to_a_sequence(stands, times, noise):
     road = drive(150, 6)
-    places = np.repeat(np.arange(150), np.where(np.isin(np.arange(150), (30, 90)), 40, 1))
-    still, moving = again(again(road, 0.8, 7)[places], 0.03, 8), np.arange(150)
+    places = np.repeat(np.arange(150), np.where(np.isin(np.arange(150), (30, 90)), times, 1))
+    still, moving = again(again(road, 0.8, 7)[places], noise, 8), np.arange(150)
     there, here = (places, moving) if stands == "query" else (moving, places)
     scores = alike(still, road) if stands == "query" else alike(road, still)
     found = answer(scores, everything(scores), two=True)
     assert np.count_nonzero(found.accepted) > 0.95 * len(there)
     assert np.all(np.abs(here[found.match] - there)[found.accepted] <= 1)
+
+
+def test_a_robot_that_moves_slowly_for_a_while_does_not_stand():
+    road = drive(200, 6)
+    places = np.cumsum(np.where(np.isin(np.arange(200) // 40, (1, 3)), 0.4, 1))
+    left, part = np.floor(places).astype(int), (places % 1)[:, None]
+    scores = alike((1 - part) * road[left] + part * road[left + 1], road)
+    taken, same = moved(scores)
+    assert np.array_equal(taken, np.arange(200))
+    assert np.array_equal(same, taken)
+
+
+def test_what_a_fifth_of_unlike_pairs_has_verifies_nothing():
+    """A hood has enough points in many pairs: a loop ends with the last match that has more."""
+    road = drive(150, 6)
+    scores = alike(np.concatenate([again(road[:90], 1.0, 7), drive(60, 16)]), road)
+    found = answer(
+        scores,
+        everything(scores),
+        True,
+        0.99,
+        GeometricCheck(),
+        lambda q, r: Agreement(60, 50 if q < 90 and abs(q - r) <= 3 else 24 * ((q + r) % 5 == 0), 20),
+    )
+    assert re.search("and ([5-9]|1[0-9]) of 40 unlike pairs", found.reasons[1])
+    assert np.count_nonzero(found.accepted[:90]) > 80
+    assert not found.accepted[90:].any()
 
 
 def test_a_loop_does_not_go_on_past_a_seam():
