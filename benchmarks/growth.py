@@ -1,4 +1,4 @@
-"""How cost grows: with layers, the batch, pairs in a database, frames of a sequence, places of FAB-MAP, workers.
+"""How cost grows: with layers, the batch, pairs in a database, frames of a sequence, workers.
 
 Each size is measured in a process of its own, ``python -m benchmarks.growth KIND SIZE``, so that its peak of memory is
 its own. Times are those that the process computed, in one thread, which other load hardly changes; only those of
@@ -41,7 +41,6 @@ TRAINED = "small/siamese_resnet27_256"
 WALK = 300  # frames, whose descriptors are perturbed to the number wanted
 QUERIES, AT_ONCE = 50, 4096  # frames searched for, and added at a time
 AGAIN = 0.3  # of the difference of any two descriptors: how far a frame seen again is from itself
-WORDS, WORDS_SEEN = 2000, 150
 PAIRS = 2000  # that each number of workers converts
 
 
@@ -184,26 +183,6 @@ def _differences(base: np.ndarray, count: int, random: np.random.Generator) -> n
     return base[i] - base[j]
 
 
-def places(size: int) -> Found:
-    """Locate images of 150 of 2,000 words among ``size`` places of FAB-MAP 2.0."""
-    from loopclosure.words.chow_liu import learn_tree
-    from loopclosure.words.fabmap import FabMap
-
-    random = np.random.default_rng(0)
-
-    def images(count: int) -> np.ndarray:
-        return random.random((count, WORDS)) < WORDS_SEEN / WORDS
-
-    training = images(500)
-    online = FabMap(learn_tree(training, lower_bound=0), training)
-    for seen in images(size):
-        online.add(seen)
-    queries = images(QUERIES)
-    online.locate(queries[0])  # puts the last image on the map
-    spent = _least(lambda: [online.locate(seen) for seen in queries], 1)
-    return {"locating, ms per image": 1e3 * spent / len(queries)}
-
-
 def workers(size: int) -> Found:
     """Convert pairs of PNG images of 640x480 to 224x224 with ``size`` processes."""
     import cv2
@@ -242,7 +221,6 @@ KINDS: Mapping[str, Kind] = {
     "batch": Kind("pairs per iteration", (1, 2, 4, 8, 16, 32, 64), batch),
     "pairs": Kind("pairs in an LMDB", (1000, 10_000, 100_000, 1_000_000), pairs),
     "frames": Kind("frames", (1000, 10_000, 100_000, 1_000_000), frames),
-    "places": Kind("places", (1000, 3000, 10_000), places),
     "workers": Kind("workers", (1, 2), workers),
 }
 

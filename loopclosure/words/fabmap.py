@@ -11,9 +11,6 @@ parent.
 
 from __future__ import annotations
 
-from array import array
-from bisect import bisect_left
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +27,7 @@ BLOCK_ROWS = 256
 class FabMapSettings:
     """Settings of FAB-MAP; the defaults are openFABMAP's.
 
-    version      2: inverted index, the new place sampled over all training images. 1: every word of every place
+    version      of 2 the new place is sampled over all training images, each once
     hit          p(word seen | its cause is there), PzGe
     false_alarm  p(word seen | its cause is not there), PzGNe; the Oxford model has 0.005
     new_place    "sampled" from training images, or "mean_field": the average place (version 1 only)
@@ -73,34 +70,6 @@ class FabMapSettings:
             raise InputError(f"samples is {self.samples}; 0 takes each training image once")
         if self.recent < 0:
             raise InputError(f"recent is {self.recent}; 0 puts each image on the map at once")
-
-
-@dataclass(frozen=True)
-class Location:
-    """Where one image was taken: the full distribution over a new place and the n places of the map.
-
-    new          posterior probability of a new place
-    places       (n,) posterior probabilities of the places; with ``new`` they sum to 1
-    loglik       (n,) log-likelihoods of the image given each place [nat]; version 2: up to a term common to all
-    loglik_new   the same for a new place
-    """
-
-    new: float
-    places: np.ndarray
-    loglik: np.ndarray
-    loglik_new: float
-
-    @property
-    def log_odds(self) -> np.ndarray:
-        """Evidence for each place against a new one [nat] (n,): a better score, since the posterior saturates."""
-        return self.loglik - self.loglik_new
-
-    @property
-    def best(self) -> int:
-        """The most probable place, -1 for a new place."""
-        if self.places.size == 0 or self.new >= self.places.max():
-            return -1
-        return int(np.argmax(self.places))
 
 
 def place_table(tree: WordTree, settings: FabMapSettings) -> np.ndarray:
@@ -176,20 +145,20 @@ class FabMapModel:
         return np.random.default_rng(self.settings.seed)
 
     def new_place(self, queries: np.ndarray, draws: np.random.Generator) -> np.ndarray:
-        """Return ln p(query | new place) as (Q,) for words (Q, v)."""
+        """Return ln p(query | new place) as (Q,) for words (Q, v): the mean over sampled images, or the mean field."""
         if self.settings.new_place == "sampled":
-            return self.mean_over_samples(self.likelihoods(queries, self.training), draws)
+            loglik, images, samples = (
+                self.likelihoods(queries, self.training),
+                len(self.training),
+                self.settings.samples,
+            )
+            if self.settings.version == 2 or samples == 0:
+                return logsumexp(loglik, axis=1) - np.log(images)
+            times_drawn = draws.multinomial(samples, np.full(images, 1.0 / images), size=len(loglik))
+            return logsumexp(loglik, axis=1, b=times_drawn) - np.log(samples)
         seen = np.asarray(queries) > 0
         parent_seen = seen[:, self.tree.parent]
         return self.log_mean_field[np.arange(len(self.tree)), seen.astype(int), parent_seen.astype(int)].sum(axis=1)
-
-    def mean_over_samples(self, loglik: np.ndarray, draws: np.random.Generator) -> np.ndarray:
-        """Return the log of the mean likelihood (Q,) over sampled training images, given those of all (Q, n)."""
-        images, samples = len(self.training), self.settings.samples
-        if self.settings.version == 2 or samples == 0:
-            return logsumexp(loglik, axis=1) - np.log(images)
-        times_drawn = draws.multinomial(samples, np.full(images, 1.0 / images), size=len(loglik))
-        return logsumexp(loglik, axis=1, b=times_drawn) - np.log(samples)
 
     def posterior(self, loglik: np.ndarray, loglik_new: float, previous: np.ndarray | None = None) -> np.ndarray:
         """Return the distribution (1 + n,) over a new place (entry 0) and n places.
@@ -217,117 +186,6 @@ class FabMapModel:
         return by_state[words, 0, state], by_state[words, 1, state]
 
 
-class _AllWords:
-    """The places of FAB-MAP 1: the words of each place, all of them evaluated for every query."""
-
-    def __init__(self, model: FabMapModel) -> None:
-        self._model = model
-        self._words = array("q")
-        self._owners = array("q")
-        self._size = 0
-
-    def add(self, seen: np.ndarray) -> None:
-        present = np.flatnonzero(seen)
-        self._words.extend(present.tolist())
-        self._owners.extend([self._size] * len(present))
-        self._size += 1
-
-    def loglik(self, seen: np.ndarray) -> np.ndarray:
-        absent, present = self._model._word_terms(seen[None])
-        gain = (present - absent)[0, np.frombuffer(self._words, np.int64)] if self._words else np.zeros(0)
-        owners = np.frombuffer(self._owners, np.int64) if self._owners else np.zeros(0, np.int64)
-        return absent.sum() + np.bincount(owners, gain, minlength=self._size)
-
-
-class _InvertedIndex:
-    """The places of FAB-MAP 2: for each word the places that have it, so that a query reads only its own words.
-
-    Log-likelihoods are relative to a place without words: the omitted term is common to all places.
-    """
-
-    def __init__(self, model: FabMapModel) -> None:
-        self._parent = model.tree.parent
-        gain = model.log_table[:, 1] - model.log_table[:, 0]  # what L = 1 adds [word, z, a]
-        self._default = gain[:, 0, 0]  # neither the word nor its parent is seen
-        self._seen = gain[:, 1] - self._default[:, None]  # [word, a]
-        self._orphan = gain[:, 0, 1] - self._default  # the parent is seen, the word is not
-        self._defaults = array("d")
-        self._places_with = [array("q") for _ in range(len(model.tree))]
-
-    def add(self, seen: np.ndarray) -> None:
-        present = np.flatnonzero(seen)
-        place = len(self._defaults)
-        self._defaults.append(float(self._default[present].sum()))
-        for word in present:
-            self._places_with[word].append(place)
-
-    def loglik(self, seen: np.ndarray) -> np.ndarray:
-        result = np.array(self._defaults)
-        parent_seen = seen[self._parent]
-        observed = np.flatnonzero(seen)
-        orphans = np.flatnonzero(~seen & parent_seen)
-        for words, gains in (
-            (observed, self._seen[observed, parent_seen[observed].astype(int)]),
-            (orphans, self._orphan[orphans]),
-        ):
-            for word, gain in zip(words, gains, strict=True):
-                places = self._places_with[word]
-                if places:
-                    result[np.frombuffer(places, np.int64)] += gain
-        return result
-
-
-class FabMap:
-    """FAB-MAP online, image by image.
-
-    ``add(words)`` locates an image and puts it on the map; ``locate(words)`` only locates it. ``images`` has, for each
-    place of the map, the number of its image (every call is counted, from 0).
-    """
-
-    def __init__(self, tree: WordTree, training: np.ndarray | None, settings: FabMapSettings | None = None) -> None:
-        self.model = FabMapModel(tree, training, settings)
-        self.images: list[int] = []
-        self._calls = 0
-        self._waiting: deque[tuple[int, np.ndarray]] = deque()
-        self._previous: np.ndarray | None = None
-        self._draws = self.model.draws()
-        store = _AllWords if self.model.settings.version == 1 else _InvertedIndex
-        self._places = store(self.model)
-        self._samples = store(self.model)
-        if self.model.settings.new_place == "sampled":
-            for seen in self.model.training:
-                self._samples.add(seen)
-
-    def locate(self, words: np.ndarray) -> Location:
-        """Locate the image with the words (v,); the map does not change, the state of the motion model does."""
-        seen = np.asarray(words) > 0
-        if seen.shape != (len(self.model.tree),):
-            raise InputError(f"words have shape {seen.shape}, the vocabulary {len(self.model.tree)} words")
-        while self._waiting and self._waiting[0][0] < self._calls - self.model.settings.recent:
-            image, place = self._waiting.popleft()
-            self._places.add(place)
-            self.images.append(image)
-        loglik = self._places.loglik(seen)
-        if self.model.settings.new_place == "sampled":
-            loglik_new = self.model.mean_over_samples(self._samples.loglik(seen)[None], self._draws)
-        else:
-            loglik_new = self.model.new_place(seen[None], self._draws)
-        p = self.model.posterior(loglik, loglik_new[0], self._previous)
-        self._previous = p
-        self._calls += 1
-        return Location(float(p[0]), p[1:], loglik, float(loglik_new[0]))
-
-    def add(self, words: np.ndarray, only_new: bool = False) -> Location:
-        """Locate the image with the words (v,), then make it a place.
-
-        ``only_new``: only if a new place is the most probable (openFABMAP's NewMaximumOnly); otherwise always ("All").
-        """
-        location = self.locate(words)
-        if not only_new or location.best == -1:
-            self._waiting.append((self._calls - 1, np.asarray(words) > 0))
-        return location
-
-
 @dataclass(frozen=True)
 class PlaceScores:
     """The result of FAB-MAP for Q images and P places.
@@ -353,22 +211,18 @@ def score_sets(model: FabMapModel, queries: np.ndarray, places: np.ndarray) -> P
     return PlaceScores(posterior, new, loglik - loglik_new[:, None])
 
 
-def score_sequence(model: FabMapModel, words: np.ndarray, only_new: bool = False) -> PlaceScores:
-    """Score each image of a sequence, words (n, v), on the map of the images before it, as :class:`FabMap` does.
+def score_sequence(model: FabMapModel, words: np.ndarray) -> PlaceScores:
+    """Score each image of a sequence, words (n, v), on the map of the images before it.
 
-    The upper triangle with the diagonal is NaN, and with ``only_new`` the columns of images that were not made places.
-    The posterior of images too recent to be on the map is NaN as well; their log-odds are not.
+    The upper triangle with the diagonal is NaN. The posterior of images too recent to be on the map is NaN as well;
+    their log-odds are not.
     """
     loglik, loglik_new = model.likelihoods(words, words), model.new_place(words, model.draws())
-    posterior, log_odds = np.full_like(loglik, np.nan), np.full_like(loglik, np.nan)
-    new = np.empty(len(loglik))
-    founders: list[int] = []
+    posterior, new = np.full_like(loglik, np.nan), np.empty(len(loglik))
     previous = None
     for i in range(len(loglik)):
-        places = founders[: bisect_left(founders, i - model.settings.recent)]
-        previous = model.posterior(loglik[i, places], loglik_new[i], previous)
-        new[i], posterior[i, places] = previous[0], previous[1:]
-        log_odds[i, founders] = loglik[i, founders] - loglik_new[i]
-        if not only_new or previous[0] >= previous.max():
-            founders.append(i)
-    return PlaceScores(posterior, new, log_odds)
+        places = max(0, i - model.settings.recent)
+        previous = model.posterior(loglik[i, :places], loglik_new[i], previous)
+        new[i], posterior[i, :places] = previous[0], previous[1:]
+    earlier = np.tri(len(loglik), k=-1, dtype=bool)
+    return PlaceScores(posterior, new, np.where(earlier, loglik - loglik_new[:, None], np.nan))
