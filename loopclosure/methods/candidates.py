@@ -13,8 +13,8 @@ DRIFT = 0.1  # of the way: more than odometry is usually off
 FAR_M = 2 * MAX_DISTANCE_M  # from there on two frames show different places
 AWAY = 2  # frames in a row
 STILL = 0.5  # of a usual step from frame to frame
-STOP = 6  # steps
-MOVES = 0.95  # the quantile of steps at which the search for a usual one begins
+STOP = 8  # steps
+MOVES = 0.9  # the quantile of steps at which the search for a usual one begins
 ENOUGH = 0.5  # of the queries with a candidate must have frames far apart, for these to show how others score
 
 
@@ -93,7 +93,9 @@ def moved(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return float(np.sqrt(np.mean((scores[a, both] - scores[b, both]) ** 2))) if both.any() else np.inf
 
     steps = np.array([step(i, i + 1) for i in range(len(scores) - 1)])
-    means = np.convolve(steps, np.full(STOP, 1 / STOP), "valid") if len(steps) >= STOP else np.zeros(0)
+    if len(steps) < STOP:
+        return np.arange(len(scores)), np.arange(len(scores))
+    means = np.convolve(steps, np.full(STOP, 1 / STOP), "valid")
     known = np.append(0.0, means[np.isfinite(means)])
     usual, before = np.quantile(known, MOVES), np.inf
     while usual < before:

@@ -93,8 +93,9 @@ def test_one_drive_that_comes_back_once():
     assert np.mean(right[found.accepted]) >= 0.99
 
 
-def test_too_few_frames_tell_nothing():
-    scores = alike(drive(12, 1), drive(12, 1))
+@pytest.mark.parametrize("frames", [1, 2, 12])
+def test_too_few_frames_tell_nothing(frames):
+    scores = alike(drive(frames, 1), drive(frames, 1))
     assert not answer(scores, everything(scores), two=True).accepted.any()
 
 
