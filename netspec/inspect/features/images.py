@@ -62,8 +62,8 @@ class ImageNet:
         options: BuildOptions | None = None,
     ) -> None:
         options = replace(options or BuildOptions(), seed=0)
-        net, source = parse_net(model)
-        net, source = filter_net(with_state(net, TEST), source)
+        read, source = parse_net(model)
+        net, source = filter_net(with_state(read, TEST), source)
         before, before_source = prune(net, source, [input_blob], {})
         shape = shape or _shape_of(input_blob, before, before_source, options)
         if len(shape) != 4 or shape[1] not in (1, 3):
@@ -85,7 +85,7 @@ class ImageNet:
             return built
 
         self._build, self._net, self._model = build, None, None
-        self._after, self._weights = after, weights
+        self._read, self._weights = read, weights
         self._choice = choice or Choice()
         made_of = {"blob": blob, "input": input_blob, "shape": shape, "strict": options.strict, "scaled": bool(steps)}
         self._open(Origin([model, *weights], made_of), options.device)
@@ -113,10 +113,10 @@ class ImageNet:
 
     @cached_property
     def fingerprint(self) -> str:
-        """A hash of what decides the blob: the net, its weights, what is done to images; not what engine runs it."""
+        """A hash of what decides the blob: net and weights of the files, what is done to images; not the engine."""
         s = self.scaling
-        done = f"{self.shape} {self.zooms} {s.mean.tolist()} {s.scale} {s.raw_scale} {s.swap}"
-        digest = hashlib.sha256(self._after.SerializeToString(deterministic=True) + done.encode())
+        done = f"{self.input} {self.blob} {self.shape} {self.zooms} {s.mean.tolist()} {s.scale} {s.raw_scale} {s.swap}"
+        digest = hashlib.sha256(self._read.SerializeToString(deterministic=True) + done.encode())
         for path in self._weights:
             digest.update(Path(path).read_bytes())
         return digest.hexdigest()[:16]

@@ -189,7 +189,7 @@ class Net(Thumbnailer):
     fingerprint = "a net"
 
 
-@pytest.mark.parametrize(("older", "described"), [(False, "a net"), (True, "73e9d500b1c7d365")])
+@pytest.mark.parametrize(("older", "described"), [(False, "a net"), (True, "63cb899e0703cb96")])
 def test_a_map_that_another_net_described_is_refused(
     older: bool, described: str, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
