@@ -96,6 +96,7 @@ class Net:
         names = [node.name for node in net.plan.nodes]
         self._layer_names = names
         self._blob_names = list(runner.names)
+        self._blob_names_index = {name: i for i, name in enumerate(runner.names)}
         self._blobs = list(runner.blobs)
         self._blobs_dict: Named[Blob] = Named("blob", zip(runner.names, runner.blobs, strict=True))
         self.layers: list[Any] = [
@@ -199,6 +200,14 @@ class Net:
             self._fill(tops, self.outputs, "diff", "Top diff arguments do not match net outputs.")
             self._backward(first, last)
             return {name: self.blobs[name].diff for name in dict.fromkeys(wanted)}
+
+    def forward_simple(self) -> None:
+        """Run all layers; as Dosovitskiy's fork has it."""
+        self._forward(0, len(self.layers) - 1)
+
+    def backward_simple(self) -> None:
+        """Run all layers' backward passes; as Dosovitskiy's fork has it."""
+        self._backward(len(self.layers) - 1, 0)
 
     def _forward(self, start: int, end: int) -> float:
         with self.runner.used(), caffes_errors():

@@ -132,6 +132,7 @@ class Solver:
             options = TrainingOptions(build, [mode.device()], nan="warn")
             self._training = _Training(param, node, options)
         self._callbacks: list[tuple[Callable[[], object], Callable[[], object]]] = []
+        self._counted = False
         self._training.on_start = lambda: self._call(0)
         self._training.on_gradients = lambda: self._call(1)
 
@@ -187,8 +188,15 @@ class Solver:
         net.share_with(self.net)
 
     def apply_update(self) -> None:
-        """Move the weights by the gradients that are there, and count an iteration."""
+        """Move the weights by the gradients that are there, and count an iteration unless it is counted already."""
         self._training.apply_update()
+        self._training.iteration -= self._counted
+        self._counted = False
+
+    def increment_iter(self) -> None:
+        """Count an iteration before its update, as Dosovitskiy's fork (deepsim, DCGAN) does."""
+        self._training.iteration += 1
+        self._counted = True
 
     def add_callback(self, on_start: Any, on_gradients_ready: Callable[[], object] | None = None) -> None:
         """Call two functions at each iteration: before its runs, and between them and the update.

@@ -1,7 +1,8 @@
 """What a program does that Python 3, or NumPy since 2.4, refuses: done once more, as it was meant.
 
 Only what has failed is done again, and only with other arguments, so that nothing else is changed: text is given as the
-bytes of the file that it came from where bytes are asked for, and bytes as text; an array of one element as a number.
+bytes of the file that it came from where bytes are asked for, and bytes as text; an array of one element as a number,
+and 2.0 as 2 where an integer is asked for.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ _ASKS_FOR_BYTES = re.compile(
     r"|string argument without an encoding|bytes(-like object)?,? (expected|not '?str)|but 'str'|not 'str'"
 )
 _ASKS_FOR_TEXT = re.compile(r"(not|got|found) '?(bytes|Py2Bytes)|string pattern on a bytes|strings and bytes|Py2Bytes")
+_ASKS_FOR_INTEGER = re.compile(r"as an integer|must be integers|integer argument|sequence of integers|single integer")
 _OF_BYTES = ("hex", "base64", "zlib", "bz2", "quopri", "uu")  # codecs from bytes to bytes
 
 
@@ -68,6 +70,8 @@ def _meant(said: str, of_type: bool, arguments: tuple[Any, ...], named: dict[str
         change = _as_text
     elif of_type and said.startswith("unsupported format string"):
         change = _as_shown
+    elif of_type and _ASKS_FOR_INTEGER.search(said):
+        change = _integer
     elif of_type:
         change = _number
     else:
@@ -96,6 +100,14 @@ def _number(value: Any) -> Any:
     """Return the element of an array that has one; everything else as it is."""
     is_array = hasattr(value, "dtype") and getattr(value, "ndim", 0) > 0 and value.size == 1
     return value.item() if is_array else value
+
+
+def _integer(value: Any) -> Any:
+    """Return a number with a point as an integer, as NumPy took it for an index or a size until 1.12."""
+    if isinstance(value, (tuple, list)) and any(_integer(element) is not element for element in value):
+        return type(value)(map(_integer, value))
+    value = _number(value)
+    return int(value) if isinstance(value, float) or getattr(value, "dtype", None) == "float32" else value
 
 
 def _decode(value: Any, *codec: Any) -> Any:
@@ -128,6 +140,20 @@ def _comparing(compare: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     return compared
 
 
+def _equality(compare: Callable[[Any, Any], Any], otherwise: bool) -> Callable[[Any, Any], Any]:
+    """Return == or !=; one answer for an array beside None or another length of list, as before NumPy 1.13."""
+
+    def compared(left: Any, right: Any) -> Any:
+        if right is None:
+            return compare(left is None, True)
+        try:
+            return compare(left, right)
+        except ValueError:
+            return otherwise
+
+    return compared
+
+
 def _rank(value: Any) -> tuple[int, str] | None:
     if value is None:
         return 0, ""
@@ -137,6 +163,7 @@ def _rank(value: Any) -> tuple[int, str] | None:
 
 
 BUILTINS: dict[str, Callable[..., Any]] = {
-    **{"format": _format, "call": _call, "decode": _decode, "encode": _encode},
+    **{"format": _format, "call": _call, "decode": _decode, "encode": _encode, "index": _integer},
+    **{"eq": _equality(operator.eq, False), "noteq": _equality(operator.ne, True)},
     **{name: _comparing(getattr(operator, name)) for name in ("lt", "le", "gt", "ge")},
 }

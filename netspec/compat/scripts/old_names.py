@@ -1,4 +1,4 @@
-"""What NumPy, SciPy, scikit-image, lmdb and Python itself have dropped since old scripts were written, given back.
+"""What NumPy, SciPy, scikit-image, lmdb, PyYAML and Python itself have dropped since then, given back to old scripts.
 
 Only a program that `netspec run` runs gets them: each module gets its names when it is imported, and only those that it
 has not.
@@ -114,6 +114,8 @@ def _numpy(np: Any) -> None:
     _give(np, "msort", lambda a: np.sort(a, axis=0))
     if np.__version__ >= "2":
         np.set_printoptions(legacy="1.25")  # a number is shown as 0.5, not as np.float64(0.5)
+        new = {"abs", "bool", "max", "min", "pow", "round"}  # `from numpy import *` left Python's own
+        np.__all__ = [name for name in np.__all__ if name not in new]
     np.fromstring = _fromstring(np)
     _let_threshold_be_nan(np)
 
@@ -275,6 +277,17 @@ def _skimage_io(io: Any) -> None:
     io.imread = imread
 
 
+def _skimage_transform(transform: Any) -> None:
+    """Let the last axis of an image (H, W, C) be its channels where nothing is said, as until scikit-image 0.19."""
+    new = transform.rescale
+
+    def rescale(image: Any, scale: Any, *arguments: Any, multichannel: Any = None, **named: Any) -> Any:
+        by_channel = image.ndim == 3 if multichannel is None else multichannel
+        return new(image, scale, *arguments, **{"channel_axis": -1 if by_channel else None, **named})
+
+    transform.rescale = rescale
+
+
 def _skimage_color(color: Any) -> None:
     for old, new in (("rgb2grey", "rgb2gray"), ("grey2rgb", "gray2rgb"), ("gray2rgb", "gray2rgb")):
         _give(color, old, getattr(color, new))
@@ -388,6 +401,13 @@ def _pickle(pickle: Any) -> None:
     pickle.dump = lambda obj, file, *form, **named: dump(obj, getattr(file, "buffer", file), *form, **named)
 
 
+def _yaml(yaml: Any) -> None:
+    """Let a loader be left out: it is FullLoader, as in PyYAML 5."""
+    load, load_all = yaml.load, yaml.load_all
+    yaml.load = lambda stream, Loader=yaml.FullLoader: load(stream, Loader)
+    yaml.load_all = lambda stream, Loader=yaml.FullLoader: load_all(stream, Loader)
+
+
 def _unittest_case(case: Any) -> None:
     renamed = {
         **{"assertEquals": "assertEqual", "assertNotEquals": "assertNotEqual", "assert_": "assertTrue"},
@@ -405,9 +425,11 @@ _PATCHES: dict[str, Callable[[Any], None]] = {
     "scipy.ndimage": lambda ndimage: _give(ndimage, "imread", imread),
     "skimage.io": _skimage_io,
     "skimage.color": _skimage_color,
+    "skimage.transform": _skimage_transform,
     "lmdb": _lmdb,
     "unittest.case": _unittest_case,
     "string": _string,
     "pickle": _pickle,
+    "yaml": _yaml,
 }
 PACKAGES = frozenset(name.partition(".")[0] for name in _PATCHES)

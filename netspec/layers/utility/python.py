@@ -19,7 +19,7 @@ from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
 from netspec.layers.utility.live_blobs import Blob
 from netspec.layers.utility.pycaffe_shim import can_import, importable
-from netspec.proto.schema import LayerParameter
+from netspec.proto.schema import PHASE_NAMES, LayerParameter
 
 
 class _Call(torch.autograd.Function):
@@ -33,6 +33,13 @@ class _Call(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         return None, *ctx.layer.call_backward(grads, ctx.needs_input_grad[1:])
+
+
+class _Phase(int):
+    """Caffe's number of a phase, of which the text is the name, as in rbgirshick/caffe-fast-rcnn and yjxiong/caffe."""
+
+    def __str__(self) -> str:
+        return PHASE_NAMES[self]
 
 
 @register("Python", "python_param")
@@ -157,7 +164,7 @@ class Python(Layer):
         if not hasattr(code, "blobs"):
             raise self.error(f"{p.module}.{p.layer} is not a caffe.Layer", "python_param", "layer")
         code.param_str = code.param_str_ = p.param_str  # the second is the name of 2014
-        code.phase = self.phase
+        code.phase = _Phase(self.phase)
         return code
 
     def _call(self, method: str, *arguments: Any) -> Any:

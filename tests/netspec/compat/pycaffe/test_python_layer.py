@@ -98,7 +98,9 @@ def test_learnable_blobs(python_net: Callable[..., caffe.Net]) -> None:
 
 def test_phase(python_net: Callable[..., caffe.Net]) -> None:
     for phase in (caffe.TRAIN, caffe.TEST):
-        assert python_net(layer("Phase", "phase", ""), phase).forward()["phase"] == phase
+        net = python_net(layer("Phase", "phase", ""), phase)
+        assert net.forward()["phase"] == phase
+        assert str(net.layers[0].phase) == ("TRAIN", "TEST")[phase]  # as py-faster-rcnn asks for
 
 
 def test_param_str(python_net: Callable[..., caffe.Net]) -> None:

@@ -42,6 +42,9 @@ def test_apply_update(solver: caffe.SGDSolver) -> None:
     assert solver.lr == pytest.approx(0.01)
     solver.apply_update()
     np.testing.assert_allclose(weights, -0.01, atol=1e-7)
+    solver.increment_iter()
+    solver.apply_update()
+    assert solver.iter == 2
 
 
 def test_nets_outlive_the_solver(solver: caffe.SGDSolver) -> None:

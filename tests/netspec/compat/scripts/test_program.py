@@ -160,7 +160,7 @@ def test_names_that_were_dropped_are_given_back_in_the_script_only(run: Run) -> 
 
 def test_scikit_images_old_names(run: Run) -> None:
     pytest.importorskip("skimage")
-    assert run("s.py", s=PROGRAMS["old names of scikit-image"]).stdout == "(2, 3) True\n"
+    assert run("s.py", s=PROGRAMS["old names of scikit-image"]).stdout == "(2, 3) True\n(2, 3, 3) (8, 12) (8, 12, 4)\n"
 
 
 def test_keys_of_databases_may_be_text(run: Run) -> None:
