@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from torch.nn import functional
 
 import netspec
 import netspec.pycaffe as caffe
@@ -19,6 +20,7 @@ from netspec.inspect.features.describer import Describer
 from netspec.proto.text import read_net, write_text
 
 RATE, WARM, SCALE, VIEWS = 2e-3, 30, 20, 128  # rate of learning, and iterations until it is reached; views of a batch
+LATE = 0.87  # from this share of the training on, each pair also competes with all other pairs of its batch
 folder, iterations, lists = Path(sys.argv[1]), int(sys.argv[2]), [Path(name) for name in sys.argv[3:]]
 example = Path(__file__).with_suffix(".prototxt")
 many = Path(__file__).parents[1] / "prototxt" / "many_negatives" / "siamese_words_256"
@@ -41,11 +43,16 @@ for views in lists:
 head, rng = netspec.load_net(example, "TRAIN", seed=1), np.random.default_rng(1)
 optimizer = torch.optim.AdamW(head.parameters())
 itself, partner = 1e4 * torch.eye(VIEWS), torch.arange(VIEWS) ^ 1  # views 0 and 1 are a pair, 2 and 3, ...
+others = (itself == 0).index_put((torch.arange(VIEWS), partner), torch.tensor(False))
 for k in range(iterations):
     x = torch.from_numpy(maps[rng.integers(len(maps))].astype(np.float32))
     units = head(head_blocks=x.flip(3) if rng.random() < 0.5 else x)["head_feat"].split([512, 768], 1)
-    loss = torch.stack([torch.nn.functional.cross_entropy(2 * SCALE * u @ u.T - itself, partner) for u in units]).sum()
-    optimizer.param_groups[0]["lr"] = RATE * min(1, (k + 1) / WARM) * (0.55 + 0.45 * np.cos(np.pi * k / iterations))
+    cosines = [2 * SCALE * u @ u.T for u in units]
+    loss = torch.stack([functional.cross_entropy(c - itself, partner) for c in cosines]).sum()
+    for c in (*cosines, sum(cosines) / 2) if k >= LATE * iterations else ():
+        loss = loss + functional.softplus(c[others].logsumexp(0) - c[torch.arange(VIEWS), partner]).mean() / 1.5
+    turn = np.pi * min(1, k / iterations / LATE)
+    optimizer.param_groups[0]["lr"] = RATE * min(1, (k + 1) / WARM) * (0.55 + 0.45 * np.cos(turn))
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()

@@ -1,6 +1,7 @@
 """Each script of examples/ runs as it stands, and says what it is to show."""
 
 import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -40,6 +41,10 @@ def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     if request.param.stem == "trained_head":
         given = [20, write_pairs(folder)]
         run(request.param.with_name("efficientnet_lite0.py"), folder)
+    if request.param.stem == "distilled_words":
+        for name in ("deploy.prototxt", "places.caffemodel"):
+            shutil.copy(WORDS.with_name("places") / name, folder / name.replace("deploy", "places"))
+        given = [8, WORDS / "siamese_words_256.caffemodel", write_pairs(folder)]
     return request.param.stem, run(request.param, folder, *given), folder
 
 
@@ -147,6 +152,17 @@ def check_trained_head(said: str, folder: Path) -> None:
     assert feats[0, :1856] @ words > 0.99 / 1.49**0.5
     likest = np.argmax(feats @ feats.T - 2 * np.eye(16), axis=1)
     assert likest.tolist() == [k ^ 1 for k in range(16)]
+
+
+def check_distilled_words(said: str, folder: Path) -> None:
+    (loss,) = numbers(said, r"1 batches, loss ([\d.]+)")
+    assert loss < 10  # the first has 19
+    small = Describer(WORDS / "deploy.prototxt", folder / "words.caffemodel")
+    places = Describer(folder / "places.prototxt", folder / "places.caffemodel", blob="words_feat")
+    image = read_bgr(folder / "0_a.png")
+    feat = small(cv2.resize(image, (160, 120)))
+    assert feat @ places(image) > 0.99 / 1.49**0.5
+    assert feat @ Describer(WORDS / "deploy.prototxt", WORDS / "siamese_words_256.caffemodel")(image) < 0.999
 
 
 def check_efficientnet_lite0(said: str, folder: Path) -> None:
