@@ -75,7 +75,8 @@ for k in range(iterations):
     loss.backward()
     optimizer.step()
 netspec.save_weights(words, folder / "words.caffemodel")
-taught = caffe.Net(*map(str, places), caffe.TEST)
-taught.copy_from(str(folder / "words.caffemodel"))
+taught = caffe.Net(str(places[0]), caffe.TEST)
+for weights in (places[1], folder / "words.caffemodel"):
+    taught.copy_from(str(weights))
 taught.save(str(places[1]))
 print(f"{places[1]}: {len(views)} batches, loss {loss.item():.3f}")

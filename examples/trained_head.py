@@ -47,9 +47,9 @@ others = (itself == 0).index_put((torch.arange(VIEWS), partner), torch.tensor(Fa
 for k in range(iterations):
     x = torch.from_numpy(maps[rng.integers(len(maps))].astype(np.float32))
     units = head(head_blocks=x.flip(3) if rng.random() < 0.5 else x)["head_feat"].split([512, 768], 1)
-    cosines = [2 * SCALE * u @ u.T for u in units]
-    loss = torch.stack([functional.cross_entropy(c - itself, partner) for c in cosines]).sum()
-    for c in (*cosines, sum(cosines) / 2) if k >= LATE * iterations else ():
+    whole, parts = (2 * SCALE * u @ u.T for u in units)
+    loss = torch.stack([functional.cross_entropy(c - itself, partner) for c in (whole, parts)]).sum()
+    for c in (whole, parts, (whole + parts) / 2) if k >= LATE * iterations else ():
         loss = loss + functional.softplus(c[others].logsumexp(0) - c[torch.arange(VIEWS), partner]).mean() / 1.5
     turn = np.pi * min(1, k / iterations / LATE)
     optimizer.param_groups[0]["lr"] = RATE * min(1, (k + 1) / WARM) * (0.55 + 0.45 * np.cos(turn))
