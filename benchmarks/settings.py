@@ -24,8 +24,8 @@ from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
 from loopclosure.evaluate import Judgment
 from loopclosure.methods.auto import PRECISION, Auto
 from loopclosure.methods.base import Images, MethodResult, earlier
-from loopclosure.methods.candidates import Candidates
-from loopclosure.methods.decoys import search, settings
+from loopclosure.methods.decoys import settings
+from loopclosure.methods.seqslam import standardize, trajectory_costs
 from loopclosure.places.frames import read_bgr, read_gray
 from loopclosure.progress import silent
 from netspec.files.whole_file import whole_file
@@ -150,9 +150,11 @@ def _best(scores: np.ndarray, drive: Drive, pairs: Pairs) -> tuple[float, str]:
     if not two:
         allowed &= earlier(len(scores), data.exclude_frames)
     tried = {"single images": np.where(allowed, scores, np.nan)}
-    rows, columns = map(np.arange, scores.shape)
-    given = Candidates(scores, allowed, two, rows, columns, rows)
-    tried |= {str(s): search(given, s).scores for s in settings(scores.shape[0], scores.shape[1], two)}
+    distances = np.where(allowed, -scores, np.nan)
+    for setting in settings(scores.shape[0], scores.shape[1], two):
+        assert setting.sequence is not None
+        costs = trajectory_costs(standardize(distances) if setting.standardized else distances, setting.sequence)
+        tried[str(setting)] = np.where(allowed, -costs, np.nan)
     recalls = {name: _recall(matrix, truth) for name, matrix in tried.items()}
     check = GeometricCheck()
     for name in ("single images", max(recalls, key=lambda name: recalls[name])):

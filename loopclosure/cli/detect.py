@@ -22,7 +22,7 @@ from loopclosure.detector.verification import GeometricCheck
 from loopclosure.detector.visitor import Visitor
 from loopclosure.index.index import INDEXES
 from loopclosure.methods.auto import PRECISION
-from loopclosure.methods.drive import last_session, whole_drive
+from loopclosure.methods.drive import TOO_MANY, last_session, whole_drive
 from loopclosure.methods.features import WhitenBy
 from loopclosure.places.frames import live_frames
 from loopclosure.places.pose_files import read_poses
@@ -190,7 +190,7 @@ def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
     for text in a.source:
         before, number = len(into), len(into.sessions)
         recording = recording_of(text, Path(a.map) / "frames" / f"{number:06d}")
-        results = into.add(recording, describe, a.index, bar, lambda *found: last_session(*found, progress=bar).results)
+        results = into.add(recording, describe, a.index, bar, _decided)
         warn_of_unreadable(recording)
         loops = [result.accepted for result in results if result.accepted is not None]
         between = sum(frame < before for frame in loops)
@@ -200,13 +200,20 @@ def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
     print(f"{len(into)} frames in {sessions} session{'s' * (sessions != 1)}: {into.folder}")
 
 
+def _decided(detector: LoopDetector, results: list[LoopResult], own: bool = True) -> list[LoopResult]:
+    found = last_session(detector, results, progress=bar, own=own)
+    for reason in (reason for reason in found.reasons if TOO_MANY in reason):
+        warn(reason)
+    return found.results
+
+
 def _query(a: argparse.Namespace) -> None:
     known, out = Map(a.map), Path(a.out)
     recording = recording_of(a.source, out / "frames")
     detector, before = known.detector(run.load_describe(known.describer), a.index), len(known)
     if a.index in INDEXES:  # in memory: frames that are added are not in the map
-        found = last_session(detector, run.run_detector(detector, recording, progress=bar), progress=bar, own=False)
-        results = [replace(result, query_id=result.query_id - before) for result in found.results]
+        results = _decided(detector, run.run_detector(detector, recording, progress=bar), own=False)
+        results = [replace(result, query_id=result.query_id - before) for result in results]
     else:
         results = run.run_detector(Visitor(detector), recording, progress=bar)
     recording = warn_of_unreadable(recording)

@@ -91,7 +91,7 @@ def prepare(features: np.ndarray, metric: str = "euclidean", mean: np.ndarray | 
     if features.ndim != 2 or features.shape[1] == 0:
         raise InputError(f"descriptors have shape {features.shape}; expected (frames, dimensions)")
     if features.dtype != np.float64:
-        features = features.astype(np.float32)
+        features = features.astype(np.float32, copy=False)
     finite = np.all(np.isfinite(features), axis=1)
     if not np.all(finite):
         raise InputError(

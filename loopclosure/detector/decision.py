@@ -67,13 +67,8 @@ class DetectorSettings:
 
     def __post_init__(self) -> None:
         check_metric(self.metric)
-        for name, least in (
-            ("views", 1),
-            ("exclude_recent", 0),
-            ("exclude_seconds", 0),
-            ("top_k", 1),
-            ("consistency", 0),
-        ):
+        for name in ("views", "top_k", "exclude_recent", "exclude_seconds", "consistency"):
+            least = int(name in ("views", "top_k"))
             if getattr(self, name) < least:
                 raise InputError(f"{name} is {getattr(self, name)}; expected {least} or more")
         if self.threshold is not None and np.isnan(self.threshold):

@@ -106,11 +106,7 @@ class LoopDetector:
 
         ``stamp`` in seconds; ``pose`` tx ty tz qx qy qz qw, camera-to-world: kept for the export, not used otherwise.
 
-        The cost is that of ``describe`` and of one pass over all earlier descriptors, 4 D bytes per frame. Measured on
-        one server core of the 2020s, without ``describe``: frame 1,000 takes 0.04 ms and frame 10,000 takes 0.2 ms with
-        D = 128; 0.07 ms and 1.4 to 1.8 ms with D = 512, which no longer fits in the cache. If ``describe`` takes 2 ms
-        or more, as nets and SIFT do, frame 10,000 costs at most twice as much as frame 1,000 (1.7 times at 2 ms, 1.3
-        times at 5 ms, D = 512). With thumbnails of 768 pixels, which take 0.15 ms, it costs ten times as much: 2.2 ms.
+        The cost is that of ``describe`` and of one pass over all earlier descriptors, 4 D bytes each (docs/growth.md).
         """
         if self.describe is None:
             raise InputError("this detector has no describe function; give one, or use add_descriptor")
@@ -164,7 +160,11 @@ class LoopDetector:
     @property
     def descriptors(self) -> np.ndarray:
         """The descriptors of all frames (N, views D), of unit length for cosine."""
-        return self._frames.rows().copy()
+        return self.descriptors_of(0, len(self))
+
+    def descriptors_of(self, start: int, stop: int) -> np.ndarray:
+        """Return the descriptors (stop - start, views D) of some frames."""
+        return self._frames.rows(start, stop)
 
     def local_features(self, frame: int) -> LocalFeatures:
         """Return the points that the geometric check found in a frame, to measure a loop by."""
@@ -190,7 +190,7 @@ class LoopDetector:
             "loops": [asdict(loop) for loop in self.loops],
             "sessions": self._sessions,
         }
-        arrays: dict[str, Any] = {"rows": self._frames.rows(), **self._frames.arrays(self.check is not None)}
+        arrays: dict[str, Any] = {"rows": self.descriptors, **self._frames.arrays(self.check is not None)}
         with whole_file(path) as unfinished, unfinished.open("wb") as stream:
             np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 
@@ -314,7 +314,7 @@ class LoopDetector:
         return self.check.describe(image)
 
     def _all_steps(self) -> list[float]:
-        rows = list(self._frames.rows().reshape(len(self), self.settings.views, -1)) if len(self) else []
+        rows = list(self.descriptors.reshape(len(self), self.settings.views, -1)) if len(self) else []
         if rows:
             self._last = rows[-1]
         return [float(self._score(rows[i - 1], rows[i])) for i in range(len(rows)) if i not in self._sessions]
@@ -379,10 +379,9 @@ def refuse_another(describes: str, described: str | None, instead: str, path: st
 def _checked_pose(pose: Sequence[float] | np.ndarray | None) -> np.ndarray | None:
     if pose is None:
         return None
-    values = np.asarray(pose, np.float64).reshape(-1)
+    values = np.array(pose, np.float64).reshape(-1)
     if len(values) != 7 or not np.all(np.isfinite(values)) or not np.any(values[3:]):
         raise InputError(f"a pose is {values}; expected tx ty tz qx qy qz qw")
-    values = values.copy()
     values[3:] /= np.linalg.norm(values[3:])
     return values
 

@@ -93,12 +93,8 @@ class Frames:
     def append(self, row: np.ndarray, stamp: float | None, pose: np.ndarray | None) -> None:
         """Add a frame with a descriptor (views, D)."""
         if self.count == len(self.stamps):
-            capacity = max(FIRST_CAPACITY, 2 * self.count)
-            for name in ("stamps", "poses"):
-                old = getattr(self, name)
-                new = np.empty((capacity, *old.shape[1:]), old.dtype)
-                new[: self.count] = old
-                setattr(self, name, new)
+            room = np.empty((max(FIRST_CAPACITY, self.count), 7))
+            self.stamps, self.poses = np.append(self.stamps, room[:, 0]), np.concatenate([self.poses, room])
         self.stamps[self.count] = np.nan if stamp is None else stamp
         self.poses[self.count] = np.nan if pose is None else pose
         self.waiting.append(row)
@@ -116,12 +112,14 @@ class Frames:
             self.index.add(np.concatenate(new))
             del self.waiting[: len(new)]
 
-    def rows(self) -> np.ndarray:
-        """Return all descriptors (count, views D)."""
-        if not self.count:
+    def rows(self, start: int, stop: int) -> np.ndarray:
+        """Return the descriptors (stop - start, views D) of some frames, as a copy."""
+        if start >= stop:
             return NO_ROWS
-        parts = [self.index.rows(0, self.settled * self.views)] if self.settled else []
-        return np.concatenate([*parts, *self.waiting]).reshape(self.count, -1)
+        views, known = self.views, min(stop, self.settled)
+        parts = [self.index.rows(start * views, known * views)] if start < known else []
+        parts += self.waiting[max(0, start - self.settled) : max(0, stop - self.settled)]
+        return np.concatenate(parts).reshape(stop - start, -1)
 
     def arrays(self, checked: bool, start: int = 0) -> dict[str, np.ndarray]:
         """Return what a file has of the frames from ``start`` on, but their descriptors; ``checked``: points too."""

@@ -204,13 +204,11 @@ class Map:
         before = self._projection("exact")
         if count < max(LEARNED_FROM, 2 * before.images if before else 0) or size <= COMPONENTS:
             return
-        wanted = np.linspace(0, count - 1, LEARNED_FROM).round().astype(int)
-        parts, first = [], 0
-        for session in self.sessions:
-            inside = wanted[(wanted >= first) & (wanted < first + len(session.names))] - first
-            rows = session.arrays["rows"]
-            parts += [rows[i : i + 1].astype(np.float32) for i in inside]
-            first += len(session.names)
+        starts, parts = np.cumsum([0, *(len(session.names) for session in self.sessions)]), []
+        for wanted in np.linspace(0, count - 1, LEARNED_FROM).round().astype(int):
+            number = int(np.searchsorted(starts, wanted, side="right")) - 1
+            row = int(wanted - starts[number])
+            parts.append(self.sessions[number].arrays["rows"][row : row + 1].astype(np.float32))
         rows = np.concatenate(parts)
         learned = learn_whitening(rows.reshape(len(rows) * views, -1)[::views], COMPONENTS, 0.0)
         if learned.projection.shape[1] < COMPONENTS:

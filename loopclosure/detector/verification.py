@@ -217,11 +217,11 @@ def _needed(matches: int, width: int, height: int, error_px: float) -> int:
 class Pairs:
     """Verified pairs of images, each image described and each pair matched once for all that ask.
 
-    image   how an image is read: its key -> (H, W) or (H, W, 3) uint8
+    image   how an image is read: its key -> (H, W) or (H, W, 3) uint8, or its points
     hidden  (CELLS) bool, the cells of all images, row by row, whose points do not count; None: all points do
     """
 
-    image: Callable[[Any], np.ndarray]
+    image: Callable[[Any], np.ndarray | LocalFeatures]
     hidden: np.ndarray | None = None
     _local: dict[tuple[GeometricCheck, Any], LocalFeatures] = field(default_factory=dict)
     _found: dict[tuple[GeometricCheck, Any, Any], Agreement] = field(default_factory=dict)
@@ -230,19 +230,13 @@ class Pairs:
         """Return the points of an image."""
         of = (_by_points(check), key)
         if of not in self._local:
-            self._local[of] = check.describe(self.image(key))
+            seen = self.image(key)
+            self._local[of] = seen if isinstance(seen, LocalFeatures) else check.describe(seen)
         local = self._local[of]
         if self.hidden is None:
             return local
         seen = ~self.hidden[_part(local.points, local.size, CELLS)]
         return LocalFeatures(local.points[seen], local.descriptors[seen], local.size)
-
-    def __bool__(self) -> bool:
-        return bool(self._local)
-
-    def put(self, check: GeometricCheck, key: Any, local: LocalFeatures) -> None:
-        """Take the points of an image that cannot be read later, a video's."""
-        self._local[_by_points(check), key] = local
 
     def agreement(self, check: GeometricCheck, a: Any, b: Any) -> Agreement:
         """Return how many points of two images agree."""

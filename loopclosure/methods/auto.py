@@ -76,7 +76,8 @@ def answer(
     """
     if not 0 < precision < 1:
         raise InputError(f"precision is {precision:g}; expected more than 0 and less than 1")
-    given = candidates(scores, allowed, two, far, visit)
+    count, given = len(scores), candidates(scores, allowed, two, far, visit)
+    del scores, allowed, far  # what is left of them is in the candidates
     lines = best_setting(given, precision)
     matches = Matches.of(given, lines, precision)
     loops, said = matches.accepted, "verification: not tried, there are no images"
@@ -90,7 +91,7 @@ def answer(
         matches.accepted if lines is not None else matches.inliers >= 0, "not verified", "below threshold"
     )
     verdicts = np.where(loops, "accepted", np.where(matches.there, rejected, "no candidate"))
-    results = _results(given, matches, verdicts.tolist(), np.full(len(scores), np.nan) if stamps is None else stamps)
+    results = _results(given, matches, verdicts.tolist(), np.full(count, np.nan) if stamps is None else stamps)
     unknown = int(np.count_nonzero(matches.few & (matches.inliers <= 0)))
     reasons = [*filter(None, [given.said]), _sequences_said(lines, given.others)]
     reasons.append(said + (f"; {unknown} frames cannot be verified" if unknown else ""))
@@ -130,7 +131,7 @@ def _total_said(loops: int, queries: int, given: Candidates) -> str:
         return f"{loops} of the {queries} frames that have a candidate close a loop"
     if not queries:
         return "no frame has a candidate: the camera did not come back, or the drive is too short to tell"
-    known = given.known
+    known = given.known()
     alike = np.argsort(-known.max(axis=1), kind="stable")[:TRIED]
     least, ages = known[alike].max(axis=1).min(), given.queries[alike] - given.references[known[alike].argmax(axis=1)]
     recent = "" if given.two else f" --exclude-recent {max(0, ages.min() - 1)}"

@@ -12,6 +12,7 @@ from loopclosure.places.same_place import MAX_DISTANCE_M
 DRIFT = 0.1  # of the way: more than odometry is usually off
 FAR_M = 2 * MAX_DISTANCE_M  # from there on two frames show different places
 AWAY = 2  # frames in a row
+BLOCK = 512  # frames that are looked at together
 STILL = 0.5  # of a usual step from frame to frame
 STOP = 8  # steps
 MOVES = 0.9  # the quantile of steps at which the search for a usual one begins
@@ -40,10 +41,9 @@ class Candidates:
     different: np.ndarray | None = None
     said: str = ""
 
-    @property
-    def known(self) -> np.ndarray:
-        """The scores of candidates (Q, R), -inf elsewhere."""
-        return np.where(self.allowed, self.scores, -np.inf)
+    def known(self, queries: slice | int = slice(None)) -> np.ndarray:
+        """Return the scores of the candidates of queries (n, R), or of one (R,), -inf elsewhere."""
+        return np.where(self.allowed[queries], self.scores[queries], -np.inf)
 
     @property
     def others(self) -> str:
@@ -125,13 +125,17 @@ def _returned(scores: np.ndarray, allowed: np.ndarray, frames: np.ndarray) -> tu
     numbers = np.arange(count)
     if not allowed.any():
         return allowed, np.full(count, count)
-    unlike = scores <= np.median(scores[allowed])
-    away = np.logical_and.reduce([unlike[k : count - AWAY + 1 + k] for k in range(AWAY)])  # from frame i, of frame j
-    after = away & (numbers[: len(away), None] > numbers)
-    left = np.where(after.any(axis=0), after.argmax(axis=0), count)
-    before = away & (numbers[: len(away), None] + AWAY <= numbers)
-    entered = np.where(before.any(axis=0), len(away) - 1 - before[::-1].argmax(axis=0), -1)
-    back = (numbers[:, None] >= left + AWAY) & (numbers < entered[:, None])
+    usual = np.median(scores[allowed], overwrite_input=True)
+    left, entered = np.full(count, count), np.full(count, -1)
+    for first in range(0, count - AWAY + 1, BLOCK):
+        rows = numbers[first : min(first + BLOCK, count - AWAY + 1), None]
+        # From frame i on away from frame j.
+        away = np.logical_and.reduce([scores[first + k : first + k + len(rows)] <= usual for k in range(AWAY)])
+        after, before = away & (rows > numbers), away & (rows + AWAY <= numbers)
+        left = np.where((left == count) & after.any(axis=0), first + after.argmax(axis=0), left)
+        entered = np.where(before.any(axis=0), rows[-1] - before[::-1].argmax(axis=0), entered)
+    back = numbers[:, None] >= left + AWAY
+    back &= numbers < entered[:, None]
     return back, frames[np.minimum(left, count - 1)] - frames
 
 

@@ -61,9 +61,9 @@ class Setting:
 class Lines:
     """What a search found.
 
-    scores   (Q, R) of the line through each pair, higher = more alike; NaN where a pair is not a candidate
     match    (Q,) each query's best reference, -1 without one
     targets  (Q,) its score, -inf without one
+    alone    (Q,) that of the line through the best single image, -inf without one
     decoys   (Q,) the best score of a reverse line, or of frames far apart in odometry, -inf without one
     near     (Q,) bool: of the queries just before and after, no distant one fits the match better, and the middle of
              the line is nearer to its mean than to chance. Where a loop ends, the line through its last place is the
@@ -71,9 +71,9 @@ class Lines:
     """
 
     setting: Setting
-    scores: np.ndarray
     match: np.ndarray
     targets: np.ndarray
+    alone: np.ndarray
     decoys: np.ndarray
     near: np.ndarray
 
@@ -113,7 +113,7 @@ class Matches:
         if lines is not None:
             match, score, accepted = lines.match.copy(), lines.targets, lines.accepted(precision)
         else:
-            known = given.known
+            known = given.known()
             score = known.max(axis=1)
             match = np.where(np.isfinite(score), known.argmax(axis=1), -1)
             accepted = np.zeros(len(match), bool)
@@ -155,72 +155,72 @@ def settings(queries: int, references: int, two: bool) -> Iterator[Setting]:
                 yield Setting(sequence, standardized)
 
 
-def search(given: Candidates, setting: Setting) -> Lines:
-    """Search for lines through candidates; decoys are the lines backwards, or pairs known to be different."""
-    count, sequence = len(given.scores), setting.sequence
-    reach = setting.length + 1  # of the queries before and after, that a line leads through
-    whole = _distances(given.scores, given.allowed) if setting.standardized else None
-    if whole is not None:
-        whole = standardize(whole)
-    forward = np.empty(given.scores.shape, np.float32)
-    match, targets = np.zeros(count, int), np.empty(count)
-    decoys, middle = np.empty(count), np.ones(count, bool)
+def search(given: Candidates, setting: Setting, shared: dict[str, np.ndarray]) -> Lines:
+    """Search for lines through candidates; decoys are the lines backwards, or pairs known to be different.
+
+    ``shared`` is what searches of the same candidates have in common.
+    """
+    (count, width), sequence, reach = given.scores.shape, setting.sequence, setting.length
+    if setting.standardized and "scaled" not in shared:
+        shared["scaled"] = standardize(_distances(given.scores, given.allowed))
+    middle = None if sequence is None else replace(sequence, length=MIDDLE)
+    chance = shared.setdefault(f"{middle} {setting.standardized}", np.full(count, np.nan))
+    match, targets, decoys, fits = np.zeros(count, int), np.empty(count), np.empty(count), np.empty(count)
+    alone, beside = np.empty(count), np.full((count, 2 * reach + 1), -np.inf, np.float32)
+    last = np.empty((0, width), np.float32)
     for first in range(0, count, BLOCK):
-        here, around = slice(first, first + BLOCK), slice(max(0, first - reach), first + BLOCK + reach)
-        inner = slice(first - around.start, first - around.start + BLOCK)
-        allowed, different = given.allowed[here], given.different
-        distances = _distances(given.scores[around], given.allowed[around]) if whole is None else whole[around]
-        forward[here] = found = np.where(allowed, -_along(distances, sequence)[inner], np.nan)
-        if different is None:
-            reverse = np.where(allowed, -_along(distances[:, ::-1], sequence)[inner, ::-1], np.nan)
+        here, around = slice(first, min(first + BLOCK, count)), slice(max(0, first - reach), first + BLOCK + reach)
+        inner, allowed = range(first - around.start, here.stop - around.start), given.allowed[here]
+        distances = _distances(given.scores[around], given.allowed[around])
+        block = shared["scaled"][around] if setting.standardized else distances
+        found = np.where(allowed, -_along(block, sequence, inner), np.nan)
+        if given.different is None:
+            reverse = np.where(allowed, -_along(block[:, ::-1], sequence, inner)[:, ::-1], np.nan)
         else:
-            known = _along(_distances(given.scores[around], different[around]), sequence)[inner]
-            reverse = np.where(different[here], -known, np.nan)
-        best = np.where(np.isnan(found), -np.inf, found)
-        match[here], targets[here] = best.argmax(axis=1), best.max(axis=1)
-        decoys[here] = np.where(np.isnan(reverse), -np.inf, reverse).max(axis=1)
-        if sequence is not None:
-            fits = np.where(allowed, -_along(distances, replace(sequence, length=MIDDLE))[inner], np.nan)
-            middle[here] = _fits(fits, match[here], targets[here])
-    ratio = len(forward[0]) / count if given.two else 1.0
-    owner = _owner(forward, match, setting.length)
-    near = middle & (np.abs(owner - np.arange(count)) <= max(REACH, 1 / ratio))
-    return Lines(setting, forward, np.where(np.isneginf(targets), -1, match), targets, decoys, near)
+            known = _along(_distances(given.scores[around], given.different[around]), sequence, inner)
+            reverse = np.where(given.different[here], -known, np.nan)
+        np.copyto(found, -np.inf, where=np.isnan(found))
+        numbers, single = np.arange(len(found)), given.known(here).argmax(axis=1)
+        match[here], targets[here], alone[here] = found.argmax(axis=1), found.max(axis=1), found[numbers, single]
+        decoys[here] = np.fmax.reduce(reverse, axis=1, initial=-np.inf)
+        if middle is not None:
+            line = np.where(allowed, -_along(block, middle, inner), np.nan)
+            fits[here] = line[numbers, match[here]]
+            if np.isnan(chance[first]):
+                chance[here] = [np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in line]
+        window, top = np.concatenate([last, found]), first - len(last)
+        for step in range(-reach, reach + 1):
+            queries = np.arange(max(top, top - step), min(here.stop, here.stop - step))
+            beside[queries, reach + step] = window[queries + step - top, match[queries]]
+        last = window[max(0, len(window) - reach) :]
+    near = np.abs(_owner(beside)) <= max(REACH, count / width if given.two else 1.0)
+    near &= middle is None or fits >= (chance + targets) / 2
+    return Lines(setting, np.where(np.isneginf(targets), -1, match), targets, alone, decoys, near)
 
 
 def _distances(scores: np.ndarray, which: np.ndarray) -> np.ndarray:
     return np.where(which, -scores, np.nan)
 
 
-def _along(distances: np.ndarray, sequence: SequenceSettings | None) -> np.ndarray:
-    return distances if sequence is None else trajectory_costs(distances, sequence)
+def _along(distances: np.ndarray, sequence: SequenceSettings | None, rows: range) -> np.ndarray:
+    return distances[rows.start : rows.stop] if sequence is None else trajectory_costs(distances, sequence, rows)
 
 
-def _fits(middle: np.ndarray, match: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return the queries (Q,) whose score ``middle`` (Q, R) at their match is nearer to the line's than to chance."""
-    chance = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in middle])
-    return middle[np.arange(len(match)), match] >= (chance + targets) / 2
-
-
-def _owner(scores: np.ndarray, match: np.ndarray, length: int) -> np.ndarray:
-    """Return the query (Q,) that fits each query's match best, of those that are at most ``length`` away."""
-    owner = np.arange(len(scores))
-    score = np.nan_to_num(scores[owner, match], nan=-np.inf)
-    for step in (*range(-length, 0), *range(1, length + 1)):
-        other = np.arange(len(scores)) + step
-        there = np.flatnonzero((other >= 0) & (other < len(scores)))
-        value = scores[other[there], match[there]]
-        better = there[value > score[there]]
-        owner[better], score[better] = other[better], scores[other[better], match[better]]
-    return owner
+def _owner(beside: np.ndarray) -> np.ndarray:
+    """Return how many queries away that is which fits each match best, (Q,), by what those around score (Q, steps)."""
+    reach = beside.shape[1] // 2
+    steps = np.array([0, *range(-reach, 0), *range(1, reach + 1)])
+    return steps[beside[:, reach + steps].argmax(axis=1)]
 
 
 def best_setting(given: Candidates, precision: float) -> Lines | None:
     """Return the search that finds the most loops at this precision; None if none finds any."""
-    chosen, most = None, 0
+    chosen, most, shared = None, 0, dict[str, np.ndarray]()
     alone = [] if given.different is None else [Setting(None)]
     for setting in (*alone, *settings(given.scores.shape[0], given.scores.shape[1], given.two)):
-        found = search(given, setting)
+        if most and np.count_nonzero(given.allowed.any(axis=1)) * NEARLY <= most:
+            break  # no other can find more
+        found = search(given, setting, shared)
         count = np.count_nonzero(found.accepted(precision))
         if count * NEARLY > most:
             chosen, most = found, count

@@ -21,8 +21,9 @@ from loopclosure.places.frames import gray, read_gray
 from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
 
+TOO_MANY = "are more than are compared at once"
 NOTHING = np.zeros((8, 8), np.uint8)
-MOST_PAIRS = 16_000_000  # of frames that are compared at once, in half a gigabyte
+MOST_PAIRS = 64_000_000  # of frames that are compared at once, in 0.8 GB
 
 
 def whole_drive(
@@ -45,9 +46,9 @@ def whole_drive(
         odometry = np.delete(odometry, recording.unreadable, axis=0)
     recording = recording.readable()
     check, pairs = GeometricCheck(), Pairs(lambda number: _gray_image(recording, number))
-    if recording.images is None:
-        for number, image, _ in progress(recording.frames(), "local features", len(recording)):
-            pairs.put(check, number, check.describe(gray(image)))
+    if recording.images is None:  # frames that cannot be read later
+        frames = progress(recording.frames(), "local features", len(recording))
+        pairs = Pairs({number: check.describe(gray(image)) for number, image, _ in frames}.__getitem__)
     seconds, between = detector.settings.exclude_seconds, Between(check, pairs, (), ())
     found = _among(detector, 0, len(detector), between, precision, progress, odometry, visit, seconds)
     others = float(np.max(single[~found.accepted], initial=-np.inf))
@@ -69,26 +70,29 @@ def last_session(
 
     It is compared with each session before as two traverses and, if ``own``, with itself as one drive in which a visit
     lasts ``visit`` frames (see :func:`loopclosure.methods.auto.answer`) and at least ``seconds``. ``results`` are what
-    its frames found when they came; they stay where there are too many frames to compare.
+    its frames found when they came. Of more earlier sessions than are compared at once, those are in which most frames
+    have their best candidate; loops with the others stay as they were found.
     """
-    ends, check = [*detector.sessions, len(detector)], detector.check
-    begin, count = ends[-2:]
-    if check is None or (count - begin) * count > MOST_PAIRS:
-        return Answer(results, ["too many frames to be compared at once: decided frame by frame"])
-    pairs = Pairs(lambda number: NOTHING)
-    for number in range(count):
-        pairs.put(check, number, detector.local_features(number))
-    between, found, reasons = Between(check, pairs, (), ()), list[list[LoopResult]](), list[str]()
-    for first, end in pairwise(ends):
-        if end > first and (own or first < begin):
-            answered = _among(detector, first, end, between, precision, progress, None, visit, seconds)
-            found.append(answered.results)
-            reasons = answered.reasons
-    best = [
-        max(each, key=lambda result: (bool(result), result.inliers or 0, result.score))
-        for each in zip(*found, strict=True)
-    ]
-    return Answer(best or results, reasons)
+    *earlier, (begin, count) = pairwise([*detector.sessions, len(detector)])
+    if detector.check is None or begin == count:
+        return Answer(results, ["nothing can be verified: decided frame by frame"])
+    alike = np.array([result.candidates[0][0] for result in results if result.candidates])
+    earlier.sort(key=lambda span: -np.count_nonzero((alike >= span[0]) & (alike < span[1])))
+    pairs = np.cumsum([0, *((end - first) * (count - begin) for first, end in earlier)])
+    compared = earlier[: np.count_nonzero(pairs[:-1] < MOST_PAIRS)]
+    between = Between(detector.check, Pairs(detector.local_features), (), ())
+    found, limits, reasons = list[list[LoopResult]](), list[str](), list[str]()
+    for first, end in [*compared, (begin, count)][: None if own else -1]:
+        answered = _among(detector, first, end, between, precision, progress, None, visit, seconds)
+        found, reasons = [*found, answered.results], answered.reasons
+        limits += [reason for reason in reasons if TOO_MANY in reason]
+    if left := earlier[len(compared) :]:
+        elsewhere = [any(first <= (result.accepted or 0) < end for first, end in left) for result in results]
+        none = {"candidates": [], "accepted": None, "score": -np.inf, "inliers": None}
+        found.append([r if r and kept else replace(r, **none) for r, kept in zip(results, elsewhere, strict=True)])
+        limits.append(f"{len(earlier)} sessions {TOO_MANY}: {len(left)} are looked at frame by frame")
+    best = [max(each, key=lambda r: (bool(r), r.inliers or 0, r.score)) for each in zip(*found, strict=True)]
+    return Answer(best or results, [*limits, *(reason for reason in reasons if reason not in limits)])
 
 
 def _among(
@@ -106,18 +110,17 @@ def _among(
 
     Where these are more than ``MOST_PAIRS``, every second or third frame is compared, and decides for those after it.
     """
-    begin, settings, two = detector.sessions[-1], detector.settings, first != detector.sessions[-1]
+    begin, two = detector.sessions[-1], first != detector.sessions[-1]
     count = len(detector) - begin
     step = math.isqrt(max(0, count * (end - first) - 1) // MOST_PAIRS) + 1
     queries, references = range(begin, len(detector), step), range(first, end, step)
-    rows, stamps = detector.descriptors, detector.stamps[begin:]
-    known = rows[first:end:step] if two else None
-    scores = similarity_matrix(rows[begin::step], known, settings.metric, settings.views)
-    allowed = np.ones(scores.shape, bool) if two else _earlier(stamps[::step], seconds)
+    stamps = detector.stamps[begin:]
     agree = replace(between, queries=queries, references=references)
     far = None if odometry is None else far_apart(odometry[::step])
     visit = None if visit is None else visit // step
-    answered = answer(scores, allowed, two, precision, between.check, agree, progress, far, stamps[::step], visit)
+    allowed = np.ones((len(queries), len(references)), bool) if two else _earlier(stamps[::step], seconds)
+    rest = (two, precision, between.check, agree, progress, far, stamps[::step], visit)
+    answered = answer(_compared(detector, queries, references), allowed, *rest)
     results = []
     for number in range(count):
         result = answered.results[number // step]
@@ -131,16 +134,24 @@ def _among(
                 stamp=None if np.isnan(stamps[number]) else float(stamps[number]),
             )
         )
-    thinned = f"{count} frames are more than are compared at once: one of {step} is, and decides for those after it"
+    thinned = f"{count} frames {TOO_MANY}: one of {step} is, and decides for those after it"
     return Answer(results, [*([thinned] if step > 1 else []), *answered.reasons])
+
+
+def _compared(detector: LoopDetector, queries: range, references: range) -> np.ndarray:
+    """Return the scores (Q, R) of frames and others, or themselves."""
+    rows, known = (detector.descriptors_of(of.start, of.stop)[:: of.step] for of in (queries, references))
+    same, settings = queries == references, detector.settings
+    return similarity_matrix(rows, None if same else known, settings.metric, settings.views)
 
 
 def _earlier(stamps: np.ndarray, seconds: float) -> np.ndarray:
     """Return which pairs of frames are candidates: of each, those before that are old enough."""
     numbers = np.arange(len(stamps))
-    return np.tri(len(stamps), k=-1, dtype=bool) & ~Exclusion(seconds=seconds).excludes(
-        numbers, numbers, stamps, stamps
-    )
+    allowed = np.tri(len(stamps), k=-1, dtype=bool)
+    for rows in np.array_split(numbers, len(numbers) // 512 + 1) if seconds else ():
+        allowed[rows] &= ~Exclusion(seconds=seconds).excludes(rows, numbers, stamps[rows], stamps)
+    return allowed
 
 
 def _gray_image(recording: Recording, number: int) -> np.ndarray:

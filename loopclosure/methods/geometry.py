@@ -96,7 +96,7 @@ def _sample(numbers: np.ndarray) -> np.ndarray:
 
 def _unlike(given: Candidates) -> list[tuple[int, int]]:
     """Return pairs that the scores call unlike."""
-    known, pairs = given.known, []
+    known, pairs = given.known(), []
     for query in _sample(np.flatnonzero(np.count_nonzero(np.isfinite(known), axis=1) >= 8)):
         order = np.argsort(known[query], kind="stable")
         candidates = order[np.isfinite(known[query, order])]
@@ -115,7 +115,7 @@ def _left(given: Candidates) -> list[tuple[int, int]]:
 
 def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: Geometry, progress: Progress) -> None:
     """Verify each query's match, or its best single image, which then becomes its match."""
-    check, single, there = geometry.check, given.known.argmax(axis=1), matches.there
+    check, single, there = geometry.check, given.known().argmax(axis=1), matches.there
     for query in progress(np.flatnonzero(there), "verification", int(np.count_nonzero(there))):
         # Lamps of a tunnel repeat: one image that is verified does not overrule a sequence that is accepted.
         other = matches.match if matches.accepted[query] else single
@@ -128,7 +128,7 @@ def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: G
                 matches.match[query] = reference
                 break
     if lines is not None:
-        score = lines.scores[np.arange(len(there)), matches.match]
+        score = np.where(matches.match == lines.match, lines.targets, lines.alone)
         matches.score = np.where(there & ~np.isnan(score), score, -np.inf)
 
 

@@ -24,7 +24,9 @@ DIRECTIONS = ("forward", "both")
 ANCHORS = ("center", "start")
 EDGES = ("shorten", "drop")
 STANDARDIZE = ("no", "yes", "traverses")
-TILE = 64, 256  # pairs whose sums stay in the cache
+TILE = 128, 512  # pairs whose sums stay in the cache
+SEGMENT = 4  # steps of a trajectory, which other trajectories may share
+BLOCK = 512  # rows that are scaled at a time
 LONGEST = 10_000  # frames in a sequence; memory grows with it
 
 
@@ -52,12 +54,8 @@ class SequenceSettings:
     edges: str = "shorten"
 
     def __post_init__(self) -> None:
-        for value, choices, name in (
-            (self.directions, DIRECTIONS, "directions"),
-            (self.anchor, ANCHORS, "anchor"),
-            (self.edges, EDGES, "edges"),
-        ):
-            if value not in choices:
+        for name, choices in {"directions": DIRECTIONS, "anchor": ANCHORS, "edges": EDGES}.items():
+            if (value := getattr(self, name)) not in choices:
                 raise InputError(f'{name} of SeqSLAM is "{value}"; expected {" or ".join(choices)}')
         if not 1 <= self.length <= LONGEST or self.contrast < 0:
             expected = f"length 1 to {LONGEST} and contrast >= 0"
@@ -117,18 +115,21 @@ def standardize(distances: np.ndarray) -> np.ndarray:
     """Give each row, then each column of distances (Q, R) mean 0 and deviation 1 over what is not NaN.
 
     A query that is unlike all references, and a reference that is like all queries, then count as any other: what
-    another season does to descriptors.
+    another season does to descriptors. Memory is that of the result, in the precision of ``distances``.
     """
-    for axis in (1, 0):
-        known = np.isfinite(distances)
-        count = np.maximum(known.sum(axis=axis, keepdims=True), 1)
-        mean = np.where(known, distances, 0).sum(axis=axis, keepdims=True) / count
-        centered = np.where(known, distances - mean, 0)
-        deviation = np.sqrt(np.square(centered).sum(axis=axis, keepdims=True) / count)
-        differ = deviation > 1e-12 * np.abs(mean)  # rounding, see enhance_contrast
-        scaled = np.divide(centered, deviation, out=np.zeros_like(centered), where=differ)
-        distances = np.where(known, scaled, np.nan)
-    return distances
+    result = distances.copy()
+    for along in (result, result.T):
+        for first in range(0, len(along), BLOCK):
+            rows = along[first : first + BLOCK]
+            known = np.isfinite(rows)
+            count = np.maximum(known.sum(axis=1, keepdims=True), 1)
+            mean = np.where(known, rows, 0).sum(axis=1, keepdims=True) / count
+            centered = np.where(known, rows - mean, 0)
+            deviation = np.sqrt(np.square(centered).sum(axis=1, keepdims=True) / count)
+            differ = deviation > 1e-12 * np.abs(mean)  # rounding, see enhance_contrast
+            scaled = np.divide(centered, deviation, out=np.zeros_like(centered), where=differ)
+            rows[:] = np.where(known, scaled, np.nan)
+    return result
 
 
 def _neighbors(size: int, reach: int) -> Sequence[tuple[slice, slice]]:
@@ -137,44 +138,63 @@ def _neighbors(size: int, reach: int) -> Sequence[tuple[slice, slice]]:
     return [(slice(max(0, -s), size - max(0, s)), slice(max(0, s), size - max(0, -s))) for s in shifts]
 
 
-def trajectory_costs(distances: np.ndarray, settings: SequenceSettings) -> np.ndarray:
+def trajectory_costs(distances: np.ndarray, settings: SequenceSettings, rows: range | None = None) -> np.ndarray:
     """Return the least mean distance along any trajectory through each query and reference: (Q, R).
 
     NaN in ``distances`` (Q, R) counts as outside the matrix. A cost is NaN if too little of every trajectory is inside.
+    ``rows``: only of these queries. Costs have the precision of the distances.
     """
     queries, references = distances.shape
+    rows = range(queries) if rows is None else rows
     half = settings.length // 2
     offsets = settings.offsets()
     reach = int(np.abs(offsets).max())
     needed = settings.length + 1 if settings.edges == "drop" else half + 1
     margins = ((half, settings.length - half), (reach, reach))
-    inside = np.pad(np.isfinite(distances), margins)
-    padded = np.pad(np.where(np.isfinite(distances), distances, 0.0), margins)
-    costs = np.full((queries, references), np.nan)
-    for top, left in product(range(0, queries, TILE[0]), range(0, references, TILE[1])):
+    known = np.isfinite(distances)
+    inside = np.pad(known, margins)
+    padded = np.pad(np.where(known, distances, distances.dtype.type(0)), margins)
+    costs = np.full((len(rows), references), np.nan, distances.dtype)
+    for top, left in product(range(0, len(rows), TILE[0]), range(0, references, TILE[1])):
         tile = costs[top : top + TILE[0], left : left + TILE[1]]
-        around = np.s_[top : top + len(tile) + settings.length, left : left + tile.shape[1] + 2 * reach]
+        above = top + rows.start
+        around = np.s_[above : above + len(tile) + settings.length, left : left + tile.shape[1] + 2 * reach]
         if inside[around].any():
-            _tile_costs(padded[around].astype(float), inside[around], offsets + reach, needed, tile)
+            _tile_costs(padded[around], inside[around], offsets + reach, needed, tile)
     return costs
 
 
 def _tile_costs(padded: np.ndarray, inside: np.ndarray, offsets: np.ndarray, needed: int, costs: np.ndarray) -> None:
     """Write the costs of some pairs, of which ``padded`` and ``inside`` hold the surroundings, into ``costs``."""
-    height, width = costs.shape
-    total, mean = np.empty((height, width)), np.empty((height, width))
-    count = np.empty((height, width), np.min_scalar_type(offsets.shape[1]))
-    whole, best = inside.all(), np.full((height, width), np.inf)
+    best, whole, (height, width), steps = np.full_like(costs, np.inf), inside.all(), costs.shape, offsets.shape[1]
+    mean, count = np.empty_like(costs), np.full(costs.shape, steps, np.min_scalar_type(steps))
+    sums = [(mean, {(0,): padded}), (count, {(0,): inside.view(np.uint8)})][: 1 if whole else 2]
     for path in offsets.tolist():
-        total[:], count[:] = 0, len(path) if whole else 0
-        for step, offset in enumerate(path):
-            total += padded[step : step + height, offset : offset + width]
-            if not whole:
-                count += inside[step : step + height, offset : offset + width]
-        np.divide(total, count, out=mean, where=count > 0)
-        mean[count < needed] = np.inf
+        for total, made in sums:
+            total[:] = 0
+            for step in range(0, steps, SEGMENT):
+                left = min(path[step : step + SEGMENT])
+                part = _sums(made, tuple(shift - left for shift in path[step : step + SEGMENT]))
+                total += part[step : step + height, left : left + width]
+        outside = count < needed
+        mean /= np.maximum(count, 1)
+        np.copyto(mean, np.inf, where=outside)
         np.minimum(best, mean, out=best)
     np.copyto(costs, best, where=np.isfinite(best))
+
+
+def _sums(made: dict[tuple[int, ...], np.ndarray], shifts: tuple[int, ...]) -> np.ndarray:
+    """Return the sums along part of a trajectory from each pair: fewer rows and columns than ``made[0,]``, the values.
+
+    shifts  the columns by which it is shifted in each row, the least 0
+    made    the sums so far: parts are shared by many trajectories
+    """
+    if shifts not in made:
+        half, rows, columns = len(shifts) // 2, len(made[0,]) - len(shifts) + 1, made[0,].shape[1] - max(shifts)
+        ends = [(row, part, min(part)) for row, part in ((0, shifts[:half]), (half, shifts[half:]))]
+        a, b = (_sums(made, tuple(s - x for s in part))[row:, x:][:rows, :columns] for row, part, x in ends)
+        made[shifts] = a + b
+    return made[shifts]
 
 
 def least_cost_matches(costs: np.ndarray, window: int = 10) -> tuple[np.ndarray, np.ndarray]:

@@ -91,9 +91,12 @@ def test_build_add_and_query(
     expected = [(f"000001/{i:03d}.png", f"000000/{i:03d}.png") for i in range(PLACES)]
     assert loops(tmp_path / "M" / "000001" / "loops.csv") == expected
     before = contents(tmp_path / "M")
+    monkeypatch.setattr("loopclosure.methods.drive.MOST_PAIRS", 150)  # of two sessions, one
     assert main(["map", "query", "M", str(drives / "c"), *more, "--out", "found"]) == 0
     assert contents(tmp_path / "M") == before
-    assert "5 of 15 frames are in the map: found/loops.csv" in capsys.readouterr().out
+    query = capsys.readouterr()
+    assert "5 of 15 frames are in the map: found/loops.csv" in query.out
+    assert ("2 sessions are more than are compared at once: 1 are looked" in query.err) == (index != "p.db")
     found = loops(tmp_path / "found" / "loops.csv")
     assert [(query, match.partition("/")[2]) for query, match in found] == [
         (f"{i:03d}.png", f"{i + 5:03d}.png") for i in range(5)

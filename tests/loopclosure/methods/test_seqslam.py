@@ -104,6 +104,20 @@ def test_costs_are_means_along_the_path() -> None:
     np.testing.assert_array_equal(np.isfinite(costs), np.pad(np.ones((5, 5), bool), 2))
 
 
+def test_parts_of_trajectories_are_shared_and_no_mean_changes() -> None:
+    random = np.random.default_rng(3)
+    distances = np.where(random.random((150, 600)) < 0.02, np.nan, random.random((150, 600)))
+    settings = SequenceSettings(length=21, slowest=0.5, fastest=2.0, velocity_step=0.25)
+    around, expected = np.pad(distances, ((10, 11), (22, 22)), constant_values=np.nan), np.full((150, 600), np.inf)
+    for path in settings.offsets():
+        passed = np.array([around[k : k + 150, 22 + left : 622 + left] for k, left in enumerate(path)])
+        enough = np.isfinite(passed).sum(axis=0) >= 11
+        expected = np.fmin(expected, np.where(enough, np.nanmean(passed, axis=0), np.inf))
+    costs = trajectory_costs(distances, settings)
+    np.testing.assert_allclose(np.where(np.isnan(costs), np.inf, costs), expected, rtol=1e-12)
+    np.testing.assert_array_equal(trajectory_costs(distances, settings, range(70, 140)), costs[70:140])
+
+
 def test_short_trajectories_at_the_edges() -> None:
     distances = np.random.default_rng(1).random((9, 9))
     costs = trajectory_costs(distances, SequenceSettings(length=4, slowest=1.0, fastest=1.0))
