@@ -27,7 +27,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import gammaincinv  # scipy.stats, which has chi2, takes a quarter of a second to import
 
 Array = NDArray[np.float64]
 
@@ -101,7 +101,7 @@ def solve(
 def _limits(loops: Sequence[Edge], flat: bool) -> Array:
     """Return the greatest error (L,) of a true loop: it grows with how many numbers the loop measures."""
     measured = np.linalg.matrix_rank(np.array([edge.information for edge in loops]).reshape(-1, 6, 6), hermitian=True)
-    return np.asarray(chi2.ppf(TRUE_BELOW, np.maximum(1, measured - (3 if flat else 0))))
+    return 2 * gammaincinv(np.maximum(1, measured - (3 if flat else 0)) / 2, TRUE_BELOW)
 
 
 def squares_of(poses: Array, edges: Sequence[Edge]) -> Array:
