@@ -167,8 +167,9 @@ def _watch_own(arguments: argparse.Namespace) -> int:
     log = Path(f"{prefix}.{time.strftime('%Y%m%d-%H%M%S')}.log")
     with log.open("xb") as file:
         words = [sys.executable, "-m", "netspec", "train", "--solver", arguments.solver]
+        words += [word for plugin in arguments.plugin for word in ("--plugin", plugin)]
         # Its own session: only a signal that is passed on reaches it, and it outlives a terminal that is closed.
-        training = subprocess.Popen([*words, *_plugins(arguments)], stderr=file, start_new_session=True)
+        training = subprocess.Popen(words, stderr=file, start_new_session=True)
     try:
         _follow(Follower(log), arguments.every, training)
     except KeyboardInterrupt:
@@ -181,10 +182,6 @@ def _watch_own(arguments: argparse.Namespace) -> int:
         print(log.read_text(errors="replace").splitlines()[-1], file=sys.stderr)
     print(log)
     return status
-
-
-def _plugins(arguments: argparse.Namespace) -> list[str]:
-    return [word for plugin in arguments.plugin for word in ("--plugin", plugin)]
 
 
 def _follow(follower: Follower, every: float, training: subprocess.Popen[bytes] | None = None) -> None:

@@ -36,8 +36,10 @@ def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
         where = plan.source.at(first, *path, layer=plan.nodes[first].name, type=kind)
         others = f" (also in {len(places) - 1} more of these layers)" if len(places) > 1 else ""
         yield f"{where}: {'.'.join(path)} has no effect: {reason}{others}"
-    if plan.net.debug_info:
-        yield f"{plan.source.net.find('debug_info')}: debug_info has no effect in a net; set it in the solver"
+    for field, _ in plan.net.ListFields():
+        if field.is_extension or field.name == "debug_info":
+            advice = "; set it in the solver" if field.name == "debug_info" else ""
+            yield f"{plan.source.net.find(field.name)}: {field.name} has no effect in a net{advice}"
 
 
 def unsure_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
@@ -50,7 +52,7 @@ def unsure_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
 def _unused(layer: Layer) -> Iterator[tuple[Path, str]]:
     partly = {name.partition(".")[0] for name in layer.reads if "." in name}
     for field, value in layer.param.ListFields():
-        if field.name in COMMON:
+        if field.name in COMMON | HOW_NOT_WHAT:
             continue
         if field.name not in layer.reads | partly:
             yield (field.name,), f"a layer of type {layer.type} does not read it"

@@ -144,7 +144,7 @@ class Prepared:
         changing = self._changing()
         probe = torch.empty(1, dtype=next((dtype for *_, dtype in given), torch.float32), device=self._device)
         exact = [fit is not None and fit.is_exact(probe, fit.small) for fit in found]
-        as_is = [fit is None or bool(changing & _ids(fit)) for fit in found]
+        as_is = [fit is None or bool(changing & set(map(id, fit.blobs))) for fit in found]
         roles = roles_of(plan, layers)
         foldable = [not (e or a) for e, a in zip(exact, as_is, strict=True)]
         order = schedule(
@@ -263,10 +263,6 @@ def _most_alive(steps: Sequence[planned.PlannedStep], shapes: Mapping[int, Shape
         for v in step.ends:
             alive.pop(v, None)
     return most
-
-
-def _ids(layer: Layer) -> set[int]:
-    return {id(blob) for blob in layer.blobs}
 
 
 def _both(these: Sequence[bool], those: Sequence[bool]) -> list[bool]:

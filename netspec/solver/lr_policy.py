@@ -5,6 +5,7 @@ Caffe: SGDSolver::GetLearningRate (src/caffe/solvers/sgd_solver.cpp:27)
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ import torch
 
 from netspec.errors import SpecError, did_you_mean
 from netspec.exact.libm import power
+from netspec.proto.schema import added_fields
 from netspec.proto.source_map import Place
 
 Rate = Callable[[Any, int, int], Any]
@@ -26,6 +28,26 @@ class Policy:
 
     needs: tuple[str, ...]
     rate: Rate
+
+
+#: Intel's ramp and NVIDIA's: its length, its first rate, its exponent (netspec/dialects/blocks/settings.py)
+_RAMPS = (("warmup_iter", "warmup_start_lr", 1), ("rampup_interval", "rampup_lr", 2))
+RATES_OF_FORKS = frozenset({"stagelr", "stageiter", "min_lr", *(name for ramp in _RAMPS for name in ramp[:2])})
+
+
+def _fork(param: Any, name: str, otherwise: Any = 0) -> Any:
+    field = added_fields.get(param.DESCRIPTOR.full_name, {}).get(name)
+    return otherwise if field is None else field.get(param)
+
+
+def _stage(param: Any, iteration: int, step: int) -> float:
+    rates, ends = _fork(param, "stagelr"), _fork(param, "stageiter")
+    return rates[min(bisect.bisect_left(ends, iteration), len(ends) - 1)]
+
+
+def _poly(p: Any, iteration: int, step: int) -> float:
+    least = _fork(p, "min_lr")
+    return (p.base_lr - least) * _powf(1 - np.float32(iteration) / np.float32(p.max_iter), p.power) + least
 
 
 def _power(base: float, exponent: float) -> np.float64:
@@ -42,12 +64,11 @@ POLICIES: dict[str, Policy] = {
     "exp": Policy(("gamma",), lambda p, i, step: p.base_lr * _power(p.gamma, i)),
     "inv": Policy(("gamma",), lambda p, i, step: p.base_lr * _powf(1 + np.float32(p.gamma) * np.float32(i), -p.power)),
     "multistep": Policy(("gamma",), lambda p, i, step: p.base_lr * _power(p.gamma, step)),
-    "poly": Policy(
-        ("max_iter",), lambda p, i, step: p.base_lr * _powf(1 - np.float32(i) / np.float32(p.max_iter), p.power)
-    ),
+    "poly": Policy(("max_iter",), _poly),
     "sigmoid": Policy(
         ("gamma", "stepsize"), lambda p, i, step: p.base_lr / (1 + np.exp(np.float64(-p.gamma * (i - p.stepsize))))
     ),
+    "multifixed": Policy((), _stage),
 }
 
 
@@ -64,6 +85,10 @@ def policy_faults(param: Any, node: Place) -> Iterator[SpecError]:
         hint = did_you_mean(param.lr_policy, list(POLICIES))
         yield SpecError(f"{found}, expected one of {known}{hint}", node.find("lr_policy"))
         return
+    stages = [len(_fork(param, name, ())) for name in ("stagelr", "stageiter")]
+    if param.lr_policy == "multifixed" and (not stages[0] or stages[0] != stages[1]):
+        found = f"found {stages[0]} and {stages[1]}"
+        yield SpecError(f'lr_policy "multifixed" needs as many stagelr as stageiter, {found}', node.find("lr_policy"))
     for field in policy.needs:
         value = getattr(param, field)
         if not param.HasField(field):
@@ -91,11 +116,19 @@ def learning_rate(param: Any, iteration: int, step: int) -> float:
 
     Raises SpecError if the rate is not a number, as for poly beyond max_iter.
     """
-    if param.lr_policy == "fixed":
+    ramps = [(_fork(param, length), _fork(param, start), power) for length, start, power in _RAMPS]
+    ramp = next((ramp for ramp in ramps if iteration < ramp[0]), None)
+    if ramp is None and param.lr_policy == "fixed":
         rate = param.base_lr
     else:
         with np.errstate(all="ignore"):
-            rate = float(np.float32(POLICIES[param.lr_policy].rate(param, iteration, step)))
+            if ramp:
+                rate = ramp[1] + (param.base_lr - ramp[1]) * (iteration / ramp[0]) ** ramp[2]
+            else:
+                rate = POLICIES[param.lr_policy].rate(param, iteration, step)
+            rate = float(np.float32(rate))
+    if least := _fork(param, "min_lr"):
+        rate = max(rate, least)
     if not math.isfinite(rate):
         message = f'lr_policy "{param.lr_policy}" gives the learning rate {rate} at iteration {iteration}'
         raise SpecError(f"{message} (max_iter {param.max_iter})")

@@ -36,6 +36,7 @@ from netspec.solver.checks import (
     fields_without_effect,
 )
 from netspec.solver.debug import debug_info
+from netspec.solver.lr_policy import RATES_OF_FORKS
 from netspec.solver.options import TrainingOptions, choose_device
 from netspec.solver.precision import BF16, FP16, FP32, LossScale, computing
 from netspec.solver.replicas import Replicas
@@ -187,7 +188,7 @@ class Training:
 
     def _say_doubts(self) -> None:
         """Warn of fields without effect, and of what makes the training slow or its bits depend on the machine."""
-        read = frozenset[str]().union(
+        read = RATES_OF_FORKS.union(
             *(layer.solver_reads for net in self.test_nets for layer in net.layers if isinstance(layer, Scores))
         )
         for line in fields_without_effect(self.param, self.node, read):

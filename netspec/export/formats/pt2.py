@@ -43,7 +43,8 @@ def export_pt2(net: Net, path: str | Path) -> list[str]:
     module, shapes = _made(net)
     inputs = [v for node, layer in zip(net.plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops]
     notes = list(shapes.fixed)
-    for names in _choices([free.name for free in shapes.free if not free.counted]):
+    every = [free.name for free in shapes.free if not free.counted]
+    for names in (*([every] if len(every) > 1 else []), *([["N"]] if "N" in every else []), []):
         dims = {free.name: torch.export.Dim.AUTO for free in shapes.free if free.name in names}
         axes = {axis: free.name for free in shapes.free for axis in free.axes if free.name in dims}
         dynamic = [
@@ -69,11 +70,6 @@ def export_pt2(net: Net, path: str | Path) -> list[str]:
         fixed = [free.name for free in shapes.free if not free.counted and free.name not in names]
         return [*notes, *([f"torch.export fixes the sizes {' and '.join(fixed)}"] if fixed else [])]
     raise AssertionError("the last choice has no free size")
-
-
-def _choices(names: list[str]) -> list[list[str]]:
-    """Return which sizes to leave free, the most first."""
-    return [*([names] if len(names) > 1 else []), *([["N"]] if "N" in names else []), []]
 
 
 def torch_module(net: Net) -> nn.Module:

@@ -159,7 +159,8 @@ class _Painter:
                 continue
             copies = range(part.box, block.boxes.stop, block.length)
             entries = sum(p in wire.targets for wire in wires)
-            sizes.append(_widest([self._box_size(k, entries) for k in copies]))
+            boxes = [self._box_size(k, entries) for k in copies]  # of copies of a block, which differ in names only
+            sizes.append(max(boxes, key=lambda size: (size.left, size.right)))
         return _Level(parts, wires, sizes, lay_out(sizes, wires))
 
     def _read_by(self, part: _Part) -> Sequence[Output]:
@@ -285,11 +286,6 @@ class _Painter:
         for port, label in zip(ports, self._labels(k), strict=True):
             marks.append(Text(port + 6, height + 13, label, SMALL, PALE))
         return Drawing(marks, height + LABEL * bool(ports))
-
-
-def _widest(sizes: Sequence[Size]) -> Size:
-    """Return a size that has room for each: the boxes of the copies of a block, which differ in names only."""
-    return max(sizes, key=lambda size: (size.left, size.right))
 
 
 def _gap(pieces: Sequence[Piece]) -> int:

@@ -1,11 +1,12 @@
-import math
 import re
 
 import pytest
 
+from case_files import read_texts
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
+from netspec.proto.text import parse_solver_text
 from netspec.solver.lr_policy import learning_rate, next_step, policy_faults
 
 NODE = Place(
@@ -18,52 +19,17 @@ NODE = Place(
 )
 
 
-def rates(param, iterations) -> list[float]:
-    """The rate of each iteration, run through in order from a fresh start."""
-    out, step = [], 0
-    for i in iterations:
+@pytest.mark.parametrize(("name", "case"), read_texts("netspec/solver/rates.txt").items())
+def test_rates(name: str, case: str):
+    """A case has a solver's settings, iterations, run through in order, and their rates."""
+    text, iterations, expected = case.splitlines()
+    param, node = parse_solver_text(f"net: 'n' {text}", "s.prototxt")
+    assert not list(policy_faults(param, node))
+    found, step = [], 0
+    for i in map(int, iterations.split()):
         step = next_step(param, i, step)
-        out.append(learning_rate(param, i, step))
-    return out
-
-
-def test_fixed():
-    assert rates(SolverParameter(lr_policy="fixed", base_lr=0.5), (0, 9)) == [0.5, 0.5]
-
-
-def test_step():
-    param = SolverParameter(lr_policy="step", base_lr=0.5, gamma=0.5, stepsize=10)
-    assert rates(param, (0, 9, 10, 19, 20)) == [0.5, 0.5, 0.25, 0.25, 0.125]
-
-
-def test_exp():
-    assert rates(SolverParameter(lr_policy="exp", base_lr=2, gamma=0.5), (0, 1, 3)) == [2, 1, 0.25]
-
-
-def test_inv():
-    param = SolverParameter(lr_policy="inv", base_lr=0.01, gamma=0.0001, power=0.75)
-    assert rates(param, (5000,)) == pytest.approx([0.01 * 1.5**-0.75], rel=1e-6)
-
-
-def test_poly():
-    param = SolverParameter(lr_policy="poly", base_lr=1, power=2, max_iter=10)
-    assert rates(param, (0, 5, 10)) == [1, 0.25, 0]
-
-
-def test_sigmoid():
-    param = SolverParameter(lr_policy="sigmoid", base_lr=1, gamma=0.5, stepsize=10)
-    assert rates(param, (6, 10, 14)) == pytest.approx([1 / (1 + math.exp(2)), 0.5, 1 / (1 + math.exp(-2))], rel=1e-6)
-
-
-def test_multistep():
-    param = SolverParameter(lr_policy="multistep", base_lr=1, gamma=0.5, stepvalue=[2, 4])
-    assert rates(param, range(6)) == [1, 1, 0.5, 0.5, 0.25, 0.25]
-
-
-def test_multistep_goes_up_at_most_once_an_iteration():
-    """Resumed with its step lost, Caffe takes as many iterations as it has steps to make up for."""
-    param = SolverParameter(lr_policy="multistep", base_lr=1, gamma=0.5, stepvalue=[2, 4, 5])
-    assert rates(param, range(10, 14)) == [0.5, 0.25, 0.125, 0.125]
+        found.append(learning_rate(param, i, step))
+    assert found == pytest.approx(list(map(float, expected.split())), rel=1e-6)
 
 
 def test_the_rate_is_rounded_to_float32():
@@ -95,6 +61,7 @@ def test_poly_has_no_rate_beyond_max_iter():
         ({"lr_policy": "inv", "gamma": -1}, "s.prototxt:5:1: .* gamma of at least 0, found -1"),
         ({"lr_policy": "poly"}, "needs max_iter, found none"),
         ({"lr_policy": "sigmoid", "gamma": 1}, "needs stepsize, found none"),
+        ({"lr_policy": "multifixed"}, "needs as many stagelr as stageiter, found 0 and 0"),
     ],
 )
 def test_what_is_refused_before_the_first_iteration(fields: dict, message: str):
