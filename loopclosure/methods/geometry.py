@@ -141,8 +141,9 @@ def kept(matches: Matches, geometry: Geometry, lines: Lines | None, precision: f
         while np.any(more := accepted & np.any(_beside(matches.match, loops, lines), axis=0) & ~loops):
             loops |= more
         return loops
-    # What verification alone finds must be better than what it finds in pairs that are no loop.
-    least = max(SURE, threshold(evidence, unlike, precision))
+    # What verification alone finds must be better than what it finds in pairs that are no loop. Where sequences tell
+    # loops, it must be beyond doubt: the stripes of a curb repeat, and unlike pairs may all be of another road.
+    least = max(SURE if lines is None else DOUBTLESS, threshold(evidence, unlike, precision))
     if not geometry.common(DOUBTLESS):
         least = min(least, DOUBTLESS)
     # From afar a place is seen before the camera is there: other queries fit it better.

@@ -281,6 +281,23 @@ def test_a_robot_that_moves_slowly_for_a_while_does_not_stand():
     assert np.array_equal(same, taken)
 
 
+def test_where_sequences_tell_loops_an_image_alone_must_be_beyond_doubt():
+    """The curb of another road is striped, so that its most alike frames agree; unlike pairs are of two roads."""
+    road = drive(150, 6)
+    scores = alike(np.concatenate([again(road[:90], 1.0, 7), drive(60, 16)]), road)
+    stripes = scores.argmax(axis=1)
+    found = answer(
+        scores,
+        everything(scores),
+        True,
+        0.99,
+        GeometricCheck(),
+        lambda q, r: Agreement(60, 50 if abs(q - r) <= 3 else 36 * (r == stripes[q]), 20),
+    )
+    assert np.count_nonzero(found.accepted[:90]) > 80
+    assert not found.accepted[92:].any()
+
+
 def test_what_a_fifth_of_unlike_pairs_has_verifies_nothing():
     """A hood has enough points in many pairs: a loop ends with the last match that has more."""
     road = drive(150, 6)
