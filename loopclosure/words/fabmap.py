@@ -140,11 +140,7 @@ class FabMapModel:
             result[start : start + len(absent)] = absent.sum(axis=1, keepdims=True) + (present - absent) @ known
         return result
 
-    def draws(self) -> np.random.Generator:
-        """Return the random generator of one run, from the seed."""
-        return np.random.default_rng(self.settings.seed)
-
-    def new_place(self, queries: np.ndarray, draws: np.random.Generator) -> np.ndarray:
+    def new_place(self, queries: np.ndarray) -> np.ndarray:
         """Return ln p(query | new place) as (Q,) for words (Q, v): the mean over sampled images, or the mean field."""
         if self.settings.new_place == "sampled":
             loglik, images, samples = (
@@ -154,6 +150,7 @@ class FabMapModel:
             )
             if self.settings.version == 2 or samples == 0:
                 return logsumexp(loglik, axis=1) - np.log(images)
+            draws = np.random.default_rng(self.settings.seed)
             times_drawn = draws.multinomial(samples, np.full(images, 1.0 / images), size=len(loglik))
             return logsumexp(loglik, axis=1, b=times_drawn) - np.log(samples)
         seen = np.asarray(queries) > 0
@@ -202,7 +199,7 @@ class PlaceScores:
 
 def score_sets(model: FabMapModel, queries: np.ndarray, places: np.ndarray) -> PlaceScores:
     """Score the queries' words (Q, v) on a finished map with the words (P, v), for two traverses."""
-    loglik, loglik_new = model.likelihoods(queries, places), model.new_place(queries, model.draws())
+    loglik, loglik_new = model.likelihoods(queries, places), model.new_place(queries)
     posterior, new = np.empty_like(loglik), np.empty(len(loglik))
     previous = None
     for i in range(len(loglik)):
@@ -217,7 +214,7 @@ def score_sequence(model: FabMapModel, words: np.ndarray) -> PlaceScores:
     The upper triangle with the diagonal is NaN. The posterior of images too recent to be on the map is NaN as well;
     their log-odds are not.
     """
-    loglik, loglik_new = model.likelihoods(words, words), model.new_place(words, model.draws())
+    loglik, loglik_new = model.likelihoods(words, words), model.new_place(words)
     posterior, new = np.full_like(loglik, np.nan), np.empty(len(loglik))
     previous = None
     for i in range(len(loglik)):
