@@ -52,10 +52,10 @@ class DenseBlock(Layer):
     and unbiased variance, and by these averages in testing. In training what is appended passes a Dropout of
     dropout_amount if use_dropout says so. The fork's code for GPUs is meant; that for CPUs has other averages.
 
-    bottom[0]  (N, initChannel, H, W)
-    top[0]     (N, initChannel + numTransition growthRate, H, W)
+    bottom[0]  (N, C, H, W); C is initChannel in Tongcheng's files, and counts in those of caffe_ocr, which differ
+    top[0]     (N, C + numTransition growthRate, H, W)
     blobs[0 T ...]  of T = numTransition steps, step i's at 0 T + i: filters (growthRate, C_i, 3, 3), in which C_i is
-               initChannel + i growthRate, or 4 growthRate with use_BC; then at 1 T slopes, at 2 T biases, at 3 T means
+               C + i growthRate, or 4 growthRate with use_BC; then at 1 T slopes, at 2 T biases, at 3 T means
                and at 4 T variances (1, C, 1, 1); with use_BC at 5 T filters (4 growthRate, C, 1, 1), and at 6 T to 9 T
                slopes, biases, means and variances of the second BN; last one number, not used
     Fork: Tongcheng/caffe, src/caffe/layers/DenseBlock_layer.cu
@@ -65,17 +65,20 @@ class DenseBlock(Layer):
 
     def setup(self) -> None:
         self.settings = p = value(self.param, GROUP)
+        shape = self.bottom_shapes[0]
+        if len(shape) != 4:
+            raise self.error(f"found a bottom of shape {shape}, expected (N, C, H, W)", "bottom")
         for name, only in FIXED.items():
             if getattr(p, name) != only:
                 raise self.error(f"{name} must be {only}, as the fork's code takes it to be", GROUP, name)
-        for name in ("numTransition", "initChannel", "growthRate"):
+        for name in ("numTransition", "growthRate"):
             if getattr(p, name) < 1:
                 raise self.error(f"{name} must be at least 1", GROUP, name)
         if not 0 <= p.dropout_amount < 1:
             raise self.error("dropout_amount must be at least 0 and less than 1", GROUP, "dropout_amount")
         self.steps = steps = p.numTransition
         inner = 4 * p.growthRate
-        widths = [p.initChannel + i * p.growthRate for i in range(steps)]
+        widths = [shape[1] + i * p.growthRate for i in range(steps)]
         for width in widths:
             self.add_blob((p.growthRate, inner if p.use_BC else width, 3, 3), p.Filter_Filler)
         self._add_norms(widths)
@@ -96,12 +99,8 @@ class DenseBlock(Layer):
                 self.add_blob((1, width, 1, 1), value=start)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        shape, p = bottom_shapes[0], self.settings
-        if len(shape) != 4 or shape[1] != p.initChannel:
-            raise self.error(
-                f"found a bottom of shape {shape}, expected (N, initChannel {p.initChannel}, H, W)", "bottom"
-            )
-        return [(shape[0], p.initChannel + self.steps * p.growthRate, *shape[2:])]
+        images, channels, *pixels = bottom_shapes[0]
+        return [(images, channels + self.steps * self.settings.growthRate, *pixels)]
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         p = self.settings

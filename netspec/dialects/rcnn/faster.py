@@ -18,6 +18,7 @@ import torch
 from netspec.data.images import read_image
 from netspec.dialects.boxes import Array, as_array
 from netspec.dialects.rcnn.proposals import all_anchors, base_anchors
+from netspec.dialects.rcnn.smooth import four
 from netspec.errors import SpecError
 from netspec.files.opencv import cv2
 from netspec.layers.contract.base import Layer, Shape
@@ -172,6 +173,7 @@ class ProposalTarget(_Sampling):
     top[3]     inside weights, the same shape: 1 there
     top[4]     outside weights, the same shape: 1 there
     top[5]     with num_attr_classes: attributes of the objects (32, 16), ignore_label (-1) where there is none
+    In an R-FCN the tops have four axes, and only the fork's own code chooses.
     Fork: py-faster-rcnn and bottom-up-attention, lib/rpn/proposal_target_layer.py
     """
 
@@ -197,7 +199,7 @@ class ProposalTarget(_Sampling):
         if len(bottom_shapes[1]) != 2 or bottom_shapes[1][1] not in (4, 5, self.columns):  # 4 or 5: no data yet
             raise self._wrong(bottom_shapes[1])
         tops = [(1, 5), (1,), *[(1, 4 * self.classes)] * 3, (self.objects, ATTRIBUTES)]
-        return tops[: self.num_tops]
+        return [four(top) if self.is_rfcn else top for top in tops[: self.num_tops]]
 
     @property
     def columns(self) -> int:
@@ -207,7 +209,14 @@ class ProposalTarget(_Sampling):
     def _wrong(self, shape: Shape) -> SpecError:
         return self.error(f"found true boxes of shape {shape}, expected (n, {self.columns})", "bottom", 1)
 
+    @property
+    def is_rfcn(self) -> bool:
+        """Whether R-FCN's layers are in the net."""
+        return "rfcn" in self.context.options.dialects
+
     def forward(self, proposals: torch.Tensor, boxes: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        if self.is_rfcn:
+            raise self.error(f"how R-FCN chooses regions stands in its configuration, not here; {OWN_CODE}")
         truth = as_array(boxes)
         if truth.shape[1] != self.columns:
             raise self._wrong(truth.shape)

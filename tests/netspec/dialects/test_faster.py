@@ -16,7 +16,9 @@ from netspec.dialects.rcnn.faster import settings
 from netspec.dialects.rcnn.proposals import all_anchors, base_anchors
 from netspec.errors import SpecError
 from netspec.layers import Layer
+from netspec.net.build import build_net
 from netspec.proto.schema import TEST, TRAIN
+from netspec.proto.text import parse_net_text
 from paths import ROOT
 
 Build = Callable[..., Layer]
@@ -138,6 +140,19 @@ def test_regions_that_show_an_object_are_moved_onto_it(build: Build) -> None:
             assert max(table) < 0.5
         assert (inner[k] == weights).all()
         assert (outer[k] == weights).all()
+
+
+def test_in_an_rfcn_the_tops_have_four_axes_and_the_forks_code_chooses() -> None:
+    """OHEM adds a loss of each region (R, 1, 1, 1) to one that has the labels' shape."""
+    tops = "".join(f' top: "{name}"' for name in "rlmio")
+    text = f"""layer {{ name: "in" type: "Input" top: "p" top: "t" input_param {{ shape {{ dim: [1, 5] }} }} }}
+        layer {{ name: "regions" bottom: "p" bottom: "t"{tops} {REGIONS} }}
+        layer {{ name: "l1" type: "SmoothL1LossOHEM" bottom: "p" bottom: "p" top: "loss" top: "each" }}
+        layer {{ name: "sum" type: "Eltwise" bottom: "l" bottom: "each" top: "sum" }}"""
+    net = build_net(*parse_net_text(text, "n.prototxt"))
+    assert (net.shapes["r"], net.shapes["sum"]) == ((1, 5, 1, 1), (1, 1, 1, 1))
+    with pytest.raises(SpecError, match=r"how R-FCN chooses .* --allow-python-layers runs the fork's own code"):
+        net(p=TRUTH[:1], t=TRUTH[:1])
 
 
 def test_regions_have_the_attributes_of_what_they_show(build: Build) -> None:
