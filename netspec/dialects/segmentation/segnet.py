@@ -11,6 +11,7 @@ import torch.nn.functional as F
 
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
+from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.folding import Affine, Folds, blob_in_double
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.layers.contract.whose import whose
@@ -137,6 +138,8 @@ class BN(Layer):
 
     bottom[0]  (N, C, H, W); up to four axes
     top[0]     the same shape
+    top[1]     optional, SegNet's only: the batch's mean (1, C, 1, 1); as top[2] it brings no gradient
+    top[2]     optional, SegNet's only: the batch's biased variance (1, C, 1, 1)
     blobs[0]   slopes (1, C, 1, 1), 0 unless a filler is given
     blobs[1]   biases (1, C, 1, 1)
     blobs[2]   moving mean     (1, C, 1, 1)                            PSPNet's only; not learned
@@ -144,6 +147,7 @@ class BN(Layer):
     Fork: hszhao/PSPNet, happynear/caffe-windows and alexgkendall/caffe-segnet, src/caffe/layers/bn_layer.cpp
     """
 
+    tops = (1, 3)
     loose = True  # TSN's and happynear's files have (1, C)
     forks: ClassVar[Mapping[str, str]] = {
         "blocks": "of PSPNet and TSN: the moving variance is in blobs[3]",
@@ -171,6 +175,8 @@ class BN(Layer):
         self.add_blob(size, param.shift_filler if segnet else param.bias_filler)
         self.by_batch = param.bn_mode != INFERENCE if segnet else self.phase == TRAIN and not param.frozen
         self.moving = not segnet
+        if self.num_tops > 1 and not (segnet and self.by_batch):
+            raise self.error(f"found {self.num_tops} tops, expected 1: only SegNet's BN shows a batch's mean", "top", 1)
         self.eps: float = SEGNET_EPS if segnet else param.eps
         self.inverse = fork == "happynear"  # blobs[3] is 1 / std
         if self.moving:
@@ -179,10 +185,11 @@ class BN(Layer):
             self.not_learned = frozenset(range(4) if param.frozen else (2, 3))
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return as_before(self, bottom_shapes, self.channels)
+        shown = [(1, self.channels, 1, 1)] * (self.num_tops - 1)
+        return [*as_before(self, bottom_shapes, self.channels), *shown]
 
-    def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the normalized values; in training also move the averages."""
+    def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
+        """Return the normalized values, and what else is shown; in training also move the averages."""
         slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (0, 1))
         if not self.by_batch and not self.moving:
             return data * slope + bias
@@ -195,7 +202,9 @@ class BN(Layer):
             mean, variance = (self.blob(i).detach().reshape_as(slope) for i in (2, 3))
             if self.inverse:
                 return (data - mean) * variance * slope + bias
-        return (data - mean) / (variance + self.eps).sqrt() * slope + bias
+        top = (data - mean) / (variance + self.eps).sqrt() * slope + bias
+        shown = [each.detach().reshape(1, -1, 1, 1) for each in (mean, variance)]
+        return top if self.num_tops == 1 else (top, *shown[: self.num_tops - 1])
 
     def _move(self, mean: torch.Tensor, variance: torch.Tensor) -> None:
         momentum = value(self.param, "bn_param").momentum
@@ -204,6 +213,8 @@ class BN(Layer):
                 self.blob(i).mul_(momentum).add_(batch.reshape(self.blob_shapes[i]), alpha=1 - momentum)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
+        if self.num_tops > 1:
+            raise refusal(self, "ONNX", "it shows a batch's mean")
         shape = (self.channels, *(1,) * (len(self.bottom_shapes[0]) - 2))
         slope, bias = graph.blob(0, shape), graph.blob(1, shape)
         if not self.by_batch and not self.moving:
@@ -230,6 +241,8 @@ class BN(Layer):
         return scale, bias - mean * scale
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        if self.num_tops > 1:
+            raise refusal(self, "PyTorch", "it shows a batch's mean")
         axes = len(self.bottom_shapes[0])
         shape, eps = (self.channels, *(1,) * (axes - 2)), rounded(self.eps)
         if self.by_batch or not self.moving:

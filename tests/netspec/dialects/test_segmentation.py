@@ -109,3 +109,15 @@ def test_which_of_two_forks_is_meant_is_asked(pairs: Path) -> None:
     assert use_dialects_of(text, "net.prototxt") == []
     with pytest.raises(SpecError, match='dialects "hed" and "rcf" have "ImageLabelmapData"; add --plugin hed'):
         build_net(*parse_net_text(text, "net.prototxt"))
+
+
+def test_segnets_bn_shows_the_mean_and_variance_of_its_batch(build: Build) -> None:
+    """The program that prepares SegNet and ENet for testing averages them over all batches."""
+    data = torch.arange(12.0).reshape(2, 2, 1, 3).requires_grad_()
+    layer = build("blocks", "type: 'BN' bn_param { scale_filler { value: 1 } }", data.shape, tops=3)
+    top, mean, variance = layer.run(data)
+    assert mean.tolist() == [[[[4.0]], [[7.0]]]]
+    np.testing.assert_allclose(variance.flatten(), [29 / 3, 29 / 3], rtol=1e-6)
+    np.testing.assert_allclose(top.detach(), (data.detach() - mean) / variance.sqrt(), rtol=1e-5)
+    assert [tuple(each.shape) for each in (top, mean, variance)] == layer.top_shapes
+    assert not mean.requires_grad
