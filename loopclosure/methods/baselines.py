@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -58,18 +58,24 @@ class _WordMethod:
     """The common part of methods on visual words."""
 
     source: WordModelSource = field(default_factory=WordModelSource)
+    stage: ClassVar[str] = "similarity"
 
-    def _count(
-        self, images: Images, progress: Progress, seconds: dict[str, float]
-    ) -> tuple[WordModel, np.ndarray, np.ndarray | None, list[str]]:
-        """Return the model, the words of queries and references, and notes."""
+    def score(self, images: Images, progress: Progress) -> MethodResult:
+        """Score as :class:`loopclosure.methods.base.Method` says."""
+        seconds: dict[str, float] = {}
         model, notes = self.source.learn(images, progress, seconds)
         counts = model.count_words(images.tested, progress, seconds)
         empty = int((counts.sum(axis=1) == 0).sum())
         if empty:
             notes.append(f"{empty} of {len(counts)} images have no features: places without words")
-        size = len(images.queries)
-        return model, counts[:size], None if images.references is None else counts[size:], notes
+        queries, references = np.split(counts, [len(images.queries)])
+        with timed(seconds, self.stage):
+            scores, said = self._compared(model, queries, None if images.references is None else references)
+        return MethodResult(scores, seconds, [*notes, said], TRAINING_STAGES)
+
+    def _compared(self, model: WordModel, queries: np.ndarray, references: np.ndarray | None) -> tuple[np.ndarray, str]:
+        """Return the scores of words (Q, v) and (R, v), None for one sequence, and a note."""
+        raise NotImplementedError
 
 
 @dataclass
@@ -79,24 +85,17 @@ class FabMapMethod(_WordMethod):
     settings: FabMapSettings = field(default_factory=FabMapSettings)
     scored: str = "log_odds"
     name: str = "fabmap"
+    stage: ClassVar[str] = "likelihoods"
 
     def __post_init__(self) -> None:
         if self.scored not in ("log_odds", "posterior"):
             raise InputError(f'FAB-MAP\'s score is "log_odds" or "posterior", not "{self.scored}"')
 
-    def score(self, images: Images, progress: Progress) -> MethodResult:
-        """Score as :class:`loopclosure.methods.base.Method` says."""
-        seconds: dict[str, float] = {}
-        model, queries, references, notes = self._count(images, progress, seconds)
-        with timed(seconds, "likelihoods"):
-            fabmap = FabMapModel(model.tree, model.training_words, self.settings)
-            if references is None:
-                scores = score_sequence(fabmap, queries)
-            else:
-                scores = score_sets(fabmap, queries, references)
-        notes.append(f"FAB-MAP {self.settings.version}, score: {self.scored}; {self.settings}")
-        chosen = scores.log_odds if self.scored == "log_odds" else scores.posterior
-        return MethodResult(chosen, seconds, notes, TRAINING_STAGES)
+    def _compared(self, model: WordModel, queries: np.ndarray, references: np.ndarray | None) -> tuple[np.ndarray, str]:
+        fabmap = FabMapModel(model.tree, model.training_words, self.settings)
+        found = score_sequence(fabmap, queries) if references is None else score_sets(fabmap, queries, references)
+        said = f"FAB-MAP {self.settings.version}, score: {self.scored}; {self.settings}"
+        return found.log_odds if self.scored == "log_odds" else found.posterior, said
 
 
 @dataclass
@@ -109,15 +108,9 @@ class BagOfWordsMethod(_WordMethod):
     def __post_init__(self) -> None:
         check_metric(self.metric)
 
-    def score(self, images: Images, progress: Progress) -> MethodResult:
-        """Score as :class:`loopclosure.methods.base.Method` says."""
-        seconds: dict[str, float] = {}
-        model, queries, references, notes = self._count(images, progress, seconds)
-        with timed(seconds, "similarity"):
-            bag = BagOfWords.learn(model.training_words, self.metric)
-            scores = bag.similarity(queries, queries if references is None else references)
-        notes.append(f"tf-idf, {self.metric}")
-        return MethodResult(scores, seconds, notes, TRAINING_STAGES)
+    def _compared(self, model: WordModel, queries: np.ndarray, references: np.ndarray | None) -> tuple[np.ndarray, str]:
+        bag = BagOfWords.learn(model.training_words, self.metric)
+        return bag.similarity(queries, queries if references is None else references), f"tf-idf, {self.metric}"
 
 
 @dataclass
