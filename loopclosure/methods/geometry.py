@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from loopclosure.detector.verification import DOUBTLESS, LEAST_MATCHES, SURE, Agreement, Between, GeometricCheck
 from loopclosure.methods.candidates import Candidates
@@ -21,6 +23,8 @@ RARELY = 0.05
 WINDOW = 5  # references beside a line, and at least so many queries along it, that a verified pair vouches for
 BESIDE = SequenceSettings(2 * WINDOW, *UNEVEN)  # the line through a single image that is a loop by itself
 
+COUNTS = "so a match counts if it does, lies between two that do, or is of a stretch where few do"
+
 Agree = Callable[[int, int], Agreement]
 
 
@@ -31,7 +35,7 @@ class Geometry:
     check, agree  of a query and a reference, by number
     unlike  the evidence of pairs that the scores call unlike; None where nothing can be verified
     said    what was tried, in a sentence
-    seldom  it finds few of the matches of sequences, but no unlike pairs: each stretch needs one
+    seldom  it finds few of the matches of sequences, but no unlike pairs
     """
 
     check: GeometricCheck
@@ -74,17 +78,16 @@ def try_geometry(given: Candidates, matches: Matches, check: GeometricCheck, agr
     found = f"{same} of {len(likely)} matches and {unlike} of {len(against)} unlike pairs"
     tried = f"verification: {found} show the same points{hidden}"
     if accepted.any() and LEAST_FOUND <= same < LEAST_SHARE * len(likely) and unlike <= RARELY * len(against):
-        said = f"{tried}, so a stretch of matches counts if one of it does"
-        return Geometry(check, of_part, against, said, seldom=True)
+        return Geometry(check, of_part, against, f"{tried}, {COUNTS}", seldom=True)
     if same < (LEAST_SHARE * len(likely) if accepted.any() else LEAST_FOUND):
         said = f"{tried}: these images cannot be verified, so it rejects nothing"
         return Geometry(check, of_part, None, said)
     # Unlike pairs of a small place, a desk, do show the same things, and so does a dashboard in all images.
     if unlike > LEAST_SHARE * len(against):
-        what = ": something is the same in all images, so a match needs far more points"
+        said = f"{tried}: something is the same in all images, so a match needs far more points"
     else:
-        what = ", so a match counts if it does, or lies between two that do"
-    return Geometry(check, of_part, against, tried + what)
+        said = f"{tried}, {COUNTS}"
+    return Geometry(check, of_part, against, said)
 
 
 def _sample(numbers: np.ndarray) -> np.ndarray:
@@ -137,10 +140,7 @@ def kept(matches: Matches, geometry: Geometry, lines: Lines | None, precision: f
     unlike, evidence, accepted = geometry.unlike, matches.evidence, matches.accepted
     assert unlike is not None
     if geometry.seldom:
-        loops = accepted & (matches.inliers > 0)
-        while np.any(more := accepted & np.any(_beside(matches.match, loops, lines), axis=0) & ~loops):
-            loops |= more
-        return loops
+        return accepted & _vouched(accepted & (matches.inliers > 0), matches, lines)
     # What verification alone finds must be better than what it finds in pairs that are no loop. Where sequences tell
     # loops, it must be beyond doubt: the stripes of a curb repeat, and unlike pairs may all be of another road.
     least = max(SURE if lines is None else DOUBTLESS, threshold(evidence, unlike, precision))
@@ -150,12 +150,26 @@ def kept(matches: Matches, geometry: Geometry, lines: Lines | None, precision: f
     near = np.ones(len(accepted), bool) if lines is None else lines.near
     sure = near & (evidence >= least)
     verified = sure | accepted if geometry.common(1) else geometry.rare(evidence)
-    before, after = _beside(matches.match, verified, lines)
-    # Past the last verified match a loop has ended, though the line through it goes on.
-    loops = sure | (accepted & (verified | (before & after)))
+    loops = sure | (accepted & _vouched(verified, matches, lines))
     while np.any(more := verified & near & np.any(_beside(matches.match, loops, lines), axis=0) & ~loops):
         loops |= more
     return loops
+
+
+def _vouched(verified: np.ndarray, matches: Matches, lines: Lines | None) -> np.ndarray:
+    """Return which queries (Q,) are verified, lie between two that are, or are of a stretch of which few are.
+
+    Past the last verified match a loop has ended, though the line through it goes on; but not where few are verified.
+    """
+    if lines is None:
+        return verified
+    before, after = _beside(matches.match, verified, lines)
+    pairs = _neighbors(matches.match, lines)
+    pairs = pairs[matches.accepted[pairs].all(axis=1)]
+    links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(verified), len(verified)))
+    stretch = connected_components(links, directed=False)[1]
+    share = np.bincount(stretch, verified) / np.bincount(stretch)
+    return verified | (before & after) | ((share > 0) & (share < LEAST_SHARE))[stretch]
 
 
 def _beside(match: np.ndarray, which: np.ndarray, lines: Lines | None) -> tuple[np.ndarray, np.ndarray]:
@@ -164,14 +178,19 @@ def _beside(match: np.ndarray, which: np.ndarray, lines: Lines | None) -> tuple[
     The line has the length and the velocities of the sequences, and is ``WINDOW`` references wide to each side.
     """
     before, after = np.zeros_like(which), np.zeros_like(which)
-    if lines is None:
-        return before, after
-    sequence, numbers = lines.setting.sequence or BESIDE, np.arange(len(match))
-    for step in range(1, max(WINDOW, sequence.length // 2) + 1):
-        for sign, side in ((-1, before), (1, after)):
-            other = numbers + sign * step
-            inside = np.flatnonzero((other >= 0) & (other < len(match)))
-            moved = (match[other[inside]] - match[inside]) * sign
-            low, high = sequence.slowest * step - WINDOW, sequence.fastest * step + WINDOW
-            side[inside[(moved >= low) & (moved <= high) & which[other[inside]]]] = True
+    if lines is not None:
+        earlier, later = _neighbors(match, lines).T
+        before[later[which[earlier]]] = True
+        after[earlier[which[later]]] = True
     return before, after
+
+
+def _neighbors(match: np.ndarray, lines: Lines) -> np.ndarray:
+    """Return pairs (N, 2) of queries, the earlier first, whose matches lie on the line through one another."""
+    sequence, numbers, pairs = lines.setting.sequence or BESIDE, np.arange(len(match)), []
+    for step in range(1, max(WINDOW, sequence.length // 2) + 1):
+        moved = match[step:] - match[:-step]
+        low, high = sequence.slowest * step - WINDOW, sequence.fastest * step + WINDOW
+        earlier = numbers[:-step][(moved >= low) & (moved <= high)]
+        pairs.append(np.stack([earlier, earlier + step], axis=1))
+    return np.concatenate(pairs)

@@ -145,21 +145,21 @@ def test_a_loop_ends_with_its_last_verified_match(elsewhere):
     assert not found.accepted[90:].any()
 
 
-def test_where_few_matches_are_verified_each_stretch_needs_one():
+@pytest.mark.parametrize("bright", [False, True])
+def test_a_stretch_counts_where_few_matches_are_verified_but_one_is(bright):
+    """Each fifth match of the first part is verified; or less than half of the first, and all of the third."""
     road = drive(210, 6)
     rows = np.concatenate([again(road[:70], 0.8, 7), drive(70, 16), again(road[140:], 0.8, 8)])
     scores, points = alike(rows, road), (Agreement(40, 9, 20), Agreement(60, 50, 20))
-    found = answer(
-        scores,
-        everything(scores),
-        True,
-        0.99,
-        GeometricCheck(),
-        lambda q, r: points[q < 70 and q % 5 == 0 and abs(q - r) <= 3],
-    )
-    assert "a stretch of matches counts if one of it does" in found.reasons[1]
+
+    def agree(q, r):
+        return points[(q < 30 or q >= 140 if bright else q < 70 and q % 5 == 0) and abs(q - r) <= 3]
+
+    found = answer(scores, everything(scores), True, 0.99, GeometricCheck(), agree)
+    assert "or is of a stretch where few do" in found.reasons[1]
     assert np.count_nonzero(found.accepted[:70]) > 55
-    assert not found.accepted[100:].any()
+    assert not found.accepted[100:135].any()
+    assert np.count_nonzero(found.accepted[140:]) > 55 if bright else not found.accepted[140:].any()
 
 
 def test_a_sequence_is_not_overruled_by_one_image_that_repeats():
