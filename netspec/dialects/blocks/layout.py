@@ -1,8 +1,9 @@
-"""Layers of forks that only move numbers: Transpose (OCR), Reorg (YOLO v2), CropCenter (waifu2x)."""
+"""Layers of forks that only move numbers: Transpose (OCR), Reorg (YOLO v2), MergeCrop (U-Net), CropCenter (waifu2x)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 
@@ -20,6 +21,12 @@ message ReorgParameter {
   optional uint32 stride = 1;
   optional bool reverse = 2 [default = false];
 }
+message MergeCropParameter {
+  enum MergeOp { STACK = 0; ADD = 1; }
+  repeated bool forward = 1;
+  repeated bool backward = 2;
+  optional MergeOp operation = 3 [default = STACK];
+}
 message CropCenterParameter {
   repeated uint32 crop_size = 1;
 }
@@ -27,8 +34,11 @@ extend LayerParameter {
   optional CropCenterParameter crop_center_param = 1148;
   optional TransposeParameter transpose_param = 1149;
   optional ReorgParameter reorg_param = 1155;
+  optional MergeCropParameter mergecrop_param = 1156;
 }
 """
+
+STACK = 0  # MergeCropParameter.MergeOp
 
 
 @register("Transpose", "transpose_param")
@@ -87,6 +97,50 @@ class Reorg(Layer):
         else:
             moved = data.reshape(images, few, height, s, width, s).permute(0, 3, 5, 1, 2, 4)
         return moved.reshape(self.top_shapes[0])
+
+
+@register("MergeCrop", "mergecrop_param")
+class MergeCrop(Layer):
+    """Put a larger blob, cut at its center to the smaller one's size, behind its channels, or add it.
+
+    ``forward`` says of each bottom whether it is copied, zeros standing for one that is not; ``backward`` whether it
+    gets a gradient: by default the first does, the second does not.
+
+    bottom[0]  the smaller (N, C, ...)
+    bottom[1]  the larger (N, C', ...), as many axes; with operation: ADD, C' = C
+    top[0]     (N, C + C', ...) of the first one's size; with operation: ADD, its shape
+    Fork: naibaf7/caffe, src/caffe/layers/mergecrop_layer.cu
+    """
+
+    bottoms = (2, 2)
+
+    def setup(self) -> None:
+        """Read what passes each bottom."""
+        param: Any = value(self.param, "mergecrop_param")
+        for name in ("forward", "backward"):
+            if len(getattr(param, name)) > 2:
+                message = f"found {len(getattr(param, name))} {name}, expected one per bottom"
+                raise self.error(message, "mergecrop_param", name)
+        self.copied = [*param.forward, *(True, True)[len(param.forward) :]]
+        self.learns = [*param.backward, *(True, False)[len(param.backward) :]]
+        self.stacks: bool = param.operation == STACK
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        small, large = bottom_shapes
+        fits = len(small) == len(large) > 2 and small[0] == large[0] and (self.stacks or small[1] == large[1])
+        if not fits or any(a > b for a, b in zip(small[2:], large[2:], strict=True)):
+            message = f"found bottoms of shapes {small} and {large}, expected a smaller one and one to cut to its size"
+            raise self.error(message, "bottom")
+        cuts = ((b - a) // 2 for a, b in zip(small[2:], large[2:], strict=True))
+        self.window = (..., *(slice(cut, cut + a) for cut, a in zip(cuts, small[2:], strict=True)))
+        return [(small[0], small[1] + large[1] * self.stacks, *small[2:])]
+
+    def forward(self, small: torch.Tensor, large: torch.Tensor) -> torch.Tensor:
+        parts = []
+        for part, copied, learns in zip((small, large[self.window]), self.copied, self.learns, strict=True):
+            part = part if learns else part.detach()
+            parts.append(part if copied else torch.zeros_like(part))
+        return torch.cat(parts, 1) if self.stacks else parts[0] + parts[1]
 
 
 @register("CropCenter", "crop_center_param")
