@@ -374,3 +374,43 @@ class ChannelScale(Layer):
             return scale
         p, found = self.settings, torch.where(scale < 0, mean, 0.99 * scale + 0.01 * mean)
         return scale.copy_(found.clamp(p.min_global_scale, p.max_global_scale))
+
+
+@register("Cosine")
+class Cosine(Layer):
+    """The cosine of each number.
+
+    bottom[0]  any shape
+    top[0]     the same shape
+    Fork: happynear/caffe-windows, src/caffe/layers/cosine_layer.cu; its gradient for CPUs leaves the top's out
+    """
+
+    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+        return bottom_shapes
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return data.cos()
+
+
+class _Arccos(torch.autograd.Function):
+    """The arc cosine, whose gradient is that of 0.99 above it."""
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(x)
+        return x.acos()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> torch.Tensor:
+        return -grads[0] / (1 - ctx.saved_tensors[0].clamp(max=0.99) ** 2).sqrt()
+
+
+@register("Arccos")
+class Arccos(Cosine):
+    """The arc cosine of each number, nan beyond 1; above 0.99 the gradient is that of 0.99.
+
+    Fork: happynear/caffe-windows, src/caffe/layers/arccos_layer.cpp
+    """
+
+    def forward(self, data: torch.Tensor) -> torch.Tensor:
+        return _Arccos.apply(data)
