@@ -144,12 +144,7 @@ def _encoded(net: Any, folder: Path, shape: Any, count: int) -> None:
 
 
 def _write(
-    net: Any,
-    folder: Path,
-    shape: Any,
-    count: int,
-    datum: Callable[[np.ndarray, int], Any],
-    backend: str = "lmdb",
+    net: Any, folder: Path, shape: Any, count: int, datum: Callable[[np.ndarray, int], Any], backend: str = "lmdb"
 ) -> None:
     from netspec.data.database import Writer
 

@@ -145,10 +145,7 @@ def netspec_training(task: Task) -> Run:
     keep_freed_memory()
     torch.set_num_threads(task["threads"])
     solver = netspec.load_solver(
-        task["solver"],
-        task["caffemodel"],
-        device=task["device"],
-        precision=task.get("precision", "fp32"),
+        task["solver"], task["caffemodel"], device=task["device"], precision=task.get("precision", "fp32")
     )
 
     def run() -> dict[str, Any]:

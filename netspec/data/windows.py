@@ -107,13 +107,7 @@ class WindowSource:
     """
 
     def __init__(
-        self,
-        param: Any,
-        transform: Any,
-        file: WindowFile,
-        mean: np.ndarray,
-        at: Callable[..., Where],
-        draws: Draws,
+        self, param: Any, transform: Any, file: WindowFile, mean: np.ndarray, at: Callable[..., Where], draws: Draws
     ) -> None:
         self._crop: int = transform.crop_size
         self._mirror: bool = transform.mirror

@@ -73,8 +73,7 @@ def make_plan(net: NetParameter, source: SourceMap) -> Plan:
 
         if layer.propagate_down and len(layer.propagate_down) != len(layer.bottom):
             fault(
-                f"found {len(layer.propagate_down)} propagate_down, expected 0 or {len(layer.bottom)}",
-                "propagate_down",
+                f"found {len(layer.propagate_down)} propagate_down, expected 0 or {len(layer.bottom)}", "propagate_down"
             )
         bottoms = tuple(current.get(blob, -1) for blob in layer.bottom)
         available.difference_update(layer.bottom)
@@ -146,10 +145,7 @@ class Backward:
 
 
 def plan_backward(
-    plan: Plan,
-    learns: Sequence[bool],
-    has_loss: Sequence[Sequence[bool]],
-    label_bottoms: Sequence[frozenset[int]],
+    plan: Plan, learns: Sequence[bool], has_loss: Sequence[Sequence[bool]], label_bottoms: Sequence[frozenset[int]]
 ) -> Backward:
     """Decide what needs backward computation, like Net::Init.
 

@@ -13,14 +13,7 @@ from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.folding import Affine, Folds, blob_in_double, folds_of
-from netspec.layers.contract.kernels import (
-    RELU,
-    Kernel,
-    Kernels,
-    Preparation,
-    Room,
-    finished,
-)
+from netspec.layers.contract.kernels import RELU, Kernel, Kernels, Preparation, Room, finished
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import TEST

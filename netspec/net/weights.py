@@ -35,11 +35,7 @@ Copies = list[tuple[Layer, int, np.ndarray | blobs.Elsewhere]]  # the layer, the
 
 
 def load_weights(
-    net: Net,
-    path: str | Path | Iterable[str | Path],
-    strict: bool = False,
-    *,
-    some: bool = False,
+    net: Net, path: str | Path | Iterable[str | Path], strict: bool = False, *, some: bool = False
 ) -> None:
     """Copy the weights of a .caffemodel, .caffemodel.h5 or .safetensors into the layers of the same names, all or none.
 

@@ -16,15 +16,7 @@ from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.upgrade import current as upgrades
 from netspec.proto.writer import write_text
 
-__all__ = [
-    "parse_net",
-    "parse_net_text",
-    "parse_solver",
-    "parse_solver_text",
-    "read_net",
-    "read_solver",
-    "write_text",
-]
+__all__ = ["parse_net", "parse_net_text", "parse_solver", "parse_solver_text", "read_net", "read_solver", "write_text"]
 
 
 Report = Callable[[SpecError], None] | None

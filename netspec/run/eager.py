@@ -29,11 +29,7 @@ class Eager:
     """
 
     def __init__(
-        self,
-        plan: Plan,
-        layers: Sequence[Layer],
-        loss_weights: Sequence[Sequence[float]],
-        exact: str,
+        self, plan: Plan, layers: Sequence[Layer], loss_weights: Sequence[Sequence[float]], exact: str
     ) -> None:
         self._plan, self._layers, self._exact = plan, list(layers), exact
         self._losses = losses_of(loss_weights)

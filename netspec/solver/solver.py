@@ -63,12 +63,7 @@ def load_solver(
         2
     """
     build = BuildOptions(
-        level=level,
-        stages=several(stages),
-        allow_python=allow_python,
-        exact=exact,
-        strict=strict,
-        limit=limit,
+        level=level, stages=several(stages), allow_python=allow_python, exact=exact, strict=strict, limit=limit
     )
     options = TrainingOptions(build, [device_of(each) for each in several(device)], nan, precision, action=action)
     return make_solver(path, options, weights, snapshot)

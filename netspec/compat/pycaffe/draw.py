@@ -70,11 +70,7 @@ def _own_picture(caffe_net: Any, ext: str, phase: int | None) -> bytes:
 
 
 def get_pydot_graph(
-    caffe_net: Any,
-    rankdir: str = "LR",
-    label_edges: bool = True,
-    phase: int | None = None,
-    display_lrm: bool = False,
+    caffe_net: Any, rankdir: str = "LR", label_edges: bool = True, phase: int | None = None, display_lrm: bool = False
 ) -> Any:
     """Return the pydot graph of a NetParameter; ``rankdir`` is LR, TB or BT.
 

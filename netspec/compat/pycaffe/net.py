@@ -259,10 +259,7 @@ class Net:
         inputs = {name: array for name, array in arrays.items() if name in self.inputs}
         tops = {name: array for name, array in arrays.items() if name not in self.inputs}
         for ahead, back in zip_longest(self._batch(inputs), self._batch(tops), fillvalue={}):
-            for found, made in (
-                (data, self.forward(blobs, **ahead)),
-                (grads, self.backward(diffs, **back)),
-            ):
+            for found, made in ((data, self.forward(blobs, **ahead)), (grads, self.backward(diffs, **back))):
                 for name, array in made.items():
                     found[name].extend(array.copy())
         return _without_padding(data, arrays), _without_padding(grads, arrays)

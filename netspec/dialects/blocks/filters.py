@@ -147,11 +147,7 @@ def _differs(param: LayerParameter) -> bool:
 
 
 @register(
-    "Pooling",
-    POOLING,
-    *(f"{POOLING}.{name}" for name in ("pool", *SIDES)),
-    replaces=pooling.Pooling,
-    where=_differs,
+    "Pooling", POOLING, *(f"{POOLING}.{name}" for name in ("pool", *SIDES)), replaces=pooling.Pooling, where=_differs
 )
 class Pooling(pooling.Pooling):
     """Caffe's Pooling, with pad_l, pad_r, pad_t and pad_b, and AVE_EXC_PAD: the mean of a window's pixels alone.

@@ -15,14 +15,7 @@ from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.layers.contract.whose import whose
-from netspec.layers.loss.base import (
-    BATCH_SIZE,
-    VALID,
-    Loss,
-    normalization_mode,
-    normalizer,
-    onnx_normalized_sum,
-)
+from netspec.layers.loss.base import BATCH_SIZE, VALID, Loss, normalization_mode, normalizer, onnx_normalized_sum
 from netspec.proto.schema import added_value, given, value
 
 NORMALIZED = ("loss_param", "loss_param.normalization", "loss_param.pre_fixed_normalizer")

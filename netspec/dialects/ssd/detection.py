@@ -266,16 +266,7 @@ def suppressed(boxes, overlap):
 
 
 def detection_output(
-    loc,
-    conf,
-    prior,
-    classes,
-    background,
-    overlap,
-    confidence=-torch.inf,
-    candidates=None,
-    most=None,
-    encoded=False,
+    loc, conf, prior, classes, background, overlap, confidence=-torch.inf, candidates=None, most=None, encoded=False
 ):
     """Return rows (image, label, confidence, xmin, ymin, xmax, ymax): (1, 1, D, 7).
 

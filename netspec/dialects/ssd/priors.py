@@ -10,9 +10,7 @@ import numpy as np
 import torch
 
 from netspec import log
-from netspec.dialects.boxes import (
-    Array,
-)
+from netspec.dialects.boxes import Array
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal

@@ -51,10 +51,7 @@ ON_META = BuildOptions("meta", open_data=False, passes=())  # shapes only, and n
 
 
 def check_file(
-    path: str | Path,
-    phase: PhaseValue = TEST,
-    options: BuildOptions = ON_META,
-    weights: str | None = None,
+    path: str | Path, phase: PhaseValue = TEST, options: BuildOptions = ON_META, weights: str | None = None
 ) -> list[Checked]:
     """Check a net for a phase, level and stages; or a solver and all its nets, where the training net gets these.
 

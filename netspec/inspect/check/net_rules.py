@@ -187,10 +187,7 @@ def _losses(net: Net) -> Said:
     """A loss that depends on no learnable parameter teaches nothing."""
     for i, weights in enumerate(net.loss_weights if net.phase == TRAIN else ()):
         if any(weights) and not net.backward_plan.layers[i]:
-            yield (
-                _place(net.plan, i),
-                "this loss depends on no learnable parameter; is an lr_mult 0?",
-            )
+            yield (_place(net.plan, i), "this loss depends on no learnable parameter; is an lr_mult 0?")
 
 
 @rule("caffe-stops", NET)

@@ -87,13 +87,7 @@ def _longest(diagram: Diagram, readers: dict[Output, list[int]], first: int, len
 
 
 def _alike(
-    diagram: Diagram,
-    readers: dict[Output, list[int]],
-    first: int,
-    length: int,
-    copy: int,
-    entry: Output,
-    exit_: Output,
+    diagram: Diagram, readers: dict[Output, list[int]], first: int, length: int, copy: int, entry: Output, exit_: Output
 ) -> bool:
     """Say whether a copy is wired as the first one, with the exit of the copy before it as its entry."""
     shift = copy * length

@@ -139,10 +139,7 @@ class _Seen:
 
 
 def diagram_of(
-    net: NetParameter,
-    source: SourceMap,
-    phases: Sequence[PhaseValue],
-    options: BuildOptions | None = None,
+    net: NetParameter, source: SourceMap, phases: Sequence[PhaseValue], options: BuildOptions | None = None
 ) -> Diagram:
     """Return the diagram of an upgraded net in the given phases; nothing is written, and no memory is used."""
     faults: list[SpecError] = []

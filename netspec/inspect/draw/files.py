@@ -20,11 +20,7 @@ from netspec.solver.nets import solver_nets
 
 
 def write_picture(
-    path: str | Path,
-    out: Path,
-    phases: Sequence[PhaseValue],
-    options: BuildOptions,
-    unfolded: bool = False,
+    path: str | Path, out: Path, phases: Sequence[PhaseValue], options: BuildOptions, unfolded: bool = False
 ) -> Diagram:
     """Draw the net of a file, or the training net of a solver, as SVG, PNG or HTML by the ending of ``out``.
 

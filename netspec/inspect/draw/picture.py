@@ -323,10 +323,7 @@ def _header(diagram: Diagram) -> tuple[Drawing, int]:
     if work := sum(box.work for box in diagram.boxes):
         sums.append(f"{amount_text(work)} multiply-adds in a forward pass (bars)")
     title = shortened(printable(diagram.name or "a net without a name"), 17, 600, bold=True)
-    marks: list[Mark] = [
-        Text(0, 36, title, 17, INK, bold=True),
-        Text(0, 56, " · ".join(sums), SMALL, PALE),
-    ]
+    marks: list[Mark] = [Text(0, 36, title, 17, INK, bold=True), Text(0, 56, " · ".join(sums), SMALL, PALE)]
     width = max(text_width(title, 17, True), text_width(" · ".join(sums), SMALL))
     kinds = {color_of(kind): None for box in diagram.boxes for kind in (box.kind, *(a.kind for a in box.attached))}
     x, y = 0.0, 76

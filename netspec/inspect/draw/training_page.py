@@ -22,11 +22,7 @@ def training_page(logs: Sequence[TrainingLog], figure: Figure, title: str) -> st
     told = [summary(log) for log in logs]
     columns = list(dict.fromkeys(name for line in told for name in line))
     shown = [
-        {
-            "name": log.name,
-            "color": COLORS[number % len(COLORS)],
-            "cells": [line.get(column, "") for column in columns],
-        }
+        {"name": log.name, "color": COLORS[number % len(COLORS)], "cells": [line.get(column, "") for column in columns]}
         for number, (log, line) in enumerate(zip(logs, told, strict=True))
     ]
     drawing = svg(figure)

@@ -30,10 +30,7 @@ _MOST_MARKS = 15
 
 
 def plot_lines(
-    curve: tuple[np.ndarray, np.ndarray],
-    marks: tuple[np.ndarray, np.ndarray],
-    width: int,
-    height: int,
+    curve: tuple[np.ndarray, np.ndarray], marks: tuple[np.ndarray, np.ndarray], width: int, height: int
 ) -> list[str]:
     """Return the lines of a plot, ``width`` x ``height`` characters: a curve of dots, and an ``o`` for each mark.
 

@@ -40,12 +40,7 @@ def has_bfloat16() -> bool | None:
 
 
 def convolution(
-    shape: Shape,
-    weight: torch.Tensor,
-    bias: torch.Tensor | None,
-    sliding: Filter,
-    group: int,
-    how: Preparation,
+    shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, group: int, how: Preparation
 ) -> Kernels:
     """Return a convolution of maps (N, C, H, W) by fixed weights (num_output, C / group, kernel_h, kernel_w)."""
     geometry = [list(sliding.pad), list(sliding.stride), list(sliding.dilation), group]

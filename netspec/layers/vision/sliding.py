@@ -10,10 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch.nn import functional as F
 
-from netspec.exact.products import (
-    Columns,
-    Filter,
-)
+from netspec.exact.products import Columns, Filter
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register

@@ -18,14 +18,7 @@ from google.protobuf.message import Message
 
 from netspec import log
 from netspec.errors import SpecError
-from netspec.proto.schema import (
-    BlobShape,
-    LayerParameter,
-    NetParameter,
-    SolverParameter,
-    V1LayerParameter,
-    fields_of,
-)
+from netspec.proto.schema import BlobShape, LayerParameter, NetParameter, SolverParameter, V1LayerParameter, fields_of
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.upgrade.rewrite import Draft, copy_without
 from netspec.proto.upgrade.v0 import needs_v0_upgrade, upgrade_v0

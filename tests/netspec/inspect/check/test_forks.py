@@ -33,7 +33,7 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_faults_in_the_fields_of_forks_are_found():
     Path("net.prototxt").write_text(INPUT + PERMUTE % (1, 1) + NORM + SHUFFLE)
     assert lines("net.prototxt") == [
-        'net.prototxt:3:51: layer "p1" (Permute): PermuteParameter has no field "deeper";' + OWN,
+        'net.prototxt:3:51: layer "p1" (Permute): PermuteParameter has no field "deeper";' + OWN
     ]
 
 
