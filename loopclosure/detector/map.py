@@ -38,7 +38,7 @@ COMPONENTS = 256  # of a projected descriptor
 LEARNED_FROM = 2048  # frames, evenly spread; fewer are compared as they are
 BLOCK = 4096  # frames that are read at a time
 Decide = Callable[[LoopDetector, list[LoopResult]], list[LoopResult]]
-# Of the nets of version 0.3.0, whose maps do not say it.
+# Of the nets of versions 0.2.0 and 0.3.0, whose maps do not say it.
 OLDER = {"default": "63cb899e0703cb96", "small": "2e195dd29a635c6c"}
 MAPPED = ("rows", "points", "descriptors")  # arrays in files of their own, read where they are used
 
