@@ -66,7 +66,7 @@ def test_a_solver_and_its_nets_are_read_to_the_end():
     Path("solver.prototxt").write_text('net: "net.prototxt"\nbase_lr: 1\n')
     found = [line.partition(": ")[2] for line in lines("solver.prototxt")]
     assert found == [
-        "no lr_policy, expected one of fixed, step, exp, inv, multistep, poly, sigmoid",
+        "no lr_policy, expected one of fixed, step, exp, inv, multistep, poly, sigmoid, multifixed",
         'layer "s" (Strange): LayerParameter has no field "strange_param";' + OWN,
         'layer "s" (Strange): unknown layer type "Strange"; `netspec layers` lists the known ones, '
         "docs/layer.md shows how to add one with --plugin FILE.py",
@@ -77,7 +77,7 @@ def test_a_solver_and_its_nets_are_read_to_the_end():
     assert [line.partition(": ")[2] for line in lines("solver.prototxt")] == [
         'SolverParameter has no field "fast"',
         'SolverParameter has no field "quick_mode"',
-        "no lr_policy, expected one of fixed, step, exp, inv, multistep, poly, sigmoid",
+        "no lr_policy, expected one of fixed, step, exp, inv, multistep, poly, sigmoid, multifixed",
         *found[1:],
     ]
 
