@@ -139,8 +139,9 @@ def kept(matches: Matches, geometry: Geometry, lines: Lines | None, precision: f
     """Return the queries (Q,) whose matches, which were verified, are loops."""
     unlike, evidence, accepted = geometry.unlike, matches.evidence, matches.accepted
     assert unlike is not None
+    pairs = _neighbors(matches.match, lines)
     if geometry.seldom:
-        return accepted & _vouched(accepted & (matches.inliers > 0), matches, lines)
+        return accepted & _vouched(accepted & (matches.inliers > 0), accepted, pairs)
     # What verification alone finds must be better than what it finds in pairs that are no loop. Where sequences tell
     # loops, it must be beyond doubt: the stripes of a curb repeat, and unlike pairs may all be of another road.
     least = max(SURE if lines is None else DOUBTLESS, threshold(evidence, unlike, precision))
@@ -150,47 +151,46 @@ def kept(matches: Matches, geometry: Geometry, lines: Lines | None, precision: f
     near = np.ones(len(accepted), bool) if lines is None else lines.near
     sure = near & (evidence >= least)
     verified = sure | accepted if geometry.common(1) else geometry.rare(evidence)
-    loops = sure | (accepted & _vouched(verified, matches, lines))
-    while np.any(more := verified & near & np.any(_beside(matches.match, loops, lines), axis=0) & ~loops):
+    loops = sure | (accepted & _vouched(verified, accepted, pairs))
+    while np.any(more := verified & near & np.any(_beside(loops, pairs), axis=0) & ~loops):
         loops |= more
     return loops
 
 
-def _vouched(verified: np.ndarray, matches: Matches, lines: Lines | None) -> np.ndarray:
+def _vouched(verified: np.ndarray, accepted: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Return which queries (Q,) are verified, lie between two that are, or are of a stretch of which few are.
 
     Past the last verified match a loop has ended, though the line through it goes on; but not where few are verified.
     """
-    if lines is None:
-        return verified
-    before, after = _beside(matches.match, verified, lines)
-    pairs = _neighbors(matches.match, lines)
-    pairs = pairs[matches.accepted[pairs].all(axis=1)]
-    links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(verified), len(verified)))
+    before, after = _beside(verified, pairs)
+    linked = pairs[accepted[pairs].all(axis=1)]
+    links = coo_matrix((np.ones(len(linked)), linked.T), shape=(len(verified), len(verified)))
     stretch = connected_components(links, directed=False)[1]
     share = np.bincount(stretch, verified) / np.bincount(stretch)
     return verified | (before & after) | ((share > 0) & (share < LEAST_SHARE))[stretch]
 
 
-def _beside(match: np.ndarray, which: np.ndarray, lines: Lines | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the queries that have one of ``which`` (Q,) before them, and after, on the line through their match.
-
-    The line has the length and the velocities of the sequences, and is ``WINDOW`` references wide to each side.
-    """
+def _beside(which: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the queries that have one of ``which`` (Q,) before them, and after, among their neighbors."""
     before, after = np.zeros_like(which), np.zeros_like(which)
-    if lines is not None:
-        earlier, later = _neighbors(match, lines).T
-        before[later[which[earlier]]] = True
-        after[earlier[which[later]]] = True
+    earlier, later = pairs.T
+    before[later[which[earlier]]] = True
+    after[earlier[which[later]]] = True
     return before, after
 
 
-def _neighbors(match: np.ndarray, lines: Lines) -> np.ndarray:
-    """Return pairs (N, 2) of queries, the earlier first, whose matches lie on the line through one another."""
-    sequence, numbers, pairs = lines.setting.sequence or BESIDE, np.arange(len(match)), []
+def _neighbors(match: np.ndarray, lines: Lines | None) -> np.ndarray:
+    """Return pairs (N, 2) of queries, the earlier first, whose matches lie on the line through one another.
+
+    The line has the length and the velocities of the sequences, and is ``WINDOW`` references wide to each side; without
+    lines there are no pairs.
+    """
+    if lines is None:
+        return np.empty((0, 2), int)
+    sequence, pairs = lines.setting.sequence or BESIDE, []
     for step in range(1, max(WINDOW, sequence.length // 2) + 1):
         moved = match[step:] - match[:-step]
         low, high = sequence.slowest * step - WINDOW, sequence.fastest * step + WINDOW
-        earlier = numbers[:-step][(moved >= low) & (moved <= high)]
+        earlier = np.flatnonzero((moved >= low) & (moved <= high))
         pairs.append(np.stack([earlier, earlier + step], axis=1))
     return np.concatenate(pairs)
