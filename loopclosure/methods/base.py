@@ -19,6 +19,8 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
 
+BLOCK = 512  # rows of a matrix of scores that are looked at together: memory is that of the scores, and little more
+
 
 @dataclass(frozen=True)
 class Images:

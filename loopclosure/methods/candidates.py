@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from loopclosure.methods.base import earlier
+from loopclosure.methods.base import BLOCK, earlier
 from loopclosure.places.same_place import MAX_DISTANCE_M
 
 DRIFT = 0.1  # of the way: more than odometry is usually off
 FAR_M = 2 * MAX_DISTANCE_M  # from there on two frames show different places
 AWAY = 2  # frames in a row
-BLOCK = 512  # frames that are looked at together
 STILL = 0.5  # of a usual step from frame to frame
 STOP = 8  # steps
 MOVES = 0.9  # the quantile of steps at which the search for a usual one begins
@@ -44,6 +44,12 @@ class Candidates:
     def known(self, queries: slice | int = slice(None)) -> np.ndarray:
         """Return the scores of the candidates of queries (n, R), or of one (R,), -inf elsewhere."""
         return np.where(self.allowed[queries], self.scores[queries], -np.inf)
+
+    @cached_property
+    def single(self) -> np.ndarray:
+        """The best candidate (Q,) of each query by its score alone; any where there is none."""
+        blocks = (slice(first, first + BLOCK) for first in range(0, len(self.queries) or 1, BLOCK))
+        return np.concatenate([self.known(block).argmax(axis=1) for block in blocks])
 
     @property
     def others(self) -> str:

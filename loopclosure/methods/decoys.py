@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopclosure.methods.base import BLOCK
 from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.seqslam import SequenceSettings, standardize, trajectory_costs
 
@@ -34,7 +35,6 @@ NEARLY = 0.95
 # Neighbors of a query, so many before and after, may fit its match better.
 REACH = 4
 MIDDLE = 4  # steps of a line
-BLOCK = 512  # queries that are searched at a time: memory is that of the scores, and little more
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,10 @@ def search(given: Candidates, setting: Setting, shared: dict[str, np.ndarray]) -
     for first in range(0, count, BLOCK):
         here, around = slice(first, min(first + BLOCK, count)), slice(max(0, first - reach), first + BLOCK + reach)
         inner, allowed = range(first - around.start, here.stop - around.start), given.allowed[here]
-        distances = _distances(given.scores[around], given.allowed[around])
-        block = shared["scaled"][around] if setting.standardized else distances
+        if setting.standardized:
+            block = shared["scaled"][around]
+        else:
+            block = _distances(given.scores[around], given.allowed[around])
         found = np.where(allowed, -_along(block, sequence, inner), np.nan)
         if given.different is None:
             reverse = np.where(allowed, -_along(block[:, ::-1], sequence, inner)[:, ::-1], np.nan)
@@ -180,8 +182,9 @@ def search(given: Candidates, setting: Setting, shared: dict[str, np.ndarray]) -
             known = _along(_distances(given.scores[around], given.different[around]), sequence, inner)
             reverse = np.where(given.different[here], -known, np.nan)
         np.copyto(found, -np.inf, where=np.isnan(found))
-        numbers, single = np.arange(len(found)), given.known(here).argmax(axis=1)
-        match[here], targets[here], alone[here] = found.argmax(axis=1), found.max(axis=1), found[numbers, single]
+        numbers = np.arange(len(found))
+        match[here], targets[here] = found.argmax(axis=1), found.max(axis=1)
+        alone[here] = found[numbers, given.single[here]]
         decoys[here] = np.fmax.reduce(reverse, axis=1, initial=-np.inf)
         if middle is not None:
             line = np.where(allowed, -_along(block, middle, inner), np.nan)

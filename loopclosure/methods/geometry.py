@@ -118,7 +118,7 @@ def _left(given: Candidates) -> list[tuple[int, int]]:
 
 def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: Geometry, progress: Progress) -> None:
     """Verify each query's match, or its best single image, which then becomes its match."""
-    check, single, there = geometry.check, given.known().argmax(axis=1), matches.there
+    check, single, there = geometry.check, given.single, matches.there
     for query in progress(np.flatnonzero(there), "verification", int(np.count_nonzero(there))):
         # Lamps of a tunnel repeat: one image that is verified does not overrule a sequence that is accepted.
         other = matches.match if matches.accepted[query] else single

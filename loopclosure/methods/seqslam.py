@@ -15,7 +15,7 @@ import numpy as np
 
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
+from loopclosure.methods.base import BLOCK, Images, Method, MethodContext, MethodResult, earlier
 from loopclosure.methods.baselines import ThumbnailMethod
 from loopclosure.methods.settings import configure
 from loopclosure.progress import Progress, timed
@@ -26,7 +26,6 @@ EDGES = ("shorten", "drop")
 STANDARDIZE = ("no", "yes", "traverses")
 TILE = 128, 512  # pairs whose sums stay in the cache
 SEGMENT = 4  # steps of a trajectory, which other trajectories may share
-BLOCK = 512  # rows that are scaled at a time
 LONGEST = 10_000  # frames in a sequence; memory grows with it
 
 
