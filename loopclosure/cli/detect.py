@@ -22,7 +22,7 @@ from loopclosure.detector.verification import GeometricCheck
 from loopclosure.detector.visitor import Visitor
 from loopclosure.index.index import INDEXES
 from loopclosure.methods.auto import PRECISION
-from loopclosure.methods.drive import TOO_MANY, last_session, whole_drive
+from loopclosure.methods.drive import last_session, whole_drive
 from loopclosure.methods.features import WhitenBy
 from loopclosure.places.frames import live_frames
 from loopclosure.places.pose_files import read_poses
@@ -202,8 +202,8 @@ def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
 
 def _decided(detector: LoopDetector, results: list[LoopResult], own: bool = True) -> list[LoopResult]:
     found = last_session(detector, results, progress=bar, own=own)
-    for reason in (reason for reason in found.reasons if TOO_MANY in reason):
-        warn(reason)
+    for limit in found.limits:
+        warn(limit)
     return found.results
 
 

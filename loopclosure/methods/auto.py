@@ -34,10 +34,12 @@ class Answer:
     """What became of each query, and sentences that say what was chosen and why.
 
     The candidate of a result is the query's best reference. Its score is that of a sequence where sequences are used.
+    ``limits`` are sentences about what was too much to be compared.
     """
 
     results: list[LoopResult]
     reasons: list[str]
+    limits: list[str] = field(default_factory=list)
 
     @property
     def match(self) -> np.ndarray:

@@ -16,6 +16,7 @@ from loopclosure.detector.run import Recording, run_detector
 from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.auto import PRECISION, Answer, answer
+from loopclosure.methods.base import BLOCK
 from loopclosure.methods.candidates import far_apart
 from loopclosure.places.frames import gray, read_gray
 from loopclosure.places.truth import Exclusion
@@ -54,7 +55,7 @@ def whole_drive(
     others = float(np.max(single[~found.accepted], initial=-np.inf))
     above = single[found.accepted & (single > others)]
     detector.decided([result for result in found.results if result], above.min() if len(above) else None)
-    return found
+    return replace(found, reasons=[*found.limits, *found.reasons])
 
 
 def last_session(
@@ -84,15 +85,14 @@ def last_session(
     found, limits, reasons = list[list[LoopResult]](), list[str](), list[str]()
     for first, end in [*compared, (begin, count)][: None if own else -1]:
         answered = _among(detector, first, end, between, precision, progress, None, visit, seconds)
-        found, reasons = [*found, answered.results], answered.reasons
-        limits += [reason for reason in reasons if TOO_MANY in reason]
+        found, limits, reasons = [*found, answered.results], [*limits, *answered.limits], answered.reasons
     if left := earlier[len(compared) :]:
         elsewhere = [any(first <= (result.accepted or 0) < end for first, end in left) for result in results]
         none = {"candidates": [], "accepted": None, "score": -np.inf, "inliers": None}
         found.append([r if r and kept else replace(r, **none) for r, kept in zip(results, elsewhere, strict=True)])
         limits.append(f"{len(earlier)} sessions {TOO_MANY}: {len(left)} are looked at frame by frame")
     best = [max(each, key=lambda r: (bool(r), r.inliers or 0, r.score)) for each in zip(*found, strict=True)]
-    return Answer(best or results, [*limits, *(reason for reason in reasons if reason not in limits)])
+    return Answer(best or results, [*limits, *reasons], limits)
 
 
 def _among(
@@ -135,7 +135,7 @@ def _among(
             )
         )
     thinned = f"{count} frames {TOO_MANY}: one of {step} is, and decides for those after it"
-    return Answer(results, [*([thinned] if step > 1 else []), *answered.reasons])
+    return Answer(results, answered.reasons, [thinned] if step > 1 else [])
 
 
 def _compared(detector: LoopDetector, queries: range, references: range) -> np.ndarray:
@@ -149,7 +149,7 @@ def _earlier(stamps: np.ndarray, seconds: float) -> np.ndarray:
     """Return which pairs of frames are candidates: of each, those before that are old enough."""
     numbers = np.arange(len(stamps))
     allowed = np.tri(len(stamps), k=-1, dtype=bool)
-    for rows in np.array_split(numbers, len(numbers) // 512 + 1) if seconds else ():
+    for rows in np.array_split(numbers, len(numbers) // BLOCK + 1) if seconds else ():
         allowed[rows] &= ~Exclusion(seconds=seconds).excludes(rows, numbers, stamps[rows], stamps)
     return allowed
 
