@@ -151,9 +151,10 @@ def _best(scores: np.ndarray, drive: Drive, pairs: Pairs) -> tuple[float, str]:
         allowed &= earlier(len(scores), data.exclude_frames)
     tried = {"single images": np.where(allowed, scores, np.nan)}
     distances = np.where(allowed, -scores, np.nan)
+    scaled = standardize(distances)
     for setting in settings(scores.shape[0], scores.shape[1], two):
         assert setting.sequence is not None
-        costs = trajectory_costs(standardize(distances) if setting.standardized else distances, setting.sequence)
+        costs = trajectory_costs(scaled if setting.standardized else distances, setting.sequence)
         tried[str(setting)] = np.where(allowed, -costs, np.nan)
     recalls = {name: _recall(matrix, truth) for name, matrix in tried.items()}
     check = GeometricCheck()
