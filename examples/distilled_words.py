@@ -31,10 +31,8 @@ names = [layer.name for layer in net.layer]
 del net.layer[names.index("parts") + 1 :], net.layer[: names.index("input")]
 data = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 128 dim: 3 dim: 96 dim: 128 } } }'
 tower.write_text(f"{data}\n{write_text(net)}")
-teacher, (own, words) = (
-    Describer(*places, blob="head_feat").image_net,
-    [netspec.load_net(tower, phase, start, exact="none") for phase in ("TEST", "TRAIN")],
-)
+teacher = Describer(*places, blob="head_feat").image_net
+own, words = (netspec.load_net(tower, phase, start, exact="none") for phase in ("TEST", "TRAIN"))
 views, like = [], []
 for each in lists:
     files = [each.parent / name for pair in read_pair_list(each) for name in (pair.first, pair.second)]

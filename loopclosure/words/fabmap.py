@@ -143,11 +143,8 @@ class FabMapModel:
     def new_place(self, queries: np.ndarray) -> np.ndarray:
         """Return ln p(query | new place) as (Q,) for words (Q, v): the mean over sampled images, or the mean field."""
         if self.settings.new_place == "sampled":
-            loglik, images, samples = (
-                self.likelihoods(queries, self.training),
-                len(self.training),
-                self.settings.samples,
-            )
+            images, samples = len(self.training), self.settings.samples
+            loglik = self.likelihoods(queries, self.training)
             if self.settings.version == 2 or samples == 0:
                 return logsumexp(loglik, axis=1) - np.log(images)
             draws = np.random.default_rng(self.settings.seed)

@@ -52,7 +52,7 @@ def unsure_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
 def _unused(layer: Layer) -> Iterator[tuple[Path, str]]:
     partly = {name.partition(".")[0] for name in layer.reads if "." in name}
     for field, value in layer.param.ListFields():
-        if field.name in COMMON | HOW_NOT_WHAT:
+        if field.name in COMMON or field.name in HOW_NOT_WHAT:
             continue
         if field.name not in layer.reads | partly:
             yield (field.name,), f"a layer of type {layer.type} does not read it"
