@@ -169,7 +169,7 @@ class _LevelDbReader(Reader):
 
     def __init__(self, source: str) -> None:
         plyvel = _plyvel()
-        self._source, self._stamp = source, _names_and_sizes(source)
+        self._source, self._stamp = source, _contents(source)
         folder = mkdtemp(prefix="netspec-leveldb-")
         # Unlike weakref's, this runs at the end of a worker too, and never in a process that was forked later.
         Finalize(self, shutil.rmtree, (folder, True), exitpriority=0)
@@ -201,7 +201,7 @@ class _LevelDbReader(Reader):
 
     @property
     def is_current(self) -> bool:
-        return _names_and_sizes(self._source) == self._stamp
+        return _contents(self._source) == self._stamp
 
 
 def _runs(numbers: Sequence[int]) -> Iterator[slice]:
@@ -213,9 +213,16 @@ def _runs(numbers: Sequence[int]) -> Iterator[slice]:
             start = end
 
 
-def _names_and_sizes(folder: str) -> dict[str, int]:
-    """Return the files of a LevelDB that hold its contents: none is written over, but one may grow."""
-    return {entry.name: entry.stat().st_size for entry in os.scandir(folder) if not entry.name.startswith(("LO", "."))}
+def _contents(folder: str) -> dict[str, tuple[int, int]]:
+    """Return number and size of the files that hold a LevelDB: none is written over, but one may grow. {}: it is gone.
+
+    The numbers tell it from another one: that of a folder that was removed may be the next one's.
+    """
+    try:
+        files = [entry for entry in os.scandir(folder) if not entry.name.startswith(("LO", "."))]
+        return {entry.name: (entry.inode(), entry.stat().st_size) for entry in files}
+    except FileNotFoundError:
+        return {}
 
 
 def _plyvel() -> ModuleType:

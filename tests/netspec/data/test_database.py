@@ -291,6 +291,7 @@ def test_leveldb_goes_there_and_back(tmp_path: Path) -> None:
     reader = open_reader(str(tmp_path / "db"), "LEVELDB")
     assert {reader.key(i): reader.record(i) for i in range(len(reader))} == records
     assert open_reader(str(tmp_path / "db"), "leveldb").record(3) == b"\x03" * 3  # LevelDB itself would refuse a second
+    assert len(open_reader(str((tmp_path / "db").rename(tmp_path / "moved")), "leveldb")) == len(reader)
 
 
 @pytest.mark.slow
