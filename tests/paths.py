@@ -26,6 +26,11 @@ def nets_as_found() -> list[Path]:
     return [path for path in found if "solver" not in path.name]
 
 
+def last_parts(path: Path) -> str:
+    """Return the id of a test whose case is a file: the file's name and two folders."""
+    return "/".join(path.parts[-3:])
+
+
 def shared(*parts: str) -> Path:
     """Return a folder or file of that data, or skip the test where it is absent."""
     path = SHARED.joinpath(*parts)

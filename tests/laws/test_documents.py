@@ -17,7 +17,6 @@ import loopclosure.cli
 import netspec
 import netspec.cli
 from documents import DOCUMENTS, PROGRAMS, blocks, commands
-from each import each
 from netspec.cli import run_script
 from netspec.errors import SpecError
 from paths import GOLDEN, ROOT
@@ -47,7 +46,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace | None:
 
 
 @pytest.mark.slow
-@each("where", SHELL)
+@pytest.mark.parametrize("where", SHELL)
 def test_every_command_is_one_that_its_parser_takes(where: str, tmp_path: Path) -> None:
     found = commands(BLOCKS[where].text, tmp_path)
     assert found, "a block without a language is a list of commands"
@@ -76,7 +75,7 @@ def unknown_words(line: str) -> list[str]:
 
 
 @pytest.mark.slow
-@each("document", DOCUMENTS)
+@pytest.mark.parametrize("document", DOCUMENTS)
 def test_commands_in_sentences_have_commands_and_options_that_exist(document: str) -> None:
     text = re.sub(r"^```.*?^```$", "", (ROOT / document).read_text(), flags=re.M | re.S)
     for line in re.findall(r"`([^`]+)`", text):
@@ -98,7 +97,7 @@ def test_wrong_words_in_sentences_would_be_found(line: str, unknown: list[str]) 
     assert unknown_words(line) == unknown
 
 
-@each("document", DOCUMENTS)
+@pytest.mark.parametrize("document", DOCUMENTS)
 def test_every_block_says_what_it_is(document: str) -> None:
     text = (ROOT / document).read_text()
     assert len(re.findall(r"^\s*(?:```|~~~)", text, re.M)) == 2 * len(blocks(document)), "a block begins a line: ```"
@@ -133,27 +132,27 @@ def test_what_a_shell_does_not_take_is_found(text: str, tmp_path: Path) -> None:
         commands(text, tmp_path)
 
 
-@each("where", PYTHON)
+@pytest.mark.parametrize("where", PYTHON)
 def test_python_blocks_use_names_that_exist(where: str) -> None:
     for node in ast.walk(ast.parse(BLOCKS[where].text)):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "netspec":
             assert hasattr(netspec, node.attr), node.attr
 
 
-@each("document", DOCUMENTS)
+@pytest.mark.parametrize("document", DOCUMENTS)
 def test_links_say_what_they_lead_to(document: str) -> None:
     names = re.findall(r"(?<!!)\[([^\[\]]*\.(?:md|py|cff|toml))\]\(", (ROOT / document).read_text())
     assert names == []
 
 
-@each("document", DOCUMENTS)
+@pytest.mark.parametrize("document", DOCUMENTS)
 def test_links_lead_to_files(document: str) -> None:
     path = ROOT / document
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text()):
         assert "://" in target or (path.parent / target).exists(), target
 
 
-@each("page", [path.relative_to(ROOT).as_posix() for path in benchmarks.pages.PAGES])
+@pytest.mark.parametrize("page", [path.relative_to(ROOT).as_posix() for path in benchmarks.pages.PAGES])
 def test_figures_are_those_of_their_files(page: str) -> None:
     text = (ROOT / page).read_text()
     assert benchmarks.pages.made(text) == text, "tools/bench pages writes them"

@@ -1,9 +1,8 @@
 """What every layer owes: a description, the shapes it declares, the gradient of what it computes, a word on misuse."""
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import h5py
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from each import each
 from fake_gpu import NAME, POSSIBLE, fake_gpu
 from gradients import check_gradients
 from laws.examples import EXAMPLES, Shape
@@ -61,31 +59,26 @@ def build(name: str, folder: Path, shapes: Sequence[Shape], device: str = "cpu",
     return cls(param, shapes, Context(TEST, options, Random(0), at))
 
 
-def of_each(names: Iterable[str], exacts: Sequence[str] = ("small",)) -> Callable[..., Any]:
-    """Make one test of a check of a layer: it is run with an example of each type, in double precision."""
+@pytest.fixture
+def layer(request: pytest.FixtureRequest, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Layer]:
+    """The example of a layer type, in double precision; the parameter is the type and whose sums are Caffe's."""
+    name, exact = request.param
+    monkeypatch.chdir(folder)
+    made = build(name, folder, EXAMPLES[name].shapes, exact=exact)
+    if isinstance(made, MemoryData):
+        made.set_input_arrays(np.zeros((4, 3, 4, 5)), np.zeros(4))
+    yield made.double()
+    made.close()
 
-    def decorate(check: Callable[[Layer], None]) -> Callable[..., None]:
-        @each("name, exact", [(name, exact) for name in names for exact in exacts])
-        def test(name: str, exact: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-            monkeypatch.chdir(folder)
-            layer = build(name, folder, EXAMPLES[name].shapes, exact=exact)
-            if isinstance(layer, MemoryData):
-                layer.set_input_arrays(np.zeros((4, 3, 4, 5)), np.zeros(4))
-            try:
-                check(layer.double())
-            finally:
-                layer.close()
 
-        return test
-
-    return decorate
+every_type = pytest.mark.parametrize("layer", [(name, "small") for name in TYPES], ids=TYPES, indirect=True)
 
 
 def test_every_type_has_an_example() -> None:
     assert sorted(EXAMPLES) == TYPES
 
 
-@of_each(TYPES)
+@every_type
 def test_docstring_says_what_goes_in_and_out_and_where_caffe_has_it(layer: Layer) -> None:
     lines = [line.strip() for line in (type(layer).__doc__ or "").splitlines()]
     assert lines[0].endswith((".", ":"))
@@ -106,7 +99,7 @@ def _in_a_range(k: int, named: set[str]) -> bool:
     return any(int(first) <= k <= int(last) for first, last in ranges)
 
 
-@of_each(TYPES)
+@every_type
 def test_declared_shapes_are_the_real_ones(layer: Layer) -> None:
     example = EXAMPLES[layer.type]
     for times in (1, 3, 1) if example.batch is not None else (1,):
@@ -116,7 +109,13 @@ def test_declared_shapes_are_the_real_ones(layer: Layer) -> None:
     assert [tuple(blob.shape) for blob in layer.blobs] == layer.blob_shapes
 
 
-def gradient_is_that_of_what_it_computes(layer: Layer) -> None:
+SMOOTH = [name for name in TYPES if EXAMPLES[name].smooth]
+IN_CAFFES_ORDER = [pytest.param((name, "all"), id=f"{name}-all") for name in SMOOTH]
+IN_TORCHS_ORDER = [pytest.param((name, "none"), id=f"{name}-none", marks=pytest.mark.slow) for name in SMOOTH]
+
+
+@pytest.mark.parametrize("layer", [*IN_CAFFES_ORDER, *IN_TORCHS_ORDER], indirect=True)
+def test_gradient_is_that_of_what_it_computes(layer: Layer) -> None:
     bottoms = EXAMPLES[layer.type].bottoms()
     for i, bottom in enumerate(bottoms):
         whole_numbers = bool((bottom == bottom.round()).all())
@@ -130,14 +129,9 @@ def gradient_is_that_of_what_it_computes(layer: Layer) -> None:
     check_gradients(compute, (*bottoms, *learned), rtol)
 
 
-SMOOTH = [name for name in TYPES if EXAMPLES[name].smooth]
-test_gradient_in_caffes_order = of_each(SMOOTH, ["all"])(gradient_is_that_of_what_it_computes)
-test_gradient_in_torchs_order = pytest.mark.slow(of_each(SMOOTH, ["none"])(gradient_is_that_of_what_it_computes))
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")
-@each("name", [name for name in TYPES if name != "Python"])  # whose code sees numpy arrays
+@pytest.mark.parametrize("name", [name for name in TYPES if name != "Python"])  # whose code sees numpy arrays
 def test_computes_on_the_gpu_what_it_computes_on_the_cpu(
     name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,7 +158,7 @@ def test_computes_on_the_gpu_what_it_computes_on_the_cpu(
         torch.testing.assert_close(on_gpu, on_cpu, rtol=1e-4, atol=1e-5)
 
 
-@each("name", TYPES)
+@pytest.mark.parametrize("name", TYPES)
 def test_a_wrong_number_of_bottoms_is_refused(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     shapes = EXAMPLES[name].shapes

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from each import each
 from netspec.inspect.check.check import ON_META, as_json, check_file
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_solver
@@ -35,7 +34,7 @@ def given_shapes(name: str) -> dict[str, tuple[int, ...]]:
     return {"data": (4, *image)}
 
 
-@each("name", sorted(SHAPES))
+@pytest.mark.parametrize("name", sorted(SHAPES))
 def test_net_builds_with_caffes_shapes(name: str) -> None:
     (checked,) = check_file(CORPUS / name, TEST)
     assert not checked.faults
@@ -45,7 +44,7 @@ def test_net_builds_with_caffes_shapes(name: str) -> None:
         assert found[part] == SHAPES[name][part], part
 
 
-@each("name", [name for name in WITH_DATA if not name.endswith(OTHERS)])
+@pytest.mark.parametrize("name", [name for name in WITH_DATA if not name.endswith(OTHERS)])
 def test_nets_with_data_layers_and_solvers_check(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     root = CORPUS / Path(name).parts[0]
     monkeypatch.chdir((CORPUS / name).parent if name.startswith("forresti") else root)  # where its paths begin
@@ -56,12 +55,11 @@ def test_nets_with_data_layers_and_solvers_check(name: str, monkeypatch: pytest.
         assert (checked[0].net is None) == (name in SOLVERS)
 
 
-@each("name", SOLVERS)
+@pytest.mark.parametrize("name", SOLVERS)
 def test_solver_parses(name: str) -> None:
     parse_solver(CORPUS / name)
 
 
-@each("name", FILES)
+@pytest.mark.parametrize("name", [name for name in FILES if name not in SOLVERS])
 def test_net_parses(name: str) -> None:
-    if name not in SOLVERS:
-        parse_net(CORPUS / name)
+    parse_net(CORPUS / name)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from each import each
 from netspec.exact import orders
 from netspec.exact.blas import add_sums, dot, dots, gemm, one_thread, sum_in_order, sum_of_magnitudes, sum_of_squares
 
@@ -16,7 +15,7 @@ TYPES = [torch.float32, torch.float64]
 SIZES = [(2, 3, 4), (1, 1, 1), (5, 1, 7), (1, 6, 1), (40, 300, 50)]
 
 
-@each("dtype, a_t, b_t, sizes", product(TYPES, (False, True), (False, True), SIZES))
+@pytest.mark.parametrize(("dtype", "a_t", "b_t", "sizes"), product(TYPES, (False, True), (False, True), SIZES))
 def test_gemm_multiplies_and_adds_in_place(
     dtype: torch.dtype, a_t: bool, b_t: bool, sizes: tuple[int, int, int]
 ) -> None:

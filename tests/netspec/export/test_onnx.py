@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import netspec
-from each import each
 from exported import (
     ONNX_EXTRA,
     assert_same,
@@ -273,7 +272,7 @@ pytest.importorskip("onnx", reason=ONNX_EXTRA)
 
 
 @pytest.mark.slow
-@each("case", CASES, lambda path: path.name)
+@pytest.mark.parametrize("case", CASES, ids=lambda path: path.name)
 def test_golden_layer_computes_the_same_in_onnxruntime_and_opencv_and_at_other_sizes(case: Path) -> None:
     net, inputs = golden_net(case)
     model, _ = onnx_model(net)

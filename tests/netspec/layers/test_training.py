@@ -7,7 +7,6 @@ import pytest
 import torch
 from google.protobuf import text_format
 
-from each import each
 from netspec.exact import CHOICES
 from netspec.exact.blas import one_thread
 from netspec.graph.options import BuildOptions
@@ -74,7 +73,10 @@ def build(name: str, text: str, shapes: list[tuple[int, ...]], exact: str) -> La
 
 
 @pytest.mark.slow
-@each("name, text, shapes, exact, sideways", [(*case, *how) for case in ALL for how in product(CHOICES, (False, True))])
+@pytest.mark.parametrize(
+    ("name", "text", "shapes", "exact", "sideways"),
+    [(*case, *how) for case in ALL for how in product(CHOICES, (False, True))],
+)
 @one_thread()  # as Preparation says; the two would share a product among threads in other ways, and round otherwise
 def test_kernels_are_what_autograd_computes(
     name: str, text: str, shapes: list[tuple[int, ...]], exact: str, sideways: bool

@@ -8,13 +8,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from case_files import read_texts
-from each import each, last_parts
 from netspec.cli import main
 from netspec.errors import SpecError
 from netspec.proto.format import WIDTH, format_text
 from netspec.proto.lexer import END, STRING, SYMBOL, Lexer
 from netspec.proto.text import parse_net_text, parse_solver_text, text_of
-from paths import GOLDEN, ROOT, SHARED, nets_as_found
+from paths import GOLDEN, ROOT, SHARED, last_parts, nets_as_found
 
 OWN = sorted((ROOT / "prototxt").rglob("*.prototxt"))
 
@@ -115,7 +114,11 @@ def comments(text: str) -> list[str]:
 
 
 @pytest.mark.slow
-@each("path", [*nets_as_found(), *GOLDEN.rglob("*.prototxt"), *SHARED.glob("golden/**/*.prototxt")], last_parts)
+@pytest.mark.parametrize(
+    "path",
+    [*nets_as_found(), *sorted(GOLDEN.rglob("*.prototxt")), *sorted(SHARED.glob("golden/**/*.prototxt"))],
+    ids=last_parts,
+)
 def test_files_as_they_are_found_keep_their_meaning(path: Path) -> None:
     text = text_of(path)
     formed = format_text(text, str(path))
@@ -130,7 +133,7 @@ def test_files_as_they_are_found_keep_their_meaning(path: Path) -> None:
 
 
 @pytest.mark.slow
-@each("path", OWN, last_parts)
+@pytest.mark.parametrize("path", OWN, ids=last_parts)
 def test_the_projects_own_files_have_the_form(path: Path) -> None:
     assert format_text(text_of(path), str(path)) == text_of(path)
 

@@ -10,13 +10,12 @@ from typing import Any
 import pytest
 from google.protobuf import text_format
 
-from each import each, last_parts
 from netspec.errors import SpecError
 from netspec.proto.lexer import FLOAT, INTEGER, NAME, STRING, Lexer
 from netspec.proto.reader import read_text
 from netspec.proto.schema import BlobProto, Datum, LayerParameter, NetParameter, SolverParameter, SolverState, fields_of
 from netspec.proto.text import parse_net, parse_net_text, parse_solver, read_net, read_solver, write_text
-from paths import GOLDEN, SHARED
+from paths import GOLDEN, SHARED, last_parts
 
 
 def read(text: str, message: Any = None) -> Any:
@@ -235,7 +234,7 @@ def outcome(text: str) -> Any:
 
 
 @pytest.mark.slow
-@each("seed", range(300))
+@pytest.mark.parametrize("seed", range(300))
 def test_damaged_text_is_refused_or_read_alike(seed: int) -> None:
     """Whatever is done to a text: it is a SpecError, or the message that protobuf reads from it."""
     draw = random.Random(seed)
@@ -269,7 +268,7 @@ def prototxts() -> list[Path]:
 
 
 @pytest.mark.slow
-@each("path", prototxts(), last_parts)
+@pytest.mark.parametrize("path", prototxts(), ids=last_parts)
 def test_files_read_as_protobuf_reads_them(path: Path) -> None:
     cls = message_class(path)
     expected = text_format.Parse(path.read_text(encoding="utf-8"), cls())

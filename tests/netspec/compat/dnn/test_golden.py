@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import dnn_program
-from each import each
 from netspec import dnn
 
 pytestmark = pytest.mark.slow
@@ -23,7 +22,7 @@ def test_as_much_is_found_out(ours: dict[str, np.ndarray]) -> None:
     assert sorted(ours) == sorted(OPENCV)
 
 
-@each("key", sorted(OPENCV))
+@pytest.mark.parametrize("key", sorted(OPENCV))
 def test_equals_opencv(ours: dict[str, np.ndarray], key: str) -> None:
     found, expected = ours[key], OPENCV[key]
     assert found.shape == expected.shape

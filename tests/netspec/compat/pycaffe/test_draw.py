@@ -9,10 +9,9 @@ from google.protobuf import text_format
 
 import netspec.compat.pycaffe.draw as draw
 from case_files import read_texts
-from each import each, last_parts
 from netspec.compat.pycaffe.proto import caffe_pb2
 from netspec.errors import SpecError
-from paths import ROOT
+from paths import ROOT, last_parts
 
 pydot = pytest.importorskip("pydot")
 
@@ -94,7 +93,9 @@ def test_without_pydot_one_line_says_what_to_install(net, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-@each("path", sorted(path for path in ROOT.glob("prototxt/**/*.prototxt") if "solver" not in path.name), last_parts)
+@pytest.mark.parametrize(
+    "path", sorted(path for path in ROOT.glob("prototxt/**/*.prototxt") if "solver" not in path.name), ids=last_parts
+)
 def test_every_net_of_the_project_is_drawn(path: Path) -> None:
     drawn = text_format.Parse(path.read_text(), caffe_pb2.NetParameter())
     graph = draw.get_pydot_graph(drawn, "LR")

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import netspec.pycaffe as caffe
-from each import each
 from fake_gpu import NAME, POSSIBLE, fake_gpu
 from golden_cases import LayerCase
 from netspec.compat.pycaffe import mode
@@ -28,7 +27,7 @@ def _gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.slow
-@each("folder", LAYERS)
+@pytest.mark.parametrize("folder", LAYERS, ids=lambda folder: folder.name)
 def test_blobs_hold_what_caffes_held(folder: Path) -> None:
     case = LayerCase(folder)
     for key, value in compute(case).items():

@@ -13,7 +13,6 @@ import pytest
 
 import netspec.pycaffe as caffe
 from case_files import read_cases
-from each import each
 from netspec.compat.scripts import finder
 from netspec.dialects import use_dialect
 
@@ -26,7 +25,7 @@ USES, AROUND = (
 )
 
 
-@each("use", USES)
+@pytest.mark.parametrize("use", USES)
 def test_what_scripts_do_with_nets_and_solvers(use: str, write: Callable[..., str]) -> None:
     for name in ("deploy", "memory", "train", "solver"):
         write(CASES[f"{name}.prototxt"]["text"], f"{name}.prototxt")
@@ -61,7 +60,7 @@ def as_in_netspec_run(write: Callable[..., str]) -> Iterator[None]:
         del sys.modules[name]
 
 
-@each("use", AROUND)
+@pytest.mark.parametrize("use", AROUND)
 def test_what_scripts_do_around_nets(use: str, as_in_netspec_run: None) -> None:
     if "draw" in use:
         pytest.importorskip("pydot")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from case_files import read_cases
-from each import each, last_parts
 from netspec.cli import main
 from netspec.data.blobs import from_array
 from netspec.errors import SpecError
@@ -15,7 +14,7 @@ from netspec.inspect.check.compare import compare_files
 from netspec.proto.format import format_text
 from netspec.proto.schema import BlobProto, NetParameter
 from netspec.proto.text import parse_net, write_text
-from paths import nets_as_found
+from paths import last_parts, nets_as_found
 
 NET = """name: "n"
 layer { name: "in" type: "Input" top: "x" input_param { shape { dim: 1 dim: 3 dim: 8 dim: 8 } } }
@@ -145,7 +144,7 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.slow
-@each("path", nets_as_found(), last_parts)
+@pytest.mark.parametrize("path", nets_as_found(), ids=last_parts)
 def test_nets_as_they_are_found_equal_what_is_written_of_them(path: Path) -> None:
     upgraded = write_text(parse_net(path)[0])
     Path("written").write_text(upgraded)

@@ -11,7 +11,6 @@ import pytest
 
 import netspec
 from drawn_coordinates import SCREEN, faults, texts_of
-from each import each, last_parts
 from netspec.cli import main
 from netspec.errors import SpecError, Where
 from netspec.graph.options import BuildOptions
@@ -24,7 +23,7 @@ from netspec.inspect.draw.svg import html_of, svg_of
 from netspec.layers import layer_types
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_net_text
-from paths import nets_as_found
+from paths import last_parts, nets_as_found
 
 PHASES = [TRAIN, TEST]
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 8 dim: 9 dim: 9 } } }\n'
@@ -68,13 +67,13 @@ def random_diagram(seed: int) -> Diagram:
 
 
 @pytest.mark.slow
-@each("seed", range(60))
+@pytest.mark.parametrize("seed", range(60))
 def test_nothing_overlaps_whatever_the_wiring(seed: int) -> None:
     assert list(faults(picture_of(random_diagram(seed)))) == []
 
 
 @pytest.mark.slow
-@each("path", nets_as_found(), last_parts)
+@pytest.mark.parametrize("path", nets_as_found(), ids=last_parts)
 def test_nothing_overlaps_in_nets_as_they_are_found(path: Path) -> None:
     picture = picture_of(
         diagram_of(
