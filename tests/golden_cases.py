@@ -24,6 +24,7 @@ from netspec.proto.text import parse_net
 from paths import GOLDEN
 
 Arrays = Mapping[str, np.ndarray]
+STEPS = sorted(folder.name for folder in (GOLDEN / "steps").iterdir() if folder.is_dir())
 SAMPLED, EVERY = 40_000, 97  # of arrays of so many values, the files of the examples have every 97th
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from netspec.errors import SpecError, did_you_mean
-from netspec.exact.libm import power
+from netspec.exact.libm import exp, power
 from netspec.proto.schema import added_fields
 from netspec.proto.source_map import Place
 
@@ -50,6 +50,13 @@ def _poly(p: Any, iteration: int, step: int) -> float:
     return (p.base_lr - least) * _powf(1 - np.float32(iteration) / np.float32(p.max_iter), p.power) + least
 
 
+def _sigmoid(p: Any, iteration: int, step: int) -> np.float32:
+    """Return the rate as Caffe computes it: in float, with expf."""
+    exponent = np.float32(-p.gamma) * (np.float32(iteration) - np.float32(p.stepsize))
+    denominator = np.float32(1) + exp(torch.tensor([exponent])).numpy()[0]
+    return np.float32(p.base_lr) * (np.float32(1) / denominator)
+
+
 def _power(base: float, exponent: float) -> np.float64:
     return np.power(np.float64(base), np.float64(exponent))  # inf and nan, for which Python's ** raises an error
 
@@ -65,9 +72,7 @@ POLICIES: dict[str, Policy] = {
     "inv": Policy(("gamma",), lambda p, i, step: p.base_lr * _powf(1 + np.float32(p.gamma) * np.float32(i), -p.power)),
     "multistep": Policy(("gamma",), lambda p, i, step: p.base_lr * _power(p.gamma, step)),
     "poly": Policy(("max_iter",), _poly),
-    "sigmoid": Policy(
-        ("gamma", "stepsize"), lambda p, i, step: p.base_lr / (1 + np.exp(np.float64(-p.gamma * (i - p.stepsize))))
-    ),
+    "sigmoid": Policy(("gamma", "stepsize"), _sigmoid),
     "multifixed": Policy((), _stage),
 }
 

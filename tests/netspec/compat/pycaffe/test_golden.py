@@ -11,6 +11,7 @@ import netspec.pycaffe as caffe
 from golden_cases import (
     EVERY,
     SAMPLED,
+    STEPS,
     LayerCase,
     assert_arrays,
     assert_same_layers,
@@ -78,6 +79,30 @@ def test_solvers_follow_caffe(
     if solver.param.iter_size == 1:  # else the file has the mean of several passes
         results["loss"] = found
     assert_training(results, golden, same_blas, 0.25 if case in ("adadelta", "rmsprop") else 1e-2)
+
+
+@pytest.mark.parametrize("case", STEPS)
+def test_each_step_is_caffes(
+    case: str,
+    work_in: Callable[..., Path],
+    exact: Callable[[str], None],
+    same_blas: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Outputs and weights after each of three iterations, to the last bit; on other CPUs than Caffe's to 1e-5."""
+    monkeypatch.chdir(work_in(f"steps/{case}"))
+    exact("all")
+    golden = np.load("caffe.npz")
+    solver = caffe.get_solver("solver.prototxt")
+    solver.net.copy_from("init.caffemodel")
+    found = {}
+    for i in range(3):
+        solver.step(1)
+        found |= {f"{i} output {name}": solver.net.blobs[name].data.copy() for name in solver.net.outputs}
+        for layer, blobs in solver.net.params.items():
+            found |= {f"{i} weight {layer}[{j}]": blob.data.copy() for j, blob in enumerate(blobs)}
+    assert found.keys() == set(golden.files)
+    assert_arrays(found, golden, 0 if same_blas else 1e-5)
 
 
 @pytest.fixture(scope="session")
