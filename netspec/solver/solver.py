@@ -21,6 +21,7 @@ from netspec.exact import SMALL
 from netspec.graph.filter import with_train_state
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.context import device_of
+from netspec.process.signals import waiting_interrupts
 from netspec.proto.text import parse_solver
 from netspec.solver import update
 from netspec.solver.checks import check_prefix
@@ -142,7 +143,9 @@ class Solver(Training):
     def step(self, iterations: int) -> None:
         """Run some iterations. The window of the averaged loss starts again, unless the training was just resumed.
 
-        Raises SpecError if a net has inputs: a solver cannot fill them.
+        Ctrl-C raises KeyboardInterrupt at the end of the iteration that runs, so that a later call goes on as if
+        nothing had happened; a second one raises it at once. Raises SpecError if a net has inputs: a solver cannot fill
+        them.
         """
         self.check_inputs()
         self.stopped = False
@@ -151,29 +154,36 @@ class Solver(Training):
         self.losses.extend(self.losses_before)
         self.losses_before = ()
         self._display.begin()
-        for self.to_come in reversed(range(iterations)):
-            if self.is_due(self.param.test_interval) and (self.iteration > 0 or self.param.test_initialization):
-                self.test_all()
+        with waiting_interrupts() as interrupt:
+            for self.to_come in reversed(range(iterations)):
+                self._iterate()
                 if self.stopped:
                     return
-            for net in (self.net, *self.replicas.nets):
-                net.random.begin(f"iteration {self.iteration}")
-            self.on_start()
-            loss, outputs = self._accumulate()
-            self.losses.append(loss)
-            if not math.isfinite(loss):
-                self.tell_nan(f"the loss is {loss}")
-            if self.is_due(self.param.display):
-                self._display.show(outputs)
-            self.on_gradients()
-            self.apply_update()
-            self.on_iteration()
-            request = self.options.processes.agree(self.options.action())
-            if self.is_due(self.param.snapshot) or request == "snapshot":
-                self.snapshot()
-            if request == "stop":
-                self.stopped = True
+                interrupt()
+
+    def _iterate(self) -> None:
+        """Run one iteration, with what comes before and after it: the tests, and the snapshot."""
+        if self.is_due(self.param.test_interval) and (self.iteration > 0 or self.param.test_initialization):
+            self.test_all()
+            if self.stopped:
                 return
+        for net in (self.net, *self.replicas.nets):
+            net.random.begin(f"iteration {self.iteration}")
+        self.on_start()
+        loss, outputs = self._accumulate()
+        self.losses.append(loss)
+        if not math.isfinite(loss):
+            self.tell_nan(f"the loss is {loss}")
+        if self.is_due(self.param.display):
+            self._display.show(outputs)
+        self.on_gradients()
+        self.apply_update()
+        self.on_iteration()
+        request = self.options.processes.agree(self.options.action())
+        if self.is_due(self.param.snapshot) or request == "snapshot":
+            self.snapshot()
+        if request == "stop":
+            self.stopped = True
 
     def _accumulate(self) -> tuple[float, Blobs]:
         """Sum the gradients of iter_size runs; return the mean of their losses, and the outputs of the last."""

@@ -12,6 +12,7 @@ from contextlib import suppress
 from importlib import import_module
 
 from netspec.process.programs import set_up
+from netspec.process.signals import end_forked_processes_by_sigterm
 
 
 def program(module: str, words: Sequence[str] | None = None) -> int:
@@ -36,6 +37,7 @@ def program(module: str, words: Sequence[str] | None = None) -> int:
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(errors="backslashreplace")
         set_up()
+        end_forked_processes_by_sigterm()
         return _written(import_module(module).main(words))
     finally:
         for number in ours if words is not None else ():

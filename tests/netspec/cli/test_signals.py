@@ -193,3 +193,45 @@ def test_on_a_terminal_a_line_says_how_far_it_is(work_in: Callable[..., Path]) -
     assert training.returncode == 0, shown
     assert re.search(rb"\r10 of 60 \|", shown), shown
     assert b"Iteration" not in shown, "Caffe's log has no such line, and -q hides the log"
+
+
+WAYS = {
+    "netspec train": ("-m", "netspec", "train", "solver.prototxt", "--allow-python-layers"),
+    "netspec run": ("-m", "netspec", "run", "train.py"),
+    "python": ("train.py",),
+}
+
+
+@pytest.mark.parametrize(
+    ("way", "layer"),
+    [
+        ("netspec train", "Daemon"),
+        ("netspec train", "Joined"),
+        ("netspec train", "Pooled"),
+        ("netspec run", "Joined"),
+        ("python", "Joined"),
+    ],
+)
+def test_a_training_ends_where_a_python_layer_has_a_process_of_its_own(way: str, layer: str, tmp_path: Path) -> None:
+    """A forked process has the handlers of the training, and is ended by SIGTERM all the same."""
+    for name in ("prefetching.py", "train.py", "solver.prototxt"):
+        text = (ROOT / "tests/netspec/cli/workers" / name).read_text()
+        (tmp_path / name).write_text(text.replace("LAYER", layer))
+    process = subprocess.Popen(
+        [sys.executable, *WAYS[way]],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        out, said = process.communicate(timeout=300)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # workers that are left
+    assert process.returncode == 0, said
+    assert "Traceback" not in said
+    assert "interrupted" not in said
+    assert ("joined" in out) == (layer == "Joined")

@@ -1,7 +1,9 @@
 import logging
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from netspec.errors import SpecError
 from netspec.layers.contract.reading import Fed
 from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter
+from netspec.solver import update
 from netspec.solver.snapshot import read_state
 from netspec.solver.solver import Solver, load_solver
 
@@ -297,3 +300,71 @@ def test_a_gpu_that_is_not_there_is_refused(make, monkeypatch):
         SpecError, match=r"^s\.prototxt:6:1: found device_id 3, but torch finds 1 GPU\(s\) on this machine"
     ):
         make("device_id: 3", settings=SETTINGS.replace("CPU", "GPU"))
+
+
+# Where it is interrupted
+
+
+READING = """
+layer { name: "data" type: "HDF5Data" top: "data" top: "label" hdf5_data_param { source: "files.txt" batch_size: 1 } }
+layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip"
+  inner_product_param { num_output: 2 weight_filler { type: "constant" value: 1 } } }
+layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "label" top: "loss" }
+"""
+
+
+@pytest.mark.parametrize("where", ["after the gradients", "between two updates"])
+def test_an_interrupt_comes_after_the_iteration(make, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
+    """Ctrl-C in Python leaves a training that goes on as if nothing had happened."""
+    with h5py.File("records.h5", "w") as file:
+        file["data"] = np.random.default_rng(0).normal(size=(7, 3)).astype("f4")
+        file["label"] = np.zeros((7, 2), "f4")
+    Path("files.txt").write_text("records.h5")
+    undisturbed = make(net=READING)
+    undisturbed.step(5)
+    solver = make(net=READING)
+
+    interrupted: list[int] = []
+
+    def interrupt() -> None:
+        if solver.iteration == 1 and not interrupted:
+            interrupted.append(1)
+            signal.raise_signal(signal.SIGINT)
+
+    if where == "after the gradients":
+        solver.on_gradients = interrupt
+    else:
+        move = update.move
+        monkeypatch.setattr(update, "move", lambda *arguments: (move(*arguments), interrupt()))
+    with pytest.raises(KeyboardInterrupt):
+        solver.step(5)
+    assert solver.iteration == 2
+    solver.step(3)
+    assert all(map(torch.equal, weights(solver), weights(undisturbed)))
+
+
+def test_a_second_interrupt_ends_an_iteration_at_once(make) -> None:
+    solver = make()
+
+    def interrupt_twice() -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("the second one is kept too")
+
+    solver.on_gradients = interrupt_twice
+    with pytest.raises(KeyboardInterrupt):
+        solver.step(1)
+    assert solver.iteration == 0
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_programs_own_handler_of_interrupts_stays(make, monkeypatch: pytest.MonkeyPatch) -> None:
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        solver = make()
+        solver.on_gradients = lambda: signal.raise_signal(signal.SIGINT)
+        solver.step(2)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert came == [signal.SIGINT] * 2
