@@ -24,8 +24,6 @@ EXTRAS = {
     "pydot",
     "fissix",
     "tensorboard",
-    "pygls",
-    "lsprotocol",
 }
 SCRIPTS = Path(sys.executable).parent
 
@@ -37,11 +35,12 @@ def modules(package: str) -> list[str]:
     return [module.name for module in walked if not re.search(r"__main__$|\.dialects\.", module.name)]
 
 
-def run(*words: str) -> str:
-    """Run a command of the installation; return what it printed."""
-    done = subprocess.run([str(SCRIPTS / words[0]), *words[1:]], capture_output=True, text=True, check=False)
+def run(*words: str, stderr: int = subprocess.PIPE) -> str:
+    """Run a command of the installation; return what it printed on stdout."""
+    command = [str(SCRIPTS / words[0]), *words[1:]]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=stderr, text=True, check=False)
     if done.returncode:
-        sys.exit(f"{' '.join(words)}: status {done.returncode}\n{done.stderr}")
+        sys.exit(f"{' '.join(words)}: status {done.returncode}\n{done.stderr or done.stdout}")
     return done.stdout
 
 
@@ -65,9 +64,10 @@ def main(golden: Path) -> None:
     shutil.copytree(golden / "pairs", "pairs")
     assert run("netspec", "--version") == f"netspec {version('netspec-caffe')}\n"
     run("netspec", "check", "--data", "sgd_step/solver.prototxt")
-    out = run("netspec", "watch", "--solver", "sgd_step/solver.prototxt")
-    assert "iteration 60 of 60" in out, out
-    run("netspec", "plot", out.splitlines()[-1], "--out", "training.html")
+    log = run("netspec", "train", "--solver", "sgd_step/solver.prototxt", stderr=subprocess.STDOUT)
+    Path("train.log").write_text(log)
+    out = run("netspec", "plot", "train.log", "--out", "training.html")
+    assert "state done, iterations 60" in out, out
     run("netspec", "data", "show", "pairs/test_lmdb", "--out", "sheet.png")
     run("netspec", "bug-report", "sgd_step/solver.prototxt", "--out", "report.md")
     run("lmdb-build", "walk", "walk", "--frames", "12", "--size", "48x36")

@@ -17,7 +17,7 @@ _GROUPS = {
     "look at data and trainings": data,
     "use a net elsewhere": export,
     "old programs": run_script,
-    "editor, shell, help": shell,
+    "shell, help": shell,
 }
 
 

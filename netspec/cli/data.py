@@ -1,15 +1,10 @@
-"""``netspec data``, ``plot`` and ``watch``."""
+"""``netspec data`` and ``plot``."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
-import shutil
-import signal
-import subprocess
 import sys
-import time
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +16,6 @@ from netspec.terminal.output import bar
 if TYPE_CHECKING:
     from netspec.data.records import Records
     from netspec.data.survey import Survey
-    from netspec.inspect.logs.training_log import Follower
 
 TABLE = """
 data quiet                         look at a database: a sheet of its records, or its statistics
@@ -39,11 +33,6 @@ plot quiet                         draw the curves of trainings from their logs,
   --names NAMES,...                what the logs are called, separated by commas (default: the names of the files)
   --smooth N                       average N points (default: a 25th of them)
   --log_scale                      draw losses on a logarithmic axis
-watch quiet read                   show a training in the terminal: curve, speed, time left, memory
-  [log] LOG                        the log of a training, which may still grow
-  --solver SOLVER                  train this solver, with a log beside its snapshots, and watch it
-  --every=1 SECONDS                how often to look (default: 1)
-  --once                           show the state once, and end
 """
 
 
@@ -130,90 +119,3 @@ def _names(paths: list[str]) -> list[str]:
         if len(set(names)) == len(set(paths)):
             return names
     return list(paths)
-
-
-QUIET = 60.0  # seconds without a line after which a process that is not here counts as gone
-_HOME, _CLEAR_LINE, _CLEAR_REST = "\x1b[H", "\x1b[K", "\x1b[J"
-_NEW_SCREEN, _OLD_SCREEN = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
-
-
-def _watch(arguments: argparse.Namespace) -> int:
-    from netspec.inspect.logs.training_log import Follower
-
-    if bool(arguments.log) == bool(arguments.solver):
-        raise WrongUsage("give the log of a training, or --solver to start one")
-    if not 0 < arguments.every < math.inf:
-        raise WrongUsage(f"found --every {arguments.every:g}, expected a number above 0")
-    if arguments.once:
-        refuse(arguments, ("solver", "every"), "is for following a training, not for --once")
-    if arguments.solver:
-        return _watch_own(arguments)
-    refuse(arguments, ("plugin",), "is for --solver; a log is read as it is")
-    follower = Follower(arguments.log)
-    follower.poll()
-    if arguments.once or not sys.stdout.isatty():
-        print("\n".join(_lines(follower)))
-        return DONE
-    _follow(follower, arguments.every)
-    return DONE
-
-
-def _watch_own(arguments: argparse.Namespace) -> int:
-    """Train in a process of its own, whose log goes to a file, and watch that."""
-    from netspec.inspect.logs.training_log import Follower
-    from netspec.proto.text import read_solver
-
-    prefix = read_solver(arguments.solver).snapshot_prefix or str(Path(arguments.solver).with_suffix(""))
-    log = Path(f"{prefix}.{time.strftime('%Y%m%d-%H%M%S')}.log")
-    with log.open("xb") as file:
-        words = [sys.executable, "-m", "netspec", "train", "--solver", arguments.solver]
-        words += [word for plugin in arguments.plugin for word in ("--plugin", plugin)]
-        # Its own session: only a signal that is passed on reaches it, and it outlives a terminal that is closed.
-        training = subprocess.Popen(words, stderr=file, start_new_session=True)
-    try:
-        _follow(Follower(log), arguments.every, training)
-    except KeyboardInterrupt:
-        training.send_signal(signal.SIGINT)
-    status = training.wait()
-    follower = Follower(log)
-    follower.poll()
-    print("\n".join(_lines(follower)))
-    if 0 < status < 128:  # more: a signal stopped it
-        print(log.read_text(errors="replace").splitlines()[-1], file=sys.stderr)
-    print(log)
-    return status
-
-
-def _follow(follower: Follower, every: float, training: subprocess.Popen[bytes] | None = None) -> None:
-    """Show a log as it grows, until the training ends, on a screen that is given back then."""
-    from netspec.inspect.logs.training_log import RUNNING
-
-    shown = sys.stdout.isatty()
-    if shown:
-        sys.stdout.write(_NEW_SCREEN)
-    try:
-        while True:
-            follower.poll()
-            if shown:
-                text = "".join(f"{line}{_CLEAR_LINE}\n" for line in _lines(follower))
-                sys.stdout.write(_HOME + text.rstrip("\n") + _CLEAR_REST)
-                sys.stdout.flush()
-            if follower.log.state != RUNNING or (training is not None and training.poll() is not None):
-                return
-            time.sleep(every)
-    finally:
-        if shown:
-            sys.stdout.write(_OLD_SCREEN)
-            if training is None:
-                print("\n".join(_lines(follower)))
-
-
-def _lines(follower: Follower) -> list[str]:
-    from netspec.inspect.logs.screen import is_alive, memory_of, screen
-
-    log, now = follower.log, time.time()
-    alive = is_alive(log.process) if log.process is not None else None
-    size = shutil.get_terminal_size((100, 40))
-    memory = memory_of(log.process) if alive and log.process is not None else None
-    lost = alive is False and now - follower.changed > QUIET  # else it may run on another machine
-    return screen(log, memory, lost, size.columns, size.lines, now)

@@ -1,9 +1,8 @@
-"""``netspec lsp``, ``completion`` and ``bug-report``."""
+"""``netspec completion`` and ``bug-report``."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,27 +13,12 @@ WORDS = (None, str, Path)  # the types of values that may be names of files
 
 
 TABLE = """
-lsp quiet silent                   a language server for editors, on standard input and output
 completion silent                  print a shell's completion
   shell {bash|zsh|fish}            the shell
 bug-report quiet                  collect versions, and files' shapes without weights or images, for a report of a fault
   [files...] FILE                  prototxt, weights, database, log: what the fault is about
   --out F.md                       write the report here (default: print it)
 """
-
-
-def _lsp(arguments: argparse.Namespace) -> None:
-    try:
-        from netspec.inspect.editor.server import make_server
-    except ImportError as fault:
-        if not (fault.name or "").startswith(("pygls", "lsprotocol")):
-            raise
-        raise SpecError("the language server needs pygls: pip install pygls, or 'netspec-caffe[lsp]'") from None
-    from importlib.metadata import version
-
-    from netspec.inspect.editor.messages import Messages
-
-    make_server(version("netspec-caffe")).start_io(Messages(sys.stdin.buffer))  # type: ignore[arg-type]
 
 
 def _completion(arguments: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""Caffe's databases: LMDB, and LevelDB through the optional package plyvel.
+"""Caffe's databases: LMDB, and LevelDB through the optional package plyvel (the extra ``leveldb``).
 
 Records are numbered in the order of their keys, which is the order in which Caffe reads them.
 
@@ -229,7 +229,7 @@ def _plyvel() -> ModuleType:
     try:
         import plyvel
     except ImportError:
-        raise ValueError("is a LevelDB, which needs an extra package: pip install plyvel") from None
+        raise ValueError("is a LevelDB, which needs an extra package: pip install 'netspec-caffe[leveldb]'") from None
     return plyvel
 
 

@@ -253,7 +253,6 @@ FORMATS = {
     "solver.prototxt": Format(".prototxt", text(SOLVER), solved),
     "exported net": Format(".prototxt", text(LAYERS), written.exported),
     "drawn net": Format(".prototxt", text(LAYERS), written.drawn),
-    "language server": Format(".rpc", written.talk, written.answered),
     "caffemodel": Format(".caffemodel", lambda path: save_weights(net(), path), lambda path: load_weights(net(), path)),
     "caffemodel.h5": Format(
         ".caffemodel.h5", lambda path: save_weights(net(), path), lambda path: load_weights(net(), path)

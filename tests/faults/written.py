@@ -1,16 +1,12 @@
-"""What is written about a damaged net, and what the language server says to a damaged talk: for formats.py."""
+"""What is written about a damaged net: for formats.py."""
 
 from __future__ import annotations
 
 import ast
-import io
 import json
-import logging
-import traceback
 from pathlib import Path
 from xml.etree import ElementTree
 
-from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.export.formats.convert import blob_tensors
 from netspec.export.formats.deploy import fold
@@ -22,15 +18,12 @@ from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.diagram import diagram_of
 from netspec.inspect.draw.picture import picture_of
 from netspec.inspect.draw.svg import html_of, svg_of
-from netspec.inspect.editor.messages import Messages
-from netspec.inspect.editor.server import make_server
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text, write_text
 
 MOST = 1 << 22  # bytes of a net: large ones show nothing more
-(SENT,) = (list(map(json.loads, text.splitlines())) for text in read_texts("faults/talk.txt").values())
 
 
 def _net(path: Path) -> Net:
@@ -65,37 +58,3 @@ def drawn(path: Path) -> None:
     html = html_of(diagram, picture)
     json.loads(html.partition("const layers = ")[2].partition(";\n")[0])
     html.encode()
-
-
-def talk(path: Path) -> None:
-    """Write what an editor says."""
-    bodies = [json.dumps({"jsonrpc": "2.0", **message}).encode() for message in SENT]
-    path.write_bytes(b"".join(b"Content-Length: %d\r\n\r\n%s" % (len(body), body) for body in bodies))
-
-
-def answered(path: Path) -> None:
-    """Let the server hear a talk; raise what it raised in netspec, which pygls logs."""
-    raised: list[BaseException] = []
-
-    class Kept(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            fault = record.exc_info[1] if record.exc_info else None
-            while fault is not None:
-                last = traceback.extract_tb(fault.__traceback__)[-1].filename if fault.__traceback__ else ""
-                if "/netspec/" in last and not type(fault).__name__.startswith("JsonRpc"):
-                    raised.append(fault)
-                fault = fault.__cause__
-
-    logger, kept, answers = logging.getLogger("pygls"), Kept(), io.BytesIO()
-    before, logger.propagate = logger.propagate, False
-    logger.addHandler(kept)
-    answers.close = lambda: None  # type: ignore[method-assign]
-    try:
-        make_server("1").start_io(Messages(io.BytesIO(path.read_bytes())), answers)  # type: ignore[arg-type]
-    except SystemExit:
-        pass
-    finally:
-        logger.removeHandler(kept)
-        logger.propagate = before
-    for fault in raised:
-        raise fault

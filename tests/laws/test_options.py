@@ -28,7 +28,6 @@ WAYS = {program: text.splitlines() for program, text in read_texts("laws/ways.tx
 # Commands that this test does not start, and why.
 NOT_STARTED = {
     "netspec": {
-        "lsp": "serves standard input; it has no options of its own",
         "run": "the script ends the process; tests/netspec/compat/scripts",
     },
     "lmdb_build": {"pairs": "tests/lmdb_build/test_cli.py", "mnist": "needs MNIST", "cifar": "needs CIFAR-10"},

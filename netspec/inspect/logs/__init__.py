@@ -1,1 +1,1 @@
-"""Trainings, as their logs tell them (Caffe's logs too): loss, outputs, rate and speed; the screen of watch."""
+"""Trainings, as their logs tell them (Caffe's logs too): loss, outputs, rate and speed."""

@@ -6,9 +6,7 @@ Caffe: src/caffe/solver.cpp, src/caffe/solvers/sgd_solver.cpp; the sentences dif
 from __future__ import annotations
 
 import math
-import os
 import re
-import stat
 from bisect import bisect_left
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -106,15 +104,12 @@ RUNNING, DONE, STOPPED, FAILED = "running", "done", "stopped early", "failed"
 # `I1121 00:36:27.939015 12135 solver.cpp:239] ...`; newer versions of glog write the year too.
 _COUNT = "([0-9]{1,10})(?![0-9])"  # an int of 32 bits
 _PREFIX = re.compile(rf"([IWEF])(?:\d{{4}})?(\d\d)(\d\d) (\d\d):(\d\d):(\d\d)\.(\d{{6}}) +{_COUNT} (\S+?)\] ?(.*)")
-_LOSS = re.compile(rf"Iteration {_COUNT}(?: \((\S+) iter/s[^)]*\))?[^=]*, loss = (\S+)")
+_LOSS = re.compile(rf"Iteration {_COUNT}[^=]*, loss = (\S+)")
 _RATE = re.compile(rf"Iteration {_COUNT}, lr = (\S+)")
 _TESTING = re.compile(rf"Iteration {_COUNT}, Testing net(?: \(#{_COUNT}\))?")
 _OUTPUT = re.compile(rf"(Train|Test) net output #{_COUNT}: (.*) = (\S+?)(?: \(\* .* loss\))?$")
 _SCORE = re.compile(rf"Test score #{_COUNT}: (\S+)")  # until 2014
 _TEST_LOSS = re.compile(r"Test loss: (\S+)")
-_WAITING = re.compile(r"Waiting for data: (\S+) %")
-_SNAPSHOT = re.compile(rf"Snapshotting to (?:.* file )?(\S+_iter_{_COUNT}(?:\.caffemodel\S*)?)")
-_SETTING = re.compile(r"(max_iter|display|test_interval|average_loss|type|net|snapshot_prefix): (.*)")
 # Python's, a signal's, and netspec's own: `solver.prototxt:3:1: ...`.
 _FAULT = re.compile(r"Traceback |\*\*\* .*SIG|\S[^:]*:\d+:\d+: |there is not enough memory")
 _WINDOWS = {"1.#QNAN": "nan", "-1.#IND": "nan", "1.#INF": "inf", "-1.#INF": "-inf"}
@@ -128,8 +123,7 @@ class TrainingLog:
 
     ``loss`` is averaged over ``average_loss`` iterations; ``train`` and ``tests`` hold the outputs of the training net
     and, by the number of the test net, of the test nets: name -> curve. Of a blob of several numbers, the second is
-    ``name[1]``. ``losses`` are the names of outputs that have a loss weight. ``speed`` is in iterations per second,
-    ``waiting`` the share of time in which the net waited for data, in percent. ``times`` are seconds since the first
+    ``name[1]``. ``losses`` are the names of outputs that have a loss weight. ``times`` are seconds since the first
     line, at the iterations of ``loss``.
     """
 
@@ -139,26 +133,14 @@ class TrainingLog:
     train: dict[str, Curve] = field(default_factory=dict)
     tests: dict[int, dict[str, Curve]] = field(default_factory=dict)
     losses: set[str] = field(default_factory=set)
-    speed: Curve = field(default_factory=Curve)
-    waiting: Curve = field(default_factory=Curve)
     times: Curve = field(default_factory=Curve)
-    snapshots: list[tuple[int, str]] = field(default_factory=list)
-    settings: dict[str, str] = field(default_factory=dict)
     state: str = RUNNING
-    process: int | None = None
-    fault: str = ""
 
     @property
     def iteration(self) -> int:
         """The last iteration that the log names."""
         curves = (self.loss, self.rate, *(curve for net in self.tests.values() for curve in net.values()))
         return max((curve.iterations[-1] for curve in curves if len(curve)), default=0)
-
-    @property
-    def max_iter(self) -> int | None:
-        """How many iterations the solver is to do, where the log says it."""
-        found = self.settings.get("max_iter", "")
-        return int(found) if re.fullmatch(_COUNT, found) else None
 
     def test_label(self, net: int) -> str:
         """Return what a test net is called: "test" where it is the only one."""
@@ -167,7 +149,7 @@ class TrainingLog:
     def curves(self) -> list[Curve]:
         """Return all curves."""
         tests = [curve for net in self.tests.values() for curve in net.values()]
-        return [self.loss, self.rate, self.speed, self.waiting, self.times, *self.train.values(), *tests]
+        return [self.loss, self.rate, self.times, *self.train.values(), *tests]
 
 
 class LogReader:
@@ -180,37 +162,31 @@ class LogReader:
         self._first: float | None = None
         self._last = 0.0
         self._names: dict[tuple[str, int, int], tuple[str, str]] = {}
-        self._in_settings = False
 
     def feed(self, line: str) -> None:
         """Read one line."""
         line = line.rstrip("\r\n")
         prefix = _PREFIX.search(line)
         if not prefix:
-            if self._in_settings and (found := _SETTING.match(line)):
-                self.log.settings[found[1]] = found[2].strip().strip('"')
-            elif _FAULT.match(line):
-                self._end(FAILED, line)
+            if _FAULT.match(line):
+                self.log.state = FAILED
             else:
                 self._read(line, None)  # where GLOG_log_prefix=false left out the beginning of the lines
             return
         message = prefix[10]
-        self._in_settings = message.startswith("Initializing solver from parameters")
-        if self._in_settings:
-            self.log.state, self.log.fault, self.log.process = RUNNING, "", int(prefix[8])
+        if message.startswith("Initializing solver from parameters"):
+            self.log.state = RUNNING
         self._read(message, self._seconds(prefix))
         if prefix[1] == "F":
-            self._end(FAILED, message)
+            self.log.state = FAILED
 
     def _read(self, message: str, seconds: float | None) -> None:
         log = self.log
         if found := _LOSS.search(message):
             iteration = self._at(found[1])
-            log.loss.add(iteration, _number(found[3]))
+            log.loss.add(iteration, _number(found[2]))
             if seconds is not None:
                 log.times.add(iteration, seconds)
-            if found[2]:
-                log.speed.add(iteration, _number(found[2]))
         elif found := _OUTPUT.search(message):
             self._output(found[1], int(found[2]), found[3], found[4], "loss)" in message)
         elif found := _RATE.search(message):
@@ -222,14 +198,10 @@ class LogReader:
             self._output("Test", int(found[1]), f"score {found[1]}", found[2], False)
         elif found := _TEST_LOSS.match(message):
             self._output("Test", -1, "test loss", found[1], True)
-        elif found := _WAITING.match(message):
-            log.waiting.add(self._position, _number(found[1]))
-        elif found := _SNAPSHOT.search(message):
-            log.snapshots.append((int(found[2]), found[1]))
         elif message.startswith("Optimization stopped early"):
-            self._end(STOPPED)
+            log.state = STOPPED
         elif message.startswith("Optimization Done") and log.state == RUNNING:
-            self._end(DONE)
+            log.state = DONE
 
     def _at(self, text: str) -> int:
         """Return the iteration of a line; where it is before that of the last line, the training was resumed."""
@@ -267,62 +239,20 @@ class LogReader:
         self._last = seconds
         return seconds
 
-    def _end(self, state: str, fault: str = "") -> None:
-        self.log.state, self.log.fault = state, fault
-
-
-class Follower:
-    """Reads a log that grows: ``run`` has what was there at the last :meth:`poll`, which grew at ``changed`` [s]."""
-
-    def __init__(self, path: str | Path, name: str = "") -> None:
-        self._path, self._name = Path(path), name or str(path)
-        self.changed = 0.0
-        self._begin()
-
-    def _begin(self) -> None:
-        self._reader, self._offset, self._rest, self._file = LogReader(self._name), 0, b"", 0
-
-    @property
-    def log(self) -> TrainingLog:
-        """What was read so far."""
-        return self._reader.log
-
-    def poll(self) -> bool:
-        """Read what is new, and return whether there was any. Raises SpecError if the file cannot be read.
-
-        A file that was replaced or cut is read again from its start.
-        """
-        try:
-            with open(self._path, "rb") as file:
-                status = os.fstat(file.fileno())
-                if stat.S_ISREG(status.st_mode):  # what comes through a pipe is there once
-                    if status.st_size < self._offset or (self._file and status.st_ino != self._file):
-                        self._begin()
-                    file.seek(self._offset)
-                self._file, self.changed = status.st_ino, status.st_mtime
-                new = file.read()
-        except OSError as fault:
-            raise SpecError(f"cannot be read: {fault.strerror}", Where(str(self._path))) from None
-        self._offset += len(new)
-        *lines, self._rest = (self._rest + new).split(b"\n")
-        for line in lines:
-            self._reader.feed(line.decode(errors="replace"))
-        return bool(new)
-
-    def end(self) -> None:
-        """Read the last line, which has no end."""
-        self._reader.feed(self._rest.decode(errors="replace"))
-
 
 def read_log(path: str | Path, name: str = "") -> TrainingLog:
     """Return the training of a log. Raises SpecError if the file cannot be read or holds no training."""
-    follower = Follower(path, name)
-    follower.poll()
-    follower.end()
-    if not any(len(curve) for curve in follower.log.curves()):
+    reader = LogReader(name or str(path))
+    try:
+        with open(path, encoding="utf-8", errors="replace", newline="\n") as file:
+            for line in file:
+                reader.feed(line)
+    except OSError as fault:
+        raise SpecError(f"cannot be read: {fault.strerror}", Where(str(path))) from None
+    if not any(len(curve) for curve in reader.log.curves()):
         advice = "expected what `netspec train` or `caffe train` writes to stderr (2> train.log), with display above 0"
         raise SpecError(f"holds no iteration of a training; {advice}", Where(str(path)))
-    return follower.log
+    return reader.log
 
 
 def _number(text: str) -> float:
@@ -350,16 +280,14 @@ def summary(log: TrainingLog) -> dict[str, str]:
             if name in log.losses and finite:
                 least = min(finite)
                 told[f"least {label} {name}"] = f"{number(least)} at {curve.iterations[curve.values.index(least)]:,}"
-    speed = iterations_per_second(log)
-    if speed:
+    if speed := iterations_per_second(log):
         told["iter/s"] = number(float(f"{speed:.3g}"))
     return told
 
 
-def iterations_per_second(log: TrainingLog, last: int = 0) -> float | None:
-    """Return the speed by the stamps of the log's lines, tests included; over the ``last`` displays, or all (0)."""
-    first = -last - 1 if last else 0
-    iterations, seconds = log.times.iterations[first:], log.times.values[first:]
+def iterations_per_second(log: TrainingLog) -> float | None:
+    """Return the speed by the stamps of the log's lines, tests included."""
+    iterations, seconds = log.times.iterations, log.times.values
     if len(iterations) < 2 or seconds[-1] <= seconds[0]:
         return None
     return (iterations[-1] - iterations[0]) / (seconds[-1] - seconds[0])

@@ -315,9 +315,9 @@ def test_reading_a_leveldb_neither_locks_nor_changes_it(tmp_path: Path) -> None:
 def test_without_plyvel_leveldb_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "plyvel", None)
     make_leveldb(tmp_path / "db")
-    with pytest.raises(SpecError, match="pip install plyvel"):
+    with pytest.raises(SpecError, match=r"pip install 'netspec-caffe\[leveldb\]'"):
         open_reader(str(tmp_path / "db"), "leveldb", PLACE)
-    with pytest.raises(SpecError, match="pip install plyvel"):
+    with pytest.raises(SpecError, match=r"pip install 'netspec-caffe\[leveldb\]'"):
         write(tmp_path / "new", {}, "leveldb")
     assert os.listdir(tmp_path) == ["db"]
 

@@ -9,7 +9,6 @@ import pytest
 from netspec.errors import SpecError
 from netspec.inspect.logs.training_log import (
     Curve,
-    Follower,
     LogReader,
     TrainingLog,
     iterations_per_second,
@@ -40,9 +39,7 @@ def test_a_log_of_caffe() -> None:
     assert run.tests == {0: {"loss": Curve([0, 25, 50], [0.147966, 0.0510559, 0.0502543])}}
     assert run.train["loss"].values == run.loss.values[:-1]
     assert run.losses == {"loss"}
-    assert run.snapshots[-1] == (60, "sgd_step/ref_iter_60.caffemodel")
-    assert (run.state, run.max_iter, run.process) == ("done", 60, 12526)
-    assert run.speed.values[1] == 117.647
+    assert (run.state, run.iteration) == ("done", 60)
     assert run.times.values[-1] == pytest.approx(0.639364, abs=1e-6)
     assert summary(run)["least test loss"] == "0.0502543 at 50"
 
@@ -60,7 +57,6 @@ def test_sentences_of_other_versions() -> None:
     assert run.tests == {1: {"accuracy": Curve([100], [0.5]), "score 1": Curve([100], [0.25]),
                              "test loss": Curve([100], [0.75])}}  # fmt: skip
     assert run.loss == Curve([100, 200], [1.5, 1.25])
-    assert run.speed == Curve([200], [12.5])
 
 
 def test_a_log_of_2014() -> None:
@@ -75,7 +71,6 @@ def test_a_log_of_2014() -> None:
     )
     assert run.tests == {0: {"score 0": Curve([500], [0.5504]), "score 1": Curve([500], [1.27805])}}
     assert (run.loss, run.rate) == (Curve([500], [1.5]), Curve([500], [0.001]))
-    assert run.snapshots == [(500, "lenet_iter_500")]
 
 
 def test_a_log_without_prefixes_and_one_of_several_nodes() -> None:
@@ -137,21 +132,6 @@ def test_how_a_training_ended(line: str, state: str) -> None:
     assert reader.log.state == state
 
 
-def test_a_growing_log_gives_what_the_whole_log_gives(tmp_path: Path) -> None:
-    data, path = CAFFES.read_bytes(), tmp_path / "train.log"
-    path.write_bytes(b"")
-    follower = Follower(path, str(CAFFES))
-    for start in range(0, len(data), 997):
-        with path.open("ab") as file:
-            file.write(data[start : start + 997])
-        assert follower.poll()
-    assert not follower.poll()
-    assert follower.log == read_log(CAFFES)
-    path.write_bytes(b"I0101 00:00:00.000000 1 solver.cpp:239] Iteration 7, loss = 1\n")
-    follower.poll()
-    assert follower.log.loss == Curve([7], [1])
-
-
 @pytest.mark.parametrize(("data", "what"), [(b"\xff\x00 no log", "holds no iteration"), (None, "cannot be read")])
 def test_what_is_no_log_is_refused(tmp_path: Path, data: bytes | None, what: str) -> None:
     path = tmp_path / "x.log"
@@ -198,13 +178,9 @@ def test_numbers_that_no_training_has_are_not_read(digits: int) -> None:
         f"Iteration {long}, Testing net (#{long})",
         f"Test net output #{long}: accuracy = 0.5",
         "Iteration 20, loss = 1e308",
-        f"Snapshotting to x_iter_{long}.caffemodel",
     )
-    run.settings["max_iter"] = long
     assert (run.loss.iterations, run.loss.values) == ([10, 20], [1, float("inf")])
-    assert (len(run.rate), run.tests, run.snapshots, run.max_iter) == (0, {}, [], None)
-    run.settings["max_iter"] = "\u00b2"
-    assert run.max_iter is None
+    assert (len(run.rate), run.tests) == (0, {})
 
 
 def test_a_log_may_come_through_a_pipe(tmp_path: Path) -> None:
