@@ -21,6 +21,7 @@ from lmdb_build.views import cut_view
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.places.datasets import DataSet, load_folder, load_sequence
 from loopclosure.places.frames import Selection, image_paths, read_bgr
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.truth import Exclusion, sequence_truth, traverse_truth
 from netspec.files.opencv import cv2
@@ -142,10 +143,8 @@ def _of_walk(seed: int, size: tuple[int, int], work: Path) -> Iterator[Drive]:
     first = read_sequence(walked(work, seed, size), "tum")
     yield Drive(name, f"laps{end}", load_sequence(first, exclusion=Exclusion(seconds=10.0)))
     for season in SEASONS:
-        images = in_season(list(first.images), work / f"{name}_{size[0]}", season)
-        yield Drive(
-            name, f"season {season}{end}", load_sequence(replace(first, images=tuple(images)), references=first)
-        )
+        images = in_season(list(first.paths), work / f"{name}_{size[0]}", season)
+        yield Drive(name, f"season {season}{end}", load_sequence(replace(first, paths=tuple(images)), references=first))
 
 
 def walked(work: Path, seed: int, size: tuple[int, int], frames: int = 300, laps: int = 2) -> Path:
@@ -162,13 +161,15 @@ def _traverses(queries: list[Path], there: np.ndarray, references: list[Path], h
     apart = np.abs(np.subtract.outer(there, here))
     step = np.median(np.diff(here))
     truth = traverse_truth(apart <= max(NEAR, step / 2), "same place: frames of the same number")
-    return DataSet("", queries, references, truth, overlap=apart <= OVERLAP, overlap_rule=f"{OVERLAP} frames apart")
+    both = ImageSequence.of_files(queries), ImageSequence.of_files(references)
+    return DataSet("", *both, truth, overlap=apart <= OVERLAP, overlap_rule=f"{OVERLAP} frames apart")
 
 
 def _one_drive(images: list[Path], where: np.ndarray) -> DataSet:
     apart = np.abs(np.subtract.outer(where, where))
     truth = sequence_truth(apart <= NEAR, Exclusion(GAP), "same place: frames of the same number")
-    return DataSet("", images, None, truth, GAP, overlap=apart <= OVERLAP, overlap_rule=f"{OVERLAP} frames apart")
+    rule = f"{OVERLAP} frames apart"
+    return DataSet("", ImageSequence.of_files(images), None, truth, GAP, overlap=apart <= OVERLAP, overlap_rule=rule)
 
 
 def in_season(images: list[Path], folder: Path, season: int) -> list[Path]:

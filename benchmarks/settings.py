@@ -115,12 +115,12 @@ class Scored:
 def measure(drive: Drive, kept: Kept) -> Result:
     """Run ``auto`` on one drive, and look for the best setting."""
     data = drive.data
-    queries = kept.descriptors(data.query_images)
-    references = None if data.reference_images is None else kept.descriptors(data.reference_images)
+    queries = kept.descriptors(data.queries.paths)
+    references = None if data.references is None else kept.descriptors(data.references.paths)
     scores = similarity_matrix(queries, references)
     truth = data.soft_truth or data.truth
     auto = Auto(Scored(scores), exclude_frames=data.exclude_frames, pairs=kept.pairs)
-    found = auto.score(Images(data.query_images, data.reference_images), silent)
+    found = auto.score(Images(data.queries, data.references), silent)
     accepted = int(np.count_nonzero(np.isfinite(found.scores)))
     judged = Judgment.of(found.scores, truth).best
     key = kept.net, drive.kind
@@ -142,7 +142,7 @@ def measure(drive: Drive, kept: Kept) -> Result:
 
 def _best(scores: np.ndarray, drive: Drive, pairs: Pairs) -> tuple[float, str]:
     """Return the greatest recall at the precision wanted, and the setting that has it."""
-    data, two = drive.data, drive.data.reference_images is not None
+    data, two = drive.data, drive.data.references is not None
     truth = data.soft_truth or data.truth
     if not truth.positives:
         return 0.0, "nothing to find"
@@ -163,7 +163,7 @@ def _best(scores: np.ndarray, drive: Drive, pairs: Pairs) -> tuple[float, str]:
         verified = np.full(scores.shape, np.nan)
         for query, reference in enumerate(known.argmax(axis=1)):
             if np.isfinite(known[query, reference]) and check.enough(
-                pairs.agreement(check, data.query_images[query], data.references[reference])
+                pairs.agreement(check, data.queries.paths[query], data.database.paths[reference])
             ):
                 verified[query, reference] = known[query, reference]
         recalls[f"{name}, verified"] = _recall(verified, truth)

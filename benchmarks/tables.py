@@ -88,9 +88,9 @@ def measure(
     for name in sets or SETS:
         held = data_set(name, data, work)
         kept = Kept(work / "kept" / f"{name}.pickle")
-        images = [*held.query_images, *(held.reference_images or [])]
+        images = [*held.queries.paths, *(() if held.references is None else held.references.paths)]
         np.savez(work / f"{name}.npz", features=kept.descriptors(images), names=[str(image) for image in images])
-        context = MethodContext(held.exclude_frames, stamps=held.stamps, pairs=kept.pairs)
+        context = MethodContext(held.exclude_frames, pairs=kept.pairs)
         for label in methods or METHODS:
             if name in PAIRS and (label not in TABLES["accuracy"] or "SeqSLAM" in label):
                 continue

@@ -140,7 +140,7 @@ class Evaluation:
     @property
     def image_count(self) -> int:
         """Return the number of images a method has to describe."""
-        return len(self.data.query_images) + len(self.data.reference_images or [])
+        return len(self.data.queries) + len(self.data.references or ())
 
 
 def named_method(text: str, context: MethodContext) -> tuple[str, Method]:
@@ -172,7 +172,7 @@ def judge(
     name: str, method: Method, data: DataSet, train_images: Sequence[Path] = (), progress: Progress = silent
 ) -> Outcome:
     """Run one method and judge its scores."""
-    result = method.score(Images(data.query_images, data.reference_images, list(train_images)), progress)
+    result = method.score(Images(data.queries, data.references, list(train_images)), progress)
     rule = Judgment.of(result.scores, data.truth)
     soft_truth = data.soft_truth
     silent_pairs = int(np.count_nonzero(np.isnan(result.scores) & data.truth.judged))

@@ -23,7 +23,7 @@ from lmdb_build.pairs.list_file import join_lists, root_of, write_contact_sheet
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_posed
+from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_sequence
 from loopclosure.places.source import (
     LAYOUTS,
     POSE_FORM_HELP,
@@ -179,11 +179,14 @@ def _sequences(arguments: argparse.Namespace) -> list[tuple[str, Path, PoseChoic
 def _pose_source(
     arguments: argparse.Namespace, named: list[tuple[str, Path, PoseChoice | None]], root: Path
 ) -> PoseSource:
-    sequences = [read_posed(folder, layout, arguments.max_difference, poses) for layout, folder, poses in named]
-    for (_, folder, _), sequence in zip(named, sequences, strict=True):
-        print(f"{folder}: {len(sequence)} images with a pose, {sequence.dropped} without one left out")
+    sequences = []
+    for layout, folder, poses in named:
+        every = read_sequence(folder, layout, arguments.max_difference, poses)
+        sequence = every.with_poses()
+        print(f"{folder}: {len(sequence)} images with a pose, {len(every) - len(sequence)} without one left out")
         for doubt in sequence.doubts:
             warn(doubt)
+        sequences.append(sequence)
     rule = PoseRule(
         max_distance_m=arguments.max_distance,
         max_angle_deg=arguments.max_angle,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, Indices, PairSource
 from loopclosure.errors import InputError
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.same_place import (
     MAX_ANGLE_DEG,
     MAX_DISTANCE_M,
@@ -18,7 +19,7 @@ from loopclosure.places.same_place import (
     same_place,
     view_angles_deg,
 )
-from loopclosure.places.trajectory import PosedSequence, Poses
+from loopclosure.places.trajectory import Poses
 
 # How the images of two sequences relate.
 SAME_SEQUENCE, ONE_FRAME, ONE_SCENE, OTHER_SCENE = range(4)
@@ -82,26 +83,30 @@ class PoseSource(PairSource):
 
     def __init__(
         self,
-        sequences: Sequence[PosedSequence],
+        sequences: Sequence[ImageSequence],
         folders: Sequence[str],
         rule: PoseRule = PoseRule(),
         scenes: Scenes = Scenes(),
     ) -> None:
-        """Take the frames of all sequences; ``folders`` are the sequences' folders, relative to the list's root."""
+        """Take the frames of all sequences.
+
+        sequences  frames that have a pose; those without a time have their numbers for stamps
+        folders    the sequences' folders, relative to the list's root
+        """
         self.group_names = [sequence.name for sequence in sequences]
         for name in self.group_names:
             if self.group_names.count(name) > 1:
                 raise InputError(f'two sequences have the name "{name}"; rename one of the folders')
         self.names = [
-            f"{folder}/{frame.path}" if folder not in ("", ".") else frame.path
+            f"{folder}/{name}" if folder not in ("", ".") else name
             for folder, sequence in zip(folders, sequences, strict=True)
-            for frame in sequence.frames
+            for name in sequence.names
         ]
         self.groups = self.tracks = np.repeat(np.arange(len(sequences)), [len(sequence) for sequence in sequences])
-        self.stamps = np.concatenate([sequence.stamps for sequence in sequences])
+        self.stamps = np.concatenate([_times(sequence) for sequence in sequences])
+        poses = [sequence.known_poses() for sequence in sequences]
         self.poses = Poses(
-            np.concatenate([sequence.positions for sequence in sequences]),
-            np.concatenate([sequence.quaternions for sequence in sequences]),
+            np.concatenate([each.positions for each in poses]), np.concatenate([each.quaternions for each in poses])
         )
         self.rule, self.scenes = rule, scenes
         self._relations = scenes.relations(self.group_names)
@@ -188,3 +193,9 @@ class PoseSource(PairSource):
                 "rule and show nearly the same: --clear-view-angle or --clear-distance leaves such pairs out"
             )
         return found
+
+
+def _times(sequence: ImageSequence) -> NDArray[np.float64]:
+    if sequence.stamps is not None:
+        return sequence.stamps
+    return np.arange(len(sequence), dtype=np.float64) if sequence.numbers is None else sequence.numbers.astype(float)

@@ -23,7 +23,7 @@ from lmdb_build.walk.house import HEIGHT_M, House, build_house
 from lmdb_build.walk.render import Camera, Light, Renderer
 from lmdb_build.walk.textures import Image
 from loopclosure.errors import InputError
-from loopclosure.places.trajectory import Frame, Poses, Trajectory, write_rgb_list, write_trajectory
+from loopclosure.places.trajectory import Poses, Trajectory, write_rgb_list, write_trajectory
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import write_whole
 
@@ -90,15 +90,16 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     per_image = max(POSES_PER_IMAGE, math.ceil(step_s / POSE_STEP_S))
     pose_times = step_s * (np.arange(-per_image, (walk.frames + 1) * per_image) + 0.3) / per_image
     poses = carrier.poses(pose_times)
-    frames = [Frame(walk.start_s + time, f"rgb/{walk.start_s + time:.6f}.jpg") for time in times]
-    depths = [Frame(frame.stamp, f"depth/{frame.stamp:.6f}.png") for frame in frames] if walk.depth else []
+    stamps = [walk.start_s + time for time in times]
+    frames = [(stamp, f"rgb/{stamp:.6f}.jpg") for stamp in stamps]
+    depths = [(stamp, f"depth/{stamp:.6f}.png") for stamp in stamps] if walk.depth else []
     if depths:
         (folder / "depth").mkdir(exist_ok=True)
     for number, (picture, depth) in enumerate(_pictures(house, walk, carrier, times)):
-        path = folder / frames[number].path
+        path = folder / frames[number][1]
         write_jpeg(path, picture)
         if depths:
-            write_depth(folder / depths[number].path, depth)
+            write_depth(folder / depths[number][1], depth)
         yield path
     camera = walk.camera
     calibration = f"# fx fy cx cy width height\n{camera.focal:g} {camera.focal:g} "

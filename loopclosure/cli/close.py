@@ -15,8 +15,8 @@ from loopclosure.closing.measure import measure, read_loops
 from loopclosure.errors import InputError
 from loopclosure.places import intrinsics
 from loopclosure.places.frames import read_bgr
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.pose_files import pose_form, read_poses
-from loopclosure.places.sequences import ImageSequence
 from loopclosure.places.source import FRAMES, POSES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, write_closed_paths
 from netspec.terminal.commands import WrongUsage, seed
@@ -58,7 +58,7 @@ def _close(a: argparse.Namespace) -> None:
     draw_paths(out / "paths.png", closed)
     if a.rerun:
         stamps = frames.stamps
-        images = ((i, None if stamps is None else stamps[i], read_bgr(p)) for i, p in enumerate(frames.images))
+        images = ((i, None if stamps is None else stamps[i], read_bgr(p)) for i, p in enumerate(frames.paths))
         write_closed_paths(Path(a.rerun), closed, images)
     print("\n".join(summary(closed)))
     print(f"{out / 'closed.g2o'}, {out / 'closed.txt'}, {out / 'paths.png'}")

@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from loopclosure.detector.run import Recording, open_recording
 from loopclosure.errors import InputError
 from loopclosure.places import datasets
 from loopclosure.places.bags import is_bag
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.masks import CAMERAS
 from loopclosure.places.overlap import FOV_DEG, ViewOverlap
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.sequences import ImageSequence, benchmark_parts, layout_of, read_sequence
+from loopclosure.places.sequences import benchmark_parts, layout_of, read_sequence
 from loopclosure.places.source import (
     FRAMES,
     LAYOUTS,
@@ -173,14 +173,14 @@ def _layout(source: Source, path: Path) -> str:
     return layout_of(path, "images" if "poses" in source.settings else "tum")
 
 
-def warn_of_unreadable(recording: Recording) -> Recording:
+def warn_of_unreadable(recording: ImageSequence) -> ImageSequence:
     """Name the images that could not be read; return the recording without them."""
     if unreadable := recording.left_out():
         warn(unreadable)
     return recording.readable()
 
 
-def recording_of(text: str, frames: Path) -> Recording:
+def recording_of(text: str, frames: Path) -> ImageSequence:
     """Open the frames of a source for the detector; those of a bag go to a folder ``frames``."""
     source = typed(text, {"": (*FRAMES, *TOPICS)})
     path, (topic, pose_topic) = source.path, (source.get(name, str) or "" for name in TOPICS)
@@ -189,7 +189,7 @@ def recording_of(text: str, frames: Path) -> Recording:
         print(summary)
     elif topic or pose_topic:
         raise WrongUsage(f"{source}: topics belong to bags")
-    recording = open_recording(path, source.selection())
+    recording = read_sequence(path).taken(source.selection())
     for doubt in recording.doubts:
         warn(doubt)
     return recording

@@ -25,6 +25,7 @@ from loopclosure.methods.auto import PRECISION
 from loopclosure.methods.drive import last_session, whole_drive
 from loopclosure.methods.features import WhitenBy
 from loopclosure.places.frames import live_frames
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.source import FRAMES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
@@ -114,12 +115,12 @@ def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResu
     return results, None
 
 
-def _odometry(path: str, source: str, recording: run.Recording) -> np.ndarray:
+def _odometry(path: str, source: str, recording: ImageSequence) -> np.ndarray:
     """Return the odometry (frames, 7) of the frames that are taken."""
     read = read_poses(path)
     for doubt in read.doubts:
         warn(f"{path}: {doubt}")
-    numbers = recording.numbers
+    numbers = np.arange(len(recording)) if recording.numbers is None else recording.numbers
     untimed = read.stamps is None or recording.stamps is None
     chosen = set(FRAMES) & set(typed(source, {"": (*FRAMES, *TOPICS)}).settings)
     if untimed and chosen and numbers[-1] < len(read.poses):

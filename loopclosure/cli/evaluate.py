@@ -32,7 +32,7 @@ def _evaluate(a: argparse.Namespace) -> None:
     from loopclosure.report.page import verdict, write_report
 
     data = data_set(a)
-    context = MethodContext(data.exclude_frames, a.seed, data.stamps)
+    context = MethodContext(data.exclude_frames, a.seed)
     methods = [evaluate.named_method(text, context) for text in a.method]
     train: list[Path] = []
     for source in a.train:

@@ -15,8 +15,8 @@ from loopclosure.closing.relative import LEAST_INLIERS, Relative, View, relative
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_bgr, read_depth
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import Intrinsics
-from loopclosure.places.sequences import ImageSequence
 from loopclosure.progress import Progress, silent
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import safe_cell
@@ -67,7 +67,7 @@ def measure(
 
     @lru_cache(KEPT_VIEWS)
     def view(frame: int) -> View:
-        image = read_bgr(sequence.images[frame])
+        image = read_bgr(sequence.paths[frame])
         height, width = image.shape[:2]
         depths = sequence.depths
         file, depth = None if depths is None else depths[frame], None

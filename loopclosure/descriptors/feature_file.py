@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
@@ -35,7 +36,7 @@ class Features:
     seconds_per_image: float = float("nan")
     views: int = 1
 
-    def rows_of(self, images: list[Path]) -> np.ndarray:
+    def rows_of(self, images: Sequence[Path]) -> np.ndarray:
         """Return the descriptors (len(images), D) of these images, found by name.
 
         As many trailing parts of path and name are compared as are needed to distinguish all images: ``rgb/1.png`` of
@@ -67,7 +68,7 @@ class Features:
         """Return the same images with whitened descriptors, each view by itself."""
         return replace(self, features=whitening.of_views(self.features, self.views))
 
-    def described_too(self, images: list[Path], rows: np.ndarray) -> list[Path]:
+    def described_too(self, images: Sequence[Path], rows: np.ndarray) -> list[Path]:
         """Return those of ``images``, with descriptors ``rows`` (len(images), D), that this file describes too.
 
         An image is the same if the last part of its name and its descriptor are: many data sets have a 0001.jpg. If

@@ -23,10 +23,11 @@ from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import Describe, LoopDetector, fingerprint_of, refuse_another
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.frames import Points, points_of
-from loopclosure.detector.run import NAME, Recording, run_detector, views_of
+from loopclosure.detector.run import NAME, run_detector, views_of
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.index.index import INDEXES, open_index
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.progress import Progress, silent
 from netspec.files.arrays import Rows, check_array, read_npz, regular
 from netspec.files.whole_file import only_one, whole_file, whole_folder, write_whole
@@ -149,7 +150,7 @@ class Map:
 
     def add(
         self,
-        recording: Recording,
+        recording: ImageSequence,
         describe: Describe,
         index: str = "exact",
         progress: Progress = silent,

@@ -1,4 +1,4 @@
-"""The detector on a whole recording: a folder or list of images, a TUM sequence or a video; with any descriptor."""
+"""The detector on a whole sequence of images or a video, with any descriptor."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import importlib
 import importlib.util
 import re
 import sys
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, cast
@@ -21,133 +20,42 @@ from loopclosure.detector.detector import Describe, LoopDetector
 from loopclosure.detector.export import RelativePose, relative_pose
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
-from loopclosure.places.frames import ALL_FRAMES, VIDEO_SUFFIXES, Selection, read_bgr, video_frames, video_length
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.same_place import same_place
-from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import Poses
 from loopclosure.progress import Progress, silent
 
 DESCRIBERS = "loopclosure.describers"  # the group of entry points: name -> function that makes a describer
 NAME = r"[\w-]+"  # of such an entry point
-NAMED = 10  # images that cannot be read
 OWN = ("netspec", "loopclosure", "lmdb_build")  # one distribution; a checkout of it may be the working directory
-
-
-@dataclass(frozen=True)
-class Recording:
-    """Frames in order: image files, or ``numbers`` of a video's frames.
-
-    names   (N) of the frames
-    stamps  (N,) seconds, None if not known
-    poses   (N, 7) tx ty tz qx qy qz qw, NaN or None if not known
-    doubts  sentences about poses that look wrong
-    unreadable  numbers of images that ``frames`` could not read
-    """
-
-    source: Path
-    names: list[str]
-    images: list[Path] | None
-    numbers: np.ndarray
-    stamps: np.ndarray | None = None
-    poses: np.ndarray | None = None
-    doubts: tuple[str, ...] = ()
-    unreadable: list[int] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def frames(self, wanted: Collection[int] | None = None) -> Iterator[tuple[int, np.ndarray, float | None]]:
-        """Yield the number from 0, the image (H, W, 3) uint8 BGR and the stamp of each frame, or of those ``wanted``.
-
-        An image that cannot be read is left out. Raises InputError where none can be read.
-        """
-        chosen = range(len(self)) if wanted is None else sorted(wanted)
-        if self.images is not None:
-            for i in chosen:
-                try:
-                    image = read_bgr(self.images[i])
-                except InputError:
-                    self.unreadable.append(i)
-                    if len(self.unreadable) == len(self):
-                        raise
-                    continue
-                yield i, image, None if self.stamps is None else float(self.stamps[i])
-            return
-        following_ones = iter(chosen)
-        i = next(following_ones, None)
-        following = None if i is None else int(self.numbers[i])
-        number = -1
-        for number, (seconds, image) in enumerate(video_frames(self.source) if following is not None else ()):
-            if number == following:
-                assert i is not None
-                yield i, image, seconds
-                i = next(following_ones, None)
-                following = None if i is None else int(self.numbers[i])
-                if following is None:
-                    return
-        if following is not None:
-            message = f"ends after {number + 1} frames, though frame {following} is wanted and it says that it has it"
-            raise InputError(f"{message}; write {self.source},stop={number + 1}", self.source)
-
-    def left_out(self) -> str:
-        """Say which images were left out, in a sentence; empty where all could be read."""
-        names = [self.names[i] for i in self.unreadable]
-        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-        said = f"{len(names)} of {len(self)} images cannot be read and are left out: {', '.join(names[:NAMED])}{more}"
-        return said if names else ""
-
-    def readable(self) -> Recording:
-        """Return the recording without the images that could not be read."""
-        if not self.unreadable or self.images is None:
-            return self
-        kept = [i for i in range(len(self)) if i not in set(self.unreadable)]
-        names, images = [self.names[i] for i in kept], [self.images[i] for i in kept]
-        stamps, poses = (None if of is None else of[kept] for of in (self.stamps, self.poses))
-        return Recording(self.source, names, images, self.numbers[kept], stamps, poses, self.doubts)
-
-
-def open_recording(source: str | Path, selection: Selection = ALL_FRAMES) -> Recording:
-    """Open a folder or list of images, a sequence (TUM RGB-D, EuRoC, KITTI; with its poses) or a video file."""
-    source = Path(source)
-    if source.suffix.lower() in VIDEO_SUFFIXES:
-        if not source.is_file():
-            raise InputError("no such video", source)
-        count = video_length(source)
-        if count is None:
-            raise InputError("does not say how many frames it has; save its frames as images", source)
-        numbers = selection.numbers(count)
-        return Recording(source, [f"frame {number}" for number in numbers], None, numbers)
-    every = read_sequence(source)
-    s = every.taken(selection)
-    return Recording(source, list(s.names), list(s.images), selection.numbers(len(every)), s.stamps, s.poses, s.doubts)
 
 
 def run_detector(
     detector: LoopDetector | Visitor,
-    recording: Recording,
+    sequence: ImageSequence,
     features: Features | None = None,
     progress: Progress = silent,
 ) -> list[LoopResult]:
-    """Add every frame of a recording; ``features``, with a descriptor of each image, replace ``describe``.
+    """Add every frame of a sequence; ``features``, with a descriptor of each image, replace ``describe``.
 
-    Images that cannot be read are left out: the frames are then those of ``recording.readable()``.
+    Images that cannot be read are left out: the frames are then those of ``sequence.readable()``.
     """
     rows = None
     if features is not None:
-        if recording.images is None:
+        if not sequence.paths:
             raise InputError("the frames of a video have no names to find features by; use --describe", features.path)
-        rows = features.rows_of(recording.images)
+        rows = features.rows_of(sequence.paths)
     results = []
     if rows is not None and detector.check is None:
         for i, row in enumerate(progress(rows, "frames", len(rows))):
-            stamp = None if recording.stamps is None else float(recording.stamps[i])
-            results.append(detector.add_descriptor(row, stamp, _pose(recording, i)))
+            stamp = None if sequence.stamps is None else float(sequence.stamps[i])
+            results.append(detector.add_descriptor(row, stamp, _pose(sequence, i)))
         return results
-    for i, image, stamp in progress(recording.frames(), "frames", len(recording)):
+    for i, image, stamp in progress(sequence.frames(), "frames", len(sequence)):
         if rows is None:
-            results.append(detector.add(image, stamp, _pose(recording, i)))
+            results.append(detector.add(image, stamp, _pose(sequence, i)))
         else:
-            results.append(detector.add_descriptor(rows[i], stamp, _pose(recording, i), image))
+            results.append(detector.add_descriptor(rows[i], stamp, _pose(sequence, i), image))
     return results
 
 
@@ -280,7 +188,7 @@ def _value(text: str) -> int | float | str:
     return text
 
 
-def _pose(recording: Recording, i: int) -> np.ndarray | None:
-    if recording.poses is None or np.isnan(recording.poses[i, 0]):
+def _pose(sequence: ImageSequence, i: int) -> np.ndarray | None:
+    if sequence.poses is None or np.isnan(sequence.poses[i]).any():
         return None
-    return recording.poses[i]
+    return sequence.poses[i]

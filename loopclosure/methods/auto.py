@@ -149,7 +149,6 @@ class Auto:
     odometry        file of poses of the frames of one sequence; empty: none
     exclude_frames  in one sequence, references within this many frames of the query are not candidates
     visit           how many frames a visit to a place lasts; -1: found out, for each place
-    stamps          (Q,) seconds, None if not known
     """
 
     inner: Method
@@ -158,7 +157,6 @@ class Auto:
     odometry: str = ""
     exclude_frames: int = 0
     visit: int = -1
-    stamps: np.ndarray | None = None
     pairs: Pairs = field(default_factory=lambda: Pairs(read_gray))
 
     @property
@@ -171,16 +169,16 @@ class Auto:
         found = self.inner.score(images, progress)
         seconds = dict(found.seconds)
         two = images.references is not None
-        references = images.queries if images.references is None else images.references
         allowed, far = np.isfinite(found.scores), None
         if self.odometry:
             if two:
                 raise InputError("odometry is that of one sequence; these are queries and references", self.odometry)
-            far = far_apart(read_poses(self.odometry).of_images(len(images.queries), self.stamps, self.odometry))
+            queries = images.queries
+            far = far_apart(read_poses(self.odometry).of_images(len(queries), queries.stamps, self.odometry))
         if not two:
             allowed &= earlier(len(images.queries), self.exclude_frames)
 
-        agree = Between(self.check, self.pairs, images.queries, references)
+        agree = Between(self.check, self.pairs, images.queries.paths, images.database.paths)
         visit = None if self.visit < 0 else self.visit
         with timed(seconds, "choice and verification"):
             decided = answer(found.scores, allowed, two, self.precision, self.check, agree, progress, far, visit=visit)
@@ -195,7 +193,7 @@ def auto(argument: str, context: MethodContext, inner: Method | None) -> Auto:
     """Build ``auto[:setting=value,...]+METHOD``."""
     if inner is None:
         raise InputError("auto needs a method whose scores it judges; write auto+METHOD, as in auto+features:F.npz")
-    plain = Auto(inner, exclude_frames=context.exclude_frames, stamps=context.stamps, pairs=context.pairs)
+    plain = Auto(inner, exclude_frames=context.exclude_frames, pairs=context.pairs)
     method, check = configure("auto", argument, plain, plain.check)
     method.check = check
     return method

@@ -17,6 +17,7 @@ from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.verification import Pairs
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_gray
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.progress import Progress, timed
 
 BLOCK = 512  # rows of a matrix of scores that are looked at together: memory is that of the scores, and little more
@@ -26,20 +27,33 @@ BLOCK = 512  # rows of a matrix of scores that are looked at together: memory is
 class Images:
     """The images that a method is given.
 
-    queries     Q paths
-    references  R paths; None for one sequence that visits its own places again: the queries are the references, and
-                frame i may match the frames before it
+    queries     Q image files
+    references  R image files; None for one sequence that visits its own places again: the queries are the references,
+                and frame i may match the frames before it
     train       for vocabularies and the like; may be empty: a method that needs them raises InputError
     """
 
-    queries: list[Path]
-    references: list[Path] | None = None
+    queries: ImageSequence
+    references: ImageSequence | None = None
     train: list[Path] = field(default_factory=list)
+
+    @classmethod
+    def of_files(
+        cls, queries: Sequence[Path], references: Sequence[Path] | None = None, train: Sequence[Path] = ()
+    ) -> Images:
+        """Return image files of which nothing else is known."""
+        others = None if references is None else ImageSequence.of_files(references)
+        return cls(ImageSequence.of_files(queries), others, list(train))
+
+    @property
+    def database(self) -> ImageSequence:
+        """The images that are searched: the references, or the queries themselves in one sequence."""
+        return self.queries if self.references is None else self.references
 
     @property
     def tested(self) -> list[Path]:
         """The queries, then the references if they are other images."""
-        return self.queries + (self.references or [])
+        return [*self.queries.paths, *(() if self.references is None else self.references.paths)]
 
 
 @dataclass
@@ -81,13 +95,11 @@ class MethodContext:
     exclude_frames   in one sequence, frames with |i - j| <= exclude_frames are not candidates (SeqSLAM must know this
                      before it searches)
     seed             of all random numbers
-    stamps           (Q,) seconds of the queries, None if not known
     pairs            what verification has found, for all methods of a run
     """
 
     exclude_frames: int = 0
     seed: int = 0
-    stamps: np.ndarray | None = None
     pairs: Pairs = field(default_factory=lambda: Pairs(read_gray))
 
 
@@ -96,7 +108,7 @@ def earlier(frames: int, exclude: int) -> np.ndarray:
     return np.tri(frames, frames, -1 - exclude, dtype=bool)
 
 
-def refuse_overlap(train_images: list[Path], test_images: list[Path], model: str | Path = "") -> None:
+def refuse_overlap(train_images: Sequence[Path], test_images: Sequence[Path], model: str | Path = "") -> None:
     """Raise InputError if an image is used for training and testing, which would give too good a result."""
     trained = {Path(path).resolve() for path in train_images}
     shared = [path for path in test_images if Path(path).resolve() in trained]

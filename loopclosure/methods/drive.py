@@ -12,13 +12,14 @@ from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.run import Recording, run_detector
+from loopclosure.detector.run import run_detector
 from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.auto import PRECISION, Answer, answer
 from loopclosure.methods.base import BLOCK
 from loopclosure.methods.candidates import far_apart
 from loopclosure.places.frames import gray, read_gray
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
 
@@ -29,7 +30,7 @@ MOST_PAIRS = 64_000_000  # of frames that are compared at once, in 0.8 GB
 
 def whole_drive(
     detector: LoopDetector,
-    recording: Recording,
+    recording: ImageSequence,
     features: Features | None = None,
     precision: float = PRECISION,
     progress: Progress = silent,
@@ -47,7 +48,7 @@ def whole_drive(
         odometry = np.delete(odometry, recording.unreadable, axis=0)
     recording = recording.readable()
     check, pairs = GeometricCheck(), Pairs(lambda number: _gray_image(recording, number))
-    if recording.images is None:  # frames that cannot be read later
+    if not recording.paths:  # frames that cannot be read later
         frames = progress(recording.frames(), "local features", len(recording))
         pairs = Pairs({number: check.describe(gray(image)) for number, image, _ in frames}.__getitem__)
     seconds, between = detector.settings.exclude_seconds, Between(check, pairs, (), ())
@@ -154,10 +155,9 @@ def _earlier(stamps: np.ndarray, seconds: float) -> np.ndarray:
     return allowed
 
 
-def _gray_image(recording: Recording, number: int) -> np.ndarray:
+def _gray_image(recording: ImageSequence, number: int) -> np.ndarray:
     """Return an image file as gray values; black where it cannot be read, since its features were there before."""
-    assert recording.images is not None
     try:
-        return read_gray(recording.images[number])
+        return read_gray(recording.paths[number])
     except InputError:
         return NOTHING

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,7 +29,7 @@ class WhitenBy:
     components: int = COMPONENTS
     power: float = 1.0
 
-    def learn(self, *tested: tuple[list[Path], np.ndarray]) -> Whitening:
+    def learn(self, *tested: tuple[Sequence[Path], np.ndarray]) -> Whitening:
         """Learn the whitening from all views in the file.
 
         Raises InputError if the file has an image that is ``tested``: N images, the descriptors (N, D) of their first
@@ -61,8 +62,8 @@ class FeatureMethod:
         """Score as :class:`loopclosure.methods.base.Method` says; the net's seconds are read from the file."""
         query_features = read_features(self.query_file)
         views = query_features.views
-        described = [images.queries]
-        rows = [query_features.rows_of(images.queries)]
+        described = [images.queries.paths]
+        rows = [query_features.rows_of(images.queries.paths)]
         if images.references is not None:
             same = self.reference_file == self.query_file
             reference_features = query_features if same else read_features(self.reference_file)
@@ -72,8 +73,8 @@ class FeatureMethod:
                     "give netspec extract the same --zooms",
                     self.reference_file,
                 )
-            described.append(images.references)
-            rows.append(reference_features.rows_of(images.references))
+            described.append(images.references.paths)
+            rows.append(reference_features.rows_of(images.references.paths))
         size = rows[0].shape[1] // views
         notes = [f"{f'{views} views of ' if views > 1 else ''}{size} dimensions, {self.metric}"]
         seconds: dict[str, float] = {}

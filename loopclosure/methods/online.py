@@ -15,7 +15,7 @@ import numpy as np
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.detector.decision import DetectorSettings
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.run import Recording, run_detector, verdicts_said
+from loopclosure.detector.run import run_detector, verdicts_said
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult
@@ -57,11 +57,8 @@ class OnlineMethod:
         seconds: dict[str, float] = {}
         if np.isfinite(described.seconds_per_image):
             seconds["features"] = described.seconds_per_image * len(images.queries)
-        recording = Recording(
-            self.features, [p.name for p in images.queries], images.queries, np.arange(len(images.queries))
-        )
         with timed(seconds, "detection"):
-            results = run_detector(detector, recording, described, progress)
+            results = run_detector(detector, images.queries, described, progress)
         scores = np.full((len(results), len(results)), np.nan)
         for result in results:
             if result.accepted is not None:

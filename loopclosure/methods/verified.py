@@ -95,13 +95,13 @@ class Verified:
         for path in progress(images.tested, "local features", len(images.tested)):
             with timed(seconds, "local features"):
                 self.pairs.features(self.check, path)
-        references = images.queries if images.references is None else images.references
+        queries, references = images.queries.paths, images.database.paths
         inliers = np.full(candidates.shape, -1, np.int64)
         for query in progress(range(len(candidates)), "verification", len(candidates)):
             with timed(seconds, "verification"):
                 best = np.argsort(-candidates[query], kind="stable")[: self.k]
                 for reference in best[~np.isneginf(candidates[query, best])]:
-                    found = self.pairs.agreement(self.check, images.queries[query], references[reference])
+                    found = self.pairs.agreement(self.check, queries[query], references[reference])
                     inliers[query, reference] = self.check.sure(found)
         return inliers
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from loopclosure.errors import InputError
 from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_bgr
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.masks import (
     comparable,
     images_of_places,
@@ -20,9 +21,8 @@ from loopclosure.places.masks import (
     read_place_pairs,
     read_truth_matrix,
 )
-from loopclosure.places.overlap import ViewOverlap, Views, overlap_matrix, views
+from loopclosure.places.overlap import ViewOverlap, overlap_matrix, views
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
-from loopclosure.places.sequences import ImageSequence, posed
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import write_whole
@@ -39,34 +39,34 @@ COMMON_NAMES = ("images", "image", "rgb", "samples", "query", "ref", "reference"
 class DataSet:
     """Frames and their truth.
 
-    query_images         Q paths
-    reference_images     R paths, or None for one sequence that visits its own places again
-    truth                (Q, R)
-    exclude_frames       least number of frames that covers all excluded pairs (SeqSLAM needs frames, not seconds)
-    stamps               (Q,) seconds, if known
-    positions            (Q, 3) meters or (Q, 2), if known: for the map
-    quaternions          (Q, 4) xyzw, if known
-    overlap              (Q, R) bool: views that overlap as far as poses and depth tell; None without poses
-    overlap_rule         text: when they overlap
-    notes                what a reader of the results should know: what was left out, what looks odd
+    queries         Q frames
+    references      R frames, or None for one sequence that visits its own places again
+    truth           (Q, R)
+    exclude_frames  least number of frames that covers all excluded pairs (SeqSLAM needs frames, not seconds)
+    overlap         (Q, R) bool: views that overlap as far as poses and depth tell; None without poses
+    overlap_rule    text: when they overlap
+    notes           what a reader of the results should know: what was left out, what looks odd
     """
 
     name: str
-    query_images: list[Path]
-    reference_images: list[Path] | None
+    queries: ImageSequence
+    references: ImageSequence | None
     truth: Truth
     exclude_frames: int = 0
-    stamps: np.ndarray | None = None
-    positions: np.ndarray | None = None
-    quaternions: np.ndarray | None = None
     overlap: np.ndarray | None = None
     overlap_rule: str = ""
     notes: list[str] = field(default_factory=list)
 
     @property
-    def references(self) -> list[Path]:
-        """Return the reference images: the queries themselves in one sequence."""
-        return self.query_images if self.reference_images is None else self.reference_images
+    def database(self) -> ImageSequence:
+        """The frames that are searched: the references, or the queries themselves in one sequence."""
+        return self.queries if self.references is None else self.references
+
+    @property
+    def positions(self) -> np.ndarray | None:
+        """The positions of the queries (Q, 3) in meters, for a map; None if any of them is not known."""
+        poses = self.queries.poses
+        return None if poses is None or np.isnan(poses[:, 0]).any() else poses[:, :3]
 
     @property
     def soft_truth(self) -> Truth | None:
@@ -107,34 +107,36 @@ def load_sequence(
             raise InputError(f"soft truth ({wide_m:g} m, {wide_deg:g} degrees) is narrower than hard truth ({rule})")
         wide = (wide_m, wide_deg)
         rule += f" (soft: {wide_m:g} m, {wide_deg:g} degrees)"
-    queries = _posed_images(sequence, selection)
-    others = queries if references is None else _posed_images(references, ALL_FRAMES)
-    poses, stamps = queries.views.poses, queries.stamps
-    hard = same_place_matrix(poses, others.views.poses, hard_m, hard_deg)
-    soft = None if wide is None else same_place_matrix(poses, others.views.poses, *wide)
+    taken = sequence.taken(selection)
+    queries = taken.with_poses().with_files()
+    others = queries if references is None else references.with_poses().with_files()
+    poses, stamps = queries.known_poses(), queries.stamps
+    hard = same_place_matrix(poses, others.known_poses(), hard_m, hard_deg)
+    soft = None if wide is None else same_place_matrix(poses, others.known_poses(), *wide)
     overlap_rule = (view_overlap or ViewOverlap()).of_camera(sequence.camera)
-    height, width = read_bgr(queries.images[0]).shape[:2]
-    overlap = overlap_matrix(queries.views, others.views, overlap_rule, height / width)
-    measured = bool(queries.views.measured.any() or others.views.measured.any())
+    height, width = read_bgr(queries.paths[0]).shape[:2]
+    seen = views(poses, queries.depths or ())
+    others_seen = seen if references is None else views(others.known_poses(), others.depths or ())
+    overlap = overlap_matrix(seen, others_seen, overlap_rule, height / width)
+    measured = bool(seen.measured.any() or others_seen.measured.any())
     if references is None:
         exclusion = exclusion or (FOLDER_EXCLUSION if stamps is None else TUM_EXCLUSION)
         truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=stamps)
         frames = exclusion.frames if stamps is None else _excluded_frames(exclusion, stamps)
+        name, notes = f"{queries.name}{_selection_text(selection)}", _pose_notes(taken)
     else:
-        truth = traverse_truth(hard, rule, soft=soft)
-        frames = 0
+        truth, frames = traverse_truth(hard, rule, soft=soft), 0
+        name = f"{queries.name}{_selection_text(selection)} in {others.name}"
+        notes = [*_pose_notes(taken), *(f"{others.name}: {note}" for note in _pose_notes(references))]
     data = DataSet(
-        name=f"{queries.name}{_selection_text(selection)}{'' if references is None else f' in {others.name}'}",
-        query_images=queries.images,
-        reference_images=None if references is None else others.images,
+        name=name,
+        queries=queries,
+        references=None if references is None else others,
         truth=truth,
         exclude_frames=frames,
-        stamps=stamps,
-        positions=poses.positions,
-        quaternions=poses.quaternions,
         overlap=overlap,
         overlap_rule=overlap_rule.describe(measured),
-        notes=[*queries.notes, *(() if references is None else (f"{others.name}: {note}" for note in others.notes))],
+        notes=notes,
     )
     return _checked(data, hard)
 
@@ -143,28 +145,10 @@ def _given(value: float | None, otherwise: float) -> float:
     return otherwise if value is None else value
 
 
-@dataclass(frozen=True)
-class _PosedImages:
-    """The selected frames of a sequence that have a pose: N paths, stamps (N,) or None, views, and notes."""
-
-    name: str
-    images: list[Path]
-    stamps: np.ndarray | None
-    views: Views
-    notes: list[str]
-
-
-def _posed_images(sequence: ImageSequence, selection: Selection) -> _PosedImages:
-    sequence = sequence.taken(selection)
-    with_pose = posed(sequence)
-    images = _existing([sequence.folder / frame.path for frame in with_pose.frames])
-    assert sequence.poses is not None, "posed refuses it"
-    numbers = np.flatnonzero(np.all(np.isfinite(sequence.poses), axis=1))
-    depths = [] if sequence.depths is None else [sequence.depths[i] for i in numbers]
-    stamps = None if sequence.stamps is None else with_pose.stamps
-    notes = [f"frames without a pose, left out: {with_pose.dropped}"] if with_pose.dropped else []
-    notes += with_pose.doubts
-    return _PosedImages(sequence.name, images, stamps, views(with_pose.poses, depths), notes)
+def _pose_notes(sequence: ImageSequence) -> list[str]:
+    """Say how many frames have no pose, and what looks wrong about the poses."""
+    without = int(np.count_nonzero(~sequence.known))
+    return [*([f"frames without a pose, left out: {without}"] if without else []), *sequence.doubts]
 
 
 def load_fabmap(
@@ -199,15 +183,15 @@ def load_fabmap(
     if camera == "joined":
         if joined_folder is None:
             raise InputError("joined images are written to files; give a folder for them")
-        query_images = join_images([(images[a], images[b]) for a, b in places], Path(joined_folder))
+        paths = join_images([(images[a], images[b]) for a, b in places], Path(joined_folder))
     else:
-        query_images = [images[place[0]] for place in places]
-    positions = _fabmap_positions(folder, coordinates_file, len(images), places)
+        paths = [images[place[0]] for place in places]
+    queries = replace(ImageSequence.of_files(paths), poses=_fabmap_poses(folder, coordinates_file, len(images), places))
     rule = f"same place: as {truth_path.name} says"
     truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=judged)
     views = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")
     name = f"{folder.resolve().name}, {views}{_selection_text(selection)}"
-    data = DataSet(name, query_images, None, truth, exclusion.frames, positions=positions, notes=notes)
+    data = DataSet(name, queries, None, truth, exclusion.frames, notes=notes)
     return _checked(data, hard & judged)
 
 
@@ -222,9 +206,9 @@ def load_folder(
 
     With references, ``selection`` applies to the queries only, and no pair is excluded.
     """
-    queries = image_paths(images)
     if references is not None:
         return load_traverses(images, references, selection=selection, truth_file=truth_file)
+    queries = ImageSequence.of_files(image_paths(images))
     hard, soft = read_truth_matrix(truth_file)
     name = f"{_folder_name(images)}{_selection_text(selection)}"
     rule = f"same place: as {Path(truth_file).name} says"
@@ -234,7 +218,7 @@ def load_folder(
     taken = selection.numbers(len(queries))
     hard, soft = hard[np.ix_(taken, taken)], soft[np.ix_(taken, taken)]
     truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=None)
-    data = DataSet(name, [queries[i] for i in taken], None, truth, exclusion.frames, notes=notes)
+    data = DataSet(name, queries.at(taken), None, truth, exclusion.frames, notes=notes)
     return _checked(data, hard)
 
 
@@ -253,7 +237,8 @@ def load_traverses(
     ``soft_tolerance`` is the wider one of soft truth. With a file (a mask, or the lists of VPR benchmarks: see
     :func:`loopclosure.places.masks.read_matches`), ``selection`` takes queries.
     """
-    query_images, reference_images = image_paths(queries), image_paths(references)
+    query_images = ImageSequence.of_files(image_paths(queries))
+    reference_images = ImageSequence.of_files(image_paths(references))
     name = f"{_folder_name(queries)} in {_folder_name(references)}{_selection_text(selection)}"
     if truth_file is not None:
         if tolerance or soft_tolerance is not None:
@@ -261,7 +246,7 @@ def load_traverses(
         hard, soft = read_matches(truth_file, len(query_images), len(reference_images))
         taken = selection.numbers(len(query_images))
         truth = traverse_truth(hard[taken], f"same place: as {Path(truth_file).name} says", soft=soft[taken])
-        return _checked(DataSet(name, [query_images[i] for i in taken], reference_images, truth), truth.hard)
+        return _checked(DataSet(name, query_images.at(taken), reference_images, truth), truth.hard)
     if len(query_images) != len(reference_images):
         raise InputError(
             f"{len(query_images)} queries in {queries}, {len(reference_images)} references in {references}; "
@@ -274,7 +259,7 @@ def load_traverses(
     rule = f"same place: at most {tolerance} frames apart" if tolerance else "same place: the frame of the same number"
     soft = None if soft_tolerance is None else apart <= soft_tolerance
     truth = traverse_truth(apart <= tolerance, rule, soft=soft)
-    return DataSet(name, [query_images[i] for i in taken], [reference_images[i] for i in taken], truth)
+    return DataSet(name, query_images.at(taken), reference_images.at(taken), truth)
 
 
 def load_place_pairs(folder: str | Path, selection: Selection = ALL_FRAMES) -> DataSet:
@@ -285,7 +270,9 @@ def load_place_pairs(folder: str | Path, selection: Selection = ALL_FRAMES) -> D
     places = np.array([place for place, _, _ in rows])
     truth = traverse_truth(places[:, None] == places[None, :], "same place: the same place_id in pairs.csv")
     name = f"{folder.resolve().name}{_selection_text(selection)}"
-    return DataSet(name, [query for _, query, _ in rows], [reference for _, _, reference in rows], truth)
+    queries = ImageSequence.of_files([query for _, query, _ in rows])
+    references = ImageSequence.of_files([reference for _, _, reference in rows])
+    return DataSet(name, queries, references, truth)
 
 
 def join_images(pairs: Sequence[tuple[Path, Path]], folder: Path) -> list[Path]:
@@ -315,18 +302,19 @@ def _fold(path: Path, hard: np.ndarray, soft: np.ndarray) -> tuple[np.ndarray, n
     return np.tril(hard | hard.T, -1), np.tril(soft | soft.T, -1), notes
 
 
-def _fabmap_positions(
+def _fabmap_poses(
     folder: Path, coordinates_file: str | Path | None, images: int, places: np.ndarray
 ) -> np.ndarray | None:
+    """Return poses (N, 7) of which x and y are known, from a file of coordinates; None without one."""
     path = Path(coordinates_file) if coordinates_file else _only_file(folder, ("*Coordinates.mat", "*Coordinates.txt"))
     if path is None:
         return None
     coordinates = read_coordinates(path)
-    if len(coordinates) == images:
-        return coordinates[places[:, 0]]
-    if 2 * len(coordinates) == images:
-        return coordinates[places[:, 0] // 2]
-    raise InputError(f"has {len(coordinates)} rows, but there are {images} images", path)
+    if len(coordinates) not in (images, images / 2):
+        raise InputError(f"has {len(coordinates)} rows, but there are {images} images", path)
+    poses = np.full((len(places), 7), np.nan)
+    poses[:, : coordinates.shape[1]] = coordinates[places[:, 0] * len(coordinates) // images]
+    return poses
 
 
 def _only_file(folder: Path, patterns: Sequence[str], needed: str = "") -> Path | None:
@@ -344,13 +332,6 @@ def _folder_name(source: str | Path) -> str:
     """Return the name of a folder, with its parent if many data sets have a folder of that name."""
     path = Path(source).resolve()
     return f"{path.parent.name}/{path.name}" if path.name.lower() in COMMON_NAMES else path.name
-
-
-def _existing(images: list[Path]) -> list[Path]:
-    for path in images:
-        if not os.path.isfile(path):
-            raise InputError("no such image, though the sequence lists it", path)
-    return images
 
 
 def _excluded_frames(exclusion: Exclusion, stamps: np.ndarray) -> int:
@@ -372,7 +353,7 @@ def _selection_text(selection: Selection) -> str:
 
 def _checked(data: DataSet, hard: np.ndarray) -> DataSet:
     """Note how many loops the exclusion removes, and refuse a set with nothing left to find."""
-    if data.reference_images is None:
+    if data.references is None:
         whole = int(np.count_nonzero(np.tril(hard, -1)))
         lost = whole - data.truth.positives
         if lost:

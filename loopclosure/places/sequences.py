@@ -1,6 +1,7 @@
 """Sequences of images in the layouts that people have: TUM RGB-D, EuRoC, KITTI odometry, folders and lists.
 
-All of them become one :class:`ImageSequence`, from which evaluation, detection, closing and pairs are made.
+All of them become one :class:`~loopclosure.places.image_sequence.ImageSequence`, from which evaluation, detection,
+closing and pairs are made.
 """
 
 from __future__ import annotations
@@ -15,63 +16,18 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import Selection
-from loopclosure.places.intrinsics import Intrinsics, kitti_projection, read_intrinsics, yaml_numbers
+from loopclosure.places.frames import VIDEO_SUFFIXES, video_length
+from loopclosure.places.image_sequence import ImageSequence
+from loopclosure.places.intrinsics import kitti_projection, read_intrinsics, yaml_numbers
 from loopclosure.places.pose_files import PoseForm, matrix_fault, moved, read_poses
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Frame, PosedSequence, content_lines, number, read_rgb_list
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, content_lines, number
+from netspec.errors import SpecError
 from netspec.files.image_list import list_images
 
 QUERIES = ("query", "queries", "Query", "Queries")
 REFERENCES = ("ref", "refs", "reference", "references", "database", "Ref", "Reference", "Database")
 KITTI_CAMERAS = ("image_0", "image_2", "image_1", "image_3")
 EUROC_POSES = ("state_groundtruth_estimate0", "mocap0", "vicon0")
-
-
-@dataclass(frozen=True)
-class ImageSequence:
-    """N images in order.
-
-    images   their paths;  names  the same, relative to ``source``
-    stamps   (N,) seconds, None if not known
-    poses    (N, 7) of the camera in the world, tx ty tz qx qy qz qw, NaN where not known; None without a file of poses
-    camera   None if not known
-    depths   N files of depth in TUM's form (16 bits, 5000 per meter), None for an image without; None if there are none
-    doubts   sentences about poses that look wrong
-    """
-
-    source: Path
-    images: tuple[Path, ...]
-    names: tuple[str, ...]
-    stamps: np.ndarray | None = None
-    poses: np.ndarray | None = None
-    camera: Intrinsics | None = None
-    depths: tuple[Path | None, ...] | None = None
-    doubts: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.images)
-
-    @property
-    def name(self) -> str:
-        """The name of the source."""
-        return self.source.resolve().name
-
-    @property
-    def folder(self) -> Path:
-        """What the names are relative to."""
-        return self.source if self.source.is_dir() else self.source.parent
-
-    def taken(self, selection: Selection) -> ImageSequence:
-        """Return some of the images: a selection counts the rows of the sequence, with a pose or without."""
-        numbers = selection.numbers(len(self))
-        return replace(
-            self,
-            images=tuple(self.images[i] for i in numbers),
-            names=tuple(self.names[i] for i in numbers),
-            stamps=None if self.stamps is None else self.stamps[numbers],
-            poses=None if self.poses is None else self.poses[numbers],
-            depths=None if self.depths is None else tuple(self.depths[i] for i in numbers),
-        )
 
 
 @dataclass(frozen=True)
@@ -85,7 +41,7 @@ class PoseChoice:
 def read_sequence(
     source: str | Path, layout: str = "", max_difference: float = MAX_DIFFERENCE_S, poses: PoseChoice | None = None
 ) -> ImageSequence:
-    """Read a sequence; without a ``layout`` ("tum", "euroc", "kitti" or "images") it is found out.
+    """Read a sequence; without a ``layout`` ("tum", "euroc", "kitti", "images" or "video") it is seen from the files.
 
     Frames without a pose within ``max_difference`` seconds keep no pose. Raises InputError for files that are missing
     or broken.
@@ -100,7 +56,9 @@ def read_sequence(
 
 
 def layout_of(source: Path, otherwise: str = "images") -> str:
-    """Return the layout of a source by the folders in it; ``otherwise`` where they tell nothing."""
+    """Return the layout of a source by its name and the folders in it; ``otherwise`` where they do not show it."""
+    if source.suffix.lower() in VIDEO_SUFFIXES:
+        return "video"
     if (source / "mav0").is_dir() or (source / "cam0" / "data.csv").is_file():
         return "euroc"
     if any((source / name).is_dir() for name in KITTI_CAMERAS):
@@ -129,76 +87,57 @@ def benchmark_parts(folder: Path) -> tuple[Path, Path, Path]:
     return parts[0], parts[1], newest[0]
 
 
-def read_posed(
-    source: str | Path, layout: str = "", max_difference: float = MAX_DIFFERENCE_S, poses: PoseChoice | None = None
-) -> PosedSequence:
-    """Read a sequence with poses; frames without one are counted and left out.
-
-    Frames without a time have their numbers for stamps. Raises InputError where no frame has a pose.
-    """
-    return posed(read_sequence(source, layout, max_difference, poses))
-
-
-def posed(sequence: ImageSequence) -> PosedSequence:
-    """Return the frames of a sequence that have a pose. Raises InputError if none has."""
-    poses = sequence.poses
-    if poses is None:
-        raise InputError("has no poses; expected groundtruth.txt, or the name of a file of poses", sequence.source)
-    known = np.flatnonzero(np.all(np.isfinite(poses), axis=1))
-    if not len(known):
-        raise InputError(f"none of its {len(sequence)} images has a pose", sequence.source)
-    stamps = np.arange(len(sequence), dtype=np.float64) if sequence.stamps is None else sequence.stamps
-    return PosedSequence(
-        name=sequence.name,
-        frames=tuple(Frame(float(stamps[i]), sequence.names[i]) for i in known),
-        stamps=stamps[known],
-        positions=poses[known, :3],
-        quaternions=poses[known, 3:],
-        dropped=len(sequence) - len(known),
-        doubts=sequence.doubts,
-    )
-
-
 def _tum(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
     if not folder.is_dir():
         raise InputError("no such folder; expected a TUM RGB-D sequence with rgb.txt and groundtruth.txt", folder)
-    frames = read_rgb_list(folder / "rgb.txt")
-    stamps = np.array([frame.stamp for frame in frames])
-    names = tuple(frame.path for frame in frames)
-    sequence = ImageSequence(folder, tuple(folder / name for name in names), names, stamps)
-    return _with_tum_files(sequence, max_difference, own_poses)
+    listing = folder / "rgb.txt"
+    if not listing.is_file():
+        raise InputError("no such file; expected a TUM RGB-D sequence with rgb.txt and groundtruth.txt", listing)
+    listed = list_images(folder)
+    if listed.stamps is None:
+        raise InputError('has lines without a time stamp; expected "timestamp filename" in each line', listing)
+    sequence = ImageSequence(listed.paths, listed.names, listed.stamps, folder)
+    return _with_tum_files(sequence, listed.stamps, max_difference, own_poses)
 
 
-def _with_tum_files(sequence: ImageSequence, max_difference: float, own_poses: bool) -> ImageSequence:
-    """Add what a TUM sequence has beside its images: poses, depth, calibration."""
-    folder, stamps = sequence.source, sequence.stamps
-    assert stamps is not None
+def _with_tum_files(
+    sequence: ImageSequence, stamps: np.ndarray, max_difference: float, own_poses: bool
+) -> ImageSequence:
+    """Add what a TUM sequence has next to its images: poses, depth, calibration."""
+    folder, doubts = sequence.source, []
     if own_poses:
         path = folder / "groundtruth.txt"
         read = read_poses(path, PoseForm("tum"))
-        poses = read.of_images(len(sequence), stamps, path, max_difference)
-        sequence = replace(sequence, poses=poses, doubts=_named(read.doubts, path))
+        sequence = replace(sequence, poses=read.of_images(len(sequence), stamps, path, max_difference))
+        doubts += _named(read.doubts, path)
     if (folder / "depth.txt").is_file():
-        depths = read_rgb_list(folder / "depth.txt")
-        taken = np.array([depth.stamp for depth in depths])
-        nearest = np.abs(stamps[:, None] - taken).argmin(axis=1)
-        near = np.abs(stamps - taken[nearest]) <= max_difference
-        files = tuple(
-            folder / depths[number].path if there else None for number, there in zip(nearest, near, strict=True)
-        )
-        sequence = replace(sequence, depths=files)
+        try:
+            sequence = replace(sequence, depths=_nearest_depths(folder / "depth.txt", stamps, max_difference))
+        except SpecError as fault:
+            doubts.append(f"{fault}; depth is not used")
     if (folder / "calibration.txt").is_file():
         sequence = replace(sequence, camera=read_intrinsics(folder / "calibration.txt"))
-    return sequence
+    return replace(sequence, doubts=tuple(doubts))
+
+
+def _nearest_depths(listing: Path, stamps: np.ndarray, max_difference: float) -> tuple[Path | None, ...]:
+    """Return for each image the file of depth nearest in time; None where it is too far."""
+    depths = list_images(listing)
+    if depths.stamps is None:
+        raise InputError('has lines without a time stamp; expected "timestamp filename" in each line', listing)
+    nearest = np.abs(stamps[:, None] - depths.stamps).argmin(axis=1)
+    near = np.abs(stamps - depths.stamps[nearest]) <= max_difference
+    return tuple(depths.paths[number] if there else None for number, there in zip(nearest, near, strict=True))
 
 
 def _images(source: Path, max_difference: float, own_poses: bool) -> ImageSequence:
     listed = list_images(source)
-    sequence = ImageSequence(source, listed.paths, (), listed.stamps)
+    sequence = ImageSequence(listed.paths, (), listed.stamps, source)
     sequence = replace(sequence, names=tuple(os.path.relpath(path, sequence.folder) for path in listed.paths))
     if listed.stamps is None or not source.is_dir():
         return sequence
-    return _with_tum_files(sequence, max_difference, own_poses and (source / "groundtruth.txt").is_file())
+    own_poses = own_poses and (source / "groundtruth.txt").is_file()
+    return _with_tum_files(sequence, listed.stamps, max_difference, own_poses)
 
 
 def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
@@ -227,7 +166,7 @@ def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
         mount = np.array(yaml_numbers(sensor.read_text(encoding="utf-8-sig"), "data", 16, sensor)).reshape(4, 4)
         if fault := matrix_fault(mount[:3, :3]):
             raise InputError(f"the camera's pose in the body, T_BS: {fault}", sensor)
-    sequence = ImageSequence(folder, images, _names(images, folder), times, camera=camera)
+    sequence = ImageSequence(images, _names(images, folder), times, folder, camera=camera)
     if not own_poses:
         return sequence
     for name in EUROC_POSES:
@@ -262,7 +201,7 @@ def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
         camera = read_intrinsics(path, projection)
         matrix = kitti_projection(path.read_text(encoding="utf-8-sig"), projection, path)
         beside[:3, 3] = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
-    sequence = ImageSequence(folder, images, _names(images, folder), times, camera=camera)
+    sequence = ImageSequence(images, _names(images, folder), times, folder, camera=camera)
     if not own_poses:
         return sequence
     for path in (folder / "poses.txt", folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"):
@@ -273,11 +212,21 @@ def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
     return sequence
 
 
+def _video(source: Path, max_difference: float, own_poses: bool) -> ImageSequence:
+    if not source.is_file():
+        raise InputError("no such video", source)
+    count = video_length(source)
+    if count is None:
+        raise InputError("does not say how many frames it has; save its frames as images", source)
+    return ImageSequence.of_video(source, count)
+
+
 _READERS: dict[str, Callable[[Path, float, bool], ImageSequence]] = {
     "tum": _tum,
     "euroc": _euroc,
     "kitti": _kitti,
     "images": _images,
+    "video": _video,
 }
 
 

@@ -16,7 +16,7 @@ from loopclosure.places.frames import VIDEO_SUFFIXES, Selection, video_frames, v
 from loopclosure.places.intrinsics import write_calibration
 from loopclosure.places.pose_files import DIRECTIONS, FORMS, ORDERS, pose_form
 from loopclosure.places.sequences import PoseChoice
-from loopclosure.places.trajectory import Frame, Trajectory, write_rgb_list, write_trajectory
+from loopclosure.places.trajectory import Trajectory, write_rgb_list, write_trajectory
 from loopclosure.progress import Progress, silent
 from netspec.errors import did_you_mean
 from netspec.files.opencv import cv2
@@ -26,6 +26,7 @@ FRAMES = ("start", "stop", "stride", "limit")
 POSES = ("poses", "pose-form")
 TOPICS = ("topic", "pose-topic")
 Kinds = Mapping[str, Sequence[str]]  # the settings of each kind of source, "" for one whose kind is not named
+Listed = list[tuple[float, str]]  # the stamp in seconds and the file of each frame
 T = TypeVar("T")
 
 
@@ -133,7 +134,7 @@ def extract(
     return folder, f"{source}: {len(frames)} frames{about}: {folder}"
 
 
-def _bag(source: Path, folder: Path, topic: str, pose_topic: str, progress: Progress) -> tuple[list[Frame], str]:
+def _bag(source: Path, folder: Path, topic: str, pose_topic: str, progress: Progress) -> tuple[Listed, str]:
     with open_bag(source, topic, pose_topic) as bag:
         frames = _write_images(folder, progress(bag.images(), source.name, bag.count))
         if not frames:
@@ -152,16 +153,16 @@ def _bag(source: Path, folder: Path, topic: str, pose_topic: str, progress: Prog
     return frames, about
 
 
-def _video(source: Path, folder: Path, topic: str, pose_topic: str, progress: Progress) -> tuple[list[Frame], str]:
+def _video(source: Path, folder: Path, topic: str, pose_topic: str, progress: Progress) -> tuple[Listed, str]:
     if topic or pose_topic:
         raise InputError("is a video, which has no topics", source)
     return _write_images(folder, progress(video_frames(source), source.name, video_length(source))), ""
 
 
-def _write_images(folder: Path, images: Iterable[tuple[float, np.ndarray]]) -> list[Frame]:
+def _write_images(folder: Path, images: Iterable[tuple[float, np.ndarray]]) -> Listed:
     frames = []
     for number, (stamp, image) in enumerate(images):
-        frame = Frame(stamp, f"rgb/{number:06d}.png")
-        write_picture(folder / frame.path, image, cv2.IMWRITE_PNG_COMPRESSION, 1)
-        frames.append(frame)
+        name = f"rgb/{number:06d}.png"
+        write_picture(folder / name, image, cv2.IMWRITE_PNG_COMPRESSION, 1)
+        frames.append((stamp, name))
     return frames

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,60 +57,7 @@ class Trajectory:
         return Poses(self.positions, self.quaternions)
 
 
-@dataclass(frozen=True)
-class Frame:
-    """One image of a sequence: its time in seconds, and its path as ``rgb.txt`` has it (relative to the sequence)."""
-
-    stamp: float
-    path: str
-
-
-@dataclass(frozen=True)
-class PosedSequence:
-    """The N frames of a sequence that have a pose, in order of time.
-
-    ``stamps`` (N,) in seconds are the frames' own; ``positions`` (N, 3) in meters and ``quaternions`` (N, 4) xyzw are
-    those of the nearest pose in time. ``dropped`` counts the frames left out because no pose is near enough;
-    ``doubts`` are sentences about poses that look wrong.
-    """
-
-    name: str
-    frames: tuple[Frame, ...]
-    stamps: NDArray[np.float64]
-    positions: NDArray[np.float64]
-    quaternions: NDArray[np.float64]
-    dropped: int
-    doubts: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    @property
-    def poses(self) -> Poses:
-        """The N poses without their time."""
-        return Poses(self.positions, self.quaternions)
-
-
-Posed = Poses | Trajectory | PosedSequence
-
-
-def read_rgb_list(path: str | os.PathLike[str]) -> list[Frame]:
-    """Read ``rgb.txt``: the frames in order of time. Raises InputError (file:line:column) for a broken line."""
-    frames = []
-    expected = 'a list of images, "timestamp filename" per line (TUM RGB-D: rgb.txt)'
-    for line_number, line in content_lines(path, expected):
-        fields = list(re.finditer(r"\S+", line))
-        if len(fields) != 2:
-            raise InputError(
-                f'expected "timestamp filename", found {len(fields)} field{"s"[len(fields) == 1 :]}: "{line.strip()}"',
-                path,
-                line_number,
-                _column_of_count_fault(line, fields, 2),
-            )
-        frames.append(Frame(number(fields[0], "the timestamp in seconds", path, line_number), fields[1].group()))
-    if not frames:
-        raise InputError("lists no images", path)
-    return sorted(frames, key=lambda frame: frame.stamp)
+Posed = Poses | Trajectory
 
 
 def read_groundtruth(path: str | os.PathLike[str]) -> Trajectory:
@@ -144,10 +91,15 @@ def read_groundtruth(path: str | os.PathLike[str]) -> Trajectory:
     return Trajectory(table[:, 0].copy(), table[:, 1:4].copy(), quaternions)
 
 
-def write_rgb_list(path: str | os.PathLike[str], frames: Sequence[Frame], what: str = "color images") -> None:
-    """Write ``rgb.txt`` or ``depth.txt`` with TUM's three comment lines; stamps with microseconds."""
+def write_rgb_list(
+    path: str | os.PathLike[str], frames: Iterable[tuple[float, str]], what: str = "color images"
+) -> None:
+    """Write ``rgb.txt`` or ``depth.txt`` with TUM's three comment lines.
+
+    frames  the stamp in seconds, written with microseconds, and the file of each, relative to the list
+    """
     lines = [f"# {what}", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
-    lines += [f"{frame.stamp:.6f} {frame.path}" for frame in frames]
+    lines += [f"{stamp:.6f} {file}" for stamp, file in frames]
     write_whole(Path(path), "\n".join(lines) + "\n", "backslashreplace")
 
 

@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from loopclosure.detector.decision import LoopResult
-from loopclosure.detector.run import Recording
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.report.page import Kind, Pair, png, rendered, side_by_side, spread
 from loopclosure.report.plots import AXES, COLORS, FOUND, MISSED, STYLE
 from netspec.files.whole_file import write_whole
@@ -27,7 +27,7 @@ OF_FRAMES = (
 
 
 def write_drive(
-    path: Path, results: Sequence[LoopResult], reasons: Sequence[str], recording: Recording | None, command: str
+    path: Path, results: Sequence[LoopResult], reasons: Sequence[str], recording: ImageSequence | None, command: str
 ) -> None:
     """Write the page; ``recording`` is None where the images are gone, those of a camera."""
     loops = sum(1 for result in results if result)
@@ -94,7 +94,7 @@ def _ends(results: Sequence[LoopResult]) -> list[tuple[int, int]]:
     return [pair for pair in ends if pair[1] >= 0]
 
 
-def _kinds(results: Sequence[LoopResult], recording: Recording) -> list[Kind]:
+def _kinds(results: Sequence[LoopResult], recording: ImageSequence) -> list[Kind]:
     """Return the loops of the highest and of the lowest scores, and what is most alike of what was rejected."""
     first = results[0].query_id if results else 0
     there = [r for r in results if r.candidates and r.candidates[0][0] >= first]

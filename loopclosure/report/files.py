@@ -45,8 +45,8 @@ def summary(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
         "data_set": data.name,
         "truth_and_exclusion": truth.description,
         "soft_zone": None if soft is None else soft.description,
-        "queries": len(data.query_images),
-        "references": len(data.references),
+        "queries": len(data.queries),
+        "references": len(data.database),
         "judged_pairs": int(np.count_nonzero(truth.judged)),
         "true_pairs": truth.positives,
         "queries_with_a_loop": int(np.count_nonzero(truth.queries_with_a_loop)),
@@ -154,7 +154,7 @@ def _write_matches_csv(evaluation: Evaluation, outcome: Outcome, path: Path) -> 
         soft = "" if outcome.soft is None else verdict(outcome.soft.matches, query)
         verdicts = [verdict(matches, query), soft]
         numbers = [str(query), str(reference), f"{matches.score[query]:.9g}", *verdicts, str(int(loops[query]))]
-        images = [str(data.query_images[query]), str(data.references[reference])]
+        images = [str(data.queries.paths[query]), str(data.database.paths[reference])]
         rows.append([*numbers, *images, data.truth.description])
     write_csv(path, heads.split(","), rows, "backslashreplace")
 

@@ -20,7 +20,6 @@ from matplotlib.figure import Figure
 from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome
 from loopclosure.places.frames import read_bgr
 from loopclosure.places.same_place import angles_deg, distances_m
-from loopclosure.places.trajectory import Poses
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report import plots
 from loopclosure.report.files import EXPLANATION, SOFT_MEASURES, share, write_files
@@ -79,14 +78,14 @@ def _page(evaluation: Evaluation, pictures: dict[str, bytes], title: str, comman
     data, truth = evaluation.data, evaluation.data.truth
     judged = int(np.count_nonzero(truth.judged))
     loops = int(np.count_nonzero(truth.queries_with_a_loop))
-    frames = f"{len(data.query_images)} frames"
-    if data.reference_images is not None:
-        frames = f"{len(data.query_images)} queries, {len(data.references)} references"
+    frames = f"{len(data.queries)} frames"
+    if data.references is not None:
+        frames = f"{len(data.queries)} queries, {len(data.database)} references"
     facts = {
         "data": f"{data.name}: {frames}",
         "truth": truth.description,
         "to find": f"{truth.positives:,} true pairs of {judged:,} judged ({100 * truth.positives / judged:.2f} %); "
-        f"{loops} of {len(data.query_images)} queries have a loop",
+        f"{loops} of {len(data.queries)} queries have a loop",
         "training": evaluation.train,
     }
     if data.soft_truth is not None:
@@ -166,8 +165,8 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[Kind]:
     excused = plots.overlapping(outcome, wrong)
     lowest = np.argsort(true_scores, kind="stable")
 
-    alone = evaluation.data.reference_images is None
-    apart = max(1, len(evaluation.data.query_images) // 30) if alone else 1
+    alone = evaluation.data.references is None
+    apart = max(1, len(evaluation.data.queries) // 30) if alone else 1
 
     def pairs(queries: np.ndarray, references: np.ndarray) -> list[Pair]:
         shown = spread(queries.tolist(), PAIRS_SHOWN, apart)
@@ -196,7 +195,8 @@ def _pair(evaluation: Evaluation, outcome: Outcome, query: int, reference: int) 
     score = outcome.scores[query, reference]
     caption = f"{query} and {reference}, {f'score {score:.4g}' if np.isfinite(score) else 'no score'}"
     caption += _apart(evaluation, int(query), int(reference))
-    images = [read_bgr(path) for path in (evaluation.data.query_images[query], evaluation.data.references[reference])]
+    data = evaluation.data
+    images = read_bgr(data.queries.paths[query]), read_bgr(data.database.paths[reference])
     return Pair(side_by_side(*images), caption)
 
 
@@ -218,9 +218,10 @@ def side_by_side(*images: np.ndarray) -> bytes:
 def _apart(evaluation: Evaluation, query: int, reference: int) -> str:
     """Say how far apart two views are, and whether they overlap, where the poses are known."""
     data = evaluation.data
-    if data.positions is None or data.quaternions is None or data.overlap is None or data.reference_images is not None:
+    if data.overlap is None or data.references is not None or not data.queries.known.all():
         return ""
-    a, b = (Poses(data.positions[i], data.quaternions[i]) for i in (query, reference))
+    poses = data.queries.known_poses()
+    a, b = poses[query], poses[reference]
     seen = "views overlap" if data.overlap[query, reference] else "views do not overlap"
     return f"; {float(distances_m(a, b)):.2g} m and {float(angles_deg(a, b)):.0f} degrees apart, {seen}"
 

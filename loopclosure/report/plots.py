@@ -71,7 +71,7 @@ def matrices(evaluation: Evaluation) -> Figure:
             low, high = np.percentile(some, [1, 99.5]) if len(some) else (0.0, 1.0)
             _draw_matrix(axis, scores, matplotlib.colormaps["viridis"], float(low), float(high))
             _name_panel(axis, outcome)
-        references = "earlier frame" if evaluation.data.reference_images is None else "reference"
+        references = "earlier frame" if evaluation.data.references is None else "reference"
         for axis in axes:
             axis.set_xlabel(references)
         _label_left(axes, "frame" if references == "earlier frame" else "query")
@@ -131,7 +131,7 @@ def matches(evaluation: Evaluation) -> Figure:
 
 def has_map(evaluation: Evaluation) -> bool:
     """Return whether the loops can be drawn on a trajectory: one sequence, with positions."""
-    return evaluation.data.positions is not None and evaluation.data.reference_images is None
+    return evaluation.data.positions is not None and evaluation.data.references is None
 
 
 def maps(evaluation: Evaluation) -> Figure:

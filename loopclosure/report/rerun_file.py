@@ -1,4 +1,4 @@
-"""Recordings for the viewer of Rerun (rerun.io): images, scores, paths, and loops as lines between them."""
+"""ImageSequences for the viewer of Rerun (rerun.io): images, scores, paths, and loops as lines between them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 
 from loopclosure.closing.close import Closed
 from loopclosure.detector.decision import LoopResult
-from loopclosure.detector.run import Recording
 from loopclosure.errors import InputError
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.progress import Progress, silent
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import whole_file
@@ -35,7 +35,7 @@ class RerunFile:
 
     def __init__(self, path: Path) -> None:
         self._rr = import_module("rerun")  # optional
-        self._stream: Any = self._rr.RecordingStream("loopclosure")
+        self._stream: Any = self._rr.ImageSequenceStream("loopclosure")
         self._stream.save(str(path))
 
     def frame(self, number: int, stamp: float | None, jpeg: bytes, result: LoopResult | None = None) -> None:
@@ -89,7 +89,7 @@ def rerun_file(path: str | Path) -> Iterator[RerunFile]:
 
 
 def write_detected(
-    path: Path, recording: Recording, results: Sequence[LoopResult], progress: Progress = silent
+    path: Path, recording: ImageSequence, results: Sequence[LoopResult], progress: Progress = silent
 ) -> None:
     """Write the frames of a recording, what became of each, and, where poses are known, the path and its loops."""
     matched: dict[int | None, bytes] = {}

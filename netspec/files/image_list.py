@@ -28,6 +28,9 @@ class ImageList:
     names: tuple[str, ...]
     stamps: np.ndarray | None = None
 
+    def __len__(self) -> int:
+        return len(self.names)
+
 
 def list_images(source: str | Path) -> ImageList:
     """Return the images of a folder or of a list. Raises SpecError if it has no images."""

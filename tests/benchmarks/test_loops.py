@@ -19,14 +19,14 @@ def test_a_route_in_another_season_has_the_same_places(tmp_path: Path) -> None:
             cv2.imwrite(str(tmp_path / "sequences" / name / f"{i:06d}.jpg"), picture)
     (tmp_path / "sequences" / "index.csv").write_text("name,has_revisits\na,no\nb,no\nc,yes\n")
     made = {drive.kind: drive.data for drive in drives.drives(tmp_path, tmp_path / "work", ["a"])}
-    assert len(made["season 2"].query_images) == 40
+    assert len(made["season 2"].queries.paths) == 40
     assert made["season 2"].truth.hard.sum(axis=1).tolist() == [2, *[3] * 38, 2]
-    assert len(made["keyframes"].reference_images or []) == 10
+    assert len(made["keyframes"].references or []) == 10
     assert made["in part"].truth.queries_with_a_loop.tolist() == [False] * 20 + [True] * 20
     assert made["comes back"].truth.queries_with_a_loop.sum() == 20
     assert made["shares nothing"].truth.positives == 0
-    again = drives.in_season(made["season 2"].references, tmp_path / "other", 2)
-    assert Path(again[5]).read_bytes() == Path(made["season 2"].query_images[5]).read_bytes()
+    again = drives.in_season(list(made["season 2"].database.paths), tmp_path / "other", 2)
+    assert Path(again[5]).read_bytes() == Path(made["season 2"].queries.paths[5]).read_bytes()
 
 
 def test_what_auto_should_reach() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from loopclosure.places.bags import open_bag
 from loopclosure.places.masks import read_matches
 from loopclosure.places.pose_files import moved, read_poses
-from loopclosure.places.sequences import posed, read_sequence
+from loopclosure.places.sequences import read_sequence
 from places_bags import Bag
 from places_layouts import MOUNT, euroc_rows, kitti_rows, path, tum_rows, write_pictures
 
@@ -43,7 +43,7 @@ def kitti(folder: Path) -> None:
 
 
 def read_folder(folder: Path) -> None:
-    posed(read_sequence(folder))
+    read_sequence(folder).with_poses()
 
 
 def bag(file: Path) -> None:

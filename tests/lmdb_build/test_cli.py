@@ -124,7 +124,8 @@ def test_a_fault_of_the_users_is_one_line_and_status_1(
 
 
 def test_a_broken_line_of_groundtruth_is_named(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "s").mkdir()
+    (tmp_path / "s/rgb").mkdir(parents=True)
+    (tmp_path / "s/rgb/1.png").touch()
     (tmp_path / "s/rgb.txt").write_text("1.0 rgb/1.png\n")
     (tmp_path / "s/groundtruth.txt").write_text("# head\n1.0 0 0 0 0 0 0 one\n")
     assert main(["pairs", str(tmp_path / "s"), "--out", str(tmp_path)]) == 1

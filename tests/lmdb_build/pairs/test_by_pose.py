@@ -1,5 +1,7 @@
 """Pairs by pose: scenes, frames of reference, where negatives come from, and what is warned about."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,16 +9,16 @@ from scipy.spatial.transform import Rotation
 from lmdb_build.pairs.by_pose import PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE
 from loopclosure.errors import InputError
-from loopclosure.places.trajectory import Frame, PosedSequence
+from loopclosure.places.image_sequence import ImageSequence
 
 
-def sequence(name: str, views: list[tuple[float, float, float]]) -> PosedSequence:
+def sequence(name: str, views: list[tuple[float, float, float]]) -> ImageSequence:
     """Frames at (second, x in meters, heading in degrees)."""
     stamps, x, heading = np.array(views, float).T
     quaternions = Rotation.from_euler("y", heading[:, None], degrees=True).as_quat()
     positions = np.column_stack([x, np.zeros((len(x), 2))])
-    frames = tuple(Frame(stamp, f"rgb/{stamp:g}.png") for stamp in stamps)
-    return PosedSequence(name, frames, stamps, positions, quaternions, 0)
+    names = tuple(f"rgb/{stamp:g}.png" for stamp in stamps)
+    return ImageSequence((), names, stamps, Path(name), poses=np.hstack([positions, quaternions]))
 
 
 # Index: 0 and 1 are neighbors in time and place, 2 a revisit of 0, 3 turned by 20 degrees, 4 by 90, 5 far away.

@@ -12,19 +12,20 @@ from lmdb_build.pairs.by_pose import PoseRule, PoseSource
 from lmdb_build.pairs.choose import NEGATIVE, POSITIVE, choose_pairs, find_pairs, split_by_group, split_by_time
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.errors import InputError
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.same_place import same_place
-from loopclosure.places.trajectory import Frame, PosedSequence, Poses
+from loopclosure.places.trajectory import Poses
 
 
-def wander(name: str, count: int, seed: int, start_s: float = 0.0) -> PosedSequence:
+def wander(name: str, count: int, seed: int, start_s: float = 0.0) -> ImageSequence:
     """A camera that turns and strays about, back to where it was now and then."""
     rng = np.random.default_rng(seed)
     stamps = start_s + np.arange(count) / 10
     yaw = np.cumsum(rng.normal(0, 0.12, count))
     positions = np.cumsum(rng.normal(0, 0.15, (count, 3)), axis=0)
     quaternions = np.column_stack([np.zeros((count, 2)), np.sin(yaw / 2), np.cos(yaw / 2)])
-    frames = tuple(Frame(float(stamp), f"rgb/{stamp:.6f}.png") for stamp in stamps)
-    return PosedSequence(name, frames, stamps, positions, quaternions, 0)
+    names = tuple(f"rgb/{stamp:.6f}.png" for stamp in stamps)
+    return ImageSequence((), names, stamps, Path(name), poses=np.hstack([positions, quaternions]))
 
 
 def pose_source(lengths: tuple[int, ...] = (120, 90, 110), rule: PoseRule | None = None) -> PoseSource:

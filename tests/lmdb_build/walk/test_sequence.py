@@ -13,9 +13,10 @@ from lmdb_build.walk.render import Camera, Light, Renderer
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_depth
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.same_place import same_place_matrix
-from loopclosure.places.sequences import read_posed, read_sequence
-from loopclosure.places.trajectory import PosedSequence, read_groundtruth
+from loopclosure.places.sequences import read_sequence
+from loopclosure.places.trajectory import read_groundtruth
 
 pytestmark = pytest.mark.slow
 
@@ -31,8 +32,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def sequence(folder: Path) -> PosedSequence:
-    return read_posed(folder, "tum")
+def sequence(folder: Path) -> ImageSequence:
+    return read_sequence(folder, "tum").with_poses()
 
 
 def plain_light(rooms: int = 1) -> Light:
@@ -49,19 +50,20 @@ def facing_quad(distance: float, size: float, texture: np.ndarray) -> Quad:
     return Quad(origin, np.array([size, 0, 0.0]), np.array([0, size, 0.0]), texture, 0)
 
 
-def test_it_has_the_layout_of_tum_and_every_frame_a_pose(folder: Path, sequence: PosedSequence) -> None:
-    assert (len(sequence), sequence.dropped) == (SMALL.frames, 0)
-    assert all((folder / frame.path).is_file() for frame in sequence.frames)
+def test_it_has_the_layout_of_tum_and_every_frame_a_pose(folder: Path, sequence: ImageSequence) -> None:
+    assert len(sequence) == SMALL.frames
+    assert all(path.is_file() for path in sequence.paths)
+    assert sequence.stamps is not None
     trajectory = read_groundtruth(folder / "groundtruth.txt")
     assert np.diff(trajectory.stamps).mean() * 9 < np.diff(sequence.stamps).mean()
-    picture = cv2.imread(str(folder / sequence.frames[0].path))
+    picture = cv2.imread(str(sequence.paths[0]))
     assert picture is not None
     assert picture.shape == (SMALL.height, SMALL.width, 3)
 
 
 def test_a_walk_of_few_frames_has_a_pose_for_each_of_them(tmp_path: Path) -> None:
     list(write_walk(tmp_path / "few", replace(SMALL, frames=6)))
-    assert read_posed(tmp_path / "few", "tum").dropped == 0
+    assert read_sequence(tmp_path / "few", "tum").known.all()
 
 
 @pytest.mark.slow
@@ -98,39 +100,42 @@ def test_depth_is_written_in_the_form_of_tum_and_says_how_far_the_walls_are(tmp_
     assert np.mean(np.abs(there - seen[inside, 2]) < 0.1) > 0.75  # the others are hidden by something nearer
 
 
-def test_places_are_seen_again_on_every_lap(sequence: PosedSequence) -> None:
-    truth = same_place_matrix(sequence, sequence)
+def test_places_are_seen_again_on_every_lap(sequence: ImageSequence) -> None:
+    truth = same_place_matrix(sequence.known_poses(), sequence.known_poses())
     lap = np.arange(SMALL.frames) * SMALL.laps // SMALL.frames
     for later in (1, 2):
         again = truth[np.ix_(lap == later, lap == 0)].any(axis=1)
         assert again.mean() > 0.9
 
 
-def test_the_same_place_looks_the_same_and_other_places_do_not(folder: Path, sequence: PosedSequence) -> None:
+def test_the_same_place_looks_the_same_and_other_places_do_not(folder: Path, sequence: ImageSequence) -> None:
     thumbnails = []
-    for frame in sequence.frames:
-        picture = cv2.imread(str(folder / frame.path))
+    for path in sequence.paths:
+        picture = cv2.imread(str(path))
         assert picture is not None
         small = cv2.resize(picture, (16, 12), interpolation=cv2.INTER_AREA).astype(float).ravel()
         thumbnails.append((small - small.mean()) / small.std())
     alike = np.array(thumbnails) @ np.array(thumbnails).T / len(thumbnails[0])
+    assert sequence.stamps is not None
     apart = np.abs(sequence.stamps[:, None] - sequence.stamps) > 10
-    truth = same_place_matrix(sequence, sequence)
-    nearly_the_same_view = same_place_matrix(sequence, sequence, 0.5, 6) & apart
+    poses = sequence.known_poses()
+    truth = same_place_matrix(poses, poses)
+    nearly_the_same_view = same_place_matrix(poses, poses, 0.5, 6) & apart
     other = np.median(alike[~truth])
     assert np.median(alike[nearly_the_same_view]) > 0.6
     assert np.median(alike[truth & apart]) > other + 0.3
     assert other < 0.2
 
 
-def test_a_lap_later_it_is_another_light_and_a_few_steps_aside(sequence: PosedSequence) -> None:
-    truth = same_place_matrix(sequence, sequence)
+def test_a_lap_later_it_is_another_light_and_a_few_steps_aside(sequence: ImageSequence) -> None:
+    poses = sequence.known_poses()
+    truth = same_place_matrix(poses, poses)
     later = np.flatnonzero(np.arange(SMALL.frames) >= SMALL.frames // SMALL.laps)
     aside = []
     for index in later:
         first_lap = np.flatnonzero(truth[index, : SMALL.frames // SMALL.laps])
         if len(first_lap):
-            aside.append(np.linalg.norm(sequence.positions[first_lap] - sequence.positions[index], axis=1).min())
+            aside.append(np.linalg.norm(poses.positions[first_lap] - poses.positions[index], axis=1).min())
     assert 0.03 < np.median(aside) < 0.6
 
 
@@ -207,11 +212,11 @@ def test_the_way_leads_through_every_room_and_never_into_furniture(rooms: int) -
                 assert np.linalg.norm(gap, axis=1).min() >= 0.5
 
 
-def test_the_camera_is_carried_upright(sequence: PosedSequence) -> None:
-    axes = Rotation.from_quat(sequence.quaternions).as_matrix()
+def test_the_camera_is_carried_upright(sequence: ImageSequence) -> None:
+    axes = Rotation.from_quat(sequence.known_poses().quaternions).as_matrix()
     assert (axes[:, 2, 1] < -0.98).all()  # y points down
     assert (np.abs(axes[:, 2, 0]) < 0.05).all()  # x is level
-    assert (np.abs(sequence.positions[:, 2] - 1.5) < 0.1).all()
+    assert (np.abs(sequence.known_poses().positions[:, 2] - 1.5) < 0.1).all()
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from loopclosure.cli import main
 from loopclosure.detector.export import relative_pose
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.same_place import same_place_matrix
-from loopclosure.places.sequences import read_posed
+from loopclosure.places.sequences import read_sequence
 from paths import shared
 
 pytestmark = pytest.mark.slow
@@ -26,8 +26,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("close") / "walk"
     for _ in write_walk(folder, Walk(frames=FRAMES, width=240, height=180, laps=2, seed=11, depth=True)):
         pass
-    sequence = read_posed(folder)
-    same = np.tril(same_place_matrix(sequence, sequence, 0.4, 12), -20)
+    poses = read_sequence(folder).with_poses().known_poses()
+    same = np.tril(same_place_matrix(poses, poses, 0.4, 12), -20)
     rows = [f"{i},{int(np.argmax(same[i]))}" for i in np.flatnonzero(same.any(axis=1))]
     assert len(rows) > 12
     (folder.parent / "loops.csv").write_text("query_id,match_id\n" + "\n".join(rows) + "\n")
@@ -106,8 +106,9 @@ def test_the_graph_says_what_was_measured(walk: Path, tmp_path: Path, capsys: py
     for i, j, step in edges[: FRAMES - 1]:
         assert j == i + 1
         np.testing.assert_allclose(step, relative_pose(odometry[i], odometry[j]), atol=1e-4)
-    sequence = read_posed(walk)
-    truth = np.hstack([sequence.positions, sequence.quaternions])
+    sequence = read_sequence(walk).with_poses()
+    truth = sequence.poses
+    assert truth is not None
     off = [np.linalg.norm(step[:3] - relative_pose(truth[i], truth[j])[:3]) for i, j, step in edges[FRAMES - 1 :]]
     assert np.median(off) < 0.06
 
@@ -171,11 +172,11 @@ def test_fr1_rpy_where_the_camera_turns_gets_rotations_only(tmp_path: Path, caps
 
 def test_every_third_frame(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The table of ``detect WALK,stride=3`` counts the frames that were taken, and names them."""
-    sequence = read_posed(walk)
+    sequence = read_sequence(walk).with_poses()
     with (walk.parent / "loops.csv").open() as stream:
         ends = [(int(row["query_id"]) // 3, int(row["match_id"]) // 3) for row in csv.DictReader(stream)]
     table = tmp_path / "thirds.csv"
-    names = [sequence.frames[3 * i].path for i in range(FRAMES // 3)]
+    names = [sequence.names[3 * i] for i in range(FRAMES // 3)]
     rows = [f"{a},{b},{names[a]},{names[b]}" for a, b in dict.fromkeys(ends)]
     table.write_text("query_id,match_id,query_name,match_name\n" + "\n".join(rows) + "\n")
     line = ["close", f"{walk},stride=3", "--loops", str(table), "--drift", "2", "--out", str(tmp_path / "out")]

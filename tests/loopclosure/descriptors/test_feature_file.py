@@ -95,7 +95,7 @@ def test_missing_and_broken_files(tmp_path):
 def test_method_scores_and_carries_the_seconds_of_the_net(tmp_path):
     path = save(tmp_path / "f.npz", ["1.png", "2.png", "3.png", "4.png"], seconds_per_image=np.array(0.25))
     images = [Path("1.png"), Path("2.png"), Path("3.png")]
-    found = make_method(f"features:{path}").score(Images(images), silent)
+    found = make_method(f"features:{path}").score(Images.of_files(images), silent)
     assert found.scores.shape == (3, 3)
     assert found.scores[0, 2] == pytest.approx(-np.sqrt(32))
     assert found.seconds["features"] == pytest.approx(0.75)
@@ -114,7 +114,7 @@ def test_queries_and_references_of_two_files(tmp_path):
     save(tmp_path / "q.npz", ["1.png", "2.png", "3.png", "4.png"])
     np.savez(tmp_path / "r.npz", features=ROWS + 1, names=np.array(["1.png", "2.png", "3.png", "4.png"]))
     method = make_method(f"features:{tmp_path}/q.npz,{tmp_path}/r.npz")
-    scores = method.score(Images([Path("1.png")], [Path("1.png"), Path("2.png")]), silent).scores
+    scores = method.score(Images.of_files([Path("1.png")], [Path("1.png"), Path("2.png")]), silent).scores
     np.testing.assert_allclose(scores, [[-np.sqrt(2), -np.sqrt(18)]], rtol=1e-5)
 
 

@@ -178,7 +178,7 @@ def test_queries_and_references(tmp_path, training, laps):
     np.savez(tmp_path / "other.npz", features=training)
     method = make_method(f"features:{tmp_path}/q.npz,{tmp_path}/r.npz:whiten={tmp_path}/other.npz")
     images = [Path(name) for name in names]
-    result = method.score(Images(images, images), silent)
+    result = method.score(Images.of_files(images, images), silent)
     assert found(result.scores) == 1
     assert list(result.seconds) == ["training whitening", "whitening", "similarity"]
     assert result.training_stages == ("training whitening",)
@@ -196,12 +196,14 @@ def test_each_view_is_whitened(files, training, laps):
     images = [Path(f"/data/two_laps/rgb/{i}.png") for i in range(len(laps))]
     shares = {}
     for other in ("other.npz", "halves.npz"):
-        result = make_method(f"features:{files}/views.npz:whiten={files / other}").score(Images(images), silent)
+        result = make_method(f"features:{files}/views.npz:whiten={files / other}").score(
+            Images.of_files(images), silent
+        )
         shares[other] = found(result.scores[PLACES:, :PLACES])
         assert "2 views of 24 dimensions, euclidean" in result.notes
     assert min(shares.values()) >= 0.95
     with pytest.raises(InputError, match=r"laps.npz: has 1 view\(s\) of each image, .*views.npz has 2"):
-        make_method(f"features:{files}/views.npz,{files}/laps.npz").score(Images(images, images), silent)
+        make_method(f"features:{files}/views.npz,{files}/laps.npz").score(Images.of_files(images, images), silent)
 
 
 def test_whitened_features_are_those_of_the_same_images(files, training, laps):
@@ -235,18 +237,18 @@ def test_tested_images_are_not_learned_from(files, training, laps):
         method = make_method(f"features:{files}/laps.npz:whiten={files / other}")
         sentence = rf"{other}: 1 of 40 test images are training images too, the first is .*rgb/5.png"
         with pytest.raises(InputError, match=sentence):
-            method.score(Images(images), silent)
+            method.score(Images.of_files(images), silent)
         with pytest.raises(InputError, match=r"1 of 10 test images are"):
-            method.score(Images(images[20:], images[:10]), silent)
+            method.score(Images.of_files(images[20:], images[:10]), silent)
     # Equal names alone are no equal images: those of other.npz are 0.png to 399.png as well.
-    assert make_method(f"features:{files}/laps.npz:whiten={files}/other.npz").score(Images(images), silent)
+    assert make_method(f"features:{files}/laps.npz:whiten={files}/other.npz").score(Images.of_files(images), silent)
 
 
 def test_files_of_two_nets(files, laps):
     np.savez(files / "wide.npz", features=np.random.default_rng(0).normal(size=(9, 30)))
     method = make_method(f"features:{files}/laps.npz:whiten={files}/wide.npz")
     with pytest.raises(InputError, match=r"wide.npz: has descriptors of 30 dimensions, those to be whitened have 24"):
-        method.score(Images([Path("rgb/1.png"), Path("rgb/2.png")]), silent)
+        method.score(Images.of_files([Path("rgb/1.png"), Path("rgb/2.png")]), silent)
 
 
 @pytest.mark.slow

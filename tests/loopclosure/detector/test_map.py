@@ -20,9 +20,10 @@ from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.detector import LoopDetector
 from loopclosure.detector import map as maps
 from loopclosure.detector.map import Map
-from loopclosure.detector.run import open_recording, run_detector
+from loopclosure.detector.run import run_detector
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
+from loopclosure.places.sequences import read_sequence
 from netspec.errors import SpecError
 from netspec.files.whole_file import only_one
 
@@ -61,7 +62,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def first(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of drive a."""
     folder = tmp_path_factory.mktemp("maps") / "first"
-    Map.create(folder, "thumbnails").add(open_recording(drives / "a"), Thumbnailer())
+    Map.create(folder, "thumbnails").add(read_sequence(drives / "a"), Thumbnailer())
     return folder
 
 
@@ -108,15 +109,15 @@ def test_long_descriptors_are_projected(drives: Path, tmp_path: Path, monkeypatc
     monkeypatch.setattr(maps, "LEARNED_FROM", 9)
     monkeypatch.setattr(maps, "COMPONENTS", 8)
     opened = Map.create(tmp_path / "M", "thumbnails")
-    opened.add(open_recording(drives / "a"), Thumbnailer())
+    opened.add(read_sequence(drives / "a"), Thumbnailer())
     assert (tmp_path / "M" / "projection.npz").is_file()
     for again in (opened, Map(tmp_path / "M")):
         detector = again.detector(Thumbnailer())
         assert detector.descriptors.shape == (10, 8)
         visitor = Visitor(detector)
-        found = [visitor.add(image).accepted for _, image, _ in open_recording(drives / "b").frames()]
+        found = [visitor.add(image).accepted for _, image, _ in read_sequence(drives / "b").frames()]
         assert found == list(range(PLACES))
-    results = opened.add(open_recording(drives / "b"), Thumbnailer())
+    results = opened.add(read_sequence(drives / "b"), Thumbnailer())
     assert [result.accepted for result in results] == list(range(PLACES))
 
 
@@ -125,7 +126,7 @@ def test_what_is_projected_is_kept(drives: Path, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(maps, "LEARNED_FROM", 9)
     monkeypatch.setattr(maps, "COMPONENTS", 8)
     opened, folder = Map.create(tmp_path / "M", "thumbnails"), tmp_path / "M"
-    opened.add(open_recording(drives / "a"), Thumbnailer())
+    opened.add(read_sequence(drives / "a"), Thumbnailer())
     assert [path.name for path in folder.glob("projected-*/*")] == ["000000.npy"]
     expected = opened.detector(Thumbnailer()).descriptors
     path = folder / "projected-10" / "000000.npy"
@@ -133,7 +134,7 @@ def test_what_is_projected_is_kept(drives: Path, tmp_path: Path, monkeypatch: py
     np.testing.assert_array_equal(Map(folder).detector(Thumbnailer()).descriptors, expected + 1)  # not computed again
     np.save(path, expected[:3])
     np.testing.assert_allclose(Map(folder).detector(Thumbnailer()).descriptors, expected, rtol=1e-4)
-    opened.add(open_recording(drives / "b"), Thumbnailer())  # twice the frames, another projection
+    opened.add(read_sequence(drives / "b"), Thumbnailer())  # twice the frames, another projection
     frames = len(opened)
     assert {path.parent.name for path in folder.glob("projected-*/*")} == {f"projected-{frames}"}
 
@@ -145,14 +146,14 @@ def test_of_what_was_projected_before_only_a_maps_own_files_go(
     monkeypatch.setattr(maps, "LEARNED_FROM", 9)
     monkeypatch.setattr(maps, "COMPONENTS", 8)
     opened, folder = Map.create(tmp_path / "M", "thumbnails"), tmp_path / "M"
-    opened.add(open_recording(drives / "a"), Thumbnailer())
+    opened.add(read_sequence(drives / "a"), Thumbnailer())
     own = folder / "projected-10" / "000000.npy"
     strange = [own.with_name("notes.txt"), folder / "projected-photos" / "000000.npy", folder / "projected-3"]
     strange[1].parent.mkdir()
     for path in strange:
         path.touch()
     assert own.exists()
-    opened.add(open_recording(drives / "b"), Thumbnailer())
+    opened.add(read_sequence(drives / "b"), Thumbnailer())
     assert not own.exists()
     assert all(path.exists() for path in strange)
 
@@ -170,7 +171,7 @@ def test_a_run_that_is_killed_leaves_the_map_as_it_was(a_map: Map, drives: Path,
     assert any("rows.npy" in key for key in left.keys() - before.keys())
     assert all(".unfinished" in key or key == ".lock" for key in left.keys() - before.keys())
     assert len(Map(tmp_path / "M")) == PLACES
-    a_map.add(open_recording(drives / "b"), Thumbnailer())
+    a_map.add(read_sequence(drives / "b"), Thumbnailer())
     assert len(Map(tmp_path / "M")) == 2 * PLACES
 
 
@@ -179,10 +180,10 @@ def test_one_adds_at_a_time_and_others_read(a_map: Map, drives: Path, tmp_path: 
     other = Map(tmp_path / "M")
     with only_one(tmp_path / "M" / ".lock", ""):
         with pytest.raises(SpecError, match="held by another run"):
-            a_map.add(open_recording(drives / "b"), Thumbnailer())
+            a_map.add(read_sequence(drives / "b"), Thumbnailer())
         assert len(Map(tmp_path / "M").detector(Thumbnailer())) == PLACES
-    other.add(open_recording(drives / "b"), Thumbnailer())
-    a_map.add(open_recording(drives / "c"), Thumbnailer())  # sees what the other has added
+    other.add(read_sequence(drives / "b"), Thumbnailer())
+    a_map.add(read_sequence(drives / "c"), Thumbnailer())  # sees what the other has added
     assert [len(session.names) for session in a_map.sessions] == [10, 10, 15]
 
 
@@ -196,7 +197,7 @@ class Net(Thumbnailer):
 def test_a_map_that_another_net_described_is_refused(
     older: bool, described: str, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    Map.create(tmp_path / "M", "default").add(open_recording(drives / "a"), Net())
+    Map.create(tmp_path / "M", "default").add(read_sequence(drives / "a"), Net())
     if older:
         with np.load(tmp_path / "M" / "000000" / "frames.npz") as arrays:
             kept = {key: arrays[key] for key in arrays.files if key != "fingerprint"}
@@ -209,10 +210,10 @@ def test_a_map_that_another_net_described_is_refused(
     with pytest.raises(InputError, match=f"M: its frames were {told}or build the map again from its drives"):
         Map(tmp_path / "M").detector(Net())
     with pytest.raises(InputError, match=told):
-        Map(tmp_path / "M").add(open_recording(drives / "b"), Net())
+        Map(tmp_path / "M").add(read_sequence(drives / "b"), Net())
     with pytest.raises(InputError, match=f"d.npz: its frames were {told}or begin anew"):
         LoopDetector.load(tmp_path / "d.npz", Net())
-    Map(tmp_path / "M").add(open_recording(drives / "b"), Thumbnailer())  # of a function nothing is known
+    Map(tmp_path / "M").add(read_sequence(drives / "b"), Thumbnailer())  # of a function nothing is known
 
 
 @pytest.mark.parametrize(
@@ -257,7 +258,7 @@ def test_a_file_that_is_cut_while_it_is_open_is_a_fault(name: str, a_map: Map, d
     before = a_map.detector(Thumbnailer())
     os.truncate(a_map.folder / "000000" / f"{name}.npy", 200)
     with pytest.raises(InputError, match=f"{name}.npy: cannot be read .it was cut since it was opened"):
-        a_map.detector(Thumbnailer()) if name == "rows" else run_detector(before, open_recording(drives / "b"))
+        a_map.detector(Thumbnailer()) if name == "rows" else run_detector(before, read_sequence(drives / "b"))
 
 
 def test_faults_are_named(a_map: Map, drives: Path, tmp_path: Path) -> None:
@@ -269,9 +270,9 @@ def test_faults_are_named(a_map: Map, drives: Path, tmp_path: Path) -> None:
         Map.create(tmp_path / "N", "here.py:describe")
     assert not (tmp_path / "N").exists()
     with pytest.raises(InputError, match="ends at 65,504"):
-        a_map.add(open_recording(drives / "b"), lambda image: np.full(768, 1e5, np.float32))
+        a_map.add(read_sequence(drives / "b"), lambda image: np.full(768, 1e5, np.float32))
     with pytest.raises(InputError, match="5 dimensions, those before 768; take the net that described those"):
-        a_map.add(open_recording(drives / "b"), lambda image: np.ones(5))
+        a_map.add(read_sequence(drives / "b"), lambda image: np.ones(5))
     assert len(Map(tmp_path / "M")) == PLACES
     shutil.rmtree(tmp_path / "M" / "000000")
     assert len(Map(tmp_path / "M").detector(Thumbnailer())) == 0

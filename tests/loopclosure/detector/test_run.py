@@ -9,10 +9,12 @@ import pytest
 from loopclosure.descriptors.feature_file import Features, read_features
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.run import Recording, from_poses, judged_by_poses, load_describe, open_recording, run_detector
+from loopclosure.detector.run import from_poses, judged_by_poses, load_describe, run_detector
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.frames import Selection
+from loopclosure.places.image_sequence import ImageSequence
+from loopclosure.places.sequences import read_sequence
 from netspec.errors import SpecError
 from netspec.inspect.features import shipped
 
@@ -22,7 +24,7 @@ def small(image):
 
 
 def test_sequence_with_poses(two_laps):
-    recording = open_recording(two_laps)
+    recording = read_sequence(two_laps)
     assert len(recording) == 40
     assert recording.stamps is not None
     assert recording.poses is not None
@@ -38,7 +40,9 @@ def test_sequence_with_poses(two_laps):
 
 def test_features_take_the_place_of_describe(two_laps, two_laps_features):
     detector = LoopDetector(exclude_recent=5, threshold=-0.2)
-    results = run_detector(detector, open_recording(two_laps, Selection(stride=2)), read_features(two_laps_features))
+    results = run_detector(
+        detector, read_sequence(two_laps).taken(Selection(stride=2)), read_features(two_laps_features)
+    )
     assert [r.accepted for r in results] == [None] * 10 + list(range(10))
 
 
@@ -47,7 +51,7 @@ def test_features_with_verification_read_the_images(two_laps, two_laps_features)
     detector = LoopDetector(
         exclude_recent=10, threshold=-0.2, check=GeometricCheck(max_features=100, min_inliers=8, ratio=0.9)
     )
-    results = run_detector(detector, open_recording(two_laps), read_features(two_laps_features))
+    results = run_detector(detector, read_sequence(two_laps), read_features(two_laps_features))
     assert {r.verdict for r in results[20:]} <= {"accepted", "not verified"}
     assert all(r.inliers is not None for r in results[20:])
 
@@ -63,8 +67,8 @@ def write_video(path, count=30):
 
 def test_video(tmp_path):
     write_video(tmp_path / "walk.avi")
-    recording = open_recording(tmp_path / "walk.avi", Selection(stride=3))
-    assert recording.names[:2] == ["frame 0", "frame 3"]
+    recording = read_sequence(tmp_path / "walk.avi").taken(Selection(stride=3))
+    assert list(recording.names[:2]) == ["frame 0", "frame 3"]
     detector = LoopDetector(small, exclude_recent=2, metric="cosine", threshold=0.98)
     results = run_detector(detector, recording)
     assert [r.accepted for r in results] == [None] * 5 + list(range(5))
@@ -72,7 +76,7 @@ def test_video(tmp_path):
     with pytest.raises(InputError, match="no names to find features by"):
         run_detector(detector, recording, Features(tmp_path / "f.npz", np.zeros((1, 2))))
     with pytest.raises(InputError, match="no such video"):
-        open_recording(tmp_path / "gone.mp4")
+        read_sequence(tmp_path / "gone.mp4")
 
 
 def test_describe_by_name(tmp_path, monkeypatch):
@@ -123,8 +127,10 @@ def test_nothing_in_the_working_directory_runs_unnamed(tmp_path, monkeypatch):
 
 def test_a_video_that_is_shorter_than_it_says(tmp_path, monkeypatch):
     image = np.zeros((8, 8, 3), np.uint8)
-    recording = Recording(tmp_path / "v.avi", ["frame"] * 3, None, np.array([0, 5, 99]))
-    monkeypatch.setattr("loopclosure.detector.run.video_frames", lambda path: ((i / 10, image) for i in range(30)))
+    recording = ImageSequence.of_video(tmp_path / "v.avi", 100).at([0, 5, 99])
+    monkeypatch.setattr(
+        "loopclosure.places.image_sequence.video_frames", lambda path: ((i / 10, image) for i in range(30))
+    )
     frames = recording.frames()
     assert [next(frames)[2], next(frames)[2]] == [0.0, 0.5]
     with pytest.raises(InputError, match=r"v\.avi: ends after 30 frames, though .* 99 is wanted .* write .*,stop=30"):

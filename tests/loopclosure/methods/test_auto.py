@@ -10,7 +10,7 @@ import pytest
 
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.run import Recording, verdicts_said
+from loopclosure.detector.run import verdicts_said
 from loopclosure.detector.verification import Agreement, Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods import decoys
@@ -21,6 +21,7 @@ from loopclosure.methods.candidates import candidates, far_apart, moved
 from loopclosure.methods.decoys import threshold
 from loopclosure.methods.geometry import try_geometry
 from loopclosure.methods.named import make_method
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.progress import silent
 
 SIZE = 64
@@ -386,7 +387,7 @@ def test_as_a_method(tmp_path, monkeypatch):
     monkeypatch.setattr(type(method.pairs), "agreement", lambda *_: Agreement(0, 0, 20))
     monkeypatch.setattr(type(method.pairs), "without_fixed", lambda pairs, *_: pairs)
     paths = [tmp_path / f"{i}.png" for i in range(150)]
-    result = method.score(Images(paths, paths), silent)
+    result = method.score(Images.of_files(paths, paths), silent)
     assert np.count_nonzero(np.isfinite(result.scores)) > 0.9 * 150
     assert any(note.startswith("sequences of") for note in result.notes)
     assert result.answer.startswith("frames: ")
@@ -420,8 +421,9 @@ def test_of_a_longer_drive_than_is_compared_at_once_every_second_frame_decides(m
     rows = np.concatenate([road, again(drive(60, 8), 0, 9), again(road, 0.3, 10)])
     monkeypatch.setattr(whole, "MOST_PAIRS", len(rows) ** 2 // 2)
     detector, paths = LoopDetector(), [Path(f"{number}.png") for number in range(len(rows))]
-    recording = Recording(Path("drive"), [path.name for path in paths], paths, np.arange(len(rows)))
-    found = whole.whole_drive(detector, recording, Features(Path("rows.npz"), rows.astype(np.float32)))
+    found = whole.whole_drive(
+        detector, ImageSequence.of_files(paths), Features(Path("rows.npz"), rows.astype(np.float32))
+    )
     assert "one of 2 is" in found.reasons[0]
     assert len(found.results) == len(rows)
     assert np.count_nonzero(found.accepted[220:]) > 120

@@ -44,7 +44,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
 
 @pytest.mark.parametrize("spec", [f"fabmap:{WORDS}", f"fabmap:{WORDS},scored=posterior", f"bow:{WORDS}", "thumbnails"])
 def test_two_traverses(spec: str, images: dict[str, list[Path]]) -> None:
-    result = make_method(spec).score(Images(images["again"], images["first"], images["train"]), silent)
+    result = make_method(spec).score(Images.of_files(images["again"], images["first"], images["train"]), silent)
     assert result.scores.shape == (PLACES, PLACES)
     np.testing.assert_array_equal(np.argmax(result.scores, axis=1), np.arange(PLACES))
     assert result.notes
@@ -54,7 +54,9 @@ def test_two_traverses(spec: str, images: dict[str, list[Path]]) -> None:
 @pytest.mark.parametrize("spec", [f"fabmap:{WORDS}", f"bow:{WORDS}", "thumbnails"])
 def test_one_sequence(spec: str, images: dict[str, list[Path]]) -> None:
     walk = images["first"] + images["again"]
-    result = make_method(spec, MethodContext(exclude_frames=2)).score(Images(walk, None, images["train"]), silent)
+    result = make_method(spec, MethodContext(exclude_frames=2)).score(
+        Images.of_files(walk, None, images["train"]), silent
+    )
     assert result.scores.shape == (2 * PLACES, 2 * PLACES)
     assert np.isfinite(result.scores[np.tril_indices(2 * PLACES, -1)]).all()
     earlier = np.where(np.tri(2 * PLACES, 2 * PLACES, -3, dtype=bool), result.scores, -np.inf)
@@ -68,7 +70,9 @@ def test_every_stage_is_shown_and_timed(images: dict[str, list[Path]]) -> None:
         shown[stage] = total
         return items
 
-    result = make_method(f"fabmap:{WORDS}").score(Images(images["again"], images["first"], images["train"]), progress)
+    result = make_method(f"fabmap:{WORDS}").score(
+        Images.of_files(images["again"], images["first"], images["train"]), progress
+    )
     assert shown == {"training features": 10, "features": 16}
     assert list(result.seconds) == [
         "training features", "vocabulary", "training words", "tree", "features", "words", "likelihoods",
@@ -78,23 +82,23 @@ def test_every_stage_is_shown_and_timed(images: dict[str, list[Path]]) -> None:
 def test_a_vocabulary_is_kept_and_used_again(tmp_path: Path, images: dict[str, list[Path]]) -> None:
     path = tmp_path / "words.npz"
     first = make_method(f"fabmap:model={path},{WORDS}").score(
-        Images(images["again"], images["first"], images["train"]), silent
+        Images.of_files(images["again"], images["first"], images["train"]), silent
     )
     assert len(WordModel.load(path).vocabulary) == 200
-    second = make_method(f"fabmap:model={path}").score(Images(images["again"], images["first"]), silent)
+    second = make_method(f"fabmap:model={path}").score(Images.of_files(images["again"], images["first"]), silent)
     np.testing.assert_array_equal(first.scores, second.scores)
     assert "vocabulary" not in second.seconds
     assert f"read from {path}" in second.notes[0]
     with pytest.raises(InputError, match=r"words.npz: 10 of 10 test images are training images too"):
-        make_method(f"bow:model={path}").score(Images(images["train"]), silent)
+        make_method(f"bow:model={path}").score(Images.of_files(images["train"]), silent)
 
 
 @pytest.mark.parametrize("spec", ["fabmap", "bow"])
 def test_training_images_are_needed_and_are_not_tested(spec: str, images: dict[str, list[Path]]) -> None:
     with pytest.raises(InputError, match="needs training images"):
-        make_method(spec).score(Images(images["again"], images["first"]), silent)
+        make_method(spec).score(Images.of_files(images["again"], images["first"]), silent)
     with pytest.raises(InputError, match=r"8 of 16 test images are training images too"):
-        make_method(spec).score(Images(images["again"], images["first"], images["first"]), silent)
+        make_method(spec).score(Images.of_files(images["again"], images["first"], images["first"]), silent)
 
 
 def test_settings_reach_the_part_they_belong_to() -> None:
@@ -127,7 +131,7 @@ def test_corridor_loop_with_its_two_images_without_features() -> None:
     train = sorted(shared("data", "tum_fr1", "rgbd_dataset_freiburg1_rpy", "rgb").glob("*.jpg"))[::12]
     walk = [corridor / f"{k}.jpg" for k in range(1, 85)]
     result = make_method("fabmap:words=300,max_features=150", MethodContext(exclude_frames=10)).score(
-        Images(walk, None, train), silent
+        Images.of_files(walk, None, train), silent
     )
     assert "2 of 84 images have no features: places without words" in result.notes
     assert np.isfinite(result.scores[np.tril_indices(84, -1)]).all()

@@ -78,7 +78,7 @@ def test_vlad_of_orb_words(tmp_path):
         paths.append(tmp_path / f"{i}.png")
         cv2.imwrite(str(paths[-1]), cv2.resize(blots(i % 5), (320, 240)))
     train, laps = paths[:5], [path.rename(tmp_path / f"lap_{path.name}") for path in paths[5:]]
-    images = Images(laps, laps, train)
+    images = Images.of_files(laps, laps, train)
     scores = make_method("vlad:words=4,kind=orb").score(images, silent).scores
     np.testing.assert_array_equal(np.argmax(scores, axis=1), np.arange(5))
     np.testing.assert_allclose(scores.diagonal(), 1, rtol=1e-5)
@@ -87,8 +87,8 @@ def test_vlad_of_orb_words(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("spec", ["hog", "cohog:side=128"])
 def test_two_traverses_are_compared_in_full(spec, two_laps):
-    images = load_sequence(read_sequence(two_laps, "tum")).query_images
-    scores = make_method(spec).score(Images(images[20:], images[:20]), silent).scores
+    images = load_sequence(read_sequence(two_laps, "tum")).queries.paths
+    scores = make_method(spec).score(Images.of_files(images[20:], images[:20]), silent).scores
     assert scores.shape == (20, 20)
     np.testing.assert_array_equal(np.argmax(scores, axis=1), np.arange(20))
 
@@ -143,13 +143,13 @@ def test_it_scores_only_what_it_accepts(two_laps, two_laps_features):
 @pytest.mark.slow
 def test_without_a_threshold_its_candidates_are_verified(two_laps, two_laps_features):
     method = make_method(f"detector:{two_laps_features}:verify=yes,min_inliers=500", MethodContext(9))
-    result = method.score(Images(load_sequence(read_sequence(two_laps, "tum")).query_images), silent)
+    result = method.score(Images.of_files(load_sequence(read_sequence(two_laps, "tum")).queries.paths), silent)
     assert not np.isfinite(result.scores).any()
     assert "30 not verified" in result.answer
 
 
 def test_two_traverses_are_refused(two_laps, two_laps_features):
-    images = load_sequence(read_sequence(two_laps, "tum")).query_images
+    images = load_sequence(read_sequence(two_laps, "tum")).queries.paths
     method = make_method(f"detector:{two_laps_features}:threshold=-1")
     with pytest.raises(InputError, match="finds loops in one sequence"):
-        method.score(Images(images, images), silent)
+        method.score(Images.of_files(images, images), silent)

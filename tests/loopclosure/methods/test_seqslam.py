@@ -180,7 +180,7 @@ def two_laps() -> np.ndarray:
 
 def test_one_sequence_never_matches_its_neighbors() -> None:
     method = SeqSlam(Fixed(two_laps()), exclude_frames=5)
-    result = method.score(Images(frames(40)), silent)
+    result = method.score(Images.of_files(frames(40)), silent)
     assert not np.isfinite(result.scores[~earlier(40, 5)]).any()
     best = np.argmax(np.nan_to_num(result.scores[20:], nan=-np.inf), axis=1)
     assert np.mean(best == np.arange(20)) > 0.9
@@ -192,13 +192,15 @@ def test_two_traverses_use_the_whole_matrix() -> None:
     scores = -noise_with_path(30, 30, [(q, q) for q in range(30)])
     noisy = scores + np.random.default_rng(9).normal(0, 0.3, scores.shape)
     alone = np.argmax(noisy, axis=1) == np.arange(30)
-    result = SeqSlam(Fixed(noisy)).score(Images(frames(30), frames(30)), silent)
+    result = SeqSlam(Fixed(noisy)).score(Images.of_files(frames(30), frames(30)), silent)
     together = np.argmax(np.nan_to_num(result.scores, nan=-np.inf), axis=1) == np.arange(30)
     assert together.mean() > 0.85 > 0.5 > alone.mean()  # what sequences are for
 
 
 def test_uniqueness_as_the_score() -> None:
-    result = SeqSlam(Fixed(two_laps()), exclude_frames=5, scored="uniqueness").score(Images(frames(40)), silent)
+    result = SeqSlam(Fixed(two_laps()), exclude_frames=5, scored="uniqueness").score(
+        Images.of_files(frames(40)), silent
+    )
     assert np.all(np.isfinite(result.scores).sum(axis=1) <= 1)
     query, reference = np.argwhere(np.isfinite(result.scores)).T
     second = query >= 20
@@ -209,7 +211,9 @@ def test_uniqueness_as_the_score() -> None:
 def test_uniqueness_of_scores_that_may_be_of_either_sign() -> None:
     log_odds = 40.0 * (two_laps() + 1.0)
     settings = SequenceSettings(contrast=0)
-    result = SeqSlam(Fixed(log_odds), settings, scored="uniqueness", exclude_frames=5).score(Images(frames(40)), silent)
+    result = SeqSlam(Fixed(log_odds), settings, scored="uniqueness", exclude_frames=5).score(
+        Images.of_files(frames(40)), silent
+    )
     found = result.scores[np.isfinite(result.scores)]
     assert len(found) > 20
     assert np.all((found >= 0) & (found <= 1))
@@ -219,7 +223,7 @@ def test_a_sequence_shorter_than_the_exclusion_has_no_scores() -> None:
     for settings in (SequenceSettings(), SequenceSettings(contrast=0)):
         for scored in ("cost", "uniqueness"):
             method = SeqSlam(Fixed(np.zeros((4, 4))), settings, scored, exclude_frames=5)
-            assert np.isnan(method.score(Images(frames(4)), silent).scores).all()
+            assert np.isnan(method.score(Images.of_files(frames(4)), silent).scores).all()
 
 
 def test_the_command_line_builds_it() -> None:
@@ -246,11 +250,11 @@ def right(scores: np.ndarray) -> float:
 
 
 def test_what_resembles_everything_says_nothing() -> None:
-    pictures = Images(frames(30), frames(30))
+    pictures = Images.of_files(frames(30), frames(30))
     plain = SeqSlam(Fixed(another_season()), SequenceSettings(contrast=0))
     scaled = SeqSlam(Fixed(another_season()), SequenceSettings(contrast=0), standardize="traverses")
     assert right(plain.score(pictures, silent).scores) < 0.3 < 0.9 < right(scaled.score(pictures, silent).scores)
-    one_sequence = Images(frames(30))
+    one_sequence = Images.of_files(frames(30))
     np.testing.assert_array_equal(plain.score(one_sequence, silent).scores, scaled.score(one_sequence, silent).scores)
 
 

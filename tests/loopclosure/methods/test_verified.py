@@ -60,7 +60,7 @@ def first(scores, given):
 def test_the_same_walls_come_first_and_the_rest_keeps_its_order(walls):
     rng = np.random.default_rng(0)
     given = rng.normal(size=(12, 12))
-    result = Verified(Fixed(given), k=12).score(Images(walls), silent)
+    result = Verified(Fixed(given), k=12).score(Images.of_files(walls), silent)
     loops = [(i, i - WALLS) for i in range(WALLS, 2 * WALLS)]
     assert first(result.scores, given) == loops
     order = sorted(loops, key=lambda pair: given[pair])
@@ -68,7 +68,7 @@ def test_the_same_walls_come_first_and_the_rest_keeps_its_order(walls):
     others = np.tri(12, k=-1, dtype=bool)
     others[tuple(np.transpose(loops))] = False
     np.testing.assert_array_equal(result.scores[others], given[others])
-    by_inliers = Verified(Fixed(given), k=12, order="inliers").score(Images(walls), silent).scores
+    by_inliers = Verified(Fixed(given), k=12, order="inliers").score(Images.of_files(walls), silent).scores
     assert accepted(by_inliers) == loops
     assert np.nanmin(by_inliers) >= 8
     assert list(result.seconds) == ["fixed", "local features", "verification"]
@@ -81,7 +81,7 @@ def test_the_same_walls_come_first_and_the_rest_keeps_its_order(walls):
 def test_only_the_best_k_of_each_query_are_examined(walls):
     scores = np.zeros((WALLS, WALLS))
     scores[range(WALLS), range(WALLS)] = np.array([-1, 1, 1, 1, 1, np.nan])
-    result = Verified(Fixed(scores), k=1).score(Images(walls[WALLS:], walls[:WALLS]), silent)
+    result = Verified(Fixed(scores), k=1).score(Images.of_files(walls[WALLS:], walls[:WALLS]), silent)
     assert first(result.scores, scores) == [(i, i) for i in range(1, 5)]
 
 
@@ -89,7 +89,7 @@ def test_images_that_cannot_be_verified_pass_through(walls):
     blank = walls[0].parent / "gray.png"
     cv2.imwrite(str(blank), np.full((240, 320, 3), 90, np.uint8))
     given = np.random.default_rng(0).normal(size=(6, 6))
-    result = Verified(Fixed(given)).score(Images([blank] * 6, walls[:6]), silent)
+    result = Verified(Fixed(given)).score(Images.of_files([blank] * 6, walls[:6]), silent)
     np.testing.assert_array_equal(result.scores, given)
     assert result.notes[-1].startswith("these images cannot be verified")
 
@@ -98,7 +98,7 @@ def test_images_that_cannot_be_verified_pass_through(walls):
 def test_just_more_inliers_than_chance_do_not_overrule_a_score(walls, inliers, best):
     given = np.array([[0.9, 0.5, 0.1]])
     method = Verified(Fixed(given), k=3)
-    images = Images(walls[:1], walls[1:4])
+    images = Images.of_files(walls[:1], walls[1:4])
     for reference, found in zip(walls[1:4], ((7, 0), (26, inliers), (5, 0)), strict=True):
         method.pairs._found[method.check, walls[0], reference] = Agreement(*found, 17)
     assert np.nanargmax(method.score(images, silent).scores) == best
@@ -107,7 +107,7 @@ def test_just_more_inliers_than_chance_do_not_overrule_a_score(walls, inliers, b
 @pytest.mark.slow
 def test_another_method_of_the_run_finds_nothing_again(walls, monkeypatch):
     context = MethodContext()
-    images = Images(walls[WALLS:], walls[:WALLS])
+    images = Images.of_files(walls[WALLS:], walls[:WALLS])
     scores = make_method("verified:k=6+thumbnails", context).score(images, silent).scores
     monkeypatch.setattr(GeometricCheck, "describe", None)
     monkeypatch.setattr(GeometricCheck, "agreement", None)
@@ -121,14 +121,14 @@ def test_on_top_of_seqslam_a_sequence_is_verified(walls):
     blank = walls[0].parent / "blank.png"
     cv2.imwrite(str(blank), np.full((240, 320, 3), 90, np.uint8))
     partly = [*walls[:8], blank, *walls[9:]]  # what the third frame of the second lap shows has no features
-    alone = Verified(Fixed(given), k=1).score(Images(partly), silent)
+    alone = Verified(Fixed(given), k=1).score(Images.of_files(partly), silent)
     assert (8, 2) not in first(alone.scores, given)
     sequences = Verified(SeqSlam(Fixed(given), SequenceSettings(length=4, contrast=0)), k=1)
-    together = first(sequences.score(Images(partly), silent).scores, given)
+    together = first(sequences.score(Images.of_files(partly), silent).scores, given)
     assert {(i, i - WALLS) for i in range(WALLS, 2 * WALLS)} <= set(together)
     assert (11, 1) not in together
     ended = [*walls[:11], blank]  # past the last verified pair the line goes on, but not the loop
-    assert (11, 5) not in first(sequences.score(Images(ended), silent).scores, given)
+    assert (11, 5) not in first(sequences.score(Images.of_files(ended), silent).scores, given)
 
 
 def test_trajectories_support_what_is_on_them():
@@ -143,12 +143,12 @@ def test_trajectories_support_what_is_on_them():
 @pytest.mark.slow
 def test_excluded_frames_are_no_candidates(walls):
     method = Verified(Fixed(np.zeros((12, 12))), exclude_frames=WALLS)
-    assert [i - j for i, j in accepted(method.score(Images(walls), silent).scores) if i - j <= WALLS] == []
+    assert [i - j for i, j in accepted(method.score(Images.of_files(walls), silent).scores) if i - j <= WALLS] == []
 
 
 @pytest.mark.slow
 def test_a_known_camera(walls):
     camera = "focal_px=260,center_x_px=160,center_y_px=120"
     method = make_method(f"verified:{camera},k=12,min_inliers=25+thumbnails", MethodContext())
-    found = first(method.score(Images(walls), silent).scores, np.zeros(1))
+    found = first(method.score(Images.of_files(walls), silent).scores, np.zeros(1))
     assert found == [(i, i - WALLS) for i in range(WALLS, 2 * WALLS)]

@@ -28,7 +28,7 @@ def test_a_bag_becomes_a_sequence(name: str, ros: int, encoding: str, tmp_path: 
     assert said == f"{bag}: 48 frames of /cam/image, poses of /odom, moved from base to camera: {folder}"
     sequence = read_sequence(folder)
     assert len(sequence) == COUNT
-    image = cv2.imread(str(sequence.images[7]))
+    image = cv2.imread(str(sequence.paths[7]))
     np.testing.assert_array_equal(image, picture(7))
     assert sequence.stamps is not None
     assert sequence.stamps[7] == START_S + 7

@@ -39,8 +39,8 @@ def tum_folder(tmp_path):
 
 def test_tum_truth_is_the_papers_rule(tum_folder):
     data = load_sequence(read_sequence(tum_folder, "tum"))
-    assert len(data.query_images) == 72
-    assert data.reference_images is None
+    assert len(data.queries.paths) == 72
+    assert data.references is None
     loops = {(int(i), int(j)) for i, j in np.argwhere(data.truth.hard & data.truth.judged)}
     assert loops == {(i, j) for i in range(72) for j in range(72) if i - j in (35, 36, 37, 71)}
     assert data.truth.judged[10, 0]
@@ -54,7 +54,7 @@ def test_tum_truth_is_the_papers_rule(tum_folder):
 
 def test_tum_soft_truth_and_selection(tum_folder):
     data = load_sequence(read_sequence(tum_folder, "tum"), Selection(stride=2), soft_angle_deg=25)
-    assert len(data.query_images) == 36
+    assert len(data.queries.paths) == 36
     only_soft = {(int(i), int(j)) for i, j in np.argwhere(data.truth.soft & ~data.truth.hard & data.truth.judged)}
     assert only_soft == {(i, j) for i in range(36) for j in range(36) if i - j in (17, 19, 35)}
     assert "every 2nd" in data.name
@@ -94,13 +94,13 @@ def fabmap_folder(tmp_path):
 )
 def test_fabmap_cameras(fabmap_folder, tmp_path, camera, frames, loops):
     data = load_fabmap(fabmap_folder, camera=camera, exclusion=Exclusion(frames=1), joined_folder=tmp_path / "joined")
-    assert [path.stem for path in data.query_images] == frames
+    assert [path.stem for path in data.queries.paths] == frames
     assert {(int(i), int(j)) for i, j in np.argwhere(data.truth.hard & data.truth.judged)} == loops
     assert data.positions is not None
     assert data.positions.shape == (len(frames), 2)
     np.testing.assert_allclose(data.positions[-1], [5.0, 15.5])
     if camera == "joined":
-        joined = cv2.imread(str(data.query_images[0]))
+        joined = cv2.imread(str(data.queries.paths[0]))
         assert joined is not None
         assert joined.shape == (6, 16, 3)
     if camera == "both":
@@ -113,7 +113,7 @@ def test_fabmap_stride_and_limit_count_places(fabmap_folder):
     data = load_fabmap(
         fabmap_folder, camera="left", selection=Selection(stride=4, limit=2), exclusion=Exclusion(frames=0)
     )
-    assert [path.stem for path in data.query_images] == ["0001", "0009"]
+    assert [path.stem for path in data.queries.paths] == ["0001", "0009"]
     assert data.truth.positives == 1
 
 
@@ -123,7 +123,7 @@ def test_fabmap_mask_of_places_for_images_of_both_cameras(fabmap_folder):
     np.save(fabmap_folder / "six.npy", truth)
     data = load_fabmap(fabmap_folder, fabmap_folder / "six.npy", camera="right", exclusion=Exclusion(frames=1))
     assert data.truth.hard[5, 2]
-    assert data.query_images[5].stem == "0012"
+    assert data.queries.paths[5].stem == "0012"
 
 
 @pytest.mark.slow
@@ -149,7 +149,7 @@ def test_folder_with_a_mask_in_natural_order(tmp_path):
     truth[11, 0], truth[10, 0] = 255, 128  # the gray one is soft
     cv2.imwrite(str(tmp_path / "truth.bmp"), truth)
     data = load_folder(folder, tmp_path / "truth.bmp", exclusion=Exclusion(frames=2))
-    assert [path.stem for path in data.query_images] == [str(i + 1) for i in range(12)]
+    assert [path.stem for path in data.queries.paths] == [str(i + 1) for i in range(12)]
     assert np.argwhere(data.truth.hard).tolist() == [[11, 0]]
     assert np.argwhere(data.truth.soft).tolist() == [[10, 0], [11, 0]]
     assert "1 pairs that nearly show the same place are ignored" in data.truth.description
@@ -171,7 +171,7 @@ def test_folder_with_references(tmp_path):
     references = write_images(tmp_path / "day", ["a.png", "b.png", "c.png"])
     np.save(tmp_path / "truth.npy", np.array([[1, 0, 0], [0, 0, 1]], bool))
     data = load_folder(queries, tmp_path / "truth.npy", references)
-    assert data.reference_images is not None
+    assert data.references is not None
     assert data.truth.judged.all()
     np.save(tmp_path / "turned.npy", np.ones((3, 2), bool))
     with pytest.raises(InputError, match="2 queries and 3 references; transpose it"):
@@ -230,8 +230,8 @@ def test_new_college_mask():
 def test_corridor_loop():
     folder = shared("data/corridor_loop")
     data = load_folder(folder / "samples", folder / "samples_GT.bmp")
-    assert len(data.query_images) == 84
-    assert data.query_images[9].name == "10.jpg"
+    assert len(data.queries.paths) == 84
+    assert data.queries.paths[9].name == "10.jpg"
     assert data.truth.positives == 228
     assert int(data.truth.queries_with_a_loop.sum()) == 44
     assert data.name == "corridor_loop/samples"
@@ -240,5 +240,5 @@ def test_corridor_loop():
 @pytest.mark.slow
 def test_tum_fr1():
     data = load_sequence(read_sequence(shared("data/tum_fr1/rgbd_dataset_freiburg1_rpy"), "tum"))
-    assert len(data.query_images) == 721
+    assert len(data.queries.paths) == 721
     assert data.truth.positives > 0

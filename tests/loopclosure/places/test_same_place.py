@@ -17,7 +17,7 @@ from loopclosure.places.same_place import (
     same_place_matrix,
     view_angles_deg,
 )
-from loopclosure.places.sequences import read_posed, read_sequence
+from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import Poses
 from paths import shared
 
@@ -90,7 +90,7 @@ def test_the_rule_is_symmetric() -> None:
 def test_fr1_rpy_has_the_clear_negatives_its_readme_counts_and_xyz_none() -> None:
     folder = shared("data", "tum_fr1")
     for name, clear in (("rpy", 20_101), ("xyz", 0)):
-        poses = read_posed(folder / f"rgbd_dataset_freiburg1_{name}", "tum", 0.03).poses
+        poses = read_sequence(folder / f"rgbd_dataset_freiburg1_{name}", "tum", 0.03).with_poses().known_poses()
         first, second = np.triu_indices(len(poses), 1)
         assert int(np.sum(view_angles_deg(poses[first], poses[second]) > 50)) == clear
         assert distances_m(poses[first], poses[second]).max() < 0.71

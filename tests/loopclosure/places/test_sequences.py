@@ -11,7 +11,7 @@ from loopclosure.errors import InputError
 from loopclosure.places.datasets import load_sequence, load_traverses
 from loopclosure.places.frames import Selection
 from loopclosure.places.masks import read_matches
-from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, posed, read_posed, read_sequence
+from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_sequence
 from loopclosure.places.source import extract
 from loopclosure.places.truth import Exclusion
 from places_layouts import (
@@ -52,7 +52,7 @@ def test_euroc_without_its_truth_or_with_a_missing_image(tmp_path: Path) -> None
     sequence = read_sequence(folder)
     assert sequence.poses is None
     with pytest.raises(InputError, match="MH_00: has no poses; expected"):
-        posed(sequence)
+        sequence.with_poses()
     (folder / "mav0/cam0/data/1403636581000000000.png").unlink()
     with pytest.raises(InputError, match=r'data\.csv:4:1: no such image "1403636581000000000\.png"'):
         read_sequence(folder)
@@ -127,9 +127,9 @@ def test_a_file_of_poses_takes_the_place_of_the_sequences_own(tmp_path: Path) ->
     folder = write_kitti(tmp_path)
     poses = tmp_path / "slam.txt"
     poses.write_text(tum_rows(path()[:30]))
-    sequence = read_posed(folder, poses=PoseChoice(poses))
-    assert (len(sequence), sequence.dropped) == (30, 18)
-    assert sequence.frames[29].path == "image_0/000029.png"
+    sequence = read_sequence(folder, poses=PoseChoice(poses))
+    assert (len(sequence), len(sequence.with_poses())) == (48, 30)
+    assert sequence.with_poses().names[29] == "image_0/000029.png"
 
 
 def test_a_video_becomes_a_folder_and_stays_one(tmp_path: Path) -> None:
@@ -234,4 +234,4 @@ def test_a_selection_counts_frames_without_a_pose_too(two_laps, tmp_path):
     assert every_fourth.poses is not None
     assert np.isnan(every_fourth.poses[1]).all()
     data = load_sequence(read_sequence(tmp_path / "laps", "tum"), Selection(stride=4), Exclusion(2))
-    assert [path.name for path in data.query_images[:2]] == ["0.png", "8.png"]
+    assert [path.name for path in data.queries.paths[:2]] == ["0.png", "8.png"]

@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.places.sequences import read_posed
+from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import (
-    Frame,
     Trajectory,
     associate,
     read_groundtruth,
-    read_rgb_list,
     write_rgb_list,
     write_trajectory,
 )
+from netspec.errors import SpecError
 from paths import shared
 
 GOOD_POSE = "1.5 0.1 0.2 0.3 0 0 0 1"
@@ -24,6 +23,12 @@ GOOD_POSE = "1.5 0.1 0.2 0.3 0 0 0 1"
 def trajectory_at(*stamps: float) -> Trajectory:
     count = len(stamps)
     return Trajectory(np.array(stamps), np.zeros((count, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
+
+
+def pictures(folder: Path, *names: str) -> None:
+    (folder / "rgb").mkdir()
+    for name in names:
+        (folder / "rgb" / name).touch()
 
 
 def write(path: Path, text: str) -> Path:
@@ -63,29 +68,41 @@ def test_a_broken_line_of_groundtruth_is_named_with_its_column(
 
 
 def test_a_broken_line_of_rgb_txt_is_named(tmp_path: Path) -> None:
-    path = write(tmp_path / "rgb.txt", "1.0 rgb/a b.png\n")
-    with pytest.raises(InputError, match=r"rgb\.txt:1:11: expected \"timestamp filename\", found 3 fields"):
-        read_rgb_list(path)
-    write(path, "now rgb/a.png\n")
-    with pytest.raises(InputError, match=r"rgb\.txt:1:1: expected a number for the timestamp"):
-        read_rgb_list(path)
+    pictures(tmp_path, "a.png", "b.png")
+    path = write(tmp_path / "rgb.txt", "1.0 rgb/a.png\n2.0 rgb/gone.png\n")
+    with pytest.raises(SpecError, match=r"rgb\.txt:2:5: no such image \"rgb/gone.png\""):
+        read_sequence(tmp_path, "tum")
+    write(path, "1.0 rgb/a.png\nrgb/b.png\n")
+    with pytest.raises(SpecError, match=r"rgb\.txt: has lines without a time stamp; expected \"timestamp filename\""):
+        read_sequence(tmp_path, "tum")
+
+
+def test_depth_that_is_listed_and_gone_is_a_warning(tmp_path: Path) -> None:
+    pictures(tmp_path, "a.png")
+    write(tmp_path / "rgb.txt", "1.0 rgb/a.png\n")
+    write(tmp_path / "depth.txt", "1.0 depth/a.png\n")
+    write_trajectory(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
+    sequence = read_sequence(tmp_path)
+    assert sequence.depths is None
+    assert sequence.doubts[-1].endswith(f'no such image "depth/a.png" in {tmp_path}; depth is not used')
 
 
 def test_missing_empty_and_binary_files_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
-        read_posed(tmp_path / "nowhere", "tum")
-    with pytest.raises(InputError, match=r"rgb\.txt: cannot be read \(No such file"):
-        read_posed(tmp_path, "tum")
+        read_sequence(tmp_path / "nowhere", "tum").with_poses()
+    with pytest.raises(InputError, match=r"rgb\.txt: no such file; expected a TUM RGB-D sequence"):
+        read_sequence(tmp_path, "tum").with_poses()
     write(tmp_path / "rgb.txt", "# nothing\n")
-    with pytest.raises(InputError, match=r"rgb\.txt: lists no images"):
-        read_posed(tmp_path, "tum")
+    with pytest.raises(SpecError, match=r"rgb\.txt: lists no images"):
+        read_sequence(tmp_path, "tum").with_poses()
+    pictures(tmp_path, "a.png")
     write(tmp_path / "rgb.txt", "1.5 rgb/a.png\n")
     (tmp_path / "groundtruth.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match=r"groundtruth\.txt: is not a text file"):
-        read_posed(tmp_path, "tum")
+        read_sequence(tmp_path, "tum").with_poses()
     write(tmp_path / "groundtruth.txt", "")
     with pytest.raises(InputError, match=r"groundtruth\.txt: holds no pose"):
-        read_posed(tmp_path, "tum")
+        read_sequence(tmp_path, "tum").with_poses()
 
 
 def test_associate_takes_the_nearest_pose_within_the_limit() -> None:
@@ -96,21 +113,26 @@ def test_associate_takes_the_nearest_pose_within_the_limit() -> None:
 
 
 def test_frames_without_a_pose_are_counted_and_left_out(tmp_path: Path) -> None:
-    write_rgb_list(tmp_path / "rgb.txt", [Frame(stamp, f"rgb/{stamp:g}.png") for stamp in (1.0, 1.01, 5.0, 2.0)])
+    frames = [(stamp, f"rgb/{stamp:g}.png") for stamp in (1.0, 1.01, 5.0, 2.0)]
+    pictures(tmp_path, *(Path(name).name for _, name in frames))
+    write_rgb_list(tmp_path / "rgb.txt", frames)
     write_trajectory(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
-    sequence = read_posed(tmp_path, "tum")
+    every = read_sequence(tmp_path, "tum")
+    sequence = every.with_poses()
     assert sequence.name == tmp_path.name
-    assert [frame.path for frame in sequence.frames] == ["rgb/1.png", "rgb/1.01.png", "rgb/2.png"]
+    assert list(sequence.names) == ["rgb/1.png", "rgb/1.01.png", "rgb/2.png"]
+    assert sequence.stamps is not None
     assert sequence.stamps.tolist() == [1.0, 1.01, 2.0]
-    assert sequence.dropped == 1
-    assert len(sequence.poses[np.array([0, 2])]) == 2
+    assert len(every) == 4
+    assert len(sequence.known_poses()[np.array([0, 2])]) == 2
 
 
 def test_no_frame_with_a_pose_at_all_says_both_time_spans(tmp_path: Path) -> None:
-    write_rgb_list(tmp_path / "rgb.txt", [Frame(100.0, "rgb/a.png")])
+    pictures(tmp_path, "a.png")
+    write_rgb_list(tmp_path / "rgb.txt", [(100.0, "rgb/a.png")])
     write_trajectory(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
     with pytest.raises(InputError, match=r"images from 100\.000 to 100\.000 s, poses from 1\.000 to 2\.000 s"):
-        read_posed(tmp_path, "tum")
+        read_sequence(tmp_path, "tum").with_poses()
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
@@ -130,6 +152,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("name", "posed", "listed"), [("xyz", 796, 798), ("rpy", 721, 723)])
 def test_tum_fr1_has_the_poses_its_readme_counts(name: str, posed: int, listed: int) -> None:
     folder = shared("data", "tum_fr1", f"rgbd_dataset_freiburg1_{name}")
-    sequence = read_posed(folder, "tum", 0.03)
-    assert (len(sequence), len(sequence) + sequence.dropped) == (posed, listed)
-    np.testing.assert_allclose(np.linalg.norm(sequence.quaternions, axis=1), 1, atol=1e-12)
+    sequence = read_sequence(folder, "tum", 0.03)
+    poses = sequence.with_poses().known_poses()
+    assert (len(poses), len(sequence)) == (posed, listed)
+    np.testing.assert_allclose(np.linalg.norm(poses.quaternions, axis=1), 1, atol=1e-12)

@@ -12,6 +12,7 @@ from matplotlib.legend import Legend
 from given_scores import GivenScores
 from loopclosure.evaluate import Evaluation, evaluate
 from loopclosure.places.datasets import DataSet
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.truth import Exclusion, sequence_truth
 from loopclosure.report.plots import curves, matches, matrices
 from paths import ROOT
@@ -25,7 +26,10 @@ def evaluation_of(names: list[str]) -> Evaluation:
     rng = np.random.default_rng(0)
     hard = np.eye(FRAMES, k=-FRAMES // 2, dtype=bool)
     data = DataSet(
-        "synthetic", [Path(f"{i}.png") for i in range(FRAMES)], None, sequence_truth(hard, Exclusion(5), "the rule")
+        "synthetic",
+        ImageSequence.of_files([Path(f"{i}.png") for i in range(FRAMES)]),
+        None,
+        sequence_truth(hard, Exclusion(5), "the rule"),
     )
     return evaluate(data, [(name, GivenScores(hard + rng.normal(size=hard.shape))) for name in names])
 

@@ -1,0 +1,158 @@
+"""The one type of frames: what a data set, a detector, a method and a list of pairs are given."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from loopclosure.errors import InputError
+from loopclosure.places.frames import Selection, read_bgr, video_frames
+from loopclosure.places.intrinsics import Intrinsics
+from loopclosure.places.trajectory import Poses
+from netspec.files.image_list import ImageList
+
+NAMED = 10  # of the images that cannot be read
+
+
+@dataclass(frozen=True)
+class ImageSequence(ImageList):
+    """N frames in order: image files, or frames of a video.
+
+    paths       the N files; empty for a video
+    names       (N) of the frames: those of the files relative to ``source``, or "frame NUMBER" of a video
+    stamps      (N,) seconds, None if not known
+    source      what was read: a folder, a list or a video
+    numbers     (N,) positions of the frames in the source, counted from 0; None: all of its frames
+    poses       (N, 7) of the camera in the world, tx ty tz qx qy qz qw, NaN where not known; None if no pose is known
+    camera      None if not known
+    depths      N files of depth in TUM's form (16 bits, 5000 per meter), None for an image without one; or None
+    doubts      sentences about poses that look wrong
+    unreadable  indices of the images that ``frames`` could not read
+    """
+
+    source: Path = Path()
+    numbers: np.ndarray | None = None
+    poses: np.ndarray | None = None
+    camera: Intrinsics | None = None
+    depths: tuple[Path | None, ...] | None = None
+    doubts: tuple[str, ...] = ()
+    unreadable: list[int] = field(default_factory=list)
+
+    @classmethod
+    def of_files(cls, paths: Sequence[Path]) -> ImageSequence:
+        """Return image files as frames of which nothing else is known."""
+        return cls(tuple(paths), tuple(path.name for path in paths))
+
+    @classmethod
+    def of_video(cls, source: Path, count: int) -> ImageSequence:
+        """Return the first ``count`` frames of a video."""
+        return cls((), tuple(f"frame {number}" for number in range(count)), source=source)
+
+    @property
+    def name(self) -> str:
+        """The name of the source."""
+        return self.source.resolve().name
+
+    @property
+    def folder(self) -> Path:
+        """What the names are relative to."""
+        return self.source if self.source.is_dir() else self.source.parent
+
+    @property
+    def known(self) -> np.ndarray:
+        """Which frames (N,) have a pose."""
+        if self.poses is None:
+            return np.zeros(len(self), bool)
+        return np.all(np.isfinite(self.poses), axis=1)
+
+    def taken(self, selection: Selection) -> ImageSequence:
+        """Return some of the frames: a selection counts the rows of the sequence, with a pose or without."""
+        return self.at(selection.numbers(len(self)))
+
+    def at(self, indices: Sequence[int] | np.ndarray) -> ImageSequence:
+        """Return the frames with these indices."""
+        indices = np.asarray(indices, int)
+        return replace(
+            self,
+            paths=tuple(self.paths[i] for i in indices) if self.paths else (),
+            names=tuple(self.names[i] for i in indices),
+            stamps=None if self.stamps is None else self.stamps[indices],
+            numbers=indices if self.numbers is None else self.numbers[indices],
+            poses=None if self.poses is None else self.poses[indices],
+            depths=None if self.depths is None else tuple(self.depths[i] for i in indices),
+            unreadable=[],
+        )
+
+    def with_poses(self) -> ImageSequence:
+        """Return the frames that have a pose. Raises InputError if none has."""
+        if self.poses is None:
+            raise InputError("has no poses; expected groundtruth.txt, or the name of a file of poses", self.source)
+        known = np.flatnonzero(self.known)
+        if not len(known):
+            raise InputError(f"none of its {len(self)} images has a pose", self.source)
+        return self.at(known)
+
+    def known_poses(self) -> Poses:
+        """Return the N poses of a sequence in which each frame has one, as those of :meth:`with_poses`."""
+        assert self.poses is not None
+        return Poses(self.poses[:, :3], self.poses[:, 3:])
+
+    def with_files(self) -> ImageSequence:
+        """Return the same sequence. Raises InputError for the first image that is not there."""
+        for path in self.paths:
+            if not os.path.isfile(path):
+                raise InputError("no such image, though the sequence lists it", path)
+        return self
+
+    def frames(self, wanted: Collection[int] | None = None) -> Iterator[tuple[int, np.ndarray, float | None]]:
+        """Yield the index, the image (H, W, 3) uint8 BGR and the stamp of each frame, or of those ``wanted``.
+
+        An image that cannot be read is left out, and listed in ``unreadable``. Raises InputError where none can be
+        read, and where a video ends too soon.
+        """
+        chosen = range(len(self)) if wanted is None else sorted(wanted)
+        if not self.paths:
+            yield from self._video_frames(chosen)
+            return
+        for i in chosen:
+            try:
+                image = read_bgr(self.paths[i])
+            except InputError:
+                self.unreadable.append(i)
+                if len(self.unreadable) == len(self):
+                    raise
+                continue
+            yield i, image, None if self.stamps is None else float(self.stamps[i])
+
+    def _video_frames(self, chosen: Sequence[int]) -> Iterator[tuple[int, np.ndarray, float | None]]:
+        """Read a video once, from its beginning to the last frame of those chosen, which are in order."""
+        wanted = [(i if self.numbers is None else int(self.numbers[i]), i) for i in chosen]
+        if not wanted:
+            return
+        count = 0
+        for number, (seconds, image) in enumerate(video_frames(self.source)):
+            count += 1
+            if number == wanted[0][0]:
+                yield wanted.pop(0)[1], image, seconds
+                if not wanted:
+                    return
+        message = f"ends after {count} frames, though frame {wanted[0][0]} is wanted and it says that it has it"
+        raise InputError(f"{message}; write {self.source},stop={count}", self.source)
+
+    def left_out(self) -> str:
+        """Say in one sentence which images could not be read; empty where all could."""
+        names = [self.names[i] for i in self.unreadable]
+        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        said = f"{len(names)} of {len(self)} images cannot be read and are left out: {', '.join(names[:NAMED])}{more}"
+        return said if names else ""
+
+    def readable(self) -> ImageSequence:
+        """Return the sequence without the images that could not be read."""
+        if not self.unreadable:
+            return self
+        unreadable = set(self.unreadable)
+        return self.at([i for i in range(len(self)) if i not in unreadable])
