@@ -11,11 +11,11 @@ if TYPE_CHECKING:
 
     from netspec.dialects import use_dialect
     from netspec.errors import SpecError
-    from netspec.load import load_net
+    from netspec.load import load_net, load_solver
     from netspec.net.net import Net
     from netspec.net.one_layer import layer
     from netspec.net.weights import load_weights, save_weights
-    from netspec.solver.solver import Solver, load_solver
+    from netspec.solver.solver import Solver
 
 _HOMES = {
     "SpecError": "netspec.errors",
@@ -24,7 +24,7 @@ _HOMES = {
     "layer": "netspec.net.one_layer",
     "load_net": "netspec.load",
     "Solver": "netspec.solver.solver",
-    "load_solver": "netspec.solver.solver",
+    "load_solver": "netspec.load",
     "load_weights": "netspec.net.weights",
     "save_weights": "netspec.net.weights",
 }

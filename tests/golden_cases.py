@@ -17,6 +17,7 @@ import netspec
 from netspec.exact import CHOICES
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
+from netspec.load import speed
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import PHASES, Datum
@@ -142,7 +143,9 @@ class LayerCase:
     def outputs(self, exact: str = "small", device: str = "cpu") -> dict[str, np.ndarray]:
         """Return the outputs of a run without gradients, for which nets of phase TEST are prepared."""
         net, source = parse_net(self.folder / "net.prototxt")
-        built = build_net(with_state(net, PHASES[self.meta["phase"]]), source, BuildOptions(device, exact=exact))
+        built = build_net(
+            with_state(net, PHASES[self.meta["phase"]]), source, BuildOptions(device, exact=exact, speed=speed())
+        )
         set_parameters(built, self.golden, "param_init/")
         inputs = {name: torch.from_numpy(self.golden[f"in/{name}"]).to(device) for name in built.inputs}
         with torch.no_grad():

@@ -15,8 +15,8 @@ from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
 from netspec.export.engines.choice import BF16, ENGINES, FP32, OPENVINO, PRECISIONS, TORCH, Choice
 from netspec.files.limits import read_amount
-from netspec.graph.options import BuildOptions
-from netspec.graph.steps import PASSES
+from netspec.graph.options import PASSES, BuildOptions
+from netspec.load import speed
 from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
 from netspec.terminal import commands
@@ -222,7 +222,7 @@ def options(arguments: argparse.Namespace, **chosen: Any) -> BuildOptions:
     said = {field: getattr(arguments, name) for name, field in _CHOSEN.items() if name in arguments}
     if "stage" in arguments:
         said["stages"] = stages(arguments)
-    return BuildOptions(**{**said, **chosen})
+    return BuildOptions(**{"speed": speed(), **said, **chosen})
 
 
 def stages(arguments: argparse.Namespace) -> tuple[str, ...]:

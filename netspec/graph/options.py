@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from netspec.errors import check_choice, several
 from netspec.exact import CHOICES, SMALL
-from netspec.graph.steps import PASSES
+
+FOLD, FUSE, SKIP, PACK = PASSES = ("fold", "fuse", "skip", "pack")  # netspec/fast/steps.py says what they do
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,8 @@ class BuildOptions:
     ``accumulate_in_place`` makes layers add the gradients that they sum up to ``grad`` themselves, like Caffe
     (netspec/exact/accumulate.py); hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP then do not see
     these gradients.
-    ``passes`` are those of netspec/graph/steps.py that a net of phase TEST may use when it runs without gradients.
+    ``speed`` makes the net faster (:class:`netspec.run.speed.Speed`; None: nothing does); ``passes`` are what it may do
+    to a net of phase TEST that runs without gradients (netspec/fast/steps.py).
     Weights must have every layer of the net if ``strict``. The net may need ``limit`` bytes of memory (None: what there
     is on its device). ``dialects`` are those of Caffe's forks that the net uses; what its text says is added. One text
     where several are meant is one of them. Raises SpecError for an ``exact`` or a pass that there is not.
@@ -43,6 +46,7 @@ class BuildOptions:
     ranks: int = 1
     exact: str = SMALL
     accumulate_in_place: bool = False
+    speed: Any = None
     passes: Collection[str] = PASSES
     strict: bool = False
     limit: int | None = None

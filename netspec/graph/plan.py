@@ -189,3 +189,13 @@ def plan_backward(
             [need or j not in label_bottoms[i] for j, need in enumerate(needs)] for i, needs in enumerate(bottom_needs)
         ]
     return Backward(tuple(layer_needs), tuple(tuple(needs) for needs in bottom_needs))
+
+
+def origins(plan: Plan, passes_on: Sequence[bool]) -> tuple[int, ...]:
+    """Return, by value, the one that it is by another name: a Split's top, or a Dropout's in testing, is its bottom."""
+    found = list(range(len(plan.blobs)))
+    for node, passes in zip(plan.nodes, passes_on, strict=True):
+        if passes:
+            for v in node.tops:
+                found[v] = found[node.bottoms[0]]
+    return tuple(found)

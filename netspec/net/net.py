@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,9 +27,8 @@ from netspec.net.assembly import Assembly
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST
 from netspec.run.eager import Eager
-from netspec.run.prepared import Prepared
-from netspec.run.training import LARGEST, TrainingStep, obstacle
-from netspec.run.walk import Runner, weighted_sum
+from netspec.run.speed import Trainer
+from netspec.run.walk import Runner
 
 Array = np.ndarray | torch.Tensor
 
@@ -86,11 +84,11 @@ class Net(torch.nn.Module):
     def _set_runners(self) -> None:
         """Make what runs the net: of ``runners`` the first that can. The last, ``eager``, always can."""
         options = self.options
-        made = self.plan, list(self.layers), self.loss_weights, options.exact
-        self.eager = Eager(*made)
-        self.prepared = Prepared(*made, options.passes) if self.phase == TEST and options.passes else None
-        self._training: TrainingStep | str | None = None  # made at the first pass that trains
-        self.largest_trained: float = LARGEST  # numbers in all tops, for training_step
+        self.eager = Eager(self.plan, list(self.layers), self.loss_weights, options.exact)
+        prepares = options.speed and options.passes and self.phase == TEST
+        self.prepared: Any = options.speed.prepared(self.eager, options.passes) if prepares else None
+        self._training: Trainer | str | None = None  # made at the first pass that trains
+        self.largest_trained: float | None = None  # numbers in all tops, for new_trainer
         self.runners: list[Runner] = [runner for runner in (self.prepared, self.eager) if runner]
 
     def replace_layer(self, i: int, layer: Layer) -> None:
@@ -159,10 +157,10 @@ class Net(torch.nn.Module):
     def forward_backward(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]] | None:
         """Run forward and backward by kernels prepared once; return the loss and the outputs, as forward_loss does.
 
-        Gradients are added to ``grad``. None where autograd must do it: see :meth:`training_step`, or where hooks or
+        Gradients are added to ``grad``. None where autograd must do it: see :meth:`new_trainer`, or where hooks or
         ``keep`` look at the pass. The loss is valid until the next call.
         """
-        training = self.training_kernels()
+        training = self.trainer()
         if training is None or self.keep or training.is_watched():
             return None
         with self._passing.lock:
@@ -170,21 +168,21 @@ class Net(torch.nn.Module):
             self._passing.own.blobs = self._passing.last = outputs
         return loss, outputs
 
-    def training_kernels(self, anew: bool = False) -> TrainingStep | None:
-        """Return what :meth:`forward_backward` runs, made once, or ``anew`` where it is next used; None without it."""
-        if anew:
-            self._training = None
-            return None
+    def trainer(self) -> Trainer | None:
+        """Return what :meth:`forward_backward` runs, made once; None without it."""
         if self._training is None:
-            self._training = self.training_step()
+            self._training = self.new_trainer()
         return None if isinstance(self._training, str) else self._training
 
-    def training_step(self) -> TrainingStep | str:
-        """Return the prepared kernels that train the net, or the reason why it has none."""
-        if why := obstacle(self.plan, self.eager.parts(), self.largest_trained):
-            return why
-        weighted = partial(weighted_sum, exact=self.options.exact)
-        return TrainingStep(self.plan, self.eager.parts(), self.loss_weights, self.eager.overwritten, weighted)
+    def forget_trainer(self) -> None:
+        """Let the next pass of :meth:`forward_backward` be one of a new trainer, in other memory."""
+        self._training = None
+
+    def new_trainer(self) -> Trainer | str:
+        """Return what trains the net faster than autograd, or the reason why nothing does."""
+        if self.options.speed is None:
+            return "nothing makes it faster (netspec/fast)"
+        return self.options.speed.trainer(self.eager, self.largest_trained)
 
     def given(self, inputs: Mapping[str, Array]) -> dict[int, torch.Tensor]:
         """Return the values of the net's inputs. Raises SpecError where one is missing, or unknown."""

@@ -18,7 +18,7 @@ import torch
 from netspec.graph.plan import Node, Plan
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
-from netspec.run.fold import Part, parts_of
+from netspec.run.parts import Part, parts_of
 from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
 
 
@@ -31,7 +31,7 @@ class Eager:
     def __init__(
         self, plan: Plan, layers: Sequence[Layer], loss_weights: Sequence[Sequence[float]], exact: str
     ) -> None:
-        self._plan, self._layers, self._exact = plan, list(layers), exact
+        self.plan, self.layers, self.loss_weights, self.exact = plan, list(layers), loss_weights, exact
         self._losses = losses_of(loss_weights)
         self._last_uses = last_uses(plan)
         self.overwritten = [is_overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
@@ -43,15 +43,15 @@ class Eager:
         values: Values = dict(given)
         if kept not in self._lines:
             self._lines = {kept: self._line(kept)}
-        return walk(self._lines[kept], values, self._exact, self._remembering()), values
+        return walk(self._lines[kept], values, self.exact, self._remembering()), values
 
     def one_by_one(self) -> list[Step]:
         """Return a step for each layer but the inputs, all by themselves; no value ends."""
-        return [step._replace(ends=()) for i in range(len(self._layers)) for step in self._alone(i)]
+        return [step._replace(ends=()) for i in range(len(self.layers)) for step in self._alone(i)]
 
     def _line(self, kept: frozenset[int]) -> list[Step]:
         """Return the steps of runs that keep some values."""
-        nodes, steps = self._plan.nodes, list[Step]()
+        nodes, steps = self.plan.nodes, list[Step]()
         for part in self.parts(kept):
             if len(part.members) == 1:
                 steps += self._alone(part.first, kept)
@@ -62,11 +62,11 @@ class Eager:
 
     def parts(self, kept: frozenset[int] = frozenset()) -> list[Part]:
         """Return the layers, those as one that may run as one where these values are kept."""
-        return parts_of(self._plan, self._layers, self._apart, kept)
+        return parts_of(self.plan, self.layers, self._apart, kept)
 
     def _alone(self, i: int, kept: frozenset[int] = frozenset()) -> list[Step]:
         """Return the step that runs layer ``i`` alone; none for an input, whose values are given."""
-        node, layer = self._plan.nodes[i], self._layers[i]
+        node, layer = self.plan.nodes[i], self.layers[i]
         losses, ends = self._losses[i], self._ends(i, i, kept)
         if not layer.is_input:
             return [Step(i, self._as_asked(i), node.bottoms, node.tops, losses, ends)]
@@ -74,8 +74,8 @@ class Eager:
 
     def _as_asked(self, i: int) -> Callable[..., tuple[torch.Tensor, ...]]:
         """Return what runs a layer: without gradients for blocked bottoms; losses are float32 in every precision."""
-        layer, force = self._layers[i], self._plan.net.force_backward
-        blocked = [stop and not force for stop in self._plan.nodes[i].blocked]
+        layer, force = self.layers[i], self.plan.net.force_backward
+        blocked = [stop and not force for stop in self.plan.nodes[i].blocked]
         if not layer.is_loss and not any(blocked):
             return layer.run
 
@@ -92,7 +92,7 @@ class Eager:
 
     def _must_be_apart(self) -> list[bool]:
         """Return which layers must run by themselves, whatever they compute."""
-        final, nodes = self._plan.final, self._plan.nodes
+        final, nodes = self.plan.final, self.plan.nodes
         read_again = {final[node.tops[0]] for node, is_read in zip(nodes, self.overwritten, strict=True) if is_read}
         return [
             any(node.blocked) or bool(losses) or any(final[v] in read_again for v in node.tops)
@@ -103,11 +103,11 @@ class Eager:
         """Return a visit that keeps, for one run, what later layers leave in memory, where a gradient reads it."""
         if not any(self.overwritten) or not torch.is_grad_enabled():
             return None
-        plan, memories = self._plan, dict[int, Memory]()
+        plan, memories = self.plan, dict[int, Memory]()
 
         def visit(step: Step, bottoms: list[torch.Tensor]) -> Any:
             if self.overwritten[step.node]:
-                node, layer = plan.nodes[step.node], self._layers[step.node]
+                node, layer = plan.nodes[step.node], self.layers[step.node]
                 memory = memories.setdefault(plan.final[node.tops[0]], Memory())
                 stop = node.blocked[0] and not plan.net.force_backward
                 bottom = bottoms[0].detach() if stop else bottoms[0]

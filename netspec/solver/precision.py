@@ -67,3 +67,9 @@ class LossScale:
         if self._good == PATIENCE:
             self.factor, self._good = min(2 * self.factor, LARGEST_SCALE), 0
         return True
+
+
+def has_bfloat16() -> bool | None:
+    """Return whether the CPU multiplies bfloat16 numbers, None where torch cannot tell."""
+    found = [getattr(torch.cpu, name, None) for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported")]
+    return any(test() for test in found if test) if any(found) else None

@@ -6,7 +6,7 @@ Caffe: src/caffe/solver.cpp; the sites in the log calls are the lines of that fi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +17,7 @@ import torch
 
 from netspec import log
 from netspec.errors import SpecError, Where, several
-from netspec.exact import SMALL
 from netspec.graph.filter import with_train_state
-from netspec.graph.options import BuildOptions
-from netspec.layers.contract.context import device_of
 from netspec.process.signals import waiting_interrupts
 from netspec.proto.text import parse_solver
 from netspec.solver import update
@@ -28,46 +25,11 @@ from netspec.solver.checks import check_prefix
 from netspec.solver.extra import read_extra
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.options import TrainingOptions, choose_device
-from netspec.solver.precision import FP16, FP32
+from netspec.solver.precision import FP16
 from netspec.solver.processes import own_device
 from netspec.solver.resuming import Snapshots
 from netspec.solver.testing import Display, Tests
 from netspec.solver.training import Blobs, Training
-
-
-def load_solver(
-    path: str | Path,
-    weights: str | Path | Iterable[str | Path] | None = None,
-    snapshot: str | Path | None = None,
-    device: str | torch.device | Sequence[str | torch.device] | None = None,
-    level: int | None = None,
-    stages: str | Iterable[str] = (),
-    allow_python: bool = False,
-    action: Callable[[], str | None] = lambda: None,
-    exact: str = SMALL,
-    strict: bool = False,
-    precision: str = FP32,
-    nan: str = "stop",
-    limit: int | None = None,
-) -> Solver:
-    """Build the solver of a prototxt and its nets, ready to run.
-
-    ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field; with
-    ``strict`` they must have every layer of each net. ``snapshot`` is a .solverstate to go on from; ``level`` and
-    ``stages`` go to the training net. Several devices train side by side, the first being the root. For the others see
-    :class:`~netspec.solver.options.TrainingOptions` and :class:`~netspec.graph.options.BuildOptions`, which all of this
-    is from here on. Raises SpecError for every fault of the files.
-
-        >>> solver = netspec.load_solver("solver.prototxt", weights="x.caffemodel")
-        >>> solver.step(2)
-        >>> solver.iteration
-        2
-    """
-    build = BuildOptions(
-        level=level, stages=several(stages), allow_python=allow_python, exact=exact, strict=strict, limit=limit
-    )
-    options = TrainingOptions(build, [device_of(each) for each in several(device)], nan, precision, action=action)
-    return make_solver(path, options, weights, snapshot)
 
 
 def make_solver(
@@ -76,7 +38,7 @@ def make_solver(
     weights: str | Path | Iterable[str | Path] | None = None,
     snapshot: str | Path | None = None,
 ) -> Solver:
-    """Build a solver as :func:`load_solver` does.
+    """Build the solver of a prototxt and its nets, as ``netspec.load_solver`` (netspec/load.py) does.
 
     Where no device is given, each of several processes has the GPU of its number on its machine.
     """

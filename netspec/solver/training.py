@@ -16,7 +16,6 @@ import torch
 
 from netspec import log
 from netspec.errors import SpecError, Where
-from netspec.layers.contract.fused import has_bfloat16
 from netspec.layers.contract.reading import Scores
 from netspec.net.build import build_net
 from netspec.net.net import Net
@@ -38,7 +37,7 @@ from netspec.solver.checks import (
 from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import RATES_OF_FORKS
 from netspec.solver.options import TrainingOptions, choose_device
-from netspec.solver.precision import BF16, FP16, FP32, LossScale, computing
+from netspec.solver.precision import BF16, FP16, FP32, LossScale, computing, has_bfloat16
 from netspec.solver.replicas import Replicas
 
 Blobs = dict[str, torch.Tensor]  # the outputs of a run, by name

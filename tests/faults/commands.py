@@ -14,8 +14,8 @@ import numpy as np
 import lmdb_build.cli
 import loopclosure.cli
 import netspec.cli
+from netspec.load import load_solver
 from netspec.solver.snapshot import read_state
-from netspec.solver.solver import load_solver
 from paths import GOLDEN
 
 Main = Callable[[list[str]], int]

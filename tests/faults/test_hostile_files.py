@@ -27,10 +27,9 @@ from netspec.data.mean import read_mean_option
 from netspec.errors import SpecError
 from netspec.inspect.features import embedding
 from netspec.inspect.features.images import read_pixels as read_for_features
-from netspec.load import load_net
+from netspec.load import load_net, load_solver
 from netspec.net.weights import load_weights
 from netspec.solver.snapshot import read_state
-from netspec.solver.solver import load_solver
 from paths import ROOT
 
 HUGE = (1 << 20, 1 << 20)

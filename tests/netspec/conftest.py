@@ -17,6 +17,7 @@ from netspec.exact.blas import CAFFES, kernels
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer
+from netspec.load import speed
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, PhaseValue
@@ -57,7 +58,9 @@ def net_of() -> Callable[..., Net]:
 
     def build(text: str, phase: PhaseValue = TEST, report: Report = raise_fault, **options: Any) -> Net:
         net, source = parse_net_text(text, "net.prototxt")
-        return build_net(with_state(net, phase), source.telling(report), BuildOptions(**{"seed": 0, **options}))
+        return build_net(
+            with_state(net, phase), source.telling(report), BuildOptions(**{"seed": 0, "speed": speed(), **options})
+        )
 
     return build
 

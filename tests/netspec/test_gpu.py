@@ -9,7 +9,7 @@ import torch
 
 from fake_gpu import GPUS, NAME, POSSIBLE, FakeTensor, fake_gpu, gpu
 from netspec.inspect.features.describer import Describer
-from netspec.solver.solver import load_solver
+from netspec.load import load_solver
 from paths import GOLDEN
 
 needs_fake = pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")

@@ -196,7 +196,7 @@ class BlobRunner:
         for memory in fresh.values():
             memory.leave_views()
         self._bound = [None] * len(self._layers)  # kernels keep the memory that they compute into
-        self.net.training_kernels(anew=True)
+        self.net.forget_trainer()
 
     def forget(self, kernels: bool) -> None:
         """Forget the runs of layers: a later backward pass takes what their blobs hold now; and their kernels."""
@@ -240,7 +240,7 @@ class BlobRunner:
         )
 
     def _forward_prepared(self) -> torch.Tensor:
-        """Run the whole net as netspec does (netspec/run/prepared.py), and put what it computes where views look."""
+        """Run the whole net as netspec does (netspec/fast/prepared.py), and put what it computes where views look."""
         assert self.net.prepared is not None
         given = {v: self.blobs[b].data_memory.tensor(self.blobs[b].shape) for v, b in self._given}
         found = self.net.prepared.run(given, self._final_values)

@@ -15,6 +15,7 @@ from netspec.errors import check_choice
 from netspec.exact import CHOICES, SMALL
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.context import Random
+from netspec.load import speed
 
 
 @dataclass
@@ -101,7 +102,9 @@ def exact() -> str:
 
 def build_options() -> BuildOptions:
     """Return how the next net is built."""
-    return BuildOptions(str(device()), next_seed(), allow_python=True, exact=_mode.exact, accumulate_in_place=True)
+    return BuildOptions(
+        str(device()), next_seed(), allow_python=True, exact=_mode.exact, accumulate_in_place=True, speed=speed()
+    )
 
 
 def set_multiprocess(value: bool) -> None:

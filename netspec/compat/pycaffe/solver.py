@@ -23,6 +23,7 @@ from netspec.compat.pycaffe.whole import WholeRun
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.reading import Constant
 from netspec.layers.utility.python import Python
+from netspec.load import speed
 from netspec.net import net as core
 from netspec.proto.text import parse_solver
 from netspec.solver import solver as core_solver
@@ -127,7 +128,7 @@ class Solver:
         if self.type_name:
             param.type = self.type_name
         with caffes_errors():
-            build = BuildOptions(seed=mode.solver_seed(), allow_python=True, exact=mode.exact())
+            build = BuildOptions(seed=mode.solver_seed(), allow_python=True, exact=mode.exact(), speed=speed())
             # nan: as Caffe goes on: a script may look for itself
             options = TrainingOptions(build, [mode.device()], nan="warn")
             self._training = _Training(param, node, options)

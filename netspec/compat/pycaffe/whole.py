@@ -15,8 +15,8 @@ from netspec.compat.pycaffe.tapes import overwrites_shared
 from netspec.graph.plan import AUTOMATIC
 from netspec.layers.contract.gradients import gradient_reads
 from netspec.layers.utility.live_blobs import Blob
-from netspec.run.training import LARGEST
 
+LARGE = 2**22  # numbers in all blobs: of more, two sets of kernels take too much memory
 Passed = tuple[torch.Tensor, dict[str, torch.Tensor]]
 
 
@@ -25,7 +25,7 @@ class WholeRun:
 
     def __init__(self, runner: BlobRunner) -> None:
         self._runner, self._net = runner, runner.net
-        self._is_large = sum(blob.count for blob in runner.blobs) > LARGEST  # not to be kept by two sets of kernels
+        self._is_large = sum(blob.count for blob in runner.blobs) > LARGE
         # of several that are written to one memory, the last
         self._tops = list({id(blob.data_memory): (v, blob) for v, blob in self._written()}.values())
         self._diffs = list({id(blob.diff_memory): (v, blob) for v, blob in self._reached()}.values())
@@ -50,7 +50,7 @@ class WholeRun:
         """Run the net, and show what it computed; None where the layers must run one by one."""
         if any(self._runner.hooks.values()):
             return None
-        step = self._net.training_kernels()
+        step = self._net.trainer()
         if step is None:
             return None
         step.keeps = True

@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from netspec.data import blobs
+from netspec.errors import SpecError, Where
 from netspec.files.whole_file import whole_file
 from netspec.graph.filter import add_input, filter_net
-from netspec.graph.fold import origins
 from netspec.graph.options import BuildOptions
+from netspec.graph.plan import origins
 from netspec.layers.contract.folding import folds_of
 from netspec.layers.contract.reading import reads_data
 from netspec.net.build import build_net, not_to_be_given
@@ -25,7 +27,6 @@ from netspec.proto.schema import NetParameter, ParamSpec
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import write_text
 from netspec.proto.upgrade.rewrite import copy_without
-from netspec.run.fold import Fold, find_folds
 
 
 def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool = True) -> tuple[Any, SourceMap]:
@@ -61,10 +62,10 @@ def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool
 def fold(net: Net) -> NetParameter:
     """Return a net with its weights, folded, without Splits, Dropouts and others that only pass their bottom on.
 
-    netspec/run/fold.py says what is folded. Blobs keep their names where they still exist, outputs always do;
+    netspec/fast/fold.py says what is folded. Blobs keep their names where they still exist, outputs always do;
     layers that share parameters share them still where folding left them equal.
     """
-    folds = find_folds(net.plan, list(net.layers))
+    folds = _found_folds(net)
     plan = net.plan
     passes = [folds_of(layer).passes_on for layer in net.layers]
     origin = origins(plan, passes)
@@ -93,6 +94,14 @@ def fold(net: Net) -> NetParameter:
     return result
 
 
+def _found_folds(net: Net) -> list[Any]:
+    if find_spec("netspec.fast") is None:
+        raise SpecError("to fold a net needs netspec/fast, which is not installed", Where(net.plan.source.file))
+    from netspec.fast.fold import find_folds
+
+    return find_folds(net.plan, list(net.layers))
+
+
 def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
     """Return the names of the values that are left.
 
@@ -118,7 +127,7 @@ def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
     return names
 
 
-def _shared_names(net: Net, index: int, absorbed: Mapping[int, Fold]) -> list[Any]:
+def _shared_names(net: Net, index: int, absorbed: Mapping[int, Any]) -> list[Any]:
     """Return the ``param { name }`` of a layer that still shares its blobs, all of them or none."""
     layer, node = net.layers[index], net.plan.nodes[index]
     named = [spec.name for spec in node.params]

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from netspec.export.formats.shapes import Fixed, NetShapes
-from netspec.graph.fold import origins
+from netspec.graph.plan import origins
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.exporting import export
 from netspec.layers.contract.folding import folds_of

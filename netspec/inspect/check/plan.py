@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
-from netspec.graph.steps import PASSES, PlannedStep
-from netspec.layers.contract.fused import has_bfloat16
+from netspec.graph.options import PASSES
 from netspec.net.net import Net
 from netspec.proto.schema import TRAIN
+from netspec.solver.precision import has_bfloat16
 
 KINDS = {
     "packed": "by oneDNN, weights laid out in advance, channels side by side",
@@ -27,7 +29,7 @@ def plan_text(net: Net) -> str:
     """
     bfloat16 = f"bfloat16 on this CPU: {_BFLOAT16[has_bfloat16()]}"
     if net.phase == TRAIN:
-        why = net.training_step()
+        why = net.new_trainer()
         how = f"each pass goes through autograd: {why}" if isinstance(why, str) else "by kernels prepared once"
         return f"no passes: nets run layer by layer in phase TRAIN. Training in fp32, {how}; {bfloat16}"
     if net.prepared is None:
@@ -54,7 +56,7 @@ def plan_text(net: Net) -> str:
     )
 
 
-def _name(net: Net, step: PlannedStep) -> str:
+def _name(net: Net, step: Any) -> str:
     members = [step.node, *(step.chain.folded if step.chain else ())]
     members = sorted(members) + ([step.finish] if step.finish is not None else [])
     return " + ".join(net.plan.nodes[i].name for i in members)

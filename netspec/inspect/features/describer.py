@@ -11,6 +11,7 @@ from netspec.export.engines.choice import Choice
 from netspec.graph.options import BuildOptions
 from netspec.inspect.features.images import ImageNet
 from netspec.inspect.features.scaling import Steps, read_zooms
+from netspec.load import speed
 from netspec.proto.binary import split_paths
 
 
@@ -50,7 +51,15 @@ class Describer:
         choice = Choice.of(engine, precision, cache)
         views = read_zooms(zooms)
         self.image_net = ImageNet(
-            model, split_paths(weights), blob, input, None, views, steps, choice, BuildOptions(str(device))
+            model,
+            split_paths(weights),
+            blob,
+            input,
+            None,
+            views,
+            steps,
+            choice,
+            BuildOptions(str(device), speed=speed()),
         )
         self.views = len(self.image_net.zooms)
 

@@ -24,6 +24,7 @@ from netspec.files.opencv import cv2
 from netspec.graph.filter import filter_net, is_input, prune, shapes_of_input, with_state
 from netspec.graph.options import BuildOptions
 from netspec.inspect.features.scaling import Steps, middle, scaling_of
+from netspec.load import speed
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap
@@ -61,7 +62,7 @@ class ImageNet:
         choice: Choice | None = None,
         options: BuildOptions | None = None,
     ) -> None:
-        options = replace(options or BuildOptions(), seed=0)
+        options = replace(options or BuildOptions(speed=speed()), seed=0)
         read, source = parse_net(model)
         net, source = filter_net(with_state(read, TEST), source)
         before, before_source = prune(net, source, [input_blob], {})

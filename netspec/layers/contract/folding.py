@@ -1,4 +1,4 @@
-"""How the work of a layer and that of its neighbors become one: netspec/graph/fold.py and run/fold.py put it together.
+"""How the work of a layer and that of its neighbors become one: netspec/fast/chains.py and fold.py put it together.
 
 A convolution y = W x + b followed by z = s y + t, both s and t one number for each channel, is a convolution with the
 weights s W and the bias s b + t. A map from number to number can be done in place to the top of the layer before it.

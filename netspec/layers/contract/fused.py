@@ -33,12 +33,6 @@ def suits(weight: torch.Tensor) -> bool:
     return here and torch.backends.mkldnn.is_available() and all(hasattr(_ops(), name) for name in _NEEDED)
 
 
-def has_bfloat16() -> bool | None:
-    """Return whether the CPU multiplies bfloat16 numbers, None where torch cannot tell."""
-    found = [getattr(torch.cpu, name, None) for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported")]
-    return any(test() for test in found if test) if any(found) else None
-
-
 def convolution(
     shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, group: int, how: Preparation
 ) -> Kernels:

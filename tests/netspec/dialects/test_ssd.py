@@ -12,10 +12,10 @@ from netspec.dialects import use_dialect
 from netspec.dialects.boxes import CENTER_SIZE, decode, suppress
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer
+from netspec.load import load_solver
 from netspec.net.build import build_net
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
-from netspec.solver.solver import load_solver
 
 Build = Callable[..., Layer]
 Gradcheck = Callable[..., None]

@@ -11,12 +11,12 @@ import netspec
 from case_files import read_texts
 from exported import assert_same, here, random_inputs, trained
 from netspec.export.formats.deploy import fold, with_inputs, write_caffe
+from netspec.fast.fold import find_folds
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net
-from netspec.run.fold import find_folds
 from paths import GOLDEN
 
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 4 dim: 5 dim: 5 } } }'

@@ -10,9 +10,8 @@ import pytest
 import torch
 
 import netspec
-from netspec.load import load_net
+from netspec.load import load_net, load_solver
 from netspec.net.net import Net
-from netspec.solver.solver import load_solver
 
 POOL = 'type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }'
 

@@ -15,7 +15,8 @@ from typing_extensions import override
 from case_files import read_texts
 from exported import trained
 from netspec.exact.blas import one_thread
-from netspec.graph.steps import PASSES
+from netspec.fast import prepared as programs
+from netspec.graph.options import PASSES
 from netspec.layers.activation import ReLU
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.offers import offered
@@ -23,7 +24,6 @@ from netspec.layers.vision.convolution import Convolution
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, write_binary
 from netspec.proto.schema import TRAIN, LayerParameter
-from netspec.run import prepared as programs
 
 FILLERS = 'weight_filler { type: "gaussian" std: 0.2 } bias_filler { type: "uniform" min: -1 max: 1 }'
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 8 dim: 40 dim: 40 } } }'

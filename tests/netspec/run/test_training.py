@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from case_files import read_cases
-from netspec.run.training import TrainingStep
-from netspec.solver.solver import Solver, load_solver
+from netspec.fast.training import TrainingStep
+from netspec.load import load_solver
+from netspec.solver.solver import Solver
 
 NETS = {name: case["net"] for name, case in read_cases("netspec/run/training.txt").items()}
 NETS["single image"] = NETS["residual"].replace("dim: 6 dim: 6", "dim: 1 dim: 6").replace("{ dim: 6 }", "{ dim: 1 }")

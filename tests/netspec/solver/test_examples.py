@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from golden_cases import assert_same_layers, assert_training, lay_out_examples, parameters, set_parameters, train
-from netspec.solver.solver import Solver, load_solver
+from netspec.load import load_solver
+from netspec.solver.solver import Solver
 from paths import GOLDEN
 
 RUNS = sorted(folder.name for folder in (GOLDEN / "examples" / "runs").iterdir())

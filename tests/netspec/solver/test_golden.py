@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from golden_cases import STEPS, assert_arrays, assert_same_layers, assert_training, parameters, promised, train
+from netspec.load import load_solver
 from netspec.proto.text import parse_solver
 from netspec.solver.lr_policy import learning_rate
 from netspec.solver.snapshot import read_state
-from netspec.solver.solver import load_solver
 from paths import GOLDEN
 
 pytestmark = pytest.mark.slow

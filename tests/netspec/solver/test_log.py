@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from netspec import load_net, log
-from netspec.solver.solver import load_solver
+from netspec.load import load_solver
 from netspec.solver.testing import Tally, score_lines
 
 

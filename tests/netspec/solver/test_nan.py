@@ -9,7 +9,7 @@ import pytest
 from netspec.cli import main
 from netspec.data.mean import read_mean, read_mean_option, write_mean
 from netspec.errors import SpecError
-from netspec.solver.solver import load_solver
+from netspec.load import load_solver
 
 NET = """
 layer { name: "data" type: "DummyData" top: "data" top: "label" dummy_data_param {

@@ -10,9 +10,9 @@ import torch
 
 from golden_cases import train
 from netspec.errors import SpecError
+from netspec.load import load_solver
 from netspec.solver import training
 from netspec.solver.precision import BF16, FIRST_SCALE, FP16, FP32, PATIENCE, TF32, LossScale, computing
-from netspec.solver.solver import load_solver
 
 
 def losses(case: str, **options: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -14,8 +14,9 @@ import pytest
 import torch
 
 import forked
+from netspec.load import load_solver
 from netspec.solver.extra import newest_pair, read_extra
-from netspec.solver.solver import Solver, load_solver
+from netspec.solver.solver import Solver
 from paths import GOLDEN
 
 pytestmark = pytest.mark.slow

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from netspec.data.sources import Cursor, Draws
+from netspec.load import load_solver
 from netspec.net.net import Net
 from netspec.solver.checks import dependence
-from netspec.solver.solver import load_solver
 from paths import GOLDEN
 
 CPU = torch.device("cpu")

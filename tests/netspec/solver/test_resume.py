@@ -18,10 +18,11 @@ from netspec.cli import main
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
 from netspec.errors import SpecError
+from netspec.load import load_solver
 from netspec.net.sealed import sealed
 from netspec.solver.extra import changes, newest_pair, path_beside, read_extra
 from netspec.solver.snapshot import State, read_state, write_state
-from netspec.solver.solver import Solver, load_solver
+from netspec.solver.solver import Solver
 from netspec.solver.update import RULES
 
 pytestmark = pytest.mark.slow

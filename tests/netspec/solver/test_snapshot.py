@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from netspec.errors import SpecError
+from netspec.load import load_solver
 from netspec.net.weights import load_weights
 from netspec.proto.schema import BlobProto, BlobShape, SolverState
 from netspec.solver.snapshot import State, find_learned_net, merge_shared, read_state, write_state
-from netspec.solver.solver import Solver, load_solver
+from netspec.solver.solver import Solver
 from paths import GOLDEN
 
 pytestmark = pytest.mark.slow

@@ -11,11 +11,12 @@ import torch
 from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.layers.contract.reading import Fed
+from netspec.load import load_solver
 from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter
 from netspec.solver import update
 from netspec.solver.snapshot import read_state
-from netspec.solver.solver import Solver, load_solver
+from netspec.solver.solver import Solver
 
 NET = """
 name: "tiny"

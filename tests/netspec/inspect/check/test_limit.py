@@ -19,10 +19,10 @@ from netspec.files import limits
 from netspec.graph import splits
 from netspec.layers.contract import fillers
 from netspec.layers.contract.base import Shape
+from netspec.load import load_solver
 from netspec.net.need import limit_on
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN, LayerParameter
-from netspec.solver.solver import load_solver
 
 MIB = 1 << 20
 PARAMETERS, DUMMY, HUGE = read_texts("netspec/inspect/check/limit.txt").values()

@@ -3,6 +3,7 @@
 ``fold``   what scales and shifts channels becomes part of the weights of the layer before or after it
 ``fuse``   an activation is computed in place, on the top of the layer before it
 ``skip``   layers that hand their bottom on are not run
+``pack``   weights are laid out in advance (fused.py)
 
 They know no layer type: :class:`Roles` says of each layer what it can do.
 """
@@ -12,11 +13,9 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
-from netspec.graph.fold import Chain, Roles, find_chains, origins
-from netspec.graph.plan import Plan
-
-FOLD, FUSE, SKIP, PACK = "fold", "fuse", "skip", "pack"
-PASSES = (FOLD, FUSE, SKIP, PACK)  # pack: weights laid out in advance (netspec/layers/contract/fused.py)
+from netspec.fast.chains import Chain, Roles, find_chains
+from netspec.graph.options import FOLD, FUSE, SKIP
+from netspec.graph.plan import Plan, origins
 
 
 @dataclass(frozen=True)

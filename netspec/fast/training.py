@@ -33,7 +33,7 @@ from netspec.layers.contract.kernels import (
     own_kernels,
     recorded,
 )
-from netspec.run.fold import Part
+from netspec.run.parts import Part
 from netspec.run.walk import losses_of
 
 LARGEST = 2**22  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory

@@ -1,7 +1,7 @@
 """Fold layers that only scale, shift or copy into the layers before them.
 
 The pass knows no layer type. Its callers say of each layer whether it is an affine map of its channels, can take one
-on, or hands its bottom on unchanged; netspec/run/fold.py asks the layers.
+on, or hands its bottom on unchanged; fold.py asks the layers.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from netspec.graph.plan import Plan
+from netspec.graph.plan import Plan, origins
 
 
 @dataclass(frozen=True)
@@ -38,16 +38,6 @@ class Chain:
     def last(self) -> int:
         """The layer whose top is the chain's."""
         return max(self.keeper, *self.folded)
-
-
-def origins(plan: Plan, passes_on: Sequence[bool]) -> tuple[int, ...]:
-    """Return, by value, the one that it is by another name: a Split's top, or a Dropout's in testing, is its bottom."""
-    found = list(range(len(plan.blobs)))
-    for node, passes in zip(plan.nodes, passes_on, strict=True):
-        if passes:
-            for v in node.tops:
-                found[v] = found[node.bottoms[0]]
-    return tuple(found)
 
 
 def find_chains(plan: Plan, roles: Roles, kept: Collection[int] = ()) -> list[Chain]:

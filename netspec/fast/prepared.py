@@ -21,9 +21,11 @@ from netspec.data.blobs import Shape
 from netspec.exact import ALL
 from netspec.exact.blas import one_thread
 from netspec.exact.switch import is_recorded
-from netspec.graph import steps as planned
+from netspec.fast import steps as planned
+from netspec.fast.fold import absorbed_by, roles_of
+from netspec.fast.steps import Schedule, schedule
+from netspec.graph.options import PACK
 from netspec.graph.plan import Plan
-from netspec.graph.steps import PACK, Schedule, schedule
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.folding import Absorbed, absorbing, folds_of
 from netspec.layers.contract.kernels import Kernel, Preparation, finished, own_kernels
@@ -31,7 +33,6 @@ from netspec.layers.contract.learned import Stamp, is_lent, stamp
 from netspec.layers.contract.offers import offered
 from netspec.layers.contract.reading import changes_itself
 from netspec.process.heap import give_back_freed_memory
-from netspec.run.fold import absorbed_by, roles_of
 from netspec.run.shapes import fitted
 from netspec.run.walk import Result, Step, Values, losses_of, walk
 

@@ -1,0 +1,65 @@
+"""Layers in a row that are one: where a net learns, one layer may do the work of those after it.
+
+It reads the blobs of all in each run. BatchNorm, Scale and ReLU are one kernel of torch's, which rounds once where they
+round thrice: so this is part of what a training computes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from netspec.graph.plan import Plan
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.folding import folds_of
+
+
+@dataclass(frozen=True)
+class Part:
+    """Layers in a row, ``members``, from node ``first`` to node ``last``; ``layer`` does the work of all."""
+
+    first: int
+    last: int
+    layer: Layer
+    members: tuple[Layer, ...]
+
+    @property
+    def blobs(self) -> list[torch.Tensor]:
+        """The learnable blobs of all."""
+        return [blob for layer in self.members for blob in layer.blobs]
+
+    def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Run all, one after the other where hooks look at one."""
+        if len(self.members) > 1 and any(layer._forward_hooks for layer in self.members):
+            for layer in self.members:
+                bottoms = layer.run(*bottoms)
+            return bottoms
+        return self.layer.run(*bottoms)
+
+
+def parts_of(
+    plan: Plan, layers: Sequence[Layer], apart: Sequence[bool], kept: Collection[int] = frozenset()
+) -> list[Part]:
+    """Return the layers of a plan, joined where one can do the work of those after it.
+
+    Layers that are ``apart`` are parts of their own. Nobody else reads a value within a part, and none is ``kept``.
+    """
+    readers = Counter(v for node in plan.nodes for v in node.bottoms)
+
+    def is_between(v: int) -> bool:
+        return readers[v] == 1 and v not in kept
+
+    parts: list[Part] = []
+    for i, (node, layer) in enumerate(zip(plan.nodes, layers, strict=True)):
+        before, joined = parts[-1] if parts else None, None
+        if before and plan.nodes[before.last].tops == node.bottoms and not (apart[before.first] or apart[i]):
+            join = folds_of(before.layer).join
+            joined = join(layer) if join and [*map(is_between, node.bottoms)] == [True] else None
+        if before and joined:
+            parts[-1] = Part(before.first, i, joined, (*before.members, layer))
+        else:
+            parts.append(Part(i, i, layer, (layer,)))
+    return parts
