@@ -1,20 +1,36 @@
-# Sourced by the scripts of tools/: makes .venv in this project and installs into it, once. NEEDS names the extras
-# of pyproject.toml that a script needs; without it only what the programs themselves need is installed.
+# Sourced by the scripts of tools/: makes a Python environment, .venv in this project, and installs into it, once.
+# NEEDS: the extras of pyproject.toml that a script needs; without it only what the programs themselves need is installed.
+# VENV: another environment, which may be there already; a torch in it stays. PYTHON: the Python to make it with.
+# What pip reads from its own variables holds, such as PIP_EXTRA_INDEX_URL.
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="${VENV:-$ROOT/.venv}"
+PYTHON="${PYTHON:-python3}"
 NEEDS="${NEEDS:-}"
 INSTALLED="$VENV/installed${NEEDS:+-$NEEDS}"
 if [ ! -x "$VENV/bin/netspec" ] || [ ! -e "$INSTALLED" ] || [ "$ROOT/pyproject.toml" -nt "$INSTALLED" ]; then
   quiet=--quiet
   if [ -t 2 ]; then quiet=; fi  # on a terminal pip shows how long a download takes
-  install() { "$VENV/bin/python" -m pip install $quiet --disable-pip-version-check -c "$ROOT/constraints.txt" "$@" >&2; }
-  echo "Installing into $VENV, once: about $([ "$NEEDS" ] && echo 2 || echo 1.5) GB on disk" >&2
-  "${PYTHON:-python3}" -m venv "$VENV"
-  echo "1 of 2: PyTorch, which is most of it; a few minutes" >&2
-  install torch
-  echo "2 of 2: everything else" >&2
+  # pip unpacks gigabytes into TMPDIR, and /tmp may be in memory.
+  install() { TMPDIR="$VENV/tmp" "$VENV/bin/python" -m pip install $quiet --disable-pip-version-check "$@" >&2; }
+  if ! "$VENV/bin/python" -m pip --version >/dev/null 2>&1; then
+    if ! "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 10))'; then
+      echo "$("$PYTHON" --version) is too old; name Python 3.10 or later: PYTHON=python3.12 $0" >&2
+      exit 1
+    fi
+    "$PYTHON" -m venv "$VENV"
+  fi
+  mkdir -p "$VENV/tmp"
+  if "$VENV/bin/python" -c 'import torch' 2>/dev/null; then
+    echo "Installing into $VENV, once; its PyTorch stays" >&2
+  else
+    echo "Installing into $VENV, once: on Linux about 6 GB, most of it PyTorch for NVIDIA GPUs." >&2
+    echo "With PyTorch for the CPU alone it is a third of that: README.md says how" >&2
+    install -c "$ROOT/constraints.txt" torch
+  fi
+  echo "Installing everything else" >&2
   install -e "$ROOT${NEEDS:+[$NEEDS]}"
+  rm -r "$VENV/tmp"
   touch "$VENV/installed" "$INSTALLED"
 fi
-"${PYTHON:-python3}" "$ROOT/prototxt/variants.py"
+"$PYTHON" "$ROOT/prototxt/variants.py"
 export PATH="$VENV/bin:$PATH"

@@ -1,7 +1,7 @@
 """Environment variables that must stand while a library is loaded: set around that, and put back afterwards.
 
 These are all: the most pixels of an image, for OpenCV (netspec/files/opencv.py), OpenBLAS's kernels, for SciPy, and
-what threadpoolctl sets itself (netspec/exact/blas.py).
+what threadpoolctl (netspec/exact/blas.py) and torch's report (netspec/inspect/check/bug_report.py) set themselves.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ from contextlib import contextmanager
 
 @contextmanager
 def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables within the block, but for those that the user has set."""
-    ours = {name: value for name, value in variables.items() if name not in os.environ}
-    os.environ.update(ours)
+    """Set environment variables within the block, but for those that the user has set; then they are as before."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update({name: value for name, value in variables.items() if before[name] is None})
     try:
         yield
     finally:
-        for name in ours:
+        for name, value in before.items():
             os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value

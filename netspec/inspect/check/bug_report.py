@@ -15,6 +15,7 @@ from netspec.errors import SpecError, printable
 from netspec.exact.blas import kernels
 from netspec.files.limits import amount, memory
 from netspec.inspect.check.check import check_file
+from netspec.process.environment import environment
 from netspec.proto.binary import is_net_binary
 from netspec.terminal.commands import UNKNOWN, version
 
@@ -40,7 +41,9 @@ def _machine() -> Iterator[str]:
     yield f"BLAS kernels: {', '.join(sorted(kernels())) or 'another BLAS'}"
     yield f"Memory: {amount(memory())}"
     yield from (f"{name}: {os.environ[name]}" for name in sorted(os.environ) if VARIABLES.fullmatch(name))
-    yield from get_pretty_env_info().splitlines()
+    with environment({"PIP_DISABLE_PIP_VERSION_CHECK": "1"}):  # torch sets that and leaves it set
+        versions = get_pretty_env_info()
+    yield from versions.splitlines()
 
 
 def _about(path: Path) -> Iterator[str]:

@@ -28,6 +28,20 @@ def test_versions_and_the_machine() -> None:
         assert f"\n{said}" in text
 
 
+@pytest.mark.parametrize("before", [None, "0"])
+def test_the_variable_that_torch_sets_does_not_stay(before: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    def torchs() -> str:
+        os.environ["PIP_DISABLE_PIP_VERSION_CHECK"] = "1"
+        return "PyTorch version: x"
+
+    monkeypatch.delenv("PIP_DISABLE_PIP_VERSION_CHECK", raising=False)
+    if before:
+        monkeypatch.setenv("PIP_DISABLE_PIP_VERSION_CHECK", before)
+    monkeypatch.setattr("torch.utils.collect_env.get_pretty_env_info", torchs)
+    bug_report([])
+    assert os.environ.get("PIP_DISABLE_PIP_VERSION_CHECK") == before
+
+
 def test_the_home_folder_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NETSPEC_SHARED", f"{Path.home()}/x")
     assert "NETSPEC_SHARED: ~/x\n" in bug_report([])
