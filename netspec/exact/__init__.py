@@ -20,7 +20,8 @@ part from these files:
   were compared, transposed or not, and in gemv, dot, asum, axpy and scal. 0.3.31 sums rows of 6 or 7 numbers otherwise
   in gemv (over maps of so many pixels: gradients of biases, BatchNorm), 0.3.34 the absolute values of 264 numbers and
   more (asum: HingeLoss, Reduction with ASUM).
-- Another C library, which may round expf, logf, powf and tanhf otherwise than glibc 2.36.
+- A C library other than glibc, which may round expf, logf, powf and tanh differently. glibc 2.36, 2.41 and 2.43 round
+  them alike. tanhf, which 2.41 changed, is computed here (netspec.exact.libm).
 - Parameters shared with share_mode PERMISSIVE in another shape than their owner's: autograd adds their gradients.
 - BatchReindex that chooses an item more than 16 times: Caffe sorts with std::sort, which leaves the order open.
 - Scale over a batch of one, or from axis 0 on: Caffe overwrites the gradient of its factors in each pass, where it adds

@@ -100,12 +100,12 @@ def test_dots_along_the_middle_axis(dtype: torch.dtype, shape: tuple[int, ...]) 
 
 
 @pytest.mark.parametrize("length", [1, 7, 31, 32, 33, 500])
-def test_dots_have_the_bits_of_a_dot(length: int, same_blas: bool) -> None:
+def test_dots_have_the_bits_of_a_dot(length: int, caffes_bits: bool) -> None:
     a, b = torch.randn(2, 20, length)
     expected = torch.stack([dot(x, y) for x, y in zip(a, b, strict=True)])
     found = dots(a.unsqueeze(2), b.unsqueeze(2)).squeeze(1)
     torch.testing.assert_close(found, expected)
-    assert torch.equal(found, expected) or not same_blas  # another CPU's BLAS may sum otherwise
+    assert torch.equal(found, expected) or not caffes_bits  # another CPU's BLAS may sum otherwise
 
 
 @pytest.mark.parametrize("count", [1, 2, 1000])

@@ -1,13 +1,17 @@
-"""The functions are the C library's, to the last bit."""
+"""The functions are the C library's, to the last bit; tanhf is that of glibc up to 2.40, whatever is installed."""
 
 import ctypes
+import hashlib
+import platform
 
 import numpy as np
 import pytest
 import torch
 
+from libm_bits import GLIBC_2_36, digest
 from netspec.exact import libm
 
+LIBRARY, VERSION = platform.libc_ver()  # ("glibc", "2.36"); of another C library ("", "")
 WIDE = np.array(
     [0, -0.0, 1e-45, 1e-38, 87.9, 88.0, 88.1, 88.7, -88, -103.9, -104, 1e-8, -1e-8, 0.5, -0.5, 20, -20], np.float32
 )
@@ -27,13 +31,50 @@ def values_of(shape: tuple[int, ...]) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize(("function", "name"), [(libm.exp, "expf"), (libm.tanh, "tanhf")])
-def test_of_any_float(function, name: str, shape: tuple[int, ...]) -> None:
+def test_exponential_of_floats(shape: tuple[int, ...]) -> None:
     for values in (values_of(shape), torch.from_numpy(WIDE)):
-        found = function(values)
+        found = libm.exp(values)
         assert found.dtype == torch.float32
         assert found.is_contiguous()
-        np.testing.assert_array_equal(found, each(name, ctypes.c_float, values))
+        np.testing.assert_array_equal(found, each("expf", ctypes.c_float, values))
+
+
+def test_tanh_of_a_million_floats_has_the_bits_of_glibc_2_36() -> None:
+    """Of each 4099th float; the digest was computed with tanhf of glibc 2.36."""
+    values = np.arange(0, 2**32, 4099, dtype=np.uint32).view(np.float32)
+    found = libm.tanh(torch.from_numpy(values[~np.isnan(values)])).numpy()
+    expected = "1a5350336c2f1e386ed0ada012ce16ee702f23c2710c6352d3599ba995fbd28b"
+    assert hashlib.sha256(found.astype("<f4").tobytes()).hexdigest() == expected
+
+
+@pytest.mark.skipif(LIBRARY != "glibc", reason="another C library may round differently")
+def test_the_functions_have_the_bits_of_the_golden_files() -> None:
+    assert digest() == GLIBC_2_36
+
+
+@pytest.mark.skipif(
+    LIBRARY != "glibc" or tuple(map(int, VERSION.split("."))) >= (2, 41),
+    reason="its tanhf has other bits",
+)
+def test_tanh_is_that_of_an_older_glibc() -> None:
+    values = torch.cat([values_of((20000,)), torch.rand(20000) * 2 - 1, torch.from_numpy(WIDE)])
+    np.testing.assert_array_equal(libm.tanh(values), each("tanhf", ctypes.c_float, values))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_tanh_of_any_shape(shape: tuple[int, ...]) -> None:
+    values = values_of(shape)
+    found = libm.tanh(values)
+    assert found.dtype == torch.float32
+    assert found.is_contiguous()
+    assert found.shape == shape
+    torch.testing.assert_close(found, values.tanh())
+
+
+def test_tanh_of_no_number_and_of_infinity() -> None:
+    found = libm.tanh(torch.tensor([float("nan"), float("inf"), -float("inf"), -0.0]))
+    np.testing.assert_array_equal(found, np.array([np.nan, 1, -1, 0], np.float32))
+    assert found[3].signbit()
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -40,9 +40,9 @@ def test_a_run_without_gradients_computes_the_same(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("folder", CASES, ids=lambda path: path.name)
-def test_layer_computes_caffes_bits(folder: Path, same_blas: bool) -> None:
+def test_layer_computes_caffes_bits(folder: Path, caffes_bits: bool) -> None:
     """On other CPUs than Caffe's, whose BLAS rounds in another way, within the tolerance."""
     case = LayerCase(folder)
     for exact in promised(folder):
         for found in (case.compute(exact), case.outputs(exact)):
-            assert_arrays(found, case.golden, 0 if same_blas else TOLERANCE, exact)
+            assert_arrays(found, case.golden, 0 if caffes_bits else TOLERANCE, exact)

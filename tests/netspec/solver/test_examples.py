@@ -30,7 +30,7 @@ def start(run: str, meta: dict) -> Solver:
 
 
 @pytest.mark.parametrize("run", RUNS)
-def test_follows_caffe(run: str, folder: Path, same_blas: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_follows_caffe(run: str, folder: Path, caffes_bits: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """The outputs of 120 iterations, the weights after them and what the test nets then put out, to the last bit.
 
     On other CPUs than Caffe's to a twentieth.
@@ -44,9 +44,9 @@ def test_follows_caffe(run: str, folder: Path, same_blas: bool, monkeypatch: pyt
     solver.test_all()
     solver.close()
     found = {key: np.array([out[key[4:]] for out in outputs]) for key in golden.files if key.startswith("out/")}
-    assert_training({**found, **parameters(solver.net, golden, "final/")}, golden, same_blas, 0.05)
+    assert_training({**found, **parameters(solver.net, golden, "final/")}, golden, caffes_bits, 0.05)
     tested = [{name: value for name, (value,) in scores.items()} for scores in solver.scores]
-    expected = meta["tests_after"] if same_blas else [pytest.approx(one, rel=0.05) for one in meta["tests_after"]]
+    expected = meta["tests_after"] if caffes_bits else [pytest.approx(one, rel=0.05) for one in meta["tests_after"]]
     assert tested == expected
 
 

@@ -21,7 +21,7 @@ CASES = sorted(folder.name for folder in (GOLDEN / "train").iterdir())
 
 
 @pytest.mark.parametrize(("case", "exact"), [(case, promised(GOLDEN / "train" / case)[0]) for case in CASES])
-def test_follows_caffe(case: str, exact: str, work_in: Callable[..., Path], same_blas: bool) -> None:
+def test_follows_caffe(case: str, exact: str, work_in: Callable[..., Path], caffes_bits: bool) -> None:
     """Its losses, weights, history and test losses, to the last bit.
 
     On other CPUs than Caffe's to 1e-2; to a quarter where ties in max poolings decide, which fall as the CPU rounds.
@@ -39,14 +39,14 @@ def test_follows_caffe(case: str, exact: str, work_in: Callable[..., Path], same
     losses = {"loss": found, "test/loss": tested}
     if solver.param.iter_size > 1:  # the file has the mean of several passes, which Caffe did not take
         assert_training({"loss": losses.pop("loss")}, golden, False, drift)
-    assert_training({**losses, **parameters(solver.net, golden, "final/")}, golden, same_blas, drift)
+    assert_training({**losses, **parameters(solver.net, golden, "final/")}, golden, caffes_bits, drift)
     state = read_state(next(Path(case).glob("ref_iter_*.solverstate")))
     assert state.iteration == solver.iteration
     assert state.current_step == solver.current_step
     kept = {f"final/history/{i}": np.asarray(values) for i, values in enumerate(state.history)}
     mine = {f"final/history/{i}": values.numpy() for i, values in enumerate(solver.history)}
     assert mine.keys() == kept.keys()
-    assert_training(mine, kept, same_blas, 2 * drift)
+    assert_training(mine, kept, caffes_bits, 2 * drift)
 
 
 @pytest.mark.parametrize("exact", ["small", "all"])
@@ -66,7 +66,7 @@ def test_begins_as_caffe_does_on_every_cpu(case: str, exact: str, work_in: Calla
 
 @pytest.mark.parametrize("case", STEPS)
 def test_each_step_is_caffes(
-    case: str, work_in: Callable[..., Path], same_blas: bool, monkeypatch: pytest.MonkeyPatch
+    case: str, work_in: Callable[..., Path], caffes_bits: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Outputs and weights after each of three iterations, to the last bit; on other CPUs than Caffe's to 1e-5."""
     monkeypatch.chdir(work_in(f"steps/{case}"))
@@ -82,7 +82,7 @@ def test_each_step_is_caffes(
                 found[f"{i} weight {layer}[{j}]"] = blob.detach().numpy().copy()
     solver.close()
     assert found.keys() == set(golden.files)
-    assert_arrays(found, golden, 0 if same_blas else 1e-5)
+    assert_arrays(found, golden, 0 if caffes_bits else 1e-5)
 
 
 def test_the_rates_of_sigmoid_have_caffes_bits(work_in: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -129,7 +129,7 @@ def test_resume_from_caffes_state_ends_at_caffes_weights(work_in: Callable[..., 
     solver.close()
 
 
-def test_a_run_with_a_snapshot_is_caffes_run(work_in: Callable[..., Path], same_blas: bool, rounding: float):
+def test_a_run_with_a_snapshot_is_caffes_run(work_in: Callable[..., Path], caffes_bits: bool, rounding: float):
     """Straight through to 60, with the snapshot at 40 on the way; then on from our snapshot as Caffe from its own."""
     work_in("snapshot", "sgd_step")
     state = read_state("sgd_step/ref_iter_40.solverstate")
@@ -141,7 +141,7 @@ def test_a_run_with_a_snapshot_is_caffes_run(work_in: Callable[..., Path], same_
     _assert_weights(solver, "caffemodel", rounding)
     ours = read_state("sgd_step/ref_iter_40.solverstate")
     assert (ours.iteration, ours.learned_net, ours.current_step) == (40, state.learned_net, state.current_step)
-    if same_blas:
+    if caffes_bits:
         assert [Path(f"sgd_step/ref_iter_40.{kind}").read_bytes() for kind in ("caffemodel", "solverstate")] == caffes
     solver.step(20)
     _assert_weights(solver, "sgd_step/resumed_from_40_iter_60.caffemodel", rounding)

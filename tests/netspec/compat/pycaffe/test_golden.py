@@ -52,15 +52,15 @@ def test_blobs_hold_what_caffes_held(folder: Path) -> None:
 @pytest.mark.parametrize(
     "folder", [folder for folder in LAYERS if "all" in promised(folder)], ids=lambda folder: folder.name
 )
-def test_blobs_hold_caffes_bits(folder: Path, exact: Callable[[str], None], same_blas: bool) -> None:
+def test_blobs_hold_caffes_bits(folder: Path, exact: Callable[[str], None], caffes_bits: bool) -> None:
     exact("all")
     case = LayerCase(folder)
-    assert_arrays(compute(case), case.golden, 0 if same_blas else TOLERANCE)
+    assert_arrays(compute(case), case.golden, 0 if caffes_bits else TOLERANCE)
 
 
 @pytest.mark.parametrize("case", TRAININGS)
 def test_solvers_follow_caffe(
-    case: str, work_in: Callable[..., Path], exact: Callable[[str], None], same_blas: bool
+    case: str, work_in: Callable[..., Path], exact: Callable[[str], None], caffes_bits: bool
 ) -> None:
     """A loop of step(1), as scripts have it: losses, final weights and test losses."""
     work_in(f"train/{case}")
@@ -78,7 +78,7 @@ def test_solvers_follow_caffe(
     results = {"test/loss": tested, **{key: sampled(solver, key, "data") for key in golden if key.startswith("final/")}}
     if solver.param.iter_size == 1:  # else the file has the mean of several passes
         results["loss"] = found
-    assert_training(results, golden, same_blas, 0.25 if case in ("adadelta", "rmsprop") else 1e-2)
+    assert_training(results, golden, caffes_bits, 0.25 if case in ("adadelta", "rmsprop") else 1e-2)
 
 
 @pytest.mark.parametrize("case", STEPS)
@@ -86,7 +86,7 @@ def test_each_step_is_caffes(
     case: str,
     work_in: Callable[..., Path],
     exact: Callable[[str], None],
-    same_blas: bool,
+    caffes_bits: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Outputs and weights after each of three iterations, to the last bit; on other CPUs than Caffe's to 1e-5."""
@@ -102,7 +102,7 @@ def test_each_step_is_caffes(
         for layer, blobs in solver.net.params.items():
             found |= {f"{i} weight {layer}[{j}]": blob.data.copy() for j, blob in enumerate(blobs)}
     assert found.keys() == set(golden.files)
-    assert_arrays(found, golden, 0 if same_blas else 1e-5)
+    assert_arrays(found, golden, 0 if caffes_bits else 1e-5)
 
 
 @pytest.fixture(scope="session")
@@ -113,7 +113,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize("run", EXAMPLES)
 def test_caffes_examples(
-    run: str, folder: Path, exact: Callable[[str], None], same_blas: bool, monkeypatch: pytest.MonkeyPatch
+    run: str, folder: Path, exact: Callable[[str], None], caffes_bits: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """LeNet, the autoencoder and the Siamese net: outputs, and what was subtracted from the weights first."""
     monkeypatch.chdir(folder)
@@ -133,7 +133,7 @@ def test_caffes_examples(
         outputs.append({name: float(solver.net.blobs[name].data) for name in solver.net.outputs})
     found = {key: np.array([out[key[4:]] for out in outputs]) for key in golden.files if key.startswith("out/")}
     found |= {key: sampled(solver, key, "data") for key in golden.files if key.startswith("final/")}
-    assert_training(found, golden, same_blas, 0.05)
+    assert_training(found, golden, caffes_bits, 0.05)
 
 
 def sampled(solver: Solver, key: str, what: str) -> np.ndarray:
