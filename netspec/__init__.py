@@ -1,9 +1,12 @@
 """netspec, the living Caffe: runs Caffe's prototxt in PyTorch, unmodified, with Caffe's numbers.
 
 The public names are loaded when they are first used, so that ``import netspec.proto.text`` needs no torch. Nothing is
-imported here: until this is done a program cannot answer signals (netspec/terminal/main.py), and ``python -m netspec``
-still looks for modules in the working directory first (netspec/__main__.py).
+imported here but a file that imports nothing: until this is done a program cannot answer signals
+(netspec/terminal/main.py), and ``python -m netspec`` still looks for modules in the working directory first
+(netspec/__main__.py).
 """
+
+from netspec.proto import forks as _forks
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -40,6 +43,20 @@ __all__ = [
     "save_weights",
     "use_dialect",
 ]
+
+
+def _find_forks() -> "_forks.Forks | None":
+    """Return who knows Caffe's forks; None where netspec/dialects is not there."""
+    import importlib.util
+
+    if importlib.util.find_spec("netspec.dialects") is None:
+        return None
+    from netspec.dialects.answers import Dialects
+
+    return Dialects()
+
+
+_forks.find = _find_forks
 
 
 def load_ipython_extension(ipython: object) -> None:

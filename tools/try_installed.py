@@ -72,7 +72,7 @@ def main(golden: Path) -> None:
     run("netspec", "bug-report", "sgd_step/solver.prototxt", "--out", "report.md")
     run("lmdb-build", "walk", "walk", "--frames", "12", "--size", "48x36")
     run("loopclosure", "evaluate", "--help")
-    from netspec.proto.dialect.files import known_files
+    from netspec.dialects.files import known_files
 
     for dialect in known_files():
         run("netspec", "layers", "--plugin", dialect)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from netspec import log
-from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
 from netspec.export.engines.choice import BF16, ENGINES, FP32, OPENVINO, PRECISIONS, TORCH, Choice
@@ -18,6 +17,7 @@ from netspec.files.limits import read_amount
 from netspec.graph.options import PASSES, BuildOptions
 from netspec.load import speed
 from netspec.proto.binary import split_paths
+from netspec.proto.forks import forks
 from netspec.proto.schema import PHASES
 from netspec.terminal import commands
 from netspec.terminal.commands import WrongUsage, refuse
@@ -186,7 +186,7 @@ class Commands(commands.Commands):
 
 def _use_dialects(arguments: argparse.Namespace) -> None:
     for plugin in arguments.plugin:
-        use_dialect(plugin)
+        forks().use(plugin)
 
 
 class _Verbose(argparse.Action):

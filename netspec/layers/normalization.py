@@ -5,13 +5,15 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
+from typing_extensions import override
 
 from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization
-from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.base import Layer, Param, Shape
 from netspec.layers.contract.folding import Affine, Folds, blob_in_double, folds_of
 from netspec.layers.contract.kernels import RELU, Kernel, Kernels, Preparation, Room, finished
 from netspec.layers.contract.registry import register
@@ -37,7 +39,6 @@ class BatchNorm(Layer):
     Caffe: src/caffe/layers/batch_norm_layer.cpp
     """
 
-    default_param_lr = 0.0
     joined: tuple[Layer, ...] = ()  # a Scale of its channels, a ReLU: it does their work too, where the batch counts
     rectifies = False  # whether there is a ReLU among them
     fresh = True
@@ -58,6 +59,10 @@ class BatchNorm(Layer):
         self.channels = self.bottom_shapes[0][1]
         for shape in ((self.channels,), (self.channels,), (1,)):
             self.add_blob(shape)
+
+    @override
+    def param_spec(self, j: int, given: Param | None) -> Param:
+        return given or replace(super().param_spec(j, None), lr_mult=0.0)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return as_before(self, bottom_shapes, self.channels)

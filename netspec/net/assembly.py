@@ -23,9 +23,9 @@ from netspec.graph.plan import AUTOMATIC, Backward, Node, Param, Plan, plan_back
 from netspec.layers import class_of, unknown_type
 from netspec.layers.contract.base import Layer, Shape, shape_string
 from netspec.layers.contract.context import Context, Random, device_of
-from netspec.layers.contract.registry import dialects_of
-from netspec.net.ignored_fields import unsure_layers, unused_fields
+from netspec.net.ignored_fields import doubtful_layers, unused_fields
 from netspec.net.need import BYTES, Need, limit_on, limit_text
+from netspec.proto.forks import forks
 from netspec.run.eager import last_uses
 
 MUCH = 8  # a net that needs more than 1/8 of the limit is summed up before it is built
@@ -51,7 +51,7 @@ class Assembly:
 
     def __init__(self, plan: Plan, options: BuildOptions) -> None:
         self._plan, self._report = plan, plan.source.report
-        dialects = {*options.dialects, *plan.source.dialects, *dialects_of(plan.net)}
+        dialects = {*options.dialects, *plan.source.dialects, *forks().dialects_of(plan.net)}
         self.options = replace(options, dialects=tuple(sorted(dialects)))
         self._warnings = list(align_crops(plan, self.options.dialects))
         self.layers: dict[int, Layer] = {}
@@ -202,7 +202,7 @@ class Assembly:
         for name in self._plan.outputs:
             log.info("net.cpp:244", f"This network produces output {name}")
         log.info("net.cpp:257", "Network initialization done.")
-        for line in (*self._warnings, *unsure_layers(self._plan, layers), *unused_fields(self._plan, layers)):
+        for line in (*self._warnings, *doubtful_layers(self._plan, layers), *unused_fields(self._plan, layers)):
             log.warning("net.cpp:257", line)
         return backward
 
@@ -244,8 +244,7 @@ class _Tie:
 
 def _spec(node: Node, layer: Layer, j: int) -> Param:
     """Return the settings of learnable blob ``j``, from the prototxt or the layer."""
-    spec = node.params[j] if j < len(node.params) else Param("", layer.default_param_lr, 1.0, False, None)
-    return replace(spec, lr_mult=0.0, decay_mult=0.0) if j in layer.not_learned else spec
+    return layer.param_spec(j, node.params[j] if j < len(node.params) else None)
 
 
 def _loss_weights(layer: Layer, report: Report) -> list[float]:
@@ -256,4 +255,4 @@ def _loss_weights(layer: Layer, report: Report) -> list[float]:
             return given
         message = f"found {len(given)} loss_weight, expected none or one per top blob ({layer.num_tops})"
         report(layer.error(message, "loss_weight"))
-    return [1.0 if layer.is_loss and layer.counts and j == 0 else 0.0 for j in range(layer.num_tops)]
+    return [layer.default_loss_weight if j == 0 else 0.0 for j in range(layer.num_tops)]

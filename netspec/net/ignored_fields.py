@@ -14,6 +14,7 @@ from google.protobuf.message import Message
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.fillers import READS
+from netspec.proto.forks import forks
 
 #: Fields of every layer, which the net reads.
 COMMON = frozenset(
@@ -42,11 +43,14 @@ def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
             yield f"{plan.source.net.find(field.name)}: {field.name} has no effect in a net{advice}"
 
 
-def unsure_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
+def doubtful_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
     """Yield a line for each type of layers of which nothing shows which fork's they are: the first of them."""
-    first = {layer.unsure: i for i, layer in reversed(list(enumerate(layers))) if layer.unsure}
-    for message, i in sorted(first.items(), key=lambda item: item[1]):
-        yield f"{plan.source.at(i, layer=plan.nodes[i].name, type=plan.nodes[i].type)}: {message}"
+    first: dict[str, int] = {}
+    for i, layer in enumerate(layers):
+        if doubt := forks().doubt(layer):
+            first.setdefault(doubt, i)
+    for doubt, i in first.items():
+        yield f"{plan.source.at(i, layer=plan.nodes[i].name, type=plan.nodes[i].type)}: {doubt}"
 
 
 def _unused(layer: Layer) -> Iterator[tuple[Path, str]]:

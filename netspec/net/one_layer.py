@@ -17,8 +17,8 @@ from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, Random, class_of, unknown_type
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.context import device_of, nowhere
-from netspec.layers.contract.registry import dialects_of
 from netspec.net.net import Array
+from netspec.proto.forks import forks
 from netspec.proto.reader import read_text
 from netspec.proto.schema import LayerParameter, NetParameter, phase_of
 from netspec.proto.source_map import Place, SourceMap
@@ -80,7 +80,7 @@ def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int |
     net, source = upgrade_net(NetParameter(layer=[param]), SourceMap(FILE, Place(place.where), (place,)))
     (param,) = net.layer
     at = partial(source.at, 0, layer=param.name, type=param.type)
-    options = replace(context.options, dialects=tuple(sorted(dialects_of(net))))
+    options = replace(context.options, dialects=tuple(sorted(forks().dialects_of(net))))
     cls = class_of(param, options)
     if cls is None:
         raise SpecError(unknown_type(param.type), at("type"))
@@ -90,6 +90,6 @@ def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int |
         tops = fewest or int(cls.tops[1] is None)
     param.top.extend(f"top{i}" for i in range(len(param.top), tops))
     layer = cls(param, shapes, replace(context, options=options, **({"at": at} if context.at is nowhere else {})))
-    if layer.unsure:
-        log.logger.warning(f"{at()}: {layer.unsure}")
+    if doubt := forks().doubt(layer):
+        log.logger.warning(f"{at()}: {doubt}")
     return layer

@@ -28,6 +28,7 @@ from netspec.net.net import Net
 from netspec.net.sealed import check_weights
 from netspec.process.heap import give_back_freed_memory
 from netspec.proto.binary import MOST_BYTES, net_beside_numbers
+from netspec.proto.forks import forks
 from netspec.proto.schema import NetParameter
 
 MOST_NAMES = 20  # layers that a warning names
@@ -199,7 +200,7 @@ def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
     for layer in net.layers:
         written = proto.layer.add()
         written.CopyFrom(layer.param)
-        if layer.is_loss and layer.counts and layer.num_tops == 1 and not written.loss_weight:
+        if layer.default_loss_weight and layer.num_tops == 1 and not written.loss_weight:
             written.loss_weight.append(1)  # Caffe's loss layers note their default (loss_layer.cpp)
         del written.blobs[:]
         for j in range(len(layer.blobs)):
@@ -332,7 +333,7 @@ def _wrong_count(path: str, name: str, found: int, expected: int) -> SpecError:
 
 def _fits_loosely(layer: Layer, j: int, shape: tuple[int, ...]) -> bool:
     """Return whether a file's blob differs in axes of size 1 only, for a layer of which forks differ in that."""
-    return layer.loose and [n for n in shape if n != 1] == [n for n in layer.blob_shapes[j] if n != 1]
+    return [n for n in shape if n != 1] == [n for n in layer.blob_shapes[j] if n != 1] and forks().is_loose(layer)
 
 
 def _wrong_shape(path: str, name: str, j: int, found: tuple[int, ...], expected: tuple[int, ...]) -> SpecError:

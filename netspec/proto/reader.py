@@ -2,7 +2,8 @@
 
 It accepts what the C++ parser of Caffe accepts: a file that Caffe reads is read here, and a file that Caffe refuses is
 refused here, with one line that says where and why. One field is added: ``ceil_mode: true`` in a pooling_param, which
-many forks write for ``round_mode: CEIL``; it needs no dialect.
+many forks write for ``round_mode: CEIL``. A field or a value that Caffe lacks and one known fork has is added to the
+schema where it is met (netspec/proto/forks.py).
 """
 
 from __future__ import annotations
@@ -16,8 +17,7 @@ from google.protobuf.message import Message
 
 from netspec import log
 from netspec.errors import ForkFault, SpecError, Where, did_you_mean
-from netspec.proto.dialect import registry as dialect
-from netspec.proto.dialect.files import announce_known
+from netspec.proto.forks import forks
 from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer, Token
 from netspec.proto.schema import MORE, Field, NetParameter, SolverParameter, V1LayerParameter, fields_of
 from netspec.proto.source_map import Place
@@ -87,7 +87,10 @@ class _Reader:
         name = self._next()
         key = (message.DESCRIPTOR.full_name, name.text)
         alias, meaning = _ALIASES.get(key, (name.text, None))
-        field = fields_of(message.DESCRIPTOR).get(alias)
+        fields = fields_of(message.DESCRIPTOR)
+        if alias not in fields and forks().add_field(*key, self.lexer.text, self.token.start, self.lexer.file):
+            fields = fields_of(message.DESCRIPTOR)
+        field = fields.get(alias)
         if field is None:
             fault = self._unknown_field(message, name)
             if self._report is None or not isinstance(fault, ForkFault):
@@ -95,7 +98,7 @@ class _Reader:
             self._report(fault)
             self._skip(name)
             return
-        more = fields_of(message.DESCRIPTOR).get(alias + MORE)
+        more = fields.get(alias + MORE)
         if not field.repeated and any(f is not None and f.present(message) for f in (field, more)):
             first = children[alias][0].where.line
             raise self._error(f'"{alias}" was already given in line {first}; it can be given only once', name)
@@ -104,8 +107,8 @@ class _Reader:
             self._next()
         elif field.type != Declared.TYPE_MESSAGE:
             raise self._expected('":"', f'after "{name.text}"')
-        if more is not None and self.token.text in more.descriptor.enum_type.values_by_name:
-            field = more
+        if field.type == Declared.TYPE_ENUM and meaning is None and self.token.kind == NAME:
+            field = self._with_value(message, field, self.token.text)
         if meaning is not None:
             field.set(message, field.descriptor.enum_type.values_by_name[meaning[self._boolean()]].number)
             nodes.append(Place(self.lexer.where(name.start)))
@@ -118,6 +121,18 @@ class _Reader:
             nodes.append(self._value(field, message, name))
         if self._at(",") or self._at(";"):
             self._next()
+
+    def _with_value(self, message: Message, field: Field, value: str) -> Field:
+        """Return the field of an enum that has a value: ``field``, or that of the values that forks add to it."""
+        if value in field.descriptor.enum_type.values_by_name:
+            return field
+        for is_last in (False, True):
+            more = fields_of(message.DESCRIPTOR).get(field.name + MORE)
+            if more is not None and value in more.descriptor.enum_type.values_by_name:
+                return more
+            if is_last or not forks().add_value(message.DESCRIPTOR.full_name, field.name, value, self.lexer.file):
+                break
+        return field
 
     def _skip(self, name: Token) -> None:
         """Pass over the value of an unknown field: a scalar, a list or a message, whatever is in it."""
@@ -250,10 +265,9 @@ class _Reader:
             more = fields_of(self._open[-1][0].DESCRIPTOR).get(field.name + MORE)
             names = [*values, *(more.descriptor.enum_type.values_by_name if more else ())]
             owner = self._open[-1][0].DESCRIPTOR
-            announce_known()
-            dialects = dialect.dialects_with_value(owner.full_name, field.name, word)
+            dialects = forks().with_value(owner.full_name, field.name, word)
             known = did_you_mean(word, names) or f"; it is one of {', '.join(names)}"
-            hint = f"; {dialect.advice_for(word, dialects)}" if dialects else known
+            hint = f"; {forks().advice(word, dialects)}" if dialects else known
             error = self._error(f'"{field.name}" has no value "{word}"{hint}', start)
             raise ForkFault(error.message, error.where, "value", word, dialects, owner.name) if dialects else error
         negative = self._minus()
@@ -358,16 +372,16 @@ class _Reader:
 
         That is a ForkFault unless the fault seems to lie elsewhere: in a bracket, a quotation mark, the kind of file.
         """
-        announce_known()
         descriptor, name = message.DESCRIPTOR, token.text
-        dialects = dialect.dialects_with_field(descriptor.full_name, name)
+        dialects = forks().with_field(descriptor.full_name, name)
         fault = f'{descriptor.name} has no field "{name}"'
         elsewhere = "" if dialects else self._elsewhere(message, name)
-        hint = f"; {dialect.advice_for(name, dialects)}" if dialects else self._meant(message, name)
+        hint = f"; {forks().advice(name, dialects)}" if dialects else self._meant(message, name)
         error = self._error(fault + (elsewhere or hint), token)
         if elsewhere or self.lexer.suspicion(token.start):
             return error
-        own = f"{'' if hint else ';'} {dialect.OWN_FIELD}"
+        new = forks().new_field
+        own = f"{'' if hint else ';'} {new}" if new else ""
         if hint[-1:] not in ("", "?") or all(outer.DESCRIPTOR.full_name not in _LAYERS for outer, _ in self._open):
             own = ""
         return ForkFault(error.message + own, error.where, "field", name, dialects, descriptor.name)

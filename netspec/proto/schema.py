@@ -8,7 +8,6 @@ how to compile it; ``caffe_pb2.pyi`` is made with it and gives the fields to typ
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +20,7 @@ PACKAGE = "caffe"
 MORE = "+"  # no name in a text ends in it
 _LAST_NUMBER = 1 << 29  # field numbers end before this
 
-#: The pool; :mod:`netspec.proto.dialect.registry` adds the messages and fields of forks to it.
+#: The pool; forks add their messages and fields to it (netspec/dialects/registry.py).
 pool = descriptor_pool.DescriptorPool()
 _declarations: dict[str, descriptor_pb2.DescriptorProto] = {}  # by the message's full name
 
@@ -60,21 +59,6 @@ def message(name: str) -> type[CaffeMessage]:
     """
     found: Any = message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{PACKAGE}.{name}"))
     return found
-
-
-@cache
-def caffe_names() -> frozenset[str]:
-    """Return the names of the fields of Caffe's own messages."""
-    messages = pool.FindFileByName("caffe.proto").message_types_by_name.values()
-    return frozenset(field.name for found in messages for field in found.fields)
-
-
-@cache
-def fields_with(message: str) -> frozenset[str]:
-    """Return the names of the fields of Caffe's own messages that hold a message (full name)."""
-    messages = pool.FindFileByName("caffe.proto").message_types_by_name.values()
-    kinds = ((field.name, field.message_type) for found in messages for field in found.fields)
-    return frozenset(name for name, kind in kinds if kind is not None and kind.full_name == message)
 
 
 if TYPE_CHECKING:

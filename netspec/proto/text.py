@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from netspec.errors import ForkFault, SpecError, Where
+from netspec.errors import SpecError, Where
 from netspec.files.kinds import kind_of, pointer_fault, unreadable
 from netspec.files.limits import read_bytes
-from netspec.proto.dialect.choice import named_dialects, use_dialects_of
+from netspec.proto.forks import forks
 from netspec.proto.reader import read_text
 from netspec.proto.schema import NetParameter, SolverParameter
 from netspec.proto.source_map import Place, SourceMap
@@ -35,8 +35,8 @@ def read_solver(path: str | Path) -> SolverParameter:
 def parse_net(path: str | Path, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
     """Return the net of a .prototxt and where its parts stand. Raises SpecError.
 
-    ``report``, if given, gets a ForkFault for each unknown field, which then is left out. Fields that a fork of Caffe
-    has are not unknown: its dialect is switched on (netspec/dialects).
+    ``report``, if given, gets a ForkFault for each unknown field, which then is left out. A field that one fork of
+    Caffe has is added to the schema (netspec/proto/forks.py).
     """
     return parse_net_text(text_of(path), str(path), upgrade, report)
 
@@ -44,8 +44,8 @@ def parse_net(path: str | Path, upgrade: bool = True, report: Report = None) -> 
 def parse_net_text(text: str, file: str, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
     """Return the net that a text describes and where its parts stand; ``file`` is what errors call it."""
     net = NetParameter()
-    named = named_dialects(text, file)
-    source = replace(SourceMap.of(_read(text, file, net, report)), dialects=named)
+    named = forks().named_in(text, file)
+    source = replace(SourceMap.of(read_text(text, file, net, report)), dialects=named)
     return upgrades.upgrade_net(net, source) if upgrade else (net, source)
 
 
@@ -63,30 +63,11 @@ def parse_solver_text(
 ) -> tuple[SolverParameter, Place]:
     """Return the solver that a text describes and where its parts stand; ``file`` is what errors call it."""
     solver = SolverParameter()
-    node = _read(text, file, solver, report)
+    node = read_text(text, file, solver, report)
     if upgrade:
         solver, node = upgrades.upgrade_solver(solver, node)
         solver = upgrades.upgrade_snapshot_prefix(solver, file)
     return solver, node
-
-
-def _read(text: str, file: str, message: NetParameter | SolverParameter, report: Report) -> Place:
-    """Read a text. Where it has fields of known dialects, these are switched on, and it is read again."""
-    faults: list[SpecError] = []
-    place = None
-    try:
-        place = read_text(text, file, message, faults.append)
-    except SpecError as fault:
-        faults.append(fault)
-    if any(isinstance(fault, ForkFault) and fault.dialects for fault in faults) and use_dialects_of(text, file):
-        message.Clear()
-        return read_text(text, file, message, report)
-    for fault in faults:
-        if report is None or not isinstance(fault, ForkFault):
-            raise fault
-        report(fault)
-    assert place is not None
-    return place
 
 
 def text_of(path: str | Path) -> str:

@@ -120,7 +120,7 @@ def test_gradient_is_that_of_what_it_computes(layer: Layer) -> None:
     for i, bottom in enumerate(bottoms):
         whole_numbers = bool((bottom == bottom.round()).all())
         bottom.requires_grad_(not whole_numbers and i not in layer.label_bottoms)
-    learned = list(layer.blobs) if layer.default_param_lr else []
+    learned = [blob for j, blob in enumerate(layer.blobs) if layer.param_spec(j, None).lr_mult]
 
     def compute(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return tuple(top for top in layer.run(*tensors[: len(bottoms)]) if top.requires_grad)

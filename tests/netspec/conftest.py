@@ -79,7 +79,7 @@ def gradcheck() -> Callable[..., None]:
     def check(layer: Layer, *bottoms: torch.Tensor, fixed: Sequence[int] = ()) -> None:
         layer.double()
         inputs = [bottom.double().requires_grad_(i not in fixed) for i, bottom in enumerate(bottoms)]
-        learned = [blob for j, blob in enumerate(layer.blobs) if layer.default_param_lr and j not in layer.not_learned]
+        learned = [blob for j, blob in enumerate(layer.blobs) if layer.param_spec(j, None).lr_mult]
         check_gradients(lambda *args: layer.run(*args[: len(inputs)])[0], (*inputs, *learned))
 
     return check

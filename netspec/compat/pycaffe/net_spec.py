@@ -18,8 +18,7 @@ from typing import Any
 
 from netspec.compat.pycaffe.proto import caffe_pb2
 from netspec.errors import did_you_mean
-from netspec.proto.dialect.files import announce_known
-from netspec.proto.dialect.registry import advice_for, dialects_with_field, dialects_with_type
+from netspec.proto.forks import forks
 
 Name = Callable[["Top | Function"], str]
 
@@ -78,12 +77,12 @@ class Function:
         if own:
             messages.append(layer.DESCRIPTOR.fields_by_name[own].message_type)
         places = f"{own} and LayerParameter have" if own else "LayerParameter has"
-        announce_known()
-        with_field = {d for message in messages for d in dialects_with_field(message.full_name, name)}
-        with_type = dialects_with_type(self.type_name)
-        advice = advice_for(name, tuple(sorted(with_field))) or advice_for(self.type_name, with_type)
-        known = [field for message in messages for field in message.fields_by_name]
-        hint = f"; {advice}" if advice else did_you_mean(name, known)
+        known = forks()
+        with_field = {d for message in messages for d in known.with_field(message.full_name, name)}
+        with_type = known.with_type(self.type_name)
+        advice = known.advice(name, tuple(sorted(with_field))) or known.advice(self.type_name, with_type)
+        fields = [field for message in messages for field in message.fields_by_name]
+        hint = f"; {advice}" if advice else did_you_mean(name, fields)
         return f'layer of type "{self.type_name}": {places} no field "{name}"{hint}'
 
 

@@ -140,10 +140,8 @@ def remedy(fault: BaseException) -> str:
     if np and _is_too_new(np) and text.startswith(one_element):
         return _TOO_NEW.format(np.__version__)
     if unknown := re.search(r'has no (?:field named )?"(\w+)"', text):
-        registry, files = (importlib.import_module(f"netspec.proto.dialect.{name}") for name in ("registry", "files"))
-        files.announce_known()
-        named = {d.name for d in registry.known() if any(unknown[1] == field for _, field in d.fields())}
-        return registry.advice_for(unknown[1], tuple(sorted(named)))
+        forks = importlib.import_module("netspec.proto.forks").forks()
+        return forks.advice(unknown[1], tuple(sorted(forks.with_field("", unknown[1]))))
     caffe = sys.modules.get("netspec.compat.pycaffe")
     if isinstance(fault, FileNotFoundError) and caffe and isinstance(fault.filename, str):
         beside = os.path.relpath(fault.filename, os.path.dirname(str(caffe.__file__)))

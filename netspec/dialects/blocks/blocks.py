@@ -5,8 +5,8 @@ Where two forks have different layers of one name (BN, Upsample), the fields tha
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -96,7 +96,6 @@ class Axpy(Layer):
     """
 
     bottoms = (3, 3)
-    forks: ClassVar[Mapping[str, str]] = {"blocks": "", "happynear": ""}  # of the same numbers: it shows neither
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         a, x, y = bottom_shapes

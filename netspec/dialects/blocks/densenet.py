@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 import torch.nn.functional as F
 
-from netspec.layers import Layer, register
+from netspec.dialects.not_learned import NotLearned
+from netspec.layers import register
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import TRAIN, value
 
@@ -44,7 +45,7 @@ FIXED = {"pad_h": 1, "pad_w": 1, "conv_verticalStride": 1, "conv_horizentalStrid
 
 
 @register("DenseBlock", GROUP)
-class DenseBlock(Layer):
+class DenseBlock(NotLearned):
     """Append growthRate channels numTransition times: of all channels so far, BN, ReLU and a convolution of 3 x 3.
 
     With use_BC the convolution has 4 growthRate channels to read, which a convolution of 1 x 1, BN and ReLU make

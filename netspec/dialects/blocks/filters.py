@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.dialects.blocks.relu6 import Capped
-from netspec.layers import activation, common, register
+from netspec.dialects.layers import replace
+from netspec.layers import common
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.folding import Folds
@@ -55,11 +56,10 @@ GROUP = "convolution_param"
 SIDES = ("pad_l", "pad_r", "pad_t", "pad_b")  # in the order of F.pad
 
 
-@register(
+@replace(
     "Convolution",
     GROUP,
     *(f"{GROUP}.{name}" for name in ("hole", "hole_h", "hole_w", *SIDES)),
-    replaces=convolution.Convolution,
 )
 class Convolution(convolution.Convolution):
     """Caffe's Convolution, with ``hole`` as an older name of dilation, and pad_l, pad_r, pad_t and pad_b.
@@ -146,9 +146,7 @@ def _differs(param: LayerParameter) -> bool:
     return bool(added_value(p, "pool")) or any(value(p, name) for name in SIDES)
 
 
-@register(
-    "Pooling", POOLING, *(f"{POOLING}.{name}" for name in ("pool", *SIDES)), replaces=pooling.Pooling, where=_differs
-)
+@replace("Pooling", POOLING, *(f"{POOLING}.{name}" for name in ("pool", *SIDES)), where=_differs)
 class Pooling(pooling.Pooling):
     """Caffe's Pooling, with pad_l, pad_r, pad_t and pad_b, and AVE_EXC_PAD: the mean of a window's pixels alone.
 
@@ -225,11 +223,10 @@ class Pooling(pooling.Pooling):
         return graph.node("Div", graph.node("AveragePool", framed, **geometry), graph.constant(shares[None, None]))
 
 
-@register(
+@replace(
     "ReLU",
     "relu_param",
     "relu_param.relu6",
-    replaces=activation.ReLU,
     where=lambda param: value(param.relu_param, "relu6"),
 )
 class ReLU(Capped):
@@ -244,12 +241,11 @@ class ReLU(Capped):
         self.slope: float = self.param.relu_param.negative_slope
 
 
-@register(
+@replace(
     "Dropout",
     "dropout_param",
     "dropout_param.scale_train",
     "dropout_param.sample_weights_test",
-    replaces=common.Dropout,
 )
 class Dropout(common.Dropout):
     """As Caffe's; with scale_train: false it does not scale in training but, by 1 - p, in testing.

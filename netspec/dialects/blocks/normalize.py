@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 
+from netspec.dialects.signatures import whose
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
-from netspec.layers.contract.whose import whose
 from netspec.proto.schema import given, value
 
 SSD, TSN, HAPPYNEAR = "ssd", "tsn", "happynear"
@@ -57,18 +57,12 @@ class Normalize(Layer):
     """
 
     tops = (1, 2)
-    forks: ClassVar[Mapping[str, str]] = {
-        SSD: "a learned scale, the length of the whole image",
-        TSN: "no scale, the length of the whole image",
-        HAPPYNEAR: "no scale, the length over the channels of each pixel",
-    }
 
     def setup(self) -> None:
         fields, shape = given(self.param), self.bottom_shapes[0]
         if len(shape) < 2:
             raise self.error(f"found a bottom of shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
-        of_happynear = self.num_tops > 1 or "normalize_param" in fields
-        self.fork = HAPPYNEAR if of_happynear else SSD if "norm_param" in fields else whose(self)
+        self.fork = whose(self)
         self.across, self.eps, self.squares = self.fork == TSN, 0.0, True
         if self.fork == HAPPYNEAR:
             self._set_up_as_happynears(value(self.param, "normalize_param") if "normalize_param" in fields else None)

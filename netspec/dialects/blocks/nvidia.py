@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 from typing_extensions import override
 
-from netspec.layers import normalization, register
+from netspec.dialects.layers import replace
+from netspec.dialects.not_learned import NotLearned
+from netspec.layers import normalization
 from netspec.layers.contract.folding import Affine, Folds, blob_in_double
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import has, value
@@ -22,13 +24,12 @@ GROUP = "batch_norm_param"
 SLOPES, BIASES = 3, 4
 
 
-@register(
+@replace(
     "BatchNorm",
     GROUP,
     *(f"{GROUP}.{name}" for name in ("scale_filler", "bias_filler", "scale_bias")),
-    replaces=normalization.BatchNorm,
 )
-class BatchNorm(normalization.BatchNorm):
+class BatchNorm(NotLearned, normalization.BatchNorm):
     """Caffe's BatchNorm; with scale_bias its top is multiplied by learned slopes, and learned biases are added.
 
     bottom[0]  (N, C) or (N, C, ...)
@@ -41,7 +42,6 @@ class BatchNorm(normalization.BatchNorm):
     Fork: NVIDIA/caffe, src/caffe/layers/batch_norm_layer.cpp
     """
 
-    default_param_lr = 1.0
     not_learned = frozenset(range(SLOPES))
 
     def setup(self) -> None:

@@ -5,18 +5,18 @@ Forks: ydwen/caffe-face, wy1iu/sphereface, wy1iu/LargeMargin_Softmax_Loss; happy
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from typing_extensions import override
 
 from netspec.dialects.faces.margins import Margin, MarginProduct
+from netspec.dialects.signatures import whose
 from netspec.layers import register
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.whose import whose
 from netspec.layers.loss.base import Classified, Loss
-from netspec.proto.schema import TRAIN, value
+from netspec.proto.schema import value
 
 DECLARATIONS = """
 message CenterLossParameter {
@@ -82,12 +82,12 @@ class CenterLoss(Loss, Classified):
     Fork: ydwen/caffe-face, happynear/caffe-windows, src/caffe/layers/center_loss_layer.cpp
     """
 
-    counts = False
     not_exported = "it is for training"
-    forks: ClassVar[Mapping[str, str]] = {
-        "faces": "a center moves by the sum of differences / (n + 1), n the number of its class in a batch",
-        "happynear": "a center moves by n times that",
-    }
+
+    @property
+    @override
+    def default_loss_weight(self) -> float:
+        return 0.0
 
     def setup(self) -> None:
         p, shape = value(self.param, "center_loss_param"), self.bottom_shapes[0]
@@ -100,7 +100,7 @@ class CenterLoss(Loss, Classified):
         axis = self.canonical_axis(p.axis, shape, "center_loss_param", "axis")
         self.length = torch.Size(shape[axis:]).numel()
         self.add_blob((p.num_output, self.length), p.center_filler)
-        self.n_times = p.HasField("distance_type") or (self.phase == TRAIN and whose(self) == "happynear")
+        self.n_times = whose(self) == "happynear"
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         vectors, labels = (torch.Size(shape) for shape in bottom_shapes)

@@ -7,16 +7,18 @@ domain-guided-dropout. Where no field shows whose a layer is, the dialect has to
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.dialects.faces.margins import MarginProduct
+from netspec.dialects.layers import replace
+from netspec.dialects.not_learned import NotLearned
+from netspec.dialects.signatures import whose
 from netspec.layers import Layer, common, register
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.whose import whose
 from netspec.layers.loss.base import VALID, Classified, Loss, ignore_label, normalization_mode, normalizer
 from netspec.layers.loss.scores import FLT_MIN
 from netspec.proto.schema import TEST, value
@@ -113,11 +115,10 @@ def normalizes(param: Any) -> bool:
     return value(param.inner_product_param, "normalize")
 
 
-@register(
+@replace(
     "InnerProduct",
     "inner_product_param",
     "inner_product_param.normalize",
-    replaces=common.InnerProduct,
     where=normalizes,
 )
 class NormalizedInnerProduct(common.InnerProduct):
@@ -252,11 +253,6 @@ class FocalLoss(Loss, Classified):
 
     tops = (1, 2)
     not_exported = "it is for training"
-    forks: ClassVar[Mapping[str, str]] = {
-        "happynear": "(alpha - p)^gamma",
-        "ssd": "",
-        "rcnn": "of zimenglan, as the paper's: alpha (1 - p)^gamma",
-    }
 
     def setup(self) -> None:
         self.settings = p = value(self.param, "focal_loss_param")
@@ -264,9 +260,8 @@ class FocalLoss(Loss, Classified):
             if wrong:
                 message = f"{name} must be {expected}, found {getattr(p, name):g}"
                 raise self.error(message, "focal_loss_param", name)
-        alike = p.HasField("alpha") and p.alpha == 1
         self.base, self.factor = p.alpha, 1.0
-        if p.type != ONEADDP and not alike and whose(self) != "happynear":
+        if whose(self) != "happynear":
             self.base, self.factor = 1.0, p.alpha if p.HasField("alpha") else 0.25
         self.ignored = ignore_label(self.param.loss_param)
         self.normalization = normalization_mode(self.param.loss_param, VALID)
@@ -325,7 +320,7 @@ class _Scaled(torch.autograd.Function):
 
 
 @register("ChannelScale", "channel_scale_param")
-class ChannelScale(Layer):
+class ChannelScale(NotLearned):
     """Multiply all channels of a pixel by one number; with global_scale, everything by their running mean.
 
     do_forward: false leaves the maps as they are, do_backward_feature: false their gradient; do_backward_scale: false

@@ -41,13 +41,6 @@ class ROIAlign(RegionPooling):
         self.cascade = group == CASCADE and has(param, "pad_ratio")
         self.pad_ratio = float(param.pad_ratio) if self.cascade else 0.0
         self.samples = int(param.sampling_ratio) if group == ALIGN else -1
-        if not self.cascade and not (group == ALIGN and has(param, "sampling_ratio")):
-            self.unsure = (
-                "forks have other layers of this type, and nothing here shows whose it is; it is computed as "
-                "Detectron's (the mean of a point for each pixel), not as Cascade R-CNN's (the corners of the bins) or "
-                "as the largest of four points; to choose, give sampling_ratio: 0 in roi_align_param, or pad_ratio: 0 "
-                "in roi_pooling_param for Cascade R-CNN's"
-            )
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return [(self.check_regions(bottom_shapes), bottom_shapes[0][1], *(n + self.cascade for n in self.bins))]

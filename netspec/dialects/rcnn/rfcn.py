@@ -11,6 +11,7 @@ import torch
 from typing_extensions import override
 
 from netspec.dialects.boxes import as_array, highest
+from netspec.dialects.layers import replace
 from netspec.dialects.rcnn.regions import RegionPooling, whole
 from netspec.dialects.rcnn.smooth import NORMALIZED, SmoothL1LossOHEM, divisor, four
 from netspec.layers import Layer, register
@@ -132,11 +133,10 @@ class SoftmaxWithLossOHEM(SoftmaxWithLoss):
         return total(losses, exact) / divisor(self, self.outer, self.inner, valid)
 
 
-register(
+replace(
     "SoftmaxWithLoss",
     "softmax_param",
     *NORMALIZED,
-    replaces=SoftmaxWithLoss,
     where=lambda param: len(param.top) > 2 or added_value(param.loss_param, "normalization") == "PRE_FIXED",
 )(type("SoftmaxWithLoss", (SoftmaxWithLossOHEM,), {"__doc__": SoftmaxWithLossOHEM.__doc__}))
 register("SmoothL1LossOHEM", *NORMALIZED)(SmoothL1LossOHEM)

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
+from netspec.dialects.signatures import whose
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
-from netspec.layers.contract.whose import whose
 from netspec.layers.loss.base import BATCH_SIZE, VALID, Loss, normalization_mode, normalizer, onnx_normalized_sum
-from netspec.proto.schema import added_value, given, value
+from netspec.proto.schema import added_value, value
 
 NORMALIZED = ("loss_param", "loss_param.normalization", "loss_param.pre_fixed_normalizer")
 
@@ -62,19 +62,12 @@ class SmoothL1Loss(Loss):
     Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/smooth_L1_loss_layer.cu; daijifeng001/caffe-rfcn; weiliu89/caffe
     """
 
-    bottoms, tops, counts = (2, 4), (1, 2), False
+    bottoms, tops = (2, 4), (1, 2)
     label_bottoms = frozenset({2, 3})
-    forks: ClassVar[Mapping[str, str]] = {
-        "rcnn": "divided by N; only a loss_weight that is given counts",
-        "ssd": "divided by N; it counts without loss_weight too",
-        "yolo": "",
-        "rfcn": "divided by N H W; the gradient leaves the weights out",
-    }
 
     def setup(self) -> None:
-        fork = self.fork()
-        self.counts = fork in ("ssd", "yolo")
-        self.by_pixel = fork == "rfcn"
+        self.fork = self.found_fork()
+        self.by_pixel = self.fork == "rfcn"
         if self.by_pixel and len(self.bottom_shapes) > 3:
             raise self.error(
                 "found outside weights, which R-FCN's loss (loss_param, a second top) has not", "bottom", 3
@@ -84,15 +77,14 @@ class SmoothL1Loss(Loss):
             raise self.error(f"sigma must be above 0, found {sigma:g}", "smooth_l1_loss_param", "sigma")
         self.knee = 1 / (sigma * sigma)
 
-    def fork(self) -> str:
-        """Return whose layer it is; nobody is asked where all forks compute the same."""
-        fields, shape = given(self.param), four(self.bottom_shapes[0])
-        if "loss_param" in fields or self.num_tops > 1:
-            return "rfcn"
-        if "smooth_l1_loss_param" in fields or len(self.bottom_shapes) == 4:
-            return "rcnn"
-        alike = len(self.bottom_shapes) == 2 and math.prod(shape[2:]) == 1 and "loss_weight" in fields
-        return "rcnn" if alike else whose(self)
+    def found_fork(self) -> str:
+        """Return whose layer it is."""
+        return whose(self)
+
+    @property
+    @override
+    def default_loss_weight(self) -> float:
+        return float(self.fork in ("ssd", "yolo"))
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the tops' shapes; the bottoms must be of one shape, but for ones at its end."""
@@ -172,9 +164,8 @@ class SmoothL1LossOHEM(SmoothL1Loss):
 
     bottoms = (2, 3)
     label_bottoms = frozenset({2})
-    forks: ClassVar[Mapping[str, str]] = {}
     not_exported = "it is for training"
 
     @override
-    def fork(self) -> str:
+    def found_fork(self) -> str:
         return "rfcn"

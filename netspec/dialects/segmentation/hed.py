@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 from typing_extensions import override
 
+from netspec.dialects.layers import replace
 from netspec.dialects.segmentation.edges import Balanced, EdgeMaps
 from netspec.dialects.segmentation.pairs import Array
 from netspec.layers import register
-from netspec.layers.loss.losses import SigmoidCrossEntropyLoss
 
 DECLARATIONS = ""  # no field says whose the file is: it has to be named
 
@@ -30,7 +30,7 @@ class ImageLabelmapData(EdgeMaps):
         return np.rint(gray / 255).astype(np.float32)
 
 
-@register("SigmoidCrossEntropyLoss", "loss_param", replaces=SigmoidCrossEntropyLoss)
+@replace("SigmoidCrossEntropyLoss", "loss_param")
 class BalancedLoss(Balanced):
     """The cross entropy of sigmoid(x) and edges, weighed in each image: an edge by the share of all else.
 

@@ -12,6 +12,7 @@ from netspec.data.images import read_image
 from netspec.data.random_words import words
 from netspec.data.sources import Source
 from netspec.data.transformer import contradictions
+from netspec.dialects.layers import replace
 from netspec.dialects.segmentation.pairs import Array, Pair, PairSource, read_labels, read_pairs
 from netspec.errors import SpecError
 from netspec.layers import register
@@ -122,13 +123,12 @@ class DenseImageData(ReadingLayer):
         return (data[0], 1, *(size // less for size in data[2:]))
 
 
-@register(
+@replace(
     "SoftmaxWithLoss",
     "softmax_param",
     "loss_param",
     "loss_param.weight_by_label_freqs",
     "loss_param.class_weighting",
-    replaces=losses.SoftmaxWithLoss,
     where=lambda param: value(param.loss_param, "weight_by_label_freqs"),
 )
 class SoftmaxWithLoss(losses.SoftmaxWithLoss):
@@ -198,11 +198,6 @@ class DiceCoefLoss(Loss):
 
     label_bottoms = frozenset()
     not_exported = "it is for training"
-    unsure = (
-        "forks have other layers of this type, and nothing shows whose it is; it is computed of each image, with "
-        "squares (HolmesShuan's, for real values), not of the whole batch or with sums; to have those, write the "
-        "layer as docs/layer.md shows and pass --plugin FILE.py"
-    )
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the scalar top's shape; the bottoms must have as many numbers."""

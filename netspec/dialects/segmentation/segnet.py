@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 
+from netspec.dialects.not_learned import NotLearned
+from netspec.dialects.signatures import whose
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.folding import Affine, Folds, blob_in_double
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
-from netspec.layers.contract.whose import whose
 from netspec.layers.normalization import as_before, onnx_normalized, torch_batch_norm
 from netspec.proto.schema import TRAIN, given, value
 
@@ -54,7 +55,6 @@ class Upsample(Layer):
 
     bottoms = (1, 2)
     label_bottoms = frozenset({1})
-    forks: ClassVar[Mapping[str, str]] = {"segmentation": "", "yolo": ""}  # its bottoms show which is meant
 
     def setup(self) -> None:
         param = value(self.param, "upsample_param")
@@ -128,7 +128,7 @@ class Upsample(Layer):
         )
 
 
-class BN(Layer):
+class BN(NotLearned):
     """Batch normalization and a learned slope and bias in one; PSPNet's, or SegNet's where its fields are given.
 
     PSPNet's subtracts the batch's mean and divides by sqrt(variance + eps) in training, and by moving averages in
@@ -148,13 +148,6 @@ class BN(Layer):
     """
 
     tops = (1, 3)
-    loose = True  # TSN's and happynear's files have (1, C)
-    forks: ClassVar[Mapping[str, str]] = {
-        "blocks": "of PSPNet and TSN: the moving variance is in blobs[3]",
-        "tsn": "",
-        "segmentation": "",
-        "happynear": "of happynear, L-Softmax, domain-guided dropout: 1 / std is there",
-    }
 
     def setup(self) -> None:
         param, shape = value(self.param, "bn_param"), self.bottom_shapes[0]
@@ -167,7 +160,7 @@ class BN(Layer):
             raise self.error(
                 f"{other} is PSPNet's and {min(segnets)} is SegNet's; use one kind only", "bn_param", other
             )
-        fork = "segmentation" if segnets else whose(self)
+        fork = whose(self)
         segnet = fork == "segmentation" and not fields - segnets
         self.channels = shape[1]
         size = (1, self.channels, 1, 1)

@@ -5,9 +5,6 @@ A database for its layer AnnotatedData is what the fork's convert_annoset writes
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 from netspec.dialects.blocks.normalize import Normalize
 from netspec.dialects.blocks.order import Reordered
 from netspec.dialects.ssd.annotated import AnnotatedData
@@ -260,8 +257,6 @@ class Permute(Reordered):
     top[0]     its axes in the new order
     Fork: src/caffe/layers/permute_layer.cpp
     """
-
-    forks: ClassVar[Mapping[str, str]] = {"ssd": "", "happynear": ""}  # of the same numbers: it shows neither
 
     def setup(self) -> None:
         given = list(value(self.param, "permute_param").order)

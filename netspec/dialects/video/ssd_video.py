@@ -13,13 +13,13 @@ import numpy as np
 
 from netspec.data.random_words import derived
 from netspec.data.sources import Arrays, Cursor, Draws, Source
+from netspec.dialects.files import find_file, switch_on
 from netspec.dialects.ssd.augment import COLUMNS, Augmenter, fixed_size, wrong_settings
 from netspec.errors import SpecError, Where
 from netspec.files.opencv import cv2
 from netspec.layers import register
 from netspec.layers.contract.base import Shape
 from netspec.layers.data.files import ReadingLayer
-from netspec.proto.dialect.files import find_file, switch_on
 from netspec.proto.schema import value
 
 DECLARATIONS = """

@@ -18,6 +18,7 @@ from netspec.data.images import list_lines, read_image
 from netspec.data.random_words import words
 from netspec.data.sources import Arrays, Cursor, Source
 from netspec.data.transformer import Transformer, contradictions
+from netspec.dialects.layers import replace
 from netspec.errors import SpecError, Where
 from netspec.files.opencv import cv2
 from netspec.layers import register
@@ -150,7 +151,7 @@ class LaterShuffled(Cursor):
         return position if position < self.count else super()._record(position)
 
 
-@register("Data", "data_param", "data_param.shuffle", *TRANSFORM, replaces=files.Data)
+@replace("Data", "data_param", "data_param.shuffle", *TRANSFORM)
 class Data(files.Data):
     """Caffe's Data; with shuffle each epoch after the first has a random order of its own.
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from netspec.errors import SpecError, Where
-from netspec.proto.dialect.registry import active_dialects
+from netspec.proto.forks import forks
 
 _EXPORTING = ("dialects", "exact", "export", "graph", "layers", "net", "proto")  # the rooms that decide
 
@@ -28,7 +28,7 @@ def key_of(files: Sequence[str | Path], options: Mapping[str, Any]) -> str:
     Raises SpecError for a file that cannot be read.
     """
     digests = [_digest(path) for path in files]
-    dialects = [[d.name, _digest(d.file) if d.file else d.source] for d in active_dialects()]
+    dialects = [[name, _digest(file) if file else source] for name, file, source in forks().active()]
     said = {"code": _code(), "files": digests, "dialects": dialects, "options": options}
     return hashlib.sha256(json.dumps(said, sort_keys=True, default=str).encode()).hexdigest()
 

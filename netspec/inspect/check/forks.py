@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from netspec.errors import ForkFault, SpecError
 from netspec.layers import class_of, layer_class, unknown_type
-from netspec.proto.dialect.registry import dialects_with_type
+from netspec.proto.forks import forks
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 
@@ -19,7 +19,7 @@ def unknown_types(net: NetParameter, source: SourceMap) -> Iterator[ForkFault]:
         if layer_class(layer.type) is None:
             where = source.at(i, "type", layer=layer.name, type=layer.type)
             message = unknown_type(layer.type)
-            yield ForkFault(message, where, "layer", layer.type, dialects_with_type(layer.type))
+            yield ForkFault(message, where, "layer", layer.type, forks().with_type(layer.type))
 
 
 def python_layers(net: NetParameter, source: SourceMap) -> Iterator[SpecError]:

@@ -11,7 +11,7 @@ database in a layer's constructor, before it logs the layer's bottoms and tops, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -21,6 +21,7 @@ from netspec.data.blobs import Shape
 from netspec.errors import SpecError
 from netspec.exact import switch
 from netspec.files.limits import amount, is_out_of_memory, memory
+from netspec.graph.plan import Param
 from netspec.layers.contract import fillers
 from netspec.layers.contract.context import Context
 from netspec.layers.contract.learned import Learned, values_of
@@ -52,18 +53,12 @@ class Layer(torch.nn.Module):
     bottoms: ClassVar[tuple[int, int | None]] = (1, 1)  # fewest and most (None: any number)
     tops: ClassVar[tuple[int, int | None]] = (1, 1)
     same_tops: ClassVar[bool] = False  # as many tops as bottoms
-    is_loss: ClassVar[bool] = False  # loss_weight 1 on the first top unless given; a missing top is made
-    counts: bool = True  # of a loss: whether it has that loss_weight of 1; in some forks only a given one counts
-    forks: ClassVar[Mapping[str, str]] = {}  # where several forks have the type: dialects, and what their layers do
-    unsure: str = ""  # what the net warns of: nothing shows whose the layer is
+    is_loss: ClassVar[bool] = False  # a missing top is made, and default_loss_weight is 1
     is_input: ClassVar[bool] = False  # its tops are given by the caller
     label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
     reads: ClassVar[frozenset[str]] = frozenset()  # its own fields of LayerParameter; set where it is registered
     ignores: frozenset[str] = frozenset()  # of these, what has no effect, e.g. "data_param.scale"
     shares: frozenset[str] = frozenset()  # of "data", "diff": its tops lie where its bottom lies, in Caffe's memory
-    default_param_lr: ClassVar[float] = 1.0  # lr_mult of a blob for which the prototxt has no param { }
-    loose: ClassVar[bool] = False  # files may have its blobs with other axes of size 1, as its forks do
-    not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
     counted_axis: ClassVar[int | None] = None  # the tops' axis whose size only a forward pass finds out
     promises: ClassVar[bool] = True  # its tops have the shapes that ``reshape`` returned, but for ``counted_axis``
 
@@ -184,6 +179,15 @@ class Layer(torch.nn.Module):
         """Return learnable blob ``index`` in this layer's shape (a PERMISSIVE sharer's owner may have another)."""
         tensor = self.blobs[index]
         return tensor if tensor.shape == self.blob_shapes[index] else tensor.view(self.blob_shapes[index])
+
+    def param_spec(self, j: int, given: Param | None) -> Param:
+        """Return how blob ``j`` is learned: as ``given`` by the prototxt, or without that at the plain rate."""
+        return given or Param("", 1.0, 1.0, False, None)
+
+    @property
+    def default_loss_weight(self) -> float:
+        """The loss_weight of the first top where the prototxt gives none."""
+        return float(self.is_loss)
 
     def values(self) -> list[torch.Tensor]:
         """Return the values of all learnable blobs, in this layer's shapes, without gradients, for reading."""

@@ -16,10 +16,8 @@ def write_weights() -> None:
     import torch
 
     import netspec
-    from netspec.dialects import use_dialects_of
 
     for path in sorted(HERE.glob("*.prototxt")):
-        use_dialects_of(path.read_text(), str(path))
         net = netspec.load_net(path, seed=1)
         draw = torch.Generator().manual_seed(1)
         with torch.no_grad():

@@ -12,14 +12,14 @@ import pytest
 
 import netspec
 import netspec.dialects
+from fresh_dialects import switched_on_by
 from netspec.cli import main
-from netspec.dialects import use_dialect, use_dialects_of
+from netspec.dialects import files as dialect_files
+from netspec.dialects import registry as dialect
+from netspec.dialects import use_dialect
+from netspec.dialects.files import find_file, known_files, read_dialect
 from netspec.errors import SpecError
 from netspec.layers import layer_class, layer_types
-from netspec.proto.dialect import files as dialect_files
-from netspec.proto.dialect import registry as dialect
-from netspec.proto.dialect.files import find_file, known_files, read_dialect
-from netspec.proto.schema import caffe_names
 from netspec.proto.text import parse_net_text
 from paths import ROOT
 
@@ -174,7 +174,7 @@ def test_a_file_name_that_is_no_word_will_do(tmp_path: Path) -> None:
 
 FOUND = """
 import sys
-from netspec.proto.dialect.registry import active
+from netspec.dialects.registry import active
 from netspec.proto.text import parse_net_text
 for text in sys.argv[1:]:
     parse_net_text(text, "f")
@@ -267,36 +267,31 @@ def test_a_packages_entry_point_is_found_and_used(tmp_path: Path, capsys: pytest
 
 def test_a_prototxt_switches_on_what_it_needs(files_afresh: None) -> None:
     text = 'layer { name: "n" type: "Normalize" bottom: "x" top: "n" norm_param { across_spatial: false } }'
-    assert use_dialects_of(text, "x.prototxt") == ["ssd"]
+    assert switched_on_by(text) == ["ssd"]
     assert layer_class("Normalize") is not None
-    assert use_dialects_of(text, "x.prototxt") == []
 
 
 def test_a_prototxt_of_caffes_own_layers_switches_on_nothing(files_afresh: None) -> None:
     text = 'layer { name: "Normalize" type: "ReLU" bottom: "Permute" top: "Swish" }'  # names, not types
-    assert use_dialects_of(text, "x.prototxt") == []
+    assert switched_on_by(text) == []
 
 
-def test_a_name_that_caffe_has_too_switches_on_nothing(files_afresh: None) -> None:
+def test_a_field_that_caffe_has_in_another_message_is_of_the_message_around_it(files_afresh: None) -> None:
     before = layer_class("BatchNorm")
     text = 'layer { type: "Convolution" convolution_param { num_output: 1 bias_filler { type: "constant" } } }'
-    assert use_dialects_of(text, "x.prototxt") == []
-    dialect_files.announce_known()
-    for each in dialect.known():
-        words = " ".join(f"{name}: 1" for _, name in each.fields() if name in caffe_names())
-        assert use_dialects_of(f"some_param {{ {words} }}", "x.prototxt") == [], each.name
+    assert switched_on_by(text) == []
+    assert switched_on_by('layer { type: "BatchNorm" batch_norm_param { bias_filler { } } }') == ["nvidia"]
     assert layer_class("BatchNorm") is before
-    assert use_dialects_of(text.replace("num_output", "scale_bias: true num_output"), "x.prototxt") == ["nvidia"]
 
 
 @pytest.mark.slow
 def test_a_prototxt_of_two_dialects_switches_on_both(files_afresh: None) -> None:
     text = 'layer { type: "Permute" permute_param { order: 0 } } layer { type: "Axpy" } layer { type: "Normalize" }'
-    assert use_dialects_of(text, "x.prototxt") == ["ssd", "blocks"]
+    assert switched_on_by(text) == ["ssd", "blocks"]
 
 
 def test_what_no_dialect_has_is_left_to_the_reader(files_afresh: None) -> None:
-    assert use_dialects_of('layer { type: "NoSuchType" no_such_param { } }', "x.prototxt") == []
+    assert switched_on_by('layer { type: "NoSuchType" no_such_param { } }') == []
 
 
 def test_the_page_names_every_dialect() -> None:

@@ -22,9 +22,9 @@ from benchmarks.pages import write
 from fresh_dialects import fresh_dialects
 from golden_cases import LayerCase, layer_distances, parameters, set_parameters, train
 from netspec.dialects import use_dialect
+from netspec.dialects.files import announce_known
+from netspec.dialects.registry import known
 from netspec.errors import SpecError
-from netspec.proto.dialect.files import announce_known
-from netspec.proto.dialect.registry import known
 from paths import GOLDEN, ROOT
 
 FORKS = GOLDEN / "forks"
@@ -190,7 +190,7 @@ def layer_types() -> dict[str, list[str]]:
         if not Path(dialect.file).is_relative_to(ROOT / "netspec"):  # of a package, from another test
             continue
         source = Path(dialect.file).read_text()
-        replaced = re.findall(r'register\(\s*"(\w+)",(?:(?!register\(|\nclass).)*?replaces=', source, re.DOTALL)
+        replaced = re.findall(r'replace\(\s*"(\w+)"', source)
         for kind in {*dialect.layer_types, *replaced}:
             owners.setdefault(kind, []).append(dialect.name)
     return owners

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.dialects import use_dialects_of
 from netspec.net.net import Net
 
 BITS = "bw_layer_in: 6 fl_layer_in: 3 bw_layer_out: 8 fl_layer_out: 2 bw_params: 5 fl_params: 4"
@@ -26,7 +25,6 @@ def test_a_prepared_net_computes_the_same(layer: str, net_of: Callable[..., Net]
     text = f"""layer {{ name: "x" type: "Input" top: "x" input_param {{ shape {{ dim: 2 dim: 3 dim: 9 dim: 8 }} }} }}
         layer {{ name: "it" {LAYERS[layer]} bottom: "x" top: "y" }}
         layer {{ name: "relu" type: "ReLU" bottom: "y" top: "y" }}"""
-    use_dialects_of(text, "net.prototxt")
     net = net_of(text)
     for blob in net.params["it"][:3] if layer == "slopes" else ():
         with torch.no_grad():

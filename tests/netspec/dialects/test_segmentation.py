@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.dialects import use_dialect, use_dialects_of
+from fresh_dialects import switched_on_by
+from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.layers import Context, Layer
 from netspec.net.build import build_net
@@ -106,7 +107,7 @@ def test_edge_maps(pairs: Path, dialect: str) -> None:
 
 def test_which_of_two_forks_is_meant_is_asked(pairs: Path) -> None:
     text = EDGES % (pairs, pairs)
-    assert use_dialects_of(text, "net.prototxt") == []
+    assert switched_on_by(text) == []
     with pytest.raises(SpecError, match='dialects "hed" and "rcf" have "ImageLabelmapData"; add --plugin hed'):
         build_net(*parse_net_text(text, "net.prototxt"))
 

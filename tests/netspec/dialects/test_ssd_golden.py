@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import netspec
+from fresh_dialects import switched_on_by
 from golden_cases import LayerCase, assert_same_layers, parameters, train
-from netspec.dialects import use_dialects_of
 from netspec.dialects.boxes import highest
 from netspec.load import load_net
 from paths import GOLDEN
@@ -26,7 +26,7 @@ TRAININGS = ["corner_no_mining", "norm_per_channel"]
 
 
 def _use_dialects(prototxt: Path) -> None:
-    use_dialects_of(prototxt.read_text(), str(prototxt))
+    switched_on_by(prototxt.read_text())
 
 
 def _assert_close(found: np.ndarray, expected: np.ndarray, name: str, tolerance: float = 1e-5) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
+from fresh_dialects import switched_on_by
 from netspec.cli import main
-from netspec.dialects import use_dialects_of
 from netspec.errors import SpecError
 from netspec.net.net import Net
 from places_layouts import COUNT, write_video
@@ -135,12 +135,13 @@ def test_wrong_settings(net_of: Callable[..., Net], video: Path) -> None:
         ('video_type: VIDEO video_file: "v.avi"', ["ssd_video"]),
         ("skip_frames: 2", ["ssd_video"]),
         ('source: "list.txt" batch_size: 2 num_segments: 3', ["tsn"]),
-        ("device_id: 1", []),  # Caffe's solver has a device_id
+        ("device_id: 1", ["ssd_video"]),
+        ("", []),
     ],
 )
 def test_its_fields_tell_which_fork_is_meant(net_of: Callable[..., Net], given: str, dialects: list[str]) -> None:
     net = LAYER % (given, 1, 4, "")
-    assert use_dialects_of(net, "net.prototxt") == dialects
+    assert switched_on_by(net) == dialects
     if not dialects:
         with pytest.raises(SpecError, match='dialects "ssd_video" and "tsn" have "video_data_param"; add --plugin ssd'):
             net_of(net)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.dialects import use_dialect, use_dialects_of
+from fresh_dialects import switched_on_by
+from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.layers import Context, Layer
 from netspec.layers.data.files import ReadingLayer
@@ -113,5 +114,5 @@ def test_a_field_is_known_by_the_message_around_it() -> None:
     """Caffe has a field shuffle too, in image_data_param and hdf5_data_param."""
     text = """layer { name: "data" type: "Data" top: "data" data_param { source: "x" %s } }
         layer { name: "image" type: "ImageData" top: "image" image_data_param { source: "x" shuffle: true } }"""
-    assert use_dialects_of(text % "", "net.prototxt") == []
-    assert use_dialects_of(text % "shuffle: true", "net.prototxt") == ["tsn"]
+    assert switched_on_by(text % "") == []
+    assert switched_on_by(text % "shuffle: true") == ["tsn"]

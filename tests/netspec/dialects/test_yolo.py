@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from netspec.dialects import use_dialects_of
+from fresh_dialects import switched_on_by
 from netspec.layers import Layer
 
 Build = Callable[..., Layer]
@@ -30,4 +30,4 @@ def test_nothing_found_is_a_row_for_each_image(build: Build) -> None:
 
 
 def test_the_dialect_is_found_by_the_layer_type() -> None:
-    assert use_dialects_of(f"layer {{ {V3 % 1} }}", "net.prototxt") == ["yolo"]
+    assert switched_on_by(f"layer {{ {V3 % 1} }}") == ["yolo"]

@@ -9,8 +9,8 @@ import pytest
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 
+from netspec.dialects.declarations import read_declarations
 from netspec.proto import schema
-from netspec.proto.dialect.declarations import read_declarations
 from paths import ROOT
 
 PROTO = ROOT / "netspec" / "proto"

@@ -14,27 +14,30 @@ from google.protobuf import message_factory
 from google.protobuf.internal.enum_type_wrapper import EnumTypeWrapper
 
 from netspec.errors import did_you_mean
-from netspec.proto.dialect.files import announce_known
-from netspec.proto.dialect.merged import merged_file
-from netspec.proto.dialect.registry import advice_for, dialects_with_message
+from netspec.proto.forks import forks
+from netspec.proto.schema import pool
 
 
 def __getattr__(name: str) -> Any:
     if name == "DESCRIPTOR":
-        return merged_file()
-    names = _names(merged_file())
+        return _file()
+    names = _names(_file())
     if name == "__all__":
         return [public for public in names if not public.startswith("_")]
     if name in names:
         return names[name]
-    announce_known()
-    advice = advice_for(name, dialects_with_message(name))
+    advice = forks().advice(name, forks().with_message(name))
     hint = f"; {advice}" if advice else did_you_mean(name, list(names))
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
 
 
 def __dir__() -> list[str]:
-    return sorted(_names(merged_file()))
+    return sorted(_names(_file()))
+
+
+def _file() -> Any:
+    """Return the descriptor of caffe.proto, with the additions of the active dialects."""
+    return forks().schema_file() or pool.FindFileByName("caffe.proto")
 
 
 @cache

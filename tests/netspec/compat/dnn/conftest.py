@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import pytest
 
 from fresh_dialects import keep_registry
-from netspec.proto.dialect import files as dialect_files
-from netspec.proto.dialect import registry as dialect
+from netspec.dialects import files as dialect_files
+from netspec.dialects import registry as dialect
 
 
 @pytest.fixture(autouse=True)

@@ -12,8 +12,8 @@ from netspec.compat.pycaffe.net_spec import layers, params
 from netspec.compat.pycaffe.proto import caffe_pb2
 from netspec.compat.scripts import old_names
 from netspec.dialects import use_dialect
+from netspec.dialects.registry import deactivate
 from netspec.proto import schema
-from netspec.proto.dialect.registry import deactivate
 
 
 @pytest.fixture

@@ -9,17 +9,17 @@ from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto,
 from google.protobuf.descriptor_pool import DescriptorPool
 
 from case_files import read_texts
+from netspec.dialects import registry as dialect
+from netspec.dialects.declarations import read_declarations
+from netspec.dialects.registry import Dialect
 from netspec.errors import SpecError
 from netspec.proto import schema
-from netspec.proto.dialect import registry as dialect
-from netspec.proto.dialect.declarations import read_declarations
-from netspec.proto.dialect.registry import Dialect
 from netspec.proto.schema import BlobProto, LayerParameter, NetParameter
 from netspec.proto.text import parse_net_text, write_text
 
 PROTO = Path(schema.__file__).parent
 
-SOURCE, NET = read_texts("netspec/proto/dialect.txt").values()
+SOURCE, NET = read_texts("netspec/dialects/registry.txt").values()
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """Caffe's schema with the additions of the active dialects as ordinary messages and fields.
 
-:mod:`netspec.proto.dialect.registry` adds the fields of dialects as extensions, so that they can come and go. Programs
+:mod:`netspec.dialects.registry` adds the fields of dialects as extensions, so that they can come and go. Programs
 that were written for a fork know them as fields of the fork's own ``caffe_pb2``: ``layer.permute_param.order``. Their
 classes come from here. They have the same text; the same bytes too, but for values added to an enum of Caffe's.
 """
@@ -13,8 +13,8 @@ from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool
 
+from netspec.dialects.registry import Dialect, active_dialects, full_name_of
 from netspec.errors import SpecError, Where
-from netspec.proto.dialect.registry import Dialect, active_dialects, full_name_of
 from netspec.proto.schema import PACKAGE, pool
 
 _FILE = "caffe.proto"

@@ -35,8 +35,8 @@ from typing import Any
 
 from google.protobuf.descriptor_pb2 import FileDescriptorProto
 
+from netspec.dialects.declarations import read_declarations
 from netspec.errors import SpecError, Where
-from netspec.proto.dialect.declarations import read_declarations
 from netspec.proto.schema import MORE, PACKAGE, add_file, added_fields, as_field, fields_of, pool
 
 
@@ -96,8 +96,6 @@ def is_enum_of_caffe(message: str, field: str) -> bool:
     return found is not None and found.enum_type is not None
 
 
-OWN_LAYER = "docs/layer.md shows how to add one with --plugin FILE.py"
-OWN_FIELD = "docs/layer.md shows how to add a fork's with --plugin FILE.py"
 _known: dict[str, Dialect] = {}
 _active: dict[str, Dialect] = {}
 
@@ -214,8 +212,16 @@ def active_dialects() -> tuple[Dialect, ...]:
 
 
 def dialects_with_field(message: str, field: str) -> tuple[str, ...]:
-    """Return the known dialects that have a field of a message (full name)."""
-    return tuple(d.name for d in _known.values() if (message, field) in d.fields())
+    """Return the known dialects that have a field of a message (full name; "" is any message)."""
+    found = {d.name: d.fields() for d in _known.values()}
+    return tuple(name for name, fields in found.items() if any(f == field and message in (m, "") for m, f in fields))
+
+
+def dialects_with_inner_fields(dialects: Sequence[str], names: set[str]) -> tuple[str, ...]:
+    """Return those of some known dialects whose messages have most of these fields: none where they have none."""
+    found = {name: len(_known[name].inner_fields() & names) for name in dialects}
+    most = max(found.values())
+    return tuple(name for name, count in found.items() if count == most > 0)
 
 
 def dialects_with_value(message: str, field: str, value: str) -> tuple[str, ...]:

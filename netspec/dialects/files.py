@@ -15,9 +15,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from netspec import log
+from netspec.dialects.registry import Dialect, activate, announce
 from netspec.errors import SpecError, Where, did_you_mean
-from netspec.proto.dialect.folders import FOLDERS
-from netspec.proto.dialect.registry import Dialect, activate, announce
 
 GROUP = "netspec.dialects"  # of entry points: other packages' dialects, a name and a module each
 
@@ -33,7 +32,7 @@ class DialectFile:
 
 @cache
 def known_files() -> dict[str, DialectFile]:
-    """Return the dialects found by name: those in FOLDERS, and those of installed packages' entry points."""
+    """Return the dialects found by name: those of the families here, and those of installed packages' entry points."""
     from importlib.metadata import entry_points  # it takes longer to import than a command takes to start
 
     found = {}
@@ -47,10 +46,9 @@ def known_files() -> dict[str, DialectFile]:
             log.logger.warning(f'dialect "{point.name}": there is no module {module}; the dialect is ignored')
         else:
             found[point.name] = DialectFile(point.name, Path(spec.origin), module)
-    for folder, package in FOLDERS:
-        for path in sorted(Path(folder).glob("*/*.py"), key=lambda path: path.stem):
-            if "\nDECLARATIONS = " in path.read_text("utf-8"):
-                found[path.stem] = DialectFile(path.stem, path, f"{package}.{path.parent.name}.{path.stem}")
+    for path in sorted(Path(__file__).parent.glob("*/*.py"), key=lambda path: path.stem):
+        if "\nDECLARATIONS = " in path.read_text("utf-8"):
+            found[path.stem] = DialectFile(path.stem, path, f"{__package__}.{path.parent.name}.{path.stem}")
     return found
 
 
@@ -93,12 +91,11 @@ def read_dialect(file: DialectFile) -> Dialect:
 
 
 def _registered_types(tree: ast.Module) -> Iterator[str]:
-    """Yield the types under which new layers are registered, not those that replace Caffe's."""
+    """Yield the types under which new layers are registered."""
     for call in ast.walk(tree):
         if isinstance(call, ast.Call) and _name(call.func) == "register" and call.args:
             first = call.args[0]
-            replaces = any(keyword.arg == "replaces" for keyword in call.keywords)
-            if isinstance(first, ast.Constant) and isinstance(first.value, str) and not replaces:
+            if isinstance(first, ast.Constant) and isinstance(first.value, str):
                 yield first.value
 
 

@@ -1,0 +1,149 @@
+"""The layers of the dialects: which dialect has a type, which class it puts in the place of one of Caffe's."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from google.protobuf.message import Message
+
+from netspec.dialects.files import DialectFile, announce_known, find_file, known_files, switch_on, waiting
+from netspec.dialects.registry import deactivate, dialects_with_type
+from netspec.dialects.signatures import has_several
+from netspec.errors import SpecError, Where
+from netspec.graph.options import BuildOptions
+from netspec.layers.contract.base import Layer
+from netspec.layers.contract.registry import layer_class, registered
+from netspec.proto.schema import PACKAGE, LayerParameter, NetParameter
+
+_owners: dict[str, str] = {}  # layer type -> the dialect that has it; Caffe's own are not here
+Wants = Callable[[LayerParameter], bool]
+_replacing: dict[str, dict[str, tuple[type[Layer], Wants]]] = {}  # layer type of Caffe's -> dialect -> class, for which
+_everywhere: set[str] = set()  # dialects that count for every net of the process: a user asked for them
+_loading = ""  # the dialect whose file is run now
+L = TypeVar("L", bound=type[Layer])
+
+
+def replace(type_name: str, *reads: str, where: Wants = lambda param: True) -> Callable[[L], L]:
+    """Class decorator: put a subclass of one of Caffe's layers in its place, in nets that use the dialect.
+
+    It takes the place in those layers ``where`` the LayerParameter asks for it. ``reads`` are as for
+    :func:`netspec.layers.register`, with the fields that the dialect adds: ``"pooling_param.extra"``.
+    """
+
+    def add(cls: L) -> L:
+        cls.type = type_name
+        cls.reads = frozenset(reads)
+        _replacing.setdefault(type_name, {})[_loading or cls.__module__.rpartition(".")[2]] = cls, where
+        return cls
+
+    return add
+
+
+def dialects_of(net: NetParameter) -> set[str]:
+    """Return the dialects that count for a net: those whose fields and layer types it has, and those for every net.
+
+    A layer of a type that several forks have shows none of them (netspec/dialects/signatures.py).
+    """
+    types = {layer.type for layer in net.layer}
+    shown = {each for each in types if layer_class(each) and not has_several(each)}
+    found = {*_everywhere, *(_owners[each] for each in shown if each in _owners)}
+    return found.union(*(_dialects_in(layer) for layer in net.layer if layer.type in shown))
+
+
+def _dialects_in(message: Message) -> set[str]:
+    """Return the dialects whose fields a message, or one inside it, has."""
+    found: set[str] = set()
+    fields: Any = message.ListFields()
+    for field, value in fields:
+        if field.is_extension:
+            found.add(field.file.package.removeprefix(f"{PACKAGE}."))
+        if field.message_type is not None:
+            values = [value] if isinstance(value, Message) else value
+            found.update(*(_dialects_in(each) for each in values))
+    return found
+
+
+def use_everywhere(dialect: str) -> None:
+    """Let the layers of a dialect count for every net that this process builds from now on."""
+    run_dialects()
+    _everywhere.add(dialect)
+
+
+def register_type(layer_type: str) -> None:
+    """Register the layers of the dialects that were switched on, and of the one that alone has a layer type."""
+    run_dialects()
+    if registered(layer_type) is None:
+        announce_known()
+        dialects = [name for name in dialects_with_type(layer_type) if name in known_files()]
+        if len(dialects) == 1:
+            switch_on(find_file(dialects[0]))
+            run_dialects()
+
+
+def class_of(param: LayerParameter, options: BuildOptions | None = None) -> type[Layer] | None:
+    """Return the class of a layer where the dialects in ``options`` have another than that of its type, or None.
+
+    A Python layer that a dialect knows by its module and class, ``"rpn.proposal_layer.ProposalLayer"``, is the
+    dialect's, unless Python code is allowed to run and its module is there.
+    """
+    run_dialects()
+    for dialect in options.dialects if options else ():
+        cls, wants = _replacing.get(param.type, {}).get(dialect, (None, bool))
+        if cls and wants(param):
+            return cls
+    if param.type != "Python":
+        return None
+    python: Any = registered("Python")
+    if options and options.allow_python and python.is_there(param):
+        return None
+    return layer_class(f"{param.python_param.module}.{param.python_param.layer}")
+
+
+def run_dialects() -> None:
+    """Register the layers of the dialects that were switched on. Raises SpecError for one that cannot be loaded."""
+    global _loading
+    while waiting:
+        file, dialect = waiting.pop(0)
+        module = file.module or f"netspec_dialect_{file.name}"
+        if module in sys.modules:
+            continue
+        try:
+            for layer_type in dialect.layer_types:
+                if cls := registered(layer_type):
+                    message = f'layer type "{layer_type}" already exists, from {cls.__module__}'
+                    raise SpecError(message, Where(str(file.path)))
+            _loading = file.name
+            _run(file, module)
+        except SpecError:
+            deactivate(dialect.name)
+            raise
+        finally:
+            _loading = ""
+        _owners.update(dict.fromkeys(dialect.layer_types, file.name))
+
+
+def _run(file: DialectFile, name: str) -> None:
+    """Run a dialect's file, which registers its layers."""
+    try:
+        if file.module:
+            importlib.import_module(name)
+            return
+        spec = importlib.util.spec_from_file_location(name, file.path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[name] = module
+        spec.loader.exec_module(module)
+    except Exception as fault:
+        sys.modules.pop(name, None)
+        frames, own = traceback.extract_tb(fault.__traceback__), str(Path(file.path).absolute())
+        lines = [frame.lineno or 0 for frame in frames if frame.filename == own]
+        text = " ".join(str(fault).split())
+        place = Where(str(file.path), lines[-1] if lines else 0, 1)
+        raise SpecError(f"cannot be loaded: {type(fault).__name__}: {text}", place) from fault

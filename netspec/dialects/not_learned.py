@@ -1,0 +1,21 @@
+"""Layers of forks some of whose blobs are never learned, such as moving averages."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from typing_extensions import override
+
+from netspec.graph.plan import Param
+from netspec.layers import Layer
+
+
+class NotLearned(Layer):
+    """A base for such layers."""
+
+    not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
+
+    @override
+    def param_spec(self, j: int, given: Param | None) -> Param:
+        spec = super().param_spec(j, given)
+        return replace(spec, lr_mult=0.0, decay_mult=0.0) if j in self.not_learned else spec

@@ -1,1 +1,0 @@
-"""The dialects of Caffe's forks as additions to the schema."""
