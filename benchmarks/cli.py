@@ -1,4 +1,4 @@
-"""``tools/bench``: its commands; netspec/terminal/commands.py reads them as it reads those of netspec."""
+"""Time netspec and loopclosure, and other programs that do the same, for the tables of the pages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from typing import Any
 
 from benchmarks.growth import KINDS
 from benchmarks.report import Row
-from netspec.terminal.commands import Commands, WrongUsage, run
+from netspec.terminal.commands import WrongUsage, run
+from netspec.terminal.parser import Commands, Parser
 
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
 FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
@@ -28,77 +29,34 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run(made, words)
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of all commands."""
-    made = argparse.ArgumentParser(prog="tools/bench", description=__doc__, allow_abbrev=False)
-    commands = _Quiet(made)
-    p = commands.add("forward", _forward, "time forward passes beside those of other programs")
-    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list), or a prototxt")
-    p.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
-    p.add_argument("--twin", help="the net of the catalog whose PyTorch twin the prototxt has")
-    _add_common(p, FORWARD, (*ENGINES, "pytorch", "opencv4"))
-    p.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
-    p = commands.add("train", _train, "time training iterations: forward, backward, update")
-    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
-    _add_common(p, TRAINING, ("netspec", "pytorch"))
-    p.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
-    p.add_argument("--device", default="cpu", help="torch's name of it, for netspec and pytorch (default: cpu)")
-    p = commands.add("small", _small, "time small nets and batches: training iterations, then forward passes")
-    p.add_argument("nets", nargs="*", metavar="NET", default=SMALL, help=f"default: {' '.join(SMALL)}")
-    _add_common(p, WAYS_OF_SMALL, WAYS_OF_SMALL)
-    p.set_defaults(batch=[1, 4, 16, 64])
-    p = commands.add("start", _start, "time processes that load a net and describe one image")
-    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list), or a prototxt")
-    p.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
-    _add_ways(p, (*ENGINES, "opencv4"), (*ENGINES[:3], "opencv4"))
-    p = commands.add(
-        "waiting", _waiting, "time two trainings side by side, as their OpenMP threads wait in several ways"
-    )
-    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
-    p.add_argument(
-        "--waits", nargs="+", default=["", "OMP_WAIT_POLICY=PASSIVE", "GOMP_SPINCOUNT=2000"], metavar="VARIABLE=VALUE"
-    )
-    p.add_argument("--batch", type=int, default=32, help="items of a batch (default: 32)")
-    p.add_argument("--threads", type=int, default=2, help="threads of each training (default: 2)")
-    p.add_argument("--rounds", type=int, default=7, help="default: 7")
-    p = commands.add("growth", _growth, "time and memory of more and more layers, pairs, frames, ...")
-    p.add_argument("kind", choices=KINDS, help="what grows")
-    p.add_argument("sizes", type=int, nargs="*", metavar="SIZE", help="how many of it, several times (default: usual)")
-    p.add_argument("--plot", metavar="FILE", help="draw what was measured, as .png or .svg")
-    _add_json(p)
-    p = commands.add("feeding", _feeding, "how long trainings wait for data from databases and image files")
-    p.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
-    p.add_argument("--batch", type=int, default=4, help="items of a batch (default: 4)")
-    p.add_argument("--threads", type=int, default=2, help="threads of the training (default: 2)")
-    _add_json(p)
-    p = commands.add("settings", _settings, "judge loopclosure's auto on drives whose loops are known")
-    _add_data(p)
-    p.add_argument("families", nargs="*", metavar="FAMILY", help="only the drives made of these (default: all)")
-    p = commands.add("tables", _tables, "measure loopclosure's methods for the tables of its pages")
-    _add_data(p)
-    p.add_argument("sets", nargs="*", metavar="SET", help="only on these (default: all)")
-    p.add_argument("--methods", nargs="+", default=[], metavar="NAME", help="only these, as the tables name them")
-    commands.add("pages", _pages, "write the figures of the pages from benchmarks/results")
-    commands.add("list", _list, "list the nets of the catalog")
+    made = Parser(prog="tools/bench", description=__doc__)
+    commands = Commands(made, log_level=logging.WARNING)
+    _add_forward(commands)
+    _add_train(commands)
+    _add_small(commands)
+    _add_start(commands)
+    _add_waiting(commands)
+    _add_growth(commands)
+    _add_feeding(commands)
+    _add_settings(commands)
+    _add_tables(commands)
+    _add_pages(commands)
+    _add_list(commands)
     return made
 
 
-class _Quiet(Commands):
-    """Commands that show no log."""
-
-    def add(self, name: str, function: Callable[[argparse.Namespace], int | None], summary: str) -> Any:
-        """See :class:`netspec.terminal.commands.Commands`."""
-        added = super().add(name, function, summary)
-        added.set_defaults(log_level=logging.WARNING)
-        return added
-
-
-def _add_common(p: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
-    _add_ways(p, known, default)
-    p.add_argument("--caffe", metavar="BINARY", help="also Caffe's own program")
-    p.add_argument("--batch", type=int, nargs="+", default=[1], help="items of a batch, one or several (default: 1)")
-    p.add_argument("--threads", type=int, nargs="+", default=[1], help="threads of a pass, one or several (default: 1)")
-    p.add_argument(
+def _add_common(parser: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
+    _add_ways(parser, known, default)
+    parser.add_argument("--caffe", metavar="BINARY", help="also Caffe's own program")
+    parser.add_argument(
+        "--batch", type=int, nargs="+", default=[1], help="items of a batch, one or several (default: 1)"
+    )
+    parser.add_argument(
+        "--threads", type=int, nargs="+", default=[1], help="threads of a pass, one or several (default: 1)"
+    )
+    parser.add_argument(
         "--seconds",
         type=float,
         default=60,
@@ -107,29 +65,48 @@ def _add_common(p: argparse.ArgumentParser, known: Sequence[str], default: Seque
     )
 
 
-def _add_ways(p: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
-    p.add_argument(
+def _add_ways(parser: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
+    parser.add_argument(
         "--with", dest="ways", nargs="+", choices=known, default=list(default), help=f"default: {' '.join(default)}"
     )
-    p.add_argument("--rounds", type=int, default=9, help="rounds, in each of which every way has its turn (default: 9)")
-    _add_json(p)
+    parser.add_argument(
+        "--rounds", type=int, default=9, help="rounds, in each of which every way has its turn (default: 9)"
+    )
+    _add_json(parser)
 
 
-def _add_json(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
+def _add_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
 
 
-def _add_data(p: argparse.ArgumentParser) -> None:
-    p.add_argument(
+def _add_data(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
         "--data", type=Path, required=True, metavar="FOLDER", help="with sequences, tum_fr1, place_pairs, ..."
     )
-    p.add_argument("--work", type=Path, required=True, metavar="FOLDER", help="for images, descriptors and results")
+    parser.add_argument(
+        "--work", type=Path, required=True, metavar="FOLDER", help="for images, descriptors and results"
+    )
+
+
+def _add_settings(commands: Commands) -> None:
+    parser = commands.add_parser("settings", help="judge loopclosure's auto on drives whose loops are known")
+    parser.set_defaults(function=_settings)
+    _add_data(parser)
+    parser.add_argument("families", nargs="*", metavar="FAMILY", help="only the drives made of these (default: all)")
 
 
 def _settings(arguments: argparse.Namespace) -> None:
     from benchmarks.settings import run, summary
 
     print(summary(run(arguments.data, arguments.work, arguments.families, partial(print, flush=True))))
+
+
+def _add_tables(commands: Commands) -> None:
+    parser = commands.add_parser("tables", help="measure loopclosure's methods for the tables of its pages")
+    parser.set_defaults(function=_tables)
+    _add_data(parser)
+    parser.add_argument("sets", nargs="*", metavar="SET", help="only on these (default: all)")
+    parser.add_argument("--methods", nargs="+", default=[], metavar="NAME", help="only these, as the tables name them")
 
 
 def _tables(arguments: argparse.Namespace) -> None:
@@ -139,16 +116,36 @@ def _tables(arguments: argparse.Namespace) -> None:
     measure(arguments.data, arguments.work, arguments.sets, arguments.methods, say, arguments.words)
 
 
+def _add_pages(commands: Commands) -> None:
+    parser = commands.add_parser("pages", help="write the figures of the pages from benchmarks/results")
+    parser.set_defaults(function=_pages)
+
+
 def _pages(arguments: argparse.Namespace) -> None:
     from benchmarks import pages
 
     print("\n".join(f"written: {page.relative_to(pages.ROOT)}" for page in pages.write()) or "no figure changed")
 
 
+def _add_list(commands: Commands) -> None:
+    parser = commands.add_parser("list", help="list the nets of the catalog")
+    parser.set_defaults(function=_list)
+
+
 def _list(arguments: argparse.Namespace) -> None:
     from benchmarks.case import CATALOG
 
     print("\n".join(CATALOG))
+
+
+def _add_forward(commands: Commands) -> None:
+    parser = commands.add_parser("forward", help="time forward passes beside those of other programs")
+    parser.set_defaults(function=_forward)
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list), or a prototxt")
+    parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
+    parser.add_argument("--twin", help="the net of the catalog whose PyTorch twin the prototxt has")
+    _add_common(parser, FORWARD, (*ENGINES, "pytorch", "opencv4"))
+    parser.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
 
 
 def _forward(arguments: argparse.Namespace) -> None:
@@ -161,12 +158,29 @@ def _forward(arguments: argparse.Namespace) -> None:
     _compare(arguments, case, "")
 
 
+def _add_train(commands: Commands) -> None:
+    parser = commands.add_parser("train", help="time training iterations: forward, backward, update")
+    parser.set_defaults(function=_train)
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
+    _add_common(parser, TRAINING, ("netspec", "pytorch"))
+    parser.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
+    parser.add_argument("--device", default="cpu", help="torch's name of it, for netspec and pytorch (default: cpu)")
+
+
 def _train(arguments: argparse.Namespace) -> None:
     from benchmarks.case import training_case
 
     if arguments.device != "cpu" and ("pycaffe" in arguments.ways or arguments.caffe):
         raise WrongUsage("only netspec and pytorch are timed on other devices than the CPU")
     _compare(arguments, training_case, "_training", arguments.device)
+
+
+def _add_small(commands: Commands) -> None:
+    parser = commands.add_parser("small", help="time small nets and batches: training iterations, then forward passes")
+    parser.set_defaults(function=_small)
+    parser.add_argument("nets", nargs="*", metavar="NET", default=SMALL, help=f"default: {' '.join(SMALL)}")
+    _add_common(parser, WAYS_OF_SMALL, WAYS_OF_SMALL)
+    parser.set_defaults(batch=[1, 4, 16, 64])
 
 
 def _small(arguments: argparse.Namespace) -> None:
@@ -178,6 +192,20 @@ def _small(arguments: argparse.Namespace) -> None:
     _compare(arguments, partial(forward_case, onnx=False), "", before=trained)
 
 
+def _add_waiting(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "waiting", help="time two trainings side by side, as their OpenMP threads wait in several ways"
+    )
+    parser.set_defaults(function=_waiting)
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
+    parser.add_argument(
+        "--waits", nargs="+", default=["", "OMP_WAIT_POLICY=PASSIVE", "GOMP_SPINCOUNT=2000"], metavar="VARIABLE=VALUE"
+    )
+    parser.add_argument("--batch", type=int, default=32, help="items of a batch (default: 32)")
+    parser.add_argument("--threads", type=int, default=2, help="threads of each training (default: 2)")
+    parser.add_argument("--rounds", type=int, default=7, help="default: 7")
+
+
 def _waiting(arguments: argparse.Namespace) -> None:
     from benchmarks.waiting import compare
 
@@ -185,10 +213,30 @@ def _waiting(arguments: argparse.Namespace) -> None:
         compare(name, arguments.waits, arguments.batch, arguments.threads, arguments.rounds)
 
 
+def _add_feeding(commands: Commands) -> None:
+    parser = commands.add_parser("feeding", help="how long trainings wait for data from databases and image files")
+    parser.set_defaults(function=_feeding)
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
+    parser.add_argument("--batch", type=int, default=4, help="items of a batch (default: 4)")
+    parser.add_argument("--threads", type=int, default=2, help="threads of the training (default: 2)")
+    _add_json(parser)
+
+
 def _feeding(arguments: argparse.Namespace) -> None:
     from benchmarks.feeding import measure
 
     _keep(arguments, measure(arguments.nets, arguments.batch, arguments.threads, partial(print, flush=True)))
+
+
+def _add_growth(commands: Commands) -> None:
+    parser = commands.add_parser("growth", help="time and memory of more and more layers, pairs, frames, ...")
+    parser.set_defaults(function=_growth)
+    parser.add_argument("kind", choices=KINDS, help="what grows")
+    parser.add_argument(
+        "sizes", type=int, nargs="*", metavar="SIZE", help="how many of it, several times (default: usual)"
+    )
+    parser.add_argument("--plot", metavar="FILE", help="draw what was measured, as .png or .svg")
+    _add_json(parser)
 
 
 def _growth(arguments: argparse.Namespace) -> None:
@@ -206,6 +254,14 @@ def _keep(arguments: argparse.Namespace, rows: Sequence[Any], described: Any = N
 
     if arguments.json:
         results.write(arguments.json, rows, arguments.words, described)
+
+
+def _add_start(commands: Commands) -> None:
+    parser = commands.add_parser("start", help="time processes that load a net and describe one image")
+    parser.set_defaults(function=_start)
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list), or a prototxt")
+    parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
+    _add_ways(parser, (*ENGINES, "opencv4"), (*ENGINES[:3], "opencv4"))
 
 
 def _start(arguments: argparse.Namespace) -> None:

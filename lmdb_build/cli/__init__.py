@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 
 from lmdb_build.cli import databases, images, pairs
 from netspec.files.opencv import cv2
-from netspec.terminal.commands import Commands, program, run
+from netspec.terminal.commands import run
+from netspec.terminal.parser import Commands, Parser, program
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -17,12 +17,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run(parser(), list(sys.argv[1:] if argv is None else argv))
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of all commands."""
     made = program(
         "lmdb-build", "From image sequences to labeled pairs, to databases that Caffe reads, to a table of nets."
     )
     commands = Commands(made)
-    for group in (images, pairs, databases):
-        commands.table(group.COMMANDS)
+    for module in (images, pairs, databases):
+        module.add_commands(commands)
     return made

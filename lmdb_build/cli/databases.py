@@ -29,12 +29,92 @@ from netspec.data.mean import channel_means, compute_mean, write_mean
 from netspec.errors import Where
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar
+from netspec.terminal.parser import Commands
+
+
+def add_commands(commands: Commands) -> None:
+    """Add the commands of this module."""
+    _add_convert_pairs(commands)
+    _add_convert_images(commands)
+    _add_mean(commands)
+    _add_mnist(commands)
+    _add_cifar(commands)
+    _add_compare(commands)
+
+
+def _add_backend(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--backend", default="lmdb", choices=BACKENDS, help="backend of the database (default: %(default)s)"
+    )
+
+
+def _add_image_list(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--gray", action="store_true", help="read images as grayscale")
+    parser.add_argument("--shuffle", action="store_true", help="write in random order")
+    parser.add_argument(
+        "--seed", type=int, default=1, metavar="N", help="seed of the random order (default: %(default)s)"
+    )
+    _add_backend(parser)
+    parser.add_argument(
+        "--resize_width", type=int, default=0, metavar="N", help="resize images to this width (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--resize_height", type=int, default=0, metavar="N", help="resize images to this height (default: %(default)s)"
+    )
+    parser.add_argument("--check_size", action="store_true", help="refuse images of different sizes")
+    parser.add_argument("--encoded", action="store_true", help="store encoded images")
+    parser.add_argument(
+        "--encode_type",
+        default="",
+        metavar="NAME",
+        help="format to encode images in (png, jpg, ...); by default each file's own",
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=0,
+        metavar="N",
+        help="processes that read images; 0: one per core (default: %(default)s)",
+    )
+    parser.add_argument("rootfolder", metavar="ROOTFOLDER", help="folder that the names in the list are relative to")
+    parser.add_argument(
+        "listfile", metavar="LISTFILE", help="the list; blank lines and lines that begin with # are ignored"
+    )
+    parser.add_argument("db_name", metavar="DB_NAME", help="the database to write; it must not exist")
+
+
+OF_PAIRS = """Write one Datum per pair of images, both stacked along the channels, into a database that Caffe reads.
+A line of LISTFILE is: a.png b.png 1. With -encoded the databases are DB_NAME_a and DB_NAME_b."""
+OF_IMAGES = """Write one Datum per image into a database that Caffe reads. A line of LISTFILE is: subfolder/file.png 7.
+Images that cannot be read are left out, and counted in the last line."""
+
+
+def _add_convert_pairs(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "convert",
+        help="write the pairs of a list into a database (convert_pairs_lmdb)",
+        epilog=OF_PAIRS,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(function=_convert_pairs)
+    _add_image_list(parser)
 
 
 def _convert_pairs(arguments: argparse.Namespace) -> None:
     name = arguments.db_name.rstrip("/")
     twins = [f"{name}_a", f"{name}_b"] if _is_encoded(arguments) else [name]
     _convert(arguments, read_pairs, twins, pair_key, "pairs")
+
+
+def _add_convert_images(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "imageset",
+        help="write the images of a list into a database (convert_imageset)",
+        epilog=OF_IMAGES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(function=_convert_images)
+    _add_image_list(parser)
 
 
 def _convert_images(arguments: argparse.Namespace) -> None:
@@ -77,6 +157,16 @@ def _is_encoded(arguments: argparse.Namespace) -> bool:
     return arguments.encoded or bool(arguments.encode_type)
 
 
+def _add_mean(commands: Commands) -> None:
+    parser = commands.add_parser("mean", help="compute the mean image of a database (compute_image_mean)")
+    parser.set_defaults(function=_mean)
+    _add_backend(parser)
+    parser.add_argument("input_db", metavar="INPUT_DB", help="the database to read")
+    parser.add_argument(
+        "output_file", nargs="?", metavar="OUTPUT_FILE", help="where to write the mean, as .binaryproto"
+    )
+
+
 def _mean(arguments: argparse.Namespace) -> None:
     mean = compute_mean(open_reader(arguments.input_db, arguments.backend), Where(arguments.input_db))
     if arguments.output_file:
@@ -84,13 +174,61 @@ def _mean(arguments: argparse.Namespace) -> None:
     channel_means(mean)
 
 
+def _add_mnist(commands: Commands) -> None:
+    parser = commands.add_parser("mnist", help="write the files of MNIST into a database (convert_mnist_data)")
+    parser.set_defaults(function=_mnist)
+    _add_backend(parser)
+    parser.add_argument(
+        "--pairs", action="store_true", help="write pairs chosen at random (convert_mnist_siamese_data)"
+    )
+    parser.add_argument("images", metavar="IMAGES", help="the file of images, unpacked: train-images-idx3-ubyte")
+    parser.add_argument("labels", metavar="LABELS", help="the file of labels, unpacked: train-labels-idx1-ubyte")
+    parser.add_argument("db_name", metavar="DB_NAME", help="the database to write; it must not exist")
+
+
 def _mnist(arguments: argparse.Namespace) -> None:
     name = arguments.db_name.rstrip("/")
     convert_mnist(arguments.images, arguments.labels, name, arguments.backend, bar, arguments.pairs)
 
 
+def _add_cifar(commands: Commands) -> None:
+    parser = commands.add_parser("cifar", help="write the files of CIFAR-10 into two databases (convert_cifar_data)")
+    parser.set_defaults(function=_cifar)
+    parser.add_argument(
+        "input_folder",
+        metavar="INPUT_FOLDER",
+        help="the folder of data_batch_1.bin to data_batch_5.bin and test_batch.bin",
+    )
+    parser.add_argument(
+        "output_folder",
+        metavar="OUTPUT_FOLDER",
+        help="where cifar10_train_DB_TYPE and cifar10_test_DB_TYPE are written",
+    )
+    parser.add_argument("db_type", choices=BACKENDS, help="the form of the databases")
+
+
 def _cifar(arguments: argparse.Namespace) -> None:
     convert_cifar(arguments.input_folder, arguments.output_folder, arguments.db_type, bar)
+
+
+def _add_compare(commands: Commands) -> None:
+    parser = commands.add_parser("compare", help="train nets on the same pairs and print the table that compares them")
+    parser.set_defaults(function=_compare)
+    parser.add_argument("solver", nargs="+", metavar="SOLVER", help="solver prototxt files of Siamese nets")
+    parser.add_argument(
+        "--train",
+        action="store_true",
+        default=True,
+        help="the default; --no-train evaluates the snapshots of an earlier training",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/compare"),
+        metavar="FOLDER",
+        help="folder for all files (default: out/compare)",
+    )
+    parser.add_argument("--gpu", default="", metavar="N", help="the number of the GPU to use (default: the CPU)")
 
 
 def _compare(arguments: argparse.Namespace) -> None:
@@ -118,56 +256,3 @@ def _compare(arguments: argparse.Namespace) -> None:
     print(table)
     for path in files:
         say(f"wrote {path}")
-
-
-BACKEND = ("--backend", BACKENDS, "lmdb", "backend of the database")
-IMAGES = (
-    ("--gray", bool, False, "read images as grayscale"),
-    ("--shuffle", bool, False, "write in random order"),
-    ("--seed N", int, 1, "seed of the random order"),
-    BACKEND,
-    ("--resize_width N", int, 0, "resize images to this width"),
-    ("--resize_height N", int, 0, "resize images to this height"),
-    ("--check_size", bool, False, "refuse images of different sizes"),
-    ("--encoded", bool, False, "store encoded images"),
-    ("--encode_type NAME", str, "", "format to encode images in (png, jpg, ...); by default each file's own"),
-    ("--workers N", int, 0, "processes that read images; 0: one per core"),
-    ("ROOTFOLDER", str, None, "folder that the names in the list are relative to"),
-    ("LISTFILE", str, None, "the list; blank lines and lines that begin with # are ignored"),
-    ("DB_NAME", str, None, "the database to write; it must not exist"),
-)
-MEAN = (
-    BACKEND,
-    ("INPUT_DB", str, None, "the database to read"),
-    ("[OUTPUT_FILE]", str, None, "where to write the mean, as .binaryproto"),
-)
-MNIST = (
-    BACKEND,
-    ("--pairs", bool, False, "write pairs chosen at random (convert_mnist_siamese_data)"),
-    ("IMAGES", str, None, "the file of images, unpacked: train-images-idx3-ubyte"),
-    ("LABELS", str, None, "the file of labels, unpacked: train-labels-idx1-ubyte"),
-    ("DB_NAME", str, None, "the database to write; it must not exist"),
-)
-CIFAR = (
-    ("INPUT_FOLDER", str, None, "the folder of data_batch_1.bin to data_batch_5.bin and test_batch.bin"),
-    ("OUTPUT_FOLDER", str, None, "where cifar10_train_DB_TYPE and cifar10_test_DB_TYPE are written"),
-    ("DB_TYPE", BACKENDS, None, "the form of the databases"),
-)
-COMPARE = (
-    ("SOLVER...", str, None, "solver prototxt files of Siamese nets"),
-    ("--train", bool, True, "the default; --no-train evaluates the snapshots of an earlier training"),
-    ("--out FOLDER", Path, Path("out/compare"), "folder for all files (default: out/compare)"),
-    ("--gpu N", str, "", "the number of the GPU to use (default: the CPU)"),
-)
-OF_PAIRS = """Write one Datum per pair of images, both stacked along the channels, into a database that Caffe reads.
-A line of LISTFILE is: a.png b.png 1. With -encoded the databases are DB_NAME_a and DB_NAME_b."""
-OF_IMAGES = """Write one Datum per image into a database that Caffe reads. A line of LISTFILE is: subfolder/file.png 7.
-Images that cannot be read are left out, and counted in the last line."""
-COMMANDS = (
-    ("convert", _convert_pairs, "write the pairs of a list into a database (convert_pairs_lmdb)", IMAGES, OF_PAIRS),
-    ("imageset", _convert_images, "write the images of a list into a database (convert_imageset)", IMAGES, OF_IMAGES),
-    ("mean", _mean, "compute the mean image of a database (compute_image_mean)", MEAN),
-    ("mnist", _mnist, "write the files of MNIST into a database (convert_mnist_data)", MNIST),
-    ("cifar", _cifar, "write the files of CIFAR-10 into two databases (convert_cifar_data)", CIFAR),
-    ("compare", _compare, "train nets on the same pairs and print the table that compares them", COMPARE),
-)

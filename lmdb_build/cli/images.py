@@ -11,8 +11,15 @@ from lmdb_build.views import Batches, Changes, write_views
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.errors import InputError
 from loopclosure.places.source import Source, read_source
-from netspec.terminal.commands import WrongUsage, above_zero, refuse, seed
+from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar
+from netspec.terminal.parser import Commands, above_zero, seed
+
+
+def add_commands(commands: Commands) -> None:
+    """Add ``walk`` and ``views``."""
+    _add_walk(commands)
+    _add_views(commands)
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -31,6 +38,61 @@ def _source(text: str) -> Source:
     if found.kind and len(found.settings) < 2:
         raise argparse.ArgumentTypeError(f"{text} needs ,track=COLUMN,time=COLUMN")
     return found
+
+
+def _add_views(commands: Commands) -> None:
+    parser = commands.add_parser("views", help="make two views of each place, in batches of different places")
+    parser.set_defaults(function=_views)
+    parser.add_argument(
+        "source",
+        nargs="+",
+        type=_source,
+        metavar="SOURCE",
+        help="a folder of images, a run; or index:CSV,track=COLUMN,time=COLUMN, a table of frames of several runs",
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FOLDER", help="folder for the views; the list is FOLDER.txt"
+    )
+    parser.add_argument(
+        "--step",
+        type=above_zero,
+        default=1.0,
+        metavar="S",
+        help="seconds between two images of a folder (default: %(default)g)",
+    )
+    parser.add_argument("--batches", type=int, default=400, metavar="N", help="how many batches (default: %(default)s)")
+    parser.add_argument(
+        "--size",
+        type=int,
+        default=48,
+        metavar="N",
+        help="pairs per batch, each of a different place (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--window",
+        type=float,
+        default=float("inf"),
+        metavar="S",
+        help="places of one run come from so many seconds of it (default: all)",
+    )
+    parser.add_argument(
+        "--viewpoint",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="how many times as strong zoom, turn and perspective are (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--calm",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="share of views that keep their colors and what they show (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--view-size", type=_size, default=(128, 96), metavar="WxH", help="size of a view (default: 128x96)"
+    )
+    parser.add_argument("--seed", type=seed, default=1, metavar="N", help="random seed (default: %(default)s)")
 
 
 def _views(arguments: argparse.Namespace) -> None:
@@ -52,6 +114,33 @@ def _views(arguments: argparse.Namespace) -> None:
     print(f"{path}: {made}; the names of images in it are relative to {path.parent}/")
 
 
+def _add_walk(commands: Commands) -> None:
+    parser = commands.add_parser("walk", help="render a synthetic walk through textured rooms, as TUM RGB-D sequences")
+    parser.set_defaults(function=_walk)
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder for the sequences walk_1, walk_2, ...")
+    parser.add_argument(
+        "--sequences",
+        type=int,
+        default=1,
+        metavar="N",
+        help="number of sequences, each in its own house (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--frames", type=int, default=400, metavar="N", help="images per sequence (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--size", type=_size, default=(320, 240), metavar="WxH", help="size of an image (default: 320x240)"
+    )
+    parser.add_argument(
+        "--laps", type=int, default=3, metavar="N", help="laps through the house (default: %(default)s)"
+    )
+    parser.add_argument("--depth", action="store_true", help="write depth images too, in TUM's form")
+    parser.add_argument(
+        "--rooms", type=int, default=4, metavar="N", help="rooms per house, an even number (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=seed, default=1, metavar="N", help="random seed (default: %(default)s)")
+
+
 def _walk(arguments: argparse.Namespace) -> None:
     if not 1 <= arguments.sequences <= 999:
         raise WrongUsage("--sequences must be 1 to 999")
@@ -70,32 +159,3 @@ def _walk(arguments: argparse.Namespace) -> None:
         for _ in bar(write_walk(folder, walk), folder.name, walk.frames):
             pass
         print(f"{folder}: {walk.frames} images, {walk.laps} laps of {walk.rooms} rooms")
-
-
-WALK = (
-    ("OUT", Path, None, "folder for the sequences walk_1, walk_2, ..."),
-    ("--sequences N", int, 1, "number of sequences, each in its own house"),
-    ("--frames N", int, 400, "images per sequence"),
-    ("--size WxH", _size, (320, 240), "size of an image (default: 320x240)"),
-    ("--laps N", int, 3, "laps through the house"),
-    ("--depth", bool, False, "write depth images too, in TUM's form"),
-    ("--rooms N", int, 4, "rooms per house, an even number"),
-    ("--seed N", seed, 1, "random seed"),
-)
-SOURCE = "a folder of images, a run; or index:CSV,track=COLUMN,time=COLUMN, a table of frames of several runs"
-VIEWS = (
-    ("SOURCE...", _source, None, SOURCE),
-    ("--out FOLDER", Path, ..., "folder for the views; the list is FOLDER.txt"),
-    ("--step S", above_zero, 1.0, "seconds between two images of a folder"),
-    ("--batches N", int, 400, "how many batches"),
-    ("--size N", int, 48, "pairs per batch, each of a different place"),
-    ("--window S", float, float("inf"), "places of one run come from so many seconds of it (default: all)"),
-    ("--viewpoint X", float, 1.0, "how many times as strong zoom, turn and perspective are"),
-    ("--calm SHARE", float, 0.0, "share of views that keep their colors and what they show"),
-    ("--view-size WxH", _size, (128, 96), "size of a view (default: 128x96)"),
-    ("--seed N", seed, 1, "random seed"),
-)
-COMMANDS = (
-    ("walk", _walk, "render a synthetic walk through textured rooms, as TUM RGB-D sequences", WALK),
-    ("views", _views, "make two views of each place, in batches of different places", VIEWS),
-)

@@ -37,8 +37,9 @@ from loopclosure.places.source import (
     read_source,
 )
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
-from netspec.terminal.commands import WrongUsage, above_zero, refuse, seed
+from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar, warn
+from netspec.terminal.parser import Commands, above_zero, seed
 
 SEQUENCES = ("", *LAYOUTS)
 KINDS = {
@@ -78,6 +79,128 @@ POSED = (
     *("max_distance", "max_angle", "negatives", "clear_distance", "clear_view_angle", "same_scene", "same_frame"),
     *("different_scenes", "max_difference"),
 )
+
+
+def add_commands(commands: Commands) -> None:
+    """Add the commands of this module."""
+    _add_pairs(commands)
+    _add_sheet(commands)
+    _add_join(commands)
+
+
+def _add_pairs(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "pairs",
+        help="choose labeled pairs and write their lists",
+        epilog=HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(function=_pairs)
+    parser.add_argument(
+        "source", nargs="+", type=_source_text, metavar="SOURCE", help="sequences with poses, or one other, see below"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FOLDER", help="folder for train.txt, val.txt and test.txt"
+    )
+    parser.add_argument(
+        "--root",
+        type=Path,
+        metavar="FOLDER",
+        help="folder that the lists' names are relative to (the sources' common parent)",
+    )
+    group = parser.add_argument_group("what is the same place")
+    group.add_argument(
+        "--max-distance",
+        type=above_zero,
+        default=MAX_DISTANCE_M,
+        metavar="M",
+        help=f"less is a positive (default: {MAX_DISTANCE_M:g})",
+    )
+    group.add_argument(
+        "--max-angle",
+        type=above_zero,
+        default=MAX_ANGLE_DEG,
+        metavar="DEG",
+        help=f"less is a positive (default: {MAX_ANGLE_DEG:g})",
+    )
+    group.add_argument(
+        "--min-gap",
+        type=float,
+        metavar="S",
+        help="leave out pairs nearer in time: seconds (images: frames) (default: 0)",
+    )
+    group.add_argument(
+        "--negatives", default="both", choices=NEGATIVES, help="where negatives come from (default: %(default)s)"
+    )
+    group.add_argument(
+        "--clear-distance", type=float, metavar="M", help="negatives by pose are at least this far apart"
+    )
+    group.add_argument("--clear-view-angle", type=float, metavar="DEG", help="or their viewing axes are")
+    group.add_argument(
+        "--same-scene",
+        action="append",
+        type=_names,
+        default=[],
+        metavar="A,B",
+        help="sequences of one room: no pair is made across them",
+    )
+    group.add_argument(
+        "--same-frame",
+        action="append",
+        type=_names,
+        default=[],
+        metavar="A,B",
+        help="sequences whose poses share a frame: labeled by pose across them",
+    )
+    group.add_argument("--different-scenes", action="store_true", help="all other sequences show different rooms")
+    group.add_argument(
+        "--max-difference",
+        type=float,
+        default=MAX_DIFFERENCE_S,
+        metavar="S",
+        help=f"longest time from image to pose (default: {MAX_DIFFERENCE_S:g})",
+    )
+    group = parser.add_argument_group("the choice")
+    for split, count in zip(SPLITS, (30000, 6000, 6000), strict=True):
+        group.add_argument(
+            f"--{split}", type=int, default=count, metavar="N", help="pairs, half positive (default: %(default)s)"
+        )
+    group.add_argument("--at-most", action="store_true", help="take fewer pairs if there are not enough")
+    group.add_argument(
+        "--split", choices=("time", "sequence"), help="by stretches of time, or by whole sequences (places, groups)"
+    )
+    group.add_argument(
+        "--shares",
+        type=_shares,
+        default=(0.6, 0.2, 0.2),
+        metavar="A,B,C",
+        help="shares of the images per split (default: 0.6,0.2,0.2)",
+    )
+    group.add_argument(
+        "--split-gap",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="time left out between two splits (default: %(default)g)",
+    )
+    for split in SPLITS:
+        group.add_argument(f"--{split}-sequences", type=_names, metavar="A,B", help=f"sequences (groups) of {split}")
+    group.add_argument(
+        "--hard-negatives", type=Path, metavar="NPZ", help="choose negatives that are near by these features"
+    )
+    group.add_argument(
+        "--hard-share", type=float, default=0.5, metavar="SHARE", help="share of such negatives (default: %(default)g)"
+    )
+    group.add_argument(
+        "--warp-share",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="share of pairs in which one image is a warped copy (default: %(default)g)",
+    )
+    group.add_argument(
+        "--seed", type=seed, default=1, metavar="N", help="seed of the random choice (default: %(default)s)"
+    )
 
 
 def _pairs(arguments: argparse.Namespace) -> None:
@@ -215,59 +338,39 @@ def _shares(text: str) -> tuple[float, ...]:
     return shares
 
 
+def _add_sheet(commands: Commands) -> None:
+    parser = commands.add_parser("sheet", help="draw sample pairs of a list as a picture")
+    parser.set_defaults(function=_sheet)
+    parser.add_argument("list", type=Path, metavar="LIST", help="a list of pairs")
+    parser.add_argument("picture", type=Path, metavar="PICTURE", help="the picture to write, such as sheet.png")
+    parser.add_argument(
+        "--root", type=Path, metavar="FOLDER", help="folder of the images (default: as in the list's header)"
+    )
+    parser.add_argument("--rows", type=int, default=6, metavar="N", help="pairs of each label (default: %(default)s)")
+    parser.add_argument(
+        "--seed", type=seed, default=1, metavar="N", help="seed of the random choice (default: %(default)s)"
+    )
+
+
 def _sheet(arguments: argparse.Namespace) -> None:
     root = arguments.root or root_of(arguments.list)
     write_contact_sheet(arguments.list, root, arguments.picture, arguments.rows, arguments.seed)
     print(arguments.picture)
 
 
+def _add_join(commands: Commands) -> None:
+    parser = commands.add_parser("join", help="shuffle several lists into one")
+    parser.set_defaults(function=_join)
+    parser.add_argument("out", type=Path, metavar="OUT", help="the list to write")
+    parser.add_argument("list", nargs="+", type=Path, metavar="LIST", help="lists of pairs")
+    parser.add_argument(
+        "--root", type=Path, metavar="FOLDER", help="folder that the names are relative to (the lists' roots' parent)"
+    )
+    parser.add_argument(
+        "--seed", type=seed, default=1, metavar="N", help="seed of the random order (default: %(default)s)"
+    )
+
+
 def _join(arguments: argparse.Namespace) -> None:
     number, root = join_lists(arguments.list, arguments.out, arguments.seed, arguments.root)
     print(f"{arguments.out}: {number} pairs, images below {root}")
-
-
-PAIRS = (
-    ("SOURCE...", _source_text, None, "sequences with poses, or one other, see below"),
-    ("--out FOLDER", Path, ..., "folder for train.txt, val.txt and test.txt"),
-    ("--root FOLDER", Path, None, "folder that the lists' names are relative to (the sources' common parent)"),
-    "what is the same place",
-    ("--max-distance M", above_zero, MAX_DISTANCE_M, "less is a positive"),
-    ("--max-angle DEG", above_zero, MAX_ANGLE_DEG, "less is a positive"),
-    ("--min-gap S", float, None, "leave out pairs nearer in time: seconds (images: frames) (default: 0)"),
-    ("--negatives", NEGATIVES, "both", "where negatives come from"),
-    ("--clear-distance M", float, None, "negatives by pose are at least this far apart"),
-    ("--clear-view-angle DEG", float, None, "or their viewing axes are"),
-    ("--same-scene A,B", [_names], None, "sequences of one room: no pair is made across them"),
-    ("--same-frame A,B", [_names], None, "sequences whose poses share a frame: labeled by pose across them"),
-    ("--different-scenes", bool, False, "all other sequences show different rooms"),
-    ("--max-difference S", float, MAX_DIFFERENCE_S, "longest time from image to pose"),
-    "the choice",
-    *((f"--{split} N", int, n, "pairs, half positive") for split, n in zip(SPLITS, (30000, 6000, 6000), strict=True)),
-    ("--at-most", bool, False, "take fewer pairs if there are not enough"),
-    ("--split", ("time", "sequence"), None, "by stretches of time, or by whole sequences (places, groups)"),
-    ("--shares A,B,C", _shares, (0.6, 0.2, 0.2), "shares of the images per split (default: 0.6,0.2,0.2)"),
-    ("--split-gap S", float, 0.0, "time left out between two splits"),
-    *((f"--{split}-sequences A,B", _names, None, f"sequences (groups) of {split}") for split in SPLITS),
-    ("--hard-negatives NPZ", Path, None, "choose negatives that are near by these features"),
-    ("--hard-share SHARE", float, 0.5, "share of such negatives"),
-    ("--warp-share SHARE", float, 0.0, "share of pairs in which one image is a warped copy"),
-    ("--seed N", seed, 1, "seed of the random choice"),
-)
-SHEET = (
-    ("LIST", Path, None, "a list of pairs"),
-    ("PICTURE", Path, None, "the picture to write, such as sheet.png"),
-    ("--root FOLDER", Path, None, "folder of the images (default: as in the list's header)"),
-    ("--rows N", int, 6, "pairs of each label"),
-    ("--seed N", seed, 1, "seed of the random choice"),
-)
-JOIN = (
-    ("OUT", Path, None, "the list to write"),
-    ("LIST...", Path, None, "lists of pairs"),
-    ("--root FOLDER", Path, None, "folder that the names are relative to (the lists' roots' parent)"),
-    ("--seed N", seed, 1, "seed of the random order"),
-)
-COMMANDS = (
-    ("pairs", _pairs, "choose labeled pairs and write their lists", PAIRS, HELP),
-    ("sheet", _sheet, "draw sample pairs of a list as a picture", SHEET),
-    ("join", _join, "shuffle several lists into one", JOIN),
-)

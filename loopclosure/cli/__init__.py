@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 
 from loopclosure.cli import close, detect, evaluate
-from netspec.terminal.commands import Commands, program, run
+from netspec.terminal.commands import run
+from netspec.terminal.parser import QUIET, Commands, Parser, program
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -15,12 +15,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run(parser(), list(sys.argv[1:] if argv is None else argv))
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of all commands."""
     made = program("loopclosure", "Evaluate, detect and close loops.")
-    commands = Commands(made, quiet=True)
-    for group in (evaluate, detect, close):
-        commands.table(group.COMMANDS)
-    maps = commands.group("map", "keep a map of several drives on disk: build it, add to it, query it")
-    Commands(maps, quiet=True).table(detect.MAP_COMMANDS)
+    commands = Commands(made, **QUIET)
+    for module in (evaluate, detect, close):
+        module.add_commands(commands)
+    detect.add_map_commands(commands)
     return made

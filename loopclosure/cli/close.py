@@ -19,12 +19,50 @@ from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.pose_files import pose_form, read_poses
 from loopclosure.places.source import FRAMES, POSES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, write_closed_paths
-from netspec.terminal.commands import WrongUsage, seed
+from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
+from netspec.terminal.parser import Commands, seed
 
 # What belongs to frames, and means nothing to --graph.
 OF_FRAMES = ("loops", "odometry", "drift", "odometry_form", "seed", "camera", "rerun")
 ALL = "all"  # --loops of a graph in which none is false
+
+
+def add_commands(commands: Commands) -> None:
+    """Add ``close``."""
+    _add_close(commands)
+
+
+def _add_close(commands: Commands) -> None:
+    parser = commands.add_parser("close", help="correct a path by the loops that detect found")
+    parser.set_defaults(function=_close)
+    parser.add_argument(
+        "source",
+        nargs="?",
+        metavar="SOURCE",
+        help="the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag; with "
+        f"{', '.join((*POSES, *TOPICS))} behind it, as in drive.mp4,poses=slam.txt",
+    )
+    parser.add_argument(
+        "--graph", type=Path, metavar="IN.g2o", help="a pose graph to solve as it is, instead of frames"
+    )
+    parser.add_argument(
+        "--loops", metavar="CSV", help="the loops.csv that detect wrote; with --graph: all, if no loop of it is false"
+    )
+    exclusive = parser.add_mutually_exclusive_group()
+    exclusive.add_argument(
+        "--odometry", type=Path, metavar="FILE", help="the path to correct: poses of TUM, KITTI or EuRoC"
+    )
+    exclusive.add_argument(
+        "--drift", type=float, metavar="PERCENT", help="simulate odometry that drifts, from the true poses"
+    )
+    parser.add_argument("--odometry-form", metavar="WORDS", help="how --odometry is written, as pose-form")
+    parser.add_argument("--seed", type=seed, metavar="N", help="of --drift (default: 1)")
+    parser.add_argument("--camera", metavar="NUMBERS", help=f"{intrinsics.FORM}, if the source does not say")
+    parser.add_argument(
+        "--rerun", metavar="F.rrd", help="write images, both paths and loops for the viewer of rerun.io"
+    )
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="where closed.g2o, closed.txt and paths.png go")
 
 
 def _close(a: argparse.Namespace) -> None:
@@ -96,24 +134,3 @@ def _odometry(a: argparse.Namespace, frames: ImageSequence) -> np.ndarray:
     path = frames.poses.copy()
     path[known] = drifted(path[known], a.drift, 1 if a.seed is None else a.seed)
     return path
-
-
-SOURCE = (
-    "the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag; with "
-    f"{', '.join((*POSES, *TOPICS))} behind it, as in drive.mp4,poses=slam.txt"
-)
-CLOSE = (
-    ("[SOURCE]", str, None, SOURCE),
-    ("--graph IN.g2o", Path, None, "a pose graph to solve as it is, instead of frames"),
-    ("--loops CSV", str, None, "the loops.csv that detect wrote; with --graph: all, if no loop of it is false"),
-    [
-        ("--odometry FILE", Path, None, "the path to correct: poses of TUM, KITTI or EuRoC"),
-        ("--drift PERCENT", float, None, "simulate odometry that drifts, from the true poses"),
-    ],
-    ("--odometry-form WORDS", str, None, "how --odometry is written, as pose-form"),
-    ("--seed N", seed, None, "of --drift (default: 1)"),
-    ("--camera NUMBERS", str, None, f"{intrinsics.FORM}, if the source does not say"),
-    ("--rerun F.rrd", str, None, "write images, both paths and loops for the viewer of rerun.io"),
-    ("--out FOLDER", str, ..., "where closed.g2o, closed.txt and paths.png go"),
-)
-COMMANDS = (("close", _close, "correct a path by the loops that detect found", CLOSE),)

@@ -28,8 +28,9 @@ from loopclosure.places.source import (
     read_source,
 )
 from loopclosure.places.truth import Exclusion
-from netspec.terminal.commands import WrongUsage, above_zero, refuse
+from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar, warn
+from netspec.terminal.parser import above_zero
 
 SEQUENCE = (*FRAMES, *POSES, "references")
 KINDS = {
@@ -63,22 +64,35 @@ TRAVERSES = ("tolerance", "soft_tolerance")
 
 EXCLUDED = f"fabmap {datasets.FABMAP_EXCLUSION.frames}, images {datasets.FOLDER_EXCLUSION.frames}"
 OVERLAP = "the soft zone: a match is no mistake if so much of each view is visible in the other"
-DATA_SET = (
-    ("SOURCE", str, None, "the data set, see below"),
-    ("--tolerance FRAMES", int, None, "of traverses (default: 0)"),
-    ("--soft-tolerance FRAMES", int, None, "a match up to here is ignored, not wrong"),
-    ("--max-distance M", above_zero, None, f"of poses (default: {MAX_DISTANCE_M:g})"),
-    ("--max-angle DEG", above_zero, None, f"of poses (default: {MAX_ANGLE_DEG:g})"),
-    ("--soft-distance M", above_zero, None, "a match up to here is ignored, not wrong"),
-    ("--soft-angle DEG", above_zero, None, "the same, for the angle"),
-    ("--fov DEG", float, None, f"horizontal field of view (default: the camera's, or {FOV_DEG:g})"),
-    ("--overlap SHARE", float, None, f"{OVERLAP} (default: {ViewOverlap().least:g})"),
-    ("--exclude-frames N", int, None, f"frames i and j with |i - j| <= N are no pair (default: {EXCLUDED})"),
-    (
-        *("--exclude-seconds S", float, None),
-        f"frames less than S seconds apart are no pair (default: with times {datasets.TUM_EXCLUSION.seconds:g})",
-    ),
-)
+
+
+def add_data_set(parser: argparse.ArgumentParser) -> None:
+    """Add the source of a data set, and the options that say which frames show the same place; HELP explains it."""
+    parser.add_argument("source", metavar="SOURCE", help="the data set, see below")
+    parser.add_argument("--tolerance", type=int, metavar="FRAMES", help="of traverses (default: 0)")
+    parser.add_argument("--soft-tolerance", type=int, metavar="FRAMES", help="a match up to here is ignored, not wrong")
+    parser.add_argument("--max-distance", type=above_zero, metavar="M", help=f"of poses (default: {MAX_DISTANCE_M:g})")
+    parser.add_argument("--max-angle", type=above_zero, metavar="DEG", help=f"of poses (default: {MAX_ANGLE_DEG:g})")
+    parser.add_argument(
+        "--soft-distance", type=above_zero, metavar="M", help="a match up to here is ignored, not wrong"
+    )
+    parser.add_argument("--soft-angle", type=above_zero, metavar="DEG", help="the same, for the angle")
+    parser.add_argument(
+        "--fov", type=float, metavar="DEG", help=f"horizontal field of view (default: the camera's, or {FOV_DEG:g})"
+    )
+    parser.add_argument("--overlap", type=float, metavar="SHARE", help=f"{OVERLAP} (default: {ViewOverlap().least:g})")
+    parser.add_argument(
+        "--exclude-frames",
+        type=int,
+        metavar="N",
+        help=f"frames i and j with |i - j| <= N are no pair (default: {EXCLUDED})",
+    )
+    parser.add_argument(
+        "--exclude-seconds",
+        type=float,
+        metavar="S",
+        help=f"frames less than S seconds apart are no pair (default: with times {datasets.TUM_EXCLUSION.seconds:g})",
+    )
 
 
 def typed(text: str, kinds: Kinds) -> Source:

@@ -32,12 +32,92 @@ from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, w
 from netspec.files.whole_file import write_whole
 from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
+from netspec.terminal.parser import Commands
 
 # The detector's settings that --resume takes from the saved one.
 SETTINGS = ("metric", "exclude_recent", "exclude_seconds", "top_k", "threshold", "consistency", "consistency_window")
 RECENT_SECONDS = 10.0  # of --video: the present place does not count as seen again
 # Settings of the search frame by frame.
+OF = DetectorSettings()
 ONLINE = ("top_k", "consistency", "consistency_window")
+
+
+def add_commands(commands: Commands) -> None:
+    """Add ``detect``."""
+    _add_detect(commands)
+
+
+def add_map_commands(commands: Commands) -> None:
+    """Add ``map`` and its commands."""
+    known_map = commands.add_group("map", help="keep a map of several drives on disk: build it, add to it, query it")
+    _add_build(known_map)
+    _add_add(known_map)
+    _add_query(known_map)
+
+
+def _add_detect(commands: Commands) -> None:
+    parser = commands.add_parser("detect", help="find the loops in a folder of images or a video")
+    parser.set_defaults(function=_detect)
+    parser.add_argument(
+        "source",
+        nargs="?",
+        metavar="SOURCE",
+        help="a folder or list of images, a sequence (TUM, EuRoC, KITTI), a video or a ROS bag; with "
+        f"{', '.join((*FRAMES, *TOPICS))} behind it, as in drive.bag,stride=2,topic=/cam0",
+    )
+    parser.add_argument(
+        "--video", metavar="CAMERA|URL|FILE", help="decide as images come, of camera 0, rtsp://HOST/PATH or a file"
+    )
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="where loops.csv, and loops.g2o with poses, go")
+    exclusive = parser.add_mutually_exclusive_group()
+    exclusive.add_argument(
+        "--describe",
+        default="default",
+        metavar="NAME|MODULE:FUNCTION|FILE.py:FUNCTION",
+        help="image (H, W, 3) BGR -> descriptor: default and small are nets that come with it (default: %(default)s)",
+    )
+    exclusive.add_argument(
+        "--features", metavar="F.npz", help="descriptors computed beforehand (netspec extract --images)"
+    )
+    parser.add_argument("--with", action="append", default=[], metavar="KEY=VALUE", help="a keyword for --describe")
+    parser.add_argument(
+        "--whiten", metavar="OTHER.npz", help="whiten the descriptors by these, of images of other places"
+    )
+    exclusive = parser.add_mutually_exclusive_group()
+    exclusive.add_argument(
+        "--least-precision",
+        type=float,
+        metavar="P",
+        help=f"share of the loops that should be right (default: {PRECISION:g})",
+    )
+    exclusive.add_argument(
+        "--threshold",
+        type=float,
+        metavar="S",
+        help="decide frame by frame, by this least score (euclidean: minus the distance)",
+    )
+    exclusive.add_argument("--resume", metavar="F.npz", help="decide frame by frame, with a detector that --save wrote")
+    parser.add_argument("--metric", choices=METRICS, help=f"of the descriptors (default: {OF.metric})")
+    parser.add_argument(
+        "--exclude-recent",
+        type=int,
+        metavar="FRAMES",
+        help=f"no candidates (default: those of one visit to a place; frame by frame {OF.exclude_recent})",
+    )
+    parser.add_argument("--exclude-seconds", type=float, metavar="S", help="nor are frames less than S seconds old")
+    parser.add_argument("--top-k", type=int, metavar="K", help=f"candidates examined (default: {OF.top_k})")
+    parser.add_argument(
+        "--consistency", type=int, metavar="K", help="previous frames that must have led to the candidate"
+    )
+    parser.add_argument(
+        "--consistency-window", type=int, metavar="FRAMES", help=f"how near (default: {OF.consistency_window})"
+    )
+    parser.add_argument("--verify", action="store_true", help="verify candidates by SIFT matches and RANSAC")
+    parser.add_argument(
+        "--odometry", metavar="FILE", help="poses (TUM, KITTI, EuRoC): frames that they put far apart are no loop"
+    )
+    parser.add_argument("--save", metavar="F.npz", help="write the detector, to continue with --resume")
+    parser.add_argument("--rerun", metavar="F.rrd", help="write images, scores and loops for the viewer of rerun.io")
 
 
 def _detect(a: argparse.Namespace) -> None:
@@ -177,9 +257,41 @@ def _detector(a: argparse.Namespace, describe: Describe | None, views: int) -> L
     return LoopDetector(describe, check=check, views=views, **changes)
 
 
+def _add_map(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("map", metavar="MAP", help="the map's folder")
+
+
+def _add_index(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--index",
+        default="exact",
+        metavar="NAME",
+        help="exact, faiss, or Milvus: FILE.db or http://HOST:PORT (default: %(default)s)",
+    )
+
+
+def _add_build(commands: Commands) -> None:
+    parser = commands.add_parser("build", help="make a map of one or several drives")
+    parser.set_defaults(function=_build)
+    _add_map(parser)
+    parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as those of detect")
+    _add_index(parser)
+    parser.add_argument(
+        "--describe", default="default", metavar="NAME", help="the net: default or small (default: %(default)s)"
+    )
+
+
 def _build(a: argparse.Namespace) -> None:
     describe = run.load_describe(checked_name(a.describe))
     _add_all(Map.create(a.map, a.describe), describe, a)
+
+
+def _add_add(commands: Commands) -> None:
+    parser = commands.add_parser("add", help="add drives to a map, and find the loops between all of its drives")
+    parser.set_defaults(function=_add)
+    _add_map(parser)
+    parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as those of detect")
+    _add_index(parser)
 
 
 def _add(a: argparse.Namespace) -> None:
@@ -208,6 +320,15 @@ def _decided(detector: LoopDetector, results: list[LoopResult], own: bool = True
     return found.results
 
 
+def _add_query(commands: Commands) -> None:
+    parser = commands.add_parser("query", help="find the frames of a drive in a map, and add nothing to it")
+    parser.set_defaults(function=_query)
+    _add_map(parser)
+    parser.add_argument("source", metavar="SOURCE", help="frames, as those of detect")
+    _add_index(parser)
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="where loops.csv goes")
+
+
 def _query(a: argparse.Namespace) -> None:
     known, out = Map(a.map), Path(a.out)
     recording = recording_of(a.source, out / "frames")
@@ -222,49 +343,3 @@ def _query(a: argparse.Namespace) -> None:
     write_loops_csv(out / "loops.csv", loops, recording.stamps, recording.names, detector.stamps, known.names)
     print(run.verdicts_said(results))
     print(f"{len(loops)} of {len(results)} frames are in the map: {out / 'loops.csv'}")
-
-
-OF = DetectorSettings()
-SOURCE = (
-    "a folder or list of images, a sequence (TUM, EuRoC, KITTI), a video or a ROS bag; with "
-    f"{', '.join((*FRAMES, *TOPICS))} behind it, as in drive.bag,stride=2,topic=/cam0"
-)
-DESCRIBE = "image (H, W, 3) BGR -> descriptor: default and small are nets that come with it"
-RECENT = f"no candidates (default: those of one visit to a place; frame by frame {OF.exclude_recent})"
-DETECT = (
-    ("[SOURCE]", str, None, SOURCE),
-    ("--video CAMERA|URL|FILE", str, None, "decide as images come, of camera 0, rtsp://HOST/PATH or a file"),
-    ("--out FOLDER", str, ..., "where loops.csv, and loops.g2o with poses, go"),
-    [
-        ("--describe NAME|MODULE:FUNCTION|FILE.py:FUNCTION", str, "default", DESCRIBE),
-        ("--features F.npz", str, None, "descriptors computed beforehand (netspec extract --images)"),
-    ],
-    ("--with KEY=VALUE", [str], None, "a keyword for --describe"),
-    ("--whiten OTHER.npz", str, None, "whiten the descriptors by these, of images of other places"),
-    [
-        ("--least-precision P", float, None, f"share of the loops that should be right (default: {PRECISION:g})"),
-        ("--threshold S", float, None, "decide frame by frame, by this least score (euclidean: minus the distance)"),
-        ("--resume F.npz", str, None, "decide frame by frame, with a detector that --save wrote"),
-    ],
-    ("--metric", METRICS, None, f"of the descriptors (default: {OF.metric})"),
-    ("--exclude-recent FRAMES", int, None, RECENT),
-    ("--exclude-seconds S", float, None, "nor are frames less than S seconds old"),
-    ("--top-k K", int, None, f"candidates examined (default: {OF.top_k})"),
-    ("--consistency K", int, None, "previous frames that must have led to the candidate"),
-    ("--consistency-window FRAMES", int, None, f"how near (default: {OF.consistency_window})"),
-    ("--verify", bool, False, "verify candidates by SIFT matches and RANSAC"),
-    ("--odometry FILE", str, None, "poses (TUM, KITTI, EuRoC): frames that they put far apart are no loop"),
-    ("--save F.npz", str, None, "write the detector, to continue with --resume"),
-    ("--rerun F.rrd", str, None, "write images, scores and loops for the viewer of rerun.io"),
-)
-MAP = ("MAP", str, None, "the map's folder")
-INDEX = ("--index NAME", str, "exact", "exact, faiss, or Milvus: FILE.db or http://HOST:PORT")
-DRIVES, NET = ("SOURCE...", str, None, "frames, as those of detect"), "the net: default or small"
-BUILD = (MAP, DRIVES, INDEX, ("--describe NAME", str, "default", NET))
-QUERY = (MAP, ("SOURCE", *DRIVES[1:]), INDEX, ("--out FOLDER", str, ..., "where loops.csv goes"))
-COMMANDS = (("detect", _detect, "find the loops in a folder of images or a video", DETECT),)
-MAP_COMMANDS = (
-    ("build", _build, "make a map of one or several drives", BUILD),
-    ("add", _add, "add drives to a map, and find the loops between all of its drives", (MAP, DRIVES, INDEX)),
-    ("query", _query, "find the frames of a drive in a map, and add nothing to it", QUERY),
-)

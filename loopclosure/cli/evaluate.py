@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from loopclosure import evaluate
-from loopclosure.cli.data_set import DATA_SET, HELP, data_set
+from loopclosure.cli.data_set import HELP, add_data_set, data_set
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS, top_k, write_similarity, write_top_k
 from loopclosure.errors import InputError
@@ -15,8 +15,16 @@ from loopclosure.methods.named import METHODS
 from loopclosure.places.frames import image_paths
 from loopclosure.places.source import FRAMES, Source, read_source
 from loopclosure.places.truth import Exclusion
-from netspec.terminal.commands import WrongUsage, seed
+from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar
+from netspec.terminal.parser import Commands, seed
+
+
+def add_commands(commands: Commands) -> None:
+    """Add the commands of this module."""
+    _add_evaluate(commands)
+    _add_compare(commands)
+    _add_similarity(commands)
 
 
 def _training(text: str) -> Source:
@@ -24,6 +32,40 @@ def _training(text: str) -> Source:
         return read_source(text, {"": FRAMES})
     except InputError as fault:
         raise argparse.ArgumentTypeError(str(fault)) from None
+
+
+def _add_evaluate(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "evaluate",
+        help="run methods on one data set and write a report",
+        epilog=HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(function=_evaluate)
+    add_data_set(parser)
+    parser.add_argument(
+        "--method",
+        action="append",
+        required=True,
+        default=[],
+        metavar="[LABEL=]METHOD",
+        help=f"may be repeated; METHOD is one of {', '.join(METHODS)}, with :settings, or NAME+METHOD: "
+        "features:PATH.npz[:cosine][:whiten=OTHER.npz], seqslam+features:PATH.npz, fabmap:model=words.npz",
+    )
+    parser.add_argument(
+        "--train",
+        action="append",
+        type=_training,
+        default=[],
+        metavar="PATH[,KEY=VALUE]",
+        help="may be repeated: images for vocabularies, other than those tested: a folder, list or TUM sequence, "
+        "with start, stop, stride, limit",
+    )
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the report and its parts go")
+    parser.add_argument("--title", default="", metavar="TEXT", help="heading of the report")
+    parser.add_argument(
+        "--seed", type=seed, default=0, metavar="N", help="of the methods' random numbers (default: %(default)s)"
+    )
 
 
 def _evaluate(a: argparse.Namespace) -> None:
@@ -46,6 +88,15 @@ def _evaluate(a: argparse.Namespace) -> None:
     print(f"report: {page}")
 
 
+def _add_compare(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "compare", help="put the reports of several evaluations side by side: table and curves"
+    )
+    parser.set_defaults(function=_compare)
+    parser.add_argument("report", nargs="+", metavar="REPORT.json", help="two or more, as evaluate writes them")
+    parser.add_argument("--out", default="comparison.html", metavar="FILE.html", help="the page (default: %(default)s)")
+
+
 def _compare(a: argparse.Namespace) -> None:
     # Drawing takes seconds to import, which the other commands need not wait for.
     from loopclosure.report.compare import read_reports, text, write_comparison
@@ -56,6 +107,24 @@ def _compare(a: argparse.Namespace) -> None:
     write_comparison(reports, a.out, a.command_line)
     print(text(reports))
     print(f"comparison: {a.out}")
+
+
+def _add_similarity(commands: Commands) -> None:
+    parser = commands.add_parser("similarity", help="compare all descriptors of a file, by blocks")
+    parser.set_defaults(function=_similarity)
+    parser.add_argument("features", metavar="FEATURES", help="the .npz file of the queries")
+    parser.add_argument("--references", metavar="F.npz", help="the references (default: the queries, as one sequence)")
+    parser.add_argument(
+        "--metric", default=METRICS[0], choices=METRICS, help="of the descriptors (default: %(default)s)"
+    )
+    parser.add_argument("--top-k", type=int, metavar="K", help="write the best K of each query as CSV, not all as .npy")
+    parser.add_argument(
+        "--exclude-frames", type=int, default=0, metavar="N", help="of --top-k in one sequence (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--exclude-seconds", type=float, default=0.0, metavar="S", help="the same, by stamps (default: %(default)g)"
+    )
+    parser.add_argument("--out", required=True, metavar="FILE", help="the file to write")
 
 
 def _similarity(a: argparse.Namespace) -> None:
@@ -76,39 +145,3 @@ def _similarity(a: argparse.Namespace) -> None:
     found = top_k(queries.features, references, a.top_k, a.metric, exclusion, queries.stamps)
     write_top_k(a.out, found)
     print(f"the best {a.top_k} of {len(found.indices)} queries ({exclusion or 'no pair excluded'}): {a.out}")
-
-
-METHOD = (
-    f"may be repeated; METHOD is one of {', '.join(METHODS)}, with :settings, or NAME+METHOD: "
-    "features:PATH.npz[:cosine][:whiten=OTHER.npz], seqslam+features:PATH.npz, fabmap:model=words.npz"
-)
-TRAINING = (
-    "may be repeated: images for vocabularies, other than those tested: a folder, list or TUM sequence, "
-    "with start, stop, stride, limit"
-)
-EVALUATE = (
-    *DATA_SET,
-    ("--method [LABEL=]METHOD", [str], ..., METHOD),
-    ("--train PATH[,KEY=VALUE]", [_training], None, TRAINING),
-    ("--out FOLDER", str, ..., "where the report and its parts go"),
-    ("--title TEXT", str, "", "heading of the report"),
-    ("--seed N", seed, 0, "of the methods' random numbers"),
-)
-COMPARE = (
-    ("REPORT.json...", str, None, "two or more, as evaluate writes them"),
-    ("--out FILE.html", str, "comparison.html", "the page"),
-)
-SIMILARITY = (
-    ("FEATURES", str, None, "the .npz file of the queries"),
-    ("--references F.npz", str, None, "the references (default: the queries, as one sequence)"),
-    ("--metric", METRICS, METRICS[0], "of the descriptors"),
-    ("--top-k K", int, None, "write the best K of each query as CSV, not all as .npy"),
-    ("--exclude-frames N", int, 0, "of --top-k in one sequence"),
-    ("--exclude-seconds S", float, 0.0, "the same, by stamps"),
-    ("--out FILE", str, ..., "the file to write"),
-)
-COMMANDS = (
-    ("evaluate", _evaluate, "run methods on one data set and write a report", EVALUATE, HELP),
-    ("compare", _compare, "put the reports of several evaluations side by side: table and curves", COMPARE),
-    ("similarity", _similarity, "compare all descriptors of a file, by blocks", SIMILARITY),
-)

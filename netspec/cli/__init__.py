@@ -1,14 +1,13 @@
-"""The command line: a module for each group of commands, with the table of its commands; it computes nothing."""
+"""The command line: a module for each group of commands; it computes nothing."""
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 
 from netspec.cli import caffe, data, export, nets, run_script, shell
-from netspec.cli.arguments import Commands
-from netspec.terminal.commands import program, run
+from netspec.terminal.commands import run
+from netspec.terminal.parser import Commands, Parser, program
 
 # The modules of the commands, and the headings in ``netspec --help`` that these stand below.
 _GROUPS = {
@@ -31,12 +30,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run(made, words)
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of all commands."""
     made = program("netspec", "Run Caffe's prototxt in PyTorch, with Caffe's numbers.")
     commands = Commands(made)
     for commands.heading, module in _GROUPS.items():
-        added = commands.read(module.TABLE, vars(module))
-        if module is run_script:
-            added[run_script.NAME].usage = run_script.USAGE
+        module.add_commands(commands)
     return made

@@ -1,12 +1,9 @@
-"""What the commands of netspec share: their dialects, the options of several of them, and how values are read."""
+"""What the commands of netspec share: the options that several of them have, and what these options say."""
 
 from __future__ import annotations
 
 import argparse
-import logging
 import re
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from netspec import log
@@ -19,20 +16,33 @@ from netspec.load import speed
 from netspec.proto.binary import split_paths
 from netspec.proto.forks import forks
 from netspec.proto.schema import PHASES
-from netspec.terminal import commands
 from netspec.terminal.commands import WrongUsage, refuse
+from netspec.terminal.parser import CAFFES_LOG
 
-_WARNINGS = logging.Formatter("warning: %(message)s")
-_HOW: dict[str, dict[str, Any]] = {  # words that a table has behind the name of a command
-    "quiet": {"log_level": logging.WARNING, "log_form": _WARNINGS},
-    "warnings": {"log_level": logging.WARNING},  # Caffe's, in the form of its log
-    "silent": {"log_form": None},
-    "compares": {"fault_status": commands.UNREADABLE},
-    "read": {},  # it reads the files of nets
-    "built": {},  # it makes nets, which takes memory
-}
-_PLUGIN = "a dialect (the layers of a Caffe fork): its name, or a Python file of your own; may be repeated"
-_LIMIT = "memory that a net may need, e.g. 64GiB; more is refused (default: this machine's)"
+# How values are read
+
+
+def positive(text: str) -> int:
+    """Read a number of at least 1."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"found {text}, expected a positive number")
+    return value
+
+
+def blob_shape(text: str) -> tuple[str, tuple[int, ...]]:
+    """Read ``BLOB=N,C,H,W``."""
+    match = re.fullmatch(r"([^=]+)=(\d+(?:,\d+)*)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected BLOB=N,C,H,W, e.g. data=32,3,224,224")
+    return match[1], tuple(int(d) for d in match[2].split(","))
+
+
+def _int32(text: str) -> int:
+    value = int(text)
+    if not -(2**31) <= value < 2**31:
+        raise argparse.ArgumentTypeError(f"found {text}, expected {-(2**31)} to {2**31 - 1}")
+    return value
 
 
 def _passes(text: str) -> tuple[str, ...]:
@@ -43,50 +53,6 @@ def _passes(text: str) -> tuple[str, ...]:
     return names
 
 
-def _int32(text: str) -> int:
-    value = int(text)
-    if not -(2**31) <= value < 2**31:
-        raise argparse.ArgumentTypeError(f"found {text}, expected {-(2**31)} to {2**31 - 1}")
-    return value
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"found {text}, expected a positive number")
-    return value
-
-
-def _tolerance(text: str) -> float:
-    value = float(text)
-    if not value >= 0:
-        raise argparse.ArgumentTypeError(f"found {text}, expected a number of at least 0")
-    return value
-
-
-def _shape(text: str) -> tuple[str, tuple[int, ...]]:
-    match = re.fullmatch(r"([^=]+)=(\d+(?:,\d+)*)", text)
-    if not match:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected BLOB=N,C,H,W, e.g. data=32,3,224,224")
-    return match[1], tuple(int(d) for d in match[2].split(","))
-
-
-def _source(text: str) -> tuple[str, str]:
-    name, equals, path = text.partition("=")
-    if not (name and equals and path):
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected LAYER=DB")
-    return name, path
-
-
-def _zooms(text: str) -> tuple[float, ...]:
-    from netspec.inspect.features.scaling import read_zooms
-
-    try:
-        return read_zooms(text)
-    except SpecError as fault:
-        raise argparse.ArgumentTypeError(str(fault)) from None
-
-
 def _amount(text: str) -> int:
     try:
         return read_amount(text)
@@ -94,94 +60,19 @@ def _amount(text: str) -> int:
         raise argparse.ArgumentTypeError(str(fault)) from None
 
 
-_TYPES: dict[str, Callable[[str], Any]] = {  # by the word for a value
-    "N": _positive,
-    "K": int,
-    "S": float,
-    "SECONDS": float,
-    "X": _tolerance,
-    "LEVEL": _int32,
-    "NAMES": _passes,
-    "BLOB=N,C,H,W": _shape,
-    "LAYER=DB": _source,
-    "1,0.7": _zooms,
-    "{TEST|TRAIN}": str.upper,
-    **dict.fromkeys(("OUT", "PREFIX", "F.svg|F.png|F.html", "F.py", "FOLDER"), Path),
-}
-_SHARED = {
-    "net": """
-  [net] NET                        the net's prototxt
-  --model MODEL                    the same, as Caffe's programs name it""",
-    "gpu": """
-  --gpu= GPU                       the GPU's number; for training also several: 0,1 or all (default: the solver's
-                                   choice)""",
-    "files": """
-  input IN                         the file to read
-  output OUT                       the file to write""",
-    "phase": """
-  --phase=TEST {TEST|TRAIN}        default: TEST""",
-    "part": """
-  --blob+ BLOB                     only the layers that compute these blobs
-  --shape... BLOB=N,C,H,W          the shape of an input or a data layer's top
-  @phase @state @python""",
-    "picture": """
-  --out! F.png|svg                 the picture to write""",
-    "described": """
-  net NET                          the net's prototxt
-  --weights! WEIGHTS               the trained weights, several separated by commas
-  --blob! BLOB                     the blob
-  --input=data BLOB                the blob that the image goes into (default: data)
-  --shape BLOB=N,C,H,W             its shape, if its data is not available
-  @steps""",
-    "state": """
-  --level=0 LEVEL                  the NetState's level (default: 0)
-  --stage= STAGE                   the NetState's stages, separated by commas""",
-    "strict": """
-  --strict                         refuse weights that lack a layer of the net""",
-    "python": """
-  --allow-python-layers            allow the net's Python layers to run their code""",
-    "exact": f"""
-  --exact={SMALL} {{{"|".join(CHOICES)}}}   which sums equal Caffe's in every bit, on the CPU; all is slower
-                                   (default: {SMALL})""",
-    "passes": f"""
-  --passes={",".join(PASSES)} NAMES   what may speed up a net of phase TEST: {",".join(PASSES)} (the default), some of
-                                   these, or none""",
-    "engine": f"""
-  --engine={TORCH} {{{"|".join(ENGINES)}|{OPENVINO},{BF16}}}   what runs the net (default: {TORCH}); with
-                                   ,{BF16} it computes in bfloat16
-  --precision {{{"|".join(PRECISIONS)}}}
-  --cache DIR|none                 keep nets exported for an engine here, or do not keep them (default: the user's
-                                   cache folder)""",
-    "steps": """
-  --swap                           images: reverse the channels, to RGB
-  --raw-scale=1 S                  then multiply pixels, 0 to 255, by this
-  --mean A,B,C|FILE                then subtract this: numbers in the net's order, or a .binaryproto or .npy
-  --scale=1 S                      then multiply by this; these four replace the data layer's transform_param""",
-}
+# Options of several commands
 
 
-class Commands(commands.Commands):
-    """Commands of netspec: ``--plugin``, ``--limit`` and ``-v`` are of those that read or make nets."""
-
-    types, shared = _TYPES, _SHARED
-
-    def add(self, name: str, function: commands.Function, summary: str, *how: str) -> argparse.ArgumentParser:
-        """Return the parser of a new command that runs ``function``.
-
-        A command of Caffe shows Caffe's log. A ``quiet`` command shows only warnings and, if it makes nets (``built``),
-        the log with ``-v``; a ``silent`` one shows none.
-        """
-        added = super().add(name, function, summary)
-        added.set_defaults(plugin=[], limit=None, begin=_use_dialects)
-        for word in how:
-            added.set_defaults(**_HOW[word])
-        if "quiet" in how and "built" in how:
-            added.add_argument("-v", "--verbose", nargs=0, action=_Verbose, help="show Caffe's log")
-        if "read" in how or "built" in how:
-            added.add_argument("--plugin", action="append", default=[], metavar="NAME|FILE.py", help=_PLUGIN)
-        if "built" in how:
-            added.add_argument("--limit", type=_amount, metavar="SIZE", help=_LIMIT)
-        return added
+def add_plugin(parser: argparse.ArgumentParser) -> None:
+    """Add ``--plugin``, of the commands that read the files of nets."""
+    parser.add_argument(
+        "--plugin",
+        action="append",
+        default=[],
+        metavar="NAME|FILE.py",
+        help="a dialect (the layers of a Caffe fork): its name, or a Python file of your own; may be repeated",
+    )
+    parser.set_defaults(prepare=_use_dialects)
 
 
 def _use_dialects(arguments: argparse.Namespace) -> None:
@@ -189,11 +80,151 @@ def _use_dialects(arguments: argparse.Namespace) -> None:
         forks().use(plugin)
 
 
+def add_limit(parser: argparse.ArgumentParser) -> None:
+    """Add ``--limit``, of the commands that build nets, which takes memory."""
+    parser.add_argument(
+        "--limit",
+        type=_amount,
+        metavar="SIZE",
+        help="memory that a net may need, e.g. 64GiB; more is refused (default: this machine's)",
+    )
+
+
+def add_verbose(parser: argparse.ArgumentParser) -> None:
+    """Add ``-v``, of the commands that build nets and show only warnings otherwise."""
+    parser.add_argument("-v", "--verbose", nargs=0, action=_Verbose, help="show Caffe's log")
+
+
 class _Verbose(argparse.Action):
     """Show the whole log, like the commands that Caffe has."""
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
-        namespace.log_level, namespace.log_form = logging.INFO, log.GlogFormatter()
+        for name, value in CAFFES_LOG.items():
+            setattr(namespace, name, value)
+
+
+def add_net(parser: argparse.ArgumentParser) -> None:
+    """Add the net's prototxt, as an argument and as ``--model``; :func:`model` reads them."""
+    parser.add_argument("net", nargs="?", metavar="NET", help="the net's prototxt")
+    parser.add_argument("--model", metavar="MODEL", help="the same, as Caffe's programs name it")
+
+
+def add_gpu(parser: argparse.ArgumentParser) -> None:
+    """Add ``--gpu``."""
+    parser.add_argument(
+        "--gpu",
+        default="",
+        metavar="GPU",
+        help="the GPU's number; for training also several: 0,1 or all (default: the solver's choice)",
+    )
+
+
+def add_phase(parser: argparse.ArgumentParser, default: str = "TEST") -> None:
+    """Add ``--phase``."""
+    parser.add_argument(
+        "--phase", type=str.upper, default=default, choices=["TEST", "TRAIN"], help="default: %(default)s"
+    )
+
+
+def add_state(parser: argparse.ArgumentParser) -> None:
+    """Add ``--level`` and ``--stage``."""
+    parser.add_argument(
+        "--level", type=_int32, default=0, metavar="LEVEL", help="the NetState's level (default: %(default)s)"
+    )
+    parser.add_argument("--stage", default="", metavar="STAGE", help="the NetState's stages, separated by commas")
+
+
+def add_part(parser: argparse.ArgumentParser) -> None:
+    """Add what a written net is made of: ``--blob``, ``--shape``, the state, Python layers."""
+    parser.add_argument(
+        "--blob",
+        action="extend",
+        nargs="+",
+        default=[],
+        metavar="BLOB",
+        help="only the layers that compute these blobs",
+    )
+    add_shapes(parser, "the shape of an input or a data layer's top")
+    add_phase(parser)
+    add_state(parser)
+    add_python(parser)
+
+
+def add_shapes(parser: argparse.ArgumentParser, text: str) -> None:
+    """Add ``--shape``, which may be repeated."""
+    parser.add_argument("--shape", action="append", type=blob_shape, default=[], metavar="BLOB=N,C,H,W", help=text)
+
+
+def add_strict(parser: argparse.ArgumentParser) -> None:
+    """Add ``--strict``."""
+    parser.add_argument("--strict", action="store_true", help="refuse weights that lack a layer of the net")
+
+
+def add_python(parser: argparse.ArgumentParser) -> None:
+    """Add ``--allow-python-layers``."""
+    parser.add_argument(
+        "--allow-python-layers", action="store_true", help="allow the net's Python layers to run their code"
+    )
+
+
+def add_exact(parser: argparse.ArgumentParser) -> None:
+    """Add ``--exact``."""
+    parser.add_argument(
+        "--exact",
+        default=SMALL,
+        choices=CHOICES,
+        help="which sums equal Caffe's in every bit, on the CPU; all is slower (default: %(default)s)",
+    )
+
+
+def add_passes(parser: argparse.ArgumentParser) -> None:
+    """Add ``--passes``."""
+    parser.add_argument(
+        "--passes",
+        type=_passes,
+        default=PASSES,
+        metavar="NAMES",
+        help=f"what may speed up a net of phase TEST: {','.join(PASSES)} (the default), some of these, or none",
+    )
+
+
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """Add ``--engine`` and its options; :func:`run_by` reads them."""
+    parser.add_argument(
+        "--engine",
+        default=TORCH,
+        choices=[*ENGINES, f"{OPENVINO},{BF16}"],
+        help=f"what runs the net (default: %(default)s); with ,{BF16} it computes in bfloat16",
+    )
+    parser.add_argument("--precision", choices=PRECISIONS, help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--cache",
+        metavar="DIR|none",
+        help="keep nets exported for an engine here, or do not keep them (default: the user's cache folder)",
+    )
+
+
+def add_steps(parser: argparse.ArgumentParser) -> None:
+    """Add what is done to the pixels of image files before a net gets them."""
+    parser.add_argument("--swap", action="store_true", help="images: reverse the channels, to RGB")
+    parser.add_argument(
+        "--raw-scale", type=float, default=1.0, metavar="S", help="then multiply pixels, 0 to 255, by this"
+    )
+    parser.add_argument(
+        "--mean",
+        metavar="A,B,C|FILE",
+        help="then subtract this: numbers in the net's order, or a .binaryproto or .npy",
+    )
+    parser.add_argument(
+        "--scale",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="then multiply by this; these four replace the data layer's transform_param",
+    )
+
+
+# What the options say
 
 
 def model(arguments: argparse.Namespace) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import signal
 import sys
@@ -13,68 +14,100 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netspec import log
-from netspec.cli.arguments import device, devices, load, load_weights, options, run_by
+from netspec.cli.arguments import (
+    add_engine,
+    add_exact,
+    add_gpu,
+    add_limit,
+    add_net,
+    add_passes,
+    add_phase,
+    add_plugin,
+    add_python,
+    add_shapes,
+    add_state,
+    add_strict,
+    device,
+    devices,
+    load,
+    load_weights,
+    options,
+    positive,
+    run_by,
+)
 from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
 from netspec.inspect.logs.scores import Score, Scores, Snapshot, read_scores
 from netspec.proto.binary import check_readable, split_paths
 from netspec.terminal.commands import DONE, FAULT, WrongUsage
+from netspec.terminal.parser import Commands
 
 if TYPE_CHECKING:
     from netspec.solver.processes import Processes
     from netspec.solver.solver import Solver
 
-TABLE = """
-train built                        train or fine-tune a model (caffe train)
-  [path] SOLVER                    the solver's prototxt
-  --solver SOLVER                  the solver's prototxt
-  --snapshot SNAPSHOT              a .solverstate to resume from
-  --resume                         resume from the newest whole snapshot, if there is any
-  --weights WEIGHTS                weights to start from, several separated by commas
-  --scores F.json                  write the scores of each test and the snapshots taken to this file
-  --tensorboard DIR                write losses, rates and test outputs here for TensorBoard
-  --nan=stop {stop|warn}           what a loss of NaN or infinity does (default: stop)
-  @gpu @state
-  --sigint_effect=stop {stop|snapshot|none}       what Ctrl-C does (default: stop); SIGTERM stops
-  --sighup_effect=snapshot {stop|snapshot|none}   what SIGHUP does (default: snapshot)
-  @python @exact
-  --precision=fp32 {fp32|tf32|bf16|fp16}          of the training net's passes; bf16 is faster on CPUs and GPUs that
-                                   have it, fp16 on GPUs; both round more (default: fp32)
-  @strict
-test built                         score a model on its TEST-phase data (caffe test)
-  @net
-  --weights! WEIGHTS               the trained weights
-  --iterations=50 N                batches to run (default: 50)
-  --scores F.json                  also write the mean scores to this file
-  @gpu @state @python @exact @passes @strict @engine
-time built                         measure the forward and backward time of each layer (caffe time)
-  @net
-  --iterations=50 N                passes to time (default: 50)
-  @gpu
-  --phase=TRAIN {TEST|TRAIN}       default: TRAIN
-  @state @python @exact @engine
-extract_features warnings built    write blobs to databases of float Datums (extract_features)
-  weights WEIGHTS                  the trained weights
-  model MODEL                      the net's prototxt, with a data layer
-  blobs BLOBS                      blob names, separated by commas
-  databases DATABASES              the databases to write, one per blob, separated by commas
-  batches N                        mini-batches to run
-  db_type {lmdb|leveldb}           the form of the databases
-  [mode=CPU] {CPU|GPU}             where the net runs (default: CPU)
-  [device=0] DEVICE_ID=0           the GPU's number
-device_query                       show the GPUs (caffe device_query)
-  --gpu=all GPU                    one number, several separated by commas, or all (the default)
-upgrade_net_proto_text read        write a net's prototxt, or the net inside a .caffemodel, in the current format
-  @files
-  --shape... BLOB=N,C,H,W          of a .caffemodel, whose net is written as a deploy prototxt: the shape of an input
-upgrade_net_proto_binary           write a .caffemodel in the current format
-  @files
-upgrade_solver_proto_text          write a solver's prototxt in the current format
-  @files
-"""
+
+def add_commands(commands: Commands) -> None:
+    """Add the commands of this module."""
+    _add_train(commands)
+    _add_test(commands)
+    _add_time(commands)
+    _add_extract_features(commands)
+    _add_device_query(commands)
+    _add_upgrade_net_proto_text(commands)
+    _add_upgrade_net_proto_binary(commands)
+    _add_upgrade_solver_proto_text(commands)
 
 
 BAR = "{n_fmt} of {total_fmt} |{bar}| {elapsed}, {remaining} left{postfix}"
+
+
+def _add_train(commands: Commands) -> None:
+    parser = commands.add_parser("train", help="train or fine-tune a model (caffe train)")
+    parser.set_defaults(function=_train)
+    add_plugin(parser)
+    add_limit(parser)
+    parser.add_argument("path", nargs="?", metavar="SOLVER", help="the solver's prototxt")
+    parser.add_argument("--solver", metavar="SOLVER", help="the solver's prototxt")
+    parser.add_argument("--snapshot", metavar="SNAPSHOT", help="a .solverstate to resume from")
+    parser.add_argument("--resume", action="store_true", help="resume from the newest whole snapshot, if there is any")
+    parser.add_argument("--weights", metavar="WEIGHTS", help="weights to start from, several separated by commas")
+    parser.add_argument(
+        "--scores", metavar="F.json", help="write the scores of each test and the snapshots taken to this file"
+    )
+    parser.add_argument(
+        "--tensorboard", metavar="DIR", help="write losses, rates and test outputs here for TensorBoard"
+    )
+    parser.add_argument(
+        "--nan",
+        default="stop",
+        choices=["stop", "warn"],
+        help="what a loss of NaN or infinity does (default: %(default)s)",
+    )
+    add_gpu(parser)
+    add_state(parser)
+    parser.add_argument(
+        "--sigint_effect",
+        default="stop",
+        choices=["stop", "snapshot", "none"],
+        help="what Ctrl-C does (default: %(default)s); SIGTERM stops",
+    )
+    parser.add_argument(
+        "--sighup_effect",
+        default="snapshot",
+        choices=["stop", "snapshot", "none"],
+        help="what SIGHUP does (default: %(default)s)",
+    )
+    add_python(parser)
+    add_exact(parser)
+    parser.add_argument(
+        "--precision",
+        default="fp32",
+        choices=["fp32", "tf32", "bf16", "fp16"],
+        help="of the training net's passes; bf16 is faster on CPUs and GPUs that have it, fp16 on GPUs; both round "
+        "more (default: %(default)s)",
+    )
+    add_strict(parser)
 
 
 def _train(arguments: argparse.Namespace) -> int:
@@ -268,6 +301,26 @@ def _signals(effects: Mapping[signal.Signals, str]) -> Iterator[_Signals]:
             signal.signal(number, handler)
 
 
+def _add_test(commands: Commands) -> None:
+    parser = commands.add_parser("test", help="score a model on its TEST-phase data (caffe test)")
+    parser.set_defaults(function=_test)
+    add_plugin(parser)
+    add_limit(parser)
+    add_net(parser)
+    parser.add_argument("--weights", required=True, metavar="WEIGHTS", help="the trained weights")
+    parser.add_argument(
+        "--iterations", type=positive, default=50, metavar="N", help="batches to run (default: %(default)s)"
+    )
+    parser.add_argument("--scores", metavar="F.json", help="also write the mean scores to this file")
+    add_gpu(parser)
+    add_state(parser)
+    add_python(parser)
+    add_exact(parser)
+    add_passes(parser)
+    add_strict(parser)
+    add_engine(parser)
+
+
 def _test(arguments: argparse.Namespace) -> None:
     from netspec.inspect.check.measure import test_net
 
@@ -279,6 +332,23 @@ def _test(arguments: argparse.Namespace) -> None:
     net.close()
     if arguments.scores:
         Scores([Score(None, 0, means)]).write(arguments.scores)
+
+
+def _add_time(commands: Commands) -> None:
+    parser = commands.add_parser("time", help="measure the forward and backward time of each layer (caffe time)")
+    parser.set_defaults(function=_time)
+    add_plugin(parser)
+    add_limit(parser)
+    add_net(parser)
+    parser.add_argument(
+        "--iterations", type=positive, default=50, metavar="N", help="passes to time (default: %(default)s)"
+    )
+    add_gpu(parser)
+    add_phase(parser, default="TRAIN")
+    add_state(parser)
+    add_python(parser)
+    add_exact(parser)
+    add_engine(parser)
 
 
 def _time(arguments: argparse.Namespace) -> None:
@@ -294,6 +364,25 @@ def _time(arguments: argparse.Namespace) -> None:
     net.close()
 
 
+def _add_extract_features(commands: Commands) -> None:
+    parser = commands.add_parser("extract_features", help="write blobs to databases of float Datums (extract_features)")
+    parser.set_defaults(function=_extract_features, log_level=logging.WARNING)
+    add_plugin(parser)
+    add_limit(parser)
+    parser.add_argument("weights", metavar="WEIGHTS", help="the trained weights")
+    parser.add_argument("model", metavar="MODEL", help="the net's prototxt, with a data layer")
+    parser.add_argument("blobs", metavar="BLOBS", help="blob names, separated by commas")
+    parser.add_argument(
+        "databases", metavar="DATABASES", help="the databases to write, one per blob, separated by commas"
+    )
+    parser.add_argument("batches", type=positive, metavar="N", help="mini-batches to run")
+    parser.add_argument("db_type", choices=["lmdb", "leveldb"], help="the form of the databases")
+    parser.add_argument(
+        "mode", nargs="?", default="CPU", choices=["CPU", "GPU"], help="where the net runs (default: %(default)s)"
+    )
+    parser.add_argument("device", nargs="?", default="0", metavar="DEVICE_ID=0", help="the GPU's number")
+
+
 def _extract_features(arguments: argparse.Namespace) -> None:
     from netspec.inspect.features.records import extract_features as write_features
     from netspec.net.build import load_net
@@ -306,6 +395,14 @@ def _extract_features(arguments: argparse.Namespace) -> None:
         net, arguments.blobs.split(","), arguments.databases.split(","), arguments.batches, arguments.db_type
     )
     net.close()
+
+
+def _add_device_query(commands: Commands) -> None:
+    parser = commands.add_parser("device_query", help="show the GPUs (caffe device_query)")
+    parser.set_defaults(function=_device_query)
+    parser.add_argument(
+        "--gpu", default="all", metavar="GPU", help="one number, several separated by commas, or all (the default)"
+    )
 
 
 def _device_query(arguments: argparse.Namespace) -> None:
@@ -330,6 +427,21 @@ def _device_query(arguments: argparse.Namespace) -> None:
             log.info("common.cpp:178", f"{title:<31}{value}")
 
 
+def _add_files(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("input", metavar="IN", help="the file to read")
+    parser.add_argument("output", type=Path, metavar="OUT", help="the file to write")
+
+
+def _add_upgrade_net_proto_text(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "upgrade_net_proto_text", help="write a net's prototxt, or the net inside a .caffemodel, in the current format"
+    )
+    parser.set_defaults(function=_upgrade_net_proto_text)
+    add_plugin(parser)
+    _add_files(parser)
+    add_shapes(parser, "of a .caffemodel, whose net is written as a deploy prototxt: the shape of an input")
+
+
 def _upgrade_net_proto_text(arguments: argparse.Namespace) -> None:
     from netspec.proto.binary import is_net_binary
     from netspec.proto.text import read_net, write_text
@@ -346,11 +458,23 @@ def _upgrade_net_proto_text(arguments: argparse.Namespace) -> None:
     log.info("upgrade_net_proto_text.cpp:49", f"Wrote upgraded NetParameter text proto to {arguments.output}")
 
 
+def _add_upgrade_net_proto_binary(commands: Commands) -> None:
+    parser = commands.add_parser("upgrade_net_proto_binary", help="write a .caffemodel in the current format")
+    parser.set_defaults(function=_upgrade_net_proto_binary)
+    _add_files(parser)
+
+
 def _upgrade_net_proto_binary(arguments: argparse.Namespace) -> None:
     from netspec.proto.binary import read_net_binary
 
     write_whole(arguments.output, read_net_binary(arguments.input).SerializeToString())
     log.info("upgrade_net_proto_binary.cpp:49", f"Wrote upgraded NetParameter binary proto to {arguments.output}")
+
+
+def _add_upgrade_solver_proto_text(commands: Commands) -> None:
+    parser = commands.add_parser("upgrade_solver_proto_text", help="write a solver's prototxt in the current format")
+    parser.set_defaults(function=_upgrade_solver_proto_text)
+    _add_files(parser)
 
 
 def _upgrade_solver_proto_text(arguments: argparse.Namespace) -> None:

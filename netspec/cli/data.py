@@ -9,35 +9,48 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from netspec.cli.arguments import positive
 from netspec.errors import printable
 from netspec.terminal.commands import DONE, FAULT, WrongUsage, refuse
 from netspec.terminal.output import bar
+from netspec.terminal.parser import QUIET, Commands
 
 if TYPE_CHECKING:
     from netspec.data.records import Records
     from netspec.data.survey import Survey
 
-TABLE = """
-data quiet                         look at a database: a sheet of its records, or its statistics
-  what {show|stat}                 show: draw records, labels, statistics; stat: print statistics
-  source DB                        an LMDB, a LevelDB, an HDF5 file, or a list of HDF5 files
-  --records N                      look at N records, evenly spread (default: all)
-  --out F.png|svg                  show: the picture to write
-  --count=40 N                     show: how many records to draw (default: 40)
-  --start K                        show: draw the records from number K on (default: a spread)
-  --images N                       show: images side by side in a record (default: 2 of 2 or 6 channels)
-  --json                           stat: print JSON
-plot quiet                         draw the curves of trainings from their logs, netspec's or Caffe's
-  logs... LOG                      what a training wrote to stderr
-  --out! F.png|svg|html            the picture, or a page, to write
-  --names NAMES,...                what the logs are called, separated by commas (default: the names of the files)
-  --smooth N                       average N points (default: a 25th of them)
-  --log_scale                      draw losses on a logarithmic axis
-"""
-
-
 SHOW, STAT = "show", "stat"
 SHOWN_FAULTS = 4  # which come first
+
+
+def add_commands(commands: Commands) -> None:
+    """Add the commands of this module."""
+    _add_data(commands)
+    _add_plot(commands)
+
+
+def _add_data(commands: Commands) -> None:
+    parser = commands.add_parser("data", help="look at a database: a sheet of its records, or its statistics")
+    parser.set_defaults(function=_data, **QUIET)
+    parser.add_argument(
+        "what", choices=[SHOW, STAT], help="show: draw records, labels, statistics; stat: print statistics"
+    )
+    parser.add_argument("source", metavar="DB", help="an LMDB, a LevelDB, an HDF5 file, or a list of HDF5 files")
+    parser.add_argument("--records", type=positive, metavar="N", help="look at N records, evenly spread (default: all)")
+    parser.add_argument("--out", metavar="F.png|svg", help="show: the picture to write")
+    parser.add_argument(
+        "--count", type=positive, default=40, metavar="N", help="show: how many records to draw (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--start", type=int, metavar="K", help="show: draw the records from number K on (default: a spread)"
+    )
+    parser.add_argument(
+        "--images",
+        type=positive,
+        metavar="N",
+        help="show: images side by side in a record (default: 2 of 2 or 6 channels)",
+    )
+    parser.add_argument("--json", action="store_true", help="stat: print JSON")
 
 
 def _data(arguments: argparse.Namespace) -> int:
@@ -87,6 +100,20 @@ def _show(arguments: argparse.Namespace, records: Records, found: Survey) -> Non
         numbers = list(range(arguments.start, min(arguments.start + arguments.count, len(records))))
     write_figure(sheet([records[k] for k in numbers], found, arguments.source, arguments.images), arguments.out)
     print(f"{arguments.out}: {len(numbers)} of {len(records):,} records")
+
+
+def _add_plot(commands: Commands) -> None:
+    parser = commands.add_parser("plot", help="draw the curves of trainings from their logs, netspec's or Caffe's")
+    parser.set_defaults(function=_plot, **QUIET)
+    parser.add_argument("logs", nargs="+", metavar="LOG", help="what a training wrote to stderr")
+    parser.add_argument("--out", required=True, metavar="F.png|svg|html", help="the picture, or a page, to write")
+    parser.add_argument(
+        "--names",
+        metavar="NAMES,...",
+        help="what the logs are called, separated by commas (default: the names of the files)",
+    )
+    parser.add_argument("--smooth", type=positive, metavar="N", help="average N points (default: a 25th of them)")
+    parser.add_argument("--log_scale", action="store_true", help="draw losses on a logarithmic axis")
 
 
 def _plot(arguments: argparse.Namespace) -> None:

@@ -11,7 +11,31 @@ from pathlib import Path
 from typing import Any
 
 from netspec import log
-from netspec.cli.arguments import choice, device, load_weights, model, options, run_by, stages
+from netspec.cli.arguments import (
+    add_engine,
+    add_exact,
+    add_gpu,
+    add_limit,
+    add_net,
+    add_part,
+    add_passes,
+    add_phase,
+    add_plugin,
+    add_python,
+    add_state,
+    add_steps,
+    add_strict,
+    add_verbose,
+    blob_shape,
+    choice,
+    device,
+    load_weights,
+    model,
+    options,
+    positive,
+    run_by,
+    stages,
+)
 from netspec.errors import SpecError
 from netspec.files.limits import amount
 from netspec.files.whole_file import whole_file, why_unwritable
@@ -19,40 +43,72 @@ from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar
+from netspec.terminal.parser import QUIET, Commands
 
-TABLE = """
-extract quiet built                write blobs to an .npz file, for the records of a data layer or for images
-  @net
-  --weights WEIGHTS                the trained weights (default: random weights)
-  --blob+! BLOB                    the blobs to write
-  --out! OUT                       the .npz to write
-  --source... LAYER=DB             use another database
-  --iterations N                   batches to run (default: every record once)
-  --images FOLDER|LIST             use image files instead of records
-  --input=data BLOB                the blob that images go into (default: data)
-  --zooms 1,0.7                    describe several views of each image: the whole (1) and its middle (0.7)
-  --shape BLOB=N,C,H,W             the input blob's shape, if its data is not available
-  @steps @gpu @phase @state @python @exact @passes @strict @engine
-export quiet built                 write a net as ONNX, PyTorch source, a torch.export archive or safetensors
-  file FILE                        the net's prototxt
-  --to! {onnx|torch|pt2|safetensors}   the form
-  --weights WEIGHTS                the trained weights (default: random weights)
-  --out! OUT                       the file to write
-  @part
-  --no-labels                      leave out labels, and the losses and accuracies that need them
-  --input=data BLOB                the input for the options below (default: data)
-  --crop                           ONNX: take the middle of larger images
-  --swap                           ONNX: images come with reversed channels (RGB for BGR)
-  --raw-scale=1 S                  ONNX: multiply images by this first
-  --mean A,B,C|FILE                ONNX: then subtract this, numbers or a .binaryproto or .npy file
-  --scale=1 S                      ONNX: then multiply by this
-  --uint8                          ONNX: images are bytes
-fold quiet built                   write the deploy net with BatchNorm and Scale folded in: OUT.prototxt, OUT.caffemodel
-  file MODEL                       the net's prototxt; of a training net, labels and losses are removed
-  --weights! WEIGHTS               the trained weights
-  --out! PREFIX                    write PREFIX.prototxt and .caffemodel
-  @part
-"""
+
+def add_commands(commands: Commands) -> None:
+    """Add the commands of this module."""
+    _add_extract(commands)
+    _add_export(commands)
+    _add_fold(commands)
+
+
+def _layer_source(text: str) -> tuple[str, str]:
+    name, equals, path = text.partition("=")
+    if not (name and equals and path):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected LAYER=DB")
+    return name, path
+
+
+def _zooms(text: str) -> tuple[float, ...]:
+    from netspec.inspect.features.scaling import read_zooms
+
+    try:
+        return read_zooms(text)
+    except SpecError as fault:
+        raise argparse.ArgumentTypeError(str(fault)) from None
+
+
+def _add_extract(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "extract", help="write blobs to an .npz file, for the records of a data layer or for images"
+    )
+    parser.set_defaults(function=_extract, **QUIET)
+    add_verbose(parser)
+    add_plugin(parser)
+    add_limit(parser)
+    add_net(parser)
+    parser.add_argument("--weights", metavar="WEIGHTS", help="the trained weights (default: random weights)")
+    parser.add_argument(
+        "--blob", action="extend", nargs="+", required=True, default=[], metavar="BLOB", help="the blobs to write"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="the .npz to write")
+    parser.add_argument(
+        "--source", action="append", type=_layer_source, default=[], metavar="LAYER=DB", help="use another database"
+    )
+    parser.add_argument("--iterations", type=positive, metavar="N", help="batches to run (default: every record once)")
+    parser.add_argument("--images", metavar="FOLDER|LIST", help="use image files instead of records")
+    parser.add_argument(
+        "--input", default="data", metavar="BLOB", help="the blob that images go into (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--zooms",
+        type=_zooms,
+        metavar="1,0.7",
+        help="describe several views of each image: the whole (1) and its middle (0.7)",
+    )
+    parser.add_argument(
+        "--shape", type=blob_shape, metavar="BLOB=N,C,H,W", help="the input blob's shape, if its data is not available"
+    )
+    add_steps(parser)
+    add_gpu(parser)
+    add_phase(parser)
+    add_state(parser)
+    add_python(parser)
+    add_exact(parser)
+    add_passes(parser)
+    add_strict(parser)
+    add_engine(parser)
 
 
 def _extract(arguments: argparse.Namespace) -> None:
@@ -137,14 +193,6 @@ def _tell_arrays(out: Path, arrays: Mapping[str, Any]) -> None:
     print(f"{out}: {shapes}; {arrays[seconds] * 1e3:.3g} ms per {what}")
 
 
-WRITTEN = {
-    "onnx": "an ONNX model",
-    "torch": "the source of a PyTorch module",
-    "pt2": "a torch.export archive",
-    "safetensors": "weights",
-}
-
-
 def _source(arguments: argparse.Namespace, labels: bool) -> Any:
     from netspec.export.formats.convert import Source
 
@@ -161,17 +209,56 @@ def _source(arguments: argparse.Namespace, labels: bool) -> Any:
     )
 
 
+WRITTEN = {
+    "onnx": "an ONNX model",
+    "torch": "the source of a PyTorch module",
+    "pt2": "a torch.export archive",
+    "safetensors": "weights",
+}
+EXPORT = """Write a net in another form, with its weights.
+
+--to onnx         an ONNX model (opset 21), batch, height and width free where the net allows it;
+                  weights of more than 2 GB go into a file beside it
+--to torch        the source of a PyTorch module, OUT.py, and its weights, OUT.safetensors beside it
+--to pt2          a torch.export archive
+--to safetensors  the weights alone: LAYER.INDEX, in Caffe's order
+
+Layers that read data become inputs; --shape says what they read, where the prototxt does not."""
+
+
+def _add_export(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "export",
+        help="write a net as ONNX, PyTorch source, a torch.export archive or safetensors",
+        description=EXPORT,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(function=_export, **QUIET)
+    add_verbose(parser)
+    add_plugin(parser)
+    add_limit(parser)
+    parser.add_argument("file", metavar="FILE", help="the net's prototxt")
+    parser.add_argument("--to", required=True, choices=list(WRITTEN), help="the form")
+    parser.add_argument("--weights", metavar="WEIGHTS", help="the trained weights (default: random weights)")
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="the file to write")
+    add_part(parser)
+    parser.add_argument(
+        "--no-labels", action="store_true", help="leave out labels, and the losses and accuracies that need them"
+    )
+    parser.add_argument(
+        "--input", default="data", metavar="BLOB", help="the input for the options below (default: %(default)s)"
+    )
+    parser.add_argument("--crop", action="store_true", help="ONNX: take the middle of larger images")
+    parser.add_argument("--swap", action="store_true", help="ONNX: images come with reversed channels (RGB for BGR)")
+    parser.add_argument("--raw-scale", type=float, default=1.0, metavar="S", help="ONNX: multiply images by this first")
+    parser.add_argument(
+        "--mean", metavar="A,B,C|FILE", help="ONNX: then subtract this, numbers or a .binaryproto or .npy file"
+    )
+    parser.add_argument("--scale", type=float, default=1.0, metavar="S", help="ONNX: then multiply by this")
+    parser.add_argument("--uint8", action="store_true", help="ONNX: images are bytes")
+
+
 def _export(arguments: argparse.Namespace) -> None:
-    """Write a net in another form, with its weights.
-
-    --to onnx         an ONNX model (opset 21), batch, height and width free where the net allows it;
-                      weights of more than 2 GB go into a file beside it
-    --to torch        the source of a PyTorch module, OUT.py, and its weights, OUT.safetensors beside it
-    --to pt2          a torch.export archive
-    --to safetensors  the weights alone: LAYER.INDEX, in Caffe's order
-
-    Layers that read data become inputs; --shape says what they read, where the prototxt does not.
-    """
     from netspec.data.mean import read_mean_option
     from netspec.export.formats.convert import export_net
     from netspec.export.formats.preprocess import Preprocess
@@ -195,6 +282,24 @@ def _export(arguments: argparse.Namespace) -> None:
     for line in export_net(source, arguments.to, arguments.out, steps if steps.changes_images else None):
         print(f"note: {line}", file=sys.stderr)
     print(f"{arguments.out}: {WRITTEN[arguments.to]}, {amount(arguments.out.stat().st_size)}")
+
+
+def _add_fold(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "fold", help="write the deploy net with BatchNorm and Scale folded in: OUT.prototxt, OUT.caffemodel"
+    )
+    parser.set_defaults(function=_fold, **QUIET)
+    add_verbose(parser)
+    add_plugin(parser)
+    add_limit(parser)
+    parser.add_argument(
+        "file", metavar="MODEL", help="the net's prototxt; of a training net, labels and losses are removed"
+    )
+    parser.add_argument("--weights", required=True, metavar="WEIGHTS", help="the trained weights")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="PREFIX", help="write PREFIX.prototxt and .caffemodel"
+    )
+    add_part(parser)
 
 
 def _fold(arguments: argparse.Namespace) -> None:

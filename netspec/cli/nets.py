@@ -9,77 +9,73 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from netspec.cli.arguments import options
+from netspec.cli.arguments import (
+    add_limit,
+    add_passes,
+    add_phase,
+    add_plugin,
+    add_python,
+    add_shapes,
+    add_state,
+    add_steps,
+    add_strict,
+    add_verbose,
+    blob_shape,
+    options,
+    positive,
+)
 from netspec.errors import SpecError, Where, did_you_mean, printable
 from netspec.files.whole_file import write_whole
 from netspec.process.garbage import no_collection
 from netspec.proto.binary import is_net_binary, split_paths
 from netspec.proto.schema import PHASES, TEST, TRAIN
 from netspec.terminal.commands import DONE, FAULT, SOMETHING, UNREADABLE, WrongUsage, refuse
+from netspec.terminal.parser import QUIET, Commands
 
 if TYPE_CHECKING:
     from netspec.inspect.features.images import ImageNet
 
-TABLE = """
-check quiet built                  build a net, or a solver's nets, and report every error; nothing is written
-  file FILE                        a net's or a solver's prototxt, or a .caffemodel
-  @phase @state
-  --shape... BLOB=N,C,H,W          the shape of a data layer's top; its data is then not opened
-  --data                           open databases, lists and mean files too
-  --weights WEIGHTS                weights that must fit the net, several separated by commas
-  --plan                           print how the net runs without gradients; needs its memory
-  @passes
-  --json                           print blobs, params, inputs, outputs as JSON; or the faults, if any
-  @strict @python
-lint quiet read                    find what is legal but likely a mistake, in nets and solvers
-  [files...] FILE                  a net's or a solver's prototxt
-  --rules                          print the rules, with their reasons
-  --json                           print faults and findings as JSON, one object for each file
-  @state
-  --shape... BLOB=N,C,H,W          the shape of a data layer's top; some rules need shapes
-  --data                           open databases, lists and mean files
-  @python
-draw quiet read                    draw a net: layers, shapes, shared parameters, multiply-adds
-  file FILE                        a net, a .caffemodel, or a solver, whose training net is drawn
-  --out! F.svg|F.png|F.html        the file to write
-  --phase {TEST|TRAIN}             only this phase (default: both in one)
-  @state
-  --shape... BLOB=N,C,H,W          the shape of a data layer's top; without it shapes may be unknown
-  --data                           open databases and lists to learn their shapes
-  --unfold                         draw every copy of what repeats (HTML has both)
-  @python
-diff quiet read compares           tell what differs in meaning: nets, solvers or weights
-  first A                          a prototxt, a .caffemodel or a .caffemodel.h5
-  second B                         another of the same kind
-  --tolerance=0 X                  weights no further apart are equal (default: 0)
-fmt quiet                          write prototxt files in one form; comments are kept
-  files... FILE                    a net's or a solver's prototxt; - is standard input
-  --check                          write nothing; name the files that would change
-layers quiet read                  list the layer types, each with its description
-look:                              draw what a net has learned: filters, maps, saliency, embedding
-filters quiet                      draw the filters of a layer, by default the first
-  weights WEIGHTS                  a .caffemodel or .caffemodel.h5
-  --layer LAYER                    the layer (default: the first with filters)
-  --rgb                            the net was trained with red, green, blue (Caffe's order: BGR)
-  @picture
-maps quiet built                   draw the maps of a blob for an image
-  @described
-  --image! IMAGE                   the image file
-  @picture
-saliency quiet built               draw which pixels matter for a number of a blob, or a distance
-  @described
-  --image! IMAGE                   the image file
-  --unit K                         which of the blob's numbers (default: the greatest)
-  --to IMAGE                       instead: the distance of the blob to that of this image
-  --samples=16 N                   average over N noisy copies (default: 16)
-  @picture
-embedding quiet                    draw descriptors in a plane, with the images as points
-  features FEATURES.npz            what netspec extract wrote
-  --array= ARRAY                   which array of the file (default: the first with descriptors)
-  --images FOLDER|LIST|DB          the images: a folder, a list, or the records' database
-  --method=pca {pca|tsne}          how to find the plane (default: pca)
-  @picture
-"""
+
+def add_commands(commands: Commands) -> None:
+    """Add the commands of this module."""
+    _add_check(commands)
+    _add_lint(commands)
+    _add_draw(commands)
+    _add_diff(commands)
+    _add_fmt(commands)
+    _add_layers(commands)
+    look = commands.add_group("look", help="draw what a net has learned: filters, maps, saliency, embedding")
+    _add_filters(look)
+    _add_maps(look)
+    _add_saliency(look)
+    _add_embedding(look)
+
+
+def _add_check(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "check", help="build a net, or a solver's nets, and report every error; nothing is written"
+    )
+    parser.set_defaults(function=_check, **QUIET)
+    add_verbose(parser)
+    add_plugin(parser)
+    add_limit(parser)
+    parser.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt, or a .caffemodel")
+    add_phase(parser)
+    add_state(parser)
+    add_shapes(parser, "the shape of a data layer's top; its data is then not opened")
+    parser.add_argument("--data", action="store_true", help="open databases, lists and mean files too")
+    parser.add_argument(
+        "--weights", metavar="WEIGHTS", help="weights that must fit the net, several separated by commas"
+    )
+    parser.add_argument(
+        "--plan", action="store_true", help="print how the net runs without gradients; needs its memory"
+    )
+    add_passes(parser)
+    parser.add_argument(
+        "--json", action="store_true", help="print blobs, params, inputs, outputs as JSON; or the faults, if any"
+    )
+    add_strict(parser)
+    add_python(parser)
 
 
 @no_collection()  # of the whole command: of the text and the table too
@@ -129,6 +125,21 @@ def _check(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _add_lint(commands: Commands) -> None:
+    parser = commands.add_parser("lint", help="find what is legal but likely a mistake, in nets and solvers")
+    parser.set_defaults(function=_lint, **QUIET)
+    add_plugin(parser)
+    parser.add_argument("files", nargs="*", default=[], metavar="FILE", help="a net's or a solver's prototxt")
+    parser.add_argument("--rules", action="store_true", help="print the rules, with their reasons")
+    parser.add_argument(
+        "--json", action="store_true", help="print faults and findings as JSON, one object for each file"
+    )
+    add_state(parser)
+    add_shapes(parser, "the shape of a data layer's top; some rules need shapes")
+    parser.add_argument("--data", action="store_true", help="open databases, lists and mean files")
+    add_python(parser)
+
+
 def _lint(arguments: argparse.Namespace) -> int:
     if arguments.rules == bool(arguments.files):
         raise WrongUsage("give files, or --rules")
@@ -160,6 +171,22 @@ FORMATS = (".svg", ".png", ".html")
 STDIN = "-"
 
 
+def _add_draw(commands: Commands) -> None:
+    parser = commands.add_parser("draw", help="draw a net: layers, shapes, shared parameters, multiply-adds")
+    parser.set_defaults(function=_draw, **QUIET)
+    add_plugin(parser)
+    parser.add_argument("file", metavar="FILE", help="a net, a .caffemodel, or a solver, whose training net is drawn")
+    parser.add_argument("--out", type=Path, required=True, metavar="F.svg|F.png|F.html", help="the file to write")
+    parser.add_argument(
+        "--phase", type=str.upper, choices=["TEST", "TRAIN"], help="only this phase (default: both in one)"
+    )
+    add_state(parser)
+    add_shapes(parser, "the shape of a data layer's top; without it shapes may be unknown")
+    parser.add_argument("--data", action="store_true", help="open databases and lists to learn their shapes")
+    parser.add_argument("--unfold", action="store_true", help="draw every copy of what repeats (HTML has both)")
+    add_python(parser)
+
+
 def _draw(arguments: argparse.Namespace) -> None:
     if arguments.out.suffix not in FORMATS:
         raise WrongUsage(f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}")
@@ -180,6 +207,28 @@ def _draw(arguments: argparse.Namespace) -> None:
     print(f"{arguments.out}: {layers} layers of {printable(drawn.name) or 'a net without a name'}")
 
 
+def _tolerance(text: str) -> float:
+    value = float(text)
+    if not value >= 0:
+        raise argparse.ArgumentTypeError(f"found {text}, expected a number of at least 0")
+    return value
+
+
+def _add_diff(commands: Commands) -> None:
+    parser = commands.add_parser("diff", help="tell what differs in meaning: nets, solvers or weights")
+    parser.set_defaults(function=_diff, **QUIET, fault_status=UNREADABLE)
+    add_plugin(parser)
+    parser.add_argument("first", metavar="A", help="a prototxt, a .caffemodel or a .caffemodel.h5")
+    parser.add_argument("second", metavar="B", help="another of the same kind")
+    parser.add_argument(
+        "--tolerance",
+        type=_tolerance,
+        default=0.0,
+        metavar="X",
+        help="weights no further apart are equal (default: %(default)g)",
+    )
+
+
 def _diff(arguments: argparse.Namespace) -> int:
     from netspec.inspect.check.compare import compare_files
 
@@ -188,6 +237,13 @@ def _diff(arguments: argparse.Namespace) -> int:
         print(each)
         status = SOMETHING
     return status
+
+
+def _add_fmt(commands: Commands) -> None:
+    parser = commands.add_parser("fmt", help="write prototxt files in one form; comments are kept")
+    parser.set_defaults(function=_fmt, **QUIET)
+    parser.add_argument("files", nargs="+", metavar="FILE", help="a net's or a solver's prototxt; - is standard input")
+    parser.add_argument("--check", action="store_true", help="write nothing; name the files that would change")
 
 
 def _fmt(arguments: argparse.Namespace) -> int:
@@ -229,6 +285,12 @@ def _write(path: str, text: str) -> None:
     print(f"{path}: formatted")
 
 
+def _add_layers(commands: Commands) -> None:
+    parser = commands.add_parser("layers", help="list the layer types, each with its description")
+    parser.set_defaults(function=_layers, **QUIET)
+    add_plugin(parser)
+
+
 def _layers(arguments: argparse.Namespace) -> None:
     from netspec.layers import layer_class, layer_types
 
@@ -239,6 +301,21 @@ def _layers(arguments: argparse.Namespace) -> None:
 
 
 PICTURES = ("png", "svg")
+
+
+def _add_picture(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", required=True, metavar="F.png|svg", help="the picture to write")
+
+
+def _add_filters(commands: Commands) -> None:
+    parser = commands.add_parser("filters", help="draw the filters of a layer, by default the first")
+    parser.set_defaults(function=_filters, **QUIET)
+    parser.add_argument("weights", metavar="WEIGHTS", help="a .caffemodel or .caffemodel.h5")
+    parser.add_argument("--layer", metavar="LAYER", help="the layer (default: the first with filters)")
+    parser.add_argument(
+        "--rgb", action="store_true", help="the net was trained with red, green, blue (Caffe's order: BGR)"
+    )
+    _add_picture(parser)
 
 
 def _filters(arguments: argparse.Namespace) -> None:
@@ -263,6 +340,32 @@ def _filters(arguments: argparse.Namespace) -> None:
     print(f"{arguments.out}: {chosen} {filters.shape}")
 
 
+def _add_described_blob(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("net", metavar="NET", help="the net's prototxt")
+    parser.add_argument(
+        "--weights", required=True, metavar="WEIGHTS", help="the trained weights, several separated by commas"
+    )
+    parser.add_argument("--blob", required=True, metavar="BLOB", help="the blob")
+    parser.add_argument(
+        "--input", default="data", metavar="BLOB", help="the blob that the image goes into (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--shape", type=blob_shape, metavar="BLOB=N,C,H,W", help="its shape, if its data is not available"
+    )
+    add_steps(parser)
+
+
+def _add_maps(commands: Commands) -> None:
+    parser = commands.add_parser("maps", help="draw the maps of a blob for an image")
+    parser.set_defaults(function=_maps, **QUIET)
+    add_verbose(parser)
+    add_plugin(parser)
+    add_limit(parser)
+    _add_described_blob(parser)
+    parser.add_argument("--image", required=True, metavar="IMAGE", help="the image file")
+    _add_picture(parser)
+
+
 def _maps(arguments: argparse.Namespace) -> None:
     from netspec.inspect.draw.learned import maps_figure
     from netspec.inspect.draw.style import ending_of, write_figure
@@ -273,6 +376,22 @@ def _maps(arguments: argparse.Namespace) -> None:
     maps = net.values(net.inputs([image]))[0]
     write_figure(maps_figure(maps, image, f"{arguments.blob} of {Path(arguments.image).name}"), arguments.out)
     print(f"{arguments.out}: {arguments.blob} {maps.shape}")
+
+
+def _add_saliency(commands: Commands) -> None:
+    parser = commands.add_parser("saliency", help="draw which pixels matter for a number of a blob, or a distance")
+    parser.set_defaults(function=_saliency, **QUIET)
+    add_verbose(parser)
+    add_plugin(parser)
+    add_limit(parser)
+    _add_described_blob(parser)
+    parser.add_argument("--image", required=True, metavar="IMAGE", help="the image file")
+    parser.add_argument("--unit", type=int, metavar="K", help="which of the blob's numbers (default: the greatest)")
+    parser.add_argument("--to", metavar="IMAGE", help="instead: the distance of the blob to that of this image")
+    parser.add_argument(
+        "--samples", type=positive, default=16, metavar="N", help="average over N noisy copies (default: %(default)s)"
+    )
+    _add_picture(parser)
 
 
 def _saliency(arguments: argparse.Namespace) -> None:
@@ -295,6 +414,22 @@ def _saliency(arguments: argparse.Namespace) -> None:
     title = f"what matters for the {what}: {number(value)}"
     write_figure(saliency_figure(images, maps, title), arguments.out)
     print(f"{arguments.out}: {what}: {number(value)}")
+
+
+def _add_embedding(commands: Commands) -> None:
+    parser = commands.add_parser("embedding", help="draw descriptors in a plane, with the images as points")
+    parser.set_defaults(function=_embedding, **QUIET)
+    parser.add_argument("features", metavar="FEATURES.npz", help="what netspec extract wrote")
+    parser.add_argument(
+        "--array", default="", metavar="ARRAY", help="which array of the file (default: the first with descriptors)"
+    )
+    parser.add_argument(
+        "--images", metavar="FOLDER|LIST|DB", help="the images: a folder, a list, or the records' database"
+    )
+    parser.add_argument(
+        "--method", default="pca", choices=["pca", "tsne"], help="how to find the plane (default: %(default)s)"
+    )
+    _add_picture(parser)
 
 
 def _embedding(arguments: argparse.Namespace) -> None:

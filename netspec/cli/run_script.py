@@ -5,25 +5,21 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
+from pathlib import Path
 
+from netspec.cli.arguments import add_limit, add_plugin
 from netspec.terminal.commands import VARIABLE, WrongUsage, refuse
+from netspec.terminal.parser import NO_LOG, Commands
 
-NAME, USAGE = "run", "netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]"
+NAME = "run"
 _WITH_VALUE = ("--plugin", "--write-py3", "--minloglevel", "--limit")
 
 
-TABLE = """
-run silent built                   run a Python script; in it `import caffe` finds netspec
-  --shadow-caffe                   use netspec also where a real Caffe is installed
-  --python2                        translate from Python 2, also what runs as Python 3
-  --write-py3 F.py                 only write a script of Python 2 as Python 3
-  -m                               run a module, as python -m does
-install-caffe                      put a package `caffe` and Caffe's commands into this Python environment
-  --replace                        move a real Caffe that is in the way aside
-  --build FOLDER                   only make FOLDER/tools/caffe and so on, for scripts
-remove-caffe                       undo install-caffe
-  --build FOLDER                   undo install-caffe --build FOLDER
-"""
+def add_commands(commands: Commands) -> None:
+    """Add the commands of this module."""
+    _add_run(commands)
+    _add_install_caffe(commands)
+    _add_remove_caffe(commands)
 
 
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -36,6 +32,21 @@ def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
             break
         position += name in _WITH_VALUE
     return list(words[:position]), list(words[position:])
+
+
+def _add_run(commands: Commands) -> None:
+    parser = commands.add_parser(
+        NAME,
+        help="run a Python script; in it `import caffe` finds netspec",
+        usage="netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]",
+    )
+    parser.set_defaults(function=_run, **NO_LOG)
+    add_plugin(parser)
+    add_limit(parser)
+    parser.add_argument("--shadow-caffe", action="store_true", help="use netspec also where a real Caffe is installed")
+    parser.add_argument("--python2", action="store_true", help="translate from Python 2, also what runs as Python 3")
+    parser.add_argument("--write-py3", type=Path, metavar="F.py", help="only write a script of Python 2 as Python 3")
+    parser.add_argument("-m", action="store_true", help="run a module, as python -m does")
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -61,6 +72,17 @@ def _run(arguments: argparse.Namespace) -> None:
     run_script(name, own, options)
 
 
+def _add_install_caffe(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "install-caffe", help="put a package `caffe` and Caffe's commands into this Python environment"
+    )
+    parser.set_defaults(function=_install_caffe)
+    parser.add_argument("--replace", action="store_true", help="move a real Caffe that is in the way aside")
+    parser.add_argument(
+        "--build", type=Path, metavar="FOLDER", help="only make FOLDER/tools/caffe and so on, for scripts"
+    )
+
+
 def _install_caffe(arguments: argparse.Namespace) -> None:
     from netspec.compat.scripts.environment import install_caffe, make_build_folder
 
@@ -73,6 +95,12 @@ def _install_caffe(arguments: argparse.Namespace) -> None:
         print(f"scripts find Caffe's commands in {arguments.build}; netspec remove-caffe --build undoes this")
     else:
         print("import caffe and Caffe's commands are netspec's now; netspec remove-caffe undoes this")
+
+
+def _add_remove_caffe(commands: Commands) -> None:
+    parser = commands.add_parser("remove-caffe", help="undo install-caffe")
+    parser.set_defaults(function=_remove_caffe)
+    parser.add_argument("--build", type=Path, metavar="FOLDER", help="undo install-caffe --build FOLDER")
 
 
 def _remove_caffe(arguments: argparse.Namespace) -> None:

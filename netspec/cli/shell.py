@@ -8,26 +8,36 @@ from pathlib import Path
 
 from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
+from netspec.terminal.parser import NO_LOG, QUIET, Commands
 
 WORDS = (None, str, Path)  # the types of values that may be names of files
 
 
-TABLE = """
-completion silent                  print a shell's completion
-  shell {bash|zsh|fish}            the shell
-bug-report quiet                  collect versions, and files' shapes without weights or images, for a report of a fault
-  [files...] FILE                  prototxt, weights, database, log: what the fault is about
-  --out F.md                       write the report here (default: print it)
-"""
+def add_commands(commands: Commands) -> None:
+    """Add the commands of this module."""
+    _add_completion(commands)
+    _add_bug_report(commands)
+
+
+COMPLETION = """Print what makes a shell complete the commands of netspec.
+
+bash: netspec completion bash > ~/.local/share/bash-completion/completions/netspec
+zsh:  netspec completion zsh > a file _netspec in a folder of $fpath
+fish: netspec completion fish > ~/.config/fish/completions/netspec.fish"""
+
+
+def _add_completion(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "completion",
+        help="print a shell's completion",
+        description=COMPLETION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(function=_completion, **NO_LOG)
+    parser.add_argument("shell", choices=["bash", "zsh", "fish"], help="the shell")
 
 
 def _completion(arguments: argparse.Namespace) -> None:
-    """Print what makes a shell complete the commands of netspec.
-
-    bash: netspec completion bash > ~/.local/share/bash-completion/completions/netspec
-    zsh:  netspec completion zsh > a file _netspec in a folder of $fpath
-    fish: netspec completion fish > ~/.config/fish/completions/netspec.fish
-    """
     from netspec.cli import parser  # which makes the parser of all commands, this one among them
 
     try:
@@ -48,6 +58,17 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
         if isinstance(action, argparse._SubParsersAction):
             for command in action.choices.values():
                 yield from _actions(command)
+
+
+def _add_bug_report(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "bug-report", help="collect versions, and files' shapes without weights or images, for a report of a fault"
+    )
+    parser.set_defaults(function=_bug_report, **QUIET)
+    parser.add_argument(
+        "files", nargs="*", default=[], metavar="FILE", help="prototxt, weights, database, log: what the fault is about"
+    )
+    parser.add_argument("--out", metavar="F.md", help="write the report here (default: print it)")
 
 
 def _bug_report(arguments: argparse.Namespace) -> None:

@@ -47,7 +47,7 @@ class Watched(argparse.Namespace):
     read: ClassVar[set[str]] = set()
 
     def __getattribute__(self, name: str) -> object:
-        if name == "run":  # from here on the command itself
+        if name == "function":  # from here on the command itself
             Watched.read = set()
         Watched.read.add(name)
         return super().__getattribute__(name)

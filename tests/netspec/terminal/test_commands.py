@@ -10,12 +10,14 @@ import pytest
 
 from netspec import cli, log
 from netspec.errors import SpecError, Where
-from netspec.terminal.commands import Commands, WrongUsage, refuse, run
+from netspec.terminal.commands import WrongUsage, refuse, run
+from netspec.terminal.parser import Commands, Parser
 
 
-def command(function: Callable[[argparse.Namespace], int | None]) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("program", allow_abbrev=False)
-    added = Commands(parser).add("convert", function, "a command")
+def command(function: Callable[[argparse.Namespace], int | None]) -> Parser:
+    parser = Parser("program")
+    added = Commands(parser).add_parser("convert", help="a command")
+    added.set_defaults(function=function)
     added.add_argument("--gray", action="store_true", help="read images as gray")
     added.add_argument("--train", action="store_true", default=True)
     added.add_argument("--check_size", action="store_true")
@@ -133,6 +135,23 @@ def test_an_option_that_was_typed_can_be_refused(capsys: pytest.CaptureFixture[s
     for words, status in ((["-shift=0"], 2), (["-nogray"], 2), (["--", "--shift"], 0), (["-resize_width", "3"], 0)):
         assert run(made, ["convert", *words]) == status
     assert "program convert: error: --shift is for others\n" in capsys.readouterr().err
+
+
+def test_the_options_of_a_command_in_a_group_are_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    """A group of commands does not know their options: it once took -v for glog's, with the word after it."""
+    parser = Parser("program")
+    group = Commands(parser).add_group("look", help="commands that draw")
+    maps = group.add_parser("maps", help="draw maps")
+    found: list[argparse.Namespace] = []
+    maps.set_defaults(function=found.append)
+    maps.add_argument("-v", action="store_true")
+    maps.add_argument("--out")
+    assert run(parser, ["look", "maps", "-v", "-out", "a.png", "-vmodule", "x=1"]) == 0
+    assert (found[0].v, found[0].out) == (True, "a.png")
+    assert (
+        capsys.readouterr().err
+        == "program look maps: -vmodule is a flag of Caffe's or glog's that has no effect here\n"
+    )
 
 
 # The log

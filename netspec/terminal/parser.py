@@ -1,0 +1,239 @@
+"""An argparse parser that reads options as gflags does, for the commands of all programs.
+
+Options have one dash or two, ``-flag value`` or ``-flag=value``. A Boolean flag is ``-flag``, ``-noflag``,
+``-flag=true`` or ``-flag=false``; it never takes the next argument. Everything else is argparse.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+from netspec import log
+from netspec.errors import did_you_mean
+from netspec.terminal.commands import FAULT, version
+
+TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
+
+# The defaults of a command (``parser.set_defaults``) that decide what its log shows.
+CAFFES_LOG = {"log_level": logging.INFO, "log_form": log.GlogFormatter()}
+QUIET = {"log_level": logging.WARNING, "log_form": logging.Formatter("warning: %(message)s")}
+NO_LOG = {"log_level": logging.WARNING, "log_form": None}
+
+# Flags that gflags gives every command of Caffe, and glog's. A command that lacks one accepts it and says that it has
+# no effect, so that scripts written for Caffe run.
+_CAFFES_COMMANDS = ("train", "test", "time", "device_query")
+_CAFFES_FLAGS = (
+    "gpu",
+    "solver",
+    "model",
+    "phase",
+    "level",
+    "stage",
+    "snapshot",
+    "weights",
+    "iterations",
+    "sigint_effect",
+    "sighup_effect",
+)
+_GLOGS_FLAGS = (
+    "v",
+    "vmodule",
+    "stderrthreshold",
+    "logbuflevel",
+    "logbufsecs",
+    "max_log_size",
+    "log_link",
+    "logfile_mode",
+)
+_GLOGS_SWITCHES = ("colorlogtostderr", "log_prefix", "stop_logging_if_full_disk", "log_backtrace_at")
+
+
+def program(name: str, description: str) -> Parser:
+    """Return the parser of a program, which has ``--version``; :class:`Commands` adds its commands."""
+    parser = Parser(prog=name, description=description)
+    parser.add_argument("-help", action="help", help=argparse.SUPPRESS)
+    parser.add_argument("--version", "-version", nargs=0, action=_Version, help="show the version and exit")
+    return parser
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser with gflags' spellings, without abbreviations; it suggests what a mistyped word was meant to be.
+
+    An argument with ``action="store_true"`` is a Boolean flag in all spellings of gflags. The namespace of a command
+    has ``given``: the options that were typed, by their names in the namespace, each as it was spelled.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, allow_abbrev=False, **options)
+        self.register("action", "store_true", _Switch)
+        self._has_commands = False
+
+    def add_subparsers(self, **options: Any) -> Any:
+        """Add what holds the commands; from then on their parsers, not this one, read the spellings of gflags."""
+        self._has_commands = True
+        return super().add_subparsers(**options)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse as argparse does, after the words were translated; an unknown option is an error with a hint."""
+        if self._has_commands:
+            return super().parse_known_args(args, namespace)
+        words = [self._translated(word) for word in self._without_effect(list(args or ()))]
+        found, unknown = super().parse_known_args(words, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{self._suggestion(unknown)}")
+        found.given = {
+            action.dest: word.partition("=")[0].lstrip("-")
+            for word in takewhile(lambda word: word != "--", words)
+            if (action := self._option_string_actions.get(word.partition("=")[0]))
+        }
+        return found, unknown
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
+            hint = did_you_mean(value, list(action.choices)) or f"; see {self.prog} --help"
+            self.error(f'there is no command "{value}"{hint}')
+        super()._check_value(action, value)
+
+    def _without_effect(self, words: list[str]) -> Iterator[str]:
+        """Yield the words, and those of a ``-flagfile``, without the flags of Caffe and glog that have no effect."""
+        caffes = _CAFFES_FLAGS if self.prog.split()[-1] in _CAFFES_COMMANDS else ()
+        own = {name.lstrip("-") for name in self._option_string_actions}
+        while words:
+            word = words.pop(0)
+            name, equals, value = word.lstrip("-").partition("=")
+            if not word.startswith("-") or word == "--" or name in own:
+                yield word
+                if word == "--":
+                    yield from words
+                    return
+            elif name == "flagfile":
+                path = value if equals else words.pop(0) if words else ""
+                try:
+                    lines = Path(path).read_text("utf-8", "replace").splitlines()
+                except OSError as fault:
+                    self.error(f"-flagfile {path}: {fault.strerror}")
+                words = [line.strip() for line in lines if line.strip().startswith("-")] + words
+            elif name in _GLOGS_FLAGS + caffes or name.removeprefix("no") in _GLOGS_SWITCHES:
+                if not equals and name in _GLOGS_FLAGS + caffes and words:
+                    words.pop(0)
+                print(f"{self.prog}: -{name} is a flag of Caffe's or glog's that has no effect here", file=sys.stderr)
+            else:
+                yield word
+
+    def _suggestion(self, unknown: Sequence[str]) -> str:
+        """Return a hint at the option that is most like the first unknown one."""
+        wrong = next((word for word in unknown if word.startswith("-")), "").partition("=")[0].lstrip("-")
+        names = [name[2:] for name in self._option_string_actions if name.startswith("--")]
+        meant = did_you_mean(wrong, names)
+        return meant.replace('mean "', 'mean "--') if wrong else ""
+
+    def _translated(self, word: str) -> str:
+        """Return ``-flag`` as ``--flag``, and a Boolean flag as ``--flag`` or ``--noflag``."""
+        if not re.match(r"--?[A-Za-z_]\w", word):  # argparse knows options of one letter; -1 is a number
+            return word
+        word = word.lstrip("-")
+        name, equals, value = word.partition("=")
+        switches = {action.name: action for action in self._actions if isinstance(action, _Switch)}
+        if name in switches:
+            truth = value.lower() if equals else "true"
+            if truth not in TRUE + FALSE:
+                self.error(f"argument --{name}: found {value!r}, expected true or false")
+            return switches[name].on if truth in TRUE else switches[name].off
+        if name.startswith("no-") and name[3:] in switches and not equals:
+            return switches[name[3:]].off
+        return "--" + word
+
+
+class Commands:
+    """The commands of a parser. Its help lists them below headings.
+
+    ``heading`` is the heading of the commands that are added next. ``defaults`` are those of every command, as
+    ``parser.set_defaults`` takes them, for example ``**QUIET``.
+    """
+
+    def __init__(self, parser: Parser, **defaults: Any) -> None:
+        self.heading = "commands"
+        self._parser = parser
+        self._defaults = {**CAFFES_LOG, **defaults}
+        self._listed: dict[str, list[str]] = {}
+        self._subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+        parser.formatter_class = _Overview
+
+    def add_parser(self, name: str, *, help: str, **options: Any) -> Parser:
+        """Add a command as argparse's ``add_parser`` does, with glog's flags; ``help`` is its description too.
+
+        The command sets the default ``function``, which is called with the namespace and returns the exit status, or
+        None for 0. ``prepare``, if it is set, is called first. ``fault_status`` is the exit status for a fault in the
+        user's files.
+        """
+        parser = self._add(name, help=help, **options)
+        parser.set_defaults(prog=parser.prog, prepare=None, fault_status=FAULT, **self._defaults)
+        parser.add_argument("--minloglevel", type=int, choices=range(4), help=argparse.SUPPRESS)
+        parser.add_argument("-q", dest="minloglevel", action="store_const", const=1, help=argparse.SUPPRESS)
+        for flag in ("--logtostderr", "--alsologtostderr"):  # it always does
+            parser.add_argument(flag, action="store_true", help=argparse.SUPPRESS)
+        parser.add_argument("--log_dir", help=argparse.SUPPRESS)
+        return parser
+
+    def add_group(self, name: str, *, help: str) -> Commands:
+        """Add a command that has commands of its own, and return these."""
+        return Commands(self._add(name, help=help), **self._defaults)
+
+    def _add(self, name: str, *, help: str, **options: Any) -> Parser:
+        self._listed.setdefault(self.heading, []).append(f"  {name:25} {help}")
+        lists = ("\n".join((f"{heading}:", *lines)) for heading, lines in self._listed.items())
+        self._parser.epilog = "\n\n".join([*lists, "Every command takes -q, for warnings and errors only."])
+        return self._subparsers.add_parser(name, help=help, **{"description": help, **options})
+
+
+class _Overview(argparse.RawDescriptionHelpFormatter):
+    """The help of a program, whose epilog lists the commands."""
+
+    def _iter_indented_subactions(self, action: argparse.Action) -> Iterator[argparse.Action]:
+        return iter(())
+
+
+class _Version(argparse.Action):
+    """Show the version."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object, **__: object) -> None:
+        print(f"{parser.prog} {version()}")
+        parser.exit()
+
+
+class _Switch(argparse.Action):
+    """A Boolean flag: ``--flag`` and ``--noflag``; ``--no-flag`` and ``--flag``."""
+
+    def __init__(
+        self, option_strings: Sequence[str], dest: str, default: bool = False, help: str | None = None
+    ) -> None:
+        (self.on,) = option_strings
+        self.name = self.on[2:]
+        self.off = f"--{self.name[3:]}" if self.name.startswith("no-") else f"--no{self.name}"
+        super().__init__([self.on, self.off], dest, nargs=0, default=default, help=help)
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        setattr(namespace, self.dest, option_string == self.on)
+
+
+def seed(text: str) -> int:
+    """Read a seed of random numbers, from 0."""
+    value = int(text)
+    if not 0 <= value < 2**31:
+        raise argparse.ArgumentTypeError(f"found {text}, expected a number from 0 to {2**31 - 1}")
+    return value
+
+
+def above_zero(text: str) -> float:
+    """Read a number above 0."""
+    value = float(text)
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"found {text}, expected a number above 0")
+    return value
