@@ -22,7 +22,7 @@ from loopclosure.detector.verification import GeometricCheck
 from loopclosure.detector.visitor import Visitor
 from loopclosure.index.index import INDEXES
 from loopclosure.methods.auto import PRECISION
-from loopclosure.methods.drive import last_session, whole_drive
+from loopclosure.methods.drive import last_session, later_threshold, whole_drive
 from loopclosure.methods.features import WhitenBy
 from loopclosure.places.frames import live_frames
 from loopclosure.places.image_sequence import ImageSequence
@@ -150,6 +150,8 @@ def _detect(a: argparse.Namespace) -> None:
         found = whole_drive(detector, recording, features, precision, bar, odometry, a.exclude_recent)
         results = found.results
         reasons = [*found.reasons, run.verdicts_said(results)]
+        if a.save:
+            detector.decided(detector.loops, later_threshold(detector, found.accepted))
     else:
         results = run.run_detector(detector, recording, features, bar)
         reasons = [run.verdicts_said(results)]
@@ -313,8 +315,8 @@ def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
     print(f"{len(into)} frames in {sessions} session{'s' * (sessions != 1)}: {into.folder}")
 
 
-def _decided(detector: LoopDetector, results: list[LoopResult], own: bool = True) -> list[LoopResult]:
-    found = last_session(detector, results, progress=bar, own=own)
+def _decided(detector: LoopDetector, own: bool = True) -> list[LoopResult]:
+    found = last_session(detector, progress=bar, own=own)
     for limit in found.limits:
         warn(limit)
     return found.results
@@ -334,7 +336,8 @@ def _query(a: argparse.Namespace) -> None:
     recording = recording_of(a.source, out / "frames")
     detector, before = known.detector(run.load_describe(known.describer), a.index), len(known)
     if a.index in INDEXES:  # in memory: frames that are added are not in the map
-        results = _decided(detector, run.run_detector(detector, recording, progress=bar), own=False)
+        run.remember_all(detector, recording, progress=bar)
+        results = _decided(detector, own=False)
         results = [replace(result, query_id=result.query_id - before) for result in results]
     else:
         results = run.run_detector(Visitor(detector), recording, progress=bar)

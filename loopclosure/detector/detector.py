@@ -123,20 +123,55 @@ class LoopDetector:
         position = _checked_pose(pose)
         row = self._row(descriptor)
         self._check_stamp(stamp)
-        frames = self._frames
-        frames.settle(self._end(stamp))
+        self._frames.settle(self._end(stamp))
         candidates = self._candidates(row, False)
         local = self._local(image)
         result, self._runs = self._decide(len(self), candidates, stamp, local, self._runs)
-        if len(self) > self._sessions[-1]:
-            self._steps.append(float(self._score(self._last, row)))
-        self._last = row
-        frames.append(row, stamp, position)
-        if local is not None:
-            frames.local.append(local)
+        self._keep(row, stamp, position, local)
         if result.accepted is not None:
             self.loops.append(result)
         return result
+
+    def remember(
+        self,
+        descriptor: Sequence[float] | np.ndarray | None,
+        stamp: float | None = None,
+        pose: Sequence[float] | np.ndarray | None = None,
+        image: np.ndarray | None = None,
+    ) -> None:
+        """Add the next frame and decide nothing: for a drive that is decided as a whole when it is over.
+
+        descriptor  (D,), or None: ``describe`` makes it of ``image``
+        image       (H, W, 3) uint8 BGR; also needed for a geometric check
+        """
+        if descriptor is None:
+            if self.describe is None or image is None:
+                raise InputError("a frame has neither a descriptor nor an image that can be described")
+            descriptor = self.describe(image)
+        position = _checked_pose(pose)
+        row = self._row(descriptor)
+        self._check_stamp(stamp)
+        self._runs = []
+        self._keep(row, stamp, position, self._local(image))
+
+    def look_up(self, frame: int) -> LoopResult:
+        """Look for the place of a remembered frame of the last session in the sessions before it."""
+        row = self.descriptors_of(frame, frame + 1).reshape(self.settings.views, -1)
+        local = None if self.check is None else self.local_features(frame)
+        stamp = float(self._frames.stamps[frame])
+        before = self._sessions[-1]
+        known = [(number, score) for number, score in self._candidates(row, False) if number < before]
+        return self._decide(frame, known, None if np.isnan(stamp) else stamp, local, [])[0]
+
+    def _keep(
+        self, row: np.ndarray, stamp: float | None, position: np.ndarray | None, local: LocalFeatures | None
+    ) -> None:
+        if len(self) > self._sessions[-1]:
+            self._steps.append(float(self._score(self._last, row)))
+        self._last = row
+        self._frames.append(row, stamp, position)
+        if local is not None:
+            self._frames.local.append(local)
 
     def looked_up(
         self,

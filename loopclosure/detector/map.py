@@ -23,7 +23,7 @@ from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import Describe, LoopDetector, fingerprint_of, refuse_another
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.frames import Points, points_of
-from loopclosure.detector.run import NAME, run_detector, views_of
+from loopclosure.detector.run import NAME, remember_all, run_detector, views_of
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.index.index import INDEXES, open_index
@@ -38,7 +38,7 @@ METRIC = "euclidean"
 COMPONENTS = 256  # of a projected descriptor
 LEARNED_FROM = 2048  # frames, evenly spread; fewer are compared as they are
 BLOCK = 4096  # frames that are read at a time
-Decide = Callable[[LoopDetector, list[LoopResult]], list[LoopResult]]
+Decide = Callable[[LoopDetector], list[LoopResult]]
 # Of the nets of versions 0.2.0 and 0.3.0, whose maps do not say it.
 OLDER = {"default": "63cb899e0703cb96", "small": "2e195dd29a635c6c"}
 MAPPED = ("rows", "points", "descriptors")  # arrays in files of their own, read where they are used
@@ -154,19 +154,24 @@ class Map:
         describe: Describe,
         index: str = "exact",
         progress: Progress = silent,
-        decide: Decide = lambda detector, results: results,
+        decide: Decide | None = None,
     ) -> list[LoopResult]:
         """Add a recording as a session; return what each of its frames found, in all sessions and in its own.
 
-        ``decide`` says which are loops, of the detector with all frames and of what each found when it came. Its loops
-        are in ``loops.csv`` of its folder. Raises InputError, and adds nothing, where another process is adding.
+        ``decide`` says which are loops, of a detector that has all frames; None: each is decided when it comes. The
+        loops are in ``loops.csv`` of the session's folder. Raises InputError, and adds nothing, where another process
+        is adding.
         """
         with only_one(self.folder / ".lock", "wait until it has ended"):
             self._read_sessions()  # what others have added
             described = _Described(describe, self._projection(index))
             detector = self._detector(described, index)
             before = len(detector)
-            results = decide(detector, run_detector(detector, recording, progress=progress))
+            if decide is None:
+                results = run_detector(detector, recording, progress=progress)
+            else:
+                remember_all(detector, recording, progress=progress)
+                results = decide(detector)
             recording = recording.readable()
             rows = np.array(described.kept)
             folder = self.folder / f"{len(self.sessions):06d}"

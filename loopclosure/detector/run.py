@@ -6,7 +6,7 @@ import importlib
 import importlib.util
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, cast
@@ -40,23 +40,42 @@ def run_detector(
 
     Images that cannot be read are left out: the frames are then those of ``sequence.readable()``.
     """
+    results = []
+    for row, image, stamp, pose in _described(sequence, features, detector.check is not None, progress):
+        if row is not None:
+            results.append(detector.add_descriptor(row, stamp, pose, image))
+        else:
+            assert image is not None
+            results.append(detector.add(image, stamp, pose))
+    return results
+
+
+def remember_all(
+    detector: LoopDetector, sequence: ImageSequence, features: Features | None = None, progress: Progress = silent
+) -> None:
+    """Do as :func:`run_detector`, but decide nothing: the drive is decided as a whole when it is over."""
+    for row, image, stamp, pose in _described(sequence, features, detector.check is not None, progress):
+        detector.remember(row, stamp, pose, image)
+
+
+def _described(
+    sequence: ImageSequence, features: Features | None, checked: bool, progress: Progress
+) -> Iterator[tuple[np.ndarray | None, np.ndarray | None, float | None, np.ndarray | None]]:
+    """Yield the descriptor, the image, the stamp and the pose of each frame, as far as they are needed and known.
+
+    ``checked``: a geometric check needs the images even where their descriptors are known.
+    """
     rows = None
     if features is not None:
         if not sequence.paths:
             raise InputError("the frames of a video have no names to find features by; use --describe", features.path)
         rows = features.rows_of(sequence.paths)
-    results = []
-    if rows is not None and detector.check is None:
+    if rows is not None and not checked:
         for i, row in enumerate(progress(rows, "frames", len(rows))):
-            stamp = None if sequence.stamps is None else float(sequence.stamps[i])
-            results.append(detector.add_descriptor(row, stamp, _pose(sequence, i)))
-        return results
+            yield row, None, None if sequence.stamps is None else float(sequence.stamps[i]), _pose(sequence, i)
+        return
     for i, image, stamp in progress(sequence.frames(), "frames", len(sequence)):
-        if rows is None:
-            results.append(detector.add(image, stamp, _pose(sequence, i)))
-        else:
-            results.append(detector.add_descriptor(rows[i], stamp, _pose(sequence, i), image))
-    return results
+        yield None if rows is None else rows[i], image, stamp, _pose(sequence, i)
 
 
 def verdicts_said(results: Sequence[LoopResult]) -> str:

@@ -12,7 +12,7 @@ from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.run import run_detector
+from loopclosure.detector.run import remember_all
 from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.auto import PRECISION, Answer, answer
@@ -40,10 +40,9 @@ def whole_drive(
     """Add every frame of a recording to a new detector, then decide with all of them in view which close loops.
 
     ``odometry`` are poses (frames, 7), NaN where not known; ``visit`` is that of
-    :func:`loopclosure.methods.auto.answer`. The detector gets these loops, and for frames to come the
-    least threshold that accepts none of this drive's others.
+    :func:`loopclosure.methods.auto.answer`. The detector gets these loops.
     """
-    single = np.array([result.score for result in run_detector(detector, recording, features, progress)])
+    remember_all(detector, recording, features, progress)
     if recording.unreadable and odometry is not None:
         odometry = np.delete(odometry, recording.unreadable, axis=0)
     recording = recording.readable()
@@ -53,15 +52,34 @@ def whole_drive(
         pairs = Pairs({number: check.describe(gray(image)) for number, image, _ in frames}.__getitem__)
     seconds, between = detector.settings.exclude_seconds, Between(check, pairs, (), ())
     found = _among(detector, 0, len(detector), between, precision, progress, odometry, visit, seconds)
-    others = float(np.max(single[~found.accepted], initial=-np.inf))
-    above = single[found.accepted & (single > others)]
-    detector.decided([result for result in found.results if result], above.min() if len(above) else None)
+    detector.decided([result for result in found.results if result], None)
     return replace(found, reasons=[*found.limits, *found.reasons])
+
+
+def later_threshold(detector: LoopDetector, accepted: np.ndarray) -> float | None:
+    """Return a threshold for the frames that come after a drive that was decided as a whole.
+
+    It is the least score, frame by frame, of an ``accepted`` frame (N,) that is above those of all frames that were not
+    accepted; None if there is none.
+    """
+    settings, rows, stamps = detector.settings, detector.descriptors, detector.stamps
+    exclusion = Exclusion(settings.exclude_recent, settings.exclude_seconds)
+    single = np.full(len(rows), -np.inf)
+    for start in range(0, len(rows), BLOCK):
+        stop = min(start + BLOCK, len(rows))
+        scores = similarity_matrix(rows[start:stop], rows[:stop], settings.metric, settings.views)
+        queries, references = np.arange(start, stop), np.arange(stop)
+        scores[exclusion.excludes(queries, references, stamps[start:stop], stamps[:stop])] = -np.inf
+        scores[references >= queries[:, None]] = -np.inf
+        single[start:stop] = scores.max(axis=1)
+    others = float(np.max(single[~accepted], initial=-np.inf))
+    above = single[accepted & (single > others)]
+    return float(above.min()) if len(above) else None
 
 
 def last_session(
     detector: LoopDetector,
-    results: list[LoopResult],
+    results: list[LoopResult] | None = None,
     precision: float = PRECISION,
     progress: Progress = silent,
     visit: int | None = None,
@@ -71,29 +89,36 @@ def last_session(
     """Decide on the last session of a detector that verifies, with all of its frames in view.
 
     It is compared with each session before as two traverses and, if ``own``, with itself as one drive in which a visit
-    lasts ``visit`` frames (see :func:`loopclosure.methods.auto.answer`) and at least ``seconds``. ``results`` are what
-    its frames found when they came. Of more earlier sessions than are compared at once, those are in which most frames
-    have their best candidate; loops with the others stay as they were found.
+    lasts ``visit`` frames (see :func:`loopclosure.methods.auto.answer`) and at least ``seconds``. Of more earlier
+    sessions than are compared at once, those are in which most frames have their best candidate; in the others each
+    frame is looked up by itself. ``results`` are what the frames found when they came; None: they were remembered.
     """
     *earlier, (begin, count) = pairwise([*detector.sessions, len(detector)])
+    together = detector.check is not None and bool(earlier or own)
+    if results is None and (not together or begin * (count - begin) > MOST_PAIRS):
+        frames = progress(range(begin, count), "looking up", count - begin)
+        results = [detector.look_up(frame) for frame in frames]
     if detector.check is None or begin == count:
-        return Answer(results, ["nothing can be verified: decided frame by frame"])
-    alike = np.array([result.candidates[0][0] for result in results if result.candidates])
-    earlier.sort(key=lambda span: -np.count_nonzero((alike >= span[0]) & (alike < span[1])))
-    pairs = np.cumsum([0, *((end - first) * (count - begin) for first, end in earlier)])
-    compared = earlier[: np.count_nonzero(pairs[:-1] < MOST_PAIRS)]
+        return Answer(results or [], ["nothing can be verified: decided frame by frame"])
+    compared, left = earlier, []
+    if results is not None:
+        alike = np.array([result.candidates[0][0] for result in results if result.candidates])
+        earlier.sort(key=lambda span: -np.count_nonzero((alike >= span[0]) & (alike < span[1])))
+        pairs = np.cumsum([0, *((end - first) * (count - begin) for first, end in earlier)])
+        many = np.count_nonzero(pairs[:-1] < MOST_PAIRS)
+        compared, left = earlier[:many], earlier[many:]
     between = Between(detector.check, Pairs(detector.local_features), (), ())
     found, limits, reasons = list[list[LoopResult]](), list[str](), list[str]()
     for first, end in [*compared, (begin, count)][: None if own else -1]:
         answered = _among(detector, first, end, between, precision, progress, None, visit, seconds)
         found, limits, reasons = [*found, answered.results], [*limits, *answered.limits], answered.reasons
-    if left := earlier[len(compared) :]:
+    if results is not None and left:
         elsewhere = [any(first <= (result.accepted or 0) < end for first, end in left) for result in results]
         none = {"candidates": [], "accepted": None, "score": -np.inf, "inliers": None}
         found.append([r if r and kept else replace(r, **none) for r, kept in zip(results, elsewhere, strict=True)])
         limits.append(f"{len(earlier)} sessions {TOO_MANY}: {len(left)} are looked at frame by frame")
     best = [max(each, key=lambda r: (bool(r), r.inliers or 0, r.score)) for each in zip(*found, strict=True)]
-    return Answer(best or results, [*limits, *reasons], limits)
+    return Answer(best or results or [], [*limits, *reasons], limits)
 
 
 def _among(

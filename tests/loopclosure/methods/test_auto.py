@@ -429,3 +429,19 @@ def test_of_a_longer_drive_than_is_compared_at_once_every_second_frame_decides(m
     assert np.count_nonzero(found.accepted[220:]) > 120
     assert np.all(np.abs(found.match + 220 - np.arange(len(rows)))[found.accepted] <= 3)
     assert [result.query_id for result in found.results] == list(range(len(rows)))
+
+
+def test_a_remembered_drive_is_decided_once_and_has_a_threshold_for_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is decided when a frame comes; the threshold is that of a detector that looks up frame by frame."""
+    road = drive(80, 7)
+    rows = np.concatenate([road, drive(60, 8), again(road, 0.3, 10)]).astype(np.float32)
+    monkeypatch.setattr(LoopDetector, "_decide", None)
+    detector, paths = LoopDetector(exclude_recent=20), [Path(f"{number}.png") for number in range(len(rows))]
+    found = whole.whole_drive(detector, ImageSequence.of_files(paths), Features(Path("rows.npz"), rows))
+    assert len(detector.loops) == np.count_nonzero(found.accepted) > 60
+    later = whole.later_threshold(detector, found.accepted)
+    monkeypatch.undo()
+    online = LoopDetector(exclude_recent=20, threshold=-np.inf)
+    single = np.array([online.add_descriptor(row).score for row in rows])
+    others = single[~found.accepted].max()
+    assert later == pytest.approx(single[found.accepted & (single > others)].min(), rel=1e-4)
