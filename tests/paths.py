@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "golden"
-PYTHON_LAYERS = ROOT / "tests" / "python_layers.txt"  # a module of them
+PYTHON_LAYERS = ROOT / "tests" / "python_layers.py"  # a module of them
 SHARED = Path(os.environ.get("NETSPEC_SHARED", ROOT.parent / "shared"))
 
 

@@ -15,11 +15,28 @@ import torch
 
 import documents
 import places_layouts
-from case_files import read_texts
 from paths import GOLDEN, ROOT
 
 FRAMES = 60
-NET, DATA, SOLVER, SCRIPT = read_texts("playground.txt").values()
+NET = """name: "tiny"
+%s
+layer {
+  name: "conv1" type: "Convolution" bottom: "data" top: "conv1"
+  convolution_param { num_output: 8 kernel_size: 5 stride: 4 bias_term: false weight_filler { type: "msra" } }
+}
+layer { name: "bn1" type: "BatchNorm" bottom: "conv1" top: "conv1" }
+layer { name: "scale1" type: "Scale" bottom: "conv1" top: "conv1" scale_param { bias_term: true } }
+layer { name: "relu1" type: "ReLU" bottom: "conv1" top: "conv1" }
+layer { name: "pool1" type: "Pooling" bottom: "conv1" top: "pool1" pooling_param { pool: AVE global_pooling: true } }
+layer {
+  name: "feat" type: "InnerProduct" bottom: "pool1" top: "feat"
+  inner_product_param { num_output: 4 weight_filler { type: "xavier" } }
+}
+%s
+"""
+DATA = (Path(__file__).parent / "nets" / "data.prototxt").read_text()
+SOLVER = (Path(__file__).parent / "nets" / "solver.prototxt").read_text()
+SCRIPT = (Path(__file__).parent / "programs" / "script.py").read_text()
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 dim: 32 dim: 32 } } }'
 LOSS = 'layer { name: "loss" type: "SoftmaxWithLoss" bottom: "feat" bottom: "label" top: "loss" }'
 PROB = 'layer { name: "prob" type: "Softmax" bottom: "feat" top: "prob" }'

@@ -20,7 +20,6 @@ import lmdb
 import numpy as np
 import scipy.io
 
-from case_files import read_texts
 from faults import recordings, written
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.descriptors.feature_file import read_features
@@ -53,7 +52,9 @@ from netspec.solver.checks import check_settings
 from netspec.solver.extra import Extra, changes, read_extra, resume, write_extra
 from netspec.solver.snapshot import State, read_state, write_state
 
-NET, LAYERS, SOLVER = read_texts("faults/formats.txt").values()
+NET = (Path(__file__).parent / "nets" / "formats.prototxt").read_text()
+LAYERS = (Path(__file__).parent / "nets" / "layers.prototxt").read_text()
+SOLVER = (Path(__file__).parent / "nets" / "solver.prototxt").read_text()
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,55 @@ from pathlib import Path
 
 import pytest
 
-from case_files import read_texts
 from paths import ROOT
 
 pytestmark = pytest.mark.slow
 
-CODE, IMPORTED, MANGLED, THROUGH_C, LATE = read_texts("faults/signals.txt").values()
+CODE = """
+import argparse, sys, time
+from netspec.terminal.commands import Commands, run
+
+def endless(arguments):
+    try:
+        print("begun", flush=True)
+        while True:
+            time.sleep(0.01)
+    finally:
+        print("ending", flush=True)
+        time.sleep({cleaning})
+
+parser = argparse.ArgumentParser()
+Commands(parser).add("endless", endless, "")
+sys.exit(run(parser, ["endless"]))
+"""
+IMPORTED = """
+import sys
+
+class Slow:
+    def find_spec(self, name, path, target=None):
+        if name == "{package}.cli":
+            import time
+            print("begun", flush=True)
+            time.sleep(60)
+
+sys.meta_path.insert(0, Slow())
+from {package}.__main__ import main
+sys.exit(main())
+"""
+MANGLED = (Path(__file__).parent / "programs" / "mangled.py").read_text()
+THROUGH_C = (Path(__file__).parent / "programs" / "through_c.py").read_text()
+LATE = """
+import atexit, os, signal, sys
+from netspec.__main__ import main
+
+def kill(*_):
+    os.kill(os.getpid(), {number})
+
+{before}
+status = main()
+{after}
+sys.exit(status)
+"""
 
 
 def start(*words: str) -> subprocess.Popen[str]:

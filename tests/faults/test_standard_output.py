@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from case_files import read_texts
 from paths import ROOT
 
-(CODE,) = read_texts("faults/standard_output.txt").values()
+CODE = (Path(__file__).parent / "programs" / "standard_output.py").read_text()
 
 
 def printed(text: str, stdout: int, **variables: str) -> subprocess.CompletedProcess[bytes]:

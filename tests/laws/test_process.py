@@ -7,12 +7,79 @@ from pathlib import Path
 
 import pytest
 
-from case_files import read_texts
 from paths import GOLDEN, ROOT
 
 pytestmark = pytest.mark.slow
 
-CODE, NET, TRAINING, LOOPS = read_texts("laws/process.txt").values()
+CODE = """
+import logging, os, signal, sys, warnings
+import torch
+
+def loggers():
+    known = {name: log for name, log in logging.root.manager.loggerDict.items() if isinstance(log, logging.Logger)}
+    ours = ("netspec", "loopclosure", "lmdb_build")
+    return {
+        name: (log.level, log.disabled, log.propagate, list(log.handlers))
+        for name, log in {**known, "": logging.root}.items()
+        if not name.startswith(ours)
+    }
+
+def settings():
+    backends = torch.backends
+    return {
+        "environment": dict(os.environ),
+        "signals": {number: signal.getsignal(number) for number in signal.valid_signals()},
+        "logging": loggers(),
+        "warnings": list(warnings.filters),
+        "hooks": (list(sys.meta_path), sys.excepthook, sys.displayhook, list(sys.path), sys.getrecursionlimit()),
+        "torch": (
+            torch.get_num_threads(), torch.get_num_interop_threads(), torch.get_default_dtype(),
+            torch.is_grad_enabled(), torch.is_inference_mode_enabled(), torch.get_float32_matmul_precision(),
+            torch.are_deterministic_algorithms_enabled(), torch.initial_seed(), tuple(torch.get_rng_state().tolist()),
+            backends.cudnn.enabled, backends.cudnn.benchmark, backends.cudnn.allow_tf32, backends.cudnn.deterministic,
+            backends.cuda.matmul.allow_tf32, backends.mkldnn.enabled, torch.get_default_device(),
+        ),
+    }
+
+def compared(did):
+    after = settings()
+    for name, was in before.items():
+        now = after[name]
+        if name == "logging":  # others' loggers come with the libraries that are loaded
+            now = {logger: how for logger, how in now.items() if logger in was}
+        if name == "warnings":  # as above
+            now = [each for each in now if each in was]
+        assert now == was, (did, name, was, now)
+
+{libraries}
+from netspec.process import heap
+heap.keep_freed_memory = None  # its effect cannot be seen
+before = settings()
+{work}
+assert "netspec.process.programs" not in sys.modules
+"""
+NET = """
+import numpy as np
+import netspec
+compared("import")
+net = netspec.load_net("deploy.prototxt", phase="TEST", seed=0, exact="all")
+compared("build")
+net(**{name: np.zeros(net.shapes[name], np.float32) for name in net.inputs})
+compared("run")
+"""
+TRAINING = """
+solver = netspec.load_solver("sgd_step/solver.prototxt", device="cpu")
+compared("build")
+solver.step(2)
+compared("train")
+solver.close()
+"""
+LOOPS = """
+import numpy as np
+import loopclosure, lmdb_build.databases, loopclosure.report.page
+from loopclosure import LoopDetector
+compared("import")
+"""
 LIBRARIES = "import torch._dynamo, cv2, h5py, scipy.linalg.blas, google.protobuf"  # they have settings of their own
 SMALL = """layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1 dim: 8 dim: 8 } } }
 layer { name: "c" type: "Convolution" bottom: "data" top: "c" convolution_param { num_output: 2 kernel_size: 3 } }

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 
-from case_files import read_texts
 from loopclosure.cli import main
 from paths import ROOT
 
@@ -214,7 +213,26 @@ def expanded(line: str, **names: object) -> list[str]:
     return parts
 
 
-@pytest.mark.parametrize(("sentence", "line"), read_texts("loopclosure/cases/faults.txt").items())
+@pytest.mark.parametrize(
+    ("sentence", "line"),
+    [
+        ("NOWHERE: no such folder", "evaluate NOWHERE --method thumbnails --out OUT"),
+        ('unknown method "magic"', "evaluate LAPS --method magic --out OUT"),
+        ("has no truth, which says what frames show the same place", "evaluate LAPS/rgb --method thumbnails --out OUT"),
+        ("no judged pair shows the same place", "evaluate LAPS,start=50% --method thumbnails --out OUT"),
+        ("test images are training images", "evaluate LAPS --method bow --train LAPS --out OUT"),
+        ("NOWHERE.npz: no such file", "evaluate LAPS --method features:NOWHERE.npz --out OUT"),
+        ("cannot be read", "detect NOWHERE --threshold 1 --out OUT"),
+        ("expected module:function", "detect LAPS --threshold 1 --describe nothing --out OUT"),
+        ("no such file", "similarity NOWHERE.npz --out OUT"),
+        ("cannot be written", "similarity FEATURES --out OUT/no/folder.npy"),
+        ("FEATURES: File exists", "detect LAPS --threshold 0.5 --out FEATURES"),
+        (
+            "cannot exclude 0 frames, nan s; expected 0 or more",
+            "evaluate LAPS --exclude-seconds nan --method thumbnails --out OUT",
+        ),
+    ],
+)
 def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_features, tmp_path, capsys):
     names = {"LAPS": two_laps, "OUT": tmp_path / "out", "FEATURES": two_laps_features}
     assert main(expanded(line, **names)) == 1
@@ -222,7 +240,23 @@ def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_fea
     assert sentence.replace("FEATURES", str(two_laps_features)) in printed
 
 
-@pytest.mark.parametrize(("sentence", "line"), read_texts("loopclosure/cases/usage.txt").items())
+@pytest.mark.parametrize(
+    ("sentence", "line"),
+    [
+        ('a sequence has no setting "camera"', "evaluate LAPS,camera=left --method thumbnails --out OUT"),
+        ("needs ,truth=MASK", "evaluate images:LAPS --method thumbnails --out OUT"),
+        ("--fov is for sequences with poses, not for ", "evaluate pairs:LAPS --fov 60 --method thumbnails --out OUT"),
+        ("nothing is near in time", "evaluate LAPS,references=LAPS --exclude-seconds 3 --method thumbnails --out OUT"),
+        ("expected KEY=VALUE", "detect LAPS --threshold 1 --with width --out OUT"),
+        ("--with belongs to --describe", "detect LAPS --threshold 1 --features FEATURES --with width=8 --out OUT"),
+        ("leave out others", "detect LAPS --resume OUT --metric cosine --out OUT"),
+        ("--top-k means nothing without --threshold", "detect LAPS --top-k 3 --out OUT"),
+        ("--verify means nothing without --threshold", "detect LAPS --verify --out OUT"),
+        ("--odometry means nothing to a search frame by frame", "detect LAPS --threshold 1 --odometry O --out OUT"),
+        ("belongs to --top-k", "similarity FEATURES --exclude-frames 3 --out OUT"),
+        ("one sequence", "similarity FEATURES --references FEATURES --top-k 1 --exclude-frames 3 --out OUT"),
+    ],
+)
 def test_options_that_do_not_go_together_are_one_line_and_status_2(
     line, sentence, two_laps, two_laps_features, tmp_path, capsys
 ):
@@ -256,7 +290,17 @@ def test_wrong_usage_is_status_2(line, capsys):
     assert "usage: loopclosure" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("said", "words"), read_texts("loopclosure/cases/numbers.txt").items())
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ("argument --seed: found -1, expected a number from 0 to 2147483647", "evaluate --seed -1"),
+        ("argument --seed: found 99999999999, expected a number from 0 to", "close x --seed 99999999999"),
+        ("argument --max-distance: found nan, expected a number above 0", "evaluate --max-distance nan"),
+        ("argument --max-angle: found nan, expected a number above 0", "evaluate --max-angle nan"),
+        ("argument --soft-distance: found -1, expected a number above 0", "evaluate --soft-distance -1"),
+        ("argument --soft-angle: found 0, expected a number above 0", "evaluate --soft-angle 0"),
+    ],
+)
 def test_numbers_that_mean_nothing_are_wrong_usage(words, said, capsys):
     assert main(words.split()) == 2
     assert said in capsys.readouterr().err

@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 
-from case_files import read_texts
 from loopclosure.cli import main
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.detector import LoopDetector
@@ -158,7 +157,7 @@ def test_of_what_was_projected_before_only_a_maps_own_files_go(
     assert all(path.exists() for path in strange)
 
 
-(DYING,) = read_texts("loopclosure/detector/map.txt").values()
+DYING = (Path(__file__).parent / "programs" / "dying.py").read_text()
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from case_files import read_texts
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, MethodContext
 from loopclosure.methods.baselines import BagOfWordsMethod, FabMapMethod, ThumbnailMethod
@@ -119,7 +118,34 @@ def test_settings_reach_the_part_they_belong_to() -> None:
     assert (small.thumbnailer.width, small.thumbnailer.normalize) == (16, "none")
 
 
-@pytest.mark.parametrize(("message", "spec"), read_texts("loopclosure/methods/refused.txt").items())
+@pytest.mark.parametrize(
+    ("message", "spec"),
+    [
+        ("expected at least 2 x 2 whole cells", "hog:side=100"),
+        ("expected 0..1", "cohog:least_entropy=2"),
+        ("unknown kind of features", "vlad:kind=surf"),
+        ("works on images", "hog+thumbnails"),
+        ("expected detector:FILE.npz, or", "detector"),
+        ('has no setting "calibrate=b"', "detector:a.npz:calibrate=b"),
+        ("top_k is 0", "detector:a.npz:threshold=-1,top_k=0"),
+        ("works on images, not on the scores", "detector+thumbnails"),
+        (r"write verified\+METHOD", "verified"),
+        ("k = 0; expected 1 or more", "verified:k=0+thumbnails"),
+        ("expected at least 8", "verified:min_inliers=3+thumbnails"),
+        ("needs focal_px, center_x_px and center_y_px", "verified:focal_px=300+thumbnails"),
+        ('order of verified is "size"; expected score or inliers', "verified:order=size+thumbnails"),
+        ('verified has no setting "depth=3"', "verified:depth=3+thumbnails"),
+        ('fabmap has no setting "wrods=5"; write setting=value with .*words', "fabmap:wrods=5"),
+        ('fabmap has no setting "words"', "fabmap:words"),
+        ('fabmap: words is a whole number, not "many"', "fabmap:words=many"),
+        ('fabmap: hit is a number, not "high"', "fabmap:hit=high"),
+        ('fabmap: motion is yes or no, not "2"', "fabmap:motion=2"),
+        ('"log_odds" or "posterior", not "odds"', "fabmap:scored=odds"),
+        ("fabmap has no setting", "fabmap:name=x"),
+        ('unknown metric "chi2"', "bow:metric=chi2"),
+        (r"bow\+thumbnails: bow works on images", "bow+thumbnails"),
+    ],
+)
 def test_a_method_or_setting_that_makes_no_sense_is_refused(spec: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         make_method(spec.strip())

@@ -1,10 +1,11 @@
 """HOG, CoHOG-like regions and VLAD."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
-from case_files import read_texts
 from loopclosure.descriptors.thumbnails import Hog
 from loopclosure.errors import InputError
 from loopclosure.evaluate import evaluate, named_method
@@ -94,7 +95,7 @@ def test_two_traverses_are_compared_in_full(spec, two_laps):
 
 
 # A function of the user's as a method
-(MEANS,) = read_texts("loopclosure/methods/references.txt").values()
+MEANS = (Path(__file__).parent / "programs" / "means.py").read_text()
 
 
 @pytest.fixture

@@ -16,7 +16,6 @@ import pytest
 import torch
 
 import netspec
-from case_files import read_texts
 from netspec.files import whole_file
 from netspec.graph.options import BuildOptions
 from netspec.layers import layer_types
@@ -337,7 +336,29 @@ def test_a_net_that_waits_for_inputs(run: Run, edited: Edit) -> None:
 # Usage
 
 
-@pytest.mark.parametrize(("said", "words"), read_texts("netspec/cli/cases/usage.txt").items())
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ("the following arguments are required: COMMAND", ""),
+        ('there is no command "fit"', "fit"),
+        ("netspec train: error: need one solver definition: netspec train solver.prototxt", "train"),
+        ("need one solver definition", "train a --solver b"),
+        ("give a snapshot to resume training or weights to fine-tune", "train s --snapshot a --weights b"),
+        ("unrecognized arguments: --momentum", "train s --momentum 0.9"),
+        ("argument --sigint_effect: invalid choice: 'die'", "train s -sigint_effect die"),
+        ("the following arguments are required: --weights", "test --model m"),
+        ("found 0, expected a positive number", "test --model m --weights w --iterations 0"),
+        ("found 'data=1x2', expected BLOB=N,C,H,W, e.g. data=32,3,224,224", "check net --shape data=1x2"),
+        ("argument --exact: invalid choice: 'some'", "time --model m --exact some"),
+        ("found 2147483648, expected -2147483648 to 2147483647", "check net --level 2147483648"),
+        ("found -1, expected a number of at least 0", "diff a b --tolerance -1"),
+        ("found nan, expected a number of at least 0", "diff a b --tolerance nan"),
+        ("argument --phase: invalid choice: 'VAL'", "check net --phase VAL"),
+        ("found 'db', expected LAYER=DB", "extract --model m --blob b --out o --source db"),
+        ("--images needs exactly one --blob, found 2", "extract --model m --blob a b --out o --images i"),
+        ("--shape names b, expected the input blob data", "extract --model m --blob a --out o --images i --shape b=1"),
+    ],
+)
 def test_wrong_usage_ends_with_status_2(run: Run, words: str, said: str) -> None:
     result = run(*words.split())
     assert result.status == 2

@@ -15,7 +15,6 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 
 import netspec
-from case_files import read_texts
 from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, random_inputs, run_module
 from netspec.net.net import Net
 
@@ -149,7 +148,16 @@ def test_images_steps(onnx: Any, net: Net, run: Run) -> None:
     assert_same(in_onnxruntime(onnx.load("net.onnx"), inputs), expected)
 
 
-@pytest.mark.parametrize(("fault", "words"), read_texts("netspec/cli/cases/export.txt").items())
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("no/net.onnx: there is no folder no; make it first", "--to onnx --out no/net.onnx"),
+        ("--out net.txt: expected a name that ends in .py", "--to torch --out net.txt"),
+        ('no data layer has a top "dat"; did you mean "data"?', "--to onnx --out n.onnx --shape dat=1,3,8,8"),
+        ("no.npy: cannot be read as an array", "--to onnx --out n.onnx --mean no.npy"),
+        ('no input "x" in this net; it has: data', "--to onnx --out n.onnx --swap --input x"),
+    ],
+)
 def test_faults_are_one_line(words: str, fault: str, onnx: Any, net: Net, run: Run) -> None:
     assert fault in run("export", MODEL, "--weights", WEIGHTS, *words.split()).fault
     assert not list(Path().glob("n.onnx"))

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 import netspec
-from case_files import read_texts
 from netspec.data.database import open_reader
 from netspec.data.datum import datum_to_array, parse_datum
 from paths import GOLDEN, ROOT
@@ -149,14 +148,57 @@ def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run,
     assert run("extract", *words, "--shape", "data=1,1,28,28").status == 0
 
 
-@pytest.mark.parametrize(("fault", "words"), read_texts("netspec/cli/cases/extract.txt").items())
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("nowhere: cannot be read: No such file or directory; expected a folder of images", "--images nowhere"),
+        ('list.txt:2:1: no such image "b.png" in .', "--images list.txt"),
+        ("empty: contains no images; expected files that end in .png, ", "--images empty"),
+        (
+            'sgd_step/train_val.prototxt: no blob "dat" in this net; did you mean "data"? it has: ',
+            "--images walk/rgb --input dat",
+        ),
+        (
+            'sgd_step/train_val.prototxt: input blob "sim" has shape (50,), expected N x 1 or 3 x ',
+            "--images walk/rgb --input sim",
+        ),
+        (
+            'sgd_step/train_val.prototxt: no data layer "pair" in this net; its data layers: pair_data',
+            "--source pair=pairs/train_lmdb",
+        ),
+        ('database "nowhere" does not exist', "--source pair_data=nowhere"),
+        ("--out nowhere/f.npz: cannot be written: No such file or directory", "--out nowhere/f.npz"),
+        ("nowhere.caffemodel: cannot be read: No such file or directory", "--weights nowhere.caffemodel"),
+    ],
+)
 def test_extract_says_in_one_line_what_is_wrong(run: Run, images: Path, words: str, fault: str) -> None:
     Path("empty").mkdir()
     Path("list.txt").write_text("walk/rgb/1.png\nb.png\n")
     assert fault in run("extract", *IMAGES, *words.split()).fault
 
 
-@pytest.mark.parametrize(("fault", "words"), read_texts("netspec/cli/cases/extract_usage.txt").items())
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("found zoom 2, expected more than 0 and at most 1", "--images walk/rgb --zooms 1,2"),
+        ('found zooms "1,x", expected numbers separated by commas', "--images walk/rgb --zooms 1,x"),
+        ("--images needs exactly one --blob, found 2", "--images walk/rgb --blob sim"),
+        ("--shape names x, expected the input blob data", "--images walk/rgb --shape x=1,1,9,9"),
+        ("--zooms is for --images; a data layer's records have its shape and its transform_param", "--zooms 1,0.5"),
+        ("--input is for --images", "--input x"),
+        ("--shape is for --images", "--shape data=1,1,9,9"),
+        ("--mean is for --images", "--mean 1"),
+        ("--phase is for records; --images are read, and run in phase TEST", "--images walk/rgb --phase TRAIN"),
+        ("--level is for records; --images are read, and run in phase TEST", "--images walk/rgb --level 7"),
+        ("--stage is for records; --images are read, and run in phase TEST", "--images walk/rgb --stage x"),
+        ("--iterations is for records; --images are read, and run in phase TEST", "--images walk/rgb --iterations 99"),
+        ("--source is for records; --images are read, and run in phase TEST", "--images walk/rgb --source no=/nowhere"),
+        (
+            "--allow-python-layers is for records; --images are read, and run in phase TEST",
+            "--images walk/rgb --allow-python-layers",
+        ),
+    ],
+)
 def test_extract_refuses_words_that_do_not_go_together(run: Run, images: Path, words: str, fault: str) -> None:
     result = run("extract", *IMAGES, *words.split())
     assert result.status == 2

@@ -16,7 +16,6 @@ from typing import Any
 import pytest
 
 import forked
-from case_files import read_texts
 from paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -159,7 +158,7 @@ def test_a_training_whose_standard_error_is_closed(work_in: Callable[..., Path])
     assert Path("sgd_step/ref_iter_60.solverstate.extra").is_file()
 
 
-(ENDLESS,) = read_texts("netspec/cli/signals.txt").values()
+ENDLESS = (Path(__file__).parent / "programs" / "endless.py").read_text()
 
 
 def test_a_second_interrupt_ends_a_training_at_once(endless) -> None:

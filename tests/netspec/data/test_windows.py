@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from case_files import read_texts
 from netspec.data.sources import Draws
 from netspec.data.windows import WindowSource, read_window_file, window_mean, wrong_means
 from netspec.errors import SpecError, Where
@@ -15,7 +14,17 @@ from netspec.proto.schema import TransformationParameter, message
 
 CROP = 8
 IMAGE = np.random.default_rng(0).integers(1, 256, (30, 40, 3), np.uint8)  # no zero: a zero in a top is padding
-(FILE,) = read_texts("netspec/data/windows.txt").values()
+FILE = """# 0
+{folder}/0.png
+3
+30
+40
+4
+5 0.9 4 6 19 17
+7 0.6 0 0 9 9
+2 0.4 20 20 29 25
+3 0.1 10 12 25 27
+"""
 
 
 @pytest.fixture

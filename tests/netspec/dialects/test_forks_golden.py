@@ -19,6 +19,7 @@ import pytest
 
 import netspec
 from benchmarks.pages import write
+from dialect_numbers import NUMBERS
 from fresh_dialects import fresh_dialects
 from golden_cases import LayerCase, layer_distances, parameters, set_parameters, train
 from netspec.dialects import use_dialect
@@ -168,7 +169,7 @@ def table(monkeypatch: pytest.MonkeyPatch, margin: float = 1) -> list[tuple[str,
         worst[kind] = max(worst.get(kind, 0.0), off)
         forks.setdefault(kind, []).append(fork)
     owners = layer_types()
-    loops = set(re.findall(r"type: ['\"](\w+)", (Path(__file__).parent / "cases" / "numbers.txt").read_text()))
+    loops = {case.layer.split('"')[1] for case in NUMBERS}
     groups: dict[tuple[str, ...], list[str]] = {}
     for kind in sorted({*forks, *owners}):
         how = ", ".join(sorted(set(forks.get(kind, ())))) or ("a loop" if kind in loops else "its formula")

@@ -8,7 +8,6 @@ import pytest
 from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto, FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 
-from case_files import read_texts
 from netspec.dialects import registry as dialect
 from netspec.dialects.declarations import read_declarations
 from netspec.dialects.registry import Dialect
@@ -19,7 +18,8 @@ from netspec.proto.text import parse_net_text, write_text
 
 PROTO = Path(schema.__file__).parent
 
-SOURCE, NET = read_texts("netspec/dialects/registry.txt").values()
+SOURCE = (Path(__file__).parent / "nets" / "dialect.proto").read_text()
+NET = (Path(__file__).parent / "nets" / "dialect.prototxt").read_text()
 
 
 @pytest.fixture

@@ -1,14 +1,15 @@
 """Gradients go where the net was built to have them: to autograd, or product by product into ``grad``."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
-from case_files import read_texts
 from netspec.exact import products
 from netspec.exact.products import rounded_weight, weights_rounded_once
 
-(SIAMESE,) = read_texts("netspec/exact/accumulate.txt").values()
+SIAMESE = (Path(__file__).parent / "nets" / "siamese.prototxt").read_text()
 
 
 def images() -> dict[str, torch.Tensor]:

@@ -4,12 +4,12 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from case_files import read_texts
 from netspec.exact import blas
 from netspec.exact.blas import CAFFES, CORE_TYPE
 from netspec.net.net import Net
@@ -17,7 +17,14 @@ from paths import ROOT
 
 OWN = "import scipy.linalg"  # OpenBLAS' own choice
 CHOSEN = "from netspec.exact.blas import kernels; kernels()"
-KERNELS, AFTERWARDS = read_texts("netspec/exact/caffes_cpu.txt").values()
+KERNELS = """
+import os, threadpoolctl
+{load}
+found = [library for library in threadpoolctl.threadpool_info() if "scipy.libs" in library["filepath"]]
+print(found[0]["architecture"])
+print(os.environ.get("OPENBLAS_CORETYPE"))
+"""
+AFTERWARDS = (Path(__file__).parent / "programs" / "afterwards.py").read_text()
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from case_files import read_texts
+from case_files import read_cases
 from exported import (
     ONNX_EXTRA,
     assert_same,
@@ -43,10 +43,13 @@ def net_text(layer: str, shapes: Mapping[str, Shape], tops: int = 1) -> str:
     return f'{inputs}layer {{ name: "it" {layer} {bottoms} {made} }}'
 
 
-@pytest.mark.parametrize(("name", "text"), read_texts("netspec/export/dialects.txt").items())
-def test_layer_computes_the_same(name: str, text: str, net_of: Callable[..., Net]) -> None:
-    use_dialect(name.rpartition(" ")[2])
-    net = trained(net_of(text))
+CASES = read_cases("netspec/export/cases/dialects.txt")
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_layer_computes_the_same(case: dict[str, str], net_of: Callable[..., Net]) -> None:
+    use_dialect(case["dialect"])
+    net = trained(net_of(case["net"]))
     inputs = random_inputs(net)
     model, _ = onnx_model(net)
     module = source_module(net)

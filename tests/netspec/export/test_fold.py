@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import netspec
-from case_files import read_texts
 from exported import assert_same, here, random_inputs, trained
 from netspec.export.formats.deploy import fold, with_inputs, write_caffe
 from netspec.fast.fold import find_folds
@@ -22,7 +21,23 @@ from paths import GOLDEN
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 4 dim: 5 dim: 5 } } }'
 FILLERS = 'weight_filler { type: "gaussian" std: 0.5 } bias_filler { type: "uniform" min: -1 max: 1 }'
 CONV = f"convolution_param {{ num_output: 6 kernel_size: 3 {FILLERS} }}"
-NORM, TOWERS = read_texts("netspec/export/fold.txt").values()
+NORM = """
+layer {{ name: "bn{0}" type: "BatchNorm" bottom: "{0}" top: "{1}" }}
+layer {{ name: "scale{0}" type: "Scale" bottom: "{1}" top: "{2}"
+  scale_param {{ bias_term: true filler {{ type: "uniform" min: 0.5 max: 2 }} bias_filler {{ type: "uniform" }} }} }}
+"""
+TOWERS = """layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 4 dim: 5 dim: 5 } } }
+layer { name: "p" type: "Input" top: "p" input_param { shape { dim: 2 dim: 4 dim: 5 dim: 5 } } }
+layer { name: "conv" type: "Convolution" bottom: "data" top: "a" param { name: "w" } param { name: "b" }
+  convolution_param { num_output: 6 kernel_size: 3
+    weight_filler { type: "gaussian" std: 0.5 } bias_filler { type: "uniform" min: -1 max: 1 } } }
+layer { name: "conv_p" type: "Convolution" bottom: "p" top: "x" param { name: "w" } param { name: "b" }
+  convolution_param { num_output: 6 kernel_size: 3
+    weight_filler { type: "gaussian" std: 0.5 } bias_filler { type: "uniform" min: -1 max: 1 } } }
+layer { name: "bn" type: "BatchNorm" bottom: "a" top: "y"
+  param { name: "m" lr_mult: 0 } param { name: "v" lr_mult: 0 } param { name: "n" lr_mult: 0 } }
+layer { name: "bn_p" type: "BatchNorm" bottom: "x" top: "z" {shared} }
+"""
 
 
 def folded(net: Net, folder: Path) -> Net:

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import netspec
-from case_files import read_texts
 from exported import assert_same, here, random_inputs, trained
 from netspec.export.formats.deploy import fold, write_caffe
 from netspec.graph.options import BuildOptions
@@ -26,7 +25,8 @@ from paths import GOLDEN
 FOLDER = GOLDEN / "export" / "opencv4"
 PYTHON = os.environ.get("NETSPEC_OPENCV4", "")
 
-TEXT, READ = read_texts("netspec/export/opencv4.txt").values()
+TEXT = (Path(__file__).parent / "nets" / "opencv4.prototxt").read_text()
+READ = (Path(__file__).parent / "programs" / "read.py").read_text()
 
 
 def residual_net() -> Net:

@@ -13,7 +13,6 @@ import pytest
 import torch
 
 import netspec
-from case_files import read_texts
 from exported import assert_same, golden_net, here, other_inputs, random_inputs, run_module, source_module, trained
 from netspec.export.formats.pt2 import export_pt2, torch_module
 from netspec.export.formats.shapes import settled
@@ -69,12 +68,13 @@ def test_the_module_runs_without_this_project(tmp_path: Path) -> None:
     assert_same({net.outputs[0]: np.load(tmp_path / "found.npy")}, here(net, inputs))
 
 
-SMALL, PAIRS = read_texts("netspec/export/torch.txt").values()
+SMALL = (Path(__file__).parent / "nets" / "small.prototxt").read_text()
+PAIRS = (Path(__file__).parent / "nets" / "pairs.prototxt").read_text()
 
 
 def test_reads_as_a_person_would_have_written_it(net_of: Callable[..., Net]) -> None:
     text, state, _ = torch_source(trained(net_of(SMALL)), "small.prototxt")
-    assert text == (Path(__file__).parent / "small.txt").read_text()
+    assert text == (Path(__file__).parent / "programs" / "small.py").read_text()
     assert list(state)[:3] == ["conv1.weight", "conv1.bias", "bn1.running_mean"]
 
 

@@ -1,15 +1,16 @@
 """Passes on text: which layers a state includes, and Caffe's names for split blobs."""
 
+from pathlib import Path
+
 import pytest
 
-from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.graph.filter import filter_net, in_state, with_state
 from netspec.graph.splits import insert_splits
 from netspec.proto.schema import TRAIN, NetParameter, NetState, PhaseValue
 from netspec.proto.text import parse_net_text
 
-(RULES,) = read_texts("netspec/graph/filter_splits.txt").values()
+RULES = (Path(__file__).parent / "nets" / "rules.prototxt").read_text()
 
 
 @pytest.mark.parametrize(

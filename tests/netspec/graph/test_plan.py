@@ -2,7 +2,7 @@
 
 import pytest
 
-from case_files import read_texts
+from case_files import read_cases
 from netspec.errors import SpecError
 from netspec.graph.plan import make_plan, plan_backward
 from netspec.graph.splits import insert_splits
@@ -49,10 +49,13 @@ def test_the_first_of_a_name_owns_and_multipliers_may_be_given_once() -> None:
     assert made.nodes[2].params[0].owner == (1, 0)
 
 
-@pytest.mark.parametrize(("message", "text"), read_texts("netspec/graph/cases/faults.txt").items())
-def test_faults_name_their_place(text: str, message: str) -> None:
-    with pytest.raises(SpecError, match=message):
-        plan(text)
+FAULTS = read_cases("netspec/graph/cases/faults.txt")
+
+
+@pytest.mark.parametrize("case", FAULTS.values(), ids=FAULTS)
+def test_faults_name_their_place(case: dict[str, str]) -> None:
+    with pytest.raises(SpecError, match=case["message"]):
+        plan(case["net"])
 
 
 def test_faults_can_all_be_collected() -> None:

@@ -12,7 +12,6 @@ import pytest
 import torch
 from google.protobuf import text_format
 
-from case_files import read_texts
 from contexts import context
 from netspec.data.database import Writer, open_reader
 from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
@@ -398,7 +397,16 @@ def test_dummy_data_without_filler_is_zero_and_takes_the_old_axes(build: Callabl
     assert not any(top.any() for top in layer.run())
 
 
-@pytest.mark.parametrize(("message", "param"), read_texts("netspec/layers/cases/dummy_data.txt").items())
+@pytest.mark.parametrize(
+    ("message", "param"),
+    [
+        (r"found 0 shape, expected 1 or one per top \(2\)", ""),
+        ("found 0 width", "num: 1 channels: 1 height: 1"),
+        ("both shape and the old", "num: 1 channels: 1 height: 1 width: 1 shape { dim: 1 }"),
+        ("found 3 data_filler", "shape { dim: 1 } data_filler { } data_filler { } data_filler { }"),
+        ('did you mean "gaussian"', 'shape { dim: 1 } data_filler { type: "gausian" }'),
+    ],
+)
 def test_bad_dummy_data_params_are_refused(build: Callable[..., Layer], param: str, message: str) -> None:
     with pytest.raises(SpecError, match=message):
         build(f'type: "DummyData" dummy_data_param {{ {param} }}', tops=2)

@@ -19,7 +19,7 @@ from paths import PYTHON_LAYERS
 
 @pytest.fixture
 def python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Layer]]:
-    """``python(class_name, *bottom_shapes, ...)``: one of python_layers.txt, from the current directory."""
+    """``python(class_name, *bottom_shapes, ...)``: one of tests/python_layers.py, from the current directory."""
     (tmp_path / "layers_of_mine.py").write_text(PYTHON_LAYERS.read_text())
     monkeypatch.chdir(tmp_path)
     monkeypatch.delitem(sys.modules, "layers_of_mine", raising=False)

@@ -6,7 +6,6 @@ import re
 import numpy as np
 import pytest
 
-from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.layers import Layer, layer_class, layer_types
 from netspec.proto.schema import LayerParameter
@@ -19,7 +18,39 @@ def layer(kind: str, rest: str = "", name: str = "a") -> str:
     return f'layer {{ name: "{name}" type: "{kind}" bottom: "x" top: "{name}" {rest} }}\n'
 
 
-@pytest.mark.parametrize(("said", "text"), read_texts("netspec/net/cases/ignored_fields.txt").items())
+@pytest.mark.parametrize(
+    ("said", "text"),
+    [
+        (
+            "pooling_param has no effect: a layer of type ReLU does not read it",
+            'layer { name: "a" type: "ReLU" bottom: "x" top: "a" pooling_param { pool: MAX } }',
+        ),
+        (
+            'convolution_param.bias_filler.std has no effect: filler "msra" does not read it',
+            'layer { name: "a" type: "Convolution" bottom: "x" top: "a" '
+            'convolution_param { num_output: 1 kernel_size: 1 bias_filler { type: "msra" std: 1 }} }',
+        ),
+        (
+            "eltwise_param.coeff has no effect: a layer of type Eltwise does not read it",
+            'layer { name: "a" type: "Eltwise" bottom: "x" top: "a" '
+            'bottom: "x" eltwise_param { operation: MAX coeff: 2 coeff: 1 } }',
+        ),
+        (
+            "lrn_param.k has no effect: a layer of type LRN does not read it",
+            'layer { name: "a" type: "LRN" bottom: "x" top: "a" lrn_param { norm_region: WITHIN_CHANNEL k: 2 } }',
+        ),
+        (
+            'dummy_data_param.data_filler.std has no effect: filler "constant" does not read it',
+            'layer { name: "a" type: "DummyData"  top: "a" '
+            "dummy_data_param { shape { dim: 1 } data_filler { std: 2 }} }",
+        ),
+        (
+            "loss_param has no effect: a layer of type EuclideanLoss does not read it",
+            'layer { name: "a" type: "EuclideanLoss" bottom: "x" top: "a" '
+            'bottom: "x" loss_param { normalization: NONE } }',
+        ),
+    ],
+)
 def test_a_field_without_effect_is_named(net_of, warnings, text: str, said: str) -> None:
     net_of(INPUT + text)
     name = said.partition(" ")[0].split(".")[-1]

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 import netspec
-from case_files import read_texts
 from netspec.errors import SpecError
 from netspec.net.recovered import recover_net
 from netspec.net.weights import net_to_proto
@@ -17,7 +16,17 @@ from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import BlobProto, LayerParameter, NetParameter, V1LayerParameter
 from netspec.proto.text import write_text
 
-(TRAINED,) = read_texts("netspec/net/recovered.txt").values()
+TRAINED = """
+name: "classifier"
+layer { name: "d" type: "Data" top: "data" top: "label" include { phase: TRAIN }
+  transform_param { %s scale: 0.5 } data_param { source: "gone" batch_size: 8 backend: LMDB } }
+layer { name: "conv" type: "Convolution" bottom: "data" top: "conv" convolution_param { num_output: 4 kernel_size: 3 } }
+layer { name: "relu" type: "ReLU" bottom: "conv" top: "relu" }
+layer { name: "both" type: "Eltwise" bottom: "conv" bottom: "relu" top: "both" }
+layer { name: "in" type: "ReLU" bottom: "both" top: "both" }
+layer { name: "ip" type: "InnerProduct" bottom: "both" top: "ip" inner_product_param { num_output: 3 } }
+layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" }
+"""
 SHAPE = {"data": (8, 3, 9, 9)}
 
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import netspec
-from case_files import read_texts
 from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
@@ -22,7 +21,9 @@ from paths import GOLDEN
 
 CASES = sorted(path.name for path in (GOLDEN / "train").iterdir())
 
-TOWERS, WIDE, TWO = read_texts("netspec/net/weights.txt").values()
+TOWERS = (Path(__file__).parent / "nets" / "towers.prototxt").read_text()
+WIDE = (Path(__file__).parent / "nets" / "wide.prototxt").read_text()
+TWO = (Path(__file__).parent / "nets" / "two.prototxt").read_text()
 
 
 def net_of(text: str, seed: int = 1) -> Net:

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from case_files import read_texts
 from netspec.cli import main
 from netspec.errors import SpecError
 from netspec.proto.format import WIDTH, format_text
@@ -15,11 +14,12 @@ from netspec.proto.lexer import END, STRING, SYMBOL, Lexer
 from netspec.proto.text import parse_net_text, parse_solver_text, text_of
 from paths import GOLDEN, ROOT, SHARED, last_parts, nets_as_found
 
+NETS = Path(__file__).parent / "nets"
 OWN = sorted((ROOT / "prototxt").rglob("*.prototxt"))
 
 
 def test_the_form() -> None:
-    typed, formed = read_texts("netspec/proto/cases/format.txt").values()
+    typed, formed = [(NETS / f"{name}.prototxt").read_text() for name in ("unformatted", "formatted")]
     assert format_text(typed, "f") == formed
 
 

@@ -2,14 +2,15 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 import torch
 
-from case_files import read_texts
 from netspec.net.net import Net
 
-NET, APART = read_texts("netspec/run/joined.txt").values()
+NET = (Path(__file__).parent / "nets" / "joined.prototxt").read_text()
+APART = (Path(__file__).parent / "nets" / "apart.prototxt").read_text()
 
 
 @contextmanager

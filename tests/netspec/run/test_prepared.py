@@ -12,7 +12,6 @@ import pytest
 import torch
 from typing_extensions import override
 
-from case_files import read_texts
 from exported import trained
 from netspec.exact.blas import one_thread
 from netspec.fast import prepared as programs
@@ -35,7 +34,7 @@ layer { name: "scale" type: "Scale" bottom: "bn" top: "scale" scale_param { bias
 layer { name: "relu" type: "ReLU" bottom: "scale" top: "scale" }
 """
 BLOCK = INPUT + f'layer {{ name: "conv" bottom: "data" top: "conv" {CONV} }}' + NORM
-NETS = read_texts("netspec/run/prepared.txt")
+NETS = {path.stem: path.read_text() for path in (Path(__file__).parent / "nets").glob("*.prototxt")}
 SHARED = f"""
 layer {{ name: "drop" type: "Dropout" bottom: "scale" top: "scale" }}
 layer {{ name: "left" bottom: "scale" top: "left" {CONV} }}
@@ -293,7 +292,7 @@ def test_nets_that_train_are_not_prepared(net_of: Callable[..., Net]) -> None:
 
 
 def test_inputs_and_earlier_outputs_are_never_overwritten(net_of: Callable[..., Net]) -> None:
-    net, x = net_of(NETS["earlier outputs"]), images()
+    net, x = net_of(NETS["earlier_outputs"]), images()
     expected = slowly(net, data=x)
     first = quickly(net, data=x)
     assert torch.equal(x, images())
@@ -307,7 +306,7 @@ def test_inputs_and_earlier_outputs_are_never_overwritten(net_of: Callable[..., 
 def test_products_lend_memory_only_where_nobody_looks_afterwards(
     exact: str, keep: str | tuple[str, ...], net_of: Callable[..., Net]
 ) -> None:
-    net = net_of(NETS["lent memory"], exact=exact)
+    net = net_of(NETS["shared_memory"], exact=exact)
     net.keep = keep
     given = [images(n, 8, 5, 4) * k for k, n in enumerate((3, 3, 1, 0, 3))]
     with one_thread():
@@ -319,7 +318,7 @@ def test_products_lend_memory_only_where_nobody_looks_afterwards(
 
 
 def test_what_follows_on_a_count_of_items_is_run_by_its_values(net_of: Callable[..., Net]) -> None:
-    net, x = trained(net_of(NETS["a count of items"])), images(4, 8, 40, 40)
+    net, x = trained(net_of(NETS["count_of_items"])), images(4, 8, 40, 40)
     for which in ([1, 0, 1, 1], [0, 1, 0, 0], [1, 1, 1, 1]):
         inputs = {"data": x, "which": torch.tensor(which, dtype=torch.float32)}
         assert_same(quickly(net, **inputs), slowly(net, **inputs))

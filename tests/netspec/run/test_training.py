@@ -5,12 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from case_files import read_cases
 from netspec.fast.training import TrainingStep
 from netspec.load import load_solver
 from netspec.solver.solver import Solver
 
-NETS = {name: case["net"] for name, case in read_cases("netspec/run/training.txt").items()}
+NETS = {path.stem: path.read_text() for path in sorted((Path(__file__).parent / "trainings").glob("*.prototxt"))}
 NETS["single image"] = NETS["residual"].replace("dim: 6 dim: 6", "dim: 1 dim: 6").replace("{ dim: 6 }", "{ dim: 1 }")
 
 

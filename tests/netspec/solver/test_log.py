@@ -1,4 +1,4 @@
-"""What of the log depends on the clock or on settings; whole logs are compared in tests/netspec/test_log.py."""
+"""What of the log depends on the clock or on settings; tests/netspec/terminal/test_log.py compares whole logs."""
 
 import logging
 import re

@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 from google.protobuf.message import Message
 
-from case_files import read_texts
+from case_files import read_cases
 from netspec.errors import SpecError
 from netspec.graph.filter import with_train_state
 from netspec.proto.reader import read_text
@@ -85,10 +85,13 @@ def test_a_net_within_the_solver_keeps_its_places():
     assert str(train.source.at(0, "type")).startswith("s.prototxt:3:5")
 
 
-@pytest.mark.parametrize(("message", "text"), read_texts("netspec/solver/cases/nets.txt").items())
-def test_what_caffe_refuses(text: str, message: str):
-    with pytest.raises(SpecError, match=message):
-        nets(text)
+REFUSED = read_cases("netspec/solver/cases/nets.txt")
+
+
+@pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
+def test_what_caffe_refuses(case: dict[str, str]):
+    with pytest.raises(SpecError, match=case["message"]):
+        nets(case["solver"])
 
 
 def test_a_file_is_read_once_however_many_nets_it_holds(monkeypatch: pytest.MonkeyPatch):

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import netspec
-from case_files import read_texts
 from netspec.cli import main
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
@@ -59,7 +58,16 @@ CLASSIFY = """layer { name: "ip" type: "InnerProduct" bottom: "{bottom}" top: "i
   inner_product_param { num_output: 4 weight_filler { type: "xavier" } } }
 layer { name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "label" top: "loss" }"""
 DROPOUT = 'layer { name: "drop" type: "Dropout" bottom: "data" top: "drop" }'
-LSTM, SOLVER, COUNTER, HOOKS = read_texts("netspec/solver/resume.txt").values()
+LSTM = (Path(__file__).parent / "nets" / "lstm.prototxt").read_text()
+SOLVER = (Path(__file__).parent / "nets" / "solver.prototxt").read_text()
+COUNTER = (Path(__file__).parent / "programs" / "counter.py").read_text()
+HOOKS = """
+    def running_state(self):
+        return {"passes": self.passes}
+
+    def resume(self, state):
+        self.passes = state["passes"]
+"""
 POOL = """layer { name: "pool" type: "Pooling" bottom: "data" top: "pool"
   pooling_param { pool: STOCHASTIC kernel_size: 2 stride: 2 } }"""
 

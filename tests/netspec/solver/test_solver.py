@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from case_files import read_texts
+from case_files import read_cases
 from netspec.errors import SpecError
 from netspec.layers.contract.reading import Fed
 from netspec.load import load_solver
@@ -267,10 +267,13 @@ def test_weights_and_a_snapshot_exclude_each_other(make):
 # What is refused before the first iteration
 
 
-@pytest.mark.parametrize(("message", "settings"), read_texts("netspec/solver/cases/settings.txt").items())
-def test_faults_are_found_before_the_first_iteration(settings: str, message: str, make):
-    with pytest.raises(SpecError, match=message):
-        make(settings=settings)
+FAULTS = read_cases("netspec/solver/cases/settings.txt")
+
+
+@pytest.mark.parametrize("case", FAULTS.values(), ids=FAULTS)
+def test_faults_are_found_before_the_first_iteration(case: dict[str, str], make):
+    with pytest.raises(SpecError, match=case["message"]):
+        make(settings=case["solver"])
 
 
 def test_a_prefix_for_the_last_snapshot_is_tried_before_training(make):

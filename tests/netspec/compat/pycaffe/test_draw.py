@@ -8,14 +8,13 @@ import pytest
 from google.protobuf import text_format
 
 import netspec.compat.pycaffe.draw as draw
-from case_files import read_texts
 from netspec.compat.pycaffe.proto import caffe_pb2
 from netspec.errors import SpecError
 from paths import ROOT, last_parts
 
 pydot = pytest.importorskip("pydot")
 
-(NET,) = read_texts("netspec/compat/pycaffe/draw.txt").values()
+NET = (Path(__file__).parent / "nets" / "draw.prototxt").read_text()
 
 
 @pytest.fixture

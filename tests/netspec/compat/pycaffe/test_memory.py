@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
-from case_files import read_texts
+from case_files import read_cases
 from paths import ROOT
 
 INPUT = 'force_backward: true input: "data" input_shape { dim: 1 dim: 3 dim: 12 dim: 12 }\n'
 # The shape of MTCNN's first net: fully convolutional, run on an image pyramid.
-PYRAMID, ROUNDS = read_texts("netspec/compat/pycaffe/memory.txt").values()
+PYRAMID = (Path(__file__).parent / "nets" / "pyramid.prototxt").read_text()
+ROUNDS = (Path(__file__).parent / "programs" / "rounds.py").read_text()
 
 
 def image(*shape: int) -> np.ndarray:
@@ -459,14 +460,14 @@ X = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 
 FOUR = 'layer { name: "ip" type: "InnerProduct" bottom: "x" top: "ip" inner_product_param { num_output: 4 } }\n'
 
 
-@pytest.mark.parametrize(("said", "layers"), read_texts("netspec/compat/pycaffe/cases/checks.txt").items())
-def test_a_failed_check_has_caffes_words_and_the_place(
-    net_of: Callable[..., caffe.Net], layers: str, said: str
-) -> None:
-    place, _, check = said.partition(" ")
-    with pytest.raises(ValueError, match=rf"net\.prototxt:{place}: ") as fault:
-        net_of(X + layers)
-    assert check in str(fault.value)
+CHECKS = read_cases("netspec/compat/pycaffe/cases/checks.txt")
+
+
+@pytest.mark.parametrize("case", CHECKS.values(), ids=CHECKS)
+def test_a_failed_check_has_caffes_words_and_the_place(net_of: Callable[..., caffe.Net], case: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match=rf"net\.prototxt:{case['place']}: ") as fault:
+        net_of(X + case["layers"])
+    assert case["check"] in str(fault.value)
 
 
 def test_a_failed_check_of_a_pass_has_caffes_words(net_of: Callable[..., caffe.Net], tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import torch
 
 import forked
 import netspec.pycaffe as caffe
-from case_files import read_texts
 from netspec.compat.pycaffe import mode
 from paths import ROOT
 from pycaffe_nets import SMALL
@@ -127,7 +126,7 @@ def test_the_log_is_glogs(write: Callable[..., str], tmp_path: Path) -> None:
     assert script(f"{code}; caffe.init_log(2); caffe.log('not this')", tmp_path).stderr.count("not this") == 0
 
 
-(TWO,) = read_texts("netspec/compat/pycaffe/module.txt").values()
+TWO = (Path(__file__).parent / "programs" / "two.py").read_text()
 
 
 @pytest.mark.slow

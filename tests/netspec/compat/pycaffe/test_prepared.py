@@ -1,16 +1,16 @@
 """Whole passes of deploy nets are prepared: scripts see in the blobs' memory what layer-by-layer passes leave there."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
-from case_files import read_texts
 
 FILLERS = 'weight_filler { type: "gaussian" std: 0.2 } bias_filler { type: "uniform" min: -1 max: 1 }'
 RELU = 'layer { name: "relu" type: "ReLU" bottom: "data" top: "relu" }'
-(NET,) = read_texts("netspec/compat/pycaffe/prepared.txt").values()
+NET = (Path(__file__).parent / "nets" / "prepared.prototxt").read_text()
 
 
 @pytest.fixture

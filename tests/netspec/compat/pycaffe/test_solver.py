@@ -11,11 +11,11 @@ import netspec
 import netspec.pycaffe as caffe
 from benchmarks.case import training_case
 from benchmarks.zoo import ZOO
-from case_files import read_texts
 from netspec.compat.pycaffe import mode
 from pycaffe_nets import CLASSES, SMALL
 
-SETTINGS, MEMORY = read_texts("netspec/compat/pycaffe/solver.txt").values()
+SETTINGS = (Path(__file__).parent / "nets" / "settings.prototxt").read_text()
+MEMORY = (Path(__file__).parent / "nets" / "memory.prototxt").read_text()
 
 
 @pytest.fixture

@@ -1,34 +1,222 @@
 """Every way in which public scripts use pycaffe: each a few lines of code that must run.
 
-The names in usage.txt are those of a count over 493 public scripts. Not there is what single forks have in modules of
+The names are those of a count over 493 public scripts. Not there is what single forks have in modules of
 their own (caffe.tools, caffe.mpi_init and the like).
 """
 
-import re
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
-from case_files import read_cases
 from netspec.compat.scripts import finder
 from netspec.dialects import use_dialect
 
 pytestmark = pytest.mark.slow
 
-CASES = read_cases("netspec/compat/pycaffe/usage.txt")
-USES, AROUND = (
-    dict(re.findall(r"^# (.*)\n((?:(?!# ).*\n)*)", CASES[part]["uses"] + "\n", re.M))
-    for part in ("nets and solvers", "around nets")
-)
+NETS = Path(__file__).parent / "nets"
+USES = {  # what scripts do with nets and solvers, by the names of the count
+    "import caffe": "import netspec.pycaffe as caffe",
+    "caffe.Net": "assert isinstance(net, caffe.Net)",
+    "caffe.TEST": "assert caffe.TEST == 1",
+    "caffe.TRAIN": "assert caffe.TRAIN == 0",
+    "Net(str,str,phase)": "caffe.Net('deploy.prototxt', 'usage.caffemodel', caffe.TEST)",
+    "Net(str,phase)": "caffe.Net('deploy.prototxt', caffe.TEST)",
+    "Net(str,phase,weights=)": "caffe.Net('deploy.prototxt', caffe.TEST, weights='usage.caffemodel')",
+    "Net(str,int,weights=)": "caffe.Net('deploy.prototxt', 1, weights='usage.caffemodel')",
+    ".forward()": "out = net.forward(); assert out['prob'].shape == (2, 5); assert out['prob'].argmax() >= 0",
+    "caffe.set_mode_gpu": "caffe.set_mode_gpu(); caffe.set_mode_cpu()",
+    "caffe.set_mode_cpu": "caffe.set_mode_cpu()",
+    "caffe.set_device": "caffe.set_device(0)",
+    "net.blobs[..].data[...] = ": "net.blobs['data'].data[...] = image; assert (net.blobs['data'].data == image).all()",
+    "net.blobs[..].reshape(..)": "net.blobs['data'].reshape(1, 3, 20, 20); assert net.blobs['data'].shape[2] == 20",
+    "net.blobs[..].reshape": "f = net.blobs['data'].reshape; f(1, 3, 9, 9); assert net.blobs['data'].height == 9",
+    "net.params[..][i].data read": "assert net.params['conv1'][0].data.shape == (4, 3, 3, 3)",
+    "net.blobs[..].data.shape": "assert net.blobs['data'].data.shape[1:] == (3, 12, 12)",
+    "net.blobs[..].data[index]": "net.forward(); assert net.blobs['prob'].data[0].sum() > 0.99",
+    "net.params[..][i].data[..] = ": "net.params['fc2'][1].data[2] = 50; assert net.forward()['prob'][0].argmax() == 2",
+    "net.blobs[..].data read": "assert net.blobs['prob'].data.dtype == np.float32",
+    ".save(..)": "net.save('again.caffemodel')",
+    "net.params.keys()": "assert list(net.params.keys()) == ['conv1', 'fc2']",
+    "class X(caffe.Layer): setup/reshape/forward/backward": """
+class X(caffe.Layer):
+  def setup(self, b, t): pass
+""",
+    "caffe.Layer": "assert issubclass(type(net.layers[1]), caffe.Layer)",
+    "net.params[..] itself": "w, b = net.params['conv1']; assert len(net.params['conv1']) == 2; assert b.count == 4",
+    "solver.net": "assert solver.net.blobs['loss'].data.shape == ()",
+    ".step(..)": "solver.step(2); assert solver.iter == 2",
+    ".copy_from(..)": "net.copy_from('usage.caffemodel')",
+    "net.params.items()": "assert [(k, v[0].data.ndim) for k, v in net.params.items()] == [('conv1', 4), ('fc2', 2)]",
+    "caffe.SGDSolver": "assert isinstance(solver, caffe.SGDSolver)",
+    ".inputs[i]": "assert net.inputs[0] == 'data'",
+    "net.blobs[..].data[index] = ": "net.blobs['data'].data[1] = 1; assert net.blobs['data'].data[1].mean() == 1",
+    "for/in net.params": "assert 'fc2' in net.params; assert [p for p in net.params] == ['conv1', 'fc2']",
+    ".layers[i]": "assert net.layers[1].type == 'Convolution'; assert net.layers[1].blobs[0].data.ndim == 4",
+    ".outputs[i]": "assert net.outputs[0] == 'prob'",
+    ".forward_all(<blob>=)": "assert net.forward_all(data=images)['prob'].shape == (5, 5)",
+    "caffe.get_solver": "assert caffe.get_solver('solver.prototxt').iter == 0",
+    "net.blobs[..] itself": "blob = net.blobs['data']; assert blob.num == 2",
+    ".test_nets[i]": "assert 'accuracy' in solver.test_nets[0].forward()",
+    ".test_nets": "assert len(solver.test_nets) == 1",
+    "._layer_names": "assert list(net._layer_names).index('fc2') == 4",
+    "net.blobs.items()": "assert dict(net.blobs.items())['prob'] is net.blobs['prob']",
+    "net.blobs.keys()": "assert list(net.blobs.keys()) == ['data', 'conv1', 'pool1', 'fc2', 'prob']",
+    "net.outputs": "assert net.outputs == ['prob']",
+    "net.inputs": "assert net.inputs == ['data']",
+    ".top_names": "assert net.top_names['pool1'] == ['pool1']",
+    "net.params.has_key()": "assert net.params.has_key('conv1') and not net.params.has_key('conv9')",
+    ".solve(..)": "solver.solve(); assert solver.iter == 3",
+    "solver.iter": "assert solver.iter == 0",
+    "net.params.iteritems()": "assert [name for name, _ in net.params.iteritems()] == ['conv1', 'fc2']",
+    ".set_input_arrays(..)": """
+memory = caffe.Net('memory.prototxt', caffe.TRAIN)
+memory.set_input_arrays(np.ones((4, 1, 2, 3), np.float32), np.float32([0, 1, 2, 0]))
+assert memory.forward()['loss'] > 0
+assert memory.blobs['label'].data.tolist() == [0, 1]
+memory.forward()
+assert memory.blobs['label'].data.tolist() == [2, 0]
+""",
+    "net.blobs[..].data.copy": "a = net.blobs['data'].data.copy(); a += 1; assert not net.blobs['data'].data.any()",
+    ".forward_all(**)": "assert net.forward_all(**{net.inputs[0]: images})['prob'].shape == (5, 5)",
+    ".forward(**)": "assert net.forward(**{net.inputs[0]: image})['prob'].shape == (2, 5)",
+    "net.blobs.iteritems()": "assert [name for name, _ in net.blobs.iteritems()][0] == 'data'",
+    "net.params[..][i].data.flat": """
+net.params['fc2'][0].data.flat = np.arange(20)
+assert net.params['fc2'][0].data[1, 0] == 4
+""",
+    ".bottom_names": "assert net.bottom_names['fc2'] == ['pool1']",
+    ".forward(<blob>=)": "net.forward(data=image); assert (net.blobs['data'].data == image).all()",
+    "caffe.set_random_seed": "caffe.set_random_seed(0)",
+    "net.blobs[..].data[...]": "assert net.blobs['data'].data[...].shape == (2, 3, 12, 12)",
+    "net.blobs[..].shape": "n, c, h, w = net.blobs['data'].shape; assert (n, c, h, w) == (2, 3, 12, 12)",
+    "caffe._caffe.BlobVec": """
+import netspec.compat.pycaffe._caffe as _caffe; assert isinstance(net.params['fc2'], _caffe.BlobVec)
+""",
+    "net.params.iterkeys()": "assert list(net.params.iterkeys()) == ['conv1', 'fc2']",
+    "net.blobs[..].num": "b = net.blobs['data']; assert (b.num, b.channels, b.height, b.width) == (2, 3, 12, 12)",
+    ".forward(pos)": "assert sorted(net.forward(['pool1'])) == ['pool1', 'prob']",
+    "net.blobs[..].diff read": "net.forward(); net.backward(prob=ones); net.blobs['data'].diff.reshape(2, -1)",
+    ".set_phase_test(..)": "net.set_phase_test()",
+    ".set_mode_gpu(..)": "net.set_mode_gpu()",
+    ".set_mode_cpu(..)": "net.set_mode_cpu()",
+    ".restore(..)": "solver.snapshot(); solver.step(1); solver.restore('usage_iter_0.solverstate')",
+    "caffe.init_log": "caffe.init_log()",
+    "net.reshape()": "net.blobs['data'].reshape(7, 3, 12, 12); net.reshape(); assert net.blobs['prob'].shape == (7, 5)",
+    ".forward(pos,pos,pos)": "assert list(net.forward(None, 'conv1', 'pool1')) == ['pool1']",
+    ".backward(pos,pos)": "net.forward(); net.blobs['fc2'].diff[...] = 1; assert 'data' in net.backward(None, 'fc2')",
+    "net.blobs[..].size": "assert net.blobs['data'].data.size == net.blobs['data'].count == 864",
+    "net.blobs.values()": "assert len(net.blobs.values()) == 5",
+    ".forward_all(**,blobs)": "assert net.forward_all(blobs=['pool1'], data=images)['pool1'].shape == (5, 4, 1, 1)",
+    "net.params[..][i].shape": "assert tuple(net.params['fc2'][0].shape) == (5, 4)",
+    "net.blobs[..].data.flat = ": "net.blobs['data'].data.flat = image.flat; assert net.blobs['data'].data.any()",
+    ".backward()": "net.forward(); assert list(net.backward()) == ['data']",
+    ".add_callback(..)": "solver.add_callback(lambda: None, lambda: None); solver.step(1)",
+    "for/in net.blobs": "assert [name for name in net.blobs if 'conv' in name] == ['conv1']",
+    ".forward(start)": "net.forward(start='pool1')",
+    "._blob_names": "assert list(net._blob_names)[0] == 'data'",
+    "._layer_names[i]": "assert net._layer_names[1] == 'conv1'",
+    "._blob_names[i]": "assert net._blob_names[4] == 'prob'",
+}
+BEFORE = """
+import numpy as np
+import caffe
+from caffe import layers as L, params as P
+from caffe.proto import caffe_pb2
+net = caffe.Net('deploy.prototxt', caffe.TEST)
+transformer = caffe.io.Transformer({'data': net.blobs['data'].data.shape})
+image = np.random.rand(8, 6, 3)
+"""
+AROUND = {  # and around them, each after BEFORE
+    "from caffe.proto import caffe_pb2": "assert caffe_pb2.NetParameter is caffe.proto.caffe_pb2.NetParameter",
+    "import caffe.proto.caffe_pb2": "import caffe.proto.caffe_pb2; caffe.proto.caffe_pb2.NetParameter()",
+    "from caffe.proto.caffe_pb2 import NetParameter": "from caffe.proto.caffe_pb2 import NetParameter; NetParameter()",
+    "from caffe.proto.caffe_pb2 import LayerParameter": "from caffe.proto.caffe_pb2 import LayerParameter",
+    "caffe.proto.caffe_pb2": "assert caffe.proto.caffe_pb2.__name__.endswith('caffe_pb2')",
+    "caffe.proto.caffe_pb2.NetParameter": """
+from google.protobuf import text_format
+p = caffe_pb2.NetParameter(); text_format.Merge(open('deploy.prototxt').read(), p)
+assert [layer.name for layer in p.layer] == ['data', 'pool']
+""",
+    "caffe.proto.caffe_pb2.BlobProto": "b = caffe_pb2.BlobProto(); b.data.extend([1, 2]); b.shape.dim.extend([2])",
+    "caffe.proto.caffe_pb2.SolverParameter": "s = caffe_pb2.SolverParameter(); s.base_lr = 0.1; s.test_iter.append(3)",
+    "caffe.proto.caffe_pb2.SolverParameter.GPU": "assert caffe_pb2.SolverParameter.GPU == 1",
+    "caffe.proto.caffe_pb2.Datum": "d = caffe_pb2.Datum(); d.ParseFromString(caffe_pb2.Datum().SerializeToString())",
+    "caffe.proto.caffe_pb2.Datum.FromString": "assert caffe_pb2.Datum.FromString(b'').label == 0",
+    "caffe.proto.caffe_pb2.LayerParameter": "caffe_pb2.LayerParameter(name='x', bottom=['a'])",
+    "caffe.proto.caffe_pb2.ParamSpec": "assert caffe_pb2.ParamSpec(lr_mult=2).decay_mult == 1",
+    "caffe.proto.caffe_pb2.TRAIN": "assert caffe_pb2.TRAIN == caffe.TRAIN",
+    "caffe.proto.caffe_pb2.TEST": "assert caffe_pb2.TEST == caffe.TEST",
+    "caffe.proto.caffe_pb2.Phase.Value": "assert caffe_pb2.Phase.Value('TEST') == 1",
+    "caffe.proto.caffe_pb2.DataParameter.LMDB": "assert caffe_pb2.DataParameter.LMDB == P.Data.LMDB",
+    "caffe.proto.caffe_pb2.PoolingParameter.AVE": "assert caffe_pb2.PoolingParameter.AVE == P.Pooling.AVE",
+    "caffe.proto.caffe_pb2.LabelMap": "m = caffe_pb2.LabelMap(); m.item.add(name='n', label=1, display_name='d')",
+    "caffe.proto.caffe_pb2.BNParameter.INFERENCE": "assert caffe_pb2.BNParameter.INFERENCE == 1",
+    "caffe.io.load_image": "assert caffe.io.load_image('image.png').shape == (8, 6, 3)",
+    "caffe.io.resize_image": "assert caffe.io.resize_image(image, (4, 4)).shape == (4, 4, 3)",
+    "caffe.io.resize": "assert caffe.io.resize(image, (4, 4)).shape == (4, 4, 3)",
+    "caffe.io.oversample": "assert caffe.io.oversample([image], (4, 4)).shape == (10, 4, 4, 3)",
+    "caffe.io.array_to_datum": "assert caffe.io.array_to_datum(image.transpose(2, 0, 1), 1).label == 1",
+    "caffe.io.datum_to_array": "assert caffe.io.datum_to_array(caffe.io.array_to_datum(image)).shape == image.shape",
+    "caffe.io.blobproto_to_array": """
+b = caffe_pb2.BlobProto(data=[1, 2], num=1, channels=2, height=1, width=1)
+assert caffe.io.blobproto_to_array(b)[0].mean(1).mean(1).tolist() == [1, 2]
+""",
+    "caffe.io.caffe_pb2.BlobProto.FromString": "assert not caffe.io.caffe_pb2.BlobProto.FromString(b'').data",
+    "caffe.io.Transformer": "assert transformer.inputs['data'] == (2, 3, 8, 6)",
+    ".set_transpose(..)": "transformer.set_transpose('data', (2, 0, 1))",
+    ".set_mean(..)": "transformer.set_mean('data', np.array([104, 117, 123]))",
+    ".set_channel_swap(..)": "transformer.set_channel_swap('data', (2, 1, 0))",
+    ".set_raw_scale(..)": "transformer.set_raw_scale('data', 255)",
+    ".set_input_scale(..)": "transformer.set_input_scale('data', 0.017)",
+    ".preprocess(..)": """
+transformer.set_transpose('data', (2, 0, 1))
+net.blobs['data'].data[...] = transformer.preprocess('data', image)
+assert np.allclose(net.forward()['prob'][1, :, 0, 0], image.mean((0, 1)), rtol=1e-5)
+""",
+    ".deprocess(..)": """
+transformer.set_transpose('data', (2, 0, 1))
+assert transformer.deprocess('data', net.blobs['data'].data[0]).shape == (8, 6, 3)
+""",
+    "caffe.Classifier": "caffe.Classifier('deploy.prototxt', 'net.caffemodel', mean=np.ones(3), image_dims=(9, 9))",
+    ".predict(..)": "assert len(caffe.Classifier('deploy.prototxt', 'net.caffemodel').predict([image], False)) == 1",
+    "from caffe import params": "from caffe import params as P; assert P.Pooling.MAX == 0",
+    "from caffe import layers": "from caffe import layers as L; L.ReLU(L.Input())",
+    "caffe.layers.<Type>": "assert caffe.layers.ReLU(caffe.layers.Input()).fn.type_name == 'ReLU'",
+    "caffe.params.<X>": "assert caffe.params.Eltwise.SUM == 1",
+    "caffe.NetSpec": "n = caffe.NetSpec(); n.data = L.Input(); assert n.to_proto().layer[0].name == 'data'",
+    ".to_proto(..)": "assert L.ReLU(L.Input()).to_proto().layer[1].type == 'ReLU'",
+    "from caffe import to_proto": "from caffe import to_proto; assert len(to_proto(L.Input()).layer) == 1",
+    "caffe.to_proto": "assert 'type: \"Input\"' in str(caffe.to_proto(L.Input()))",
+    "from caffe.coord_map import crop": "from caffe.coord_map import crop",
+    "caffe.coord_map.crop": """
+data = L.Input(); up = L.Deconvolution(L.Pooling(data, kernel_size=2, stride=2), kernel_size=4, stride=2)
+import caffe.coord_map
+assert caffe.coord_map.crop(up, data).fn.params['crop_param']['offset'] == [1]
+""",
+    "import caffe.draw": "import caffe.draw; caffe.draw.draw_net_to_file",
+    "caffe.draw.draw_net_to_file": """
+import caffe.draw
+caffe.draw.draw_net_to_file(L.ReLU(L.Input()).to_proto(), 'net.dot', 'TB')
+""",
+    "from caffe.draw import get_pydot_graph": "from caffe.draw import get_pydot_graph",
+    "caffe.draw.get_pydot_graph": """
+import caffe.draw
+assert caffe.draw.get_pydot_graph(L.ReLU(L.Input()).to_proto(), 'TB').get_nodes()
+""",
+    ".param_str": "p = L.Python(param_str='{}').to_proto().layer[0]; assert p.python_param.param_str == '{}'",
+    "caffe._caffe.BlobVec": "import caffe._caffe; caffe._caffe.BlobVec",
+    "import caffe": "import caffe; assert caffe.__name__ == 'netspec.compat.pycaffe'",
+}
 
 
 @pytest.mark.parametrize("use", USES)
 def test_what_scripts_do_with_nets_and_solvers(use: str, write: Callable[..., str]) -> None:
     for name in ("deploy", "memory", "train", "solver"):
-        write(CASES[f"{name}.prototxt"]["text"], f"{name}.prototxt")
+        write((NETS / f"usage_{name}.prototxt").read_text(), f"{name}.prototxt")
     net = caffe.Net("deploy.prototxt", caffe.TEST)
     net.save("usage.caffemodel")
     random = np.random.default_rng(0)
@@ -48,7 +236,7 @@ def test_what_scripts_do_with_nets_and_solvers(use: str, write: Callable[..., st
 def as_in_netspec_run(write: Callable[..., str]) -> Iterator[None]:
     """Let ``import caffe`` find netspec, in a folder with a net, its weights and an image."""
     cv2 = pytest.importorskip("cv2")
-    write(CASES["pool.prototxt"]["text"], "deploy.prototxt")
+    write((NETS / "usage_pool.prototxt").read_text(), "deploy.prototxt")
     caffe.Net("deploy.prototxt", caffe.TEST).save("net.caffemodel")
     cv2.imwrite("image.png", np.zeros((8, 6, 3), np.uint8))
     use_dialect("ssd")
@@ -66,4 +254,4 @@ def test_what_scripts_do_around_nets(use: str, as_in_netspec_run: None) -> None:
         pytest.importorskip("pydot")
     if any(word in AROUND[use] for word in ("load_image", "resize", "Classifier")):
         pytest.importorskip("skimage")
-    exec(f"{CASES['around nets']['before']}\n{AROUND[use]}", {})
+    exec(BEFORE + AROUND[use], {})

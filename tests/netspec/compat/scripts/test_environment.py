@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from case_files import read_texts
 from paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -107,7 +106,7 @@ def test_a_real_caffe_elsewhere_on_the_path_is_refused(environment: Path, monkey
     assert "caffe.py: is there already" in run(environment, "python", "-m", "netspec", "install-caffe", rc=1).stderr
 
 
-(CREATE,) = read_texts("netspec/compat/scripts/environment.txt").values()
+CREATE = (Path(__file__).parent / "programs" / "create.sh").read_text()
 
 
 def test_shell_scripts_find_the_commands_where_caffe_is_built(environment: Path) -> None:

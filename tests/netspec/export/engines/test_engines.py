@@ -14,7 +14,6 @@ import pytest
 import torch
 
 import netspec
-from case_files import read_texts
 from netspec.cli import main
 from netspec.errors import SpecError
 from netspec.export.engines import choice, runners
@@ -22,7 +21,8 @@ from netspec.inspect.features.describer import Describer
 from netspec.inspect.features.records import extract_records
 
 ENGINES = ["onnxruntime", "openvino"]
-NET, FIRST_GOES_FIRST = read_texts("netspec/export/engines/engines.txt").values()
+NET = (Path(__file__).parent / "nets" / "engines.prototxt").read_text()
+FIRST_GOES_FIRST = (Path(__file__).parent / "programs" / "first_goes_first.py").read_text()
 
 
 @pytest.fixture(params=ENGINES)

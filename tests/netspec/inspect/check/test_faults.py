@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import netspec
-from case_files import read_cases, read_texts
+from case_files import read_cases
 from netspec.data.blobs import from_array
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
@@ -20,7 +20,12 @@ from netspec.data.mean import write_mean
 
 Run = Callable[..., Any]  # the fixture of conftest.py
 
-SOLVER, NET, READS = read_texts("netspec/inspect/check/faults.txt").values()
+SOLVER = (Path(__file__).parent / "nets" / "solver.prototxt").read_text()
+NET = (Path(__file__).parent / "nets" / "faults.prototxt").read_text()
+READS = """layer { name: "d" type: "Data" top: "data" top: "label"
+  data_param { source: "%s" backend: LMDB batch_size: 2 } }
+layer { name: "hush" type: "Silence" bottom: "data" bottom: "label" }
+"""
 #: A net that reads from the database ``%s``.
 # The files of each, where they are not the two above, and how each line begins that says what is wrong with them.
 CASES = read_cases("netspec/inspect/check/cases/faults.txt")

@@ -11,7 +11,6 @@ import pytest
 import torch
 from google.protobuf import text_format
 
-from case_files import read_texts
 from netspec.cli import main
 from netspec.data.images import read_image
 from netspec.errors import SpecError
@@ -25,7 +24,9 @@ from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN, LayerParameter
 
 MIB = 1 << 20
-PARAMETERS, DUMMY, HUGE = read_texts("netspec/inspect/check/limit.txt").values()
+PARAMETERS = (Path(__file__).parent / "nets" / "parameters.prototxt").read_text()
+DUMMY = (Path(__file__).parent / "nets" / "dummy.prototxt").read_text()
+HUGE = (Path(__file__).parent / "nets" / "huge.prototxt").read_text()
 CHAIN = 'layer { name: "data" type: "Input" top: "0" input_param { shape { dim: 1 dim: 1048576 } } }\n' + "".join(
     f'layer {{ name: "r{i}" type: "TanH" bottom: "{i}" top: "{i + 1}" }}\n' for i in range(10)
 )
@@ -69,9 +70,9 @@ def filled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 @pytest.mark.parametrize(
     ("text", "limit", "said"),
     [
-        (PARAMETERS, "100MiB", '4:1: layer "two" (InnerProduct): needs 235 MiB of memory, the most of all layers'),
-        (DUMMY, "100MiB", '2:1: layer "first" (DummyData): needs 244 MiB of memory, the most of all layers'),
-        (HUGE, "100TiB", '3:1: layer "ip" (InnerProduct): found shape (4000000, 1000000), 4,000,000,000,000 numbers'),
+        (PARAMETERS, "100MiB", '3:1: layer "two" (InnerProduct): needs 235 MiB of memory, the most of all layers'),
+        (DUMMY, "100MiB", '1:1: layer "first" (DummyData): needs 244 MiB of memory, the most of all layers'),
+        (HUGE, "100TiB", '2:1: layer "ip" (InnerProduct): found shape (4000000, 1000000), 4,000,000,000,000 numbers'),
     ],
     ids=["parameters", "a blob", "more than Caffe counts"],
 )

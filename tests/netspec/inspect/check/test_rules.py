@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from case_files import read_texts
+from case_files import read_cases
 from netspec.cli import main
 from netspec.inspect.check.check import ON_META
 from netspec.inspect.check.findings import RULES
@@ -56,9 +56,12 @@ def test_nothing_is_found_in_a_sound_net_and_solver() -> None:
     assert found(DUMMY + CONV.replace("num_output", "bias_term: false num_output") + NORM + IP + LOSS) == []
 
 
-@pytest.mark.parametrize(("rule", "net"), read_texts("netspec/inspect/check/cases/rules.txt").items())
-def test_rules_for_nets(rule: str, net: str) -> None:
-    name, place = rule.split()[:2]
+CASES = read_cases("netspec/inspect/check/cases/rules.txt")
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_rules_for_nets(case: dict[str, str]) -> None:
+    net, (name, place) = case["net"], case["found"].split()
     assert found(net) == [f"{name} {place}"]
     (first, *_) = lint(net).found
     with_comment = net.split("\n")
