@@ -13,8 +13,9 @@ from paths import ROOT
 pytestmark = pytest.mark.slow
 
 CODE = """
-import argparse, sys, time
-from netspec.terminal.commands import Commands, run
+import sys, time
+from netspec.terminal.commands import run
+from netspec.terminal.parser import Commands, Parser
 
 def endless(arguments):
     try:
@@ -25,8 +26,8 @@ def endless(arguments):
         print("ending", flush=True)
         time.sleep({cleaning})
 
-parser = argparse.ArgumentParser()
-Commands(parser).add("endless", endless, "")
+parser = Parser()
+Commands(parser).add_parser("endless", help="").set_defaults(function=endless)
 sys.exit(run(parser, ["endless"]))
 """
 IMPORTED = """

@@ -1,5 +1,6 @@
-import argparse, sys, time
-from netspec.terminal.commands import Commands, run
+import sys, time
+from netspec.terminal.commands import run
+from netspec.terminal.parser import Commands, Parser
 
 def loading(arguments):
     try:
@@ -8,6 +9,6 @@ def loading(arguments):
     except BaseException:
         raise ImportError("initialization failed")
 
-parser = argparse.ArgumentParser()
-Commands(parser).add("loading", loading, "")
+parser = Parser()
+Commands(parser).add_parser("loading", help="").set_defaults(function=loading)
 sys.exit(run(parser, ["loading"]))

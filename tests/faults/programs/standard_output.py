@@ -1,10 +1,11 @@
-import argparse, sys, types
+import sys, types
 from netspec.terminal.main import program
-from netspec.terminal.commands import Commands, run
+from netspec.terminal.commands import run
+from netspec.terminal.parser import Commands, Parser
 
 def main(words):
-    parser = argparse.ArgumentParser()
-    Commands(parser).add("say", lambda arguments: print(*words), "")
+    parser = Parser()
+    Commands(parser).add_parser("say", help="").set_defaults(function=lambda arguments: print(*words))
     return run(parser, ["say"])
 
 sys.modules["commands"] = types.SimpleNamespace(main=main)
