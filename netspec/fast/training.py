@@ -214,8 +214,7 @@ class TrainingStep:
                 continue
             layer.fit([shapes[v] for v in node.bottoms])
             shapes.update(zip(tops, layer.top_shapes, strict=False))
-            free = [plan.net.force_backward or not blocked for blocked in node.blocked]
-            wanted = tuple(v in needs and f for v, f in zip(node.bottoms, free, strict=True))
+            wanted = tuple(v in needs and not stop for v, stop in zip(node.bottoms, node.blocked, strict=True))
             forward, backward = self._kernels(part, wanted)
             made.forward.append((forward, node.bottoms, tops, self._losses(i, layer, made)))
             if any(wanted) or any(blob.requires_grad for blob in part.blobs):

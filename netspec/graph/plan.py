@@ -8,7 +8,7 @@ Caffe: Net::Init, AppendTop, AppendBottom, AppendParam (src/caffe/net.cpp).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from netspec.errors import SpecError
 from netspec.proto.schema import LayerParameter, NetParameter
@@ -39,7 +39,7 @@ class Node:
     tops: tuple[int, ...]
     in_place: tuple[bool, ...]
     params: tuple[Param, ...]
-    blocked: tuple[bool, ...]  # propagate_down: false, by bottom
+    blocked: tuple[bool, ...]  # propagate_down: false, by bottom; see also unblocked()
 
 
 @dataclass(frozen=True)
@@ -138,19 +138,28 @@ def _shared_multipliers(net: NetParameter, source: SourceMap) -> dict[str, tuple
 
 @dataclass(frozen=True)
 class Backward:
-    """What Caffe propagates backward: by layer, and by layer and bottom."""
+    """What Caffe propagates backward: by layer, and by layer and bottom.
+
+    ``computed``: the bottoms whose gradient is computed, also where a layer does not heed propagate_down.
+    """
 
     layers: tuple[bool, ...]
     bottoms: tuple[tuple[bool, ...], ...]
+    computed: tuple[tuple[bool, ...], ...]
 
 
 def plan_backward(
-    plan: Plan, learns: Sequence[bool], has_loss: Sequence[Sequence[bool]], label_bottoms: Sequence[frozenset[int]]
+    plan: Plan,
+    learns: Sequence[bool],
+    has_loss: Sequence[Sequence[bool]],
+    label_bottoms: Sequence[frozenset[int]],
+    unheeding: Sequence[frozenset[int]],
 ) -> Backward:
     """Decide what needs backward computation, like Net::Init.
 
     ``learns[i]``: layer i has a parameter with a nonzero rate; ``has_loss[i][j]``: its top j has a loss weight (also
-    anonymous tops); ``label_bottoms[i]``: its bottoms that never receive a gradient.
+    anonymous tops); ``label_bottoms[i]``: its bottoms that never receive a gradient; ``unheeding[i]``: those that
+    receive one even with ``propagate_down: false``, which is of use where the layer that made them goes backward.
     """
     value_needs = [False] * len(plan.blobs)
     layer_needs: list[bool] = []
@@ -188,7 +197,24 @@ def plan_backward(
         bottom_needs = [
             [need or j not in label_bottoms[i] for j, need in enumerate(needs)] for i, needs in enumerate(bottom_needs)
         ]
-    return Backward(tuple(layer_needs), tuple(tuple(needs) for needs in bottom_needs))
+    goes_on = {v: needs for node, needs in zip(plan.nodes, layer_needs, strict=True) for v in node.tops}
+    computed = tuple(
+        tuple(
+            need or (layer_needs[i] and j in unheeding[i] and goes_on.get(node.bottoms[j], False))
+            for j, need in enumerate(bottom_needs[i])
+        )
+        for i, node in enumerate(plan.nodes)
+    )
+    return Backward(tuple(layer_needs), tuple(tuple(needs) for needs in bottom_needs), computed)
+
+
+def unblocked(plan: Plan, backward: Backward) -> Plan:
+    """Return the plan with ``blocked`` only where the gradient of a bottom is really not computed."""
+    nodes = [
+        replace(node, blocked=tuple(stop and not made for stop, made in zip(node.blocked, computed, strict=True)))
+        for node, computed in zip(plan.nodes, backward.computed, strict=True)
+    ]
+    return replace(plan, nodes=tuple(nodes))
 
 
 def origins(plan: Plan, passes_on: Sequence[bool]) -> tuple[int, ...]:

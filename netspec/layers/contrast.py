@@ -40,7 +40,9 @@ class LRN(Layer):
         if param.local_size % 2 == 0 or param.local_size > MOST:
             expected = "odd" if param.local_size % 2 == 0 else f"at most {MOST}"
             raise self.error(f"local_size must be {expected}, found {param.local_size}", "lrn_param", "local_size")
-        if param.norm_region != ACROSS_CHANNELS:
+        if param.norm_region == ACROSS_CHANNELS:
+            self.ignores_propagate_down = frozenset({0})
+        else:
             self.ignores = frozenset({"lrn_param.k"})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
@@ -127,6 +129,8 @@ class MVN(Layer):
     top[0]     (N, C, H, W); always four axes, missing ones are 1
     Caffe: src/caffe/layers/mvn_layer.cpp
     """
+
+    ignores_propagate_down = frozenset({0})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shape = bottom_shapes[0]

@@ -39,6 +39,7 @@ class BatchNorm(Layer):
     Caffe: src/caffe/layers/batch_norm_layer.cpp
     """
 
+    ignores_propagate_down = frozenset({0})
     joined: tuple[Layer, ...] = ()  # a Scale of its channels, a ReLU: it does their work too, where the batch counts
     rectifies = False  # whether there is a ReLU among them
     fresh = True

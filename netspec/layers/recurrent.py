@@ -97,6 +97,7 @@ class Recurrent(Layer):
         self.exposed: bool = p.expose_hidden
         exposed = len(self.state_names) * self.exposed
         self.has_static = len(self.bottom_shapes) == 3 + exposed
+        self.ignores_propagate_down = frozenset({0, 2} if self.has_static else {0})
         if len(self.bottom_shapes) != 2 + self.has_static + exposed:
             names = ", ".join(("x", "cont", "[x_static]", *self.state_names[:exposed]))
             raise self.error(f"found {len(self.bottom_shapes)} bottom blob(s), expected {names}", "bottom")
@@ -367,6 +368,10 @@ class LSTMUnit(Layer):
     bottoms = (3, 3)
     tops = (2, 2)
     label_bottoms = frozenset({2})
+
+    def setup(self) -> None:
+        if any(self.param.propagate_down[:2]):  # Caffe computes both gradients where one is asked for
+            self.ignores_propagate_down = frozenset({0, 1})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         cell, gates, cont = bottom_shapes

@@ -23,6 +23,7 @@ from netspec.graph.plan import AUTOMATIC, Backward, Node, Param, Plan, plan_back
 from netspec.layers import class_of, unknown_type
 from netspec.layers.contract.base import Layer, Shape, shape_string
 from netspec.layers.contract.context import Context, Random, device_of
+from netspec.layers.contract.gradients import ignores_propagate_down
 from netspec.net.ignored_fields import doubtful_layers, unused_fields
 from netspec.net.need import BYTES, Need, limit_on, limit_text
 from netspec.proto.forks import forks
@@ -193,7 +194,9 @@ class Assembly:
         for node, layer in zip(self._plan.nodes, layers, strict=True):
             learns.append(any(_spec(node, layer, j).lr_mult for j in range(len(layer.blobs))))
         has_loss = [[bool(w) for w in weights] for weights in self.loss_weights]
-        backward = plan_backward(self._plan, learns, has_loss, [layer.label_bottoms for layer in layers])
+        labels = [layer.label_bottoms for layer in layers]
+        unheeding = [ignores_propagate_down(layer) for layer in layers]
+        backward = plan_backward(self._plan, learns, has_loss, labels, unheeding)
         for node, needs in zip(reversed(self._plan.nodes), reversed(backward.layers), strict=True):
             if needs:
                 log.info("net.cpp:200", f"{node.name} needs backward computation.")

@@ -19,7 +19,7 @@ from netspec.exact import ALL
 from netspec.exact.blas import other_kernels
 from netspec.graph import check_blobs
 from netspec.graph.options import BuildOptions
-from netspec.graph.plan import Plan
+from netspec.graph.plan import Plan, unblocked
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.context import device_of
 from netspec.layers.contract.reading import Fed, Restarts, TakesArrays
@@ -79,6 +79,7 @@ class Net(torch.nn.Module):
         ]
         if made.backward is not None:  # otherwise errors were collected: it will not run
             self.backward_plan = made.backward
+            self.plan = unblocked(plan, made.backward)
             self._set_runners()
 
     def _set_runners(self) -> None:

@@ -74,8 +74,7 @@ class Eager:
 
     def _as_asked(self, i: int) -> Callable[..., tuple[torch.Tensor, ...]]:
         """Return what runs a layer: without gradients for blocked bottoms; losses are float32 in every precision."""
-        layer, force = self.layers[i], self.plan.net.force_backward
-        blocked = [stop and not force for stop in self.plan.nodes[i].blocked]
+        layer, blocked = self.layers[i], self.plan.nodes[i].blocked
         if not layer.is_loss and not any(blocked):
             return layer.run
 
@@ -109,8 +108,7 @@ class Eager:
             if self.overwritten[step.node]:
                 node, layer = plan.nodes[step.node], self.layers[step.node]
                 memory = memories.setdefault(plan.final[node.tops[0]], Memory())
-                stop = node.blocked[0] and not plan.net.force_backward
-                bottom = bottoms[0].detach() if stop else bottoms[0]
+                bottom = bottoms[0].detach() if node.blocked[0] else bottoms[0]
                 tops = run_overwritten(layer, bottom, memory, node.in_place[0])
             else:
                 tops = step.run(*bottoms)

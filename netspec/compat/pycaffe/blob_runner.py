@@ -151,7 +151,7 @@ class BlobRunner:
     def _is_asked(self, i: int) -> bool:
         """Return whether a gradient of layer ``i`` is asked for, of a bottom or of a learnable blob."""
         plan = self.net.backward_plan
-        return plan.layers[i] and (any(plan.bottoms[i]) or any(blob.requires_grad for blob in self._layers[i].blobs))
+        return plan.layers[i] and (any(plan.computed[i]) or any(blob.requires_grad for blob in self._layers[i].blobs))
 
     def _can_bind(self, i: int) -> bool:
         """Return whether layer ``i`` has kernels of its own for what autograd would watch."""
@@ -358,7 +358,7 @@ class BlobRunner:
             made = forward(*values)
             return Tape(values, holders, (made,) if isinstance(made, torch.Tensor) else made, backward)
         leaves, holders = [], []
-        for blob, wanted in zip(self.bottoms[i], self.net.backward_plan.bottoms[i], strict=True):
+        for blob, wanted in zip(self.bottoms[i], self.net.backward_plan.computed[i], strict=True):
             memory = blob.data_memory
             value = memory.tensor(blob.shape)
             overwritten = memory.is_watched() and self._is_in_place(i, blob)
@@ -377,7 +377,7 @@ class BlobRunner:
         if bound is None or bound.shapes != shapes or bound.places != places_of(layer):
             layer.fit(shapes)
             sums = tuple(gradient_of(blob) if blob.requires_grad else None for blob in layer.blobs)
-            wanted = tuple(self.net.backward_plan.bottoms[i])
+            wanted = tuple(self.net.backward_plan.computed[i])
             made = own_kernels(layer, Preparation(wanted, sums, steady=False))
             made = made or recorded(layer.run, wanted, list(layer.blobs))
             bound = self._bound[i] = Bound(shapes, places_of(layer), made)
@@ -407,7 +407,7 @@ class BlobRunner:
         if not self.net.backward_plan.layers[i]:
             return
         layer, bottoms, tops = self._layers[i], self.bottoms[i], self.tops[i]
-        wanted = self.net.backward_plan.bottoms[i]
+        wanted = self.net.backward_plan.computed[i]
         if isinstance(layer, Python):
             with importable():
                 layer.code.backward(tops, list(wanted), bottoms)

@@ -75,7 +75,7 @@ class WholeRun:
     def _reached(self) -> Iterator[tuple[int, Blob]]:
         """Yield values and the blobs of their gradients, as they are written in a backward pass."""
         plan, runner = self._net.backward_plan, self._runner
-        every = zip(self._net.plan.nodes, self._net.layers, runner.bottoms, plan.layers, plan.bottoms, strict=True)
+        every = zip(self._net.plan.nodes, self._net.layers, runner.bottoms, plan.layers, plan.computed, strict=True)
         for node, layer, bottoms, reached, wanted in reversed(list(every)):
             if reached and "diff" not in layer.shares:
                 yield from ((v, b) for v, b, w in zip(node.bottoms, bottoms, wanted, strict=True) if w)

@@ -25,9 +25,20 @@ class OwnGradient(Protocol):
         ...
 
 
+class Unheeding(Protocol):
+    """A layer that does not look at ``propagate_down`` in its backward pass."""
+
+    ignores_propagate_down: frozenset[int]  # the bottoms that get a gradient even where it is false
+
+
 def gradient_reads(layer: Layer) -> frozenset[str]:
     """Return what a layer's gradient reads, nothing where autograd keeps what it needs."""
     return getattr(layer, "gradient_reads", NOTHING)
+
+
+def ignores_propagate_down(layer: Layer) -> frozenset[int]:
+    """Return the bottoms of a layer that get a gradient even where ``propagate_down`` is false."""
+    return getattr(layer, "ignores_propagate_down", frozenset())
 
 
 def gradient_from_memory(layer: Layer, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:

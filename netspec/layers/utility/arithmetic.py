@@ -243,6 +243,7 @@ class Softmax(Layer):
     """
 
     gradient_reads = frozenset({"top"})
+    ignores_propagate_down = frozenset({0})
     fresh = True
     any_layout = True
 

@@ -39,6 +39,7 @@ class Concat(Layer):
     def setup(self) -> None:
         if len(self.bottom_shapes) == 1:  # it is not copied
             self.shares = frozenset({"data", "diff"})
+            self.ignores_propagate_down = frozenset({0})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         first = bottom_shapes[0]
@@ -88,6 +89,7 @@ class Slice(Layer):
     def setup(self) -> None:
         if self.num_tops == 1:  # it is not copied
             self.shares = frozenset({"data", "diff"})
+            self.ignores_propagate_down = frozenset({0})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shape = bottom_shapes[0]

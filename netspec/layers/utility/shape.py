@@ -20,6 +20,7 @@ class _OtherShape(Layer):
     """A layer whose top has its bottom's numbers in another shape."""
 
     shares = frozenset({"data", "diff"})
+    ignores_propagate_down = frozenset({0})
 
     def setup(self) -> None:
         refuse_in_place(self)

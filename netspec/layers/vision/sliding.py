@@ -145,6 +145,7 @@ class Im2col(SlidingFilter):
     Caffe: src/caffe/layers/im2col_layer.cpp
     """
 
+    ignores_propagate_down = frozenset({0})
     ignores = frozenset(
         f"convolution_param.{name}" for name in ("num_output", "bias_term", "group", "weight_filler", "bias_filler")
     )
