@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import struct
 import threading
 import weakref
 from abc import ABC, abstractmethod
@@ -164,7 +165,7 @@ class _LevelDbReader(Reader):
     """A LevelDB, opened in a folder of links to its files.
 
     The library locks a database and rewrites parts of it, even to read. The links let several processes read one, and
-    one on read-only media.
+    one on read-only media. Without ``paranoid_checks`` and ``verify_checksums`` it would pass over what is damaged.
     """
 
     def __init__(self, source: str) -> None:
@@ -174,13 +175,15 @@ class _LevelDbReader(Reader):
         # Unlike weakref's, this runs at the end of a worker too, and never in a process that was forked later.
         Finalize(self, shutil.rmtree, (folder, True), exitpriority=0)
         for name in set(os.listdir(source)) - {"LOCK", "LOG", "LOG.old"}:
+            if name.endswith(".log") and _ends_within_a_record(Path(source, name)):
+                raise ValueError(f"is damaged: its file {name} ends within a record; copy or write the database again")
             os.symlink(os.path.abspath(os.path.join(source, name)), os.path.join(folder, name))
         try:
-            self._db = plyvel.DB(folder, create_if_missing=False)
+            self._db = plyvel.DB(folder, create_if_missing=False, paranoid_checks=True)
+            with self._db.iterator(include_value=False, verify_checksums=True) as keys:
+                self._keys: list[bytes] = list(keys)
         except (plyvel.Error, OSError) as fault:
-            raise ValueError(f"cannot be opened as a LevelDB ({fault})") from None
-        with self._db.iterator(include_value=False) as keys:
-            self._keys: list[bytes] = list(keys)
+            raise ValueError(f"cannot be opened as a LevelDB ({_said(fault)})") from None
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -189,15 +192,19 @@ class _LevelDbReader(Reader):
         return self._keys[i]
 
     def records(self, numbers: Sequence[int]) -> list[bytes]:
-        values: list[bytes] = []
-        for run in _runs(numbers):
-            keys = [self._keys[i] for i in numbers[run]]
-            if len(keys) == 1:
-                values.append(self._db.get(keys[0]))
-                continue
-            with self._db.iterator(start=keys[0], stop=keys[-1], include_stop=True, include_key=False) as walk:
-                values += walk
-        return values
+        try:
+            return [value for run in _runs(numbers) for value in self._values([self._keys[i] for i in numbers[run]])]
+        except (_plyvel().Error, OSError) as fault:
+            raise SpecError(f'database "{self._source}" is damaged ({_said(fault)})') from None
+
+    def _values(self, keys: Sequence[bytes]) -> list[bytes]:
+        """Return the values of keys that follow each other."""
+        if len(keys) == 1:
+            return [self._db.get(keys[0], verify_checksums=True)]
+        with self._db.iterator(
+            start=keys[0], stop=keys[-1], include_stop=True, include_key=False, verify_checksums=True
+        ) as walk:
+            return list(walk)
 
     @property
     def is_current(self) -> bool:
@@ -211,6 +218,34 @@ def _runs(numbers: Sequence[int]) -> Iterator[slice]:
         if end == len(numbers) or numbers[end] != numbers[end - 1] + 1:
             yield slice(start, end)
             start = end
+
+
+def _said(fault: Exception) -> str:
+    """Return what the library says of a fault: it has bytes there."""
+    said = fault.args[0] if fault.args else ""
+    return said.decode(errors="replace") if isinstance(said, bytes) else str(fault)
+
+
+def _ends_within_a_record(log: Path) -> bool:
+    """Say whether a log of LevelDB was cut: the library takes the rest of it for what a dead writer left.
+
+    LevelDB: doc/log_format.md
+    """
+    size, block, header = log.stat().st_size, 32768, 7
+    full, last = 1, 4  # kinds of parts; a record is one part, or several in several blocks
+    place, kind = 0, full
+    with log.open("rb") as file:
+        while place < size:
+            room = block - place % block
+            if room < header:  # zeros to the end of the block
+                place += room
+                continue
+            file.seek(place)
+            _, length, kind = struct.unpack("<IHB", file.read(header).ljust(header, b"\0"))
+            if kind == 0:  # space that was reserved and not used
+                return False
+            place += header + length
+    return place > size or kind not in (full, last)
 
 
 def _contents(folder: str) -> dict[str, tuple[int, int]]:

@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import gc
 import os
+import random
 import sys
 import tempfile
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -310,6 +312,54 @@ def test_reading_a_leveldb_neither_locks_nor_changes_it(tmp_path: Path) -> None:
     assert len(folders - set(Path(tempfile.gettempdir()).glob("netspec-leveldb-*"))) >= 1
     other.close()
     assert set(before) - set(during) <= {name for name in before if name.endswith(".log") or "MANIFEST" in name}
+
+
+def cut(data: bytes) -> bytes:
+    return data[: len(data) // 2]
+
+
+def flip(data: bytes) -> bytes:
+    return data[:-200] + bytes([data[-200] ^ 1]) + data[-199:]
+
+
+@pytest.mark.parametrize(
+    ("kind", "damage", "says"),
+    [
+        pytest.param("*.log", cut, "000003.log ends within a record", id="a log that is cut"),
+        pytest.param("*.log", flip, "checksum mismatch", id="a log with another bit"),
+        pytest.param("*.ldb", cut, "Corruption|Invalid argument", id="a table that is cut"),
+        pytest.param("*.ldb", flip, "checksum mismatch|Corruption", id="a table with another bit"),
+    ],
+)
+def test_a_damaged_leveldb_is_refused(tmp_path: Path, kind: str, damage: Callable[[bytes], bytes], says: str) -> None:
+    """The library alone reads fewer or other records."""
+    plyvel = pytest.importorskip("plyvel")
+    write(tmp_path / "db", {b"%08d" % i: bytes([i % 256]) * 100 for i in range(2500)}, "leveldb")
+    if kind == "*.ldb":
+        tables = plyvel.DB(str(tmp_path / "db"))
+        tables.compact_range()
+        tables.close()
+    (place,) = (path for path in (tmp_path / "db").glob(kind) if path.stat().st_size)
+    place.write_bytes(damage(place.read_bytes()))
+    with pytest.raises(SpecError, match=says):
+        open_reader(str(tmp_path / "db"), "leveldb")
+
+
+def test_records_of_a_leveldb_that_is_damaged_later(tmp_path: Path) -> None:
+    """What was not read when it was opened is checked when it is read."""
+    plyvel = pytest.importorskip("plyvel")
+    write(tmp_path / "db", {b"%08d" % i: random.Random(i).randbytes(10_000) for i in range(200)}, "leveldb")
+    tables = plyvel.DB(str(tmp_path / "db"))
+    tables.compact_range()
+    tables.close()
+    reader = open_reader(str(tmp_path / "db"), "leveldb")
+    (place,) = (path for path in (tmp_path / "db").glob("*.ldb") if path.stat().st_size)
+    with place.open("r+b") as file:
+        file.write(bytes(1_000_000))
+    with pytest.raises(SpecError, match="is damaged"):
+        reader.records(range(200))
+    with pytest.raises(SpecError, match="is damaged"):
+        reader.record(3)
 
 
 def test_without_plyvel_leveldb_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
