@@ -4,5 +4,6 @@ from netspec.compat.pycaffe import _caffe, classifier, coord_map, detector, draw
 from netspec.compat.pycaffe._caffe import *  # noqa: F403, the compiled module's names, as in Caffe
 from netspec.compat.pycaffe.classifier import Classifier
 from netspec.compat.pycaffe.detector import Detector
+from netspec.compat.pycaffe.mode import set_exact  # not of Caffe
 from netspec.compat.pycaffe.net_spec import NetSpec, layers, params, to_proto
 from netspec.layers.utility.pycaffe_shim import TEST, TRAIN

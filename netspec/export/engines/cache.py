@@ -12,14 +12,17 @@ import platform
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.proto.forks import forks
 
 _EXPORTING = ("dialects", "exact", "export", "graph", "layers", "net", "proto")  # the rooms that decide
+DIGESTS = "digests.json"  # of the files of an entry, by name
 
 
 def key_of(files: Sequence[str | Path], options: Mapping[str, Any]) -> str:
@@ -70,15 +73,23 @@ def _digest(path: str | Path) -> str:
 def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, bool]:
     """Return the folder of a key, and whether it was made: ``make`` fills an empty folder where it is missing.
 
-    Raises OSError where the folder cannot be written.
+    One whose files are not as they were made is moved aside, with a warning, and made again. Raises OSError where the
+    folder cannot be written.
     """
     place = folder / key
     if place.is_dir():
-        return place, False
+        if _is_whole(place):
+            return place, False
+        aside = Path(tempfile.mkdtemp(prefix=".damaged-", dir=folder))
+        log.logger.warning(f"{place}: is damaged, and is made again; what was there is {aside.name} now")
+        with suppress(FileNotFoundError):  # another process was first
+            place.rename(aside)
     folder.mkdir(parents=True, exist_ok=True)
     unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
     try:
         make(unfinished)
+        digests = {path.name: _digest(path) for path in unfinished.iterdir()}
+        (unfinished / DIGESTS).write_text(json.dumps(digests))
         for path in unfinished.iterdir():
             with path.open("rb") as file:
                 os.fsync(file.fileno())
@@ -90,3 +101,12 @@ def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, b
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)  # what this call made
     return place, True
+
+
+def _is_whole(place: Path) -> bool:
+    """Say whether the files of an entry are as they were made; others may have come since."""
+    try:
+        digests = json.loads((place / DIGESTS).read_bytes())
+        return all(_digest(place / name) == digest for name, digest in digests.items())
+    except (OSError, ValueError, AttributeError, SpecError):
+        return False

@@ -113,7 +113,7 @@ class Model:
 def _warn_again(path: Path) -> None:
     """Say the lines of a file; an older netspec kept none."""
     with suppress(OSError):
-        for line in path.read_text("utf-8").splitlines():
+        for line in path.read_text("utf-8", "replace").splitlines():
             log.logger.warning(line)
 
 

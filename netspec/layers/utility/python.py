@@ -7,8 +7,12 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
+import sysconfig
 import traceback
 from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -184,6 +188,18 @@ class Python(Layer):
 
 def _describe(fault: Exception) -> str:
     """Return the exception's class, text and place in one line."""
+    if isinstance(fault, SyntaxError):
+        remedy = "where it is Python 2, `netspec run --python2 -m netspec train ...` translates it"
+        return f"{type(fault).__name__}: {fault.msg} ({fault.filename}:{fault.lineno}); {remedy}"
     frames = traceback.extract_tb(fault.__traceback__)
-    place = f" ({frames[-1].filename}:{frames[-1].lineno})" if frames else ""
+    of_user = [frame for frame in frames if not frame.filename.startswith(_not_of_user())]
+    place = "".join(f" ({frame.filename}:{frame.lineno})" for frame in (of_user or frames)[-1:])
     return f"{type(fault).__name__}: {' '.join(str(fault).split())}{place}"
+
+
+@cache
+def _not_of_user() -> tuple[str, ...]:
+    """Return how the files of Python, of what is installed, and of netspec begin."""
+    folders = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    ours = str(Path(__file__).parents[2])
+    return ("<", *(os.path.join(folder, "") for folder in (*folders, ours)))

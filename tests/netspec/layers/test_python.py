@@ -215,8 +215,44 @@ def test_faults_of_the_code_are_one_line(python, name: str, options: dict, messa
 
 def test_faults_of_old_python_name_file_and_line(python, tmp_path: Path) -> None:
     (tmp_path / "of_2014.py").write_text('import caffe\nprint "hello"\n')
-    with pytest.raises(SpecError, match=r"SyntaxError: .*of_2014.py, line 2"):
+    with pytest.raises(SpecError) as fault:
         python("Mine", (2,), module="of_2014")
+    text = str(fault.value)
+    assert "SyntaxError: " in text
+    assert text.endswith(
+        "of_2014.py:2); where it is Python 2, `netspec run --python2 -m netspec train ...` translates it"
+    )
+
+
+FAULTY = """
+import random
+import caffe
+import their_helper
+
+class Deep(caffe.Layer):
+    def setup(self, bottom, top): random.sample(range(2), 3)
+
+class Deeper(caffe.Layer):
+    def setup(self, bottom, top): their_helper.fails()
+
+class InNetspec(caffe.Layer):
+    def setup(self, bottom, top):
+        top[0].reshape("a")
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "place"), [("Deep", "faulty.py:7"), ("Deeper", "their_helper.py:2"), ("InNetspec", "faulty.py:14")]
+)
+def test_the_place_of_a_fault_is_a_line_of_the_user(python, tmp_path: Path, name: str, place: str) -> None:
+    """Python's own files and netspec's are not where one looks for it."""
+    (tmp_path / "faulty.py").write_text(FAULTY)
+    (tmp_path / "their_helper.py").write_text("def fails():\n    raise ValueError('bad')\n")
+    with pytest.raises(SpecError) as fault:
+        python(name, (2,), module="faulty")
+    for module in ("faulty", "their_helper"):
+        sys.modules.pop(module, None)
+    assert str(fault.value).endswith(f"{place})")
 
 
 def test_faults_of_forward_and_of_a_missing_backward_name_them(python) -> None:

@@ -36,7 +36,7 @@ TOLERANCE = 1e-5  # of the largest element
 @pytest.fixture
 def exact() -> Iterator[Callable[[str], None]]:
     before = mode.exact()
-    yield mode.set_exact
+    yield caffe.set_exact
     mode.set_exact(before)
 
 

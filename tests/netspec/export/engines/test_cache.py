@@ -1,12 +1,14 @@
 """The folder of exported models: whole entries or none, by content."""
 
+import logging
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from netspec.errors import SpecError
-from netspec.export.engines.cache import entry, key_of
+from netspec.export.engines.cache import DIGESTS, entry, key_of
 from netspec.export.engines.choice import Choice, user_folder
 
 
@@ -64,6 +66,31 @@ def test_an_entry_that_another_process_made_meanwhile_is_used(tmp_path: Path) ->
     folder, _ = entry(tmp_path, "key", make)
     assert (folder / "model").stat().st_size == 20
     assert [path.name for path in tmp_path.iterdir()] == ["key"]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(lambda folder: (folder / "model").write_bytes(b"m" * 9), id="a file that was cut"),
+        pytest.param(lambda folder: (folder / "model").write_bytes(b"n" + b"m" * 9), id="a file of other bytes"),
+        pytest.param(lambda folder: (folder / "model").unlink(), id="a file that is gone"),
+        pytest.param(lambda folder: (folder / DIGESTS).write_bytes(b"\xff{"), id="no list of digests"),
+    ],
+)
+def test_a_damaged_entry_is_made_again(
+    damage: Callable[[Path], object], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    make = Maker()
+    folder, _ = entry(tmp_path, "key", make)
+    (folder / "more").write_text("what is added later is no damage")
+    assert entry(tmp_path, "key", make) == (folder, False)
+    damage(folder)
+    with caplog.at_level(logging.WARNING):
+        assert entry(tmp_path, "key", make) == (folder, True)
+        assert entry(tmp_path, "key", make) == (folder, False)
+    assert (folder / "model").read_bytes() == b"m" * 10
+    (aside,) = (path for path in tmp_path.iterdir() if path != folder)
+    assert caplog.messages == [f"{folder}: is damaged, and is made again; what was there is {aside.name} now"]
 
 
 def test_a_key_is_of_contents_and_options(tmp_path: Path) -> None:

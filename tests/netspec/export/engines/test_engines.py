@@ -335,6 +335,24 @@ def test_warnings_of_the_files_are_given_at_every_start(
 
 
 @pytest.mark.slow
+def test_a_damaged_model_is_made_again(
+    engine: str, files: Path, data: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = load(engine)(data=data)["feat"]
+    (kept,) = entries(files)
+    for path in kept.iterdir():
+        content = path.read_bytes()
+        path.write_bytes(content[: len(content) // 2] + b"\xff")
+    caplog.clear()
+    assert torch.equal(load(engine)(data=data)["feat"], first)
+    (line,) = caplog.messages
+    assert line.startswith(f"{kept}: is damaged, and is made again")
+    caplog.clear()
+    assert torch.equal(load(engine)(data=data)["feat"], first)
+    assert caplog.messages == []
+
+
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize("precision", choice.PRECISIONS)
 def test_signals_are_handled_after_nets_of_openvino_are_gone(precision: str) -> None:
