@@ -4,10 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 
@@ -22,43 +20,6 @@ def softmax(scores: torch.Tensor) -> torch.Tensor:
     """Return the softmax along axis 1 of scores (outer, classes, inner) (src/caffe/layers/softmax_layer.cpp)."""
     p = libm.exp(scores - scores.amax(1, keepdim=True))
     return p.div_(torch.from_numpy(class_sums(array(p))).unsqueeze(1))
-
-
-def bound_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return what computes :func:`softmax` of float32 scores of one shape, in memory of its own, with one thread."""
-    p, largest = torch.empty(shape), np.empty((shape[0], 1, shape[2]), np.float32)
-    values, exponents, powers = p.numpy(), np.zeros(shape, np.complex64), np.empty(shape, np.complex64)
-
-    def run(scores: torch.Tensor) -> torch.Tensor:
-        given = scores.numpy()
-        np.maximum.reduce(given, 1, out=largest, keepdims=True)
-        np.subtract(given, largest, exponents.real)  # never above 0: see libm.exp
-        np.exp(exponents, powers)
-        np.divide(powers.real, class_sums(powers.real)[:, None], values)
-        return p
-
-    return run
-
-
-def bound_cross_entropy(
-    shape: tuple[int, int, int], least: float, divisor: float
-) -> Callable[[torch.Tensor, np.ndarray], torch.Tensor]:
-    """Return what computes the sum of -log p, one after the other, by ``divisor``, ().
-
-    Of p, float32 of this shape, it takes the numbers at the given places, and of these none less than ``least``.
-    """
-    one, loss = torch.ones(()), torch.empty(())
-    chosen, logs = torch.empty(2, shape[0] * shape[2])
-    few, values, result, by = chosen.numpy(), logs.numpy(), loss.numpy(), np.float32(divisor)
-
-    def run(p: torch.Tensor, places: np.ndarray) -> torch.Tensor:
-        p.numpy().reshape(-1).take(places, out=few, mode="clip")
-        chosen.clamp_(min=least)
-        torch.special.xlogy(one, chosen, out=logs)  # see libm.log
-        result[()] = -np.add.accumulate(values)[-1] / by
-        return loss
-
-    return run
 
 
 @one_thread()

@@ -2,8 +2,8 @@
 
 A convolution y = W x + b followed by z = s y + t, both s and t one number for each channel, is a convolution with the
 weights s W and the bias s b + t. A BatchNorm that normalizes by its past is such a map, s = 1 / sqrt(var + eps) and t =
--mean s, and so is a Scale; maps in a row are one map. The arithmetic is in double precision. The layers know their own
-part (netspec/layers/contract/folding.py); here they are only put together.
+-mean s, and so is a Scale; maps in a row are one map. The arithmetic is in double precision. What each layer
+is to its neighbors stands in its entry (folding.py); here they are only put together.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from dataclasses import dataclass
 import torch
 
 from netspec.fast.chains import Chain, Roles, find_chains
+from netspec.fast.folding import Absorbed, Affine
+from netspec.fast.table import folds_of
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.folding import Absorbed, Affine, folds_of
+from netspec.layers.contract.exporting import passes_on
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ def roles_of(plan: Plan, layers: Sequence[Layer]) -> Roles:
         absorbs=[one and its.absorb is not None for one, its in zip(one_top, folds, strict=True)],
         affine=affine,
         absorbs_before=[a and its.absorb_before is not None for a, its in zip(affine, folds, strict=True)],
-        passes_on=[its.passes_on for its in folds],
+        passes_on=[passes_on(layer) for layer in layers],
     )
 
 

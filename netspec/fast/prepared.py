@@ -23,14 +23,14 @@ from netspec.exact.blas import one_thread
 from netspec.exact.switch import is_recorded
 from netspec.fast import steps as planned
 from netspec.fast.fold import absorbed_by, roles_of
+from netspec.fast.folding import Absorbed, absorbing
+from netspec.fast.kernels import Inference, Kernel, finished
 from netspec.fast.steps import Schedule, schedule
+from netspec.fast.table import entry_of, folds_of, inference_kernel, is_fresh
 from netspec.graph.options import PACK
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.folding import Absorbed, absorbing, folds_of
-from netspec.layers.contract.kernels import Kernel, Preparation, finished, own_kernels
 from netspec.layers.contract.learned import Stamp, is_lent, stamp
-from netspec.layers.contract.offers import offered
 from netspec.layers.contract.reading import changes_itself
 from netspec.process.heap import give_back_freed_memory
 from netspec.run.shapes import fitted
@@ -157,7 +157,7 @@ class Prepared:
                 absorbs_before=_both(roles.absorbs_before, foldable),
             ),
             finishes=[fit is not None and folds_of(fit).finish is not None for fit in found],
-            fresh=[fit is not None and bool(offered(fit, "fresh")) for fit in found],
+            fresh=[fit is not None and is_fresh(fit) for fit in found],
             given=[v for v, *_ in given],
             kept=kept | {v for node, losses in zip(plan.nodes, self._losses, strict=True) if losses for v in node.tops},
             passes=self.passes,
@@ -216,12 +216,12 @@ class Prepared:
             chain = step.chain
             layer = absorbing(layer, memo("fold", lambda: absorbed_by(chain, layers, layers[chain.keeper].blobs[0])))
         finish = None if step.finish is None else folds_of(layers[step.finish]).finish
-        how = Preparation(
+        how = Inference(
             finish=finish, reuse=step.reuse, lasts=step.lasts, memo=memo, pack=PACK in self.passes, keeps=keeps
         )
-        own = None if as_is else own_kernels(layer, how)
-        kernel = (own or finished(layer.forward, finish)).forward
-        if not offered(layer, "any_layout") or self._exact == ALL:
+        own = None if as_is else inference_kernel(layer, how)
+        kernel = own or finished(layer.forward, finish)
+        if not entry_of(layer).any_layout or self._exact == ALL:
             inner = kernel
             kernel = lambda *bottoms: inner(*(bottom.contiguous() for bottom in bottoms))  # noqa: E731
         if own is None:

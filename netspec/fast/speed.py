@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from netspec.fast.kernels import Learning
 from netspec.fast.prepared import Prepared
+from netspec.fast.table import is_fresh, learning_kernels, learns_alone
 from netspec.fast.training import LARGEST, TrainingStep, obstacle
+from netspec.layers.contract.base import Layer
 from netspec.run.eager import Eager
+from netspec.run.recorded import Diff, Kernels
 from netspec.run.walk import weighted_sum
 
 
@@ -27,3 +31,15 @@ class Fast:
             return why
         weighted = partial(weighted_sum, exact=eager.exact)
         return TrainingStep(eager.plan, parts, eager.loss_weights, eager.overwritten, weighted)
+
+    def is_fresh(self, layer: Layer) -> bool:
+        """Return whether the top of a prepared layer is memory of its own."""
+        return is_fresh(layer)
+
+    def learns(self, layer: Layer) -> bool:
+        """Return whether a layer has kernels of its own."""
+        return learns_alone(layer, steady=False)
+
+    def kernels(self, layer: Layer, wanted: Sequence[bool], sums: Sequence[Diff]) -> Kernels | None:
+        """Return the kernels of a layer whose bottoms may change before it goes backward."""
+        return learning_kernels(layer, Learning(tuple(wanted), tuple(sums), steady=False))

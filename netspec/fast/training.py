@@ -2,7 +2,7 @@
 
 A pass through autograd costs about a millisecond for ten layers, whatever their size; that is what a net of small
 layers or batches spends most of its time on. Here a layer is a pair of kernels
-(netspec/layers/contract/kernels.py), made for the shapes at hand, and a pass calls one after
+(kernels.py, layers/), made for the shapes at hand, and a pass calls one after
 the other. The numbers are the same.
 """
 
@@ -19,21 +19,14 @@ from typing import Any
 import torch
 
 from netspec.exact.blas import one_thread
+from netspec.fast.kernels import Kernel, Learning
+from netspec.fast.table import learning_kernels, learns_alone
 from netspec.files.limits import is_out_of_memory
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
-from netspec.layers.contract.kernels import (
-    Backward,
-    Diff,
-    Kernel,
-    Kernels,
-    Preparation,
-    learns_alone,
-    own_kernels,
-    recorded,
-)
 from netspec.run.parts import Part
+from netspec.run.recorded import Backward, Diff, Kernels, recorded
 from netspec.run.walk import losses_of
 
 LARGEST = 2**22  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory
@@ -242,8 +235,8 @@ class TrainingStep:
             for layer in part.members
             for j, blob in enumerate(layer.blobs)
         )
-        how = Preparation(wanted, tuple(blob.grad if blob.requires_grad else None for blob in part.blobs))
-        return (whole and own_kernels(part.layer, how)) or recorded(part.layer.run, wanted, part.blobs)
+        how = Learning(wanted, tuple(blob.grad if blob.requires_grad else None for blob in part.blobs))
+        return (whole and learning_kernels(part.layer, how)) or recorded(part.layer.run, wanted, part.blobs)
 
     def _overwritten_kernels(self, i: int) -> Kernels:
         """Return the kernels of a layer whose gradient reads what later layers have left in its memory."""

@@ -6,32 +6,23 @@ Caffe: the neuron layers, include/caffe/layers/neuron_layer.hpp
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
-from netspec.exact import ALL, libm, switch
+from netspec.exact import libm
 from netspec.exact.channels import Slopes
 from netspec.exact.pointwise import Pointwise, tanh_gradient
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.folding import Folds
-from netspec.layers.contract.kernels import RELU, Finish, Kernels, Preparation, Room, clip, finished
-from netspec.layers.contract.learned import values_of
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
-
-_VECTORS = 2**12  # numbers: for fewer, one call of torch is faster than several
 
 
 class Activation(Layer):
     """Base of the layers whose top has its bottom's shape."""
-
-    fresh = True
-    any_layout = True
 
     onnx_op: ClassVar[str]  # of a layer without settings, and its expression in torch
     torch_call: ClassVar[str]
@@ -51,41 +42,6 @@ class Rounded(Activation):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return Pointwise.apply(x, self.as_caffe, self.caffes_gradient) if self.is_exact(x) else self.as_torch(x)
-
-    in_place: ClassVar[Finish | None] = None  # where torch has a function that overwrites its argument
-
-    def folds(self) -> Folds:
-        return Folds(finish=None if self.context.options.exact == ALL else type(self).in_place)
-
-    # Torch's function into ``out``, and its gradient, from the top's and the top, into ``grad_input``.
-    by_torch: ClassVar[tuple[Callable[..., torch.Tensor], Callable[..., torch.Tensor]] | None] = None
-
-    def kernels(self, how: Preparation) -> Kernels | None:
-        if not how.learns:
-            return None
-        if switch.applies(self.context.options.exact, torch.empty(1)):
-            return self._prepared_as_caffe()
-        if self.by_torch is None:
-            return None
-        rooms, (compute, gradient) = (Room(), Room()), self.by_torch
-
-        def forward(x: torch.Tensor) -> torch.Tensor:
-            return compute(x, out=rooms[0].like(x))
-
-        def backward(diff: torch.Tensor) -> torch.Tensor:
-            return gradient(diff, rooms[0].like(diff), grad_input=rooms[1].like(diff))
-
-        return Kernels(forward, backward)
-
-    def _prepared_as_caffe(self) -> Kernels:
-        bottom = top = torch.empty(0)
-
-        def forward(x: torch.Tensor) -> torch.Tensor:
-            nonlocal bottom, top
-            bottom, top = x, self.as_caffe(x)
-            return top
-
-        return Kernels(forward, lambda diff: self.caffes_gradient(bottom, top, diff))
 
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
         """Return the activated bottom by torch's functions, whose gradients autograd knows."""
@@ -134,24 +90,9 @@ class ReLU(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return F.leaky_relu(x, self.slope) if self.slope else F.relu(x)
 
-    def folds(self) -> Folds:
-        if not self.slope:
-            return Folds(finish=RELU)
-        return Folds(finish=Finish(f"leaky_relu {self.slope}", partial(F.leaky_relu_, negative_slope=self.slope)))
-
-    def kernels(self, how: Preparation) -> Kernels | None:
-        if self.slope or not how.learns:
-            return None
-        rooms, gradient = (Room(), Room()), torch.ops.aten.threshold_backward.grad_input
-
-        def forward(x: torch.Tensor) -> torch.Tensor:
-            return torch.clamp_min(x, 0, out=rooms[0].like(x))
-
-        def backward(diff: torch.Tensor) -> torch.Tensor:
-            top = rooms[0].like(diff)
-            return gradient(diff, top, 0, grad_input=rooms[1].like(top))  # in the order in which autograd has it
-
-        return Kernels(forward, backward)
+    @property
+    def joins_as(self) -> str:
+        return "" if self.slope else "relu"
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * self.slope)
@@ -189,40 +130,6 @@ class PReLU(Activation):
                 x.shape
             )
         return F.prelu(x, slopes.reshape(-1))
-
-    def kernels(self, how: Preparation) -> Kernels | None:
-        if self.context.options.exact == ALL:
-            return None
-        slopes = values_of(self.blob(0))
-        if how.learns:
-            return self._learning_kernels(slopes, how)
-        slopes = slopes.clone().reshape(-1)
-        return finished(lambda x: torch.prelu(x, slopes), how.finish)
-
-    def _learning_kernels(self, slopes: torch.Tensor, how: Preparation) -> Kernels | None:
-        """Return what autograd computes."""
-        shape = self.bottom_shapes[0]
-        if math.prod(shape) == 0:
-            return None
-        gradients, given, total = torch.ops.aten._prelu_kernel_backward.default, slopes, how.sums[0]
-        flat, by_channel = slopes.reshape(-1), slopes.view(1, -1, *(1,) * (len(shape) - 2))
-
-        def forward(x: torch.Tensor) -> torch.Tensor:
-            nonlocal given
-            given = x
-            return torch.prelu(x, flat)
-
-        def backward(diff: torch.Tensor) -> torch.Tensor:
-            if diff.numel() > _VECTORS and diff.stride() == given.stride():  # torch takes number by number
-                above = given > 0
-                found, terms = torch.where(above, diff, diff * by_channel), torch.where(above, 0, given * diff)
-            else:
-                found, terms = gradients(diff, given, by_channel)
-            if total is not None:
-                total.add_(terms.sum_to_size(by_channel.shape).view(total.shape))
-            return found
-
-        return Kernels(forward, backward)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         slopes = math.prod(self.blob_shapes[0])
@@ -275,8 +182,6 @@ class Sigmoid(Rounded):
     """
 
     gradient_reads = frozenset({"top"})
-    in_place = Finish("sigmoid", torch.sigmoid_)
-    by_torch = torch.sigmoid, torch.ops.aten.sigmoid_backward.grad_input
     onnx_op, torch_call = "Sigmoid", "torch.sigmoid({x})"
 
     @override
@@ -297,8 +202,6 @@ class TanH(Rounded):
     """
 
     gradient_reads = frozenset({"top"})
-    in_place = Finish("tanh", torch.tanh_)
-    by_torch = torch.tanh, torch.ops.aten.tanh_backward.grad_input
     onnx_op, torch_call = "Tanh", "torch.tanh({x})"
 
     @override
@@ -377,9 +280,6 @@ class Clip(Activation):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.clamp(max=self.high).clamp(min=self.low)
-
-    def folds(self) -> Folds:
-        return Folds(finish=clip(self.low, self.high) if self.low <= self.high else None)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return diff * ((bottom >= self.low) & (bottom <= self.high))

@@ -9,13 +9,9 @@ import torch
 from torch.nn import functional as F
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.bound import BoundVectors, Weights, at_rest
 from netspec.exact.vectors import ChosenRows, SummedProducts, VectorProducts
-from netspec.layers.contract import fused
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.folding import Absorbed, Folds, blob_like, copy_of
-from netspec.layers.contract.kernels import Kernels, Preparation, Room, copies, finished, lent, weight_and_bias
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TRAIN
@@ -31,9 +27,6 @@ class InnerProduct(Layer):
     blobs[1]   bias    (num_output,)                                   unless bias_term: false
     Caffe: src/caffe/layers/inner_product_layer.cpp
     """
-
-    fresh = True
-    any_layout = True
 
     def setup(self) -> None:
         param = self.param.inner_product_param
@@ -71,64 +64,6 @@ class InnerProduct(Layer):
     def small(self) -> bool:
         return math.prod(self.blob_shapes[0]) <= SMALL_PRODUCT
 
-    def kernels(self, how: Preparation) -> Kernels | None:
-        if how.learns:
-            return self._learning_kernels(how)
-        weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
-        transposed, top_shape = self.param.inner_product_param.transpose, self.top_shapes[0]
-        rows = math.prod(top_shape[:-1])
-        one_by_one = (rows, self.inputs)
-        if self.is_exact(weight, self.small) and math.prod(self.bottom_shapes[0]):
-            learned = at_rest(*copies(self.values(), how))
-            return lent(BoundVectors(self.bottom_shapes[0], top_shape, transposed, learned), how)
-        weight = weight.t() if transposed else weight
-        # A single vector is multiplied as fast as memory gives the weights, whatever their layout.
-        if rows == 1:
-            multiply = finished(fused.vector_product(weight, bias), how.finish).forward
-        elif how.pack and fused.suits(weight) and rows * weight.numel() > SMALL_PRODUCT:
-            multiply = fused.product(weight, bias, how).forward
-        else:
-            multiply = finished(lambda vectors: F.linear(vectors, weight, bias), how.finish).forward
-        if self.axis == 1:
-            return Kernels(lambda data: multiply(data.reshape(one_by_one)))
-        return Kernels(lambda data: multiply(data.reshape(one_by_one)).view(top_shape))
-
-    def _learning_kernels(self, how: Preparation) -> Kernels | None:
-        (weight, bias), sums = weight_and_bias(self, how)
-        transposed = self.param.inner_product_param.transpose
-        top_shape, inputs, wanted = self.top_shapes[0], self.inputs, how.wants(0)
-        if math.prod(top_shape) == 0 or inputs == 0:
-            return None
-        if self.is_exact(weight, self.small):
-            bound = BoundVectors(self.bottom_shapes[0], top_shape, transposed, Weights(weight, bias, *sums), wanted)
-            return Kernels(bound.forward, bound.backward)
-        tops = weight.new_empty(math.prod(top_shape[:-1]), top_shape[-1])
-        top, matrix = tops.view(top_shape), weight if transposed else weight.t()
-        diff = torch.empty(self.bottom_shapes[0]) if wanted else None
-        vectors_diff = None if diff is None else diff.view(-1, inputs)
-        vectors = tops
-
-        def forward(data: torch.Tensor) -> torch.Tensor:
-            nonlocal vectors
-            vectors = data.reshape(-1, inputs)
-            if bias is None:
-                torch.mm(vectors, matrix, out=tops)
-            else:
-                torch.addmm(bias, vectors, matrix, out=tops)
-            return top
-
-        def backward(top_diff: torch.Tensor) -> torch.Tensor | None:
-            tops_diff = top_diff.reshape(tops.shape)
-            if sums[0] is not None:
-                sums[0].addmm_(*((vectors.t(), tops_diff) if transposed else (tops_diff.t(), vectors)))
-            if sums[1] is not None:
-                sums[1].add_(tops_diff.sum(0))
-            if vectors_diff is not None:
-                torch.mm(tops_diff, matrix.t(), out=vectors_diff)
-            return diff
-
-        return Kernels(forward, backward)
-
     def multiply_adds(self) -> int:
         return math.prod(self.top_shapes[0]) * self.inputs
 
@@ -140,18 +75,6 @@ class InnerProduct(Layer):
         transposed = int(not self.param.inner_product_param.transpose)
         top = graph.node("Gemm", vectors, graph.blob(0), *bias, transB=transposed)
         return top if self.axis == 1 else graph.reshape_to_top(top)
-
-    def folds(self) -> Folds:
-        return Folds(absorb=self._absorb if self.axis == 1 else None)
-
-    def _absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
-        param = copy_of(self.param)
-        param.inner_product_param.bias_term = True
-        outputs = param.inner_product_param.num_output
-        bias = blob_like(self, 1, shift) if len(self.blobs) > 1 else torch.zeros_like(shift)
-        factors = scale.expand(outputs)
-        factors = factors if param.inner_product_param.transpose else factors[:, None]
-        return Absorbed(param, (blob_like(self, 0, scale) * factors, scale * bias + shift))
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         weight = self.blob(0).t() if self.param.inner_product_param.transpose else self.blob(0)
@@ -189,31 +112,14 @@ class Dropout(Layer):
         kept = torch.empty_like(data).bernoulli_(1 - self.ratio, generator=self.context.random.on(data.device))
         return data * kept.mul_(1 / (1 - self.ratio))
 
-    def kernels(self, how: Preparation) -> Kernels | None:
-        """Return the kernels of a net that learns; the numbers drawn are kept, and scale the gradients too."""
-        if not how.learns:
-            return None
-        if self.phase != TRAIN:
-            return Kernels(lambda data: data, lambda diff: diff)
-        draws, rooms, share = self.context.random, (Room(), Room(), Room()), 1 - self.ratio
-
-        def forward(data: torch.Tensor) -> torch.Tensor:
-            kept, top = rooms[0].like(data), rooms[1].like(data)
-            kept.bernoulli_(share, generator=draws.on(data.device)).mul_(1 / share)
-            return torch.mul(data, kept, out=top)
-
-        def backward(diff: torch.Tensor) -> torch.Tensor:
-            return torch.mul(diff, rooms[0].like(diff), out=rooms[2].like(diff))
-
-        return Kernels(forward, backward)
-
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if self.phase == TRAIN:
             raise refusal(self, "ONNX", "it draws random numbers in the training phase")
         return graph.node("Identity", *bottoms)
 
-    def folds(self) -> Folds:
-        return Folds(passes_on=self.phase != TRAIN)
+    @property
+    def passes_on(self) -> bool:
+        return self.phase != TRAIN
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.phase != TRAIN:

@@ -9,11 +9,9 @@ from typing import Any
 import torch
 from torch.nn import functional as F
 
-from netspec.exact import ALL
 from netspec.exact.channels import RowNormalization
 from netspec.exact.lrn import AcrossChannels, within_channel
 from netspec.layers.contract.base import MOST, Layer, Shape
-from netspec.layers.contract.kernels import Kernels, Preparation, finished
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 
@@ -31,9 +29,6 @@ class LRN(Layer):
     top[0]     the same shape
     Caffe: src/caffe/layers/lrn_layer.cpp
     """
-
-    fresh = True
-    any_layout = True
 
     def setup(self) -> None:
         param = self.param.lrn_param
@@ -67,33 +62,6 @@ class LRN(Layer):
         else:
             base = 1 + param.alpha * F.avg_pool2d(squares, size, stride=1, padding=reach)
         return data * base.pow(-param.beta)
-
-    def kernels(self, how: Preparation) -> Kernels | None:
-        param, shape = self.param.lrn_param, self.bottom_shapes[0]
-        if how.learns or param.norm_region != ACROSS_CHANNELS or self.context.options.exact == ALL:
-            return None
-        size, channels, reach = param.local_size, shape[1], param.local_size // 2
-        frames: dict[bool, torch.Tensor] = {}
-
-        def kernel(data: torch.Tensor) -> torch.Tensor:
-            side_by_side = not data.is_contiguous()
-            if side_by_side not in frames:
-                layout = torch.channels_last if side_by_side else torch.contiguous_format
-                with torch.inference_mode(False):
-                    frame = data.new_zeros(shape[0], channels + 2 * reach, *shape[2:])
-                    frames[side_by_side] = frame.contiguous(memory_format=layout)
-            frame = frames[side_by_side]
-            torch.mul(data, data, out=frame[:, reach : reach + channels])
-            total = frame[:, :channels] + frame[:, 1 : 1 + channels] if size > 1 else frame.clone()
-            for shift in range(2, size):
-                total += frame[:, shift : shift + channels]
-            base = total.mul_(param.alpha / size).add_(param.k)
-            if param.beta == 0.75:
-                root = base.rsqrt_()  # x ** -0.75 = r sqrt(r), for r = 1 / sqrt(x), five times as fast as a power
-                return root.mul_(root.sqrt()).mul_(data)
-            return base.pow_(-param.beta).mul_(data)
-
-        return finished(kernel, how.finish)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         param = self.param.lrn_param

@@ -14,8 +14,7 @@ from typing_extensions import override
 from netspec.exact import SMALL_ITEM, libm
 from netspec.exact.channels import BatchNormalization
 from netspec.layers.contract.base import Layer, Param, Shape
-from netspec.layers.contract.folding import Affine, Folds, blob_in_double, folds_of
-from netspec.layers.contract.kernels import RELU, Kernel, Kernels, Preparation, Room, finished
+from netspec.layers.contract.offers import offered
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import TEST
@@ -42,8 +41,6 @@ class BatchNorm(Layer):
     ignores_propagate_down = frozenset({0})
     joined: tuple[Layer, ...] = ()  # a Scale of its channels, a ReLU: it does their work too, where the batch counts
     rectifies = False  # whether there is a ReLU among them
-    fresh = True
-    any_layout = True
 
     def setup(self) -> None:
         """Add the sums, all zero; refuse a ``param`` that would have them learned."""
@@ -71,19 +68,20 @@ class BatchNorm(Layer):
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the normalized values; in training also add the batch's statistics to the sums."""
         if self.use_global_stats:
-            return self._by_past(self.is_exact(data, self.small))(data)
+            return self.by_past(self.is_exact(data, self.small))(data)
         return self._by_batch(data)
 
     @property
-    def _eps(self) -> float:
+    def eps(self) -> float:
+        """What is added to the variance."""
         return self.param.batch_norm_param.eps
 
     def past(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the mean and the variance of each channel, (C,), that the sums stand for."""
         with torch.no_grad():
-            return _means(*(self.blob(i) for i in range(3)))
+            return means(*(self.blob(i) for i in range(3)))
 
-    def _by_past(self, exact: bool) -> Kernel:
+    def by_past(self, exact: bool) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return what normalizes a bottom of the present shape by the past, as it is now."""
         mean, variance = self.past()
         eps, axes = self.param.batch_norm_param.eps, (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
@@ -95,20 +93,17 @@ class BatchNorm(Layer):
         arguments = (torch.zeros_like(mean) if far else mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
         return lambda data: torch.batch_norm(data - by_channel if far else data, None, None, *arguments)
 
-    def folds(self) -> Folds:
-        return Folds(affine=self._affine) if self.use_global_stats else Folds(join=self._join)
-
-    def _join(self, after: Layer) -> Layer | None:
+    def joined_with(self, after: Layer) -> Layer | None:
         """Return this layer with a Scale of its channels after it, or a ReLU: torch's kernel does all in one."""
-        it = folds_of(after)
-        fits = (it.scales and not self.joined) or (it.finish == RELU and not self.rectifies)
-        if not fits or self.is_exact(self.blob(0), self.small):
+        kind = offered(after, "joins_as")
+        fits = (kind == "scale" and not self.joined) or (kind == "relu" and not self.rectifies)
+        if not fits or self.use_global_stats or self.is_exact(self.blob(0), self.small):
             return None
         made = copy.copy(self)
-        made.joined, made.rectifies = (*self.joined, after), it.finish == RELU
+        made.joined, made.rectifies = (*self.joined, after), kind == "relu"
         return made
 
-    def _factors(self) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+    def factors(self) -> tuple[torch.Tensor | None, torch.Tensor | None]:
         """Return the learned factors and biases of the Scale that it was joined with."""
         blobs = [layer.blob(j) for layer in self.joined for j in range(len(layer.blobs))]
         return blobs[0] if blobs else None, blobs[1] if len(blobs) > 1 else None
@@ -116,19 +111,19 @@ class BatchNorm(Layer):
     def _by_batch(self, data: torch.Tensor) -> torch.Tensor:
         if self.is_exact(data, self.small):
             values = data.numel() // self.channels
-            top, mean, variance = BatchNormalization.apply(data.reshape(*data.shape[:2], -1), self._eps)
+            top, mean, variance = BatchNormalization.apply(data.reshape(*data.shape[:2], -1), self.eps)
             self._add(mean, variance, values / (values - 1) if values > 1 else 1.0)
             tops = (top.reshape(data.shape),)
             for layer in self.joined:
                 tops = layer.run(*tops)
             return tops[0]
-        top = self._normalized(data, torch.batch_norm, torch.backends.cudnn.enabled)[0]
-        return RELU.change(top) if self.rectifies else top
+        top = self.normalized(data, torch.batch_norm, torch.backends.cudnn.enabled)[0]
+        return top.relu_() if self.rectifies else top
 
-    def _normalized(self, data: torch.Tensor, normalize: Callable[..., Any], *options: Any) -> tuple[Any, torch.Tensor]:
+    def normalized(self, data: torch.Tensor, normalize: Callable[..., Any], *options: Any) -> tuple[Any, torch.Tensor]:
         """Return what torch's function ``normalize`` makes of a batch, and of which numbers; add up its statistics."""
         made, mean, variance = self._by_torch(data, normalize, options)
-        if _far_from_zero(mean, variance, self._eps):
+        if _far_from_zero(mean, variance, self.eps):
             # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
             data = data - mean.view(-1, *(1,) * (data.dim() - 2))
             made, _, variance = self._by_torch(data, normalize, options)
@@ -142,7 +137,7 @@ class BatchNorm(Layer):
         """Return what ``normalize`` makes of a batch, its mean and its unbiased variance: running ones of one batch."""
         exact_enough = torch.promote_types(data.dtype, torch.float32)
         mean, variance = data.new_zeros(2, self.channels, dtype=exact_enough).unbind()
-        made = normalize(data, *self._factors(), mean, variance, True, 1.0, self._eps, *options)
+        made = normalize(data, *self.factors(), mean, variance, True, 1.0, self.eps, *options)
         return made, mean, variance
 
     @torch.no_grad()
@@ -157,37 +152,6 @@ class BatchNorm(Layer):
     def small(self) -> bool:
         return math.prod(self.bottom_shapes[0][1:]) <= SMALL_ITEM
 
-    def kernels(self, how: Preparation) -> Kernels | None:
-        exact = self.is_exact(self.blob(0), self.small)
-        if self.use_global_stats:
-            return None if how.learns else finished(self._by_past(exact), how.finish)
-        if not how.learns or math.prod(self.top_shapes[0]) == 0:
-            return None
-        return None if exact else self._learning_kernels(how)
-
-    def _learning_kernels(self, how: Preparation) -> Kernels:
-        room, rectifies, sums = Room(), self.rectifies, [*how.sums[3:], None, None][:2]
-        asked = [how.wants(0), *(total is not None for total in sums)]
-        gradients, rectified = torch.ops.aten.native_batch_norm_backward, torch.ops.aten.threshold_backward.grad_input
-        given = top = mean = deviation = torch.empty(0)
-
-        def forward(data: torch.Tensor) -> torch.Tensor:
-            nonlocal given, top, mean, deviation
-            (top, mean, deviation), given = self._normalized(data, torch.native_batch_norm)
-            return top.relu_() if rectifies else top
-
-        def backward(diff: torch.Tensor) -> torch.Tensor | None:
-            if rectifies:
-                diff = rectified(diff, top, 0, grad_input=room.like(top))
-            factors = self._factors()[0]
-            found, *learned = gradients(diff, given, factors, None, None, mean, deviation, True, self._eps, asked)
-            for total, gradient in zip(sums, learned, strict=True):
-                if total is not None:
-                    total.add_(gradient)
-            return found
-
-        return Kernels(forward, backward)
-
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         eps = self.param.batch_norm_param.eps
         if not self.use_global_stats:
@@ -195,11 +159,6 @@ class BatchNorm(Layer):
         ones, zeros = torch.ones(self.channels), torch.zeros(self.channels)
         constants = [graph.constant(values) for values in (ones, zeros, *self.past())]
         return graph.node("BatchNormalization", *bottoms, *constants, epsilon=eps)
-
-    def _affine(self) -> Affine:
-        mean, variance = _means(*(blob_in_double(self, i) for i in range(3)))
-        scale = (variance + self.param.batch_norm_param.eps).rsqrt()
-        return scale, -mean * scale
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         eps = rounded(self.param.batch_norm_param.eps)
@@ -217,7 +176,7 @@ def as_before(layer: Layer, shapes: Sequence[Shape], channels: int) -> Sequence[
     return shapes
 
 
-def _means(means: torch.Tensor, variances: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def means(means: torch.Tensor, variances: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the sums divided by their weight; 0 where nothing was added yet."""
     factor = torch.where(weight == 0, 0, 1 / weight)
     return means * factor, variances * factor

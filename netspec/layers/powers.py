@@ -53,7 +53,6 @@ class Power(Rounded):
     """
 
     gradient_reads = frozenset({"bottom", "top"})
-    fresh = False
 
     def setup(self) -> None:
         p = self.param.power_param

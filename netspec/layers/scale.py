@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -12,8 +12,6 @@ from netspec.data.blobs import Shape
 from netspec.exact import SMALL_ITEM
 from netspec.exact.channels import ChannelProducts
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.folding import Absorbed, Affine, Folds, blob_in_double, copy_of
-from netspec.layers.contract.kernels import Kernel, Kernels, Preparation, finished, recorded
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
@@ -90,9 +88,6 @@ class Scale(_Affine):
     Caffe: src/caffe/layers/scale_layer.cpp
     """
 
-    fresh = True
-    any_layout = True
-
     def setup(self) -> None:
         param = self.param.scale_param
         shape = self.bottom_shapes[1] if len(self.bottom_shapes) > 1 else self.learned_shape(param, "scale_param")
@@ -112,7 +107,7 @@ class Scale(_Affine):
         if self.is_exact(data, self.small):
             return self.apply_exactly(data, scale, bias, self.axis)
         if by_channel:
-            return _by_channel(scale, bias)(data)
+            return scaled_by_channel(scale, bias)(data)
         top = data * _laid_over(scale, self.axis, data)
         return top if bias is None else top + _laid_over(bias, self.axis, data)
 
@@ -127,40 +122,14 @@ class Scale(_Affine):
         shape, axes = self.bottom_shapes[0], len((*self.bottom_shapes[1:], *self.blob_shapes)[0])
         return self.axis == 1 and axes == 1 and math.prod(shape[1:]) <= SMALL_ITEM
 
-    def kernels(self, how: Preparation) -> Kernels | None:
-        if not self.by_channel:
-            return None
-        scale, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
-        if how.wanted is not None:
-            adds = self.is_exact(scale, self.small) and self.context.options.accumulate_in_place  # as Caffe, by itself
-            return recorded(self.run, how.wanted, list(self.blobs)) if adds and how.steady else None
-        if not self.is_exact(scale, self.small):
-            return finished(_by_channel(scale, bias), how.finish)
-        axes = (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
-        factors, *shifts = (values.clone().view(axes) for values in self.values())
-        if not shifts:
-            return finished(lambda data: data * factors, how.finish)
-        return finished(lambda data: (data * factors).add_(shifts[0]), how.finish)
-
     @property
     def by_channel(self) -> bool:
         """Whether it multiplies each channel by a learned factor."""
         return len(self.bottom_shapes) == 1 and self.axis == 1 and len(self.blob_shapes[0]) == 1
 
-    def folds(self) -> Folds:
-        if not self.by_channel:
-            return Folds()
-        return Folds(affine=self._affine, scales=True, absorb_before=self._absorb_before)
-
-    def _affine(self) -> Affine:
-        scale = blob_in_double(self, 0)
-        return scale, blob_in_double(self, 1) if len(self.blobs) > 1 else torch.zeros_like(scale)
-
-    def _absorb_before(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
-        param = copy_of(self.param)
-        param.scale_param.bias_term = True
-        factor, offset = (values.to(scale) for values in self._affine())
-        return Absorbed(param, (factor * scale, factor * shift + offset))
+    @property
+    def joins_as(self) -> str:
+        return "scale" if self.by_channel else ""
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.by_channel:
@@ -202,19 +171,11 @@ class Bias(_Affine):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Add", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
 
-    def folds(self) -> Folds:
-        by_channel = len(self.bottom_shapes) == 1 and self.axis == 1 and len(self.blob_shapes[0]) == 1
-        return Folds(affine=self._affine if by_channel else None)
-
-    def _affine(self) -> Affine:
-        shift = blob_in_double(self, 0)
-        return torch.ones_like(shift), shift
-
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("{x} + {y}", x=bottoms[0], y=self.torch_operand(code, bottoms, 0, self.axis))
 
 
-def _by_channel(scale: torch.Tensor, bias: torch.Tensor | None) -> Kernel:
+def scaled_by_channel(scale: torch.Tensor, bias: torch.Tensor | None) -> Callable[[torch.Tensor], torch.Tensor]:
     """Return what scales each channel: batch normalization with mean 0 and variance 1, thrice as fast, backward too."""
     arguments = (scale, bias, torch.zeros_like(scale), torch.ones_like(scale), False, 0.0, 0.0)
     return lambda data: torch.batch_norm(data, *arguments, torch.backends.cudnn.enabled)

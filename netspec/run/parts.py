@@ -14,7 +14,7 @@ import torch
 
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.folding import folds_of
+from netspec.layers.contract.joining import joined
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,11 @@ def parts_of(
 
     parts: list[Part] = []
     for i, (node, layer) in enumerate(zip(plan.nodes, layers, strict=True)):
-        before, joined = parts[-1] if parts else None, None
+        before, one = parts[-1] if parts else None, None
         if before and plan.nodes[before.last].tops == node.bottoms and not (apart[before.first] or apart[i]):
-            join = folds_of(before.layer).join
-            joined = join(layer) if join and [*map(is_between, node.bottoms)] == [True] else None
-        if before and joined:
-            parts[-1] = Part(before.first, i, joined, (*before.members, layer))
+            one = joined(before.layer, layer) if [*map(is_between, node.bottoms)] == [True] else None
+        if before and one:
+            parts[-1] = Part(before.first, i, one, (*before.members, layer))
         else:
             parts.append(Part(i, i, layer, (layer,)))
     return parts

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, Protocol
 
 import torch
 
+from netspec.layers.contract.base import Layer
 from netspec.run.eager import Eager
+from netspec.run.recorded import Diff, Kernels
 from netspec.run.walk import Runner
 
 
@@ -43,5 +45,21 @@ class Speed(Protocol):
         """Return what trains the net, or the reason, in words, why it has nothing for it.
 
         ``largest`` is the size, in numbers in all tops, of the nets that it trains; None for its own limit.
+        """
+        ...
+
+    def is_fresh(self, layer: Layer) -> bool:
+        """Return whether the top of a prepared layer is memory of its own, not a bottom's."""
+        ...
+
+    def learns(self, layer: Layer) -> bool:
+        """Return whether :meth:`kernels` has something for a layer at its present shapes."""
+        ...
+
+    def kernels(self, layer: Layer, wanted: Sequence[bool], sums: Sequence[Diff]) -> Kernels | None:
+        """Return what runs a layer forward and backward at its present shapes, for those who run layers one by one.
+
+        ``wanted[i]`` says whether bottom i's gradient is asked for, that of learnable blob j is added to ``sums[j]``.
+        The backward kernel reads the bottoms again: they may have changed.
         """
         ...

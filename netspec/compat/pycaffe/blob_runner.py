@@ -34,13 +34,12 @@ from netspec.exact.blas import one_thread
 from netspec.graph.plan import AUTOMATIC
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
-from netspec.layers.contract.kernels import Preparation, learns_alone, own_kernels, recorded
-from netspec.layers.contract.offers import offered
 from netspec.layers.contract.reading import Constant
 from netspec.layers.utility.live_blobs import Blob, BorrowedMemory
 from netspec.layers.utility.pycaffe_shim import importable
 from netspec.layers.utility.python import Python
 from netspec.net.net import Net
+from netspec.run.recorded import recorded
 from netspec.run.walk import Step, walk
 
 Hook = Callable[[int], object]
@@ -139,8 +138,13 @@ class BlobRunner:
                 if layer.is_input:
                     given.append((v, b))
                 else:
-                    results[b] = v, self.blobs[b], "data" in layer.shares, bool(offered(layer, "fresh"))
+                    results[b] = v, self.blobs[b], "data" in layer.shares, self._is_fresh(layer)
         return given, list(results.values())
+
+    def _is_fresh(self, layer: Layer) -> bool:
+        """Return whether the top of a prepared layer is memory of its own, not a bottom's."""
+        speed = self.net.options.speed
+        return speed is not None and speed.is_fresh(layer)
 
     def _is_recorded(self, i: int) -> bool:
         """Return whether autograd is to watch layer ``i`` run; the others' backward reads memory alone."""
@@ -155,13 +159,14 @@ class BlobRunner:
 
     def _can_bind(self, i: int) -> bool:
         """Return whether layer ``i`` has kernels of its own for what autograd would watch."""
-        layer = self._layers[i]
+        layer, speed = self._layers[i], self.net.options.speed
         return (
-            self.net.device.type == "cpu"
+            speed is not None
+            and self.net.device.type == "cpu"
             and not any(self._is_in_place(i, blob) for blob in self.bottoms[i])
             and all(blob.dtype == torch.float32 and blob.is_contiguous() for blob in layer.blobs)
             and all(layer.blob(j) is blob for j, blob in enumerate(layer.blobs))
-            and learns_alone(layer, steady=False)
+            and speed.learns(layer)
         )
 
     # Running
@@ -378,7 +383,7 @@ class BlobRunner:
             layer.fit(shapes)
             sums = tuple(gradient_of(blob) if blob.requires_grad else None for blob in layer.blobs)
             wanted = tuple(self.net.backward_plan.computed[i])
-            made = own_kernels(layer, Preparation(wanted, sums, steady=False))
+            made = self.net.options.speed.kernels(layer, wanted, sums)
             made = made or recorded(layer.run, wanted, list(layer.blobs))
             bound = self._bound[i] = Bound(shapes, places_of(layer), made)
         return bound

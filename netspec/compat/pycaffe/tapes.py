@@ -11,8 +11,8 @@ import torch
 
 from netspec.graph.plan import Node
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.kernels import Kernels
 from netspec.layers.utility.live_blobs import Blob, BlobVec, BorrowedMemory
+from netspec.run.recorded import Kernels
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,6 @@ from netspec.dialects.layers import replace
 from netspec.layers import common
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.folding import Folds
-from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.vision import convolution, pooling, windows
 from netspec.proto.schema import TRAIN, LayerParameter, added_value, has, value
@@ -71,9 +69,6 @@ class Convolution(convolution.Convolution):
     Fork: DeepLab (hole); foss-for-synopsys-dwc-arc-processors/synopsys-caffe, src/caffe/layers/base_conv_layer.cpp
     """
 
-    fresh = True
-    any_layout = True
-
     @override
     def read_geometry(self) -> None:
         super().read_geometry()
@@ -112,12 +107,6 @@ class Convolution(convolution.Convolution):
         if any(self.sides):
             bottoms = tuple(F.pad(bottom, self.sides) for bottom in bottoms)
         return super().forward(*bottoms)
-
-    def folds(self) -> Folds:
-        return super().folds()
-
-    def kernels(self, how: Preparation) -> Kernels | None:
-        return None if any(self.sides) else super().kernels(how)
 
     @override
     def onnx_geometry(self) -> dict[str, Any]:
@@ -272,8 +261,9 @@ class Dropout(common.Dropout):
             return top
         return graph.node("Mul", *bottoms, graph.constant(1 - self.ratio))
 
-    def folds(self) -> Folds:
-        return super().folds() if value(self.param.dropout_param, "scale_train") else Folds()
+    @property
+    def passes_on(self) -> bool:
+        return super().passes_on and value(self.param.dropout_param, "scale_train")
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if value(self.param.dropout_param, "scale_train"):

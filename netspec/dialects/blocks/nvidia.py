@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import torch
-from typing_extensions import override
 
 from netspec.dialects.layers import replace
 from netspec.dialects.not_learned import NotLearned
 from netspec.layers import normalization
-from netspec.layers.contract.folding import Affine, Folds, blob_in_double
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import has, value
 
@@ -57,17 +55,6 @@ class BatchNorm(NotLearned, normalization.BatchNorm):
             return top
         slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (SLOPES, BIASES))
         return top * slope + bias
-
-    def folds(self) -> Folds:
-        return Folds(affine=self._affine if self.use_global_stats else None)
-
-    @override
-    def _affine(self) -> Affine:
-        scale, shift = super()._affine()
-        if not self.scales:
-            return scale, shift
-        slope, bias = (blob_in_double(self, i) for i in (SLOPES, BIASES))
-        return scale * slope, shift * slope + bias
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         top = super().to_onnx(graph, *bottoms)

@@ -6,8 +6,6 @@ import torch
 import torch.nn.functional as F
 
 from netspec.layers.activation import Activation
-from netspec.layers.contract.folding import Folds
-from netspec.layers.contract.kernels import clip
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
@@ -22,9 +20,6 @@ class Capped(Activation):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return torch.where(x >= 6, 6, F.leaky_relu(x, self.slope) if self.slope else F.relu(x))
-
-    def folds(self) -> Folds:
-        return Folds(finish=None if self.slope else clip(0, 6))
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * self.slope).where(bottom < 6, 0)

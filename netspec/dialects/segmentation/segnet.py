@@ -14,7 +14,6 @@ from netspec.dialects.signatures import whose
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.folding import Affine, Folds, blob_in_double
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.layers.normalization import as_before, onnx_normalized, torch_batch_norm
 from netspec.proto.schema import TRAIN, given, value
@@ -221,17 +220,6 @@ class BN(NotLearned):
             return graph.node("BatchNormalization", *bottoms, *blobs, epsilon=self.eps)
         normalized = onnx_normalized(graph, bottoms[0], len(self.bottom_shapes[0]), self.eps)
         return graph.node("Add", graph.node("Mul", normalized, slope), bias)
-
-    def folds(self) -> Folds:
-        return Folds(affine=None if self.by_batch else self._affine)
-
-    def _affine(self) -> Affine:
-        slope, bias = (blob_in_double(self, i).reshape(-1) for i in (0, 1))
-        if not self.moving:
-            return slope, bias
-        mean, variance = (blob_in_double(self, i).reshape(-1) for i in (2, 3))
-        scale = slope * (variance if self.inverse else (variance + self.eps).rsqrt())
-        return scale, bias - mean * scale
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.num_tops > 1:

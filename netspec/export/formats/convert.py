@@ -17,7 +17,7 @@ from netspec.export.formats.pt2 import export_pt2
 from netspec.export.formats.torch import export_torch, write_tensors
 from netspec.graph.filter import prune, with_state
 from netspec.graph.options import BuildOptions
-from netspec.layers.contract.folding import folds_of
+from netspec.layers.contract.exporting import passes_on
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights
@@ -113,7 +113,7 @@ def fold_files(source: Source, prefix: Path) -> tuple[int, int]:
     net = source.net()
     message = fold(net)
     write_caffe(message, prefix)
-    splits = sum(folds_of(layer).passes_on for layer in net.layers)
+    splits = sum(passes_on(layer) for layer in net.layers)
     return len(net.layers) - splits, len(message.layer)
 
 

@@ -19,7 +19,7 @@ from netspec.files.whole_file import whole_file
 from netspec.graph.filter import add_input, filter_net
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import origins
-from netspec.layers.contract.folding import folds_of
+from netspec.layers.contract.exporting import passes_on
 from netspec.layers.contract.reading import reads_data
 from netspec.net.build import build_net, not_to_be_given
 from netspec.net.net import Net
@@ -67,7 +67,7 @@ def fold(net: Net) -> NetParameter:
     """
     folds = _found_folds(net)
     plan = net.plan
-    passes = [folds_of(layer).passes_on for layer in net.layers]
+    passes = [passes_on(layer) for layer in net.layers]
     origin = origins(plan, passes)
     names = _names(net, origin)
     gone = {i for each in folds for i in each.chain.folded}
@@ -114,7 +114,7 @@ def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
     taken.update(
         origin[v]
         for node, layer in zip(plan.nodes, net.layers, strict=True)
-        if not folds_of(layer).passes_on
+        if not passes_on(layer)
         for v in node.bottoms
     )
     taken.update(v for node, layer in zip(plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops)

@@ -19,8 +19,7 @@ import torch
 from netspec.export.formats.shapes import Fixed, NetShapes
 from netspec.graph.plan import origins
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.exporting import export
-from netspec.layers.contract.folding import folds_of
+from netspec.layers.contract.exporting import export, passes_on
 from netspec.layers.contract.targets import Sizes
 from netspec.net.net import Net
 
@@ -222,7 +221,7 @@ class _Collector:
         self.net, self.shapes = net, shapes
         self.made = Definition(names=dict(enumerate(net.plan.blobs)))
         self.value = list(range(len(net.plan.blobs)))  # value of the Plan -> value of the program
-        passes = [folds_of(layer).passes_on for layer in net.layers]
+        passes = [passes_on(layer) for layer in net.layers]
         origin = origins(net.plan, passes)
         self.readers = [0] * len(self.value)
         for node, passed in zip(net.plan.nodes, passes, strict=True):

@@ -11,6 +11,15 @@ from netspec.layers.contract.offers import offered
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
+class PassesOn(Protocol):
+    """A layer that may do nothing at its present settings."""
+
+    @property
+    def passes_on(self) -> bool:
+        """Whether every top is the bottom, unchanged."""
+        ...
+
+
 class Exported(Protocol):
     """A layer that can be exported. What it writes must compute what ``forward`` computes, at every free size."""
 
@@ -29,6 +38,11 @@ def export(layer: Layer, writer: OnnxGraph | TorchCode, target: str, *bottoms: s
     if write is None:
         raise refusal(layer, target)
     return write(writer, *bottoms)
+
+
+def passes_on(layer: Layer) -> bool:
+    """Return whether every top of a layer is its bottom, unchanged."""
+    return bool(offered(layer, "passes_on"))
 
 
 def refusal(layer: Layer, target: str, reason: str = "") -> SpecError:

@@ -1,9 +1,8 @@
 """What a layer may offer beside its forward pass, each thing by an attribute that the class defines.
 
-exporting.py  to_onnx, to_torch: the layer in another form
-kernels.py    kernels, fresh, any_layout: what is faster than forward and autograd
-folding.py    folds: one layer does the work of others
+exporting.py  to_onnx, to_torch, passes_on: the layer in another form
 gradients.py  caffes_gradient: the gradient from what lies in memory
+joining.py    joined_with, joins_as: layers in a row that one of them does in one
 reading.py    running_state, restart, and the like: records, and what goes on from one pass to the next
 
 :class:`netspec.layers.contract.base.Layer` knows none of them. One function finds what is offered: :func:`offered`.

@@ -15,7 +15,6 @@ from netspec.exact.losses import SigmoidCrossEntropy
 from netspec.exact.sums import row_magnitudes, row_squares
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.layers.loss.base import (
@@ -158,29 +157,6 @@ class EuclideanLoss(Loss):
         exact = self.is_exact(difference)
         squares = row_squares(difference.reshape(1, -1))[0] if exact else difference.square().sum()
         return squares / (2 * a.shape[0])
-
-    def kernels(self, how: Preparation) -> Kernels | None:
-        if how.wanted is None:
-            return None
-        shape, other = self.bottom_shapes
-        difference, found = torch.empty(shape), [torch.empty(shape) if wanted else None for wanted in how.wanted]
-        row, squares, exact = difference.view(1, -1), torch.empty(shape), self.is_exact(difference)
-        count = torch.tensor(float(shape[0]))  # a number would be made a tensor at each pass
-        divisor = 2 * count
-
-        def forward(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-            torch.sub(a, b.reshape(shape), out=difference)
-            return (row_squares(row)[0] if exact else torch.square(difference, out=squares).sum()) / divisor
-
-        def backward(diff: torch.Tensor) -> Sequence[torch.Tensor | None]:
-            factor = diff / count  # twice diff / divisor, to the last bit
-            if found[0] is not None:
-                torch.mul(difference, factor, out=found[0])
-            if found[1] is not None:
-                torch.mul(difference, -factor, out=found[1])
-            return found[0], None if found[1] is None else found[1].view(other)
-
-        return Kernels(forward, backward)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         a, b = (graph.node("Flatten", bottom, axis=1) for bottom in bottoms)

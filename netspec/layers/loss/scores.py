@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from google.protobuf.message import DecodeError
 
 from netspec.data.blobs import to_array
 from netspec.exact import SMALL_ITEM, libm
-from netspec.exact.losses import Infogain, bound_cross_entropy, bound_softmax, logarithm, softmax
+from netspec.exact.losses import Infogain, logarithm, softmax
 from netspec.files.limits import read_bytes
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.loss.base import (
@@ -110,44 +107,6 @@ class SoftmaxWithLoss(SoftmaxLoss):
         exact = self.is_exact(x, small=math.prod(x.shape[1:]) <= SMALL_ITEM)
         losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid, exact)
         return (self.sum_up(losses, valid, exact), p.reshape(scores.shape))[: self.num_tops]
-
-    def kernels(self, how: Preparation) -> Kernels | None:
-        """Return the kernels of a net that learns, where every label counts."""
-        if not how.learns or self.ignore_label is not None or math.prod(self.bottom_shapes[0]) == 0:
-            return None
-        shape, tops = self.bottom_shapes[0], self.num_tops
-        split, flat = (self.outer, self.classes, self.inner), (self.outer, 1, self.inner)
-        divisor = float(normalizer(self.normalization, self.outer, self.inner, None))
-        exact = self.is_exact(torch.empty(1), small=math.prod(split[1:]) <= SMALL_ITEM)
-        label, diff = torch.empty(flat, dtype=torch.long), torch.empty(split)
-        normalize = bound_softmax(split) if exact else partial(F.softmax, dim=1)
-        sum_up = bound_cross_entropy(split, FLT_MIN, divisor) if exact else lambda p, _: self._mean(p, label, divisor)
-        # Of p and its gradient, as arrays: the calls of torch take longer than what they compute.
-        p, classes, found = torch.empty(0), label.numpy().reshape(-1), diff.numpy()
-        unsigned, starts = classes.view(np.uint64), np.arange(self.outer * self.inner)
-        starts += (self.classes - 1) * self.inner * (starts // self.inner)  # where the first class is
-        places, diffs, by = np.empty_like(starts), found.reshape(-1), np.float32(divisor)
-
-        def forward(scores: torch.Tensor, labels: torch.Tensor) -> Any:
-            nonlocal p
-            label.copy_(labels.reshape(flat))
-            if np.maximum.reduce(unsigned) >= split[1]:
-                self.valid(label, None)
-            p = normalize(scores.reshape(split))
-            np.add(starts, classes if split[2] == 1 else classes * split[2], places)
-            return (sum_up(p, places), p.reshape(shape))[:tops]
-
-        def backward(top_diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
-            np.copyto(found, p.numpy())
-            diffs[places] -= 1
-            np.multiply(found, np.float32(top_diff.item()) / by, found)
-            return diff.view(shape), None
-
-        return Kernels(forward, backward)
-
-    @staticmethod
-    def _mean(p: torch.Tensor, label: torch.Tensor, divisor: float) -> torch.Tensor:
-        return (-p.gather(1, label).clamp_(min=FLT_MIN).log()).sum() / divisor
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         scores, labels = self.onnx_scores_and_labels(graph, *bottoms)

@@ -12,7 +12,6 @@ from netspec.exact.losses import softmax, softmax_gradient
 from netspec.exact.pointwise import Pointwise
 from netspec.exact.sums import Product, RowSums, row_magnitudes, row_squares
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.kernels import Kernels, Preparation, finished
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
@@ -32,8 +31,6 @@ class Eltwise(Layer):
 
     PROD, SUM, MAX = 0, 1, 2  # caffe.proto: enum EltwiseParameter.EltwiseOp
     bottoms = (2, None)
-    fresh = True
-    any_layout = True
 
     def setup(self) -> None:
         p = self.param.eltwise_param
@@ -74,13 +71,6 @@ class Eltwise(Layer):
         for x in others:
             top = top + x if self.operation == self.SUM else top * x
         return top
-
-    def kernels(self, how: Preparation) -> Kernels | None:
-        if self.operation != self.SUM or self.coeff != [1.0, 1.0]:
-            return None
-        if how.learns:
-            return Kernels(torch.add, lambda diff: (diff, diff))
-        return finished(torch.Tensor.add_ if how.reuse else torch.add, how.finish)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if self.operation == self.SUM:
@@ -244,8 +234,6 @@ class Softmax(Layer):
 
     gradient_reads = frozenset({"top"})
     ignores_propagate_down = frozenset({0})
-    fresh = True
-    any_layout = True
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         self.axis = self.canonical_axis(self.param.softmax_param.axis, bottom_shapes[0], "softmax_param", "axis")

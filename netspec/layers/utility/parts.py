@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
@@ -34,7 +33,6 @@ class Concat(Layer):
     """
 
     bottoms = (1, None)
-    any_layout = True
 
     def setup(self) -> None:
         if len(self.bottom_shapes) == 1:  # it is not copied
@@ -53,17 +51,6 @@ class Concat(Layer):
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
-
-    def kernels(self, how: Preparation) -> Kernels | None:
-        if not how.learns:
-            return None
-        axis, sizes = self.axis, [shape[self.axis] for shape in self.bottom_shapes]
-        return Kernels(lambda *bottoms: torch.cat(bottoms, axis), lambda diff: diff.split(sizes, axis))
-
-    @property
-    def fresh(self) -> bool:
-        """Whether the top is memory of its own."""
-        return len(self.bottom_shapes) > 1
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Concat", *bottoms, axis=self.axis)
@@ -84,7 +71,6 @@ class Slice(Layer):
     """
 
     tops = (1, None)
-    any_layout = True
 
     def setup(self) -> None:
         if self.num_tops == 1:  # it is not copied

@@ -7,11 +7,8 @@ from collections.abc import Sequence
 
 import torch
 
-from netspec.exact import switch
 from netspec.exact.sums import Copies, tiles
 from netspec.layers.contract.base import Layer, Shape, refuse_in_place
-from netspec.layers.contract.folding import Folds
-from netspec.layers.contract.kernels import Kernels, Preparation
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
@@ -27,10 +24,6 @@ class _OtherShape(Layer):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.reshape(self.top_shapes[0])
-
-    def kernels(self, how: Preparation) -> Kernels:
-        (shape,), (top_shape,) = self.bottom_shapes, self.top_shapes
-        return Kernels(lambda x: x.reshape(top_shape), lambda diff: diff.reshape(shape))
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.reshape_to_top(bottoms[0])
@@ -113,6 +106,7 @@ class Split(Layer):
 
     tops = (1, None)
     shares = frozenset({"data"})
+    passes_on = True
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return [bottom_shapes[0]] * self.num_tops
@@ -123,22 +117,8 @@ class Split(Layer):
             return Copies.apply(x, self.num_tops)
         return tuple(x.view_as(x) for _ in range(self.num_tops))
 
-    def kernels(self, how: Preparation) -> Kernels:
-        """Return the kernels; gradients are added in Caffe's order, or in the order of autograd: the last one first."""
-        order = 1 if self.num_tops > 2 and switch.applies(self.context.options.exact, torch.empty(1)) else -1
-        tops = self.num_tops
-
-        def backward(*diffs: torch.Tensor | None) -> torch.Tensor:
-            first, *others = [diff for diff in diffs[::order] if diff is not None]
-            return sum(others, first)
-
-        return Kernels(lambda x: (x,) * tops, backward)
-
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         return bottoms * self.num_tops
-
-    def folds(self) -> Folds:
-        return Folds(passes_on=True)
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         return bottoms * self.num_tops

@@ -12,21 +12,16 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.bound import BoundColumns, Weights, at_rest
 from netspec.exact.products import (
     ColumnProducts,
     Filter,
     SpreadProducts,
     SummedConvolutions,
     convolution,
-    laid_out_like,
 )
 from netspec.exact.switch import is_recorded
-from netspec.layers.contract import fused
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.folding import Absorbed, Folds, blob_like, copy_of
-from netspec.layers.contract.kernels import Kernels, Preparation, copies, finished, lent, weight_and_bias
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.vision.layout import channels_side_by_side, map_by_map, of_one_channel
@@ -47,8 +42,6 @@ class Convolution(SlidingFilter):
     bottoms = (1, None)
     tops = (1, None)
     same_tops = True
-    fresh = True
-    any_layout = True
 
     @staticmethod
     def channels_read(param: Any) -> int:
@@ -146,76 +139,12 @@ class Convolution(SlidingFilter):
 
     @property
     def small(self) -> bool:
-        return self.spatial_axes == 2 and self.group == 1 and self._work <= SMALL_PRODUCT
+        return self.spatial_axes == 2 and self.group == 1 and self.work <= SMALL_PRODUCT
 
     @property
-    def _work(self) -> int:
+    def work(self) -> int:
         """The multiply-adds for one image, bias aside."""
         return math.prod(self.top_shapes[0][self.channel_axis + 1 :]) * math.prod(self.blob_shapes[0])
-
-    def kernels(self, how: Preparation) -> Kernels | None:
-        """Return the kernels for a single bottom (N, C, H, W)."""
-        usual = self.channel_axis == 1 and self.spatial_axes == 2 and not any(self.overhang(self.bottom_shapes[0]))
-        if not usual or len(self.bottom_shapes) > 1 or math.prod(self.top_shapes[0]) == 0:
-            return None
-        shape, sliding = self.bottom_shapes[0], Filter(self.kernel, self.stride, self.pad, self.dilation)
-        if how.learns:
-            return self._learning_kernels(shape, sliding, how)
-        weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
-        if self.is_exact(weight, self.small):
-            return lent(BoundColumns(shape, sliding, self.group, at_rest(*copies(self.values(), how))), how)
-        if self.reads_padding_alone:
-            return None
-        if shape[0] * self._work > SMALL_PRODUCT and how.pack and fused.suits(weight):
-            return fused.convolution(shape, weight, bias, sliding, self.group, how)
-        geometry = (self.stride, self.pad, self.dilation, self.group)
-        return finished(lambda maps: torch.conv2d(of_one_channel(maps), weight, bias, *geometry), how.finish)
-
-    def _learning_kernels(self, shape: Shape, sliding: Filter, how: Preparation) -> Kernels | None:
-        (weight, bias), sums = weight_and_bias(self, how)
-        if self.is_exact(weight, self.small):
-            weights = Weights(weight, bias, *sums)
-            bound = BoundColumns(shape, sliding, self.group, weights, how.wants(0), how.steady)
-            return Kernels(bound.forward, bound.backward)
-        if self.reads_padding_alone:
-            return None
-        lay_out = channels_side_by_side if math.prod(shape) > 2 * weight.numel() else map_by_map
-        return self.convolutions(sliding, weight, bias, sums, how.wants(0), lay_out)
-
-    def convolutions(
-        self,
-        sliding: Filter,
-        weight: torch.Tensor,
-        bias: torch.Tensor | None,
-        sums: Sequence[torch.Tensor | None],
-        wanted: bool,
-        lay_out: Callable[[torch.Tensor], torch.Tensor],
-    ) -> Kernels:
-        """Return what :class:`SummedConvolutions` computes, of maps that ``lay_out`` puts into its order."""
-        geometry = (sliding.stride, sliding.pad, sliding.dilation)
-        asked = (wanted, *(total is not None for total in sums))
-        bias_shape = None if bias is None else list(bias.shape)
-        # As autograd does it: of a single image, the strides that a reshape leaves decide how BatchNorm rounds.
-        shape, top_shape = self.bottom_shapes[0], self.top_shapes[0]
-        gradients = torch.ops.aten.convolution_backward.default
-        maps = laid_out = weight
-
-        def forward(x: torch.Tensor) -> torch.Tensor:
-            nonlocal maps, laid_out
-            maps = x.reshape(shape)
-            laid_out = lay_out(maps)
-            return torch.conv2d(laid_out, weight, bias, *geometry, self.group).reshape(top_shape)
-
-        def backward(diff: torch.Tensor) -> torch.Tensor | None:
-            maps_diff, *found = gradients(
-                diff.reshape(top_shape), laid_out, weight, bias_shape, *geometry, False, [0, 0], self.group, asked
-            )
-            for total, gradient in zip(sums, found, strict=True):
-                if total is not None:
-                    total.add_(gradient)
-            return laid_out_like(maps, maps_diff).reshape(shape) if wanted else None
-
-        return Kernels(forward, backward)
 
     def multiply_adds(self) -> int:
         pixels = math.prod(self.top_shapes[0]) // self.num_output
@@ -251,20 +180,6 @@ class Convolution(SlidingFilter):
         why = "its channels are not axis 1"
         spatial = [graph.size(0, axis, why) for axis in range(first, first + self.spatial_axes)] or [1]
         return graph.reshape(bottom, [-1, self.channels, *spatial])
-
-    def folds(self) -> Folds:
-        return Folds(absorb=self._absorb if self.channel_axis == 1 else None)
-
-    def _absorb(self, scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
-        param = copy_of(self.param)
-        param.convolution_param.bias_term = True
-        bias = blob_like(self, 1, shift) if len(self.blobs) > 1 else torch.zeros_like(shift)
-        return Absorbed(param, (self.scaled_filters(scale.expand(self.num_output)), scale * bias + shift))
-
-    def scaled_filters(self, scale: torch.Tensor) -> torch.Tensor:
-        """Return blobs[0] with the filters of each output channel multiplied by a number of their own."""
-        filters = blob_like(self, 0, scale)
-        return filters * scale.reshape(-1, *(1,) * (filters.dim() - 1))
 
     torch_module: ClassVar[str] = "Conv"
 
@@ -330,27 +245,7 @@ class Deconvolution(Convolution):
     def small(self) -> bool:
         return False
 
-    def kernels(self, how: Preparation) -> Kernels | None:
-        weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
-        usual = self.channel_axis == 1 and self.spatial_axes == 2 and len(self.bottom_shapes) == 1
-        exact, large = self.is_exact(weight, self.small), self.multiply_adds() > SMALL_PRODUCT
-        if not how.learns and usual and not exact and large and how.pack and fused.suits(weight):
-            shape, sliding = self.bottom_shapes[0], Filter(self.kernel, self.stride, self.pad, self.dilation)
-            if self.group == 1:
-                return fused.deconvolution(shape, weight, bias, sliding, how)
-            fits = all(p < e for p, e in zip(self.pad, self.extent, strict=True))
-            if self.group == self.channels == self.num_output and fits and max(self.stride) <= 2:
-                return fused.spread_by_channel(shape, weight, bias, sliding, how)
-        return None
-
     @override
     def overhang(self, shape: Shape) -> list[int]:
         """Return zeros: any filter fits."""
         return [0] * (2 * self.spatial_axes)
-
-    @override
-    def scaled_filters(self, scale: torch.Tensor) -> torch.Tensor:
-        filters = blob_like(self, 0, scale)
-        grouped = filters.reshape(self.group, -1, *filters.shape[1:])
-        factors = scale.reshape(self.group, 1, -1, *(1,) * self.spatial_axes)
-        return (grouped * factors).reshape(filters.shape)

@@ -7,23 +7,18 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch.nn import functional as F
 
 from netspec.exact.sums import Copies
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.kernels import Kernels, Preparation, finished, recorded
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
-from netspec.layers.vision.layout import channels_side_by_side
 from netspec.layers.vision.windows import (
     CEIL,
-    LOWEST,
     SMALLEST,
     Pair,
     Windows,
     average_pool,
-    largest,
     max_pool,
     sampled_pool,
     weighted_pool,
@@ -31,7 +26,6 @@ from netspec.layers.vision.windows import (
 from netspec.proto.schema import TRAIN
 
 MAX, AVE, STOCHASTIC = 0, 1, 2  # caffe.proto: enum PoolingParameter.PoolMethod, and SPPParameter's
-SLICED, SLICED_BY_TWO = 2**12, 2**17  # numbers in a bottom: of more, slices pay (windows.py, largest)
 HIGHEST_PYRAMID = 16  # levels: 4^16 / 3 windows
 
 
@@ -139,8 +133,6 @@ class Pooling(_PoolingBase):
     """
 
     tops = (1, 2)
-    fresh = True
-    any_layout = True
 
     def setup(self) -> None:
         param = self.param.pooling_param
@@ -190,61 +182,6 @@ class Pooling(_PoolingBase):
     def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
         values, indices = self.pool(data, self.windows, self.method)
         return values if indices is None or self.num_tops == 1 else (values, indices.to(values.dtype))
-
-    def kernels(self, how: Preparation) -> Kernels | None:
-        windows, empty = self.windows, math.prod(self.top_shapes[0]) == 0
-        if self.num_tops > 1 or self.method == STOCHASTIC or empty or not windows.known_to_torch:
-            return None
-        if how.wanted is not None:
-            return self._learning_kernels(how.wanted)
-        geometry, ceil = (windows.kernel, windows.stride, windows.pad), windows.round_mode == CEIL
-        if self.method == AVE:
-            return finished(lambda maps: F.avg_pool2d(maps, *geometry, ceil, True), how.finish)
-
-        size = 0 if any(windows.pad) else math.prod(self.bottom_shapes[0])
-        small = size <= (SLICED_BY_TWO if max(windows.kernel) <= 2 else math.inf)  # where channels lie side by side
-
-        def kernel(maps: torch.Tensor) -> torch.Tensor:
-            if size > SLICED and not (small and not maps.is_contiguous()) and not self.is_exact(maps):
-                values = largest(maps, windows)
-            else:
-                values = torch.max_pool2d(maps, *geometry, 1, ceil)
-            # As there: torch lets NaN win.
-            return values if values.amin().item() > LOWEST else max_pool(maps, windows)[0]
-
-        return finished(kernel, how.finish)
-
-    def _learning_kernels(self, wanted: Sequence[bool]) -> Kernels:
-        """Return the kernels; where a window has no pixel to win, autograd records the run."""
-        windows = self.windows
-        record, trace = recorded(self.run, wanted)
-        geometry, ceil = (windows.kernel, windows.stride, windows.pad), windows.round_mode == CEIL
-        given = bottom = indices = torch.empty(0)
-        if self.method == AVE:
-            spread_evenly = torch.ops.aten.avg_pool2d_backward.default
-
-            def average(maps: torch.Tensor) -> torch.Tensor:
-                nonlocal bottom
-                bottom = maps
-                return F.avg_pool2d(maps, *geometry, ceil, True)
-
-            return Kernels(average, lambda diff: spread_evenly(diff, bottom, *geometry, ceil, True, None))
-        spread, is_usual = torch.ops.aten.max_pool2d_with_indices_backward.default, True
-
-        def forward(maps: torch.Tensor) -> Any:
-            nonlocal given, bottom, indices, is_usual
-            given, bottom = maps, channels_side_by_side(maps)
-            values, indices = F.max_pool2d(bottom, *geometry, 1, ceil, return_indices=True)
-            is_usual = values.amin().item() > LOWEST  # as in max_pool: torch lets NaN win
-            return values if is_usual else record(maps)
-
-        def backward(diff: torch.Tensor) -> Any:
-            if not is_usual:
-                return trace(diff)
-            found = spread(diff, bottom, *geometry, [1, 1], ceil, indices)
-            return found if bottom is given else found.contiguous()
-
-        return Kernels(forward, backward)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         if self.param.pooling_param.global_pooling and self.method != STOCHASTIC and self.num_tops == 1:

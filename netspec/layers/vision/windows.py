@@ -38,7 +38,7 @@ class Windows:
         only where either axis is padded. Unpadded, a stride longer than the kernel can leave it without a pixel.
         """
         counts = []
-        for size, kernel, stride, pad in self._axes():
+        for size, kernel, stride, pad in self.axes():
             room = size + 2 * pad - kernel
             count = (room // stride if self.round_mode == FLOOR else -(-room // stride)) + 1
             if any(self.pad) and (count - 1) * stride >= size + pad:
@@ -49,25 +49,26 @@ class Windows:
     @property
     def known_to_torch(self) -> bool:
         """Whether torch's pooling has these windows: none empty, none padded by more than half a kernel."""
-        axes = zip(self._axes(), self.count, strict=True)
+        axes = zip(self.axes(), self.count, strict=True)
         return all(2 * p <= k and (n - 1) * s < size + p for (size, k, s, p), n in axes)
 
     def padded(self, maps: torch.Tensor, value: float) -> torch.Tensor:
         """Return the maps framed by ``value`` such that every window is full."""
         frame: list[int] = []
-        for (size, kernel, stride, pad), count in zip(self._axes(), self.count, strict=True):
+        for (size, kernel, stride, pad), count in zip(self.axes(), self.count, strict=True):
             frame = [pad, (count - 1) * stride + kernel - pad - size, *frame]
         return F.pad(maps, frame, value=value)
 
     def areas(self, like: torch.Tensor) -> torch.Tensor:
         """Return what an average divides by, (count down, count across): padding counts, up to ``pad`` past the map."""
         lengths = []
-        for (size, kernel, stride, pad), count in zip(self._axes(), self.count, strict=True):
+        for (size, kernel, stride, pad), count in zip(self.axes(), self.count, strict=True):
             starts = torch.arange(count, dtype=like.dtype, device=like.device) * stride - pad
             lengths.append((starts + kernel).clamp(max=size + pad) - starts)
         return torch.outer(lengths[0], lengths[1])
 
-    def _axes(self) -> zip[tuple[int, int, int, int]]:
+    def axes(self) -> zip[tuple[int, int, int, int]]:
+        """Return size, kernel, stride and padding of the vertical and of the horizontal axis."""
         return zip(self.size, self.kernel, self.stride, self.pad, strict=True)
 
     @property
@@ -78,7 +79,7 @@ class Windows:
         long as there is a pixel left, and where either axis is padded those that begin past the padded map are dropped.
         """
         reaches = []
-        for _, kernel, stride, pad in self._axes():
+        for _, kernel, stride, pad in self.axes():
             reach = pad if self.round_mode == FLOOR else pad + stride - 1
             reaches.append(min(reach, kernel - 1) if any(self.pad) else reach)
         return reaches[0], reaches[1]
@@ -112,26 +113,6 @@ def _native_max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor
     values, indices = F.max_pool2d(framed, kernel, stride, return_indices=True)
     rows = indices.div(framed.shape[-1], rounding_mode="floor") - pad[0]
     return values, rows * maps.shape[-1] + indices % framed.shape[-1] - pad[1]
-
-
-def largest(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
-    """Return the maximum of each window, unpadded and known to torch, of maps (N, C, H, W) in this order.
-
-    NaN wins, and of zeros either sign. Rows first, then columns: torch's kernel takes such maps pixel by pixel, which
-    is up to ten times as slow.
-    """
-    for axis, (_, kernel, stride, _), count in zip((2, 3), windows._axes(), windows.count, strict=True):
-        first, *more = (
-            maps[(*(slice(None),) * axis, slice(j, j + (count - 1) * stride + 1, stride))] for j in range(kernel)
-        )
-        if more and more[0].shape == first.shape:
-            maps = torch.maximum(first, more.pop(0))
-        else:
-            maps = first.clone()
-        for part in more:
-            best = maps.narrow(axis, 0, part.shape[axis])  # the last window may reach past the map
-            torch.maximum(best, part, out=best)
-    return maps
 
 
 def average_pool(maps: torch.Tensor, windows: Windows) -> torch.Tensor:

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from netspec.errors import SpecError
-from netspec.layers.contract.kernels import Preparation, own_kernels
+from netspec.fast.kernels import Learning
+from netspec.fast.table import learning_kernels
 
 X = torch.tensor([-70.0, -3.0, -0.4, 0.0, 0.2, 1.0, 2.5, 70.0])
 
@@ -123,7 +124,7 @@ def test_kernels_of_prelu_give_the_bits_of_autograd(build, shape: tuple[int, ...
     (top,) = layer.run(leaf)
     expected = torch.autograd.grad(top, [leaf, slopes], diff)
     total = torch.zeros_like(slopes)
-    kernels = own_kernels(layer, Preparation((True,), (total,)))
+    kernels = learning_kernels(layer, Learning((True,), (total,)))
     assert kernels is not None
     forward, backward = kernels
     with torch.no_grad():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from netspec.errors import SpecError
-from netspec.layers.contract.fused import vector_product
+from netspec.fast.fused import vector_product
 from netspec.proto.schema import TEST, TRAIN
 
 FILL = 'weight_filler { type: "gaussian" } bias_filler { type: "gaussian" }'

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.layers.contract.kernels import Preparation, own_kernels
+from netspec.fast.kernels import Inference
+from netspec.fast.table import inference_kernel
 from netspec.proto.schema import TRAIN
 
 LOWEST = np.finfo(np.float32).min  # -FLT_MAX
@@ -171,9 +172,9 @@ def test_large_maps_are_pooled_by_slices_in_any_order_in_memory(build, kernel: i
     data = torch.randn(2, 19, 61, 62)
     data[0, 0, :4, :4] = torch.nan  # which never wins
     layer = build(pooling_text("MAX", (kernel, kernel), (2, 2), (0, 0), False), data.shape)
-    kernels = own_kernels(layer, Preparation())
-    assert kernels is not None
-    assert torch.equal(kernels.forward(data.contiguous(memory_format=memory_format)), layer.run(data)[0])
+    run = inference_kernel(layer, Inference())
+    assert run is not None
+    assert torch.equal(run(data.contiguous(memory_format=memory_format)), layer.run(data)[0])
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,12 @@ from google.protobuf import text_format
 
 from netspec.exact import CHOICES
 from netspec.exact.blas import one_thread
+from netspec.fast.kernels import Learning
+from netspec.fast.table import learning_kernels
 from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, layer_class
-from netspec.layers.contract.kernels import Preparation, own_kernels, recorded
 from netspec.proto.schema import TRAIN, LayerParameter
+from netspec.run.recorded import recorded
 
 MAPS = (3, 4, 9, 8)
 FILLED = "weight_filler { type: 'gaussian' std: 0.3 } bias_filler { type: 'uniform' }"
@@ -77,7 +79,7 @@ def build(name: str, text: str, shapes: list[tuple[int, ...]], exact: str) -> La
     ("name", "text", "shapes", "exact", "sideways"),
     [(*case, *how) for case in ALL for how in product(CHOICES, (False, True))],
 )
-@one_thread()  # as Preparation says; the two would share a product among threads in other ways, and round otherwise
+@one_thread()  # as Learning says; the two would share a product among threads in other ways, and round otherwise
 def test_kernels_are_what_autograd_computes(
     name: str, text: str, shapes: list[tuple[int, ...]], exact: str, sideways: bool
 ) -> None:
@@ -87,8 +89,8 @@ def test_kernels_are_what_autograd_computes(
     mine = copy.deepcopy(watched)
     for blob in (*watched.blobs, *mine.blobs):
         blob.grad = torch.zeros_like(blob)
-    how = Preparation(wanted, tuple(blob.grad for blob in mine.blobs))
-    forward, backward = own_kernels(mine, how) or recorded(mine.run, wanted, list(mine.blobs))
+    how = Learning(wanted, tuple(blob.grad for blob in mine.blobs))
+    forward, backward = learning_kernels(mine, how) or recorded(mine.run, wanted, list(mine.blobs))
     expected_forward, expected_backward = recorded(watched.run, wanted, list(watched.blobs))
     generator = torch.Generator().manual_seed(1)
 

@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F
 
 from netspec.exact.products import Filter
+from netspec.fast.kernels import Finish, Inference, Kernel, finished
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.kernels import Finish, Kernels, Preparation, finished
 from netspec.layers.contract.learned import values_of
 
 _NEEDED = ("_convolution_pointwise", "_linear_pointwise", "_convolution_transpose_pointwise")
@@ -34,8 +34,8 @@ def suits(weight: torch.Tensor) -> bool:
 
 
 def convolution(
-    shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, group: int, how: Preparation
-) -> Kernels:
+    shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, group: int, how: Inference
+) -> Kernel:
     """Return a convolution of maps (N, C, H, W) by fixed weights (num_output, C / group, kernel_h, kernel_w)."""
     geometry = [list(sliding.pad), list(sliding.stride), list(sliding.dilation), group]
     weight = _laid_out(_ops()._reorder_convolution_weight, weight, geometry, shape, how)
@@ -50,8 +50,8 @@ def convolution(
 
 
 def deconvolution(
-    shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, how: Preparation
-) -> Kernels:
+    shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, how: Inference
+) -> Kernel:
     """Return a transposed convolution of maps (N, C, H, W) by fixed weights (C, num_output, kernel_h, kernel_w).
 
     An activation is another pass here: in the same one oneDNN falls back to a slow kernel.
@@ -68,8 +68,8 @@ def deconvolution(
 
 
 def spread_by_channel(
-    shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, how: Preparation
-) -> Kernels:
+    shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, how: Inference
+) -> Kernel:
     """Return a transposed convolution by weights (C, 1, kernel_h, kernel_w), each channel of (N, C, H, W) by itself.
 
     oneDNN's own is slow. A convolution does the same on maps with ``stride`` - 1 zeros between the pixels, with the
@@ -83,20 +83,20 @@ def spread_by_channel(
     axes = zip(sliding.kernel, sliding.dilation, sliding.pad, strict=True)
     turned = replace(sliding, stride=(1, 1), pad=tuple(d * (k - 1) - p for k, d, p in axes))
     apart = replace(how, memo=lambda name, make: how.memo(f"turned {name}", make))
-    convolve = convolution(framed, values_of(weight).flip(2, 3), bias, turned, channels, apart).forward
+    convolve = convolution(framed, values_of(weight).flip(2, 3), bias, turned, channels, apart)
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         pixels.copy_(maps)
         return convolve(frame)
 
-    return Kernels(kernel)
+    return kernel
 
 
-def _kept(bias: torch.Tensor | None, how: Preparation) -> torch.Tensor | None:
+def _kept(bias: torch.Tensor | None, how: Inference) -> torch.Tensor | None:
     return None if bias is None else how.memo("bias", values_of(bias).clone)
 
 
-def _laid_out(reorder: Any, weight: torch.Tensor, geometry: Sequence[Any], shape: Shape, how: Preparation) -> Any:
+def _laid_out(reorder: Any, weight: torch.Tensor, geometry: Sequence[Any], shape: Shape, how: Inference) -> Any:
     """Return filters as oneDNN wants them for maps of this shape; in another layout it may be ten times as slow.
 
     Shapes that want the same layout share it.
@@ -112,7 +112,7 @@ def _laid_out(reorder: Any, weight: torch.Tensor, geometry: Sequence[Any], shape
     return how.memo(f"{name} {shape}", make)
 
 
-def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Preparation) -> Kernels:
+def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Inference) -> Kernel:
     """Return the product of vectors (M, K) with fixed weights (num_output, K)."""
     name = f"rows {tuple(weight.shape)} {weight.stride()}"  # of a shared matrix one layer may take the transpose
     weight = how.memo(name, lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))

@@ -1,9 +1,8 @@
-"""How the work of a layer and that of its neighbors become one: netspec/fast/chains.py and fold.py put it together.
+"""How the work of a layer and that of its neighbors become one: what each is to them; chains.py and fold.py join them.
 
 A convolution y = W x + b followed by z = s y + t, both s and t one number for each channel, is a convolution with the
 weights s W and the bias s b + t. A map from number to number can be done in place to the top of the layer before it.
-Both leave layers out where weights stay as they are. Where a net learns, two layers may be joined: one layer does the
-work of both, and reads the blobs of both in each run.
+Both leave layers out where weights stay as they are.
 """
 
 from __future__ import annotations
@@ -11,14 +10,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
+from netspec.fast.kernels import Finish
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.kernels import Finish
 from netspec.layers.contract.learned import values_of
-from netspec.layers.contract.offers import call
 
 Affine = tuple[torch.Tensor, torch.Tensor]  # scale and shift of each channel, (C,) in double: y = scale x + shift
 
@@ -38,37 +36,15 @@ Absorb = Callable[[torch.Tensor, torch.Tensor], Absorbed]  # of a scale and a sh
 class Folds:
     """What a layer is to its neighbors, at its present settings.
 
-    ``passes_on``: every top is the bottom, unchanged. ``finish``: the layer is this map from number to number.
-    ``affine`` returns how it scales and shifts the channels, axis 1, of its bottom, where that is all it does; it
-    ``scales`` where factors are its blob 0 and biases, if any, its blob 1. ``absorb`` returns the layer that scales and
-    shifts the channels of its top as well, ``absorb_before`` that which does so to its bottom before its own work.
-    ``join(after)`` returns a layer that does the work of this one and then of another, None where nothing is faster
-    than one after the other; its kernels get the sums of the blobs of both.
+    ``finish``: the layer is this map from number to number. ``affine`` returns how it scales and shifts the channels,
+    axis 1, of its bottom, where that is all it does. ``absorb`` returns the layer that scales and shifts the channels
+    of its top as well, ``absorb_before`` that which does so to its bottom before its own work.
     """
 
-    passes_on: bool = False
     finish: Finish | None = None
     affine: Callable[[], Affine] | None = None
-    scales: bool = False
     absorb: Absorb | None = None
     absorb_before: Absorb | None = None
-    join: Callable[[Layer], Layer | None] | None = None
-
-
-class Foldable(Protocol):
-    """What a layer can offer to those who fold a net."""
-
-    def folds(self) -> Folds:
-        """Return what the layer is to its neighbors."""
-        ...
-
-
-_NOTHING = Folds()
-
-
-def folds_of(layer: Layer) -> Folds:
-    """Return what a layer is to its neighbors."""
-    return call(layer, "folds") or _NOTHING
 
 
 def absorbing(layer: Layer, absorbed: Absorbed) -> Layer:

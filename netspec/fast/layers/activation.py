@@ -1,0 +1,138 @@
+"""Kernels of activations (netspec/layers/activation.py, powers.py)."""
+
+# pyright: reportPrivateImportUsage=false
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import torch
+import torch.nn.functional as F
+
+from netspec.exact import ALL, switch
+from netspec.fast.entry import Entry
+from netspec.fast.folding import Folds
+from netspec.fast.kernels import RELU, Finish, Inference, Kernel, Learning, Room, clip, finished
+from netspec.layers.activation import BNLL, ELU, Clip, PReLU, ReLU, Rounded, Sigmoid, Swish, TanH, Threshold
+from netspec.layers.contract.learned import values_of
+from netspec.layers.powers import AbsVal, Exp, Log, Power
+from netspec.run.recorded import Kernels
+
+_VECTORS = 2**12  # numbers: for fewer, one call of torch is faster than several
+
+Gradient = Callable[..., torch.Tensor]
+
+
+def _relu_folds(layer: ReLU) -> Folds:
+    if not layer.slope:
+        return Folds(finish=RELU)
+    return Folds(finish=Finish(f"leaky_relu {layer.slope}", partial(F.leaky_relu_, negative_slope=layer.slope)))
+
+
+def _learn_relu(layer: ReLU, how: Learning) -> Kernels | None:
+    if layer.slope:
+        return None
+    rooms, gradient = (Room(), Room()), torch.ops.aten.threshold_backward.grad_input
+
+    def forward(x: torch.Tensor) -> torch.Tensor:
+        return torch.clamp_min(x, 0, out=rooms[0].like(x))
+
+    def backward(diff: torch.Tensor) -> torch.Tensor:
+        top = rooms[0].like(diff)
+        return gradient(diff, top, 0, grad_input=rooms[1].like(top))  # in the order in which autograd has it
+
+    return Kernels(forward, backward)
+
+
+def _prelu(layer: PReLU, how: Inference) -> Kernel | None:
+    if layer.context.options.exact == ALL:
+        return None
+    slopes = values_of(layer.blob(0)).clone().reshape(-1)
+    return finished(lambda x: torch.prelu(x, slopes), how.finish)
+
+
+def _learn_prelu(layer: PReLU, how: Learning) -> Kernels | None:
+    shape = layer.bottom_shapes[0]
+    if layer.context.options.exact == ALL or math.prod(shape) == 0:
+        return None
+    slopes = values_of(layer.blob(0))
+    gradients, given, total = torch.ops.aten._prelu_kernel_backward.default, slopes, how.sums[0]
+    flat, by_channel = slopes.reshape(-1), slopes.view(1, -1, *(1,) * (len(shape) - 2))
+
+    def forward(x: torch.Tensor) -> torch.Tensor:
+        nonlocal given
+        given = x
+        return torch.prelu(x, flat)
+
+    def backward(diff: torch.Tensor) -> torch.Tensor:
+        if diff.numel() > _VECTORS and diff.stride() == given.stride():  # torch takes number by number
+            above = given > 0
+            found, terms = torch.where(above, diff, diff * by_channel), torch.where(above, 0, given * diff)
+        else:
+            found, terms = gradients(diff, given, by_channel)
+        if total is not None:
+            total.add_(terms.sum_to_size(by_channel.shape).view(total.shape))
+        return found
+
+    return Kernels(forward, backward)
+
+
+def _learn_rounded(compute: Gradient, gradient: Gradient, layer: Rounded, how: Learning) -> Kernels:
+    """Return kernels of torch's function into ``out``, and of its gradient, of the top's and the top."""
+    if switch.applies(layer.context.options.exact, torch.empty(1)):
+        return _learn_as_caffe(layer, how)
+    rooms = (Room(), Room())
+
+    def forward(x: torch.Tensor) -> torch.Tensor:
+        return compute(x, out=rooms[0].like(x))
+
+    def backward(diff: torch.Tensor) -> torch.Tensor:
+        return gradient(diff, rooms[0].like(diff), grad_input=rooms[1].like(diff))
+
+    return Kernels(forward, backward)
+
+
+def _learn_as_caffe(layer: Rounded, how: Learning) -> Kernels | None:
+    if not switch.applies(layer.context.options.exact, torch.empty(1)):
+        return None
+    bottom = top = torch.empty(0)
+
+    def forward(x: torch.Tensor) -> torch.Tensor:
+        nonlocal bottom, top
+        bottom, top = x, layer.as_caffe(x)
+        return top
+
+    return Kernels(forward, lambda diff: layer.caffes_gradient(bottom, top, diff))
+
+
+def _in_place(finish: Finish, layer: Rounded) -> Folds:
+    return Folds(finish=None if layer.context.options.exact == ALL else finish)
+
+
+def _clip_folds(layer: Clip) -> Folds:
+    return Folds(finish=clip(layer.low, layer.high) if layer.low <= layer.high else None)
+
+
+_ROUNDED = Entry(learning=_learn_as_caffe, fresh=True, any_layout=True)
+ENTRIES = {
+    ReLU: Entry(learning=_learn_relu, folds=_relu_folds, fresh=True, any_layout=True),
+    PReLU: Entry(_prelu, _learn_prelu, fresh=True, any_layout=True),
+    Sigmoid: Entry(
+        learning=partial(_learn_rounded, torch.sigmoid, torch.ops.aten.sigmoid_backward.grad_input),
+        folds=partial(_in_place, Finish("sigmoid", torch.sigmoid_)),
+        fresh=True,
+        any_layout=True,
+    ),
+    TanH: Entry(
+        learning=partial(_learn_rounded, torch.tanh, torch.ops.aten.tanh_backward.grad_input),
+        folds=partial(_in_place, Finish("tanh", torch.tanh_)),
+        fresh=True,
+        any_layout=True,
+    ),
+    **dict.fromkeys((BNLL, ELU, Swish, Exp, Log), _ROUNDED),
+    Power: Entry(learning=_learn_as_caffe, any_layout=True),
+    Clip: Entry(folds=_clip_folds, fresh=True, any_layout=True),
+    Threshold: Entry(fresh=True, any_layout=True),
+    AbsVal: Entry(fresh=True, any_layout=True),
+}

@@ -1,0 +1,129 @@
+"""Kernels of losses (netspec/layers/loss)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from netspec.exact import SMALL_ITEM
+from netspec.exact.losses import class_sums
+from netspec.exact.sums import row_squares
+from netspec.fast.entry import Entry
+from netspec.fast.kernels import Learning
+from netspec.layers.loss.base import normalizer
+from netspec.layers.loss.losses import EuclideanLoss
+from netspec.layers.loss.scores import FLT_MIN, SoftmaxWithLoss
+from netspec.run.recorded import Kernels
+
+
+def _learn_euclidean(layer: EuclideanLoss, how: Learning) -> Kernels:
+    shape, other = layer.bottom_shapes
+    difference, found = torch.empty(shape), [torch.empty(shape) if wanted else None for wanted in how.wanted]
+    row, squares, exact = difference.view(1, -1), torch.empty(shape), layer.is_exact(difference)
+    count = torch.tensor(float(shape[0]))  # a number would be made a tensor at each pass
+    divisor = 2 * count
+
+    def forward(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        torch.sub(a, b.reshape(shape), out=difference)
+        return (row_squares(row)[0] if exact else torch.square(difference, out=squares).sum()) / divisor
+
+    def backward(diff: torch.Tensor) -> Sequence[torch.Tensor | None]:
+        factor = diff / count  # twice diff / divisor, to the last bit
+        if found[0] is not None:
+            torch.mul(difference, factor, out=found[0])
+        if found[1] is not None:
+            torch.mul(difference, -factor, out=found[1])
+        return found[0], None if found[1] is None else found[1].view(other)
+
+    return Kernels(forward, backward)
+
+
+def _learn_softmax(layer: SoftmaxWithLoss, how: Learning) -> Kernels | None:
+    """Return the kernels where every label counts."""
+    if layer.ignore_label is not None or math.prod(layer.bottom_shapes[0]) == 0:
+        return None
+    shape, tops = layer.bottom_shapes[0], layer.num_tops
+    split, flat = (layer.outer, layer.classes, layer.inner), (layer.outer, 1, layer.inner)
+    divisor = float(normalizer(layer.normalization, layer.outer, layer.inner, None))
+    exact = layer.is_exact(torch.empty(1), small=math.prod(split[1:]) <= SMALL_ITEM)
+    label, diff = torch.empty(flat, dtype=torch.long), torch.empty(split)
+    normalize = _bound_softmax(split) if exact else partial(F.softmax, dim=1)
+    sum_up = _bound_cross_entropy(split, FLT_MIN, divisor) if exact else lambda p, _: _mean(p, label, divisor)
+    # Of p and its gradient, as arrays: the calls of torch take longer than what they compute.
+    p, classes, found = torch.empty(0), label.numpy().reshape(-1), diff.numpy()
+    unsigned, starts = classes.view(np.uint64), np.arange(layer.outer * layer.inner)
+    starts += (layer.classes - 1) * layer.inner * (starts // layer.inner)  # where the first class is
+    places, diffs, by = np.empty_like(starts), found.reshape(-1), np.float32(divisor)
+
+    def forward(scores: torch.Tensor, labels: torch.Tensor) -> Any:
+        nonlocal p
+        label.copy_(labels.reshape(flat))
+        if np.maximum.reduce(unsigned) >= split[1]:
+            layer.valid(label, None)
+        p = normalize(scores.reshape(split))
+        np.add(starts, classes if split[2] == 1 else classes * split[2], places)
+        return (sum_up(p, places), p.reshape(shape))[:tops]
+
+    def backward(top_diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None]:
+        np.copyto(found, p.numpy())
+        diffs[places] -= 1
+        np.multiply(found, np.float32(top_diff.item()) / by, found)
+        return diff.view(shape), None
+
+    return Kernels(forward, backward)
+
+
+def _mean(p: torch.Tensor, label: torch.Tensor, divisor: float) -> torch.Tensor:
+    return (-p.gather(1, label).clamp_(min=FLT_MIN).log()).sum() / divisor
+
+
+def _bound_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return what computes netspec.exact.losses.softmax of float32 scores of one shape, in memory of its own.
+
+    It expects one thread.
+    """
+    p, largest = torch.empty(shape), np.empty((shape[0], 1, shape[2]), np.float32)
+    values, exponents, powers = p.numpy(), np.zeros(shape, np.complex64), np.empty(shape, np.complex64)
+
+    def run(scores: torch.Tensor) -> torch.Tensor:
+        given = scores.numpy()
+        np.maximum.reduce(given, 1, out=largest, keepdims=True)
+        np.subtract(given, largest, exponents.real)  # never above 0: see libm.exp
+        np.exp(exponents, powers)
+        np.divide(powers.real, class_sums(powers.real)[:, None], values)
+        return p
+
+    return run
+
+
+def _bound_cross_entropy(
+    shape: tuple[int, int, int], least: float, divisor: float
+) -> Callable[[torch.Tensor, np.ndarray], torch.Tensor]:
+    """Return what computes the sum of -log p, one after the other, by ``divisor``, ().
+
+    Of p, float32 of this shape, it takes the numbers at the given places, and of these none less than ``least``.
+    """
+    one, loss = torch.ones(()), torch.empty(())
+    chosen, logs = torch.empty(2, shape[0] * shape[2])
+    few, values, result, by = chosen.numpy(), logs.numpy(), loss.numpy(), np.float32(divisor)
+
+    def run(p: torch.Tensor, places: np.ndarray) -> torch.Tensor:
+        p.numpy().reshape(-1).take(places, out=few, mode="clip")
+        chosen.clamp_(min=least)
+        torch.special.xlogy(one, chosen, out=logs)  # see libm.log
+        result[()] = -np.add.accumulate(values)[-1] / by
+        return loss
+
+    return run
+
+
+ENTRIES = {
+    EuclideanLoss: Entry(learning=_learn_euclidean),
+    SoftmaxWithLoss: Entry(learning=_learn_softmax),
+}

@@ -1,0 +1,60 @@
+"""Kernels of BatchNorm (netspec/layers/normalization.py)."""
+
+# pyright: reportPrivateImportUsage=false
+from __future__ import annotations
+
+import math
+
+import torch
+
+from netspec.fast.entry import Entry
+from netspec.fast.folding import Affine, Folds, blob_in_double
+from netspec.fast.kernels import Inference, Kernel, Learning, Room, finished
+from netspec.layers.normalization import BatchNorm, means
+from netspec.run.recorded import Kernels
+
+
+def affine(layer: BatchNorm) -> Affine:
+    """Return what a BatchNorm that normalizes by its past does to each channel."""
+    mean, variance = means(*(blob_in_double(layer, i) for i in range(3)))
+    scale = (variance + layer.eps).rsqrt()
+    return scale, -mean * scale
+
+
+def _folds(layer: BatchNorm) -> Folds:
+    return Folds(affine=(lambda: affine(layer)) if layer.use_global_stats else None)
+
+
+def _by_past(layer: BatchNorm, how: Inference) -> Kernel | None:
+    if not layer.use_global_stats:
+        return None
+    return finished(layer.by_past(layer.is_exact(layer.blob(0), layer.small)), how.finish)
+
+
+def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
+    if layer.use_global_stats or math.prod(layer.top_shapes[0]) == 0 or layer.is_exact(layer.blob(0), layer.small):
+        return None
+    room, rectifies, sums = Room(), layer.rectifies, [*how.sums[3:], None, None][:2]
+    asked = [how.wanted[0], *(total is not None for total in sums)]
+    gradients, rectified = torch.ops.aten.native_batch_norm_backward, torch.ops.aten.threshold_backward.grad_input
+    given = top = mean = deviation = torch.empty(0)
+
+    def forward(data: torch.Tensor) -> torch.Tensor:
+        nonlocal given, top, mean, deviation
+        (top, mean, deviation), given = layer.normalized(data, torch.native_batch_norm)
+        return top.relu_() if rectifies else top
+
+    def backward(diff: torch.Tensor) -> torch.Tensor | None:
+        if rectifies:
+            diff = rectified(diff, top, 0, grad_input=room.like(top))
+        factors = layer.factors()[0]
+        found, *learned = gradients(diff, given, factors, None, None, mean, deviation, True, layer.eps, asked)
+        for total, gradient in zip(sums, learned, strict=True):
+            if total is not None:
+                total.add_(gradient)
+        return found
+
+    return Kernels(forward, backward)
+
+
+ENTRIES = {BatchNorm: Entry(_by_past, _learn, _folds, fresh=True, any_layout=True)}

@@ -1,0 +1,63 @@
+"""Kernels of Scale and Bias (netspec/layers/scale.py)."""
+
+from __future__ import annotations
+
+import torch
+
+from netspec.fast.entry import Entry
+from netspec.fast.folding import Absorbed, Affine, Folds, blob_in_double, copy_of
+from netspec.fast.kernels import Inference, Kernel, Learning, finished
+from netspec.layers.scale import Bias, Scale, scaled_by_channel
+from netspec.run.recorded import Kernels, recorded
+
+
+def _scale(layer: Scale, how: Inference) -> Kernel | None:
+    if not layer.by_channel:
+        return None
+    scale, bias = layer.blob(0), layer.blob(1) if len(layer.blobs) > 1 else None
+    if not layer.is_exact(scale, layer.small):
+        return finished(scaled_by_channel(scale, bias), how.finish)
+    axes = (-1, *(1,) * (len(layer.bottom_shapes[0]) - 2))
+    factors, *shifts = (values.clone().view(axes) for values in layer.values())
+    if not shifts:
+        return finished(lambda data: data * factors, how.finish)
+    return finished(lambda data: (data * factors).add_(shifts[0]), how.finish)
+
+
+def _learn_scale(layer: Scale, how: Learning) -> Kernels | None:
+    if not layer.by_channel:
+        return None
+    adds = layer.is_exact(layer.blob(0), layer.small) and layer.context.options.accumulate_in_place  # as Caffe, itself
+    return recorded(layer.run, how.wanted, list(layer.blobs)) if adds and how.steady else None
+
+
+def _scale_folds(layer: Scale) -> Folds:
+    if not layer.by_channel:
+        return Folds()
+
+    def affine() -> Affine:
+        scale = blob_in_double(layer, 0)
+        return scale, blob_in_double(layer, 1) if len(layer.blobs) > 1 else torch.zeros_like(scale)
+
+    def absorb_before(scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
+        param = copy_of(layer.param)
+        param.scale_param.bias_term = True
+        factor, offset = (values.to(scale) for values in affine())
+        return Absorbed(param, (factor * scale, factor * shift + offset))
+
+    return Folds(affine=affine, absorb_before=absorb_before)
+
+
+def _bias_folds(layer: Bias) -> Folds:
+    def affine() -> Affine:
+        shift = blob_in_double(layer, 0)
+        return torch.ones_like(shift), shift
+
+    by_channel = len(layer.bottom_shapes) == 1 and layer.axis == 1 and len(layer.blob_shapes[0]) == 1
+    return Folds(affine=affine if by_channel else None)
+
+
+ENTRIES = {
+    Scale: Entry(_scale, _learn_scale, _scale_folds, fresh=True, any_layout=True),
+    Bias: Entry(folds=_bias_folds),
+}

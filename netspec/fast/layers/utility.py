@@ -1,0 +1,70 @@
+"""Kernels of layers that add, cut, join and reshape blobs (netspec/layers/utility)."""
+
+from __future__ import annotations
+
+import torch
+
+from netspec.exact import switch
+from netspec.fast.entry import Entry
+from netspec.fast.kernels import Inference, Kernel, Learning, finished
+from netspec.layers.utility.arithmetic import Eltwise, Softmax
+from netspec.layers.utility.parts import Concat, Slice
+from netspec.layers.utility.shape import Flatten, Reshape, Split
+from netspec.run.recorded import Kernels
+
+
+def _adds_two(layer: Eltwise) -> bool:
+    return layer.operation == layer.SUM and layer.coeff == [1.0, 1.0]
+
+
+def _eltwise(layer: Eltwise, how: Inference) -> Kernel | None:
+    if not _adds_two(layer):
+        return None
+    return finished(torch.Tensor.add_ if how.reuse else torch.add, how.finish)
+
+
+def _learn_eltwise(layer: Eltwise, how: Learning) -> Kernels | None:
+    return Kernels(torch.add, lambda diff: (diff, diff)) if _adds_two(layer) else None
+
+
+def _learn_concat(layer: Concat, how: Learning) -> Kernels:
+    axis, sizes = layer.axis, [shape[layer.axis] for shape in layer.bottom_shapes]
+    return Kernels(lambda *bottoms: torch.cat(bottoms, axis), lambda diff: diff.split(sizes, axis))
+
+
+def _reshape(layer: Flatten | Reshape, how: Inference) -> Kernel:
+    (top_shape,) = layer.top_shapes
+    return lambda x: x.reshape(top_shape)
+
+
+def _learn_reshape(layer: Flatten | Reshape, how: Learning) -> Kernels:
+    (shape,), (top_shape,) = layer.bottom_shapes, layer.top_shapes
+    return Kernels(lambda x: x.reshape(top_shape), lambda diff: diff.reshape(shape))
+
+
+def _split(layer: Split, how: Inference) -> Kernel:
+    tops = layer.num_tops
+    return lambda x: (x,) * tops
+
+
+def _learn_split(layer: Split, how: Learning) -> Kernels:
+    """Return kernels that add gradients in Caffe's order, or in the order of autograd: the last one first."""
+    order = 1 if layer.num_tops > 2 and switch.applies(layer.context.options.exact, torch.empty(1)) else -1
+    tops = layer.num_tops
+
+    def backward(*diffs: torch.Tensor | None) -> torch.Tensor:
+        first, *others = [diff for diff in diffs[::order] if diff is not None]
+        return sum(others, first)
+
+    return Kernels(lambda x: (x,) * tops, backward)
+
+
+ENTRIES = {
+    Eltwise: Entry(_eltwise, _learn_eltwise, fresh=True, any_layout=True),
+    Softmax: Entry(fresh=True, any_layout=True),
+    Concat: Entry(learning=_learn_concat, fresh=lambda layer: len(layer.bottom_shapes) > 1, any_layout=True),
+    Slice: Entry(any_layout=True),
+    Flatten: Entry(_reshape, _learn_reshape),
+    Reshape: Entry(_reshape, _learn_reshape),
+    Split: Entry(_split, _learn_split),
+}
