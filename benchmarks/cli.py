@@ -155,7 +155,7 @@ def _forward(arguments: argparse.Namespace) -> None:
         needs_onnx = any(way.startswith(("onnxruntime", "openvino")) for way in arguments.ways)
         return forward_case(name, batch, arguments.weights, arguments.twin, needs_onnx)
 
-    _compare(arguments, case, "")
+    _compare(arguments, case, training=False)
 
 
 def _add_train(commands: Commands) -> None:
@@ -172,7 +172,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
     if arguments.device != "cpu" and ("pycaffe" in arguments.ways or arguments.caffe):
         raise WrongUsage("only netspec and pytorch are timed on other devices than the CPU")
-    _compare(arguments, training_case, "_training", arguments.device)
+    _compare(arguments, training_case, training=True, device=arguments.device)
 
 
 def _add_small(commands: Commands) -> None:
@@ -187,9 +187,9 @@ def _small(arguments: argparse.Namespace) -> None:
     from benchmarks.case import forward_case, training_case
 
     print("training")
-    trained = _compare(arguments, training_case, "_training")
+    trained = _compare(arguments, training_case, training=True)
     print("\nforward")
-    _compare(arguments, partial(forward_case, onnx=False), "", before=trained)
+    _compare(arguments, partial(forward_case, onnx=False), training=False, before=trained)
 
 
 def _add_waiting(commands: Commands) -> None:
@@ -279,20 +279,21 @@ def _start(arguments: argparse.Namespace) -> None:
 def _compare(
     arguments: argparse.Namespace,
     case_of: Callable[[str, int], Any],
-    suffix: str,
+    training: bool,
     device: str = "cpu",
     before: Sequence[Row] = (),
 ) -> list[Row]:
-    from benchmarks.compare import rows_of
+    from benchmarks.compare import Comparison, rows_of
 
     def rows(yardsticks: str | None) -> Iterator[list[Row]]:
+        how = Comparison(
+            arguments.ways, training, arguments.rounds, yardsticks, arguments.caffe, arguments.seconds, device
+        )
         for name in arguments.nets:
             for batch in arguments.batch:
                 with case_of(name, batch) as case:
                     for threads in arguments.threads:
-                        ways, caffe = arguments.ways, arguments.caffe
-                        rounds, limit = arguments.rounds, arguments.seconds
-                        yield rows_of(case, threads, ways, suffix, yardsticks, caffe, rounds, limit, device)
+                        yield rows_of(case, threads, how)
 
     return _report(arguments, rows, before)
 

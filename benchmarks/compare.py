@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,27 +17,34 @@ from benchmarks.rounds import CaffeProgram, Contestant, Pass, Starter, Worker, d
 YARDSTICKS = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")  # these run in an environment of their own
 
 
-def rows_of(
-    case: Case,
-    threads: int,
-    ways: Sequence[str],
-    suffix: str,
-    yardsticks: str | None,
-    caffe: str | None,
-    rounds: int,
-    limit: float,
-    device: str = "cpu",
-) -> list[Row]:
-    """Return a row for each way; ``suffix`` is that of the worker's functions, ``yardsticks`` the Python of some.
+@dataclass(frozen=True)
+class Comparison:
+    """The ways to run a case, and for how long.
 
-    The rounds take at most ``limit`` seconds, or as long as three of them do.
-    Trainings of netspec and of the twin run on ``device``, a name of torch's.
+    training    whether a pass is a training iteration, else it is a forward pass
+    yardsticks  the Python of those among the ways that run in an environment of their own
+    caffe       Caffe's own program, if it is to be timed too
+    limit       the rounds take at most so many seconds, or as long as three of them do
+    device      where trainings of netspec and of the twin run: a name of torch's
     """
-    task = {**task_of(case, threads), "device": device}
-    contestants = [_worker(case, way, task, suffix, yardsticks) for way in ways]
-    if caffe:
-        contestants.append(CaffeProgram(caffe, task, training=bool(suffix)))
-    return _rows(case, threads, contestants, rounds, "training" if suffix else "forward", limit)
+
+    ways: Sequence[str]
+    training: bool
+    rounds: int
+    yardsticks: str | None = None
+    caffe: str | None = None
+    limit: float = math.inf
+    device: str = "cpu"
+
+
+def rows_of(case: Case, threads: int, how: Comparison) -> list[Row]:
+    """Return a row for each way."""
+    task = {**task_of(case, threads), "device": how.device}
+    suffix = "_training" if how.training else ""
+    contestants = [_worker(case, way, task, suffix, how.yardsticks) for way in how.ways]
+    if how.caffe:
+        contestants.append(CaffeProgram(how.caffe, task, training=how.training))
+    return _rows(case, threads, contestants, how.rounds, "training" if how.training else "forward", how.limit)
 
 
 def _rows(

@@ -199,9 +199,9 @@ def workers(size: int) -> Found:
         lines = [f"{names[k % len(names)]} {names[(k + 1) % len(names)]} 1" for k in range(PAIRS)]
         (folder / "pairs.txt").write_text("\n".join(lines) + "\n")
         entries = read_pairs(str(folder / "pairs.txt"))
-        options = Options(size=(224, 224))
+        options = Options(size=(224, 224), workers=size)
         start = time.perf_counter()
-        write_databases(entries, root, [str(folder / "pairs")], options, pair_key, workers=size)
+        write_databases(entries, root, [str(folder / "pairs")], options, pair_key)
         spent = time.perf_counter() - start
         decoding = _least(lambda: [cv2.imread(str(folder / name)) for name in names], 3) / len(names)
     return {"pairs per second": PAIRS / spent, "decoding, ms per pair": 2e3 * decoding}

@@ -6,7 +6,7 @@ Results equal netspec's: tests/benchmarks/test_twins.py.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -207,8 +207,9 @@ class AlexNet(nn.Module):
 class Inception(nn.Module):
     """Four ways side by side."""
 
-    def __init__(self, inputs: int, one: int, reduce3: int, three: int, reduce5: int, five: int, pooled: int) -> None:
+    def __init__(self, inputs: int, widths: Sequence[int]) -> None:
         super().__init__()
+        one, reduce3, three, reduce5, five, pooled = widths  # as the columns of the paper's table 1
         self.one = nn.Conv2d(inputs, one, 1)
         self.reduce3, self.three = nn.Conv2d(inputs, reduce3, 1), nn.Conv2d(reduce3, three, 3, padding=1)
         self.reduce5, self.five = nn.Conv2d(inputs, reduce5, 1), nn.Conv2d(reduce5, five, 5, padding=2)
@@ -232,7 +233,7 @@ class GoogLeNet(nn.Module):
         width = 192
         for _, *widths in GOOGLENET:
             if widths:
-                block = Inception(width, *widths)
+                block = Inception(width, widths)
                 blocks.append(block)
                 width = block.outputs
             else:

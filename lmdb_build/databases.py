@@ -56,7 +56,7 @@ class Options:
     ``size`` is (height, width), None for the files' own. ``encoding`` None stores pixels; "" stores the format that the
     file's name ends with, any other text that format ("png", "jpg"). ``check_size`` refuses an image of another size
     than the first. With ``skip`` an entry that cannot be read is logged and left out, as Caffe's convert_imageset does,
-    unless that is every entry; the keys of the others stay.
+    unless that is every entry; the keys of the others stay. ``workers`` processes read images, None: one per core.
     """
 
     color: bool = True
@@ -65,6 +65,7 @@ class Options:
     backend: str = "lmdb"
     check_size: bool = False
     skip: bool = False
+    workers: int | None = None
 
 
 def read_pairs(path: str) -> list[Entry]:
@@ -99,13 +100,12 @@ def write_databases(
     paths: Sequence[str],
     options: Options,
     key: Callable[[int, Entry], str],
-    workers: int | None = None,
     progress: Progress = silent,
 ) -> None:
     """Write entries, in order, into new databases, which appear when they are complete.
 
     ``paths`` names one database, or, with encoded images, one for each image of an entry. ``root`` is put in front of
-    image names, with a slash between. Images are read by ``workers`` processes (None: one per core). Raises SpecError,
+    image names, with a slash between. Raises SpecError,
     with the line in the list, for an image that is missing, unreadable, or differs in size from its partner.
     """
     assert len(paths) == (1 if options.encoding is None else len(entries[0].images))
@@ -113,7 +113,7 @@ def write_databases(
     first: tuple[int, ...] | None = None
     written, skipped = 0, None
     with ExitStack() as stack:
-        results = stack.enter_context(_Workers(workers or os.cpu_count() or 1)).ordered(work, entries)
+        results = stack.enter_context(_Workers(options.workers or os.cpu_count() or 1)).ordered(work, entries)
         writers = [stack.enter_context(Writer(path, options.backend)) for path in paths]
         for number, result in enumerate(progress(results, "records", len(entries))):
             entry = entries[number]

@@ -42,12 +42,14 @@ SMOOTHING = 0.4  # standard deviation of the filter before a part is made smalle
 class Batches:
     """How many batches, the pairs in each, and the part of a run that a batch's places come from.
 
-    The part has the length ``window`` (in units of the stamps) and is at a random position.
+    The part has the length ``window`` (in units of the stamps) and is at a random position. ``seed`` is that of the
+    choice of places, and of the views.
     """
 
     count: int
     size: int = 48
     window: float = float("inf")
+    seed: int = 1
 
     def check(self) -> None:
         """Raise InputError for numbers that cannot make a batch."""
@@ -56,18 +58,22 @@ class Batches:
                 raise InputError(f"--{name} must be at least 1, not {getattr(self, name)}")
         if not self.window > 0:
             raise InputError(f"--window must be more than 0, not {self.window:g}")
+        if self.seed < 0:
+            raise InputError(f"a seed must be 0 or more, not {self.seed}")
 
 
 @dataclass(frozen=True)
 class Changes:
-    """How the two views of a place differ.
+    """How the two views of a place are made of its images.
 
     viewpoint  how strongly the point of view does: zoom, turn and perspective are this many times as strong
     calm       this share of the views keeps its colors, and what it shows (:func:`lmdb_build.light.change_light`)
+    size       of a view: width, height
     """
 
     viewpoint: float = 1.0
     calm: float = 0.0
+    size: tuple[int, int] = (128, 96)
 
     def check(self) -> None:
         """Raise InputError for numbers that mean nothing."""
@@ -155,32 +161,28 @@ def write_views(
     runs: Runs,
     batches: Batches,
     changes: Changes,
-    size: tuple[int, int],
     root: Path,
     folder: Path,
-    seed: int,
     progress: Progress = silent,
 ) -> Path:
-    """Write two views of ``size`` (width, height) for each pair below ``folder``, and the list ``folder``.txt.
+    """Write two views for each pair below ``folder``, and the list ``folder``.txt.
 
     Both views of a pair are mirrored, or neither is. Raises InputError if batches cannot be made, or an image cannot
     be read or written.
     """
-    if seed < 0:
-        raise InputError(f"a seed must be 0 or more, not {seed}")
     changes.check()
-    first, second = choose_views(runs, batches, np.random.default_rng([seed, 0]))
+    first, second = choose_views(runs, batches, np.random.default_rng([batches.seed, 0]))
     folder.mkdir(parents=True, exist_ok=True)
     listed = []
     for number, pair in enumerate(progress(zip(first, second, strict=True), "views", len(first))):
-        rng = np.random.default_rng([seed, 1, number])
+        rng = np.random.default_rng([batches.seed, 1, number])
         mirrored, about = rng.random() < 0.5, rng.uniform(0, 1, 2)
         names = [f"{folder.name}/{number:06d}_{side}.jpg" for side in "ab"]
         for image, name in zip(pair, names, strict=True):
             picture = read_bgr(root / runs.names[image])
-            view = cut_view(
-                np.ascontiguousarray(picture[:, ::-1]) if mirrored else picture, size, about, rng, changes.viewpoint
-            )
+            if mirrored:
+                picture = np.ascontiguousarray(picture[:, ::-1])
+            view = cut_view(picture, changes.size, about, rng, changes.viewpoint)
             other = partial(read_bgr, root / runs.names[rng.integers(len(runs.names))])  # few views need it
             write_jpeg(folder.parent / name, change_light(view, other, rng, changes.calm))
         listed.append((*names, 1))
@@ -191,7 +193,7 @@ def write_views(
         f"more than {APART_S:g} apart, in a part of {batches.window:g}",
         "point of view": f"{changes.viewpoint:g} times as different",
         "calm": f"{changes.calm:g} of the views",
-        "seed": str(seed),
+        "seed": str(batches.seed),
     }
     write_pair_list(out, listed, settings)
     return out

@@ -149,8 +149,9 @@ def _convert(
         backend=arguments.backend,
         check_size=arguments.check_size,
         skip=skip,
+        workers=arguments.workers,
     )
-    write_databases(entries, arguments.rootfolder, databases, options, key, arguments.workers, bar)
+    write_databases(entries, arguments.rootfolder, databases, options, key, bar)
 
 
 def _is_encoded(arguments: argparse.Namespace) -> bool:

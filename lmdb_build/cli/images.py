@@ -107,9 +107,9 @@ def _views(arguments: argparse.Namespace) -> None:
         else:
             parts.append(folder_runs([each.path], root, arguments.step))
     runs = join_runs(parts)
-    batches = Batches(arguments.batches, arguments.size, arguments.window)
-    changes = Changes(arguments.viewpoint, arguments.calm)
-    path = write_views(runs, batches, changes, arguments.view_size, root, arguments.out, arguments.seed, bar)
+    batches = Batches(arguments.batches, arguments.size, arguments.window, arguments.seed)
+    changes = Changes(arguments.viewpoint, arguments.calm, arguments.view_size)
+    path = write_views(runs, batches, changes, root, arguments.out, bar)
     made = f"{arguments.batches} batches of {arguments.size} pairs"
     print(f"{path}: {made}; the names of images in it are relative to {path.parent}/")
 

@@ -222,8 +222,13 @@ def _pairs(arguments: argparse.Namespace) -> None:
         hard_share=arguments.hard_share,
         warp_share=1.0 if arguments.source[0].kind == "singles" else arguments.warp_share,
     )
-    lists = build_lists(source, plan, root, arguments.out, print, warn, bar)
-    print(f"wrote {', '.join(map(str, lists.values()))}; the names of images in them are relative to {root}/")
+    lists = build_lists(source, plan, root, arguments.out, bar)
+    for written in lists.values():
+        print(written.report)
+        for doubt in written.doubts:
+            warn(doubt)
+    paths = ", ".join(str(written.path) for written in lists.values())
+    print(f"wrote {paths}; the names of images in them are relative to {root}/")
 
 
 def _source_text(text: str) -> Source:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -18,6 +18,7 @@ from lmdb_build.pairs.choose import (
     Indices,
     Pairs,
     PairSource,
+    Wanted,
     choose_pairs,
     hard_negatives,
     split_by_group,
@@ -74,43 +75,49 @@ class Plan:
                 raise InputError(f"the share of {split} is {share:g}; expected a number above 0")
 
 
+@dataclass(frozen=True)
+class Split:
+    """The images of a split, and the pairs chosen among them."""
+
+    name: str
+    images: Indices
+    pairs: Pairs
+
+
+@dataclass(frozen=True)
+class Written:
+    """A list that was written: its file, what was chosen (:func:`report`), and doubts about its labels."""
+
+    path: Path
+    report: str
+    doubts: list[str]
+
+
 def build_lists(
-    source: PairSource,
-    plan: Plan,
-    root: Path,
-    out: Path,
-    say: Callable[[str], None],
-    warn: Callable[[str], None],
-    progress: Progress = silent,
-) -> dict[str, Path]:
+    source: PairSource, plan: Plan, root: Path, out: Path, progress: Progress = silent
+) -> dict[str, Written]:
     """Write ``out``/train.txt, val.txt and test.txt as planned, and warped images below ``out``; return the lists.
 
-    ``say`` receives each split's report, ``warn`` each doubt about its labels. Raises InputError, before anything is
-    written, if a split does not have enough pairs.
+    Raises InputError, before anything is written, if a split does not have enough pairs.
     """
     plan.check()
-    splits = split_images(source, plan)
-    chosen = {}
-    for split, images in splits.items():
-        rng = _stream(plan.seed, split)
+    splits = []
+    for name, images in split_images(source, plan).items():
         hard = None
         if plan.features is not None and len(images):
             rows = plan.features.rows_of([Path(source.names[image]) for image in images])
-            hard = hard_negatives(source, images, rows, round(plan.counts[split] // 2 * plan.hard_share))
-        chosen[split] = choose_pairs(
-            source, images, plan.counts[split], rng, split, plan.at_most, plan.warp_share, hard
-        )
+            hard = hard_negatives(source, images, rows, round(plan.counts[name] // 2 * plan.hard_share))
+        wanted = Wanted(plan.counts[name], plan.at_most, plan.warp_share, hard)
+        splits.append(Split(name, images, choose_pairs(source, images, wanted, _stream(plan.seed, name), name)))
     lists = {}
-    for split, pairs in chosen.items():
-        say(report(source, pairs, split, len(splits[split])))
-        for doubt in source.warnings(
-            pairs.first[~pairs.warped], pairs.second[~pairs.warped], pairs.labels[~pairs.warped]
-        ):
-            warn(f"{split}: {doubt}")
-        seconds = _write_warped(source, pairs, plan.seed, split, root, out, progress)
-        lists[split] = out / f"{split}.txt"
+    for split in splits:
+        pairs, plain = split.pairs, ~split.pairs.warped
+        doubts = source.warnings(pairs.first[plain], pairs.second[plain], pairs.labels[plain])
+        seconds = _write_warped(source, split, plan.seed, root, out, progress)
+        path = out / f"{split.name}.txt"
         listed = zip((source.names[index] for index in pairs.first), seconds, pairs.labels.tolist(), strict=True)
-        write_pair_list(lists[split], listed, _head(source, plan, split, splits[split], pairs, root, out))
+        write_pair_list(path, listed, _head(source, plan, split, root, out))
+        lists[split.name] = Written(path, report(source, split), [f"{split.name}: {doubt}" for doubt in doubts])
     return lists
 
 
@@ -126,18 +133,17 @@ def _stream(seed: int, split: str, *more: int) -> np.random.Generator:
     return np.random.default_rng([seed, 1 + SPLITS.index(split), *more])
 
 
-def _write_warped(
-    source: PairSource, pairs: Pairs, seed: int, split: str, root: Path, out: Path, progress: Progress
-) -> list[str]:
+def _write_warped(source: PairSource, split: Split, seed: int, root: Path, out: Path, progress: Progress) -> list[str]:
     """Write the warped images, if any; return the names of the second images, with those of the warped images."""
+    pairs = split.pairs
     names = [source.names[index] for index in pairs.second]
     if not pairs.warped.any():
         return names
-    folder = _below(out / f"{split}_warped", root)
-    for number in progress(np.flatnonzero(pairs.warped), f"{split}: warping"):
+    folder = _below(out / f"{split.name}_warped", root)
+    for number in progress(np.flatnonzero(pairs.warped), f"{split.name}: warping"):
         original = PurePosixPath(names[number])
         names[number] = f"{folder}/{number:06d}_{original.name}"
-        write_warped(root / original, root / names[number], _stream(seed, split, 1, int(number)))
+        write_warped(root / original, root / names[number], _stream(seed, split.name, 1, int(number)))
     return names
 
 
@@ -148,20 +154,18 @@ def _below(path: Path, root: Path) -> str:
         raise InputError(f"warped images must be below the root folder {root}; give another --root", path) from None
 
 
-def _head(
-    source: PairSource, plan: Plan, split: str, images: Indices, pairs: Pairs, root: Path, out: Path
-) -> dict[str, str]:
+def _head(source: PairSource, plan: Plan, split: Split, root: Path, out: Path) -> dict[str, str]:
     """Return the settings from which the list can be made again."""
     cut = f"time, {plan.split_gap:g} between splits" if plan.by == "time" else source.group_word
     shares = ", ".join(f"{name} {plan.shares[name]:g}" for name in SPLITS if plan.counts.get(name))
     head = dict(source.settings)
     head[ROOT_FOLDER] = Path(os.path.relpath(root.resolve(), out.resolve())).as_posix()
-    head["split"] = f"{split}, by {cut}; shares: {shares}; {len(images)} images"
+    head["split"] = f"{split.name}, by {cut}; shares: {shares}; {len(split.images)} images"
     if plan.features is not None:
         head["hard negatives"] = f"{plan.hard_share:g} of the negatives, by {plan.features.path.name}"
     if plan.warp_share:
         head["warped"] = f"{plan.warp_share:g} of the pairs"
-    head["pairs"] = "; ".join(f"{kind}: {number}" for kind, number in kinds(source, pairs).items())
+    head["pairs"] = "; ".join(f"{kind}: {number}" for kind, number in kinds(source, split.pairs).items())
     head["seed"] = str(plan.seed)
     return head
 
@@ -171,10 +175,11 @@ BARS = " ▁▂▃▄▅▆▇█"
 QUANTILES = (0, 5, 50, 95, 100)
 
 
-def report(source: PairSource, pairs: Pairs, split: str, images: int) -> str:
+def report(source: PairSource, split: Split) -> str:
     """Return a split's report: counts of each kind, then quantiles and a histogram of each measure."""
+    pairs = split.pairs
     used = len(np.unique(np.concatenate([pairs.first, pairs.second])))
-    lines = [f"{split}: {len(pairs)} pairs of {images} images, {used} of them used"]
+    lines = [f"{split.name}: {len(pairs)} pairs of {len(split.images)} images, {used} of them used"]
     lines += [f"  {kind:<44}{number:>8}" for kind, number in kinds(source, pairs).items()]
     plain = ~pairs.warped
     first, second, labels = pairs.first[plain], pairs.second[plain], pairs.labels[plain]

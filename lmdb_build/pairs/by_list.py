@@ -112,30 +112,30 @@ class PlaceSource(PairSource):
 
     def __init__(
         self,
-        names: list[str],
-        groups: Sequence[str],
+        images: Sequence[tuple[str, str]],
         positives: Sequence[tuple[int, int]],
         settings: dict[str, str],
         group_word: str = "place",
         min_gap: float = 0.0,
         sides: Sequence[int] | None = None,
     ) -> None:
-        """Take images, the name of each image's group, and pairs of indices that are the same place.
+        """Take images, each with the name of its group, and pairs of indices that are the same place.
 
         min_gap  in the given order of the groups: images of different groups nearer than this are left out, since
                  neighboring places look similar
         sides    if positives always join an image of one side (a folder, a season) with one of the other, negatives
                  must too, or a net learns to distinguish sides instead of places: pairs of one side are left out
         """
-        self.names, self.group_word, self.settings, self._min_gap = names, group_word, settings, min_gap
-        self.group_names = list(dict.fromkeys(groups))
+        self.names = [name for name, _ in images]
+        self.group_word, self.settings, self._min_gap = group_word, settings, min_gap
+        self.group_names = list(dict.fromkeys(group for _, group in images))
         numbers = {name: number for number, name in enumerate(self.group_names)}
-        self.groups = np.array([numbers[group] for group in groups], np.intp)
-        self.tracks = np.zeros(len(names), np.intp)
+        self.groups = np.array([numbers[group] for _, group in images], np.intp)
+        self.tracks = np.zeros(len(images), np.intp)
         self.stamps = self.groups.astype(np.float64)
         self._sides = None if sides is None else np.array(sides)
         listed = np.sort(np.array(positives, np.intp).reshape(-1, 2), axis=1)
-        self._codes = np.unique(listed @ np.array([len(names), 1]))
+        self._codes = np.unique(listed @ np.array([len(images), 1]))
 
     def judge(self, first: Indices, second: Indices) -> NDArray[np.int8]:
         """Label pairs (N,): listed ones positive, those of different groups negative."""
@@ -171,13 +171,13 @@ def folders_source(folder_a: Path, folder_b: Path, root: Path, min_gap: int = 0)
     }
     positives = [(number, number + len(places)) for number in range(len(places))]
     sides = np.repeat([0, 1], len(places)).tolist()
-    return PlaceSource(names, places * 2, positives, settings, min_gap=min_gap, sides=sides)
+    return PlaceSource(list(zip(names, places * 2, strict=True)), positives, settings, min_gap=min_gap, sides=sides)
 
 
 def singles_source(folder: Path, root: Path) -> PlaceSource:
     """Take each image of a folder (or list) as a different place; positives can only be made by warping."""
     names = [relative(path, root) for path in image_paths(folder)]
-    return PlaceSource(names, names, [], {"source": f"single images of {folder.name}"}, "image")
+    return PlaceSource([(name, name) for name in names], [], {"source": f"single images of {folder.name}"}, "image")
 
 
 def table_source(table: Path, root: Path, group: str | None = None, index: Path | None = None) -> PlaceSource:
@@ -215,7 +215,8 @@ def table_source(table: Path, root: Path, group: str | None = None, index: Path 
     of_second = {b for _, b in pairs}
     two_sided = index is None and not of_second & {a for a, _ in pairs}
     sides = [int(image in of_second) for image in group_of] if two_sided else None
-    return PlaceSource(names, list(group_of.values()), positives, settings, group or "place", sides=sides)
+    images = list(zip(names, group_of.values(), strict=True))
+    return PlaceSource(images, positives, settings, group or "place", sides=sides)
 
 
 def index_source(index: Path, root: Path, group: str, track: str, time: str, max_gap: float) -> PlaceSource:
@@ -243,7 +244,7 @@ def index_source(index: Path, root: Path, group: str, track: str, time: str, max
         "source": f"frames of {index.name}; negatives of different {group}",
         "positive": f"at most {max_gap:g} in {time} apart, of one {track}",
     }
-    return PlaceSource(names, groups, positives, settings, group)
+    return PlaceSource(list(zip(names, groups, strict=True)), positives, settings, group)
 
 
 def _linked(pairs: list[tuple[str, str]]) -> dict[str, str]:

@@ -143,33 +143,36 @@ def split_by_group(
     return {split: np.flatnonzero(owner[source.groups] == number) for number, split in enumerate(splits)}
 
 
-def choose_pairs(
-    source: PairSource,
-    images: Indices,
-    count: int,
-    rng: np.random.Generator,
-    split: str,
-    at_most: bool = False,
-    warp_share: float = 0.0,
-    hard_negatives: Indices | None = None,
-) -> Pairs:
-    """Choose ``count`` different pairs among ``images``, half of them positive, in shuffled order.
+@dataclass(frozen=True)
+class Wanted:
+    """The pairs to choose for a split: ``count``, half of them positive.
 
-    Each half is drawn uniformly from all pairs of its label, with two exceptions:
+    at_most         if there are not enough pairs, take as many as there are, half positive
     warp_share      this share of the positives is an image and a warped copy of it; in the same share of the negatives
                     the second image is warped, or a net would learn to detect the warp instead of the place
     hard_negatives  (K, 2) pairs that are taken as negatives before any is drawn
-
-    Raises InputError if there are not enough pairs, unless ``at_most``: then as many as there are, half positive.
     """
-    half = count // 2
+
+    count: int
+    at_most: bool = False
+    warp_share: float = 0.0
+    hard_negatives: Indices | None = None
+
+
+def choose_pairs(source: PairSource, images: Indices, wanted: Wanted, rng: np.random.Generator, split: str) -> Pairs:
+    """Choose different pairs among ``images``, in shuffled order.
+
+    Each half is drawn uniformly from all pairs of its label, but for warped images and hard negatives.
+    Raises InputError, which names the ``split``, if there are not enough pairs.
+    """
+    half, warp_share, hard_negatives = wanted.count // 2, wanted.warp_share, wanted.hard_negatives
     warped = round(half * warp_share)
     hard = np.zeros((0, 2), np.intp) if hard_negatives is None else hard_negatives[:half]
     found = find_pairs(source, images, {POSITIVE: half - warped, NEGATIVE: half}, rng)
     fresh = ~np.isin(_codes(found[NEGATIVE]), _codes(hard))
     negatives = np.concatenate([hard, found[NEGATIVE][fresh]])
     available = {POSITIVE: len(found[POSITIVE]) + (warped if len(images) else 0), NEGATIVE: len(negatives)}
-    half = _enough_pairs(available, half, len(images), split, at_most)
+    half = _enough_pairs(available, half, len(images), split, wanted.at_most)
     seen = found[POSITIVE][: half - round(half * warp_share)]
     copies = np.repeat(_draw_images(images, half - len(seen), rng)[:, None], 2, axis=1)
 

@@ -166,7 +166,7 @@ def _furniture(rng: np.random.Generator, hue: float) -> dict[str, list[Box]]:
     tint = color(hue + rng.choice([0.1, 0.33, 0.5]), rng.uniform(0.3, 0.8), rng.uniform(0.4, 0.9))
     wood, paper = partial(paint.plain, base=timber, roughness=0.12), partial(paint.plain, base=(240, 240, 245))
     painted, dark = partial(paint.plain, base=tint), partial(paint.plain, base=(30, 30, 30))
-    cloth = partial(paint.bands, base=tint, accent=color(hue, 0.4, 0.8), period=rng.uniform(0.12, 0.3), across=True)
+    cloth = partial(paint.bands, colors=(tint, color(hue, 0.4, 0.8)), period=rng.uniform(0.12, 0.3), across=True)
     leaves = partial(paint.motif, base=color(0.33, 0.7, 0.35), accent=color(0.3, 0.8, 0.6), step_m=0.1)
     wide, tall, at = rng.uniform(0.9, 1.7), rng.uniform(1.7, 2.2), rng.uniform(0.3, 1.1)
 
@@ -211,7 +211,7 @@ def _finish(rng: np.random.Generator, hue: float, kind: int) -> tuple[Texture, T
     base, deep, pale = color(hue, 0.35, 0.85), color(hue, 0.55, 0.6), color(hue, 0.2, 0.95)
     other, accent = color(hue + 0.4, 0.35, 0.65), color(hue + 0.5, 0.6, 0.85)
     timber = color(rng.uniform(0.03, 0.1), 0.5, rng.uniform(0.35, 0.7))
-    stripes = partial(paint.bands, base=base, accent=deep, period=rng.uniform(0.2, 0.4), across=False)
+    stripes = partial(paint.bands, colors=(base, deep), period=rng.uniform(0.2, 0.4), across=False)
     flowers = partial(paint.motif, base=pale, accent=accent, step_m=rng.uniform(0.25, 0.5))
     small, large = (partial(paint.courses, tints=(pale, deep), size=(size, size)) for size in (0.15, 0.33))
     bricks = partial(paint.courses, tints=(deep,), size=(0.25, 0.085))

@@ -52,9 +52,13 @@ def courses(
 
 
 def bands(
-    rng: np.random.Generator, width: float, height: float, base: Color, accent: Color, period: float, across: bool
+    rng: np.random.Generator, width: float, height: float, colors: tuple[Color, Color], period: float, across: bool
 ) -> Image:
-    """Wallpaper with vertical stripes every ``period`` meters; or cloth, with stripes ``across`` it too."""
+    """Wallpaper with vertical stripes every ``period`` meters; or cloth, with stripes ``across`` it too.
+
+    ``colors`` are that of the ground and that of the stripes.
+    """
+    base, accent = colors
     picture = plain(rng, width, height, base)
     step = max(4, round(period * PIXELS_PER_METER))
     share = 0.6 * (np.arange(picture.shape[1]) % step < step // 3)[None]

@@ -134,7 +134,7 @@ def _extract(arguments: argparse.Namespace) -> None:
 
 def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
     from netspec.files.image_list import list_images
-    from netspec.inspect.features.images import ImageNet, extract_images
+    from netspec.inspect.features.images import ImageInput, ImageNet, extract_images
     from netspec.inspect.features.scaling import Steps
 
     records = ("source", "iterations", "phase", "level", "stage", "allow_python_layers")
@@ -153,10 +153,7 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
         model(arguments),
         weights,
         blob,
-        arguments.input,
-        given,
-        arguments.zooms or (1.0,),
-        steps,
+        ImageInput(arguments.input, given, arguments.zooms or (1.0,), steps),
         choice(arguments),
         options(arguments, device=str(chosen)),
     )

@@ -448,7 +448,7 @@ def _embedding(arguments: argparse.Namespace) -> None:
 
 
 def _net(arguments: argparse.Namespace) -> ImageNet:
-    from netspec.inspect.features.images import ImageNet
+    from netspec.inspect.features.images import ImageInput, ImageNet
     from netspec.inspect.features.scaling import Steps
 
     if arguments.shape and arguments.shape[0] != arguments.input:
@@ -459,9 +459,7 @@ def _net(arguments: argparse.Namespace) -> ImageNet:
         arguments.net,
         split_paths(arguments.weights),
         arguments.blob,
-        arguments.input,
-        given,
-        steps=steps,
+        ImageInput(arguments.input, given, steps=steps),
         options=options(arguments, exact="none", passes=()),
     )
 

@@ -153,14 +153,13 @@ class SpreadProducts(ParameterSums):
         maps: torch.Tensor,
         weight: torch.Tensor,
         bias: torch.Tensor | None,
-        sliding: Filter,
-        group: int,
+        geometry: tuple[Filter, int],
         in_place: bool,
         size: Axes,
     ) -> torch.Tensor:
         maps = maps.contiguous()
         ParameterSums.keep(ctx, maps, (weight, bias), in_place)
-        ctx.sliding, ctx.group = sliding, group
+        sliding, group = ctx.sliding, ctx.group = geometry
         channels = weight.shape[1] * group
         ctx.at_once = sliding.images_at_once(channels, size)
         filters, values = weight.contiguous().flatten(1), maps.flatten(2)
@@ -190,7 +189,7 @@ class SpreadProducts(ParameterSums):
                 _gemm_by_group(values[these], columns, weight_sums.flatten(1), ctx.group, b_t=True, add=True)
             if maps_diff is not None:
                 _gemm_by_group(filters, columns, maps_diff[these].flatten(2), ctx.group)
-        return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None, None
+        return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None
 
 
 _rounded: dict[int, tuple[torch.Tensor, torch.Tensor]] | None = None  # by id, a weight and its rounded copy
@@ -236,16 +235,17 @@ class SummedConvolutions(ParameterSums):
         maps: torch.Tensor,
         weight: torch.Tensor,
         bias: torch.Tensor | None,
-        sliding: Filter,
-        group: int,
-        transposed: bool,
+        geometry: tuple[Filter, int, bool],
         lay_out: Callable[[torch.Tensor], torch.Tensor],
     ) -> torch.Tensor:
-        """Return the responses, in the precision that autocast chooses."""
+        """Return the responses, in the precision that autocast chooses.
+
+        ``geometry`` is the filter, the number of groups, and whether the convolution is transposed.
+        """
         ParameterSums.keep(ctx, maps, (weight, bias), True)
-        ctx.geometry, ctx.lay_out = (sliding, group, transposed), lay_out
+        ctx.geometry, ctx.lay_out = geometry, lay_out
         ctx.rounded = rounded_weight(weight)
-        tops = convolution(lay_out(maps), weight if ctx.rounded is None else ctx.rounded, bias, *ctx.geometry)
+        tops = convolution(lay_out(maps), weight if ctx.rounded is None else ctx.rounded, bias, *geometry)
         ctx.kind = tops.dtype
         return tops
 
@@ -268,7 +268,7 @@ class SummedConvolutions(ParameterSums):
                 total += gradient
         if maps_diff is not None:
             maps_diff = laid_out_like(maps, maps_diff).to(maps.dtype)
-        return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None, None
+        return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None
 
 
 def laid_out_like(maps: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,7 @@ import numpy as np
 
 from netspec.export.engines.choice import Choice
 from netspec.graph.options import BuildOptions
-from netspec.inspect.features.images import ImageNet
+from netspec.inspect.features.images import ImageInput, ImageNet
 from netspec.inspect.features.scaling import Steps, read_zooms
 from netspec.load import speed
 from netspec.proto.binary import split_paths
@@ -54,10 +54,7 @@ class Describer:
             model,
             split_paths(weights),
             blob,
-            input,
-            None,
-            views,
-            steps,
+            ImageInput(input, zooms=views, steps=steps),
             choice,
             BuildOptions(str(device), speed=speed()),
         )

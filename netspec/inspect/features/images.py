@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,15 +39,27 @@ if TYPE_CHECKING:
 BATCH = 16  # images per forward pass
 
 
-class ImageNet:
-    """The part of a net that computes ``blob`` from images in ``input_blob``, and what is done to their pixels before.
+@dataclass(frozen=True)
+class ImageInput:
+    """How images become the input of a net.
 
-    The net is the prototxt ``model`` in phase TEST. ``shape`` (N, C, H, W) of the input is read off the net where it is
-    None: from its Input layer, or from the first record of its data layer. ``weights`` are files, the last one winning;
-    something in them must fit. ``steps``, if any are given, are done to the pixels in the place of what the data
-    layer's transform_param says. ``choice`` is the engine that runs the net: with another than torch, whose model the
-    cache has, torch is not imported. Raises SpecError for faults of the files; warns where the weights were trained on
-    other pixels. (Its parameters are many: what one command line says of images, blob by blob.)
+    ``shape`` (N, C, H, W) of the input ``blob`` is read off the net where it is None: from its Input layer, or from the
+    first record of its data layer. ``zooms`` are the views of each image. ``steps``, if any are given, are done to the
+    pixels in the place of what the data layer's transform_param says.
+    """
+
+    blob: str = "data"
+    shape: Shape | None = None
+    zooms: Sequence[float] = (1.0,)
+    steps: Steps | None = None
+
+
+class ImageNet:
+    """The part of a net that computes ``blob`` from images, and what is done to their pixels before.
+
+    The net is the prototxt ``model`` in phase TEST. ``weights`` are files, the last one winning; something in them must
+    fit. ``choice`` is the engine that runs the net: with another than torch, whose model the cache has, torch is not
+    imported. Raises SpecError for faults of the files; warns where the weights were trained on other pixels.
     """
 
     def __init__(
@@ -55,25 +67,24 @@ class ImageNet:
         model: str | Path,
         weights: Sequence[str | Path],
         blob: str,
-        input_blob: str,
-        shape: Shape | None = None,
-        zooms: Sequence[float] = (1.0,),
-        steps: Steps | None = None,
+        images: ImageInput,
         choice: Choice | None = None,
         options: BuildOptions | None = None,
     ) -> None:
         options = replace(options or BuildOptions(speed=speed()), seed=0)
         read, source = parse_net(model)
         net, source = filter_net(with_state(read, TEST), source)
+        input_blob = images.blob
         before, before_source = prune(net, source, [input_blob], {})
-        shape = shape or _shape_of(input_blob, before, before_source, options)
+        shape = images.shape or _shape_of(input_blob, before, before_source, options)
         if len(shape) != 4 or shape[1] not in (1, 3):
             message = f'input blob "{input_blob}" has shape {tuple(shape)}, expected N x 1 or 3 x H x W for images'
             raise SpecError(message, Where(source.file))
         self.blob, self.input, self.file = blob, input_blob, source.file
         self.shape: Shape = tuple(shape[1:])
-        self.zooms = tuple(zooms)
-        transforming, steps = [layer for layer in before.layer if layer.HasField("transform_param")], steps or Steps()
+        self.zooms = tuple(images.zooms)
+        transforming = [layer for layer in before.layer if layer.HasField("transform_param")]
+        steps = images.steps or Steps()
         self.scaling = scaling_of(steps, transforming[0] if transforming else None, self.shape, source.file)
         after, after_source = prune(net, source, [blob], {input_blob: shape})
 

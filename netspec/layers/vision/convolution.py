@@ -129,7 +129,7 @@ class Convolution(SlidingFilter):
     ) -> torch.Tensor:
         """Return what torch's kernel computes of maps that ``lay_out`` puts into its order, with gradients."""
         if self.context.options.accumulate_in_place and not is_recorded():
-            return SummedConvolutions.apply(maps, weight, bias, sliding, self.group, transposed, lay_out)
+            return SummedConvolutions.apply(maps, weight, bias, (sliding, self.group, transposed), lay_out)
         return convolution(lay_out(maps), weight, bias, sliding, self.group, transposed)
 
     @property
@@ -228,11 +228,9 @@ class Deconvolution(Convolution):
     ) -> torch.Tensor:
         """Return the maps (N, C, spatial axes), at least one, spread by the filters."""
         if self.is_exact(maps):
-            in_place, size = (
-                self.context.options.accumulate_in_place,
-                self.top_shapes[0][self.channel_axis + 1 :] or (1,),
-            )
-            return SpreadProducts.apply(maps, weight, bias, sliding, self.group, in_place, size)
+            size = self.top_shapes[0][self.channel_axis + 1 :] or (1,)
+            in_place = self.context.options.accumulate_in_place
+            return SpreadProducts.apply(maps, weight, bias, (sliding, self.group), in_place, size)
         if not torch.is_grad_enabled():
             return convolution(maps, weight, bias, sliding, self.group, transposed=True)
         return self.convolved(maps, weight, bias, sliding, lambda maps: maps, transposed=True)

@@ -8,7 +8,15 @@ import pytest
 import scipy.io
 
 from lmdb_build.pairs.by_list import MaskSource, PlaceSource, folders_source, index_source, singles_source, table_source
-from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, choose_pairs, split_by_group, split_by_time
+from lmdb_build.pairs.choose import (
+    LEFT_OUT,
+    NEGATIVE,
+    POSITIVE,
+    Wanted,
+    choose_pairs,
+    split_by_group,
+    split_by_time,
+)
 from loopclosure.errors import InputError
 from paths import shared
 
@@ -96,7 +104,7 @@ class TestMask:
         source = MaskSource(folder / "samples_GT.bmp", folder / "samples", folder)
         assert len(source.names) == 84
         assert len(source.positives()) == 228
-        chosen = choose_pairs(source, np.arange(84), 400, np.random.default_rng(1), "train")
+        chosen = choose_pairs(source, np.arange(84), Wanted(400), np.random.default_rng(1), "train")
         assert chosen.labels.sum() == 200
 
 
@@ -219,7 +227,7 @@ def test_single_images_are_places_that_only_a_warp_shows_twice(tmp_path: Path) -
     images(tmp_path / "s", "1.png", "2.png", "3.png")
     source = singles_source(tmp_path / "s", tmp_path)
     assert label(source, "s/1.png", "s/2.png") == NEGATIVE
-    chosen = choose_pairs(source, np.arange(3), 6, np.random.default_rng(0), "train", warp_share=1.0)
+    chosen = choose_pairs(source, np.arange(3), Wanted(6, warp_share=1.0), np.random.default_rng(0), "train")
     assert chosen.warped.all()
     assert sorted(chosen.first[chosen.labels == 1].tolist()) == [0, 1, 2]
 

@@ -9,7 +9,15 @@ import pytest
 from lmdb_build.pairs import choose as pairs_room
 from lmdb_build.pairs.build import Plan, build_lists
 from lmdb_build.pairs.by_pose import PoseRule, PoseSource
-from lmdb_build.pairs.choose import NEGATIVE, POSITIVE, choose_pairs, find_pairs, split_by_group, split_by_time
+from lmdb_build.pairs.choose import (
+    NEGATIVE,
+    POSITIVE,
+    Wanted,
+    choose_pairs,
+    find_pairs,
+    split_by_group,
+    split_by_time,
+)
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
@@ -38,7 +46,7 @@ def everything(source: PoseSource) -> np.ndarray:
 
 
 def build(source: PoseSource, plan: Plan, out: Path) -> dict[str, Path]:
-    return build_lists(source, plan, out.parent, out, lambda text: None, lambda doubt: None)
+    return {split: written.path for split, written in build_lists(source, plan, out.parent, out).items()}
 
 
 def as_sets(pairs: np.ndarray) -> set[tuple[int, int]]:
@@ -220,7 +228,7 @@ def test_pairs_are_drawn_evenly() -> None:
 
 def test_warped_pairs_replace_their_share_of_both_labels() -> None:
     source = pose_source()
-    chosen = choose_pairs(source, everything(source), 100, np.random.default_rng(0), "train", warp_share=0.3)
+    chosen = choose_pairs(source, everything(source), Wanted(100, warp_share=0.3), np.random.default_rng(0), "train")
     for label in (POSITIVE, NEGATIVE):
         assert int(chosen.warped[chosen.labels == label].sum()) == 15
     copies = chosen.warped & (chosen.labels == POSITIVE)
@@ -231,7 +239,7 @@ def test_given_hard_negatives_are_all_taken_and_not_twice() -> None:
     source = pose_source()
     all_negatives = find_pairs(source, everything(source), {NEGATIVE: 40}, np.random.default_rng(9))[NEGATIVE]
     chosen = choose_pairs(
-        source, everything(source), 100, np.random.default_rng(0), "train", hard_negatives=all_negatives
+        source, everything(source), Wanted(100, hard_negatives=all_negatives), np.random.default_rng(0), "train"
     )
     negatives = np.column_stack([chosen.first, chosen.second])[chosen.labels == NEGATIVE]
     assert as_sets(all_negatives) <= as_sets(negatives)

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from lmdb_build.pairs.build import Plan, build_lists, report
+from lmdb_build.pairs.build import Plan, Split, build_lists, report
 from lmdb_build.pairs.by_list import PlaceSource, singles_source
-from lmdb_build.pairs.choose import NEGATIVE, choose_pairs, hard_negatives
+from lmdb_build.pairs.choose import NEGATIVE, Wanted, choose_pairs, hard_negatives
 from lmdb_build.pairs.list_file import (
     contact_sheet,
     join_lists,
@@ -42,7 +42,7 @@ def ring(count: int = 30) -> PlaceSource:
     """Places 0 to count - 1, each photographed twice."""
     places = [str(number) for number in range(count)]
     positives = [(number, number + count) for number in range(count)]
-    return PlaceSource([f"{side}/{place}.png" for side in "ab" for place in places], places * 2, positives, {})
+    return PlaceSource([(f"{side}/{place}.png", place) for side in "ab" for place in places], positives, {})
 
 
 class TestFile:
@@ -123,7 +123,7 @@ class TestWarp:
         contents = []
         for name in ("one", "two"):
             plan = Plan({"train": 8}, by="group", warp_share=1.0)
-            path = build_lists(source, plan, photos, photos / name, lambda text: None, lambda doubt: None)["train"]
+            path = build_lists(source, plan, photos, photos / name)["train"].path
             pairs = read_pair_list(path)
             assert all((photos / pair.second).is_file() for pair in pairs)
             for pair in pairs:
@@ -137,21 +137,14 @@ class TestWarp:
         source = singles_source(photos / "photos", photos / "photos")
         plan = Plan({"train": 4}, by="group", warp_share=1.0)
         with pytest.raises(InputError, match="warped images must be below the root folder"):
-            build_lists(source, plan, photos / "photos", photos / "out", lambda text: None, lambda doubt: None)
+            build_lists(source, plan, photos / "photos", photos / "out")
 
     def test_a_missing_image_is_named(self, photos: Path) -> None:
         source = singles_source(photos / "photos", photos)
         for path in (photos / "photos").iterdir():
             path.unlink()
         with pytest.raises(InputError, match=r"photos/\d\.png: no such image"):
-            build_lists(
-                source,
-                Plan({"train": 4}, by="group", warp_share=1.0),
-                photos,
-                photos / "o",
-                lambda t: None,
-                lambda d: None,
-            )
+            build_lists(source, Plan({"train": 4}, by="group", warp_share=1.0), photos, photos / "o")
 
 
 class TestHardNegatives:
@@ -176,7 +169,7 @@ class TestHardNegatives:
         assert len(np.unique(found)) > 40
 
     def test_none_are_found_among_images_of_one_place(self) -> None:
-        source = PlaceSource(["a.png", "b.png"], ["x", "x"], [(0, 1)], {})
+        source = PlaceSource([("a.png", "x"), ("b.png", "x")], [(0, 1)], {})
         assert len(hard_negatives(source, np.arange(2), np.eye(2), 5)) == 0
 
     def test_their_share_of_a_list(self, tmp_path: Path) -> None:
@@ -185,7 +178,7 @@ class TestHardNegatives:
         features = Features(tmp_path / "f.npz", line[:, None].astype(np.float32), list(source.names))
         for share, near in ((0.0, 5), (1.0, 20)):
             plan = Plan({"train": 40}, by="group", features=features, hard_share=share)
-            path = build_lists(source, plan, tmp_path, tmp_path / str(share), lambda t: None, lambda d: None)["train"]
+            path = build_lists(source, plan, tmp_path, tmp_path / str(share))["train"].path
             gaps = [
                 abs(int(Path(pair.first).stem) - int(Path(pair.second).stem))
                 for pair in read_pair_list(path)
@@ -197,14 +190,7 @@ class TestHardNegatives:
         source = ring()
         features = Features(tmp_path / "f.npz", np.zeros((1, 2), np.float32), ["a/0.png"])
         with pytest.raises(InputError, match="has no descriptor of"):
-            build_lists(
-                source,
-                Plan({"train": 4}, by="group", features=features),
-                tmp_path,
-                tmp_path,
-                lambda t: None,
-                lambda d: None,
-            )
+            build_lists(source, Plan({"train": 4}, by="group", features=features), tmp_path, tmp_path)
 
 
 class TestJoin:
@@ -228,8 +214,8 @@ class TestJoin:
 
 def test_the_report_counts_each_kind_and_every_pair() -> None:
     source = ring()
-    chosen = choose_pairs(source, np.arange(60), 40, np.random.default_rng(0), "train", warp_share=0.5)
-    lines = report(source, chosen, "train", 60).splitlines()
+    chosen = choose_pairs(source, np.arange(60), Wanted(40, warp_share=0.5), np.random.default_rng(0), "train")
+    lines = report(source, Split("train", np.arange(60), chosen)).splitlines()
     assert lines[0].startswith("train: 40 pairs of 60 images, ")
     counts = {line[:46].strip(): int(line[46:]) for line in lines[1:]}
     assert sum(counts.values()) == 40

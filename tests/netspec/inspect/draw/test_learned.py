@@ -15,7 +15,7 @@ from netspec.data.stored_weights import stored_layers
 from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.learned import embedding_figure, filters_figure, maps_figure, saliency_figure
 from netspec.inspect.features.embedding import in_plane, read_features, thumbnails
-from netspec.inspect.features.images import ImageNet
+from netspec.inspect.features.images import ImageInput, ImageNet
 from netspec.inspect.features.saliency import of_distance, of_unit
 from paths import GOLDEN
 
@@ -42,7 +42,7 @@ def linear(tmp_path: Path, channels: int = 3) -> tuple[ImageNet, np.ndarray]:
         tmp_path / "net.prototxt",
         [tmp_path / "w.caffemodel"],
         "ip",
-        "data",
+        ImageInput("data"),
         options=BuildOptions(exact="none", passes=()),
     )
     return built, weights
