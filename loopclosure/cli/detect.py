@@ -17,7 +17,7 @@ from loopclosure.detector import run
 from loopclosure.detector.decision import DetectorSettings, LoopResult
 from loopclosure.detector.detector import Describe, LoopDetector
 from loopclosure.detector.export import write_g2o, write_loops_csv
-from loopclosure.detector.map import Map, checked_name
+from loopclosure.detector.map import EXTRACTED, Map, checked_name
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.detector.visitor import Visitor
 from loopclosure.index.index import INDEXES
@@ -29,6 +29,7 @@ from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.source import FRAMES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
+from netspec.files.own_folder import inside
 from netspec.files.whole_file import write_whole
 from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
@@ -285,7 +286,8 @@ def _add_build(commands: Commands) -> None:
 
 def _build(a: argparse.Namespace) -> None:
     describe = run.load_describe(checked_name(a.describe))
-    _add_all(Map.create(a.map, a.describe), describe, a)
+    recordings = _recordings(a, 0)  # before there is a map: a name may be mistyped
+    _add_all(Map.create(a.map, a.describe), describe, recordings, a.index)
 
 
 def _add_add(commands: Commands) -> None:
@@ -298,14 +300,19 @@ def _add_add(commands: Commands) -> None:
 
 def _add(a: argparse.Namespace) -> None:
     into = Map(a.map)
-    _add_all(into, run.load_describe(into.describer), a)
+    _add_all(into, run.load_describe(into.describer), _recordings(a, len(into.sessions)), a.index)
 
 
-def _add_all(into: Map, describe: Describe, a: argparse.Namespace) -> None:
-    for text in a.source:
+def _recordings(a: argparse.Namespace, first: int) -> list[ImageSequence]:
+    """Open all sources of a command, which become session ``first`` of the map and those after it."""
+    folders = [inside(a.map, EXTRACTED, f"{number:06d}") for number in range(first, first + len(a.source))]
+    return [recording_of(text, folder) for text, folder in zip(a.source, folders, strict=True)]
+
+
+def _add_all(into: Map, describe: Describe, recordings: list[ImageSequence], index: str) -> None:
+    for recording in recordings:
         before, number = len(into), len(into.sessions)
-        recording = recording_of(text, Path(a.map) / "frames" / f"{number:06d}")
-        results = into.add(recording, describe, a.index, bar, _decided)
+        results = into.add(recording, describe, index, bar, _decided)
         warn_of_unreadable(recording)
         loops = [result.accepted for result in results if result.accepted is not None]
         between = sum(frame < before for frame in loops)

@@ -1,9 +1,12 @@
-"""A map on disk: a folder of sessions, each with the descriptors and points of its frames, written whole or not at all.
+"""A map on disk: a folder of sessions, each with the descriptors and points of its frames.
 
-``map.json`` says which net describes the frames. A session is a folder ``000000``, ``000001``, ... that appears when it
-is complete and never changes: whoever reads a map meanwhile reads the sessions before. ``projection.npz`` has the
-principal directions of all sessions, by which long descriptors are shortened, and ``projected-N`` the descriptors that
-the one learned from N frames shortened.
+``map.json`` names all that belongs to the map: the net that describes the frames, how many sessions there are, and the
+projection. A session is a folder ``000000``, ``000001``, ... that never changes. ``projected-N`` has the projection
+that was learned from N frames, their principal directions, and the descriptors that it shortened: one file for each
+session.
+
+Whoever adds a session writes all new files first and then ``map.json``, in one step. So a map is always whole: what
+``map.json`` does not name is not read, and the next add removes it. Whoever reads meanwhile reads the sessions before.
 """
 
 from __future__ import annotations
@@ -11,8 +14,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,18 +32,25 @@ from loopclosure.index.index import INDEXES, open_index
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.progress import Progress, silent
 from netspec.files.arrays import Rows, check_array, read_npz, regular
+from netspec.files.own_folder import inside, remove_own
 from netspec.files.whole_file import only_one, whole_file, whole_folder, write_whole
 
-FORMAT = 1
+FORMAT = 2
+NAMED_BY_FOLDERS = 1  # the format in which the sessions are the folders that are there
 SESSION = "a session of a map that loopclosure map wrote"
+PROJECTION = "the projection of a map"
 METRIC = "euclidean"
 COMPONENTS = 256  # of a projected descriptor
 LEARNED_FROM = 2048  # frames, evenly spread; fewer are compared as they are
 BLOCK = 4096  # frames that are read at a time
+MOST_FRAMES = 10**15  # of a map; its projection says from how many it was learned
 Decide = Callable[[LoopDetector], list[LoopResult]]
 # Of the nets of versions 0.2.0 and 0.3.0, whose maps do not say it.
 OLDER = {"default": "63cb899e0703cb96", "small": "2e195dd29a635c6c"}
 MAPPED = ("rows", "points", "descriptors")  # arrays in files of their own, read where they are used
+SESSION_FILES = ("frames.npz", *(f"{name}.npy" for name in MAPPED), "loops.csv")
+PROJECTION_FILE = "projection.npz"
+EXTRACTED, LOCK = "frames", ".lock"  # images from bags, and the lock of an add: no part of what map.json names
 
 
 @dataclass(frozen=True)
@@ -57,62 +66,97 @@ class Session:
         """Yield the descriptors (n, views D) float32 from frame ``start`` on, each view projected by itself."""
         kept = None if projection is None else self._projected(projection, views)
         for first in range(start, len(self.names), BLOCK):
-            rows = (self.arrays["rows"] if kept is None else kept)[first : first + BLOCK].astype(np.float32)
-            if not np.all(np.isfinite(rows)):
+            rows = slice(first, first + BLOCK)
+            if kept is not None:
+                try:
+                    yield kept[rows]
+                    continue
+                except InputError:  # removed since, by an add that learned another projection
+                    kept = None
+            whole = self.arrays["rows"][rows].astype(np.float32)
+            if not np.all(np.isfinite(whole)):
                 raise InputError(f"has a number that is not finite; expected {SESSION}", self.folder / "rows.npy")
-            yield rows if projection is None or kept is not None else shortened(rows, projection, views)
+            yield shortened(whole, projection, views)
 
     def _projected(self, projection: Whitening, views: int) -> Rows | None:
         """Return the descriptors that this projection shortened before; None where they are not there."""
         try:
-            kept = Rows(self.projected(projection), SESSION)
+            kept = Rows(self.folder.with_name(projected(projection)) / f"{self.folder.name}.npy", SESSION)
         except (ValueError, OSError):
             return None
         return kept if kept.shape == (len(self.names), views * COMPONENTS) and kept.dtype == np.float32 else None
 
-    def projected(self, projection: Whitening) -> Path:
-        """Return the file of what a projection shortens."""
-        return self.folder.with_name(f"projected-{projection.images}") / f"{self.folder.name}.npy"
-
 
 class Map:
-    """A map; ``describer`` is the name of what describes its frames."""
+    """A map.
+
+    describer   the name of what describes its frames
+    sessions    its sessions, in the order in which they were added
+    projection  what shortens descriptors that are searched in memory; None while there are too few
+    """
 
     def __init__(self, folder: str | Path) -> None:
         """Open a map to read it. Raises InputError for what is none."""
         self.folder = Path(folder)
-        path = self.folder / "map.json"
-        try:
-            about = json.loads(regular(path, "the head of a map").read_text(encoding="utf-8"))
-            if about["format"] != FORMAT:
-                raise InputError(f"has format {about['format']}; this version reads {FORMAT}", path)
-            self.describer = checked_name(about["describer"])
-        except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError("is no map; loopclosure map build makes one", self.folder) from None
         self.sessions: list[Session] = []
-        self._read_sessions()
+        self.projection: Whitening | None = None
+        self._read()
 
-    def _read_sessions(self) -> None:
-        while (self.folder / f"{len(self.sessions):06d}").is_dir():
-            session = _read_session(self.folder / f"{len(self.sessions):06d}")
+    def _read(self) -> None:
+        about = self._about()
+        self.describer = checked_name(about["describer"])
+        for number in range(len(self.sessions), self._count(about)):
+            session = _read_session(self.folder / f"{number:06d}")
             session.arrays.setdefault("fingerprint", OLDER.get(self.describer, ""))
             first = [*self.sessions, session][0]
             width, expected = (each.arrays["rows"].shape[1] for each in (session, first))
             if width != expected:
-                told = f"has {width} numbers a frame, that of {first.folder.name} {expected}; they are of one net"
-                raise InputError(told, session.folder / "rows.npy")
+                message = f"has {width} numbers a frame, that of {first.folder.name} {expected}; they are of one net"
+                raise InputError(message, session.folder / "rows.npy")
             self.sessions.append(session)
+        path = self.folder / about["projection"] / PROJECTION_FILE
+        known = about["projection"] or about["format"] == NAMED_BY_FOLDERS
+        self.projection = _read_projection(path) if known else None
+        if about["projection"] and (self.projection is None or projected(self.projection) != about["projection"]):
+            raise InputError(f"is not the projection that {self.folder / 'map.json'} names; build the map again", path)
+
+    def _about(self) -> dict[str, Any]:
+        """Read ``map.json``."""
+        path = self.folder / "map.json"
+        try:
+            about = json.loads(regular(path, "the head of a map").read_text(encoding="utf-8"))
+            if about["format"] not in (FORMAT, NAMED_BY_FOLDERS):
+                raise InputError(f"has format {about['format']}; this version reads {FORMAT}", path)
+            checked_name(about["describer"])
+            if about["format"] == NAMED_BY_FOLDERS:
+                return {**about, "sessions": None, "projection": ""}
+            if not isinstance(about["sessions"], int) or not re.fullmatch(r"(projected-\d+)?", about["projection"]):
+                raise InputError("does not name the sessions and the projection of a map", path)
+        except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError("is no map; loopclosure map build makes one", self.folder) from None
+        return about
+
+    def _count(self, about: dict[str, Any]) -> int:
+        """Return how many sessions there are."""
+        count = about["sessions"]
+        if count is None:
+            count = 0
+            while (self.folder / f"{count:06d}").is_dir():
+                count += 1
+        return count
 
     @classmethod
     def create(cls, folder: str | Path, describer: str) -> Map:
         """Make an empty map. Raises InputError where there is one already."""
         folder, describer = Path(folder), checked_name(describer)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        empty = names <= {"map.json", EXTRACTED, LOCK} and ("map.json" not in names or not cls(folder).sessions)
+        if folder.exists() and not (folder.is_dir() and empty):
             raise InputError("is there already; loopclosure map add adds to a map", folder)
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / "map.json", json.dumps({"format": FORMAT, "describer": describer}) + "\n")
+        _write_head(folder, describer, 0, None)
         return cls(folder)
 
     def __len__(self) -> int:
@@ -130,7 +174,11 @@ class Map:
 
         Raises InputError where descriptors of the net and of the map do not have the same size, or fingerprint.
         """
-        return self._detector(_Described(describe, self._projection(index)), index)
+        return self._detector(self._described(describe, index), index)
+
+    def _described(self, describe: Describe, index: str) -> _Described:
+        """Describe frames for an index; a database keeps their descriptors as they are."""
+        return _Described(describe, self.projection if index in INDEXES else None)
 
     def _detector(self, described: _Described, index: str) -> LoopDetector:
         views = described.views
@@ -159,87 +207,125 @@ class Map:
         """Add a recording as a session; return what each of its frames found, in all sessions and in its own.
 
         ``decide`` says which are loops, of a detector that has all frames; None: each is decided when it comes. The
-        loops are in ``loops.csv`` of the session's folder. Raises InputError, and adds nothing, where another process
-        is adding.
+        loops are in ``loops.csv`` of the session's folder. Raises InputError, SpecError or OSError, and adds nothing,
+        where another process is adding, where there are no frames, and where a file cannot be written.
         """
-        with only_one(self.folder / ".lock", "wait until it has ended"):
-            self._read_sessions()  # what others have added
-            described = _Described(describe, self._projection(index))
+        with only_one(inside(self.folder, LOCK), "wait until it has ended"):
+            self._read()  # what others have added
+            described = self._described(describe, index)
             detector = self._detector(described, index)
             before = len(detector)
             if decide is None:
                 results = run_detector(detector, recording, progress=progress)
             else:
                 remember_all(detector, recording, progress=progress)
-                results = decide(detector)
-            recording = recording.readable()
-            rows = np.array(described.kept)
-            folder = self.folder / f"{len(self.sessions):06d}"
-            arrays: dict[str, Any] = detector.arrays_since(before)
+                results = decide(detector) if len(detector) > before else []
+            if len(detector) == before:
+                raise InputError("has no frames; nothing is added", recording.source)
+            self._write(recording.readable(), described, detector, results)
+        return results
+
+    def _write(
+        self, recording: ImageSequence, described: _Described, detector: LoopDetector, results: list[LoopResult]
+    ) -> None:
+        """Write the files of a new session, then the head that names them; at a fault, remove what was written."""
+        count, views, named = len(self.sessions), described.views, self.projection
+        if self._about()["format"] == NAMED_BY_FOLDERS:
+            self._write_projected(self.sessions, named, views)
+            _write_head(self.folder, self.describer, count, named)
+        folder = inside(self.folder, f"{count:06d}")
+        remove_own(folder, SESSION_FILES)  # of an add that was killed
+        if folder.exists():
+            raise InputError("is in the way and no part of the map; move it away", folder)
+        arrays: dict[str, Any] = detector.arrays_since(len(self))
+        every = [*self.names, *(f"{folder.name}/{name}" for name in recording.names)]
+        try:
             with whole_folder(folder) as unfinished:
-                np.save(unfinished / "rows.npy", rows)
+                np.save(unfinished / "rows.npy", np.array(described.kept))
                 np.save(unfinished / "points.npy", arrays.pop("points"))
                 np.save(unfinished / "descriptors.npy", arrays.pop("descriptors"))
                 said = {"source": np.array(str(recording.source)), "fingerprint": np.array(described.fingerprint)}
                 np.savez(unfinished / "frames.npz", names=np.array(recording.names), **said, **arrays)
-                every = [*self.names, *(f"{folder.name}/{name}" for name in recording.names)]
                 write_loops_csv(unfinished / "loops.csv", [r for r in results if r], detector.stamps, every)
-            self._read_sessions()
-            self._learn_projection(described.views)
-            self._project(described.views)
-        return results
+            sessions = [*self.sessions, _read_session(folder)]
+            projection = _learned(sessions, named, views)
+            self._write_projected(sessions, projection, views)
+            _write_head(self.folder, self.describer, len(sessions), projection)
+        except BaseException:
+            if self._count(self._about()) == count:
+                remove_own(folder, SESSION_FILES)
+            raise
+        self._read()
+        self._remove_projections({projected(each) for each in (named, self.projection) if each is not None})
 
-    def _projection(self, index: str) -> Whitening | None:
-        """Return the projection for an index in memory; a database keeps the descriptors as they are."""
-        path = self.folder / "projection.npz"
-        if index not in INDEXES or not path.exists():
-            return None
-        arrays = read_npz(regular(path, "the projection of a map"), "the projection of a map")
-        try:
-            size = len(arrays["mean"])
-            check_array(arrays, "mean", "f", (size,))
-            check_array(arrays, "projection", "f", (size, COMPONENTS))
-            images = int(arrays.get("images", 0))  # files from before it do not have it
-        except (ValueError, LookupError, TypeError) as error:
-            raise InputError(f"{error}; remove it, and loopclosure map add makes it again", path) from None
-        return Whitening(arrays["mean"], arrays["projection"], images, 0, str(path))
-
-    def _learn_projection(self, views: int) -> None:
-        """Learn the projection, and again once there are twice as many frames."""
-        count, size = len(self), self.sessions[-1].arrays["rows"].shape[1] // views
-        before = self._projection("exact")
-        if count < max(LEARNED_FROM, 2 * before.images if before else 0) or size <= COMPONENTS:
-            return
-        starts, parts = np.cumsum([0, *(len(session.names) for session in self.sessions)]), []
-        for wanted in np.linspace(0, count - 1, LEARNED_FROM).round().astype(int):
-            number = int(np.searchsorted(starts, wanted, side="right")) - 1
-            row = int(wanted - starts[number])
-            parts.append(self.sessions[number].arrays["rows"][row : row + 1].astype(np.float32))
-        rows = np.concatenate(parts)
-        learned = learn_whitening(rows.reshape(len(rows) * views, -1)[::views], COMPONENTS, 0.0)
-        if learned.projection.shape[1] < COMPONENTS:
-            return
-        with whole_file(self.folder / "projection.npz") as unfinished, unfinished.open("wb") as stream:
-            np.savez(stream, mean=learned.mean, projection=learned.projection, images=np.array(count))
-
-    def _project(self, views: int) -> None:
-        """Write what the projection shortens, where it is not there, so that opening need not compute it."""
-        projection = self._projection("exact")
+    def _write_projected(self, sessions: list[Session], projection: Whitening | None, views: int) -> None:
+        """Write a projection and what it shortens, where it is not there, so that opening need not compute it."""
         if projection is None:
             return
-        for session in self.sessions:
-            path = session.projected(projection)
-            if not path.exists():
-                path.parent.mkdir(exist_ok=True)
-                rows = np.concatenate([*session.blocks(0, projection, views)])
-                with whole_file(path) as unfinished, unfinished.open("wb") as stream:
-                    np.save(stream, rows)
+        name = projected(projection)
+        inside(self.folder, name).mkdir(exist_ok=True)
+        with whole_file(inside(self.folder, name, PROJECTION_FILE)) as unfinished, unfinished.open("wb") as stream:
+            images = np.array(projection.images)
+            np.savez(stream, mean=projection.mean, projection=projection.projection, images=images)
+        for number, session in enumerate(sessions):
+            path = inside(self.folder, name, f"{session.folder.name}.npy")
+            if number < len(self.sessions) and projection is self.projection and path.exists():
+                continue
+            rows = [shortened(block, projection, views) for block in session.blocks()]
+            with whole_file(path) as unfinished, unfinished.open("wb") as stream:
+                np.save(stream, np.concatenate(rows))
+
+    def _remove_projections(self, kept: set[str]) -> None:
+        """Remove all projections but those ``kept``: that of the map, and that of whoever opened it just before."""
+        files = (PROJECTION_FILE, *(f"{session.folder.name}.npy" for session in self.sessions))
         for folder in self.folder.glob("projected-*"):
-            if folder != path.parent and re.fullmatch(r"projected-\d+", folder.name):
-                with suppress(OSError):  # what is not of a map's own making stays
-                    for session in self.sessions:
-                        (folder / f"{session.folder.name}.npy").unlink(missing_ok=True)
-                    folder.rmdir()
+            if folder.name not in kept and re.fullmatch(r"projected-\d+", folder.name):
+                remove_own(folder, files)
+        remove_own(self.folder, [PROJECTION_FILE])  # where format 1 had it
+
+
+def _write_head(folder: Path, describer: str, sessions: int, projection: Whitening | None) -> None:
+    named = "" if projection is None else projected(projection)
+    about = {"format": FORMAT, "describer": describer, "sessions": sessions, "projection": named}
+    write_whole(inside(folder, "map.json"), json.dumps(about) + "\n")
+
+
+def projected(projection: Whitening) -> str:
+    """Return the name of the folder of a projection, and of what it shortens."""
+    return f"projected-{projection.images}"
+
+
+def _read_projection(path: Path) -> Whitening | None:
+    """Read a projection; None where there is none."""
+    if not path.exists():
+        return None
+    arrays = read_npz(regular(path, PROJECTION), PROJECTION)
+    try:
+        size = len(arrays["mean"])
+        check_array(arrays, "mean", "f", (size,))
+        check_array(arrays, "projection", "f", (size, COMPONENTS))
+        images = int(arrays.get("images", 0))  # files from before it do not have it
+        if not 0 <= images < MOST_FRAMES:
+            raise ValueError(f'"images" is {images:.6g}')
+    except (ValueError, LookupError, TypeError, ArithmeticError) as error:
+        raise InputError(f"{error}; remove it, and loopclosure map add makes it again", path) from None
+    return Whitening(arrays["mean"], arrays["projection"], images, 0, str(path))
+
+
+def _learned(sessions: list[Session], before: Whitening | None, views: int) -> Whitening | None:
+    """Return a projection of these sessions: that of ``before``, or a new one once there are twice as many frames."""
+    starts = np.cumsum([0, *(len(session.names) for session in sessions)])
+    count, size = int(starts[-1]), sessions[-1].arrays["rows"].shape[1] // views
+    if count < max(LEARNED_FROM, 2 * before.images if before else 0) or size <= COMPONENTS:
+        return before
+    parts = []
+    for wanted in np.linspace(0, count - 1, LEARNED_FROM).round().astype(int):
+        number = int(np.searchsorted(starts, wanted, side="right")) - 1
+        row = int(wanted - starts[number])
+        parts.append(sessions[number].arrays["rows"][row : row + 1].astype(np.float32))
+    rows = np.concatenate(parts)
+    learned = learn_whitening(rows.reshape(len(rows) * views, -1)[::views], COMPONENTS, 0.0)
+    return before if learned.projection.shape[1] < COMPONENTS else replace(learned, images=count)
 
 
 class _Described:

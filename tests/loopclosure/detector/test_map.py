@@ -1,6 +1,7 @@
 """Maps on disk: loops between sessions; a query changes nothing; a run that is killed leaves the map as it was."""
 
 import csv
+import errno
 import json
 import os
 import shutil
@@ -9,6 +10,7 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +24,7 @@ from loopclosure.detector.map import Map
 from loopclosure.detector.run import run_detector
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.sequences import read_sequence
 from netspec.errors import SpecError
 from netspec.files.whole_file import only_one
@@ -109,7 +112,7 @@ def test_long_descriptors_are_projected(drives: Path, tmp_path: Path, monkeypatc
     monkeypatch.setattr(maps, "COMPONENTS", 8)
     opened = Map.create(tmp_path / "M", "thumbnails")
     opened.add(read_sequence(drives / "a"), Thumbnailer())
-    assert (tmp_path / "M" / "projection.npz").is_file()
+    assert (tmp_path / "M" / "projected-10" / "projection.npz").is_file()
     for again in (opened, Map(tmp_path / "M")):
         detector = again.detector(Thumbnailer())
         assert detector.descriptors.shape == (10, 8)
@@ -126,7 +129,7 @@ def test_what_is_projected_is_kept(drives: Path, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(maps, "COMPONENTS", 8)
     opened, folder = Map.create(tmp_path / "M", "thumbnails"), tmp_path / "M"
     opened.add(read_sequence(drives / "a"), Thumbnailer())
-    assert [path.name for path in folder.glob("projected-*/*")] == ["000000.npy"]
+    assert {path.name for path in folder.glob("projected-*/*")} == {"000000.npy", "projection.npz"}
     expected = opened.detector(Thumbnailer()).descriptors
     path = folder / "projected-10" / "000000.npy"
     np.save(path, expected + 1)
@@ -135,6 +138,7 @@ def test_what_is_projected_is_kept(drives: Path, tmp_path: Path, monkeypatch: py
     np.testing.assert_allclose(Map(folder).detector(Thumbnailer()).descriptors, expected, rtol=1e-4)
     opened.add(read_sequence(drives / "b"), Thumbnailer())  # twice the frames, another projection
     frames = len(opened)
+    opened.add(read_sequence(drives / "c"), Thumbnailer())  # the one before stays for those who read it
     assert {path.parent.name for path in folder.glob("projected-*/*")} == {f"projected-{frames}"}
 
 
@@ -153,6 +157,7 @@ def test_of_what_was_projected_before_only_a_maps_own_files_go(
         path.touch()
     assert own.exists()
     opened.add(read_sequence(drives / "b"), Thumbnailer())
+    opened.add(read_sequence(drives / "c"), Thumbnailer())
     assert not own.exists()
     assert all(path.exists() for path in strange)
 
@@ -227,12 +232,13 @@ def test_a_map_that_another_net_described_is_refused(
         (lambda m: np.save(m / "000000" / "points.npy", np.zeros((3, 2), np.float32)), '"points" has shape'),
         (lambda m: np.savez(m / "000000" / "frames.npz", names=np.array(["a"])), '"rows" has shape|stamps'),
         (lambda m: np.save(m / "000000" / "rows.npy", np.full((10, 8), np.nan)), "a number that is not finite"),
-        (lambda m: np.savez(m / "projection.npz", mean=np.zeros(3)), "loopclosure map add makes it again"),
+        (lambda m: np.savez(older(m), mean=np.zeros(3)), "loopclosure map add makes it again"),
         (lambda m: other_width(m), "000001/rows.npy: has 5 numbers a frame, that of 000000 768; they are of one net"),
         (lambda m: pipe(m / "map.json"), "is no regular file"),
         (lambda m: pipe(m / "000000" / "rows.npy"), "rows.npy: is no regular file"),
         (lambda m: pipe(m / "000000" / "frames.npz"), "frames.npz: is no regular file"),
-        (lambda m: pipe(m / "projection.npz"), "projection.npz: is no regular file"),
+        (lambda m: pipe(older(m)), "projection.npz: is no regular file"),
+        (lambda m: shutil.rmtree(m / "000000"), "000000/frames.npz: no such file; expected a session of a map"),
     ],
 )
 def test_damage_is_one_line(damage, sentence: str, a_map: Map, tmp_path: Path) -> None:
@@ -241,7 +247,14 @@ def test_damage_is_one_line(damage, sentence: str, a_map: Map, tmp_path: Path) -
         Map(tmp_path / "M").detector(Thumbnailer())
 
 
+def older(folder: Path) -> Path:
+    """Make it a map of format 1, and return where that has its projection."""
+    (folder / "map.json").write_text('{"format": 1, "describer": "thumbnails"}')
+    return folder / "projection.npz"
+
+
 def other_width(folder: Path) -> None:
+    older(folder)
     shutil.copytree(folder / "000000", folder / "000001")
     np.save(folder / "000001" / "rows.npy", np.zeros((PLACES, 5), np.float16))
 
@@ -273,5 +286,139 @@ def test_faults_are_named(a_map: Map, drives: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="5 dimensions, those before 768; take the net that described those"):
         a_map.add(read_sequence(drives / "b"), lambda image: np.ones(5))
     assert len(Map(tmp_path / "M")) == PLACES
-    shutil.rmtree(tmp_path / "M" / "000000")
-    assert len(Map(tmp_path / "M").detector(Thumbnailer())) == 0
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Projections are learned from few frames and have few components."""
+    monkeypatch.setattr(maps, "LEARNED_FROM", 9)
+    monkeypatch.setattr(maps, "COMPONENTS", 8)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+def test_nothing_is_removed_behind_a_link(a_map: Map, drives: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "000000.npy").write_text("of the user")
+    for name in ("projected-7", "projected-3"):
+        (a_map.folder / name).symlink_to(mine)
+    a_map.add(read_sequence(drives / "b"), Thumbnailer())
+    a_map.add(read_sequence(drives / "c"), Thumbnailer())
+    assert contents(mine) == {"000000.npy": b"of the user"}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+@pytest.mark.parametrize("name", ["projected-20", "map.json", "000001", ".lock"])
+def test_nothing_is_written_through_a_link(name: str, a_map: Map, drives: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    target = mine / name
+    if name == "map.json":
+        target.write_bytes((a_map.folder / name).read_bytes())
+        (a_map.folder / name).unlink()
+    elif name == "projected-20":
+        target.mkdir()
+    (a_map.folder / name).symlink_to(target)
+    before = contents(mine)
+    with pytest.raises(SpecError, match=f"M/{name}: is a link|M/{name}: is no lock"):
+        a_map.add(read_sequence(drives / "b"), Thumbnailer())
+    assert contents(mine) == before
+    (a_map.folder / name).unlink()
+    if name == "map.json":
+        shutil.copy(target, a_map.folder / name)
+    a_map.add(read_sequence(drives / "b"), Thumbnailer())
+    assert [len(session.names) for session in Map(a_map.folder).sessions] == [10, 10]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+@pytest.mark.parametrize("failing", ["map.json", "projection.npz", "000001.npy", "loops.csv"])
+def test_an_add_that_fails_adds_nothing(
+    failing: str, a_map: Map, drives: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk may be full at any file; tried again, the drive is there once."""
+    open_ = Path.open
+
+    def full(self: Path, *arguments: Any, **named: Any) -> Any:
+        if failing in self.name and arguments[:1] == ("wb",):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return open_(self, *arguments, **named)
+
+    before = contents(a_map.folder)
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", full)
+        patched.setattr(Path, "write_bytes", lambda self, data: full(self, "wb").write(data))
+        with pytest.raises((OSError, SpecError), match="No space left"):
+            a_map.add(read_sequence(drives / "b"), Thumbnailer())
+    left = contents(a_map.folder)
+    assert {name: left[name] for name in before} == before
+    assert not any(name.startswith("000001/") for name in left)
+    assert len(Map(a_map.folder)) == PLACES
+    a_map.add(read_sequence(drives / "b"), Thumbnailer())
+    again = Map(a_map.folder)
+    assert [len(session.names) for session in again.sessions] == [10, 10]
+    expected = np.vstack([*again.sessions[1].blocks(0)]).astype(np.float32)
+    assert again.projection is not None
+    kept = np.vstack([*again.sessions[1].blocks(0, again.projection)])
+    np.testing.assert_allclose(kept, again.projection.project(expected), rtol=1e-4, atol=1e-4)
+
+
+def test_a_drive_without_frames_is_not_added(a_map: Map) -> None:
+    with pytest.raises(InputError, match="has no frames; nothing is added"):
+        a_map.add(ImageSequence.of_files([]), Thumbnailer())
+    assert len(Map(a_map.folder)) == PLACES
+
+
+def test_a_source_that_is_not_there_leaves_no_map(drives: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "N"
+    assert main(["map", "build", str(folder), str(drives / "a"), str(drives / "typo")]) == 1
+    assert not folder.exists()
+    assert main(["map", "build", str(folder), str(drives / "a"), str(drives / "b")]) == 0
+    assert [len(session.names) for session in Map(folder).sessions] == [10, 10]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+def test_who_reads_while_a_projection_is_learned_again_reads_on(a_map: Map, drives: Path) -> None:
+    a_map.add(read_sequence(drives / "b"), Thumbnailer())
+    reader = Map(a_map.folder)
+    expected = reader.detector(Thumbnailer()).descriptors
+    blocks = reader.sessions[0].blocks(0, reader.projection)
+    for _ in range(3):
+        a_map.add(read_sequence(drives / "c"), Thumbnailer())
+    np.testing.assert_allclose(next(blocks), expected[:PLACES], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(reader.detector(Thumbnailer()).descriptors, expected, rtol=1e-4, atol=1e-4)
+    assert len({path.name for path in a_map.folder.glob("projected-*")}) <= 2
+
+
+@pytest.mark.parametrize("images", [np.inf, np.nan, 1e300])
+def test_a_projection_of_so_many_images_is_damaged(images: float, a_map: Map) -> None:
+    arrays = {"mean": np.zeros(768), "projection": np.zeros((768, 256)), "images": np.array(images)}
+    about = json.loads((a_map.folder / "map.json").read_text())
+    (a_map.folder / "projected-5").mkdir()
+    np.savez(a_map.folder / "projected-5" / "projection.npz", **arrays)
+    (a_map.folder / "map.json").write_text(json.dumps({**about, "projection": "projected-5"}))
+    with pytest.raises(InputError, match=r"projection\.npz: .*; remove it, and|projection\.npz: is not the projection"):
+        Map(a_map.folder).detector(Thumbnailer())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+def test_a_map_of_an_older_version_is_read_and_goes_on(a_map: Map, drives: Path) -> None:
+    """It named its sessions by their folders, and had the projection next to them."""
+    a_map.add(read_sequence(drives / "b"), Thumbnailer())
+    expected = Map(a_map.folder).detector(Thumbnailer()).descriptors
+    (kept,) = a_map.folder.glob("projected-*")
+    (kept / "projection.npz").rename(a_map.folder / "projection.npz")
+    (a_map.folder / "map.json").write_text(json.dumps({"format": 1, "describer": "thumbnails"}))
+    old = Map(a_map.folder)
+    assert len(old) == 2 * PLACES
+    np.testing.assert_array_equal(old.detector(Thumbnailer()).descriptors, expected)
+    old.add(read_sequence(drives / "c"), Thumbnailer())
+    new = Map(a_map.folder)
+    assert [len(session.names) for session in new.sessions] == [10, 10, 15]
+    assert json.loads((a_map.folder / "map.json").read_text())["format"] == 2
+    assert not (a_map.folder / "projection.npz").exists()
+    assert new.detector(Thumbnailer()).descriptors.shape == (35, 8)
