@@ -166,7 +166,7 @@ class RowNormalization(torch.autograd.Function):
         if eps is None:
             ctx.save_for_backward()
             return centered
-        deviation = libm.power(_row_means(libm.power(centered, 2)), 0.5) + eps
+        deviation = _deviations(centered, eps)
         tops = centered / deviation
         ctx.save_for_backward(tops, deviation)
         return tops
@@ -179,8 +179,22 @@ class RowNormalization(torch.autograd.Function):
         if not ctx.saved_tensors:
             return diff - _row_means(diff), None
         tops, deviation = ctx.saved_tensors
-        sums = tops * _row_sums(tops * diff) + _row_sums(diff)
-        return (diff + sums * (-1 / diff.shape[1])).div_(deviation), None
+        return _normalization_gradient(tops, deviation, diff), None
+
+
+@one_thread()
+def row_normalization_gradient(rows: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, eps: float) -> torch.Tensor:
+    """Return the gradient of RowNormalization, (M, K), from ``tops`` that may hold other values since."""
+    return _normalization_gradient(tops, _deviations(rows - _row_means(rows), eps), diff.contiguous())
+
+
+def _deviations(centered: torch.Tensor, eps: float) -> torch.Tensor:
+    return libm.power(_row_means(libm.power(centered, 2)), 0.5) + eps
+
+
+def _normalization_gradient(tops: torch.Tensor, deviation: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+    sums = tops * _row_sums(tops * diff) + _row_sums(diff)
+    return (diff + sums * (-1 / diff.shape[1])).div_(deviation)
 
 
 def _row_sums(rows: torch.Tensor, factor: float = 1.0) -> torch.Tensor:

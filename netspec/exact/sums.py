@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -109,14 +110,17 @@ class Product(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         top, *bottoms = ctx.saved_tensors
-        found: list[torch.Tensor | None] = []
-        for i, (bottom, asked) in enumerate(zip(bottoms, ctx.needs_input_grad[1:], strict=True)):
-            if not asked:
-                found.append(None)
-                continue
-            others = _product(bottoms[:i] + bottoms[i + 1 :])
-            found.append((others if ctx.stable else torch.where(bottom == 0, others, top / bottom)) * diff)
+        asked = ctx.needs_input_grad[1:]
+        found = [product_gradient(ctx.stable, bottoms, i, top, diff) if asked[i] else None for i in range(len(bottoms))]
         return None, *found
+
+
+def product_gradient(
+    stable: bool, bottoms: Sequence[torch.Tensor], i: int, top: torch.Tensor, diff: torch.Tensor
+) -> torch.Tensor:
+    """Return the gradient of factor ``i`` of a product, from ``top`` and ``diff``, the product's."""
+    others = _product([*bottoms[:i], *bottoms[i + 1 :]])
+    return (others if stable else torch.where(bottoms[i] == 0, others, top / bottoms[i])) * diff
 
 
 def _product(factors: Any) -> torch.Tensor:

@@ -24,7 +24,7 @@ from netspec.fast.table import learning_kernels, learns_alone
 from netspec.files.limits import is_out_of_memory
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
+from netspec.layers.contract.gradients import gradient_reads, gradients_from_memory
 from netspec.run.parts import Part
 from netspec.run.recorded import Backward, Diff, Kernels, recorded
 from netspec.run.walk import losses_of
@@ -244,11 +244,11 @@ class TrainingStep:
         final = self._plan.final[node.tops[0]]
         held = node.in_place[0] and bool(gradient_reads(layer) & {"bottom", "sign"})
 
-        def forward(bottom: torch.Tensor) -> torch.Tensor:
-            return layer.run(bottom)[0]
+        def forward(*bottoms: torch.Tensor) -> torch.Tensor:
+            return layer.run(*bottoms)[0]
 
-        def backward(diff: torch.Tensor) -> torch.Tensor:
+        def backward(diff: torch.Tensor) -> tuple[torch.Tensor, ...]:
             top = self._values[final]
-            return gradient_from_memory(layer, top if held else self._values[node.bottoms[0]], top, diff)
+            return gradients_from_memory(layer, [top] if held else [self._values[v] for v in node.bottoms], top, diff)
 
         return Kernels(forward, backward)

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch.nn import functional as F
 
-from netspec.exact.channels import RowNormalization
-from netspec.exact.lrn import AcrossChannels, within_channel
-from netspec.layers.contract.base import MOST, Layer, Shape
+from netspec.exact.channels import RowNormalization, row_normalization_gradient
+from netspec.exact.lrn import AcrossChannels, across_channels_gradient, within_channel
+from netspec.layers.contract.base import MOST, Layer, Shape, is_in_place
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 
@@ -37,6 +37,8 @@ class LRN(Layer):
             raise self.error(f"local_size must be {expected}, found {param.local_size}", "lrn_param", "local_size")
         if param.norm_region == ACROSS_CHANNELS:
             self.ignores_propagate_down = frozenset({0})
+            if not is_in_place(self):
+                self.gradient_reads = frozenset({"top"})
         else:
             self.ignores = frozenset({"lrn_param.k"})
 
@@ -47,21 +49,38 @@ class LRN(Layer):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         param = self.param.lrn_param
-        size, reach = param.local_size, param.local_size // 2
+        size = param.local_size
         if self.is_exact(data):
             if param.norm_region == ACROSS_CHANNELS:
                 return AcrossChannels.apply(data, size, param.alpha, param.beta, param.k)
             return within_channel(data, size, param.alpha, param.beta)
-        squares = data * data
         if param.norm_region == ACROSS_CHANNELS:
-            framed, channels = F.pad(squares, (0, 0, 0, 0, reach, reach)), data.shape[1]
-            total = framed[:, :channels]
-            for shift in range(1, size):
-                total = total + framed[:, shift : shift + channels]
-            base = param.k + param.alpha / size * total
-        else:
-            base = 1 + param.alpha * F.avg_pool2d(squares, size, stride=1, padding=reach)
+            return data * self._base(data).pow(-param.beta)
+        base = 1 + param.alpha * F.avg_pool2d(data * data, size, stride=1, padding=size // 2)
         return data * base.pow(-param.beta)
+
+    def _base(self, data: torch.Tensor) -> torch.Tensor:
+        """Return what a power of is divided by: k + alpha times the mean of the squares in the channels around."""
+        param = self.param.lrn_param
+        return param.k + param.alpha / param.local_size * self._window_sums(data * data)
+
+    def _window_sums(self, maps: torch.Tensor) -> torch.Tensor:
+        """Return the sums over the channels around each."""
+        size, channels = self.param.lrn_param.local_size, maps.shape[1]
+        framed = F.pad(maps, (0, 0, 0, 0, size // 2, size // 2))
+        total = framed[:, :channels]
+        for shift in range(1, size):
+            total = total + framed[:, shift : shift + channels]
+        return total
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        param = self.param.lrn_param
+        size, alpha, beta = param.local_size, param.alpha, param.beta
+        if self.is_exact(bottom):
+            return across_channels_gradient(bottom, top, diff, size, alpha, beta, param.k)
+        base = self._base(bottom)
+        sums = self._window_sums(diff * top / base)
+        return diff * base.pow(-beta) - 2 * alpha * beta / size * bottom * sums
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         param = self.param.lrn_param
@@ -100,6 +119,10 @@ class MVN(Layer):
 
     ignores_propagate_down = frozenset({0})
 
+    def setup(self) -> None:
+        if self.param.mvn_param.normalize_variance:  # Caffe keeps the variance of the forward pass, but not the top
+            self.gradient_reads = frozenset({"top", "kept"} if is_in_place(self) else {"top"})
+
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shape = bottom_shapes[0]
         if len(shape) > 4:
@@ -107,16 +130,27 @@ class MVN(Layer):
         return [(*shape, *(1,) * (4 - len(shape)))]
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        param, shape = self.param.mvn_param, self.top_shapes[0]
-        outer = 1 if param.across_channels else 2
-        maps = data.reshape(math.prod(shape[:outer]), math.prod(shape[outer:]))
+        param, maps = self.param.mvn_param, self._maps(data)
         if self.is_exact(data):
             top: torch.Tensor = RowNormalization.apply(maps, param.eps if param.normalize_variance else None)
         elif param.normalize_variance:
             top = _Standardize.apply(maps, param.eps)
         else:
             top = maps - maps.mean(dim=1, keepdim=True)
-        return top.reshape(shape)
+        return top.reshape(self.top_shapes[0])
+
+    def _maps(self, blob: torch.Tensor) -> torch.Tensor:
+        """Return the maps of a bottom or top as rows."""
+        shape, outer = self.top_shapes[0], 1 if self.param.mvn_param.across_channels else 2
+        return blob.reshape(math.prod(shape[:outer]), math.prod(shape[outer:]))
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        maps, tops, diffs = self._maps(bottom), self._maps(top), self._maps(diff)
+        eps = self.param.mvn_param.eps
+        if self.is_exact(bottom):
+            return row_normalization_gradient(maps, tops, diffs, eps).reshape(bottom.shape)
+        deviation = _deviation(maps - maps.mean(dim=1, keepdim=True), eps)
+        return _standardized_gradient(tops, deviation, diffs).reshape(bottom.shape)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         param, (data,) = self.param.mvn_param, bottoms
@@ -152,17 +186,23 @@ class _Standardize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rows: torch.Tensor, eps: float) -> torch.Tensor:
         centered = rows - rows.mean(dim=1, keepdim=True)
-        deviation = centered.square().mean(dim=1, keepdim=True).sqrt() + eps
+        deviation = _deviation(centered, eps)
         top = centered / deviation
         ctx.save_for_backward(top, deviation)
         return top
 
     @staticmethod
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
-        (grad,) = grads
-        top, deviation = ctx.saved_tensors
-        along = (grad * top).mean(dim=1, keepdim=True)
-        return (grad - grad.mean(dim=1, keepdim=True) - along * top) / deviation, None
+        return _standardized_gradient(*ctx.saved_tensors, *grads), None
+
+
+def _deviation(centered: torch.Tensor, eps: float) -> torch.Tensor:
+    return centered.square().mean(dim=1, keepdim=True).sqrt() + eps
+
+
+def _standardized_gradient(top: torch.Tensor, deviation: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:
+    along = (grad * top).mean(dim=1, keepdim=True)
+    return (grad - grad.mean(dim=1, keepdim=True) - along * top) / deviation
 
 
 def spatial_response_norm(x, size, alpha, beta):

@@ -17,7 +17,7 @@ import torch
 
 from netspec.graph.plan import Node, Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
+from netspec.layers.contract.gradients import gradient_reads, gradients_from_memory
 from netspec.run.parts import Part, parts_of
 from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
 
@@ -108,8 +108,8 @@ class Eager:
             if self.overwritten[step.node]:
                 node, layer = plan.nodes[step.node], self.layers[step.node]
                 memory = memories.setdefault(plan.final[node.tops[0]], Memory())
-                bottom = bottoms[0].detach() if node.blocked[0] else bottoms[0]
-                tops = run_overwritten(layer, bottom, memory, node.in_place[0])
+                given = [x.detach() if stop else x for x, stop in zip(bottoms, node.blocked, strict=True)]
+                tops = run_overwritten(layer, given, memory, node.in_place[0])
             else:
                 tops = step.run(*bottoms)
             for v, top in zip(step.tops, tops, strict=False):
@@ -148,22 +148,24 @@ def is_overwritten(layer: Layer, node: Node, plan: Plan) -> bool:
     return ("bottom" in reads and in_place) or ("sign" in reads and in_place and later) or ("top" in reads and later)
 
 
-def run_overwritten(layer: Layer, bottom: torch.Tensor, memory: Memory, in_place: bool) -> tuple[torch.Tensor, ...]:
+def run_overwritten(
+    layer: Layer, bottoms: Sequence[torch.Tensor], memory: Memory, in_place: bool
+) -> tuple[torch.Tensor, ...]:
     """Run a layer; its gradient reads ``memory`` as its top and, if it is in place, as its bottom."""
     held = in_place and bool(gradient_reads(layer) & {"bottom", "sign"})
-    return (_Overwritten.apply(bottom, layer, memory, held),)
+    return (_Overwritten.apply(layer, memory, held, *bottoms),)
 
 
 class _Overwritten(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, bottom: torch.Tensor, layer: Layer, memory: Memory, bottom_is_held: bool) -> torch.Tensor:
+    def forward(ctx: Any, layer: Layer, memory: Memory, bottom_is_held: bool, *bottoms: torch.Tensor) -> torch.Tensor:
         ctx.layer, ctx.memory, ctx.bottom_is_held = layer, memory, bottom_is_held
         if not bottom_is_held:
-            ctx.save_for_backward(bottom)
-        return layer.run(bottom)[0]
+            ctx.save_for_backward(*bottoms)
+        return layer.run(*bottoms)[0]
 
     @staticmethod
     def backward(ctx: Any, diff: torch.Tensor) -> Any:
         held = ctx.memory.data
-        bottom = held if ctx.bottom_is_held else ctx.saved_tensors[0]
-        return gradient_from_memory(ctx.layer, bottom, held, diff), None, None, None
+        bottoms = (held,) if ctx.bottom_is_held else ctx.saved_tensors
+        return None, None, None, *gradients_from_memory(ctx.layer, bottoms, held, diff)

@@ -33,7 +33,7 @@ from netspec.compat.pycaffe.tapes import (
 from netspec.exact.blas import one_thread
 from netspec.graph.plan import AUTOMATIC
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.gradients import gradient_from_memory, gradient_reads
+from netspec.layers.contract.gradients import gradient_reads, gradients_from_memory
 from netspec.layers.contract.reading import Constant
 from netspec.layers.utility.live_blobs import Blob, BorrowedMemory
 from netspec.layers.utility.pycaffe_shim import importable
@@ -421,13 +421,15 @@ class BlobRunner:
             return
         diffs = [top.diff_memory.tensor(top.shape) for top in tops]
         if gradient_reads(layer):
-            if wanted[0]:
+            if any(wanted):
                 top = tops[0].data_memory.tensor(tops[0].shape)
-                in_place = bottoms[0] is tops[0]
-                bottom = top if in_place else bottoms[0].data_memory.tensor(bottoms[0].shape)
-                if self._keeps[i] and (read := self._read[i]) is not None and read.shape == bottom.shape:
-                    bottom = read
-                bottoms[0].diff_memory.put(gradient_from_memory(layer, bottom, top, diffs[0]))
+                values = [top if blob is tops[0] else blob.data_memory.tensor(blob.shape) for blob in bottoms]
+                if self._keeps[i] and (read := self._read[i]) is not None and read.shape == values[0].shape:
+                    values = [read]
+                found = gradients_from_memory(layer, values, top, diffs[0])
+                for blob, gradient, asked in zip(bottoms, found, wanted, strict=True):
+                    if asked:
+                        blob.diff_memory.put(gradient)
             return
         if not self._is_asked(i):
             return

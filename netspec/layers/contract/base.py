@@ -256,7 +256,12 @@ class Layer(torch.nn.Module):
             )
 
 
+def is_in_place(layer: Layer) -> bool:
+    """Return whether a layer's first top is its first bottom."""
+    return layer.param.top[:1] == layer.param.bottom[:1]
+
+
 def refuse_in_place(layer: Layer) -> None:
     """Raise a SpecError where a layer's first top is its first bottom; called by the layers for which Caffe does so."""
-    if layer.param.top[:1] == layer.param.bottom[:1]:
+    if is_in_place(layer):
         raise layer.error("may not work in place, as in Caffe; give its top another name", "top")

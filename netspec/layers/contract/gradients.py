@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import torch
@@ -25,6 +26,18 @@ class OwnGradient(Protocol):
         ...
 
 
+class OwnGradients(Protocol):
+    """A layer of several bottoms and one top whose gradient reads memory; it does not work in place."""
+
+    gradient_reads: frozenset[str]  # "top"
+
+    def caffes_gradients(
+        self, bottoms: Sequence[torch.Tensor], top: torch.Tensor, diff: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Return the bottoms' gradients as Caffe computes them from the data in memory at backward."""
+        ...
+
+
 class Unheeding(Protocol):
     """A layer that does not look at ``propagate_down`` in its backward pass."""
 
@@ -41,6 +54,10 @@ def ignores_propagate_down(layer: Layer) -> frozenset[int]:
     return getattr(layer, "ignores_propagate_down", frozenset())
 
 
-def gradient_from_memory(layer: Layer, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-    """Return the gradient of a layer's bottom; for layers whose gradient reads something."""
-    return offered(layer, "caffes_gradient")(bottom, top, diff)
+def gradients_from_memory(
+    layer: Layer, bottoms: Sequence[torch.Tensor], top: torch.Tensor, diff: torch.Tensor
+) -> tuple[torch.Tensor, ...]:
+    """Return the gradients of a layer's bottoms; for layers whose gradient reads something."""
+    if len(bottoms) > 1:
+        return offered(layer, "caffes_gradients")(bottoms, top, diff)
+    return (offered(layer, "caffes_gradient")(bottoms[0], top, diff),)

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 
 from netspec.exact.losses import softmax, softmax_gradient
 from netspec.exact.pointwise import Pointwise
-from netspec.exact.sums import Product, RowSums, row_magnitudes, row_squares
+from netspec.exact.sums import Product, RowSums, product_gradient, row_magnitudes, row_squares
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
@@ -43,6 +43,8 @@ class Eltwise(Layer):
             raise self.error("found coeff for PROD, expected it for SUM only", "eltwise_param", "coeff")
         if self.operation == self.MAX:
             self.ignores = frozenset({"eltwise_param.coeff"})
+        if self.operation == self.PROD and not p.stable_prod_grad and self.param.top[0] not in self.param.bottom:
+            self.gradient_reads = frozenset({"top"})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         for i, shape in enumerate(bottom_shapes):
@@ -71,6 +73,11 @@ class Eltwise(Layer):
         for x in others:
             top = top + x if self.operation == self.SUM else top * x
         return top
+
+    def caffes_gradients(
+        self, bottoms: Sequence[torch.Tensor], top: torch.Tensor, diff: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        return tuple(product_gradient(False, bottoms, i, top, diff) for i in range(len(bottoms)))
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if self.operation == self.SUM:

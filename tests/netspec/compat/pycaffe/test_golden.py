@@ -22,6 +22,7 @@ from golden_cases import (
 )
 from netspec.compat.pycaffe import mode
 from netspec.compat.pycaffe.solver import Solver
+from netspec.exact import CHOICES
 from paths import GOLDEN
 from pycaffe_cases import compute
 
@@ -82,16 +83,18 @@ def test_solvers_follow_caffe(
 
 
 @pytest.mark.parametrize("case", STEPS)
+@pytest.mark.parametrize("choice", CHOICES)
 def test_each_step_is_caffes(
     case: str,
+    choice: str,
     work_in: Callable[..., Path],
     exact: Callable[[str], None],
     caffes_bits: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Outputs and weights after each of three iterations, to the last bit; on other CPUs than Caffe's to 1e-5."""
+    """Outputs and weights after each of three iterations to 1e-3; ``all`` to the last bit on a CPU as Caffe's."""
     monkeypatch.chdir(work_in(f"steps/{case}"))
-    exact("all")
+    exact(choice)
     golden = np.load("caffe.npz")
     solver = caffe.get_solver("solver.prototxt")
     solver.net.copy_from("init.caffemodel")
@@ -102,7 +105,7 @@ def test_each_step_is_caffes(
         for layer, blobs in solver.net.params.items():
             found |= {f"{i} weight {layer}[{j}]": blob.data.copy() for j, blob in enumerate(blobs)}
     assert found.keys() == set(golden.files)
-    assert_arrays(found, golden, 0 if caffes_bits else 1e-5)
+    assert_arrays(found, golden, 0 if caffes_bits and choice == "all" else 1e-3)
 
 
 @pytest.fixture(scope="session")
