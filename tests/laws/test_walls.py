@@ -84,6 +84,19 @@ def test_the_table_of_rooms_is_true() -> None:
         assert found[room] - ground - entrance - reads == listed, room
 
 
+WINGS = {"fast", "dialects", "export", "compat", "inspect"}
+CORE = {"proto", "graph", "data", "exact", "layers", "layers/contract", "run", "net", "solver", *GROUND}
+
+
+def test_the_core_imports_no_wing() -> None:
+    """But for the public doors: ``load``, and the package itself."""
+    found = imported()
+    assert {room: names & (WINGS | {"cli", "load"}) for room, names in found.items() if room in CORE} == {
+        room: set() for room in CORE
+    }
+    assert not found["fast"] & (WINGS | {"load", "cli"})
+
+
 def test_nobody_imports_the_doors() -> None:
     forbidden = {"tools", "prototxt", "tests", "benchmarks"}
     assert not [room for room, names in imported().items() if names & forbidden]

@@ -1,0 +1,99 @@
+"""Each wing can be deleted, and all of them: what the others do goes on with the same numbers, to the last bit."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from paths import ROOT
+
+pytestmark = pytest.mark.slow
+
+WINGS = ("fast", "dialects", "export", "compat", "inspect")
+RANDOM_NETS = 100
+MOST_LINES = 20_100  # of the core, Python; to be lowered whenever it falls, to 18,000 in the end
+NOT_CORE = (*WINGS, "cli", "terminal", "pycaffe.py", "dnn.py")
+
+
+def copy_without(missing: Sequence[str], folder: Path) -> Path:
+    shutil.copytree(ROOT / "netspec", folder / "netspec", ignore=shutil.ignore_patterns("__pycache__"))
+    for wing in missing:
+        shutil.rmtree(folder / "netspec" / wing)
+    return folder
+
+
+# An editable installation finds modules that are missing here in the project itself.
+START = """
+import runpy, sys
+sys.meta_path[:] = [each for each in sys.meta_path if "Editable" not in getattr(each, "__name__", "")]
+sys.argv[:] = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+found = [m.__file__ for name, m in list(sys.modules.items()) if name.partition(".")[0] == "netspec" and m.__file__]
+assert all(file.startswith(sys.path[0]) for file in found), found
+"""
+
+
+def run(program: Path, package: Path, *arguments: str) -> str:
+    """Run a program with the package of a folder, and the helpers of tests; return what it prints."""
+    path = os.pathsep.join([str(package), str(ROOT / "tests")])
+    environment = {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
+    command = [sys.executable, "-c", START, str(program), *arguments]
+    done = subprocess.run(command, cwd=package, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def numbers(package: Path, nets: int = RANDOM_NETS) -> dict[str, str]:
+    """Return the hashes of what the core of a package computes."""
+    return json.loads(run(ROOT / "tests" / "core_program.py", package, str(nets)))
+
+
+@pytest.fixture(scope="module")
+def whole() -> dict[str, str]:
+    return numbers(ROOT)
+
+
+@pytest.mark.parametrize("missing", [("fast",), WINGS], ids=["fast", "all"])
+def test_the_core_computes_the_same_without(missing: tuple[str, ...], whole: dict[str, str], tmp_path: Path) -> None:
+    found = numbers(copy_without(missing, tmp_path))
+    assert {name: value for name, value in found.items() if value != whole[name]} == {}
+
+
+@pytest.mark.parametrize("missing", WINGS[1:])
+def test_the_core_computes_the_same_without_a_wing_that_it_does_not_use(
+    missing: str, whole: dict[str, str], tmp_path: Path
+) -> None:
+    found = numbers(copy_without([missing], tmp_path), nets=3)
+    assert {name: value for name, value in found.items() if value != whole[name]} == {}
+
+
+@pytest.mark.parametrize(
+    ("missing", "asked", "message"),
+    [
+        ("export", "netspec.load_net('net.prototxt', engine='onnxruntime')", "netspec/export"),
+        (
+            "fast",
+            "from netspec.export.formats.deploy import fold; fold(netspec.load_net('net.prototxt'))",
+            "netspec/fast",
+        ),
+    ],
+    ids=["engine", "fold"],
+)
+def test_what_needs_a_wing_says_so_when_it_is_asked_for(missing: str, asked: str, message: str, tmp_path: Path) -> None:
+    folder = copy_without([missing], tmp_path)
+    text = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } }'
+    (folder / "net.prototxt").write_text(text)
+    program = folder / "program.py"
+    program.write_text(f"import netspec\ntry:\n    {asked}\nexcept netspec.SpecError as fault:\n    print(fault)\n")
+    assert message in run(program, folder)
+
+
+def test_the_core_stays_small() -> None:
+    package = ROOT / "netspec"
+    core = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] not in NOT_CORE]
+    assert sum(len(path.read_text().splitlines()) for path in core) <= MOST_LINES
