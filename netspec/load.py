@@ -121,6 +121,7 @@ def load_solver(
         2
     """
     from netspec.layers.contract.context import device_of
+    from netspec.proto.text import parse_solver
     from netspec.solver.options import TrainingOptions
     from netspec.solver.solver import make_solver
 
@@ -134,4 +135,4 @@ def load_solver(
         limit=limit,
     )
     options = TrainingOptions(build, [device_of(each) for each in several(device)], nan, precision, action=action)
-    return make_solver(path, options, weights, snapshot)
+    return make_solver(*parse_solver(path), options, weights, snapshot)

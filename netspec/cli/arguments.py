@@ -256,9 +256,9 @@ def options(arguments: argparse.Namespace, **chosen: Any) -> BuildOptions:
     return BuildOptions(**{"speed": speed(), **said, **chosen})
 
 
-def stages(arguments: argparse.Namespace) -> tuple[str, ...]:
-    """Return the stages of ``--stage``."""
-    return tuple(stage for stage in arguments.stage.split(",") if stage)
+def stages(arguments: argparse.Namespace, as_caffe: bool = False) -> tuple[str, ...]:
+    """Return the stages of ``--stage``; ``as_caffe``, whose programs split an empty text too, at least an empty one."""
+    return tuple(stage for stage in arguments.stage.split(",") if stage or as_caffe)
 
 
 def devices(gpu: str) -> list[Any]:
@@ -296,8 +296,8 @@ def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str
         log.info(cpu_site, "Use CPU.")
     else:
         log.info(gpu_site, f"Use GPU with device ID {chosen.index}")
-    stages = arguments.stage.split(",")  # without --stage an empty one, as in Caffe
-    return load_net(path, PHASES[phase], options(arguments, device=str(chosen), stages=stages, write_files=write_files))
+    built = options(arguments, device=str(chosen), stages=stages(arguments, as_caffe=True), write_files=write_files)
+    return load_net(path, PHASES[phase], built)
 
 
 def load_weights(net: Any, paths: str | None, strict: bool) -> None:

@@ -34,6 +34,7 @@ from netspec.cli.arguments import (
     options,
     positive,
     run_by,
+    stages,
 )
 from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
@@ -202,10 +203,10 @@ def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | N
         )
     if arguments.resume and (found := _newest(param.snapshot_prefix)):
         arguments.snapshot, arguments.weights = str(found), None
-    build = options(arguments, stages=arguments.stage.split(","))  # without --stage an empty one, as in Caffe
+    build = options(arguments, stages=stages(arguments, as_caffe=True))
     gpus = devices(arguments.gpu) if arguments.gpu else ()
     chosen = TrainingOptions(build, gpus, arguments.nan, arguments.precision, processes, action)
-    solver = make_solver(path, chosen, arguments.weights, arguments.snapshot)
+    solver = make_solver(param, node, chosen, arguments.weights, arguments.snapshot)
     if arguments.scores and processes.is_root:
         _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))
     return solver
@@ -224,11 +225,10 @@ def _newest(prefix: str) -> Path | None:
 def _sole_writer(solver: Solver) -> AbstractContextManager[None]:
     """Refuse a second training that would write snapshots of the same names."""
     from netspec.files.whole_file import has_locks, only_one
-    from netspec.solver.checks import check_prefix
 
     if not (solver.param.snapshot or solver.param.snapshot_after_train):
         return nullcontext()
-    check_prefix(solver.param, solver.node)
+    solver.check_prefix()
     prefix = solver.param.snapshot_prefix
     if not has_locks():
         log.logger.warning(f'no file locks here: nothing stops another training from writing over "{prefix}"')
@@ -447,7 +447,7 @@ def _upgrade_net_proto_text(arguments: argparse.Namespace) -> None:
     from netspec.proto.text import read_net, write_text
 
     if is_net_binary(arguments.input):
-        from netspec.net.recovered import recover_net
+        from netspec.net.build import recover_net
 
         net, _ = recover_net(arguments.input, dict(arguments.shape))
     elif arguments.shape:

@@ -111,6 +111,12 @@ class Dialects(Forks):
         return dialects_of(net)
 
     @override
+    def rewrite(self, plan: Any, dialects: Any) -> list[str]:
+        from netspec.dialects.segmentation.crops import align_crops
+
+        return list(align_crops(plan, dialects))
+
+    @override
     def is_loose(self, layer: Any) -> bool:
         from netspec.dialects.signatures import is_loose
 

@@ -7,29 +7,40 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
+from google.protobuf.message import Message
 
 from netspec import log
 from netspec.errors import Report, SpecError, Where
-from netspec.files.limits import amount, is_out_of_memory
-from netspec.files.limits import memory as memory_of_machine
-from netspec.graph.alignment import align_crops
+from netspec.files.limits import amount, is_out_of_memory, memory
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import AUTOMATIC, Backward, Node, Param, Plan, plan_backward
 from netspec.layers import class_of, unknown_type
 from netspec.layers.contract.base import Layer, Shape, shape_string
 from netspec.layers.contract.context import Context, Random, device_of
+from netspec.layers.contract.fillers import READS
 from netspec.layers.contract.gradients import ignores_propagate_down
-from netspec.net.ignored_fields import doubtful_layers, unused_fields
-from netspec.net.need import BYTES, Need, limit_on, limit_text
+from netspec.layers.contract.reading import bytes_ahead
 from netspec.proto.forks import forks
+from netspec.proto.schema import TEST
 from netspec.run.eager import last_uses
 
+BYTES = 4  # of a number: float32
 MUCH = 8  # a net that needs more than 1/8 of the limit is summed up before it is built
+
+#: Fields of every layer, which the net reads.
+COMMON = frozenset(
+    {"name", "type", "bottom", "top", "phase", "loss_weight", "param", "blobs", "propagate_down", "include", "exclude"}
+)
+#: These set how Caffe computes, not what: no result depends on them.
+HOW_NOT_WHAT = frozenset({"engine", "force_nd_im2col", "share_in_parallel", "stable_prod_grad"})
+
+_Fields = tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -54,7 +65,7 @@ class Assembly:
         self._plan, self._report = plan, plan.source.report
         dialects = {*options.dialects, *plan.source.dialects, *forks().dialects_of(plan.net)}
         self.options = replace(options, dialects=tuple(sorted(dialects)))
-        self._warnings = list(align_crops(plan, self.options.dialects))
+        self._warnings = forks().rewrite(plan, self.options.dialects)
         self.layers: dict[int, Layer] = {}
         self.shapes: dict[str, Shape] = {}
         self.loss_weights: list[list[float]] = []
@@ -95,7 +106,7 @@ class Assembly:
         except (MemoryError, RuntimeError) as fault:
             if not is_out_of_memory(fault):
                 raise
-            there = f"this machine has {amount(memory_of_machine())}"
+            there = f"this machine has {amount(memory())}"
             raise SpecError(f"its blobs need more memory than there is: {there}", tie.at()) from None
         tie.take_from = None
         return layer
@@ -141,7 +152,10 @@ class Assembly:
             )
 
     def _survey(self) -> Need:
-        """Return what the net needs, from the shapes that are known so far, without memory, data or Python layers."""
+        """Return what the net needs, from the shapes that are known so far, without memory, data or Python layers.
+
+        Layers are filled as they are made: the sum has to be known before, or a machine is full when it is found.
+        """
         seen = replace(
             self.options,
             device="meta",
@@ -259,3 +273,142 @@ def _loss_weights(layer: Layer, report: Report) -> list[float]:
         message = f"found {len(given)} loss_weight, expected none or one per top blob ({layer.num_tops})"
         report(layer.error(message, "loss_weight"))
     return [layer.default_loss_weight if j == 0 else 0.0 for j in range(layer.num_tops)]
+
+
+# What a net needs
+
+
+class Need:
+    """The memory that a net needs at least, in bytes, as far as the shapes of its layers are known.
+
+    ``parameters`` counts shared ones once. ``tops`` is what tops need at one time: in phase TEST each is given up after
+    its last use, in phase TRAIN the backward pass needs them all. Tops that are in place, or that lie in their bottom's
+    memory, need nothing. ``ahead`` is what data layers read ahead. Gradients, the solver's history and what kernels
+    need for their work come on top.
+    """
+
+    def __init__(self, plan: Plan, last_uses: Sequence[Sequence[int]]) -> None:
+        self.parameters = self.tops = self.ahead = 0
+        self._plan = plan
+        self._ends = last_uses if plan.net.state.phase == TEST else [()] * len(plan.nodes)
+        self._home: dict[int, int] = {}  # the value whose memory a value lies in
+        self._sizes: dict[int, int] = {}
+        self._users: dict[int, int] = {}
+        self._alive = 0
+        self._largest = (0, 0)  # bytes of the layer that needs most, and its index, negative: the first of equals
+
+    @property
+    def total(self) -> int:
+        """Bytes of all of it together."""
+        return self.parameters + self.tops + self.ahead
+
+    def add(self, i: int, layer: Layer, parameters: int) -> None:
+        """Count layer ``i``, which comes after all that were counted, with its bytes of parameters."""
+        node, made = self._plan.nodes[i], 0
+        for j, (v, shape) in enumerate(zip(node.tops, layer.top_shapes, strict=False)):
+            bottom = node.bottoms[j if node.in_place[j] else 0] if node.bottoms else -1
+            shared = node.in_place[j] or "data" in layer.shares
+            home = self._home.get(bottom, v) if shared else v
+            if home == v:
+                self._sizes[v] = BYTES * math.prod(shape)
+                made += self._sizes[v]
+            self._home[v] = home
+            self._users[home] = self._users.get(home, 0) + 1
+        self._alive += made
+        self.tops = max(self.tops, self._alive)
+        self.parameters += parameters
+        ahead = bytes_ahead(layer)
+        self.ahead += ahead
+        self._largest = max(self._largest, (made + parameters + ahead, -i))
+        for v in self._ends[i]:
+            home = self._home.pop(v, None)
+            if home is not None:
+                self._users[home] -= 1
+                self._alive -= 0 if self._users[home] else self._sizes.pop(home)
+
+    def fault(self, limit: int) -> SpecError | None:
+        """Return an error that names the layer that needs most, if the net needs more than ``limit``, in bytes."""
+        if self.total <= limit:
+            return None
+        size, i = self._largest[0], -self._largest[1]
+        node = self._plan.nodes[i]
+        most_of_all = f"needs {amount(size)} of memory, the most of all layers"
+        return SpecError(
+            f"{most_of_all}; the net needs at least {self}; {limit_text(limit)}",
+            self._plan.source.at(i, layer=node.name, type=node.type),
+        )
+
+    def __str__(self) -> str:
+        """Return the sums for people."""
+        ahead = f", batches read ahead {amount(self.ahead)}" if self.ahead else ""
+        return f"{amount(self.total)}: parameters {amount(self.parameters)}, tops {amount(self.tops)}{ahead}"
+
+
+def limit_on(device: torch.device, limit: int | None = None) -> int:
+    """Return the bytes that a net may need on a device: the limit that was chosen, or the device's memory."""
+    if limit is not None:
+        return limit
+    return torch.cuda.mem_get_info(device)[1] if device.type == "cuda" else memory()
+
+
+def limit_text(limit: int) -> str:
+    """Return what the limit is, and how to set another."""
+    return f"the limit is {amount(limit)}, --limit SIZE sets another"
+
+
+# What has no effect
+
+
+def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
+    """Yield a line for each field without effect: its first place in the file, and the number of others."""
+    found: dict[tuple[str, _Fields, str], list[int]] = {}
+    for i, layer in enumerate(layers):
+        for path, reason in _unused(layer):
+            found.setdefault((layer.type, path, reason), []).append(i)
+    for (kind, path, reason), places in found.items():
+        first = places[0]
+        where = plan.source.at(first, *path, layer=plan.nodes[first].name, type=kind)
+        others = f" (also in {len(places) - 1} more of these layers)" if len(places) > 1 else ""
+        yield f"{where}: {'.'.join(path)} has no effect: {reason}{others}"
+    for field, _ in plan.net.ListFields():
+        if field.is_extension or field.name == "debug_info":
+            advice = "; set it in the solver" if field.name == "debug_info" else ""
+            yield f"{plan.source.net.find(field.name)}: {field.name} has no effect in a net{advice}"
+
+
+def doubtful_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
+    """Yield a line for each type of layers of which nothing shows which fork's they are: the first of them."""
+    first: dict[str, int] = {}
+    for i, layer in enumerate(layers):
+        if doubt := forks().doubt(layer):
+            first.setdefault(doubt, i)
+    for doubt, i in first.items():
+        yield f"{plan.source.at(i, layer=plan.nodes[i].name, type=plan.nodes[i].type)}: {doubt}"
+
+
+def _unused(layer: Layer) -> Iterator[tuple[_Fields, str]]:
+    partly = {name.partition(".")[0] for name in layer.reads if "." in name}
+    for field, value in layer.param.ListFields():
+        if field.name in COMMON or field.name in HOW_NOT_WHAT:
+            continue
+        if field.name not in layer.reads | partly:
+            yield (field.name,), f"a layer of type {layer.type} does not read it"
+            continue
+        if field.message_type is None:
+            continue
+        whole = field.name in layer.reads
+        for inner, inner_value in value.ListFields():
+            path = f"{field.name}.{inner.name}"
+            known = (whole and not inner.is_extension and path not in layer.ignores) or path in layer.reads
+            if not known and inner.name not in HOW_NOT_WHAT:
+                yield (field.name, inner.name), f"a layer of type {layer.type} does not read it"
+            elif inner.message_type is not None and inner.message_type.full_name == "caffe.FillerParameter":
+                for filler in [inner_value] if isinstance(inner_value, Message) else inner_value:
+                    for name, reason in _unused_of_filler(filler):
+                        yield (field.name, inner.name, name), reason
+
+
+def _unused_of_filler(filler: Any) -> Iterator[tuple[str, str]]:
+    for field, _ in filler.ListFields():
+        if field.name != "type" and field.name not in READS.get(filler.type, ()):
+            yield field.name, f'filler "{filler.type}" does not read it'

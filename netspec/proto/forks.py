@@ -91,6 +91,10 @@ class Forks:
         """Return whether the files of forks have a layer's blobs with other axes of size 1."""
         return False
 
+    def rewrite(self, plan: "Any", dialects: "Any") -> "list[str]":
+        """Change the layers of a Plan whose forks read their fields in another way; return warnings."""
+        return []
+
     def doubt(self, layer: "Any") -> str:
         """Return a warning where forks have other layers of this type, and nothing shows which is meant; else ""."""
         return ""

@@ -22,7 +22,7 @@ from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.files.whole_file import write_whole
 from netspec.layers.contract import reading
-from netspec.net.ignored_fields import HOW_NOT_WHAT
+from netspec.net.assembly import HOW_NOT_WHAT
 from netspec.net.net import Net
 from netspec.net.sealed import FAULTS, Digest, damaged, sealed, shown, unsealed, whole_number
 from netspec.proto.schema import fields_of

@@ -16,12 +16,12 @@ import numpy as np
 import torch
 
 from netspec import log
-from netspec.errors import SpecError, Where, several
+from netspec.errors import SpecError, several
 from netspec.graph.filter import with_train_state
 from netspec.process.signals import waiting_interrupts
-from netspec.proto.text import parse_solver
+from netspec.proto.schema import SolverParameter
+from netspec.proto.source_map import Place
 from netspec.solver import update
-from netspec.solver.checks import check_prefix
 from netspec.solver.extra import read_extra
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.options import TrainingOptions, choose_device
@@ -33,18 +33,18 @@ from netspec.solver.training import Blobs, Training
 
 
 def make_solver(
-    path: str | Path,
+    param: SolverParameter,
+    node: Place,
     options: TrainingOptions,
     weights: str | Path | Iterable[str | Path] | None = None,
     snapshot: str | Path | None = None,
 ) -> Solver:
-    """Build the solver of a prototxt and its nets, as ``netspec.load_solver`` (netspec/load.py) does.
+    """Build a solver from ``proto.text.parse_solver`` and its nets, as ``netspec.load_solver`` does (netspec/load.py).
 
     Where no device is given, each of several processes has the GPU of its number on its machine.
     """
     if weights is not None and snapshot is not None:
-        raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", Where(str(path)))
-    param, node = parse_solver(path)
+        raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", node.where)
     if options.build.level is not None or options.build.stages:
         param = with_train_state(param, options.build.level, options.build.stages)
     if weights is not None:
@@ -86,8 +86,8 @@ class Solver(Training):
         """Train up to max_iter, then show the loss and test once more if the settings require it."""
         log.info("solver.cpp:289", f"Solving {self.net.name}")
         log.info("solver.cpp:290", f"Learning Rate Policy: {self.param.lr_policy}")
-        if self.param.snapshot_after_train and self.options.processes.is_root:
-            check_prefix(self.param, self.node)
+        if self.param.snapshot_after_train:
+            self.check_prefix()
         self.step(self.param.max_iter - self.iteration)
         if self.param.snapshot_after_train and not self.is_due(self.param.snapshot):
             self.snapshot()

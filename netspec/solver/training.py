@@ -83,6 +83,7 @@ class Training:
     losses: deque[float]
     losses_before: tuple[float, ...] = ()  # of a training that is resumed
     _told_nan = False
+    _prefix_is_checked = False
 
     def __init__(self, param: Any, node: Place | None = None, options: TrainingOptions | None = None) -> None:
         """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError."""
@@ -90,8 +91,8 @@ class Training:
         log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
         check_settings(param, self.node)
         options = self.options
-        if param.snapshot and options.processes.is_root:
-            check_prefix(param, self.node)
+        if param.snapshot:
+            self.check_prefix()
         check_readable(self._weights())
         self.device = options.devices[0] if options.devices else choose_device(param, self.node)
         self.seed = self._chosen_seed()
@@ -105,6 +106,12 @@ class Training:
         self._say_doubts()
         self.blocks = Blocks(self.net.learnable, self.rule.sets)
         self.scale = LossScale(self.options.precision)
+
+    def check_prefix(self) -> None:
+        """Refuse a snapshot_prefix that cannot be written; it is tried once, and by the root alone."""
+        if not self._prefix_is_checked and self.options.processes.is_root:
+            check_prefix(self.param, self.node)
+            self._prefix_is_checked = True
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Refuse to be copied or pickled. Raises TypeError."""

@@ -21,9 +21,8 @@ from netspec.graph.options import BuildOptions
 from netspec.inspect.check import net_rules, solver_rules  # noqa: F401, they register their rules
 from netspec.inspect.check.findings import NET, PLAN, SETTINGS, SOLVER, TEXT, Finding, findings, not_ignored
 from netspec.inspect.check.forks import gathered, others, python_layers, unknown_types
-from netspec.net.build import build_net, not_to_be_given
+from netspec.net.build import build_net, not_to_be_given, recover_net
 from netspec.net.net import Net
-from netspec.net.recovered import recover_net
 from netspec.net.weights import load_weights
 from netspec.proto.binary import is_net_binary, split_paths
 from netspec.proto.schema import TEST, NetParameter, PhaseValue, SolverParameter
@@ -55,7 +54,7 @@ def check_file(
 ) -> list[Checked]:
     """Check a net for a phase, level and stages; or a solver and all its nets, where the training net gets these.
 
-    Of a .caffemodel, the net inside it is checked (:func:`netspec.net.recovered.recover_net`).
+    Of a .caffemodel, the net inside it is checked (:func:`netspec.net.build.recover_net`).
 
     ``weights``, paths separated by commas, are what a training would begin with, in the place of a solver's own. A file
     that cannot be read comes alone, without a net. On another device than "meta" a net gets memory, so that

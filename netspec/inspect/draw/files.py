@@ -11,7 +11,7 @@ from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.diagram import Diagram, diagram_of
 from netspec.inspect.draw.picture import picture_of
 from netspec.inspect.draw.svg import html_of, svg_of
-from netspec.net.recovered import recover_net
+from netspec.net.build import recover_net
 from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap

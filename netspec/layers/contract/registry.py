@@ -19,7 +19,7 @@ def register(type_name: str, *reads: str) -> Callable[[L], L]:
     """Class decorator: make a layer known under the type that prototxt files use.
 
     ``reads`` are the fields of LayerParameter that are the layer's own, e.g. ``"pooling_param"``; a net warns of all
-    others (netspec/net/ignored_fields.py).
+    others (netspec/net/assembly.py).
     """
 
     def add(cls: L) -> L:

@@ -10,7 +10,7 @@ import torch
 
 import netspec
 from netspec.errors import SpecError
-from netspec.net.recovered import recover_net
+from netspec.net.build import recover_net
 from netspec.net.weights import net_to_proto
 from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import BlobProto, LayerParameter, NetParameter, V1LayerParameter

@@ -19,7 +19,7 @@ from netspec.graph import splits
 from netspec.layers.contract import fillers
 from netspec.layers.contract.base import Shape
 from netspec.load import load_solver
-from netspec.net.need import limit_on
+from netspec.net.assembly import limit_on
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN, LayerParameter
 
