@@ -23,8 +23,8 @@ if [ ! -x "$VENV/bin/netspec" ] || [ ! -e "$INSTALLED" ] || [ "$ROOT/pyproject.t
   if "$VENV/bin/python" -c 'import torch' 2>/dev/null; then
     echo "Installing into $VENV, once; its PyTorch stays" >&2
   else
-    echo "Installing into $VENV, once: on Linux about 6 GB, most of it PyTorch for NVIDIA GPUs." >&2
-    echo "With PyTorch for the CPU alone it is a third of that: README.md says how" >&2
+    echo "Installing into $VENV, once: on Linux 6 GB, most of it PyTorch for NVIDIA GPUs; some minutes." >&2
+    echo "With PyTorch for the CPU alone 2 GB: docs/start.md says how" >&2
     install -c "$ROOT/constraints.txt" torch
   fi
   echo "Installing everything else" >&2
