@@ -69,7 +69,7 @@ def from_array(values: np.ndarray, diff: np.ndarray | None = None) -> Any:
     for array, names in ((values, _DATA), (diff, _DIFF)):
         if array is not None:
             setattr(runs, names[wide], np.ascontiguousarray(array, "<f8" if wide else "<f4").tobytes())
-    proto = BlobProto(shape=BlobShape(dim=values.shape))
+    proto = _of_shape(values.shape)
     proto.MergeFromString(runs.SerializeToString())
     return proto
 
@@ -77,9 +77,14 @@ def from_array(values: np.ndarray, diff: np.ndarray | None = None) -> Any:
 def in_half_precision(values: np.ndarray) -> Any:
     """Return a BlobProto of the values, rounded to half precision, as NVIDIA Caffe and OpenCV write them: raw_data."""
     runs = _Runs(raw_data_type=_RAW_DTYPES.index("<f2"), raw_data=values.astype("<f2").tobytes())
-    proto = BlobProto(shape=BlobShape(dim=values.shape))
+    proto = _of_shape(values.shape)
     proto.MergeFromString(runs.SerializeToString())
     return proto
+
+
+def _of_shape(shape: Shape) -> Any:
+    """Return a BlobProto of a shape; like Caffe's, one of no axes has no field ``shape``."""
+    return BlobProto(shape=BlobShape(dim=shape)) if shape else BlobProto()
 
 
 def _values(proto: Any, names: tuple[str, str]) -> np.ndarray:

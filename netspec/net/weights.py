@@ -204,6 +204,8 @@ def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
             written.loss_weight.append(1)  # Caffe's loss layers note their default (loss_layer.cpp)
         del written.blobs[:]
         for j in range(len(layer.blobs)):
+            if j == len(written.param) and layer.param_spec(j, None).lr_mult == 0:
+                written.param.add(lr_mult=0)  # as Caffe's BatchNorm notes it (batch_norm_layer.cpp)
             written.blobs.append(blobs.from_array(_values(layer, j), _gradient(layer, j) if diff else None))
     return proto
 

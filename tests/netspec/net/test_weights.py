@@ -10,13 +10,14 @@ import torch
 import netspec
 from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError
+from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, net_to_proto, save_weights
 from netspec.proto.binary import net_beside_numbers
 from netspec.proto.schema import TRAIN, BlobProto, BlobShape, NetParameter, V0LayerParameter, V1LayerParameter
-from netspec.proto.text import parse_net_text
+from netspec.proto.text import parse_net, parse_net_text
 from paths import GOLDEN
 
 CASES = sorted(path.name for path in (GOLDEN / "train").iterdir())
@@ -454,3 +455,21 @@ def test_load_net_takes_several_files_of_weights(tmp_path: Path) -> None:
     assert torch.equal(
         loaded.params["ip"][0], netspec.load_net(tmp_path / "net.prototxt", weights=files[1]).params["ip"][0]
     )
+
+
+SHAPES = {
+    "batch_norm": {"d0": (3, 3, 5, 5)},
+    "scalar": {"d0": (4, 2, 3, 3), "d1": (4, 3), "d2": (4, 1, 2), "d3": (4,)},
+}
+
+
+@pytest.mark.parametrize("case", SHAPES)
+def test_equal_weights_make_equal_bytes(case: str, tmp_path: Path) -> None:
+    """Caffe notes a rate of 0 for BatchNorm's blobs, and no shape for blobs of no axes."""
+    folder = GOLDEN / "caffemodel" / case
+    param, source = parse_net(folder / "net.prototxt")
+    options = BuildOptions(open_data=False, given_shapes=SHAPES[case])
+    net = build_net(with_state(param, TRAIN), source, options)
+    load_weights(net, folder / "caffe.caffemodel")
+    save_weights(net, tmp_path / "ours.caffemodel")
+    assert (tmp_path / "ours.caffemodel").read_bytes() == (folder / "caffe.caffemodel").read_bytes()
