@@ -49,6 +49,7 @@ SOLVER = {
     "stepsize: 10000": "stepsize: 100",
     "max_iter: 30000": "max_iter: 300",
     "display: 100\naverage_loss: 100\nsnapshot: 2500": "display: 10\naverage_loss: 10\nsnapshot: 50",
+    "solver_mode: GPU": "solver_mode: CPU",
 }
 SLIM_SOLVER = {
     "test_iter: 24  # 24 x 250 = the 6000": "test_iter: 28  # 28 x 50",

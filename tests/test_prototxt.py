@@ -164,6 +164,7 @@ def test_the_solvers_are_the_papers() -> None:
         assert [round(v, 6) for v in (solver.base_lr, solver.gamma, solver.momentum)] == [0.01, 0.1, 0.9]
         small = read_solver(ROOT / f"prototxt/small/{name}/solver.prototxt")
         assert 3 * small.stepsize == small.max_iter
+        assert small.solver_mode == small.CPU  # the first training that one tries warns of nothing
 
 
 @pytest.mark.slow

@@ -5,8 +5,10 @@ A Git LFS pointer is the few lines of text that a clone without Git LFS has in t
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
+from pathlib import Path
 
 _POINTER = re.compile(rb"version https://git-lfs\.github\.com/spec/v1\s.*?^size (\d+)\s*$", re.DOTALL | re.MULTILINE)
 _LONGEST = 1024  # bytes; https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md
@@ -58,12 +60,27 @@ def kind_of(data: bytes) -> str:
     return next((kind for magic, kind in _KINDS.items() if start.startswith(magic)), "")
 
 
-def unreadable(path: object, fault: OSError) -> str:
-    """Return why a file cannot be read, and what to do where it is a web address."""
+def unreadable(path: object, fault: OSError | ValueError) -> str:
+    """Return why a file cannot be read, and what to do where it is a web address or is not there."""
     text = str(path)
     if "://" in text or text.startswith(("http:/", "https:/")):
         return "is a web address; download the file, and give its path"
-    return f"cannot be read: {fault.strerror or fault}"
+    reason = f"cannot be read: {getattr(fault, 'strerror', None) or fault}"
+    return f"{reason}{_what_is_there(text)}" if isinstance(fault, FileNotFoundError) else reason
+
+
+def _what_is_there(path: str) -> str:
+    """Return how far a path exists that does not, what has a similar name there, and where a relative one starts."""
+    missing = Path(path)
+    while not missing.parent.exists():
+        missing = missing.parent
+    try:
+        close = difflib.get_close_matches(missing.name, os.listdir(missing.parent), n=1)
+    except OSError:  # it is no folder, or not to be listed
+        close = []
+    found = f'; "{missing.parent}" has no "{missing.name}"' if missing != Path(path) else ""
+    found += f'; did you mean "{missing.parent / close[0]}"?' if close else ""
+    return found if Path(path).is_absolute() else f"{found}; relative paths start from {os.getcwd()}"
 
 
 def is_cut_png(data: bytes) -> bool:

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from typing_extensions import override
 
 from netspec import log
-from netspec.errors import SpecError, Where
+from netspec.errors import SpecError, Where, did_you_mean
 from netspec.exact import ALL
 from netspec.exact.blas import other_kernels
 from netspec.graph import check_blobs
@@ -31,6 +32,23 @@ from netspec.run.speed import Trainer
 from netspec.run.walk import Runner
 
 Array = np.ndarray | torch.Tensor
+
+
+V = TypeVar("V")
+
+
+class ByName(dict[str, V]):
+    """Values by the name of a blob or layer. ``known``: names that the net has beside these, which a pass may keep."""
+
+    def __init__(self, kind: str, values: Mapping[str, V], known: Iterable[str] = ()) -> None:
+        super().__init__(values)
+        self._kind, self._known = kind, known
+
+    def __missing__(self, name: str) -> V:
+        if name in self._known:
+            raise KeyError(f'{self._kind} "{name}" was not kept; set net.keep = "all", or ["{name}"], and run the net')
+        hint = did_you_mean(str(name), [*self, *self._known]) or ";"
+        raise KeyError(f'no {self._kind} "{name}" in this net{hint} it has: {", ".join(self._known or self)}')
 
 
 class Net(torch.nn.Module):
@@ -69,7 +87,8 @@ class Net(torch.nn.Module):
         made = Assembly(plan, options)
         self.options = made.options
         self.layers: Any = torch.nn.ModuleList(made.layers.values())
-        self.shapes, self.loss_weights, self.learnable = made.shapes, made.loss_weights, made.learnable
+        self.shapes = ByName("blob", made.shapes)
+        self.loss_weights, self.learnable = made.loss_weights, made.learnable
         self.need, self.random = made.need, made.random
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
@@ -153,7 +172,7 @@ class Net(torch.nn.Module):
     @property
     def blobs(self) -> dict[str, torch.Tensor]:
         """The blobs kept by the last pass of this thread, or of any where it made none; see ``keep``."""
-        return getattr(self._passing.own, "blobs", self._passing.last)
+        return ByName("blob", getattr(self._passing.own, "blobs", self._passing.last), self.shapes)
 
     def forward_backward(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]] | None:
         """Run forward and backward by kernels prepared once; return the loss and the outputs, as forward_loss does.
@@ -199,7 +218,13 @@ class Net(torch.nn.Module):
         dtype = self.learnable[0].parameter.dtype if self.learnable else torch.float32
         if isinstance(value, torch.Tensor):
             return value.to(self.device, dtype if self.learnable or not value.is_floating_point() else None)
-        return torch.as_tensor(np.asarray(value)).to(self.device, dtype)
+        array = np.asarray(value)
+        if array.dtype.kind not in "biuf":
+            what = f"a {type(value).__name__}" if array.ndim == 0 else f"values of type {array.dtype}"
+            advice = "read the file first, for example with cv2.imread" if isinstance(value, (str, Path)) else ""
+            message = f"found {what} for an input; expected an array of numbers or a tensor"
+            raise SpecError(f"{message}; {advice}" if advice else message, Where(self.plan.source.file))
+        return torch.as_tensor(array).to(self.device, dtype)
 
     def _kept(self) -> frozenset[int]:
         asked = self.keep if isinstance(self.keep, str) else tuple(self.keep)
@@ -215,11 +240,8 @@ class Net(torch.nn.Module):
     @property
     def params(self) -> dict[str, list[torch.nn.Parameter]]:
         """Layer name -> learnable blobs, in Caffe's order; only layers that have some."""
-        return {
-            node.name: list(layer.blobs)
-            for node, layer in zip(self.plan.nodes, self.layers, strict=True)
-            if len(layer.blobs)
-        }
+        learning = [pair for pair in zip(self.plan.nodes, self.layers, strict=True) if len(pair[1].blobs)]
+        return ByName("layer with learnable blobs", {node.name: list(layer.blobs) for node, layer in learning})
 
     @property
     def output_loss_weights(self) -> dict[str, float]:

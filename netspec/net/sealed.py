@@ -16,6 +16,7 @@ from typing import Any
 
 from netspec import log
 from netspec.errors import SpecError, Where
+from netspec.files.kinds import unreadable
 
 FORMAT = 2
 _BLOCK = 1 << 20  # bytes
@@ -88,7 +89,7 @@ def unsealed(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror}", Where(str(path))) from None
+        raise SpecError(unreadable(path, fault), Where(str(path))) from None
     except FAULTS as fault:
         raise damaged(path, fault) from None
 

@@ -133,7 +133,7 @@ def check_readable(paths: Iterable[str]) -> None:
         try:
             open(path, "rb").close()
         except (OSError, ValueError) as fault:  # ValueError: a NUL in the name
-            raise SpecError(f"cannot be read: {getattr(fault, 'strerror', None) or fault}", Where(path)) from None
+            raise SpecError(unreadable(path, fault), Where(path)) from None
 
 
 def is_net_binary(path: str | Path) -> bool:

@@ -158,7 +158,7 @@ def test_a_command_that_fails_ends_the_chain_with_its_line(
     edited: Callable[..., None], capfd: pytest.CaptureFixture[str]
 ) -> None:
     edited("sgd_step/init.caffemodel", "nowhere.caffemodel")
-    assert fault(capfd) == "nowhere.caffemodel: cannot be read: No such file or directory"
+    assert fault(capfd).startswith("nowhere.caffemodel: cannot be read: No such file or directory; ")
     edited('weights: "nowhere.caffemodel"', "snapshot_after_train: false", "snapshot: 5", "")
     assert fault(capfd).startswith(f"{SOLVER}: none of the snapshots of its training was found")
 

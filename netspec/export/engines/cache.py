@@ -19,6 +19,7 @@ from typing import Any
 
 from netspec import log
 from netspec.errors import SpecError, Where
+from netspec.files.kinds import unreadable
 from netspec.proto.forks import forks
 
 _EXPORTING = ("dialects", "exact", "export", "graph", "layers", "net", "proto")  # the rooms that decide
@@ -66,7 +67,7 @@ def _digest(path: str | Path) -> str:
             while part := file.read(2**20):
                 found.update(part)
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
+        raise SpecError(unreadable(path, fault), Where(str(path))) from None
     return found.hexdigest()
 
 

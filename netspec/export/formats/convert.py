@@ -15,6 +15,7 @@ from netspec.export.formats.onnx import export_onnx
 from netspec.export.formats.preprocess import Preprocess
 from netspec.export.formats.pt2 import export_pt2
 from netspec.export.formats.torch import export_torch, write_tensors
+from netspec.files.kinds import unreadable
 from netspec.graph.filter import prune, with_state
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.exporting import passes_on
@@ -121,4 +122,4 @@ def _sha256(path: Path) -> str:
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(str(path))) from None
+        raise SpecError(unreadable(path, fault), Where(str(path))) from None

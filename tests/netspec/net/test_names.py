@@ -1,0 +1,66 @@
+"""What is said where a program names a blob that a net does not have, or gives it what is no array."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netspec
+from netspec.errors import SpecError
+from netspec.net.net import Net
+
+NET = """
+layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 } } }
+layer { name: "ip" type: "InnerProduct" bottom: "data" top: "score" inner_product_param { num_output: 2 } }
+layer { name: "prob" type: "Softmax" bottom: "score" top: "prob" }
+"""
+
+
+@pytest.fixture
+def net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Net:
+    monkeypatch.chdir(tmp_path)
+    Path("net.prototxt").write_text(NET)
+    net = netspec.load_net("net.prototxt", seed=1)
+    net(np.ones((1, 3)))
+    return net
+
+
+@pytest.mark.parametrize(
+    ("find", "says"),
+    [
+        pytest.param(
+            lambda net: net.blobs["porb"], 'no blob "porb" in this net; did you mean "prob"? it has: ', id="blobs"
+        ),
+        pytest.param(lambda net: net.shapes["x"], 'no blob "x" in this net; it has: data, score, prob', id="shapes"),
+        pytest.param(
+            lambda net: net.blobs["score"],
+            'blob "score" was not kept; set net.keep = "all", or ["score"], and run the net',
+            id="a blob that was not kept",
+        ),
+        pytest.param(
+            lambda net: net.params["data"],
+            'no layer with learnable blobs "data" in this net; it has: ip',
+            id="params",
+        ),
+    ],
+)
+def test_an_unknown_name(net: Net, find, says: str) -> None:
+    with pytest.raises(KeyError) as fault:
+        find(net)
+    assert says in fault.value.args[0]
+
+
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        ("x.png", "found a str for an input; expected an array of numbers or a tensor; read the file first"),
+        (Path("x.png"), "expected an array of numbers or a tensor; read the file first, for example with cv2.imread"),
+        (None, "found a NoneType for an input; expected an array of numbers or a tensor"),
+        (["a", "b"], "found values of type <U1 for an input; expected an array of numbers or a tensor"),
+    ],
+)
+def test_what_is_no_array(net: Net, value: object, says: str) -> None:
+    with pytest.raises(SpecError) as fault:
+        net(value)
+    assert str(fault.value).startswith("net.prototxt: ")
+    assert says in str(fault.value)
