@@ -76,7 +76,8 @@ def draw(path: str | Path, rows: Sequence[Row], way: str = "netspec") -> None:
     """
     from matplotlib.figure import Figure
 
-    from netspec.inspect.draw.style import COLORS, GRID, PALE, write_figure
+    from netspec.files.figures import COLORS
+    from netspec.inspect.draw.style import GRID, PALE, write_figure
 
     shown = [row for row in rows if row.name == way and row.spent]
     figure = Figure(figsize=(7.2, 1.0 + 0.21 * max(1, len(shown))), layout="constrained")

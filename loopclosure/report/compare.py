@@ -17,9 +17,10 @@ from loopclosure.errors import InputError
 from loopclosure.evaluate import RECALL_AT, SOFT_ZONE
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report.files import SOFT_MEASURES, share
-from loopclosure.report.page import png, rendered
-from loopclosure.report.plots import COLORS, STYLE, draw_curve, frame_curves, legends_below
+from loopclosure.report.page import rendered
+from loopclosure.report.plots import STYLE, draw_curve, frame_curves, legends_below
 from netspec.errors import printable
+from netspec.files.figures import COLORS, png
 from netspec.files.whole_file import write_whole
 from netspec.terminal.output import in_columns
 

@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 
 from loopclosure.detector.decision import LoopResult
 from loopclosure.places.image_sequence import ImageSequence
-from loopclosure.report.page import Kind, Pair, png, rendered, side_by_side, spread
-from loopclosure.report.plots import AXES, COLORS, FOUND, MISSED, STYLE
+from loopclosure.report.page import Kind, Pair, rendered, side_by_side, spread
+from loopclosure.report.plots import AXES, FOUND, MISSED, STYLE
+from netspec.files.figures import COLORS, png
 from netspec.files.whole_file import write_whole
 
 BEST, WORST, REJECTED = 4, 3, 3  # pairs shown

@@ -7,7 +7,6 @@ which escapes all values: names of methods, folders and notes may have any chara
 from __future__ import annotations
 
 import base64
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from matplotlib.figure import Figure
 
 from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome
 from loopclosure.places.frames import read_bgr
@@ -23,6 +21,7 @@ from loopclosure.places.same_place import angles_deg, distances_m
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report import plots
 from loopclosure.report.files import EXPLANATION, SOFT_MEASURES, share, write_files
+from netspec.files.figures import png
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import write_whole
 
@@ -224,13 +223,6 @@ def _apart(evaluation: Evaluation, query: int, reference: int) -> str:
     a, b = poses[query], poses[reference]
     seen = "views overlap" if data.overlap[query, reference] else "views do not overlap"
     return f"; {float(distances_m(a, b)):.2g} m and {float(angles_deg(a, b)):.0f} degrees apart, {seen}"
-
-
-def png(figure: Figure) -> bytes:
-    """Return a figure as PNG."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", metadata={"Software": None})
-    return stream.getvalue()
 
 
 def rendered(template: str, **values: object) -> str:

@@ -26,10 +26,10 @@ from loopclosure.evaluate import SOFT_ZONE, Evaluation, Outcome
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from netspec.errors import printable
+from netspec.files import figures
+from netspec.files.figures import COLORS
 from netspec.files.whole_file import whole_file
 
-# Color-blind readers can distinguish these too (Okabe and Ito).
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 FOUND, FALSE, MISSED, OVERLAPPING = "#1a9641", "#d7191c", "#9e9e9e", "#f4a582"
 LINES = ("-", "--", ":", "-.")  # a second round of the colors is dashed, and so on
 TITLE_WIDTH = 38  # characters that fit above a panel of a grid
@@ -42,12 +42,9 @@ SHOWN_CELLS = (
 COLUMNS = 4
 
 STYLE: dict[Any, Any] = {
+    **figures.STYLE,
     "font.size": 9,
     "axes.titlesize": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.7,
-    "legend.frameon": False,
     "figure.dpi": 160,
     "savefig.bbox": "tight",
 }

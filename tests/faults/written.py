@@ -16,8 +16,9 @@ from netspec.export.formats.torch import torch_source
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.diagram import diagram_of
-from netspec.inspect.draw.picture import picture_of
-from netspec.inspect.draw.svg import html_of, svg_of
+from netspec.inspect.draw.dot import dot_of
+from netspec.inspect.draw.graphviz import render
+from netspec.inspect.draw.page import net_page
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN
@@ -53,8 +54,7 @@ def drawn(path: Path) -> None:
     """Draw a net as SVG and HTML: both parse."""
     message, source = parse_net_text(path.read_bytes().decode(errors="surrogateescape"), "net.prototxt")
     diagram = diagram_of(message, source, [TRAIN, TEST], BuildOptions(open_data=False, limit=MOST))
-    picture = picture_of(diagram)
-    ElementTree.fromstring(svg_of(picture).encode())
-    html = html_of(diagram, picture)
+    ElementTree.fromstring(render(dot_of(diagram, unfolded=True), "svg"))
+    html = net_page(diagram)
     json.loads(html.partition("const layers = ")[2].partition(";\n")[0])
     html.encode()

@@ -9,7 +9,9 @@ import pytest
 
 PROJECT = "netspec-caffe"
 # Licenses that let programs of any license be built on a package.
-PERMISSIVE = r"MIT|BSD|0BSD|Apache|PSF|Python Software Foundation|OLDAP|OpenLDAP|Zlib|CC0|MPL-2\.0|Mozilla|HPND|ISC|BSL"
+PERMISSIVE = (
+    r"MIT|BSD|0BSD|Apache|PSF|Python Software Foundation|OLDAP|OpenLDAP|Zlib|CC0|MPL-2\.0|Mozilla|HPND|ISC|BSL|EPL-2\.0"
+)
 RESTRICTED = r"\b(A?GPL|GNU (Affero )?General Public|SSPL|CC-BY-NC|Commercial|Proprietary)"
 # Has an exception for programs that use it: the run-time libraries of GCC, in the wheels of NumPy and SciPy.
 EXCEPTED = r"GPL-3\.0-or-later WITH GCC-exception-3\.1"

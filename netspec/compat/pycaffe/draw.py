@@ -1,6 +1,6 @@
 """Nets as pictures: a graph of layers and blobs, drawn by Graphviz.
 
-Needs pydot (the extra ``pycaffe``), and for pictures other than PNG and SVG Graphviz' program ``dot``.
+Needs pydot (the extra ``pycaffe``); PDF and other kinds need Graphviz' own program ``dot``.
 Caffe: python/caffe/draw.py
 """
 
@@ -8,14 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from google.protobuf import text_format
-
 from netspec.compat.pycaffe import errors
 from netspec.compat.pycaffe.proto import caffe_pb2
-from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
-from netspec.proto.schema import TEST, TRAIN, PhaseValue
-from netspec.proto.text import parse_net_text
 
 NEURON_LAYER_STYLE = {"shape": "record", "fillcolor": "#90EE90", "style": "filled"}
 LAYER_STYLE_DEFAULT = {"shape": "record", "fillcolor": "#6495ED", "style": "filled"}
@@ -41,32 +36,12 @@ def draw_net_to_file(
 def draw_net(
     caffe_net: Any, rankdir: str, ext: str = "png", phase: int | None = None, display_lrm: bool = False
 ) -> bytes:
-    """Return the picture of a net in a format of Graphviz.
+    """Return the picture of a net in a format of Graphviz. Raises SpecError for one that it does not have."""
+    from netspec.inspect.draw.graphviz import render  # here, so that pycaffe can be imported without the wing inspect
 
-    Without Graphviz, a PNG or an SVG is the picture of ``netspec draw``; SpecError is raised for other formats.
-    """
     graph = get_pydot_graph(caffe_net, rankdir, phase=phase, display_lrm=display_lrm)
-    if ext in _TEXT_FORMATS:
-        return graph.to_string().encode()
-    try:
-        return graph.create(format=ext)
-    except FileNotFoundError:
-        if ext not in ("png", "svg"):
-            raise SpecError(
-                f"drawing a .{ext} needs Graphviz' program dot: install graphviz, or write a .png, .svg or .dot"
-            ) from None
-    return _own_picture(caffe_net, ext, phase)
-
-
-def _own_picture(caffe_net: Any, ext: str, phase: int | None) -> bytes:
-    from netspec.inspect.draw.diagram import diagram_of  # here, as it and matplotlib take a while to load
-    from netspec.inspect.draw.picture import picture_of
-    from netspec.inspect.draw.png import png_of
-    from netspec.inspect.draw.svg import svg_of
-
-    net, source = parse_net_text(text_format.MessageToString(caffe_net), caffe_net.name or "net")
-    picture = picture_of(diagram_of(net, source, [TRAIN, TEST] if phase is None else [PhaseValue(phase)]))
-    return png_of(picture) if ext == "png" else svg_of(picture).encode()
+    text = graph.to_string()
+    return text.encode() if ext in _TEXT_FORMATS else render(text, ext)
 
 
 def get_pydot_graph(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from netspec.inspect.draw.diagram import Diagram, Output
 
 LEAST_SAVED = 4  # boxes that folding must spare
+LONGEST = 300  # boxes of a block
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,7 @@ class Block:
 
 
 def find_blocks(diagram: Diagram) -> list[Block]:
-    """Return what repeats, in order; the repetitions that spare most boxes are taken first, and none overlap."""
-    found: list[Block] = []
+    """Return what repeats, in order; none overlap. Of those that begin at a box the one that spares most is taken."""
     kinds: dict[object, int] = {}
     same = [
         kinds.setdefault((box.type, box.same, box.shapes, bool(box.owner), box.work), len(kinds))
@@ -45,23 +46,32 @@ def find_blocks(diagram: Diagram) -> list[Block]:
     for k, outputs in enumerate(diagram.reads):
         for output in outputs:
             readers.setdefault(output, []).append(k)
-    candidates = []
-    for length in range(1, len(same) // 2 + 1):
-        run = 0
-        for k in range(len(same) - length - 1, -1, -1):
-            run = run + 1 if same[k] == same[k + length] else 0
-            copies = 1 + run // length
-            if (copies - 1) * length >= LEAST_SAVED:
-                candidates.append((-(copies - 1) * length, length, k, copies))
-    taken: set[int] = set()
-    for _, length, first, copies in sorted(candidates):
-        if taken.intersection(range(first, first + length)):
-            continue
-        block = _longest(diagram, readers, first, length, copies)
-        if block and (block.copies - 1) * length >= LEAST_SAVED and not taken.intersection(block.boxes):
-            found.append(block)
-            taken.update(block.boxes)
-    return sorted(found, key=lambda block: block.first)
+    found: list[Block] = []
+    first = 0
+    while first < len(same):
+        blocks = [
+            block
+            for length in range(1, min(LONGEST, (len(same) - first) // 2) + 1)
+            if (copies := _copies(diagram, same, first, length)) > 1
+            and (block := _longest(diagram, readers, first, length, copies))
+            and (block.copies - 1) * length >= LEAST_SAVED
+        ]
+        best = max(blocks, key=lambda block: (block.copies - 1) * block.length, default=None)
+        if best:
+            found.append(best)
+        first = best.boxes.stop if best else first + 1
+    return found
+
+
+def _copies(diagram: Diagram, same: Sequence[int], first: int, length: int) -> int:
+    """Return how often the ``length`` boxes from ``first`` on are there by their kinds alone, whatever their wires."""
+    second = first + length
+    if same[first] != same[second] or not all(first <= source < second for source, _ in diagram.reads[second]):
+        return 1  # a copy begins with what the copy before gives
+    copies = 1
+    while same[first + copies * length : second + copies * length] == same[first:second]:
+        copies += 1
+    return copies
 
 
 def _longest(diagram: Diagram, readers: dict[Output, list[int]], first: int, length: int, copies: int) -> Block | None:

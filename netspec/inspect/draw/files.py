@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from netspec import log
 from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
 from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.diagram import Diagram, diagram_of
-from netspec.inspect.draw.picture import picture_of
-from netspec.inspect.draw.svg import html_of, svg_of
+from netspec.inspect.draw.dot import dot_of
+from netspec.inspect.draw.graphviz import render
+from netspec.inspect.draw.page import net_page
 from netspec.net.build import recover_net
 from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.nets import solver_nets
+
+MANY = 5000  # boxes; so many are drawn in half a minute
 
 
 def write_picture(
@@ -25,18 +29,17 @@ def write_picture(
     """Draw the net of a file, or the training net of a solver, as SVG, PNG or HTML by the ending of ``out``.
 
     Of a .caffemodel the net inside it is drawn. Returns what was drawn; its faults keep parts of the net from being
-    built: the picture has no shapes there. Raises SpecError for a file that cannot be read.
+    built: the picture has no shapes there. Raises SpecError for a file that cannot be read, or without Graphviz.
     """
     diagram = diagram_of(*_net_of(path, options), phases, options)
-    picture = picture_of(diagram)
-    if out.suffix == ".png":
-        from netspec.inspect.draw.png import png_of
-
-        content = png_of(picture, unfolded)
-    elif out.suffix == ".html":
-        content = html_of(diagram, picture).encode()
+    if len(diagram.boxes) > MANY:
+        log.warning(
+            "draw_net.py:1", f"drawing {len(diagram.boxes)} boxes takes minutes; Graphviz' time grows with their square"
+        )
+    if out.suffix == ".html":
+        content = net_page(diagram).encode()
     else:
-        content = svg_of(picture, unfolded).encode()
+        content = render(dot_of(diagram, unfolded), out.suffix[1:])
     write_whole(out, content)
     return diagram
 

@@ -15,8 +15,8 @@ from matplotlib.ticker import MaxNLocator
 
 from netspec.data.records import Record
 from netspec.data.survey import Survey, as_lines
+from netspec.files.figures import COLORS
 from netspec.inspect.draw.style import (
-    COLORS,
     FAULT,
     PALE,
     STYLE,

@@ -14,23 +14,19 @@ from matplotlib.figure import Figure
 
 from netspec.data.datum import times
 from netspec.errors import SpecError, Where
+from netspec.files import figures
 from netspec.files.whole_file import why_unwritable, write_whole
 
-# Color-blind readers can distinguish these too (Okabe and Ito).
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 GRID, PALE, FAULT = "#e6e6e6", "#777777", "#c62828"
 DPI = 144
 ENDINGS = ("png", "svg", "html")
 
 STYLE: dict[Any, Any] = {
+    **figures.STYLE,
     "font.size": 10,
     "axes.titlesize": 10,
     "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.7,
     "axes.formatter.useoffset": False,
-    "legend.frameon": False,
     "figure.dpi": DPI,
     "svg.fonttype": "none",  # text stays text: it can be read aloud, searched and copied
     "svg.hashsalt": "netspec",  # the same picture is the same file
@@ -49,7 +45,7 @@ def ending_of(path: str | Path, endings: Sequence[str] = ENDINGS) -> str:
 
 def write_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure as PNG or SVG, as the name asks for. Raises SpecError."""
-    data = svg(figure).encode() if ending_of(path) == "svg" else _png(figure)
+    data = svg(figure).encode() if ending_of(path) == "svg" else figures.png(figure)
     write_whole(path, data)
 
 
@@ -59,12 +55,6 @@ def svg(figure: Figure) -> str:
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()
-
-
-def _png(figure: Figure) -> bytes:
-    data = io.BytesIO()
-    figure.savefig(data, format="png", metadata={"Software": None})
-    return data.getvalue()
 
 
 def text_at(axis: Axes, x: float, y: float, text: str, **options: Any) -> None:

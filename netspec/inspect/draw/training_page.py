@@ -8,8 +8,9 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from netspec.inspect.draw.style import COLORS, svg
-from netspec.inspect.draw.svg import page
+from netspec.files.figures import COLORS
+from netspec.inspect.draw.page import page
+from netspec.inspect.draw.style import svg
 from netspec.inspect.draw.training import MOST_POINTS
 from netspec.inspect.logs.training_log import Curve, TrainingLog, summary, thinned
 

@@ -1,0 +1,34 @@
+"""Graphviz as a program: it lays out a graph and draws it as SVG or PNG.
+
+The package graphviz-pure brings it; a ``dot`` that is installed does as well.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sysconfig
+
+from netspec.errors import SpecError
+
+PNG_DPI = 144  # of a picture whose text has 10 points
+
+
+def render(text: str, kind: str) -> bytes:
+    """Return the picture of a graph in DOT, of a kind that Graphviz has, such as "svg", "png" or "pdf".
+
+    Raises SpecError where there is no Graphviz, or none that can draw this graph as this kind.
+    """
+    scripts = sysconfig.get_path("scripts")
+    brought = shutil.which("graphviz-pure", path=scripts) or shutil.which("graphviz-pure")
+    programs = [program for program in (brought, shutil.which("dot")) if program]
+    if not programs:
+        raise SpecError("drawing a net needs Graphviz: pip install graphviz-pure")
+    resolution = [f"-Gdpi={PNG_DPI}"] if kind == "png" else []
+    reason = ""
+    for program in programs:
+        done = subprocess.run([program, f"-T{kind}", *resolution], input=text.encode(), capture_output=True)
+        if done.returncode == 0 and done.stdout:
+            return done.stdout
+        reason = next(iter(done.stderr.decode("utf-8", "replace").strip().splitlines()), "it gave no reason")
+    raise SpecError(f"Graphviz cannot draw this net as .{kind}: {reason}")
