@@ -145,7 +145,7 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
     """Train, and return the exit status."""
     from tqdm import tqdm
 
-    from netspec.solver.board import writer_class
+    from netspec.solver.board import board, writer_class
     from netspec.solver.processes import Lost
 
     if arguments.tensorboard and processes.is_root:
@@ -163,9 +163,10 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
         bar = tqdm(total=total, initial=first, bar_format=BAR, disable=hidden, leave=False)
         with _sole_writer(solver) if processes.is_root else nullcontext(), bar:
             solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
-            board = _board(solver, arguments.tensorboard) if processes.is_root else nullcontext()
+            writes_board = arguments.tensorboard and processes.is_root
+            board_of_solver = board(solver, arguments.tensorboard) if writes_board else nullcontext()
             try:
-                with board:
+                with board_of_solver:
                     solver.solve()
             except Lost as fault:  # reported here: torchrun ends this process as soon as signals work again
                 kept = (
@@ -235,15 +236,6 @@ def _sole_writer(solver: Solver) -> AbstractContextManager[None]:
     folder, name = os.path.split(prefix)
     lock = os.path.join(folder, f".{name}.lock")
     return only_one(lock, f'give each training a snapshot_prefix of its own, not "{prefix}" to both')
-
-
-def _board(solver: Solver, folder: str | None) -> AbstractContextManager[object]:
-    """Write for TensorBoard within the block, if a folder is given."""
-    if not folder:
-        return nullcontext()
-    from netspec.solver.board import board
-
-    return board(solver, folder)
 
 
 def _keep_scores(solver: Solver, path: str, resumed: bool) -> None:

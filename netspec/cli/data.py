@@ -68,12 +68,12 @@ def _data(arguments: argparse.Namespace) -> int:
         raise WrongUsage(f"found --start {arguments.start}, expected 0 to {len(records) - 1}")
     found = survey(records, spread(len(records), arguments.records), partial(bar, stage="look", unit="record"))
     if arguments.what == STAT:
-        return _tell_survey(arguments, found)
+        return _print_survey(arguments, found)
     _show(arguments, records, found)
     return DONE
 
 
-def _tell_survey(arguments: argparse.Namespace, found: Survey) -> int:
+def _print_survey(arguments: argparse.Namespace, found: Survey) -> int:
     from netspec.data.survey import as_json, as_lines
 
     if arguments.json:

@@ -129,7 +129,7 @@ def _extract(arguments: argparse.Namespace) -> None:
         arrays.update({name: np.array(np.nan) for name in arrays if name.startswith("seconds_per_")})
     with whole_file(out) as unfinished, unfinished.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
-    _tell_arrays(out, arrays)
+    _print_arrays(out, arrays)
 
 
 def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -183,7 +183,7 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     return arrays
 
 
-def _tell_arrays(out: Path, arrays: Mapping[str, Any]) -> None:
+def _print_arrays(out: Path, arrays: Mapping[str, Any]) -> None:
     shapes = ", ".join(f"{name} {values.shape}" for name, values in arrays.items() if values.ndim)
     (seconds,) = (name for name in arrays if name.startswith("seconds_per_"))
     what = seconds.removeprefix("seconds_per_")

@@ -266,7 +266,8 @@ def _fmt(arguments: argparse.Namespace) -> int:
         elif formatted == text:
             print(f"{path}: was in this form already")
         else:
-            _write(path, formatted)
+            write_whole(path, formatted, "surrogateescape")
+            print(f"{path}: formatted")
     return status
 
 
@@ -278,11 +279,6 @@ def _differs(path: str, text: str, formatted: str) -> int:
     first = next((k for k, (a, b) in enumerate(lines, 1) if a != b), 1)
     print(f"{path}:{first}:1: netspec fmt would change this line, the first of them")
     return SOMETHING
-
-
-def _write(path: str, text: str) -> None:
-    write_whole(path, text, "surrogateescape")
-    print(f"{path}: formatted")
 
 
 def _add_layers(commands: Commands) -> None:

@@ -65,8 +65,10 @@ def datum_to_array(datum: Any, color: bool | None = None, warn: Callable[[str], 
 
     An encoded image is decoded: to three channels if ``color`` is true, to one if it is false, to the file's channels
     if it is None. Raw data is not converted. The array may be read-only. Raises ValueError for a Datum that
-    contradicts itself or cannot be decoded. Of raw data longer than its shape, Caffe's data layers read the first
-    values (data_transformer.cpp), and its other tools refuse it: it is read so if ``warn`` is there to be told.
+    contradicts itself or cannot be decoded.
+
+    Where raw data is longer than its shape, Caffe's data layers read the first values (data_transformer.cpp), and its
+    other tools refuse it. The first values are read only if ``warn`` is given; it is called with the message.
     """
     if datum.encoded:
         return decode_image(datum.data, color)

@@ -56,7 +56,7 @@ def open_records(path: str | Path) -> Records:
     Raises SpecError for anything else.
     """
     if Path(path).is_file():
-        files = [(str(path), Where(str(path)))] if h5py.is_hdf5(path) else list(_listed(str(path)))
+        files = [(str(path), Where(str(path)))] if h5py.is_hdf5(path) else list(_files_of_list(str(path)))
         return _RowRecords(files)
     return _DatumRecords(open_reader(str(path), "leveldb" if (Path(path) / "CURRENT").is_file() else "lmdb"))
 
@@ -125,11 +125,12 @@ class _RowRecords:
             if data.dtype.kind not in _NUMBERS:
                 raise SpecError(f'dataset "{chosen}" has values of type {data.dtype}, expected numbers')
             labels = file.values("label") if "label" in names and chosen != "label" else None
-        told = labels is not None and len(labels) == len(data) and labels.dtype.kind in _NUMBERS
-        return data, labels if told else None
+            if labels is not None and (len(labels) != len(data) or labels.dtype.kind not in _NUMBERS):
+                labels = None
+        return data, labels
 
 
-def _listed(path: str) -> Iterator[tuple[str, Where]]:
+def _files_of_list(path: str) -> Iterator[tuple[str, Where]]:
     found = [(name, place) for line, place in list_lines(path, Where(path)) for name in line.split()]
     if not found:
         raise SpecError("is empty; expected a database, an HDF5 file, or a list of HDF5 files", Where(path))

@@ -34,7 +34,7 @@ class StoredLayer:
 def stored_layers(path: str | Path) -> list[StoredLayer]:
     """Return the layers that have weights: in the net's order, in HDF5 in alphabetical order. Raises SpecError."""
     if h5py.is_hdf5(path):
-        return list(_of_hdf5(path))
+        return list(_hdf5_layers(path))
     layers = []
     for layer in read_net_binary(path).layer:
         if layer.blobs:
@@ -46,7 +46,7 @@ def stored_layers(path: str | Path) -> list[StoredLayer]:
     return layers
 
 
-def _of_hdf5(path: str | Path) -> Iterator[StoredLayer]:
+def _hdf5_layers(path: str | Path) -> Iterator[StoredLayer]:
     with open_hdf5(path) as file:
         data = file.group("data")
         if data is None:

@@ -16,7 +16,7 @@ from netspec.files.limits import amount
 
 Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm: wraps an iterable
 _MOST_FAULTS = 100  # that are kept by name; all are counted
-MOST_LABELS = 8  # that are told one by one
+MOST_LABELS = 8  # that are listed one by one
 _SORTED = 100  # so many records in the order of their labels are not by chance
 
 
@@ -209,9 +209,11 @@ def as_lines(found: Survey, name: str) -> list[str]:
 def labels_line(found: Survey) -> str:
     """Return how often the labels occur, in one line."""
     common = sorted(found.labels.items()) if len(found.labels) <= MOST_LABELS else found.labels.most_common(MOST_LABELS)
-    told = ", ".join(f"{label:g} ({count:,})" for label, count in common)
+    listed = ", ".join(f"{label:g} ({count:,})" for label, count in common)
     if len(found.labels) > MOST_LABELS:
         counts = found.labels.values()
-        told = f"{len(found.labels):,} different ones, {min(counts):,} to {max(counts):,} records each; most: {told}"
+        listed = (
+            f"{len(found.labels):,} different ones, {min(counts):,} to {max(counts):,} records each; most: {listed}"
+        )
     missing = f"{found.unlabeled:,} without" if found.unlabeled else ""
-    return ", ".join(part for part in (told, missing) if part) or "none"
+    return ", ".join(part for part in (listed, missing) if part) or "none"

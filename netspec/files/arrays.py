@@ -111,17 +111,15 @@ def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:
         return arrays
 
 
-def _described(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return what the header of an array in the format .npy says."""
-    version = np.lib.format.read_magic(stream)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"an array of format {version}")
-    return (np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0)(stream)
-
-
 def _header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Return shape, order by columns, and dtype of an array in the format .npy, of ``size`` bytes in a stream."""
-    shape, by_columns, dtype = _described(stream)
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        shape, by_columns, dtype = np.lib.format.read_array_header_1_0(stream)
+    elif version == (2, 0):
+        shape, by_columns, dtype = np.lib.format.read_array_header_2_0(stream)
+    else:
+        raise ValueError(f"an array of format {version}")
     if dtype.hasobject:
         raise ValueError("an array of Python objects, a pickle, which could run code; lists are read from .json")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > size:

@@ -178,7 +178,7 @@ def sync_folder(folder: Path) -> None:
     try:
         _sync(folder)
     except OSError as fault:
-        _say_not_synced(os.strerror(fault.errno) if fault.errno else str(fault))
+        _warn_not_synced(os.strerror(fault.errno) if fault.errno else str(fault))
 
 
 def why_unwritable(path: str | Path) -> str:
@@ -303,7 +303,7 @@ def _remove(path: Path) -> None:
 
 
 @cache
-def _say_not_synced(reason: str) -> None:
+def _warn_not_synced(reason: str) -> None:
     logging.getLogger(__name__).warning(
         "folders cannot be brought to disk here (%s): after a power failure an old file may be back", reason
     )

@@ -105,10 +105,11 @@ def make_plan(net: NetParameter, source: SourceMap) -> Plan:
         blocked = tuple(not down for down in layer.propagate_down) or (False,) * len(bottoms)
         nodes.append(Node(layer.name, layer.type, bottoms, tuple(tops), tuple(in_place), tuple(params), blocked))
     outputs = {name: current[name] for name in sorted(available)}
-    return Plan(net, source, tuple(nodes), tuple(blobs), outputs, _final(nodes, len(blobs)))
+    return Plan(net, source, tuple(nodes), tuple(blobs), outputs, _last_values(nodes, len(blobs)))
 
 
-def _final(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
+def _last_values(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
+    """Return for each value the one that is in its memory after all layers that compute in place."""
     final = list(range(count))
     for node in reversed(nodes):
         for j, replaces in enumerate(node.in_place):

@@ -71,7 +71,7 @@ def without_splits(net: NetParameter) -> list[LayerParameter]:
     return layers
 
 
-def _names(blobs: Mapping[str, object]) -> str:
+def _last_names(blobs: Mapping[str, object]) -> str:
     """Return the names of the blobs so far, in a large net those of the last."""
     more = f"{len(blobs) - MOST_NAMES} more, " if len(blobs) > MOST_NAMES else ""
     return more + ", ".join([*blobs][-MOST_NAMES:]) or "none"
@@ -89,15 +89,17 @@ def _count_uses(
     producer: dict[tuple[int, int], Top] = {}
     uses: Counter[Top] = Counter()
     weights: dict[Top, float] = {}
-    told: set[str] = set()
+    reported: set[str] = set()
     for i, layer in enumerate(net.layer):
         for j, blob in enumerate(layer.bottom):
             if blob not in latest:
                 maker, remedy = source.left_out.get(blob, ("", ""))
-                if (remedy or blob) not in told:
-                    told.add(remedy or blob)
-                    hint = "" if maker or len(told) > MOST_HINTS else did_you_mean(blob, list(latest))
-                    known = f": {maker} makes it {remedy}" if maker else f"{hint or ';'} available: {_names(latest)}"
+                if (remedy or blob) not in reported:
+                    reported.add(remedy or blob)
+                    hint = "" if maker or len(reported) > MOST_HINTS else did_you_mean(blob, list(latest))
+                    known = (
+                        f": {maker} makes it {remedy}" if maker else f"{hint or ';'} available: {_last_names(latest)}"
+                    )
                     where = source.at(i, "bottom", j, layer=layer.name, type=layer.type)
                     source.report(SpecError(f'unknown bottom blob "{blob}"{known}', where))
                 continue

@@ -96,8 +96,8 @@ def unsealed(path: Path) -> dict[str, Any]:
 
 def damaged(path: Path, reason: Exception) -> SpecError:
     """Return the error of an .extra file that cannot be understood."""
-    told = f"no {reason}" if isinstance(reason, KeyError) else " ".join(str(reason).split())
-    return SpecError(f"is damaged ({told}); without it the training resumes as Caffe's", Where(str(path)))
+    found = f"no {reason}" if isinstance(reason, KeyError) else " ".join(str(reason).split())
+    return SpecError(f"is damaged ({found}); without it the training resumes as Caffe's", Where(str(path)))
 
 
 def check_weights(path: Path) -> None:

@@ -66,7 +66,7 @@ def load_weights(
         whole = whole and not faults
     give_back_freed_memory()
     if whole:
-        _tell_missing(net, loaded, paths, strict, some)
+        _report_missing(net, loaded, paths, strict, some)
 
 
 def copy_weights(net: Net, message: NetParameter, path: str | Path) -> None:
@@ -113,7 +113,7 @@ def _read_into(blob: torch.Tensor, values: blobs.Elsewhere) -> None:
         blob.copy_(target)
 
 
-def _tell_missing(net: Net, loaded: set[int], paths: list[str], strict: bool, some: bool) -> None:
+def _report_missing(net: Net, loaded: set[int], paths: list[str], strict: bool, some: bool) -> None:
     """Warn of the layers of which a blob was not loaded, or report them; weights in the prototxt itself count."""
     learning = [layer for layer in net.layers if len(layer.blobs)]
     missing = [

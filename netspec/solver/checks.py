@@ -119,7 +119,7 @@ def bad_top(net: Net, passes: int, part: str) -> str:
     net.random.begin(part)
     found: list[str] = []
     hooks = [
-        layer.register_forward_hook(partial(_look, node, net.plan.blobs, found))
+        layer.register_forward_hook(partial(_note_if_not_finite, node, net.plan.blobs, found))
         for node, layer in zip(net.plan.nodes, net.layers, strict=True)
     ]
     try:
@@ -131,7 +131,9 @@ def bad_top(net: Net, passes: int, part: str) -> str:
     return found[0] if found else ""
 
 
-def _look(node: Node, names: Sequence[str], found: list[str], layer: Any, bottoms: Any, tops: Any) -> None:
+def _note_if_not_finite(
+    node: Node, names: Sequence[str], found: list[str], layer: Any, bottoms: Any, tops: Any
+) -> None:
     for v, top in zip(node.tops, tops if isinstance(tops, tuple) else (tops,), strict=False):
         if not _is_finite(top):
             found.append(f'top "{names[v]}" of layer "{node.name}"')

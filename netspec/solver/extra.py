@@ -153,7 +153,7 @@ def read_extra(state: str | Path) -> Extra | None:
         return Extra(
             whole_number(found["seed"], "seed"),
             [_loss(loss) for loss in _list(found["losses"])],
-            [_remembered(net) for net in _list(found["nets"])],
+            [_checked_states(net) for net in _list(found["nets"])],
             {str(name): dict(settings) for name, settings in found["settings"].items()},
             Digest.read(found["weights"]),
             Digest.read(found["state"]),
@@ -180,7 +180,7 @@ def newest_pair(prefix: str) -> Path | None:
     some, and none is whole: a training must not begin anew, and write over them, without a word.
     """
     passed = 0
-    for state in _states(prefix):
+    for state in _newest_first(prefix):
         try:
             found = find_learned_net(read_state(state), state)
             extra = read_extra(state)
@@ -196,7 +196,7 @@ def newest_pair(prefix: str) -> Path | None:
     return None
 
 
-def _states(prefix: str) -> Iterator[Path]:
+def _newest_first(prefix: str) -> Iterator[Path]:
     start = Path(f"{prefix}_iter_")
     pattern = re.compile(re.escape(start.name) + r"(\d+)\.solverstate(\.h5)?")
     found = [(match, path) for path in start.parent.glob("*") if (match := pattern.fullmatch(path.name))]
@@ -216,7 +216,7 @@ def _loss(value: Any) -> float:
     return float(value)
 
 
-def _remembered(value: Any) -> Remembered:
+def _checked_states(value: Any) -> Remembered:
     for i, state in value.items():
         whole_number(int(i), "layer", _MOST_LAYERS)
         for name, each in state.items():
@@ -236,9 +236,9 @@ def _packed(value: int | str | Sequence[torch.Tensor]) -> Any:
 def _unpacked(value: Any) -> int | str | tuple[torch.Tensor, ...]:
     if isinstance(value, (int, str)):
         return value
-    return tuple(torch.tensor(_array(each)) for each in value)
+    return tuple(torch.tensor(_unpacked_array(each)) for each in value)
 
 
-def _array(value: Any) -> np.ndarray:
+def _unpacked_array(value: Any) -> np.ndarray:
     shape = [whole_number(size, "size") for size in _list(value["shape"])]
     return np.frombuffer(base64.b64decode(value["float32"], validate=True), "<f4").reshape(shape)

@@ -93,7 +93,7 @@ class Snapshots:
         training = self._training
         where = Where(str(path))
         extra = read_extra(path)
-        state = self._of_today(read_state(path), where)
+        state = self._in_current_form(read_state(path), where)
         if len(state.history) != len(training.history):
             found, expected = len(state.history), len(training.history)
             message = (
@@ -118,9 +118,9 @@ class Snapshots:
         if extra is None:
             log.logger.info(f"{path} is Caffe's: the data starts again at its first record, with other random numbers")
         else:
-            self._go_on(extra, Where(str(path_beside(path))))
+            self._resume_data(extra, Where(str(path_beside(path))))
 
-    def _go_on(self, extra: Extra, where: Where) -> None:
+    def _resume_data(self, extra: Extra, where: Where) -> None:
         """Go on in the data where a training stopped, with the losses of its average."""
         training = self._training
         trained, rank = (training.net, *training.replicas.nets), training.options.processes.rank
@@ -139,8 +139,8 @@ class Snapshots:
         training.losses_before = tuple(extra.losses)
         if extra.seed != training.seed:
             log.logger.warning(f"{where}: random_seed was {extra.seed}: the random numbers are others from here on")
-        elif told := changes(extra.settings, self._settings()):
-            log.logger.warning(f"{where}: the training goes on with other numbers: {told}")
+        elif changed := changes(extra.settings, self._settings()):
+            log.logger.warning(f"{where}: the training goes on with other numbers: {changed}")
         else:
             log.logger.info(f"{where}: the training goes on as if it had never stopped")
 
@@ -158,7 +158,7 @@ class Snapshots:
         tests = {f"test net #{i}": net for i, net in enumerate(training.test_nets)}
         return settings_of(training.param, {nets.TRAIN_NET: training.net, **tests}, manner)
 
-    def _of_today(self, state: State, where: Where) -> State:
+    def _in_current_form(self, state: State, where: Where) -> State:
         """Return a state in today's form, where it has a history for each layer that shares a parameter."""
         training = self._training
         number = {id(learnable.parameter): i for i, learnable in enumerate(training.net.learnable)}
@@ -172,8 +172,8 @@ class Snapshots:
             mine = shapes[i % len(shapes)]
             if not _same_shape(mine, theirs.shape):
                 raise SpecError(f"history blob {i} has shape {theirs.shape}, expected {mine}", where)
-        told = "has a history for each layer, as before August 2015; those of shared parameters are added up"
-        log.warning("sgd_solver.cpp:336", f"{where}: {told}")
+        message = "has a history for each layer, as before August 2015; those of shared parameters are added up"
+        log.warning("sgd_solver.cpp:336", f"{where}: {message}")
         return replace(state, history=merge_shared(state.history, owners))
 
 

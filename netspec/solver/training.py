@@ -103,7 +103,7 @@ class Training:
         self.losses: deque[float] = deque(maxlen=param.average_loss)
         self._build_nets()
         self._check_size()
-        self._say_doubts()
+        self._warn_of_settings()
         self.blocks = Blocks(self.net.learnable, self.rule.sets)
         self.scale = LossScale(self.options.precision)
 
@@ -192,7 +192,7 @@ class Training:
             message = f"a snapshot cannot be written: {too_large(size)}"
             raise SpecError(message, self.node.find("snapshot_format"))
 
-    def _say_doubts(self) -> None:
+    def _warn_of_settings(self) -> None:
         """Warn of fields without effect, and of what makes the training slow or its bits depend on the machine."""
         read = RATES_OF_FORKS.union(
             *(layer.solver_reads for net in self.test_nets for layer in net.layers if isinstance(layer, Scores))

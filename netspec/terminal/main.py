@@ -30,7 +30,7 @@ def program(module: str, words: Sequence[str] | None = None) -> int:
         for number in ours:
             signal.signal(number, end_at_once)
         if words is None:
-            atexit.register(_ignore, ours)  # what is registered first comes last
+            atexit.register(_ignore_signals, ours)  # what is registered first comes last
         if sys.stderr is None:
             # No file gets descriptor 2 either, where libraries write.
             sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
@@ -38,7 +38,7 @@ def program(module: str, words: Sequence[str] | None = None) -> int:
             sys.stdout.reconfigure(errors="backslashreplace")
         set_up()
         end_forked_processes_by_sigterm()
-        return _written(import_module(module).main(words))
+        return _flush_stdout(import_module(module).main(words))
     finally:
         for number in ours if words is not None else ():
             signal.signal(number, before[number])
@@ -51,14 +51,14 @@ def end_at_once(number: int, _: object) -> None:
     os._exit(128 + number)
 
 
-def _ignore(numbers: Sequence[int]) -> None:
+def _ignore_signals(numbers: Sequence[int]) -> None:
     """Pass signals over that would end the process at once: Python forgets that handler while it ends."""
     for number in numbers:
         if signal.getsignal(number) is end_at_once:
             signal.signal(number, signal.SIG_IGN)
 
 
-def _written(status: int) -> int:
+def _flush_stdout(status: int) -> int:
     """Write what stdout still holds, and return the status. At its own end Python would print a traceback."""
     out = sys.stdout
     if out is None:  # the caller has closed it

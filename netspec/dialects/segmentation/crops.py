@@ -85,7 +85,7 @@ def _offsets(plan: Plan, makers: dict[int, int], crop: int) -> tuple[list[int], 
 
     None where the bottoms are not connected, of unlike scales, or not a whole number of pixels apart.
     """
-    first, second = (_way(plan, makers, value) for value in plan.nodes[crop].bottoms)
+    first, second = (_ancestors(plan, makers, value) for value in plan.nodes[crop].bottoms)
     common = next((value for value in second if value in first), None)
     if common is None:
         return None
@@ -97,7 +97,7 @@ def _offsets(plan: Plan, makers: dict[int, int], crop: int) -> tuple[list[int], 
             for value, maker in way.items():
                 if value == common or line is None:
                     break
-                line, beyond = _through(plan.net.layer[maker], axis, line)
+                line, beyond = _line_below(plan.net.layer[maker], axis, line)
                 padded = padded or beyond
             lines.append(line)
         if lines[0] is None or lines[1] is None or lines[0][0] != lines[1][0]:
@@ -109,7 +109,7 @@ def _offsets(plan: Plan, makers: dict[int, int], crop: int) -> tuple[list[int], 
     return offsets, padded
 
 
-def _way(plan: Plan, makers: dict[int, int], value: int) -> dict[int, int]:
+def _ancestors(plan: Plan, makers: dict[int, int], value: int) -> dict[int, int]:
     """Return the values from which a value comes, by first bottoms, and the layers that make them; -1 for an input."""
     way: dict[int, int] = {}
     while value >= 0:
@@ -120,7 +120,7 @@ def _way(plan: Plan, makers: dict[int, int], value: int) -> dict[int, int]:
     return way
 
 
-def _through(layer: LayerParameter, axis: int, line: Line) -> tuple[Line | None, bool]:
+def _line_below(layer: LayerParameter, axis: int, line: Line) -> tuple[Line | None, bool]:
     """Return where pixels that lie on a line of a layer's top lie on its bottom; whether it pads beyond its kernel."""
     scale, shift = line
     if layer.type in ELEMENTWISE:

@@ -74,7 +74,7 @@ def test_a_folder_that_cannot_be_synced_is_no_fault_and_said_once(
     monkeypatch.setattr(package, "_sync", refuse)
     monkeypatch.setattr(logging.getLogger(package.__name__), "propagate", True)
     monkeypatch.setattr(logging.getLogger(package.__name__.partition(".")[0]), "propagate", True)
-    package._say_not_synced.cache_clear()
+    package._warn_not_synced.cache_clear()
     for text in ("new", "newer"):
         with package.whole_file(tmp_path / "file") as unfinished:
             unfinished.write_text(text)
