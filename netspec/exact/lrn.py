@@ -57,28 +57,21 @@ class AcrossChannels(torch.autograd.Function):
         maps, base = ctx.saved_tensors
         size, alpha, beta = ctx.settings
         roots = libm.power(base, -beta)
-        found = _gradient(maps, base, roots, roots * maps, diff, size, -2 * alpha * beta / size)
-        return found, None, None, None, None
+        sums = _backward_sums(diff * (roots * maps) / base, size)
+        return torch.add(diff * roots, maps * sums, alpha=-2 * alpha * beta / size), None, None, None, None
 
 
 def across_channels_gradient(
-    maps: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, size: int, alpha: float, beta: float, k: float
+    maps: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, settings: tuple[int, float, float, float]
 ) -> torch.Tensor:
-    """Return the gradient of AcrossChannels, (N, C, H, W), from ``tops`` that may hold other values since."""
+    """Return the gradient of AcrossChannels, (N, C, H, W), from ``tops`` that may hold other values since.
+
+    ``settings`` are its size, alpha, beta and k.
+    """
+    size, alpha, beta, k = settings
     base = _forward_sums(maps * maps, size, alpha / size, k)
-    return _gradient(maps, base, libm.power(base, -beta), tops, diff, size, -2 * alpha * beta / size)
-
-
-def _gradient(
-    maps: torch.Tensor,
-    base: torch.Tensor,
-    roots: torch.Tensor,
-    tops: torch.Tensor,
-    diff: torch.Tensor,
-    size: int,
-    factor: float,
-) -> torch.Tensor:
-    return torch.add(diff * roots, maps * _backward_sums(diff * tops / base, size), alpha=factor)
+    sums = _backward_sums(diff * tops / base, size)
+    return torch.add(diff * libm.power(base, -beta), maps * sums, alpha=-2 * alpha * beta / size)
 
 
 def _framed(maps: torch.Tensor, size: int) -> torch.Tensor:

@@ -77,7 +77,7 @@ class LRN(Layer):
         param = self.param.lrn_param
         size, alpha, beta = param.local_size, param.alpha, param.beta
         if self.is_exact(bottom):
-            return across_channels_gradient(bottom, top, diff, size, alpha, beta, param.k)
+            return across_channels_gradient(bottom, top, diff, (size, alpha, beta, param.k))
         base = self._base(bottom)
         sums = self._window_sums(diff * top / base)
         return diff * base.pow(-beta) - 2 * alpha * beta / size * bottom * sums

@@ -120,8 +120,6 @@ UNMENDED = {
     "loopclosure/places/datasets.py: load_fabmap",
     "netspec/fast/layers/vision.py: _convolutions",
     "netspec/fast/steps.py: schedule",
-    "netspec/inspect/draw/blocks.py: _alike",
-    "netspec/inspect/draw/layout.py: _columns",
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from netspec.inspect.draw.diagram import Diagram, Output
 
@@ -88,18 +88,16 @@ def _longest(diagram: Diagram, readers: dict[Output, list[int]], first: int, len
     if len(entries) != 1 or len(given) != 1 or unread:
         return None
     (entry,), (exit_,) = entries, given
+    block = Block(first, length, 1, entry, exit_)
     whole = 1
-    for copy in range(1, copies):
-        if not _alike(diagram, readers, first, length, copy, entry, exit_):
-            break
-        whole = copy + 1
-    return Block(first, length, whole, entry, exit_)
+    while whole < copies and _is_alike(diagram, readers, block, whole):
+        whole += 1
+    return replace(block, copies=whole)
 
 
-def _alike(
-    diagram: Diagram, readers: dict[Output, list[int]], first: int, length: int, copy: int, entry: Output, exit_: Output
-) -> bool:
+def _is_alike(diagram: Diagram, readers: dict[Output, list[int]], block: Block, copy: int) -> bool:
     """Say whether a copy is wired as the first one, with the exit of the copy before it as its entry."""
+    first, length, entry, exit_ = block.first, block.length, block.entry, block.exit
     shift = copy * length
     before = (exit_[0] + shift - length, exit_[1])
     for k in range(first, first + length):
