@@ -2,7 +2,7 @@
 
 python validation_set.py OUT SEQUENCES: SEQUENCES has a folder of images, in order, for each name below. Every second
 frame is a reference, the next one a query: OUT/outdoor and OUT/indoor have the queries in season/ and viewpoint/, and
-frame by frame the references in places/. benchmarks/notes/trained.md says how a net is judged on it.
+frame by frame the references in places/. docs/trained.md says what for.
 """
 
 import sys
