@@ -12,17 +12,17 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from netspec.dialects import use_dialect
     from netspec.errors import SpecError
     from netspec.load import load_net, load_solver
     from netspec.net.net import Net
     from netspec.net.one_layer import layer
     from netspec.net.weights import load_weights, save_weights
+    from netspec.proto.forks import use_dialect
     from netspec.solver.solver import Solver
 
 _HOMES = {
     "SpecError": "netspec.errors",
-    "use_dialect": "netspec.dialects",
+    "use_dialect": "netspec.proto.forks",
     "Net": "netspec.net.net",
     "layer": "netspec.net.one_layer",
     "load_net": "netspec.load",

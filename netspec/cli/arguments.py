@@ -14,7 +14,7 @@ from netspec.files.limits import read_amount
 from netspec.graph.options import PASSES, BuildOptions
 from netspec.load import speed
 from netspec.proto.binary import split_paths
-from netspec.proto.forks import forks
+from netspec.proto.forks import use_dialect
 from netspec.proto.schema import PHASES
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.parser import CAFFES_LOG
@@ -77,7 +77,7 @@ def add_plugin(parser: argparse.ArgumentParser) -> None:
 
 def _use_dialects(arguments: argparse.Namespace) -> None:
     for plugin in arguments.plugin:
-        forks().use(plugin)
+        use_dialect(plugin)
 
 
 def add_limit(parser: argparse.ArgumentParser) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any
 
 from typing_extensions import override
@@ -24,7 +25,7 @@ class Dialects(Forks):
     new_field = "docs/layer.md shows how to add a fork's with --plugin FILE.py"
 
     @override
-    def use(self, name: str) -> None:
+    def use(self, name: str | Path) -> None:
         use_dialect(name)
 
     @override
@@ -112,6 +113,8 @@ class Dialects(Forks):
 
     @override
     def rewrite(self, plan: Any, dialects: Any) -> list[str]:
+        if not any(layer.type == "Crop" for layer in plan.net.layer):
+            return []
         from netspec.dialects.segmentation.crops import align_crops
 
         return list(align_crops(plan, dialects))
@@ -123,10 +126,14 @@ class Dialects(Forks):
         return is_loose(layer)
 
     @override
-    def doubt(self, layer: Any) -> str:
+    def doubts(self, layers: Any) -> dict[str, int]:
         from netspec.dialects.signatures import doubt
 
-        return doubt(layer)
+        found: dict[str, int] = {}
+        for i, layer in enumerate(layers):
+            if message := doubt(layer):
+                found.setdefault(message, i)
+        return found
 
 
 def _switched_on(dialects: Collection[str], file: str) -> bool:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from google.protobuf.message import Message
 
 from netspec.dialects.files import DialectFile, announce_known, find_file, known_files, switch_on, waiting
-from netspec.dialects.registry import deactivate, dialects_with_type
+from netspec.dialects.registry import active, deactivate, dialects_with_type
 from netspec.dialects.signatures import has_several
 from netspec.errors import SpecError, Where
 from netspec.graph.options import BuildOptions
@@ -53,6 +53,8 @@ def dialects_of(net: NetParameter) -> set[str]:
     types = {layer.type for layer in net.layer}
     shown = {each for each in types if layer_class(each) and not has_several(each)}
     found = {*_everywhere, *(_owners[each] for each in shown if each in _owners)}
+    if not active():
+        return found
     return found.union(*(_dialects_in(layer) for layer in net.layer if layer.type in shown))
 
 

@@ -378,11 +378,7 @@ def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
 
 def doubtful_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
     """Yield a line for each type of layers of which nothing shows which fork's they are: the first of them."""
-    first: dict[str, int] = {}
-    for i, layer in enumerate(layers):
-        if doubt := forks().doubt(layer):
-            first.setdefault(doubt, i)
-    for doubt, i in first.items():
+    for doubt, i in forks().doubts(layers).items():
         yield f"{plan.source.at(i, layer=plan.nodes[i].name, type=plan.nodes[i].type)}: {doubt}"
 
 

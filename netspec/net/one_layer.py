@@ -90,6 +90,6 @@ def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int |
         tops = fewest or int(cls.tops[1] is None)
     param.top.extend(f"top{i}" for i in range(len(param.top), tops))
     layer = cls(param, shapes, replace(context, options=options, **({"at": at} if context.at is nowhere else {})))
-    if doubt := forks().doubt(layer):
+    for doubt in forks().doubts([layer]):
         log.logger.warning(f"{at()}: {doubt}")
     return layer

@@ -7,6 +7,7 @@ are imported at the first question. This file imports nothing by itself, so that
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
     from typing import Any
 
 
@@ -19,8 +20,8 @@ class Forks:
     new_layer = ""  # how a user adds a layer type that nobody has, for an error
     new_field = ""  # how a user adds a field that nobody has
 
-    def use(self, name: str) -> None:
-        """Add a dialect, given by its name or its file, for every net of the process. Raises SpecError."""
+    def use(self, name: "str | Path") -> None:
+        """Add a dialect: see :func:`use_dialect`."""
         from netspec.errors import SpecError
 
         raise SpecError(f'dialect "{name}" is unknown: this netspec was installed without netspec/dialects')
@@ -95,9 +96,12 @@ class Forks:
         """Change the layers of a Plan whose forks read their fields in another way; return warnings."""
         return []
 
-    def doubt(self, layer: "Any") -> str:
-        """Return a warning where forks have other layers of this type, and nothing shows which is meant; else ""."""
-        return ""
+    def doubts(self, layers: "Any") -> "dict[str, int]":
+        """Return warnings of layers whose type several forks have, where nothing shows which is meant.
+
+        With each goes the index of the first of the layers that it is about.
+        """
+        return {}
 
 
 _caffe = Forks()
@@ -110,3 +114,12 @@ def forks() -> Forks:
     if not _known:
         _known.append(find() or _caffe)
     return _known[0]
+
+
+def use_dialect(name: "str | Path") -> None:
+    """Add the fields and layers of a dialect, given by its name or the path of its file, for the whole process.
+
+    Does nothing where it is there already. Raises SpecError where there is no such dialect, its file has a fault, or
+    Caffe or another dialect has one of its fields or layer types.
+    """
+    forks().use(name)

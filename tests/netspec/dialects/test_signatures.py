@@ -1,0 +1,49 @@
+"""The table of whose a layer is names what there is, and its warning is about the layers of this project only."""
+
+from pathlib import Path
+
+import pytest
+
+import netspec
+from netspec.dialects.files import known_files
+from netspec.dialects.signatures import SIGNATURES
+from netspec.layers import layer_class
+from netspec.proto.schema import LayerParameter, fields_of
+
+
+@pytest.mark.parametrize("kind", SIGNATURES)
+def test_the_table_names_dialects_types_and_fields_that_there_are(kind: str) -> None:
+    signature = SIGNATURES[kind]
+    assert {fork.dialect for fork in signature.forks} <= known_files().keys()
+    assert layer_class(kind) is not None
+    for fork in signature.forks:
+        netspec.use_dialect(fork.dialect)
+    for field in (field for fork in signature.forks for field in fork.fields):
+        outer, _, inner = field.partition(".")
+        found = fields_of(LayerParameter.DESCRIPTOR)[outer]
+        assert not inner or inner in fields_of(found.descriptor.message_type)
+
+
+def test_a_layer_that_nothing_decides_is_in_doubt(caplog: pytest.LogCaptureFixture) -> None:
+    netspec.layer('type: "DiceCoefLoss"', (2, 3), (2, 3))
+    assert "forks have other layers of this type" in caplog.text
+
+
+OWN = """
+from netspec.layers import Layer, register
+
+@register("DiceCoefLoss")
+class Dice(Layer):
+    bottoms = (2, 2)
+
+    def reshape(self, bottom_shapes):
+        return [()]
+"""
+
+
+def test_a_layer_of_a_plugin_is_in_no_doubt(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "own_dice.py"
+    path.write_text(OWN)
+    netspec.use_dialect(path)
+    assert type(netspec.layer('type: "DiceCoefLoss"', (2, 3), (2, 3)).layer).__name__ == "Dice"
+    assert caplog.text == ""
