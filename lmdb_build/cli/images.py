@@ -73,21 +73,21 @@ def _add_views(commands: Commands) -> None:
         type=float,
         default=float("inf"),
         metavar="S",
-        help="places of one run come from so many seconds of it (default: all)",
+        help="take the places of one run from so many seconds of it (default: all of it)",
     )
     parser.add_argument(
         "--viewpoint",
         type=float,
         default=1.0,
         metavar="X",
-        help="how many times as strong zoom, turn and perspective are (default: %(default)g)",
+        help="factor for the strength of zoom, turn and perspective (default: %(default)g)",
     )
     parser.add_argument(
         "--calm",
         type=float,
         default=0.0,
         metavar="SHARE",
-        help="share of views that keep their colors and what they show (default: %(default)g)",
+        help="share of the views that keep their colors and get no occlusion (default: %(default)g)",
     )
     parser.add_argument(
         "--view-size", type=_size, default=(128, 96), metavar="WxH", help="size of a view (default: 128x96)"

@@ -127,15 +127,20 @@ def _add_pairs(commands: Commands) -> None:
         "--min-gap",
         type=float,
         metavar="S",
-        help="leave out pairs nearer in time: seconds (images: frames) (default: 0)",
+        help="leave out pairs nearer to each other in time, in seconds (images: frames) (default: 0)",
     )
     group.add_argument(
         "--negatives", default="both", choices=NEGATIVES, help="where negatives come from (default: %(default)s)"
     )
     group.add_argument(
-        "--clear-distance", type=float, metavar="M", help="negatives by pose are at least this far apart"
+        "--clear-distance",
+        type=float,
+        metavar="M",
+        help="least distance of two images of a negative pair, by their poses",
     )
-    group.add_argument("--clear-view-angle", type=float, metavar="DEG", help="or their viewing axes are")
+    group.add_argument(
+        "--clear-view-angle", type=float, metavar="DEG", help="or the least angle between their viewing axes"
+    )
     group.add_argument(
         "--same-scene",
         action="append",

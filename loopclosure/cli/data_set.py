@@ -63,7 +63,7 @@ TRAVERSES = ("tolerance", "soft_tolerance")
 
 
 EXCLUDED = f"fabmap {datasets.FABMAP_EXCLUSION.frames}, images {datasets.FOLDER_EXCLUSION.frames}"
-OVERLAP = "the soft zone: a match is no mistake if so much of each view is visible in the other"
+OVERLAP = "the soft zone: a match is not counted as wrong if this share of each view is visible in the other"
 
 
 def add_data_set(parser: argparse.ArgumentParser) -> None:
@@ -91,7 +91,8 @@ def add_data_set(parser: argparse.ArgumentParser) -> None:
         "--exclude-seconds",
         type=float,
         metavar="S",
-        help=f"frames less than S seconds apart are no pair (default: with times {datasets.TUM_EXCLUSION.seconds:g})",
+        help="frames less than S seconds from each other are no pair "
+        f"(default: with times {datasets.TUM_EXCLUSION.seconds:g})",
     )
 
 

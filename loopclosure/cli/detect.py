@@ -105,7 +105,9 @@ def _add_detect(commands: Commands) -> None:
         metavar="FRAMES",
         help=f"no candidates (default: those of one visit to a place; frame by frame {OF.exclude_recent})",
     )
-    parser.add_argument("--exclude-seconds", type=float, metavar="S", help="nor are frames less than S seconds old")
+    parser.add_argument(
+        "--exclude-seconds", type=float, metavar="S", help="frames less than S seconds old are no candidates either"
+    )
     parser.add_argument("--top-k", type=int, metavar="K", help=f"candidates examined (default: {OF.top_k})")
     parser.add_argument(
         "--consistency", type=int, metavar="K", help="previous frames that must have led to the candidate"
@@ -115,7 +117,9 @@ def _add_detect(commands: Commands) -> None:
     )
     parser.add_argument("--verify", action="store_true", help="verify candidates by SIFT matches and RANSAC")
     parser.add_argument(
-        "--odometry", metavar="FILE", help="poses (TUM, KITTI, EuRoC): frames that they put far apart are no loop"
+        "--odometry",
+        metavar="FILE",
+        help="poses (TUM, KITTI, EuRoC): two frames that it puts far from each other are no loop",
     )
     parser.add_argument("--save", metavar="F.npz", help="write the detector, to continue with --resume")
     parser.add_argument("--rerun", metavar="F.rrd", help="write images, scores and loops for the viewer of rerun.io")

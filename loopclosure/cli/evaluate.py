@@ -89,9 +89,7 @@ def _evaluate(a: argparse.Namespace) -> None:
 
 
 def _add_compare(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "compare", help="put the reports of several evaluations side by side: table and curves"
-    )
+    parser = commands.add_parser("compare", help="compare the reports of several evaluations in a table and curves")
     parser.set_defaults(function=_compare)
     parser.add_argument("report", nargs="+", metavar="REPORT.json", help="two or more, as evaluate writes them")
     parser.add_argument("--out", default="comparison.html", metavar="FILE.html", help="the page (default: %(default)s)")

@@ -70,7 +70,7 @@ def add_plugin(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME|FILE.py",
-        help="a dialect (the layers of a Caffe fork): its name, or a Python file of your own; may be repeated",
+        help="a dialect (the layers of a fork of Caffe): its name, or your own Python file; may be repeated",
     )
     parser.set_defaults(prepare=_use_dialects)
 
@@ -86,7 +86,7 @@ def add_limit(parser: argparse.ArgumentParser) -> None:
         "--limit",
         type=_amount,
         metavar="SIZE",
-        help="memory that a net may need, e.g. 64GiB; more is refused (default: this machine's)",
+        help="refuse a net that needs more memory than this, e.g. 64GiB (default: the machine's memory)",
     )
 
 
@@ -115,7 +115,7 @@ def add_gpu(parser: argparse.ArgumentParser) -> None:
         "--gpu",
         default="",
         metavar="GPU",
-        help="the GPU's number; for training also several: 0,1 or all (default: the solver's choice)",
+        help="number of the GPU; train also takes several, as 0,1, or all (default: as the solver says)",
     )
 
 
@@ -129,9 +129,9 @@ def add_phase(parser: argparse.ArgumentParser, default: str = "TEST") -> None:
 def add_state(parser: argparse.ArgumentParser) -> None:
     """Add ``--level`` and ``--stage``."""
     parser.add_argument(
-        "--level", type=_int32, default=0, metavar="LEVEL", help="the NetState's level (default: %(default)s)"
+        "--level", type=_int32, default=0, metavar="LEVEL", help="level of the NetState (default: %(default)s)"
     )
-    parser.add_argument("--stage", default="", metavar="STAGE", help="the NetState's stages, separated by commas")
+    parser.add_argument("--stage", default="", metavar="STAGE", help="stages of the NetState, separated by commas")
 
 
 def add_part(parser: argparse.ArgumentParser) -> None:
@@ -173,7 +173,7 @@ def add_exact(parser: argparse.ArgumentParser) -> None:
         "--exact",
         default=SMALL,
         choices=CHOICES,
-        help="which sums equal Caffe's in every bit, on the CPU; all is slower (default: %(default)s)",
+        help="which sums equal Caffe's to the last bit, on the CPU; all is slower (default: %(default)s)",
     )
 
 
@@ -184,7 +184,7 @@ def add_passes(parser: argparse.ArgumentParser) -> None:
         type=_passes,
         default=PASSES,
         metavar="NAMES",
-        help=f"what may speed up a net of phase TEST: {','.join(PASSES)} (the default), some of these, or none",
+        help=f"optimizations for a net of phase TEST: {','.join(PASSES)} (the default), some of these, or none",
     )
 
 
@@ -194,19 +194,19 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
         "--engine",
         default=TORCH,
         choices=[*ENGINES, f"{OPENVINO},{BF16}"],
-        help=f"what runs the net (default: %(default)s); with ,{BF16} it computes in bfloat16",
+        help=f"what runs the net (default: %(default)s); ,{BF16} computes in bfloat16",
     )
     parser.add_argument("--precision", choices=PRECISIONS, help=argparse.SUPPRESS)
     parser.add_argument(
         "--cache",
         metavar="DIR|none",
-        help="keep nets exported for an engine here, or do not keep them (default: the user's cache folder)",
+        help="folder that keeps exported nets, or none to keep no files (default: the user's cache folder)",
     )
 
 
 def add_steps(parser: argparse.ArgumentParser) -> None:
     """Add what is done to the pixels of image files before a net gets them."""
-    parser.add_argument("--swap", action="store_true", help="images: reverse the channels, to RGB")
+    parser.add_argument("--swap", action="store_true", help="with image files: reverse the channels, to RGB")
     parser.add_argument(
         "--raw-scale", type=float, default=1.0, metavar="S", help="then multiply pixels, 0 to 255, by this"
     )
@@ -220,7 +220,7 @@ def add_steps(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=1.0,
         metavar="S",
-        help="then multiply by this; these four replace the data layer's transform_param",
+        help="then multiply by this; these four options replace the data layer's transform_param",
     )
 
 

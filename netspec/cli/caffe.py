@@ -71,19 +71,23 @@ def _add_train(commands: Commands) -> None:
     parser.add_argument("path", nargs="?", metavar="SOLVER", help="the solver's prototxt")
     parser.add_argument("--solver", metavar="SOLVER", help="the solver's prototxt")
     parser.add_argument("--snapshot", metavar="SNAPSHOT", help="a .solverstate to resume from")
-    parser.add_argument("--resume", action="store_true", help="resume from the newest whole snapshot, if there is any")
+    parser.add_argument(
+        "--resume", action="store_true", help="resume from the newest complete snapshot, if there is one"
+    )
     parser.add_argument("--weights", metavar="WEIGHTS", help="weights to start from, several separated by commas")
     parser.add_argument(
-        "--scores", metavar="F.json", help="write the scores of each test and the snapshots taken to this file"
+        "--scores", metavar="F.json", help="write the scores of each test, and the names of the snapshots, to this file"
     )
     parser.add_argument(
-        "--tensorboard", metavar="DIR", help="write losses, rates and test outputs here for TensorBoard"
+        "--tensorboard",
+        metavar="DIR",
+        help="write losses, learning rates and test outputs to this folder, for TensorBoard",
     )
     parser.add_argument(
         "--nan",
         default="stop",
         choices=["stop", "warn"],
-        help="what a loss of NaN or infinity does (default: %(default)s)",
+        help="what to do when the loss is NaN or infinite (default: %(default)s)",
     )
     add_gpu(parser)
     add_state(parser)
@@ -91,7 +95,7 @@ def _add_train(commands: Commands) -> None:
         "--sigint_effect",
         default="stop",
         choices=["stop", "snapshot", "none"],
-        help="what Ctrl-C does (default: %(default)s); SIGTERM stops",
+        help="what Ctrl-C does (default: %(default)s); SIGTERM always stops",
     )
     parser.add_argument(
         "--sighup_effect",
@@ -365,7 +369,7 @@ def _add_extract_features(commands: Commands) -> None:
     parser.add_argument("model", metavar="MODEL", help="the net's prototxt, with a data layer")
     parser.add_argument("blobs", metavar="BLOBS", help="blob names, separated by commas")
     parser.add_argument(
-        "databases", metavar="DATABASES", help="the databases to write, one per blob, separated by commas"
+        "databases", metavar="DATABASES", help="databases to write, one for each blob, separated by commas"
     )
     parser.add_argument("batches", type=positive, metavar="N", help="mini-batches to run")
     parser.add_argument("db_type", choices=["lmdb", "leveldb"], help="the form of the databases")
@@ -431,7 +435,7 @@ def _add_upgrade_net_proto_text(commands: Commands) -> None:
     parser.set_defaults(function=_upgrade_net_proto_text)
     add_plugin(parser)
     _add_files(parser)
-    add_shapes(parser, "of a .caffemodel, whose net is written as a deploy prototxt: the shape of an input")
+    add_shapes(parser, "shape of an input, for a .caffemodel: its net is written as a deploy prototxt")
 
 
 def _upgrade_net_proto_text(arguments: argparse.Namespace) -> None:

@@ -30,7 +30,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def _add_data(commands: Commands) -> None:
-    parser = commands.add_parser("data", help="look at a database: a sheet of its records, or its statistics")
+    parser = commands.add_parser("data", help="show the records of a database, or print its statistics")
     parser.set_defaults(function=_data, **QUIET)
     parser.add_argument(
         "what", choices=[SHOW, STAT], help="show: draw records, labels, statistics; stat: print statistics"
@@ -42,13 +42,13 @@ def _add_data(commands: Commands) -> None:
         "--count", type=positive, default=40, metavar="N", help="show: how many records to draw (default: %(default)s)"
     )
     parser.add_argument(
-        "--start", type=int, metavar="K", help="show: draw the records from number K on (default: a spread)"
+        "--start", type=int, metavar="K", help="show: draw the records from number K on (default: evenly spread ones)"
     )
     parser.add_argument(
         "--images",
         type=positive,
         metavar="N",
-        help="show: images side by side in a record (default: 2 of 2 or 6 channels)",
+        help="show: number of images in a record, side by side (default: 2 if there are 2 or 6 channels)",
     )
     parser.add_argument("--json", action="store_true", help="stat: print JSON")
 
@@ -105,14 +105,14 @@ def _show(arguments: argparse.Namespace, records: Records, found: Survey) -> Non
 def _add_plot(commands: Commands) -> None:
     parser = commands.add_parser("plot", help="draw the curves of trainings from their logs, netspec's or Caffe's")
     parser.set_defaults(function=_plot, **QUIET)
-    parser.add_argument("logs", nargs="+", metavar="LOG", help="what a training wrote to stderr")
-    parser.add_argument("--out", required=True, metavar="F.png|svg|html", help="the picture, or a page, to write")
+    parser.add_argument("logs", nargs="+", metavar="LOG", help="log of a training: what it wrote to stderr")
+    parser.add_argument("--out", required=True, metavar="F.png|svg|html", help="picture or HTML page to write")
     parser.add_argument(
         "--names",
         metavar="NAMES,...",
-        help="what the logs are called, separated by commas (default: the names of the files)",
+        help="names of the logs, separated by commas (default: the names of the files)",
     )
-    parser.add_argument("--smooth", type=positive, metavar="N", help="average N points (default: a 25th of them)")
+    parser.add_argument("--smooth", type=positive, metavar="N", help="average over N points (default: 1/25 of them)")
     parser.add_argument("--log_scale", action="store_true", help="draw losses on a logarithmic axis")
 
 

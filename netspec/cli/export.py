@@ -84,7 +84,12 @@ def _add_extract(commands: Commands) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="the .npz to write")
     parser.add_argument(
-        "--source", action="append", type=_layer_source, default=[], metavar="LAYER=DB", help="use another database"
+        "--source",
+        action="append",
+        type=_layer_source,
+        default=[],
+        metavar="LAYER=DB",
+        help="read this database instead, for a data layer",
     )
     parser.add_argument("--iterations", type=positive, metavar="N", help="batches to run (default: every record once)")
     parser.add_argument("--images", metavar="FOLDER|LIST", help="use image files instead of records")
@@ -215,8 +220,8 @@ WRITTEN = {
 EXPORT = """Write a net in another form, with its weights.
 
 --to onnx         an ONNX model (opset 21), batch, height and width free where the net allows it;
-                  weights of more than 2 GB go into a file beside it
---to torch        the source of a PyTorch module, OUT.py, and its weights, OUT.safetensors beside it
+                  weights of more than 2 GB go into a second file
+--to torch        the source of a PyTorch module, OUT.py, and its weights, OUT.safetensors
 --to pt2          a torch.export archive
 --to safetensors  the weights alone: LAYER.INDEX, in Caffe's order
 
@@ -283,14 +288,14 @@ def _export(arguments: argparse.Namespace) -> None:
 
 def _add_fold(commands: Commands) -> None:
     parser = commands.add_parser(
-        "fold", help="write the deploy net with BatchNorm and Scale folded in: OUT.prototxt, OUT.caffemodel"
+        "fold", help="fold BatchNorm and Scale into the layers before them: write OUT.prototxt and OUT.caffemodel"
     )
     parser.set_defaults(function=_fold, **QUIET)
     add_verbose(parser)
     add_plugin(parser)
     add_limit(parser)
     parser.add_argument(
-        "file", metavar="MODEL", help="the net's prototxt; of a training net, labels and losses are removed"
+        "file", metavar="MODEL", help="the net's prototxt; labels and losses of a training net are removed"
     )
     parser.add_argument("--weights", required=True, metavar="WEIGHTS", help="the trained weights")
     parser.add_argument(

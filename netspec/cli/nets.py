@@ -62,17 +62,19 @@ def _add_check(commands: Commands) -> None:
     parser.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt, or a .caffemodel")
     add_phase(parser)
     add_state(parser)
-    add_shapes(parser, "the shape of a data layer's top; its data is then not opened")
+    add_shapes(parser, "shape of a data layer's top; its data is then not opened")
     parser.add_argument("--data", action="store_true", help="open databases, lists and mean files too")
     parser.add_argument(
         "--weights", metavar="WEIGHTS", help="weights that must fit the net, several separated by commas"
     )
     parser.add_argument(
-        "--plan", action="store_true", help="print how the net runs without gradients; needs its memory"
+        "--plan", action="store_true", help="print how the net runs without gradients; this allocates its memory"
     )
     add_passes(parser)
     parser.add_argument(
-        "--json", action="store_true", help="print blobs, params, inputs, outputs as JSON; or the faults, if any"
+        "--json",
+        action="store_true",
+        help="print blobs, params, inputs and outputs as JSON, or the errors, if there are any",
     )
     add_strict(parser)
     add_python(parser)
@@ -126,13 +128,13 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _add_lint(commands: Commands) -> None:
-    parser = commands.add_parser("lint", help="find what is legal but likely a mistake, in nets and solvers")
+    parser = commands.add_parser("lint", help="find what is legal but probably a mistake, in nets and solvers")
     parser.set_defaults(function=_lint, **QUIET)
     add_plugin(parser)
     parser.add_argument("files", nargs="*", default=[], metavar="FILE", help="a net's or a solver's prototxt")
     parser.add_argument("--rules", action="store_true", help="print the rules, with their reasons")
     parser.add_argument(
-        "--json", action="store_true", help="print faults and findings as JSON, one object for each file"
+        "--json", action="store_true", help="print errors and findings as JSON, one object for each file"
     )
     add_state(parser)
     add_shapes(parser, "the shape of a data layer's top; some rules need shapes")
@@ -183,7 +185,9 @@ def _add_draw(commands: Commands) -> None:
     add_state(parser)
     add_shapes(parser, "the shape of a data layer's top; without it shapes may be unknown")
     parser.add_argument("--data", action="store_true", help="open databases and lists to learn their shapes")
-    parser.add_argument("--unfold", action="store_true", help="draw every copy of what repeats (HTML has both)")
+    parser.add_argument(
+        "--unfold", action="store_true", help="draw each copy of a repeated block (an HTML page shows both)"
+    )
     add_python(parser)
 
 
@@ -215,7 +219,7 @@ def _tolerance(text: str) -> float:
 
 
 def _add_diff(commands: Commands) -> None:
-    parser = commands.add_parser("diff", help="tell what differs in meaning: nets, solvers or weights")
+    parser = commands.add_parser("diff", help="print the differences in meaning of two nets, solvers or weights")
     parser.set_defaults(function=_diff, **QUIET, fault_status=UNREADABLE)
     add_plugin(parser)
     parser.add_argument("first", metavar="A", help="a prototxt, a .caffemodel or a .caffemodel.h5")
@@ -225,7 +229,7 @@ def _add_diff(commands: Commands) -> None:
         type=_tolerance,
         default=0.0,
         metavar="X",
-        help="weights no further apart are equal (default: %(default)g)",
+        help="weights that differ by at most this much are equal (default: %(default)g)",
     )
 
 
@@ -240,10 +244,10 @@ def _diff(arguments: argparse.Namespace) -> int:
 
 
 def _add_fmt(commands: Commands) -> None:
-    parser = commands.add_parser("fmt", help="write prototxt files in one form; comments are kept")
+    parser = commands.add_parser("fmt", help="format prototxt files; comments are kept")
     parser.set_defaults(function=_fmt, **QUIET)
     parser.add_argument("files", nargs="+", metavar="FILE", help="a net's or a solver's prototxt; - is standard input")
-    parser.add_argument("--check", action="store_true", help="write nothing; name the files that would change")
+    parser.add_argument("--check", action="store_true", help="write nothing; list the files that would change")
 
 
 def _fmt(arguments: argparse.Namespace) -> int:
@@ -375,15 +379,17 @@ def _maps(arguments: argparse.Namespace) -> None:
 
 
 def _add_saliency(commands: Commands) -> None:
-    parser = commands.add_parser("saliency", help="draw which pixels matter for a number of a blob, or a distance")
+    parser = commands.add_parser("saliency", help="draw which pixels matter for one value of a blob, or for a distance")
     parser.set_defaults(function=_saliency, **QUIET)
     add_verbose(parser)
     add_plugin(parser)
     add_limit(parser)
     _add_described_blob(parser)
     parser.add_argument("--image", required=True, metavar="IMAGE", help="the image file")
-    parser.add_argument("--unit", type=int, metavar="K", help="which of the blob's numbers (default: the greatest)")
-    parser.add_argument("--to", metavar="IMAGE", help="instead: the distance of the blob to that of this image")
+    parser.add_argument(
+        "--unit", type=int, metavar="K", help="index of the value in the blob (default: that of the largest)"
+    )
+    parser.add_argument("--to", metavar="IMAGE", help="explain the distance to the blob of this image instead")
     parser.add_argument(
         "--samples", type=positive, default=16, metavar="N", help="average over N noisy copies (default: %(default)s)"
     )
@@ -423,7 +429,7 @@ def _add_embedding(commands: Commands) -> None:
         "--images", metavar="FOLDER|LIST|DB", help="the images: a folder, a list, or the records' database"
     )
     parser.add_argument(
-        "--method", default="pca", choices=["pca", "tsne"], help="how to find the plane (default: %(default)s)"
+        "--method", default="pca", choices=["pca", "tsne"], help="method that finds the plane (default: %(default)s)"
     )
     _add_picture(parser)
 

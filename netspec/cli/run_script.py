@@ -43,9 +43,16 @@ def _add_run(commands: Commands) -> None:
     parser.set_defaults(function=_run, **NO_LOG)
     add_plugin(parser)
     add_limit(parser)
-    parser.add_argument("--shadow-caffe", action="store_true", help="use netspec also where a real Caffe is installed")
-    parser.add_argument("--python2", action="store_true", help="translate from Python 2, also what runs as Python 3")
-    parser.add_argument("--write-py3", type=Path, metavar="F.py", help="only write a script of Python 2 as Python 3")
+    parser.add_argument("--shadow-caffe", action="store_true", help="use netspec even if a real Caffe is installed")
+    parser.add_argument(
+        "--python2", action="store_true", help="translate from Python 2, even if the script is valid Python 3"
+    )
+    parser.add_argument(
+        "--write-py3",
+        type=Path,
+        metavar="F.py",
+        help="translate a Python 2 script, write it to this file, and run nothing",
+    )
     parser.add_argument("-m", action="store_true", help="run a module, as python -m does")
 
 
@@ -77,9 +84,9 @@ def _add_install_caffe(commands: Commands) -> None:
         "install-caffe", help="put a package `caffe` and Caffe's commands into this Python environment"
     )
     parser.set_defaults(function=_install_caffe)
-    parser.add_argument("--replace", action="store_true", help="move a real Caffe that is in the way aside")
+    parser.add_argument("--replace", action="store_true", help="move a real Caffe that is installed out of the way")
     parser.add_argument(
-        "--build", type=Path, metavar="FOLDER", help="only make FOLDER/tools/caffe and so on, for scripts"
+        "--build", type=Path, metavar="FOLDER", help="only make FOLDER/tools/caffe and so on, for shell scripts"
     )
 
 

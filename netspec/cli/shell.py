@@ -19,7 +19,7 @@ def add_commands(commands: Commands) -> None:
     _add_bug_report(commands)
 
 
-COMPLETION = """Print what makes a shell complete the commands of netspec.
+COMPLETION = """Print a script with which a shell completes the commands of netspec.
 
 bash: netspec completion bash > ~/.local/share/bash-completion/completions/netspec
 zsh:  netspec completion zsh > a file _netspec in a folder of $fpath
@@ -29,7 +29,7 @@ fish: netspec completion fish > ~/.config/fish/completions/netspec.fish"""
 def _add_completion(commands: Commands) -> None:
     parser = commands.add_parser(
         "completion",
-        help="print a shell's completion",
+        help="print a completion script for a shell",
         description=COMPLETION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -62,11 +62,16 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 
 def _add_bug_report(commands: Commands) -> None:
     parser = commands.add_parser(
-        "bug-report", help="collect versions, and files' shapes without weights or images, for a report of a fault"
+        "bug-report",
+        help="collect what a bug report needs: versions, and the shapes in files, without weights or images",
     )
     parser.set_defaults(function=_bug_report, **QUIET)
     parser.add_argument(
-        "files", nargs="*", default=[], metavar="FILE", help="prototxt, weights, database, log: what the fault is about"
+        "files",
+        nargs="*",
+        default=[],
+        metavar="FILE",
+        help="files that the bug is about: prototxt, weights, database, log",
     )
     parser.add_argument("--out", metavar="F.md", help="write the report here (default: print it)")
 
