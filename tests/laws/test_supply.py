@@ -16,7 +16,7 @@ RESTRICTED = r"\b(A?GPL|GNU (Affero )?General Public|SSPL|CC-BY-NC|Commercial|Pr
 # Has an exception for programs that use it: the run-time libraries of GCC, in the wheels of NumPy and SciPy.
 EXCEPTED = r"GPL-3\.0-or-later WITH GCC-exception-3\.1"
 # NVIDIA's libraries have terms of their own. They come with torch's build for Linux, and docs/licenses.md says so.
-NVIDIAS = re.compile(r"nvidia-|cuda-toolkit$")
+NVIDIAS = re.compile(r"nvidia-|cuda-")
 NAME = re.compile(r"[A-Za-z0-9._-]+")
 
 
