@@ -399,9 +399,11 @@ class BlobRunner:
             with undisturbed(self._layers[i]):
                 return self._record(i)
         for leaf, holder, blob in zip(tape.leaves, tape.holders, bottoms, strict=True):
-            kept = self._is_in_place(i, blob) or blob.data_memory.holder(blob.count) is holder
-            if not kept:
-                leaf.data.copy_(blob.data_memory.tensor(blob.shape))
+            if self._is_in_place(i, blob) or blob.data_memory.holder(blob.count) is holder:
+                continue
+            value = blob.data_memory.tensor(blob.shape)
+            if value.data_ptr() != leaf.data_ptr():  # else it has the values, and torch refuses to copy some shapes
+                leaf.data.copy_(value)
         return tape
 
     def _is_in_place(self, i: int, blob: Blob) -> bool:

@@ -250,6 +250,25 @@ def test_split_copies_and_reshaped_blobs_lie_in_one_memory(net_of: Callable[...,
     assert (net.blobs["data"].diff == 6).all()
 
 
+def test_blobs_in_one_memory_may_be_maps_of_one_pixel(net_of: Callable[..., caffe.Net]) -> None:
+    """Torch gives such maps strides that its copies take for an overlap."""
+    net = net_of(
+        """
+        force_backward: true
+        layer { name: "in" type: "Input" top: "x" input_param { shape { dim: 4 dim: 5 dim: 3 dim: 2 } } }
+        layer { name: "pool" type: "Pooling" bottom: "x" top: "p"
+                pooling_param { kernel_h: 3 kernel_w: 2 stride: 3 round_mode: FLOOR } }
+        layer { name: "flat" type: "Flatten" bottom: "p" top: "f" flatten_param { axis: 3 end_axis: 3 } }
+        layer { name: "cut" type: "Slice" bottom: "p" top: "a" top: "b" slice_param { axis: 1 slice_point: 3 } }
+        """
+    )
+    net.blobs["x"].data[...] = np.arange(120).reshape(4, 5, 3, 2)
+    net.forward()
+    net.blobs["a"].diff[...], net.blobs["b"].diff[...] = 1, 2
+    net.backward()
+    assert net.blobs["x"].diff.reshape(4, 5, 6).max(axis=2).tolist() == [[1, 1, 1, 2, 2]] * 4
+
+
 def test_dropout_of_the_test_phase_copies(net_of: Callable[..., caffe.Net]) -> None:
     net = net_of(INPUT + 'layer { name: "drop" type: "Dropout" bottom: "data" top: "drop" }')
     net.forward(data=image(1, 3, 12, 12))
