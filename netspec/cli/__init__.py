@@ -5,18 +5,18 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from netspec.cli import caffe, data, export, nets, run_script, shell
+from netspec.cli import caffe, caffe_tools, data, export, look, nets, run_script, shell
 from netspec.terminal.commands import run
 from netspec.terminal.parser import Commands, Parser, program
 
-# The modules of the commands, and the headings in ``netspec --help`` that these stand below.
+# The headings in ``netspec --help``, and the modules with the commands below each.
 _GROUPS = {
-    "Caffe's programs": caffe,
-    "look at nets": nets,
-    "look at data and trainings": data,
-    "use a net elsewhere": export,
-    "old programs": run_script,
-    "shell, help": shell,
+    "Caffe's programs": [caffe, caffe_tools],
+    "look at nets": [nets, look],
+    "look at data and trainings": [data],
+    "use a net elsewhere": [export],
+    "old programs": [run_script],
+    "shell, help": [shell],
 }
 
 
@@ -34,6 +34,8 @@ def parser() -> Parser:
     """Return the parser of all commands."""
     made = program("netspec", "Run Caffe's prototxt in PyTorch, with Caffe's numbers.")
     commands = Commands(made)
-    for commands.heading, module in _GROUPS.items():
-        module.add_commands(commands)
+    for heading, modules in _GROUPS.items():
+        commands.heading = heading
+        for module in modules:
+            module.add_commands(commands)
     return made

@@ -1,9 +1,8 @@
-"""``netspec train``, ``test``, ``time``, and Caffe's smaller tools under their own names."""
+"""``netspec train``, ``test`` and ``time``."""
 
 from __future__ import annotations
 
 import argparse
-import logging
 import os
 import signal
 import sys
@@ -24,10 +23,8 @@ from netspec.cli.arguments import (
     add_phase,
     add_plugin,
     add_python,
-    add_shapes,
     add_state,
     add_strict,
-    device,
     devices,
     load,
     load_weights,
@@ -37,7 +34,6 @@ from netspec.cli.arguments import (
     stages,
 )
 from netspec.errors import SpecError
-from netspec.files.whole_file import write_whole
 from netspec.inspect.logs.scores import Score, Scores, Snapshot, read_scores
 from netspec.proto.binary import check_readable, split_paths
 from netspec.terminal.commands import DONE, FAULT, WrongUsage
@@ -53,11 +49,6 @@ def add_commands(commands: Commands) -> None:
     _add_train(commands)
     _add_test(commands)
     _add_time(commands)
-    _add_extract_features(commands)
-    _add_device_query(commands)
-    _add_upgrade_net_proto_text(commands)
-    _add_upgrade_net_proto_binary(commands)
-    _add_upgrade_solver_proto_text(commands)
 
 
 BAR = "{n_fmt} of {total_fmt} |{bar}| {elapsed}, {remaining} left{postfix}"
@@ -358,123 +349,3 @@ def _time(arguments: argparse.Namespace) -> None:
     else:
         time_forward(net, arguments.iterations)
     net.close()
-
-
-def _add_extract_features(commands: Commands) -> None:
-    parser = commands.add_parser("extract_features", help="write blobs to databases of float Datums (extract_features)")
-    parser.set_defaults(function=_extract_features, log_level=logging.WARNING)
-    add_plugin(parser)
-    add_limit(parser)
-    parser.add_argument("weights", metavar="WEIGHTS", help="the trained weights")
-    parser.add_argument("model", metavar="MODEL", help="the net's prototxt, with a data layer")
-    parser.add_argument("blobs", metavar="BLOBS", help="blob names, separated by commas")
-    parser.add_argument(
-        "databases", metavar="DATABASES", help="databases to write, one for each blob, separated by commas"
-    )
-    parser.add_argument("batches", type=positive, metavar="N", help="mini-batches to run")
-    parser.add_argument("db_type", choices=["lmdb", "leveldb"], help="the form of the databases")
-    parser.add_argument(
-        "mode", nargs="?", default="CPU", choices=["CPU", "GPU"], help="where the net runs (default: %(default)s)"
-    )
-    parser.add_argument("device", nargs="?", default="0", metavar="DEVICE_ID=0", help="the GPU's number")
-
-
-def _extract_features(arguments: argparse.Namespace) -> None:
-    from netspec.inspect.features.records import extract_features as write_features
-    from netspec.net.build import load_net
-
-    number = arguments.device.rpartition("=")[2]
-    log.error("extract_features.cpp:62", "Using CPU" if arguments.mode == "CPU" else f"Using GPU {number}")
-    chosen = options(arguments, device=str(device(number if arguments.mode == "GPU" else "")))
-    net = load_net(arguments.model, options=chosen, weights=[arguments.weights])
-    write_features(
-        net, arguments.blobs.split(","), arguments.databases.split(","), arguments.batches, arguments.db_type
-    )
-    net.close()
-
-
-def _add_device_query(commands: Commands) -> None:
-    parser = commands.add_parser("device_query", help="show the GPUs (caffe device_query)")
-    parser.set_defaults(function=_device_query)
-    parser.add_argument(
-        "--gpu", default="all", metavar="GPU", help="one number, several separated by commas, or all (the default)"
-    )
-
-
-def _device_query(arguments: argparse.Namespace) -> None:
-    import torch
-
-    log.info("caffe.cpp:142", f"Querying GPUs {arguments.gpu}")
-    count = torch.cuda.device_count()
-    if not count:
-        log.info("common.cpp:178", "No GPU: torch finds none on this machine")
-        return
-    numbers = range(count) if arguments.gpu == "all" else [device(n).index for n in arguments.gpu.split(",")]
-    for number in numbers:
-        properties = torch.cuda.get_device_properties(number)
-        for title, value in (
-            ("Device id:", number),
-            ("Major revision number:", properties.major),
-            ("Minor revision number:", properties.minor),
-            ("Name:", properties.name),
-            ("Total global memory:", properties.total_memory),
-            ("Number of multiprocessors:", properties.multi_processor_count),
-        ):
-            log.info("common.cpp:178", f"{title:<31}{value}")
-
-
-def _add_files(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("input", metavar="IN", help="the file to read")
-    parser.add_argument("output", type=Path, metavar="OUT", help="the file to write")
-
-
-def _add_upgrade_net_proto_text(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "upgrade_net_proto_text", help="write a net's prototxt, or the net inside a .caffemodel, in the current format"
-    )
-    parser.set_defaults(function=_upgrade_net_proto_text)
-    add_plugin(parser)
-    _add_files(parser)
-    add_shapes(parser, "shape of an input, for a .caffemodel: its net is written as a deploy prototxt")
-
-
-def _upgrade_net_proto_text(arguments: argparse.Namespace) -> None:
-    from netspec.proto.binary import is_net_binary
-    from netspec.proto.text import read_net, write_text
-
-    if is_net_binary(arguments.input):
-        from netspec.net.build import recover_net
-
-        net, _ = recover_net(arguments.input, dict(arguments.shape))
-    elif arguments.shape:
-        raise WrongUsage("--shape is for the net inside a .caffemodel; a prototxt has its own shapes")
-    else:
-        net = read_net(arguments.input)
-    write_whole(arguments.output, write_text(net))
-    log.info("upgrade_net_proto_text.cpp:49", f"Wrote upgraded NetParameter text proto to {arguments.output}")
-
-
-def _add_upgrade_net_proto_binary(commands: Commands) -> None:
-    parser = commands.add_parser("upgrade_net_proto_binary", help="write a .caffemodel in the current format")
-    parser.set_defaults(function=_upgrade_net_proto_binary)
-    _add_files(parser)
-
-
-def _upgrade_net_proto_binary(arguments: argparse.Namespace) -> None:
-    from netspec.proto.binary import read_net_binary
-
-    write_whole(arguments.output, read_net_binary(arguments.input).SerializeToString())
-    log.info("upgrade_net_proto_binary.cpp:49", f"Wrote upgraded NetParameter binary proto to {arguments.output}")
-
-
-def _add_upgrade_solver_proto_text(commands: Commands) -> None:
-    parser = commands.add_parser("upgrade_solver_proto_text", help="write a solver's prototxt in the current format")
-    parser.set_defaults(function=_upgrade_solver_proto_text)
-    _add_files(parser)
-
-
-def _upgrade_solver_proto_text(arguments: argparse.Namespace) -> None:
-    from netspec.proto.text import read_solver, write_text
-
-    write_whole(arguments.output, write_text(read_solver(arguments.input)))
-    log.info("upgrade_solver_proto_text.cpp:49", f"Wrote upgraded SolverParameter text proto to {arguments.output}")
