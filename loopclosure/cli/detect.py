@@ -130,7 +130,7 @@ def _detect(a: argparse.Namespace) -> None:
     recording = None if a.video else recording_of(a.source, Path(a.out) / "frames")
     features = read_features(a.features) if a.features else None
     describe = run.load_describe(a.describe, options) if features is None else None
-    views = run.views_of(describe, features)
+    net, views = describe, run.views_of(describe, features)
     if a.whiten is not None:
         whitening = WhitenBy(a.whiten).learn()
         describe = None if describe is None else run.whitened(describe, whitening, views)
@@ -174,6 +174,8 @@ def _detect(a: argparse.Namespace) -> None:
     loops = sum(result.accepted is not None for result in results)
     print(f"{loops} loops in {len(results)} frames: {out / 'loops.csv'}; to be looked at: {out / 'report.html'}")
     print("\n".join(reasons))
+    if engine := getattr(net, "engine", ""):
+        print(f"descriptors: {a.describe}, computed by {engine}")
     if np.isfinite(detector.poses).any():
         left_out = write_g2o(out / "loops.g2o", detector.poses, detector.loops, run.from_poses(detector))
         note = f", {left_out} loops without a pose left out" if left_out else ""

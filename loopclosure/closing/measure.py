@@ -18,6 +18,7 @@ from loopclosure.places.frames import read_bgr, read_depth
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.progress import Progress, silent
+from netspec.errors import nearest_existing
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import safe_cell
 
@@ -44,6 +45,9 @@ def read_loops(path: Path, names: Sequence[str]) -> list[Loop]:
     numbers = {str(safe_cell(name)): number for number, name in enumerate(names)}
     numbers |= {name: number for number, name in enumerate(names)}
     loops = []
+    if not path.exists():
+        expected = "expected the loops.csv that loopclosure detect writes"
+        raise InputError(f"no such file; {expected}{nearest_existing(path)}", path)
     try:
         with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as stream:
             reader = csv.DictReader(stream, restval="")

@@ -304,6 +304,8 @@ class LoopDetector:
         frames, seconds = self._frames, self.settings.exclude_seconds
         if seconds and stamp is None:
             raise InputError(f"{seconds:g} s are to be excluded, but frame {frames.count} has no stamp")
+        if stamp is not None and not np.isfinite(stamp):
+            raise InputError(f"frame {frames.count} has stamp {stamp}; expected seconds")
         if stamp is not None and frames.count > self._sessions[-1] and stamp < frames.stamps[frames.count - 1]:
             raise InputError(f"frame {frames.count} has stamp {stamp:.6f}, earlier than the one before it")
 

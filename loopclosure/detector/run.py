@@ -83,7 +83,7 @@ def verdicts_said(results: Sequence[LoopResult]) -> str:
     verdicts = [result.verdict for result in results]
     words = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts))
     scores = [result.score for result in results if result.candidates]
-    return f"frames: {words}" + (f"; best score {max(scores):.4g}" if scores else "")
+    return f"frames: {words}" + (f"; best score {max(scores) + 0.0:.4g}" if scores else "")
 
 
 def from_poses(detector: LoopDetector) -> RelativePose:

@@ -17,6 +17,7 @@ from loopclosure.errors import InputError
 from netspec.files.image_list import list_images
 from netspec.files.kinds import is_cut_png
 from netspec.files.opencv import cv2
+from netspec.process.environment import environment
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 
@@ -112,16 +113,13 @@ def _capture(path: str | Path) -> cv2.VideoCapture:
         str(path).encode()
     except UnicodeEncodeError:  # it would end the process
         raise InputError("OpenCV opens no video whose path is not UTF-8; rename it", path) from None
-    return cv2.VideoCapture(str(path))
+    with environment({"OPENCV_FFMPEG_LOGLEVEL": "-8"}):  # it is read at the first video: FFmpeg prints nothing itself
+        return cv2.VideoCapture(str(path))
 
 
 def video_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
     """Yield (seconds from the start, image (H, W, 3) uint8 BGR) for each frame of a video file."""
-    capture = _capture(path)
-    if not capture.isOpened():
-        if Path(path).is_dir():
-            raise InputError("is a folder, and neither a video nor a ROS bag (which has a metadata.yaml)", path)
-        raise InputError("is not a readable video" if Path(path).is_file() else "no such video", path)
+    capture = _opened(path)
     rate = capture.get(cv2.CAP_PROP_FPS)
     number = 0
     try:
@@ -134,15 +132,39 @@ def video_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
     finally:
         capture.release()
     if not number:
-        raise InputError("has no readable frame", path)
+        raise InputError(f"opens, but no frame of it can be decoded{_advice(path)}", path)
 
 
 def video_length(path: str | Path) -> int | None:
-    """Return the number of frames that a video file says it has, None if it does not say."""
-    capture = _capture(path)
-    count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+    """Return the number of frames that a video file says it has, None if it does not say.
+
+    Raises InputError for a file that cannot be decoded.
+    """
+    capture = _opened(path)
+    count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    decoded = count > 0 or capture.read()[0]
     capture.release()
+    if not decoded:
+        raise InputError(f"opens, but no frame of it can be decoded{_advice(path)}", path)
     return count if count > 0 else None
+
+
+def _opened(path: str | Path) -> cv2.VideoCapture:
+    """Open a video. Raises InputError for what is none, or cannot be decoded."""
+    capture = _capture(path)
+    if not capture.isOpened():
+        if Path(path).is_dir():
+            raise InputError("is a folder, and neither a video nor a ROS bag (which has a metadata.yaml)", path)
+        if not Path(path).is_file():
+            raise InputError("no such video", path)
+        raise InputError(f"cannot be decoded as a video{_advice(path)}", path)
+    return capture
+
+
+def _advice(path: str | Path) -> str:
+    """Say what tried to decode a video, and what to do."""
+    advice = f"try ffmpeg -i {Path(path).name} %06d.png, and give the folder of images"
+    return f" by OpenCV {cv2.__version__}, which uses FFmpeg: it is cut, damaged, or of an unknown codec; {advice}"
 
 
 def gray(image: np.ndarray) -> np.ndarray:

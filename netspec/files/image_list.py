@@ -83,6 +83,9 @@ def _read_list(path: Path) -> ImageList:
         readings = list(_readings(text))
         for name, stamp in readings:
             if os.path.isfile(path.parent / name):  # unlike Path.is_file, it accepts names that no file can have
+                if stamp is not None and not np.isfinite(stamp):
+                    found = f'the time stamp "{text.split()[0]}" is not finite; expected seconds'
+                    raise SpecError(found, Where(str(path), number, line.index(text) + 1))
                 names.append(name)
                 stamps.append(stamp)
                 break

@@ -23,7 +23,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from netspec.errors import SpecError, Where
+from netspec.errors import SpecError, Where, printable
 
 try:
     import fcntl
@@ -34,6 +34,7 @@ NO_NUL = "a name has no character NUL"
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.unfinished")
 _MARK = re.compile(rb"a lock of netspec, held by process (\d+)\n")
 _AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # no link, and no pipe that nobody writes to
+_UNSEEN = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")  # controls, but for tabs and ends of lines
 _FORMULA = tuple("=+-@\t\r\n")  # what a formula begins with, for some spreadsheet
 _swept: set[Path] = set()
 
@@ -91,14 +92,20 @@ def write_csv(path: str | Path, head: Sequence[str], rows: Iterable[Sequence[obj
 
 
 def safe_cell(value: object) -> object:
-    """Return what stands in a table for a value: a text that a spreadsheet would compute gets an apostrophe."""
-    if not isinstance(value, str) or value[:1] not in _FORMULA:
+    """Return what stands in a table for a value: a text that a spreadsheet would compute gets an apostrophe.
+
+    Control characters, which a terminal would obey, are written as escapes; bytes that are not UTF-8 stay.
+    """
+    if not isinstance(value, str):
         return value
+    text = _UNSEEN.sub(lambda found: printable(found[0]), value)
+    if text[:1] not in _FORMULA:
+        return text
     try:
-        float(value)
+        float(text)
     except ValueError:
-        return f"'{value}"
-    return value
+        return f"'{text}"
+    return text
 
 
 @contextmanager

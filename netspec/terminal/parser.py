@@ -131,7 +131,7 @@ class Parser(argparse.ArgumentParser):
         """Return a hint at the option that is most like the first unknown one."""
         wrong = next((word for word in unknown if word.startswith("-")), "").partition("=")[0].lstrip("-")
         names = [name[2:] for name in self._option_string_actions if name.startswith("--")]
-        meant = did_you_mean(wrong, names)
+        meant = did_you_mean(wrong, [name for name in names if name[:1] == wrong[:1]])
         return meant.replace('mean "', 'mean "--') if wrong else ""
 
     def _translated(self, word: str) -> str:

@@ -72,6 +72,9 @@ REFUSED: dict[str, tuple[dict[str, str], str, str]] = {
         {"l.txt": "a.png\n  gone.png\n", "a.png": ""}, "l.txt", 'l.txt:2:3: no such image "gone.png" in .'),
     "a missing image with all else": (
         {"l.txt": "1.5 gone.png 1 # no\n"}, "l.txt", 'l.txt:1:5: no such image "gone.png" in .'),
+    "a stamp without end": (
+        {"l.txt": "1.5 a.png\n  1e999 a.png\n", "a.png": ""}, "l.txt",
+        'l.txt:2:3: the time stamp "1e999" is not finite; expected seconds'),
     "quotation marks that nobody wants": (
         {"l.txt": '"a.png"\n', "a.png": ""}, "l.txt", 'l.txt:1:1: no such image ""a.png"" in .'),
     "a folder in a list": ({"l.txt": "sub\n", "sub/a.png": ""}, "l.txt", 'l.txt:1:1: no such image "sub" in .'),

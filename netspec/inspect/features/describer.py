@@ -61,6 +61,11 @@ class Describer:
         self.views = len(self.image_net.zooms)
 
     @property
+    def engine(self) -> str:
+        """The engine that runs the net: the chosen one, or torch where that could not."""
+        return self.image_net.engine
+
+    @property
     def fingerprint(self) -> str:
         """16 hexadecimal digits: those of another net, of other weights or scaling differ; those of engines do not."""
         return self.image_net.fingerprint

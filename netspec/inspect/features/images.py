@@ -123,6 +123,11 @@ class ImageNet:
 
         write_model(self._build(), path)
 
+    @property
+    def engine(self) -> str:
+        """The engine that runs the net: the chosen one, or torch where that could not."""
+        return TORCH if self._model is None else self._choice.engine
+
     @cached_property
     def fingerprint(self) -> str:
         """A hash of what decides the blob: net and weights of the files, what is done to images; not the engine."""

@@ -87,7 +87,7 @@ def scaling_of(steps: Steps, layer: LayerParameter | None, shape: Shape, file: s
     ``file`` is the prototxt that the layer is from. Raises SpecError for a mean that does not fit.
     """
     if steps:
-        mean = np.zeros(1) if steps.mean is None else _fitted(steps.mean, shape, "--mean", Where("--mean"))
+        mean = np.zeros(1) if steps.mean is None else _fitted(steps.mean, shape, "the mean", Where("--mean"))
         return Scaling(mean, steps.scale, "from the options", steps.raw_scale, steps.swap)
     if layer is None:
         return Scaling(np.zeros(1), 1.0, "no transform_param")
@@ -110,11 +110,11 @@ def _fitted(mean: np.ndarray, shape: Shape, name: str, where: Where) -> np.ndarr
     channels, height, width = shape
     if mean.ndim < 2:
         if mean.size not in (1, channels):
-            raise SpecError(f"found {mean.size} {name} for images of {channels} channels", where)
+            raise SpecError(f"{name} has {mean.size} values, expected 1 or {channels}, one for each channel", where)
         return mean.reshape(-1, 1, 1)
     mean = mean[0] if mean.ndim == 4 and len(mean) == 1 else mean
     if mean.ndim != 3 or mean.shape[0] != channels or mean.shape[1] < height or mean.shape[2] < width:
-        raise SpecError(f"the mean of {name} is {mean.shape}, expected at least {shape}", where)
+        raise SpecError(f"{name} has shape {mean.shape}, expected at least {shape} for these images", where)
     return center(mean, height, width)
 
 

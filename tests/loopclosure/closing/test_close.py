@@ -9,7 +9,9 @@ import pytest
 
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.cli import main
+from loopclosure.closing.measure import read_loops
 from loopclosure.detector.export import relative_pose
+from loopclosure.errors import InputError
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.same_place import same_place_matrix
 from loopclosure.places.sequences import read_sequence
@@ -185,3 +187,16 @@ def test_every_third_frame(walk: Path, tmp_path: Path, capsys: pytest.CaptureFix
     before, after = errors(said)
     assert after < before
     assert len(read_poses(tmp_path / "out" / "closed.txt").poses) == FRAMES // 3
+
+
+def test_loops_that_are_not_there_are_named_as_far_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    expected = "out/lops.csv: no such file; expected the loops.csv that loopclosure detect writes"
+    with pytest.raises(InputError) as fault:
+        read_loops(Path("out/lops.csv"), ["a.png"])
+    assert (
+        str(fault.value) == f"{expected}; there is no lops.csv in {tmp_path}/out; the working directory is {tmp_path}"
+    )
+    with pytest.raises(InputError, match=f"; there is no gone in {tmp_path}$"):
+        read_loops(tmp_path / "gone" / "loops.csv", ["a.png"])

@@ -286,3 +286,13 @@ def test_sessions_of_a_damaged_file(tmp_path) -> None:
         np.savez(tmp_path / "y.npz", **{**arrays, "about": np.array(json.dumps(about))})
         with pytest.raises(InputError, match=r"expected a file that LoopDetector.save wrote"):
             LoopDetector.load(tmp_path / "y.npz")
+
+
+@pytest.mark.parametrize("stamp", [np.inf, -np.inf, np.nan])
+def test_a_stamp_that_is_not_finite_is_refused_and_the_next_frame_is_taken(stamp: float) -> None:
+    detector = LoopDetector()
+    detector.add_descriptor(np.ones(4), 1.0)
+    with pytest.raises(InputError, match=r"frame 1 has stamp .*; expected seconds"):
+        detector.add_descriptor(np.ones(4), stamp)
+    detector.add_descriptor(np.ones(4), 2.0)
+    assert len(detector) == 2

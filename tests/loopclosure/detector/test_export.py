@@ -2,6 +2,7 @@
 
 import csv
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -99,3 +100,11 @@ def test_a_name_can_be_any_bytes(tmp_path):
     assert b"caf\xe9.png,'=1+1.png" in (tmp_path / "loops.csv").read_bytes()
     (found,) = read_loops(tmp_path / "loops.csv", names)
     assert (found.query, found.match) == (1, 0)
+
+
+def test_control_characters_of_a_name_are_escaped_and_found_again(tmp_path: Path) -> None:
+    names = ["a\x1b[2J\x9b.png", "b.png"]
+    write_loops_csv(tmp_path / "loops.csv", [LoopResult(1, [(0, 0.5)], 0, "accepted", 0.5)], None, names)
+    assert not set(b"\x1b\x9b") & set((tmp_path / "loops.csv").read_bytes())
+    (loop,) = read_loops(tmp_path / "loops.csv", names)
+    assert (loop.query, loop.match) == (1, 0)

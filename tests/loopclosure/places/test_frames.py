@@ -1,8 +1,11 @@
 """Sources of frames: order, selection, and what is said of broken ones."""
 
 import os
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -225,3 +228,22 @@ def test_ctrl_c_ends_a_stream_and_keeps_what_was_found(camera, tmp_path, monkeyp
     assert (tmp_path / "loops.csv").is_file()
     with np.load(tmp_path / "d.npz") as saved:
         assert len(saved["rows"]) == 4
+
+
+@pytest.mark.parametrize("begin", [b"", b"\x00\x00\x00\x18ftypmp42\x00\x00\x00\x00mp42isom"])
+def test_a_video_that_cannot_be_decoded_says_so(begin: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "drive.mp4"
+    path.write_bytes(begin + bytes(range(256)) * 8)
+    for read in (video_length, lambda path: list(video_frames(path))):
+        with pytest.raises(InputError, match=r"drive\.mp4: cannot be decoded as a video by OpenCV .*; try ffmpeg -i"):
+            read(path)
+
+
+@pytest.mark.slow
+def test_of_a_video_that_cannot_be_decoded_nothing_else_is_printed(tmp_path: Path) -> None:
+    """FFmpeg prints lines of its own, unless it is told not to at the first video of a process."""
+    (tmp_path / "drive.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42\x00\x00\x00\x00mp42isom" + bytes(range(256)) * 8)
+    words = [sys.executable, "-m", "loopclosure", "detect", str(tmp_path / "drive.mp4"), "--out", str(tmp_path / "out")]
+    done = subprocess.run(words, check=False, capture_output=True, text=True)
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"{tmp_path}/drive.mp4: cannot be decoded as a video by OpenCV ")

@@ -46,8 +46,8 @@ def test_a_mean_image_is_cut_at_its_center():
 @pytest.mark.parametrize(
     ("mean", "fault"),
     [
-        (np.ones(2), "found 2 --mean for images of 3 channels"),
-        (np.ones((1, 3, 3)), r"the mean of --mean is \(1, 3, 3\), expected at least \(3, 1, 1\)"),
+        (np.ones(2), "--mean: the mean has 2 values, expected 1 or 3"),
+        (np.ones((1, 3, 3)), r"--mean: the mean has shape \(1, 3, 3\), expected at least \(3, 1, 1\)"),
         (np.ones((3, 0, 3)), "expected at least"),
     ],
 )
