@@ -31,16 +31,15 @@ class Where:
 
 
 def printable(text: str) -> str:
-    """Return a text in one line that moves no cursor: control characters are written as escapes.
+    """Return a text as one line, with control characters written as escapes.
 
-    Names come from files of strangers; raw, they could forge lines of a log, or talk to the terminal. Bytes of a file's
-    name that are not UTF-8 are escaped too: nothing could write them.
+    Names come from files that somebody else wrote. Unescaped, they could forge lines of a log or control the terminal.
+    Bytes of a file name that are not UTF-8 are escaped too, since they cannot be encoded.
     """
     return text.translate(_ESCAPES)
 
 
-# C0 and C1 controls, separators of lines, marks that turn the direction of writing, and what no file may hold: halves
-# of characters, and two that are none.
+# C0 and C1 controls, line separators, marks of the direction of writing, lone surrogates, and two noncharacters.
 _CONTROLS = [
     *(code for code in range(32) if chr(code) != "\t"),
     *range(127, 160),
@@ -68,17 +67,17 @@ class SpecError(ValueError):
 
 
 class InputError(SpecError):
-    """A fault of a user's data or choice, in a file or in none.
+    """An error in a user's data or options, whether in a file or not.
 
     ``str(error)`` is one line: ``file:line:column: message``; ``file: message`` if no line is known (line 0); the
-    message alone if the fault is not in a file.
+    message alone if the error is not in a file.
     """
 
     def __init__(self, message: str, file: str | os.PathLike[str] = "", line: int = 0, column: int = 0) -> None:
         super().__init__(message, Where(os.fspath(file), line, column) if os.fspath(file) else None)
 
 
-Report = Callable[[SpecError], None]  # takes an error; it may raise it, or collect it and let the work go on
+Report = Callable[[SpecError], None]  # receives an error, and raises it, or collects it so that the work continues
 
 
 def raise_fault(fault: SpecError) -> None:
@@ -108,14 +107,14 @@ class UnknownShape(SpecError):
 
 
 def check_choice(what: str, found: object, known: Sequence[str]) -> None:
-    """Raise SpecError for what is not one of the known words."""
+    """Raise SpecError if ``found`` is not one of the known words."""
     if found not in known:
         hint = did_you_mean(found, list(known)) if isinstance(found, str) else ""
         raise SpecError(f"found {what} {found!r}, expected {', '.join(map(repr, known))}{hint}")
 
 
 def several(given: Any) -> tuple[Any, ...]:
-    """Return several things where a caller may give one or none: a text or a path is one, not its letters."""
+    """Return a tuple of what a caller gave: None, one value, or several. A string or a path is one value."""
     if given is None:
         return ()
     return tuple(given) if isinstance(given, Iterable) and not isinstance(given, (str, bytes)) else (given,)

@@ -21,7 +21,7 @@ logger = logging.getLogger("netspec")
 
 
 class _OneLine(logging.Filter):
-    """Makes each message one line, but for a text that follows the first line (:func:`dump`)."""
+    """Makes each message one line, except for the text that :func:`dump` writes after its first line."""
 
     @override
     def filter(self, record: logging.LogRecord) -> bool:
@@ -64,7 +64,7 @@ def silent() -> Iterator[None]:
 
 
 class GlogFormatter(logging.Formatter):
-    """Format records like the glog of Caffe's time: exactly four space-separated fields before the message."""
+    """Format records as glog did when Caffe was written: four fields, separated by spaces, before the message."""
 
     @override
     def format(self, record: logging.LogRecord) -> str:

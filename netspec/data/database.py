@@ -221,7 +221,7 @@ def _runs(numbers: Sequence[int]) -> Iterator[slice]:
 
 
 def _said(fault: Exception) -> str:
-    """Return what the library says of a fault: it has bytes there."""
+    """Return the message of an error of the library, which gives it as bytes."""
     said = fault.args[0] if fault.args else ""
     return said.decode(errors="replace") if isinstance(said, bytes) else str(fault)
 

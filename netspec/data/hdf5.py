@@ -195,7 +195,7 @@ class Hdf5Sink:
         dataset[-len(rows) :] = rows
 
     def _end(self, fault: SpecError | None = None) -> None:
-        """End the file that is being written: it appears, or after a fault it is removed."""
+        """Close the file that is being written: it appears at its path, or is removed after an error."""
         writing, self._writing = self._writing, None
         if writing is not None:
             self._unused.detach()

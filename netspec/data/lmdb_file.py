@@ -127,7 +127,7 @@ class LmdbFile:
             return False
 
     def _meta(self, offset: int) -> tuple[int, ...] | None:
-        """Return the fields of a meta page, without those of its header; None if it is none."""
+        """Return the fields of a meta page, without those of its header; None if this is no meta page."""
         data = self._read(_META.size, offset + _HEADER)
         fields = _META.unpack(data) if len(data) == _META.size else (0, 0)
         return fields if fields[:2] == (_MAGIC, _VERSION) else None

@@ -219,7 +219,7 @@ def unblocked(plan: Plan, backward: Backward) -> Plan:
 
 
 def origins(plan: Plan, passes_on: Sequence[bool]) -> tuple[int, ...]:
-    """Return, by value, the one that it is by another name: a Split's top, or a Dropout's in testing, is its bottom."""
+    """Return for each value the one that it equals: a top of a Split, or of a Dropout in testing, equals its bottom."""
     found = list(range(len(plan.blobs)))
     for node, passes in zip(plan.nodes, passes_on, strict=True):
         if passes:

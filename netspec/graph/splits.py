@@ -57,7 +57,7 @@ def is_split(name: str, kind: str) -> bool:
 
 
 def without_splits(net: NetParameter) -> list[LayerParameter]:
-    """Return the layers without Split layers, their tops named again as what they copy."""
+    """Return the layers without Split layers; each reader of a copy reads the original blob."""
     names: dict[str, str] = {}
     layers = []
     for layer in net.layer:

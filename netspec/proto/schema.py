@@ -175,7 +175,7 @@ def value(message: Message, name: str) -> Any:
 
 
 def added_value(message: Message, name: str) -> str:
-    """Return the value that a field of an enum was given, if it is one that a dialect adds to the enum; else ""."""
+    """Return the name of the value of an enum field, if a dialect adds this value to the enum; else ""."""
     field = fields_of(message.DESCRIPTOR).get(name + MORE)
     if field is None or not field.present(message):
         return ""

@@ -71,9 +71,9 @@ class SourceMap:
         return replace(self.layers[index].find(*path), layer=layer, type=type)
 
     def telling(self, report: Report) -> SourceMap:
-        """Return the map of the same net whose faults go to ``report``."""
+        """Return a map of the same net that passes errors to ``report``."""
         return replace(self, report=report)
 
     def with_layers(self, layers: Iterable[Place]) -> SourceMap:
-        """Return the map of a net whose layers came from ``layers``, in order."""
+        """Return the map of a net with these layers, in order."""
         return replace(self, layers=tuple(layers))

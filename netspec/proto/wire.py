@@ -38,7 +38,7 @@ class Field(NamedTuple):
 
 
 def fields(data: Data, start: int, end: int) -> Iterator[Field]:
-    """Yield the fields of the message between two places. Raises ValueError where it is none."""
+    """Yield the fields of the message between two offsets. Raises ValueError if there is no valid message."""
     while start < end:
         head = data[start : min(end, start + _HEAD)]
         tag, size = _varint(head, 0)

@@ -33,7 +33,7 @@ def _write(message: Message, indent: str, lines: list[str]) -> None:
 
 
 def scalar_text(field: Field, value: Any) -> str:
-    """Return a value of a field that is no message, as the text of a prototxt has it."""
+    """Return the value of a scalar field as text, as it stands in a prototxt."""
     if field.type == Declared.TYPE_FLOAT:
         return _shortest(value, 6, 9, "f")
     if field.type == Declared.TYPE_DOUBLE:

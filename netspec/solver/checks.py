@@ -86,7 +86,7 @@ def divided_sums(net: Net) -> list[str]:
 
 
 def dependence(net: Net, threads: int) -> str:
-    """Return what to say of a net whose bits depend on the number of threads; "" if they do not."""
+    """Return a warning if the net's results depend, in the last bits, on the number of threads; else ""."""
     layers = divided_sums(net) if threads > 1 else []
     if not layers:
         return ""

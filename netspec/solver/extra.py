@@ -146,7 +146,7 @@ def write_extra(path: str | Path, extra: Extra) -> None:
 
 
 def read_extra(state: str | Path) -> Extra | None:
-    """Return what lies beside a state; None if nothing does: it is Caffe's. Raises SpecError for any other file."""
+    """Return the Extra of a state; None if there is no such file, as with Caffe's. Raises SpecError if it is bad."""
     path = path_beside(state)
     try:
         found = unsealed(path)

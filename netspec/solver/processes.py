@@ -34,7 +34,7 @@ class Lost(SpecError):
 
 
 class FaultOfAll(SpecError):
-    """A fault that every process knows of, so that one of them may tell it."""
+    """An error that every process knows of, so that only one of them reports it."""
 
 
 class Processes:

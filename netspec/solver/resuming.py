@@ -77,7 +77,7 @@ class Snapshots:
         return model, state
 
     def _running_states(self) -> list[dict[str, dict[str, Any]]]:
-        """Return what each net remembers. During a test, test nets' are as before: it is run again after a resume."""
+        """Return the running state of each net. During a test, test nets have that of before: a resume tests again."""
         training = self._training
         trained = [running_state(net) for net in (training.net, *training.replicas.nets)]
         tested = list(self._tests.states_before) or [running_state(net) for net in training.test_nets]
@@ -145,7 +145,7 @@ class Snapshots:
             log.logger.info(f"{where}: the training goes on as if it had never stopped")
 
     def _settings(self) -> Settings:
-        """Return what the numbers of this training follow from."""
+        """Return the settings that the numbers of this training depend on."""
         training = self._training
         manner: dict[str, Any] = {
             "precision": training.options.precision,

@@ -106,15 +106,18 @@ def write_state(path: str | Path, state: State, before: Callable[[Path], object]
 
 
 def find_learned_net(state: State, path: str | Path) -> Path:
-    """Return the file of the state's weights: beside the state, else as written. Raises SpecError if there is none."""
+    """Return the file of the state's weights, in the state's folder or at the path that it names.
+
+    Raises SpecError if there is none.
+    """
     if not state.learned_net:
         raise SpecError("names no weights to resume with", Where(str(path)))
     written = Path(state.learned_net)
-    beside = Path(path).parent / written.name
-    for candidate in (beside, written):
+    near = Path(path).parent / written.name
+    for candidate in (near, written):
         if os.path.isfile(candidate):
             return candidate
-    raise SpecError(f"its weights are neither at {beside} nor at {written}", Where(str(path)))
+    raise SpecError(f"its weights are neither at {near} nor at {written}", Where(str(path)))
 
 
 def _read_hdf5(path: str | Path) -> State:

@@ -225,7 +225,7 @@ class Training:
         return debug_info(net)
 
     def check_inputs(self) -> None:
-        """Raise SpecError where a net has inputs: nobody would fill them."""
+        """Raise SpecError if a net has inputs: a training has no values for them."""
         for net in (self.net, *self.test_nets):
             for fault in net.missing_inputs():
                 raise fault

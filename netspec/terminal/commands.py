@@ -80,7 +80,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
 
 
 def _fault_of_plugin(fault: Exception, plugins: Sequence[str]) -> str:
-    """Return a line for a fault that a user's file of layers raised, and "" for another."""
+    """Return the message for an exception that a user's file of layers raised; "" for any other exception."""
     files = {os.path.abspath(plugin) for plugin in plugins}
     for frame in reversed(traceback.extract_tb(fault.__traceback__)):
         if frame.filename in files:
@@ -90,10 +90,11 @@ def _fault_of_plugin(fault: Exception, plugins: Sequence[str]) -> str:
 
 
 class Interrupted(KeyboardInterrupt):
-    """An interrupt by a signal, its number.
+    """An interrupt by a signal; its argument is the number of the signal.
 
-    Where a KeyboardInterrupt itself passes through C code that runs Python source, as some modules do when they are
-    imported, Python notes it for good, and ends by SIGINT in the end though it was caught (Py_RunMain).
+    It is a subclass of KeyboardInterrupt for a reason: some modules run Python source from C code while they are
+    imported. If a plain KeyboardInterrupt passes through such code, Python remembers it and ends by SIGINT, even if it
+    was caught (Py_RunMain).
     """
 
 
@@ -101,7 +102,7 @@ class Interrupted(KeyboardInterrupt):
 def interruptible() -> Iterator[None]:
     """Make SIGTERM interrupt the block as Ctrl-C does: an Interrupted with the signal's number.
 
-    A second of either ends the process at once. Signals that the program around it handles or ignores are left alone.
+    A second signal ends the process at once. A signal that the caller already handles or ignores is not changed.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -121,7 +122,7 @@ def interruptible() -> Iterator[None]:
             signal.signal(number, interrupt)
         yield
     except Exception:
-        if came:  # what is imported meanwhile may make another error of it
+        if came:  # a module that was being imported may have turned the interrupt into another error
             raise Interrupted(*came) from None
         raise
     finally:
@@ -130,12 +131,12 @@ def interruptible() -> Iterator[None]:
 
 
 def _is_usual(handler: object) -> bool:
-    """Say whether a signal has no handler but Python's own, or that of a program that starts (``end_at_once``)."""
+    """Return whether a signal has the system's handler, Python's, or ``end_at_once`` of netspec/terminal/main.py."""
     return handler in (signal.SIG_DFL, signal.default_int_handler) or getattr(handler, "__name__", "") == "end_at_once"
 
 
 def _level(arguments: argparse.Namespace) -> int:
-    """Return the level of the log: the command's own, or a higher one set by glog's flag or variable."""
+    """Return the level of the log: the command's own, or a higher one set by glog's flag or environment variable."""
     minimum = arguments.minloglevel
     if minimum is None:
         variable = os.environ.get(VARIABLE, "")

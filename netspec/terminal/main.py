@@ -18,11 +18,13 @@ from netspec.process.signals import end_forked_processes_by_sigterm
 def program(module: str, words: Sequence[str] | None = None) -> int:
     """Run the command line of a module, and return its exit status.
 
-    An interrupt is one line and status 128 + its number from the start: most of a short command's time goes into
-    imports. Without ``words`` those of the process are taken, and it ends with the command: it answers signals to
-    Python's own end, which takes 0.1 s and longer, and lets them pass then. What the encoding of stdout does not have,
-    such as bytes of a file name that are not UTF-8, is printed as escapes. Where stderr is closed, what goes there is
-    lost.
+    ``words`` are the arguments of the command line, None for those of this process. Then the process is expected to end
+    with the command.
+
+    SIGINT and SIGTERM print one line and exit with status 128 + the number of the signal. This holds from the start,
+    since a short command spends most of its time importing. While Python shuts down, which takes 0.1 s or more, signals
+    are ignored. Characters that the encoding of stdout lacks are printed as escapes, for example bytes of a file name
+    that are not UTF-8. If stderr is closed, what is written to it is lost.
     """
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     ours = [number for number, handler in before.items() if handler in (signal.SIG_DFL, signal.default_int_handler)]
@@ -45,21 +47,21 @@ def program(module: str, words: Sequence[str] | None = None) -> int:
 
 
 def end_at_once(number: int, _: object) -> None:
-    """End the process with one line, while nothing is begun that must be undone; a command has a handler of its own."""
+    """End the process with one line. It handles signals until a command runs: until then there is nothing to undo."""
     with suppress(OSError):
         os.write(2, b"interrupted\n")
     os._exit(128 + number)
 
 
 def _ignore_signals(numbers: Sequence[int]) -> None:
-    """Pass signals over that would end the process at once: Python forgets that handler while it ends."""
+    """Ignore the signals that ``end_at_once`` handles: while Python shuts down, it resets that handler."""
     for number in numbers:
         if signal.getsignal(number) is end_at_once:
             signal.signal(number, signal.SIG_IGN)
 
 
 def _flush_stdout(status: int) -> int:
-    """Write what stdout still holds, and return the status. At its own end Python would print a traceback."""
+    """Flush stdout, and return the exit status. If this fails while Python shuts down, it prints a traceback."""
     out = sys.stdout
     if out is None:  # the caller has closed it
         return status
