@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import netspec
-from fresh_dialects import switched_on_by
 from golden_cases import LayerCase, assert_same_layers, parameters, train
 from netspec.dialects.boxes import highest
 from netspec.load import load_net
@@ -25,10 +24,6 @@ DATA = sorted((SSD / "training" / "data").iterdir())
 TRAININGS = ["corner_no_mining", "norm_per_channel"]
 
 
-def _use_dialects(prototxt: Path) -> None:
-    switched_on_by(prototxt.read_text())
-
-
 def _assert_close(found: np.ndarray, expected: np.ndarray, name: str, tolerance: float = 1e-5) -> None:
     assert found.shape == expected.shape, name
     scale = max(float(np.abs(expected).max(initial=0)), 1e-30)
@@ -38,7 +33,6 @@ def _assert_close(found: np.ndarray, expected: np.ndarray, name: str, tolerance:
 @pytest.mark.parametrize("folder", CASES, ids=lambda path: path.name)
 def test_a_layer_computes_what_the_branch_computed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(SSD)  # name_size.txt
-    _use_dialects(folder / "net.prototxt")
     case = LayerCase(folder)
     found = case.compute()
     assert [key for key in found if key.startswith("out/")] == sorted(k for k in case.golden if k.startswith("out/"))
@@ -50,7 +44,6 @@ def test_a_layer_computes_what_the_branch_computed(folder: Path, monkeypatch: py
 def test_images_and_boxes_are_read_as_the_branch_does(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(SSD / "training")
     golden = np.load(folder / "golden.npz")
-    _use_dialects(folder / "net.prototxt")
     net = load_net(folder / "net.prototxt")
     for i in range(sum(key.startswith("out/label") for key in golden)):
         outputs = net()
@@ -102,10 +95,6 @@ def test_a_number_that_is_none_does_not_stop_the_sort() -> None:
 
 
 def _lay_out(variant: str, folder: Path) -> None:
-    """Lay out a training as its paths want it, and switch on what its nets need."""
+    """Lay out a training as its paths want it."""
     for name in ("boxes_lmdb", variant):
         shutil.copytree(SSD / "training" / name, folder / name)
-    for name in ("train", "test"):
-        _use_dialects(folder / variant / f"{name}.prototxt")
-    for solver in (folder / variant).glob("eval_*.prototxt"):
-        _use_dialects(solver)
