@@ -30,7 +30,7 @@ from netspec.fast.table import entry_of, folds_of, inference_kernel, is_fresh
 from netspec.graph.options import PACK
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.learned import Stamp, is_lent, stamp
+from netspec.layers.contract.learned import Seen, blobs_of, is_lent
 from netspec.layers.contract.reading import changes_itself
 from netspec.process.heap import give_back_freed_memory
 from netspec.run.shapes import fitted
@@ -49,21 +49,21 @@ class PreparedLine:
     schedule: Schedule
     kinds: list[str]
     one_thread: bool
-    frozen: list[tuple[dict[str, Any], str, torch.Tensor, Stamp]]
-    waiting: list[tuple[torch.Tensor, Stamp]]
+    frozen: list[int]  # of the net's learned blobs: those whose values it holds
+    seen: Seen  # these, as they were
+    waiting: list[tuple[torch.Tensor, Seen]]  # those that were changing
     memos: set[Any]  # the keys of what it keeps in memory beside the blobs
     kept: int  # bytes that kernels keep for these shapes
     need: int  # bytes of the values that are alive at one time, at most, and of what kernels keep
 
-    def is_current(self) -> bool:
+    def is_current(self, blobs: list[torch.Tensor]) -> bool:
         """Return whether no blob was written to or replaced since, and every blob that was changing still is."""
-        for owner, name, blob, before in self.frozen:
-            if owner[name] is not blob or stamp(blob) != before:
-                return False
+        if not self.seen.are([blobs[i] for i in self.frozen] if self.waiting else blobs):
+            return False
         if not self.waiting:
             return True
-        resting = [stamp(blob) == before and not is_lent(blob) for blob, before in self.waiting]
-        self.waiting = [(blob, stamp(blob)) for blob, _ in self.waiting]
+        resting = [before.are([blob]) and not is_lent(blob) for blob, before in self.waiting]
+        self.waiting = [(blob, Seen([blob], values=True)) for blob, _ in self.waiting]
         return not any(resting)
 
 
@@ -88,8 +88,9 @@ class Prepared:
             if not node.bottoms and not layer.is_input
         ]
         self.made: OrderedDict[Any, PreparedLine] = OrderedDict()
-        self.memos: dict[Any, tuple[tuple[Stamp, ...], Any]] = {}  # what layers keep, by what they need it for
-        self._seen: dict[int, Stamp] = {}
+        self.memos: dict[Any, tuple[Seen, Any]] = {}  # what layers keep, by what they need it for
+        self._blobs = blobs_of(self._layers)
+        self._seen: dict[int, Seen] = {}
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
         """Run the net on the values ``given`` by the caller; None where torch records gradients or a graph.
@@ -111,7 +112,7 @@ class Prepared:
         """Return the program for values of these shapes and types, made now or before."""
         key = (given, kept)
         program = self.made.get(key)
-        if program is None or not program.is_current():
+        if program is None or not program.is_current(self._blobs()):
             give_back_freed_memory()
             with torch.inference_mode(False), torch.no_grad():
                 program = self.made[key] = self._make(given, kept)
@@ -167,15 +168,16 @@ class Prepared:
             kernel, kind = self._kernel(step, layers, found[step.node] is None, as_is[step.node], memos, own.append)
             kinds.append("exact" if exact[step.node] else kind)
             line.append(Step(step.node, kernel, step.bottoms, step.tops, self._losses[step.node], step.ends))
-        owners: list[dict[str, Any]] = [layer.blobs._parameters for layer in self._layers]
-        blobs = [(owner, name, blob) for owner in owners for name, blob in owner.items()]
+        blobs = self._blobs()
+        frozen = [i for i, blob in enumerate(blobs) if id(blob) not in changing]
         return PreparedLine(
             line,
             order,
             kinds,
             any(exact),
-            [(owner, name, blob, stamp(blob)) for owner, name, blob in blobs if id(blob) not in changing],
-            [(blob, stamp(blob)) for _, _, blob in blobs if id(blob) in changing],
+            frozen,
+            Seen([blobs[i] for i in frozen], values=True),
+            [(blob, Seen([blob], values=True)) for blob in blobs if id(blob) in changing],
             memos,
             sum(own),
             sum(own) + _most_alive(order.steps, shapes),
@@ -205,12 +207,12 @@ class Prepared:
 
         def memo(name: str, make: Callable[[], Any]) -> Any:
             uses.append(name)
-            stamps = tuple(stamp(blob) for blob in blobs)
             key = (name, step.node if step.chain else -1, *map(id, blobs))  # layers that share blobs share this too
             memos.add(key)
-            if self.memos.get(key, (None,))[0] != stamps:
-                self.memos[key] = stamps, make()
-            return self.memos[key][1]
+            kept = self.memos.get(key)
+            if kept is None or not kept[0].are(blobs):
+                kept = self.memos[key] = Seen(blobs, values=True), make()
+            return kept[1]
 
         if step.chain:
             chain = step.chain
@@ -231,12 +233,11 @@ class Prepared:
     def _changing(self) -> set[int]:
         """Return which learned blobs may change between runs: those that did, and those with a live alias."""
         found = set()
-        for layer in self._layers:
-            for blob in layer.blobs:
-                now = stamp(blob)
-                if self._seen.get(id(blob), now) != now or is_lent(blob):
-                    found.add(id(blob))
-                self._seen[id(blob)] = now
+        for blob in self._blobs():
+            before = self._seen.get(id(blob))
+            if (before and not before.are([blob])) or is_lent(blob):
+                found.add(id(blob))
+            self._seen[id(blob)] = Seen([blob], values=True)
         return found
 
 

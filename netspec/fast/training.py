@@ -13,7 +13,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from operator import is_
 from typing import Any
 
 import torch
@@ -25,8 +24,9 @@ from netspec.files.limits import is_out_of_memory
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.gradients import gradient_reads, gradients_from_memory
+from netspec.layers.contract.learned import Seen, blobs_of
 from netspec.run.parts import Part
-from netspec.run.recorded import Backward, Diff, Kernels, recorded
+from netspec.run.recorded import Backward, Kernels, recorded
 from netspec.run.walk import losses_of
 
 LARGEST = 2**22  # numbers in all tops: beyond, autograd's work is nothing beside the layers', and it needs less memory
@@ -66,19 +66,7 @@ class _Prepared:
     forward: list[tuple[Kernel, tuple[int, ...], tuple[int, ...], tuple[tuple[int, float], ...]]]
     backward: list[tuple[Backward, tuple[int, ...], tuple[int, ...]]]
     start: Values  # the gradients that are there before the backward pass: those of the losses
-    blobs: list[torch.Tensor]
-    addresses: list[int]
-    learned: list[bool]
-    gradients: list[Diff]
-
-    def is_current(self, blobs: list[torch.Tensor]) -> bool:
-        """Return whether learnable blobs and their gradients lie where they did."""
-        return (
-            all(map(is_, blobs, self.blobs))
-            and all(map(is_, [blob.grad for blob in blobs], self.gradients))
-            and [blob.data_ptr() for blob in blobs] == self.addresses
-            and [blob.requires_grad for blob in blobs] == self.learned
-        )
+    seen: Seen  # the learnable blobs, into whose gradients they write
 
 
 class TrainingStep:
@@ -110,8 +98,8 @@ class TrainingStep:
                 layer._backward_pre_hooks,
             )
         ]
-        self._owners = [(layer.blobs._parameters, name) for layer in layers for name in layer.blobs._parameters]
-        self._made: dict[tuple[torch.Size, ...], _Prepared] = {}
+        self._blobs = blobs_of(layers)
+        self._made: dict[Any, _Prepared] = {}  # by shapes, and by which blobs learn
         self._values: Values = []
         self.keeps = False  # whether ``passed`` has the values of a pass, and their gradients, until the next
         self.passed: tuple[Values, Values] | None = None
@@ -121,9 +109,6 @@ class TrainingStep:
         if any(self._hooks) or not torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
             return True
         return any(blob._backward_hooks or blob._post_accumulate_grad_hooks for blob in self._blobs())
-
-    def _blobs(self) -> list[Any]:
-        return [owner[name] for owner, name in self._owners]
 
     def run(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net forward and backward; return the weighted sum of its losses, and the outputs.
@@ -141,8 +126,10 @@ class TrainingStep:
                     for v, top in zip(plan.nodes[i].tops, tops if isinstance(tops, tuple) else (tops,), strict=False):
                         values[v] = top
                         shapes.append(top.shape)
-                prepared = self._made.get(key := tuple(shapes))
-                if prepared is None or not prepared.is_current(self._blobs()):
+                blobs = self._blobs()
+                key = (*shapes, *[blob.requires_grad for blob in blobs])
+                prepared = self._made.get(key)
+                if prepared is None or not prepared.seen.are(blobs):
                     self._made = {key: (prepared := self._prepare(values))}
                 return self._run(prepared, values)
         except (MemoryError, RuntimeError) as fault:
@@ -190,15 +177,7 @@ class TrainingStep:
         for blob in blobs:
             if blob.requires_grad and blob.grad is None:
                 blob.grad = torch.zeros_like(blob, memory_format=torch.contiguous_format)
-        made = _Prepared(
-            [],
-            [],
-            [None] * (len(plan.blobs) + len(plan.nodes)),
-            blobs,
-            [blob.data_ptr() for blob in blobs],
-            [blob.requires_grad for blob in blobs],
-            [blob.grad for blob in blobs],
-        )
+        made = _Prepared([], [], [None] * (len(plan.blobs) + len(plan.nodes)), Seen(blobs))
         for part in self._parts:
             i, layer, node, tops = part.last, part.layer, plan.nodes[part.first], plan.nodes[part.last].tops
             if i in self._sources:

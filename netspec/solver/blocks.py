@@ -11,12 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from operator import is_
 from typing import Any
 
 import torch
 
-from netspec.layers.contract.learned import values_of
+from netspec.layers.contract.learned import Seen, values_of
 from netspec.net.assembly import Learnable
 from netspec.solver import update
 
@@ -43,8 +42,6 @@ class Blocks:
     def __init__(self, learnable: Sequence[Learnable], sets: int) -> None:
         self._learnable, self._sets = learnable, sets
         self._placed: list[torch.nn.Parameter] = []
-        self._addresses: list[int] = []
-        self._their_gradients: list[torch.Tensor | None] = []
         self._gradients: list[torch.Tensor] = []  # each piece of memory
         self._blocks: list[_Block] = []
         self._histories: dict[int, list[torch.Tensor]] = {}
@@ -61,6 +58,7 @@ class Blocks:
         for indices in groups.values():
             self._put_together(indices)
         self.history = [self._histories[i][k] for k in range(sets) for i in range(len(learnable))]
+        self._seen = Seen(self._placed)
 
     def _put_together(self, indices: Sequence[int]) -> None:
         """Put blobs with the same multipliers into pieces of memory of at most ``BLOCK`` numbers."""
@@ -87,17 +85,11 @@ class Blocks:
             blob.data = weights[here].view(shape)
             if blob.requires_grad:
                 blob.grad = diffs[here].view(shape)
-            self._place(blob)
+            self._placed.append(blob)
             self._histories[i] = [each[here].view(shape) for each in history]
             start += _lines(blob)
         self._gradients.append(diffs)
         self._blocks.append(_Block(weights, diffs, history, first.lr_mult, first.decay_mult))
-
-    def _place(self, blob: torch.nn.Parameter) -> None:
-        """Note where a parameter and its gradient are."""
-        self._placed.append(blob)
-        self._addresses.append(blob.data_ptr())
-        self._their_gradients.append(blob.grad)
 
     def _keep(self, i: int) -> None:
         """Cut a large blob, which stays where it is, into blocks."""
@@ -105,7 +97,7 @@ class Blocks:
         blob = item.parameter
         if blob.requires_grad:
             blob.grad = torch.zeros_like(blob)
-        self._place(blob)
+        self._placed.append(blob)
         self._histories[i] = [torch.zeros_like(values_of(blob)) for _ in range(self._sets)]
         diffs = torch.zeros_like(values_of(blob)) if blob.grad is None else blob.grad
         self._gradients.append(diffs)
@@ -115,12 +107,7 @@ class Blocks:
 
     def _are_in_place(self) -> bool:
         """Return whether parameters and gradients are where they were put."""
-        blobs = self._placed
-        return (
-            bool(self._blocks)
-            and all(map(is_, [blob.grad for blob in blobs], self._their_gradients))
-            and [blob.data_ptr() for blob in blobs] == self._addresses
-        )
+        return bool(self._blocks) and self._seen.are(self._placed)
 
     def clear(self) -> None:
         """Set all gradients to 0."""

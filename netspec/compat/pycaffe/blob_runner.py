@@ -26,7 +26,6 @@ from netspec.compat.pycaffe.tapes import (
     gradient_of,
     overwrites_shared,
     parameters,
-    places_of,
     storages,
     undisturbed,
 )
@@ -34,6 +33,7 @@ from netspec.exact.blas import one_thread
 from netspec.graph.plan import AUTOMATIC
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.gradients import gradient_reads, gradients_from_memory
+from netspec.layers.contract.learned import Seen
 from netspec.layers.contract.reading import Constant
 from netspec.layers.utility.live_blobs import Blob, BorrowedMemory
 from netspec.layers.utility.pycaffe_shim import importable
@@ -379,13 +379,15 @@ class BlobRunner:
         if not self._has_kernels[i]:
             return None
         shapes = [blob.shape for blob in self.bottoms[i]]
-        if bound is None or bound.shapes != shapes or bound.places != places_of(layer):
+        blobs = list(layer.blobs)
+        learn = [blob.requires_grad for blob in blobs]
+        if bound is None or (bound.shapes, bound.learn) != (shapes, learn) or not bound.seen.are(blobs):
             layer.fit(shapes)
             sums = tuple(gradient_of(blob) if blob.requires_grad else None for blob in layer.blobs)
             wanted = tuple(self.net.backward_plan.computed[i])
             made = self.net.options.speed.kernels(layer, wanted, sums)
             made = made or recorded(layer.run, wanted, list(layer.blobs))
-            bound = self._bound[i] = Bound(shapes, places_of(layer), made)
+            bound = self._bound[i] = Bound(shapes, learn, Seen(blobs), made)
         return bound
 
     def _tape(self, i: int) -> Tape:

@@ -11,6 +11,7 @@ import torch
 
 from netspec.graph.plan import Node
 from netspec.layers.contract.base import Layer
+from netspec.layers.contract.learned import Seen
 from netspec.layers.utility.live_blobs import Blob, BlobVec, BorrowedMemory
 from netspec.run.recorded import Kernels
 
@@ -30,10 +31,14 @@ class Tape:
 
 @dataclass(frozen=True)
 class Bound:
-    """The kernels of a layer for bottoms of these shapes, and where its learnable blobs were when they were made."""
+    """The kernels of a layer for bottoms of these shapes, and its learnable blobs as they were when they were made.
+
+    ``learn[j]`` says whether blob j's gradient is added up.
+    """
 
     shapes: list[tuple[int, ...]]
-    places: list[Any]
+    learn: list[bool]
+    seen: Seen
     kernels: Kernels
 
 
@@ -62,11 +67,6 @@ def undisturbed(layer: Layer) -> Iterator[None]:
             with torch.no_grad():
                 for blob, before in zip(layer.blobs, blobs, strict=True):
                     blob.copy_(before)
-
-
-def places_of(layer: Layer) -> list[Any]:
-    """Return where a layer's learnable blobs and their gradients are."""
-    return [place for blob in layer.blobs for place in (blob.data_ptr(), id(blob.grad), blob.requires_grad)]
 
 
 def storages(tensors: Sequence[torch.Tensor]) -> set[int]:

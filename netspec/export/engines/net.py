@@ -6,7 +6,6 @@ import gc
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from netspec.export.engines.runners import Unable, tell_unable
 from netspec.export.formats.convert import Source
 from netspec.export.formats.onnx import export_onnx
 from netspec.graph.options import BuildOptions
-from netspec.layers.contract.learned import Stamp, is_lent, stamp
+from netspec.layers.contract.learned import Seen, blobs_of, is_lent
 from netspec.layers.contract.reading import reads_data
 from netspec.net.net import Net
 from netspec.proto.schema import PHASE_NAMES, TEST
@@ -83,7 +82,7 @@ class Engine:
     def __init__(self, net: Net, choice: Choice, origin: Origin | None, write: Write) -> None:
         self._plan, self._layers, self._exact = net.plan, list(net.layers), net.options.exact
         self._choice, self._from, self._write = choice, origin, write
-        self._blobs_of = [layer.blobs._parameters for layer in net.layers if len(layer.blobs)]
+        self._blobs = blobs_of(net.layers)
         losses = zip(net.plan.nodes, losses_of(net.loss_weights), strict=True)
         # The values that are losses with a name, and their weights.
         self._weighted = [(node.tops[j], w) for node, own in losses for j, w in own if j < len(node.tops)]
@@ -93,8 +92,8 @@ class Engine:
         self._ends = {v: net.plan.blobs[v] for node in ends for v in node.tops}  # what no layer computes
         self._built = {blob: net.shapes[blob] for blob in self._ends.values()}
         self._model: Model | None = None
-        self._opened_for: tuple[Any, ...] | None = None
-        self._as_loaded = self._exported = self._stamps()
+        self._opened_for: tuple[str, ...] = ()  # the blobs that the model has
+        self._loaded = self._exported = self._seen()  # the learned blobs as they were then
         self._unable, self._told = False, False
         self._fits: tuple[dict[int, Shape], dict[int, Shape]] = {}, {}  # of the inputs at the last pass, of all values
 
@@ -141,27 +140,23 @@ class Engine:
             self._fits = given, fitted(self._plan, self._layers, given)[1]
         return self._fits[1]
 
-    def _blobs(self) -> list[Any]:
-        """Return the learned blobs as they are now; to iterate over ParameterLists takes longer than a small net."""
-        return [blob for owner in self._blobs_of for blob in owner.values()]
-
-    def _stamps(self) -> tuple[Stamp, ...]:
-        return tuple(map(stamp, self._blobs()))
+    def _seen(self) -> Seen:
+        return Seen(self._blobs(), values=True)
 
     def _current(self, blobs: tuple[str, ...]) -> Model:
         """Return the model of the net as it is, with these blobs."""
-        if self._model is None or self._opened_for != (self._stamps(), blobs):
-            computed = [blob for blob in blobs if blob not in self._built]
-            self._model = Model(self._choice, self._origin(blobs), lambda path: self._write(path, computed))
-            if self._as_loaded == self._exported:
-                self._as_loaded = self._stamps()
-            self._opened_for = (self._stamps(), blobs)  # the export, too, counts as handing them out
+        if self._model is None or self._opened_for != blobs or not self._exported.are(self._blobs()):
+            computed, as_loaded = [blob for blob in blobs if blob not in self._built], self._loaded.are(self._blobs())
+            origin = self._origin(blobs) if as_loaded else None
+            self._model = Model(self._choice, origin, lambda path: self._write(path, computed))
+            self._opened_for, self._exported = blobs, self._seen()  # the export, too, counts as handing them out
+            if as_loaded:
+                self._loaded = self._exported
         return self._model
 
     def _origin(self, blobs: tuple[str, ...]) -> Origin | None:
-        """Return what the net is made of; None where its parameters are not those of files, or no longer."""
-        self._exported = self._stamps()
-        if self._exported != self._as_loaded or (self._from is None and self._exported):
+        """Return what the net is made of; None where its parameters are not those of files."""
+        if self._from is None and self._blobs():
             return None
         files, options = (self._from.files, self._from.options) if self._from else ([], {})
         return Origin(files, {**options, "blobs": blobs, "shapes": self._built})

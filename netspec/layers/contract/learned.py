@@ -1,4 +1,4 @@
-"""A layer's learned blobs, which record when their memory was handed out.
+"""A layer's learned blobs: they record when their memory was handed out; and :class:`Seen`, whether they are as before.
 
 Torch counts the writes to a tensor, but not those to what ``data`` and ``detach`` hand out, nor those of numpy. What a
 net keeps of its weights in another form, folded or laid out for a kernel, must follow all of them.
@@ -6,13 +6,13 @@ net keeps of its weights in another form, folded or laid out for a kernel, must 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
+from operator import is_
 from typing import Any
 
 import torch
 from typing_extensions import override
-
-Stamp = tuple[int, int, int]
 
 
 class Learned(torch.nn.Parameter):
@@ -54,10 +54,48 @@ def values_of(blob: torch.Tensor) -> torch.Tensor:
     return torch.Tensor.detach(blob)
 
 
-def stamp(blob: torch.Tensor) -> Stamp:
-    """Return what changes when a blob is written to, replaced or handed out."""
-    version = 0 if blob.is_inference() else blob._version
-    return version, getattr(blob, "handed_out", 0), blob.data_ptr()
+def blobs_of(layers: Iterable[torch.nn.Module]) -> Callable[[], list[Any]]:
+    """Return what lists the learned blobs of layers as they are at that time.
+
+    To iterate over ParameterLists takes longer than a run of a small net.
+    """
+    owners = [layer.blobs._parameters for layer in layers]  # pyright: ignore[reportAttributeAccessIssue]
+    places = [(owner, name) for owner in owners for name in owner]
+    return lambda: [owner[name] for owner, name in places]
+
+
+class Seen:
+    """Learned blobs as they were when something was made for them.
+
+    What was made reads and writes their memory, and that of their gradients. Or it holds their ``values`` in another
+    form: then a write to them counts, too, and that their memory was handed out.
+    """
+
+    __slots__ = ("_addresses", "_blobs", "_counts", "_gradients", "_values")
+
+    def __init__(self, blobs: Iterable[torch.Tensor], values: bool = False) -> None:
+        self._blobs, self._values = list(blobs), values
+        self._addresses = [blob.data_ptr() for blob in self._blobs]
+        self._gradients = [] if values else [blob.grad for blob in self._blobs]
+        self._counts = _counts(self._blobs) if values else []
+
+    def are(self, blobs: Sequence[torch.Tensor]) -> bool:
+        """Return whether these are the same blobs, and as they were."""
+        if len(blobs) != len(self._blobs) or not all(map(is_, blobs, self._blobs)):
+            return False
+        if [blob.data_ptr() for blob in blobs] != self._addresses:
+            return False
+        if self._values:
+            return _counts(blobs) == self._counts
+        return all(map(is_, [blob.grad for blob in blobs], self._gradients))
+
+
+def _counts(blobs: Sequence[Any]) -> list[tuple[int, int]]:
+    """Return how often each blob was written to, and how often its memory was handed out."""
+    try:
+        return [(blob._version, blob.handed_out) for blob in blobs]
+    except (AttributeError, RuntimeError):  # of other classes, or of inference mode, where torch counts no writes
+        return [(0 if b.is_inference() else b._version, getattr(b, "handed_out", 0)) for b in blobs]
 
 
 def is_lent(blob: torch.Tensor) -> bool:

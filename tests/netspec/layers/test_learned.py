@@ -1,0 +1,56 @@
+"""Whether learned blobs are as they were when something was made for them."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from netspec.layers.contract.learned import Learned, Seen
+
+
+def blob() -> Learned:
+    made = Learned(torch.ones(3))
+    made.grad = torch.zeros(3)
+    return made
+
+
+def _write(one: Learned) -> None:
+    with torch.no_grad():
+        one.add_(1)
+
+
+def _move(one: Learned) -> None:
+    one.data = torch.ones(3)
+
+
+def _give_another_gradient(one: Learned) -> None:
+    one.grad = torch.zeros(3)
+
+
+@pytest.mark.parametrize(
+    ("change", "memory", "values"),
+    [
+        (lambda one: None, True, True),
+        (_write, True, False),
+        (lambda one: one.data, True, False),
+        (lambda one: one.detach().numpy(), True, False),
+        (_move, False, False),
+        (_give_another_gradient, False, True),
+    ],
+    ids=["nothing", "write", "data", "array", "move", "gradient"],
+)
+def test_a_change_counts_for_what_holds_values_or_uses_memory(
+    change: Callable[[Learned], object], memory: bool, values: bool
+) -> None:
+    one = blob()
+    seen = {kind: Seen([one], values=kind) for kind in (False, True)}
+    change(one)
+    assert (seen[False].are([one]), seen[True].are([one])) == (memory, values)
+
+
+def test_other_blobs_are_not_those_that_were_seen() -> None:
+    one, other = blob(), blob()
+    for values in (False, True):
+        assert not Seen([one], values).are([other])
+        assert not Seen([one], values).are([one, other])
+        assert Seen([one, other], values).are([one, other])
