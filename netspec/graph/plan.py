@@ -71,10 +71,12 @@ def make_plan(net: NetParameter, source: SourceMap) -> Plan:
         def fault(message: str, *path: str | int, i: int = i, layer: LayerParameter = layer) -> None:
             source.report(SpecError(message, source.at(i, *path, layer=layer.name, type=layer.type)))
 
-        if layer.propagate_down and len(layer.propagate_down) != len(layer.bottom):
+        propagate = list(layer.propagate_down) or [True] * len(layer.bottom)
+        if len(propagate) != len(layer.bottom):
             fault(
                 f"found {len(layer.propagate_down)} propagate_down, expected 0 or {len(layer.bottom)}", "propagate_down"
             )
+            propagate = [True] * len(layer.bottom)
         bottoms = tuple(current.get(blob, -1) for blob in layer.bottom)
         available.difference_update(layer.bottom)
         tops, in_place = [], []
@@ -102,7 +104,7 @@ def make_plan(net: NetParameter, source: SourceMap) -> Plan:
                 owner = None if owner == (i, j) else owner
                 lr_mult, decay_mult = multipliers[spec.name]
             params.append(Param(spec.name, lr_mult, decay_mult, spec.share_mode == PERMISSIVE, owner))
-        blocked = tuple(not down for down in layer.propagate_down) or (False,) * len(bottoms)
+        blocked = tuple(not down for down in propagate)
         nodes.append(Node(layer.name, layer.type, bottoms, tuple(tops), tuple(in_place), tuple(params), blocked))
     outputs = {name: current[name] for name in sorted(available)}
     return Plan(net, source, tuple(nodes), tuple(blobs), outputs, _last_values(nodes, len(blobs)))
