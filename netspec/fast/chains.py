@@ -18,13 +18,16 @@ class Roles:
 
     ``absorbs``: it can scale and shift its top's channels; ``affine``: that is all it does to its one bottom;
     ``absorbs_before``: it can do so to its bottom's channels before its own work; ``passes_on``: its tops are its
-    bottom.
+    bottom; ``finishes``: it can be computed in place, at the end of the step before; ``fresh``: its top is memory of
+    its own. Only :func:`netspec.fast.steps.schedule` reads the last two.
     """
 
     absorbs: Sequence[bool]
     affine: Sequence[bool]
     absorbs_before: Sequence[bool]
     passes_on: Sequence[bool]
+    finishes: Sequence[bool] = ()
+    fresh: Sequence[bool] = ()
 
 
 @dataclass(frozen=True)

@@ -47,17 +47,15 @@ class Schedule:
 def schedule(
     plan: Plan,
     roles: Roles,
-    finishes: Sequence[bool],
-    fresh: Sequence[bool],
     given: Collection[int],
     kept: Collection[int],
     passes: Collection[str],
 ) -> Schedule:
     """Return the steps that compute the values ``kept`` and the net's outputs, and run every layer, once.
 
-    ``finishes[i]``: layer i can be computed in place; ``fresh[i]``: its top is memory of its own. The values ``given``
-    are there before the first step.
+    The values ``given`` are there before the first step.
     """
+    finishes, fresh = roles.finishes, roles.fresh
     passes_on = roles.passes_on if SKIP in passes else [False] * len(plan.nodes)
     kept = {*kept, *plan.outputs.values()}
     chains = find_chains(plan, replace(roles, passes_on=passes_on), kept) if FOLD in passes else []

@@ -118,8 +118,6 @@ UNMENDED = {
     "loopclosure/methods/drive.py: _among",
     "loopclosure/places/datasets.py: load_sequence",
     "loopclosure/places/datasets.py: load_fabmap",
-    "netspec/fast/layers/vision.py: _convolutions",
-    "netspec/fast/steps.py: schedule",
 }
 
 

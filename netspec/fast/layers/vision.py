@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -54,26 +54,25 @@ def learn_convolution(layer: Convolution, how: Learning) -> Kernels | None:
         return None
     shape, sliding = layer.bottom_shapes[0], Filter(layer.kernel, layer.stride, layer.pad, layer.dilation)
     (weight, bias), sums = weight_and_bias(layer, how)
+    weights = Weights(weight, bias, *sums)
     if layer.is_exact(weight, layer.small):
-        weights = Weights(weight, bias, *sums)
         bound = BoundColumns(shape, sliding, layer.group, weights, how.wanted[0], how.steady)
         return Kernels(bound.forward, bound.backward)
     if layer.reads_padding_alone:
         return None
     lay_out = channels_side_by_side if math.prod(shape) > 2 * weight.numel() else map_by_map
-    return _convolutions(layer, sliding, weight, bias, sums, how.wanted[0], lay_out)
+    return _convolutions(layer, sliding, weights, how.wanted[0], lay_out)
 
 
 def _convolutions(
     layer: Convolution,
     sliding: Filter,
-    weight: torch.Tensor,
-    bias: torch.Tensor | None,
-    sums: Sequence[torch.Tensor | None],
+    weights: Weights,
     wanted: bool,
     lay_out: Callable[[torch.Tensor], torch.Tensor],
 ) -> Kernels:
     """Return what SummedConvolutions (exact/products.py) computes, of maps that ``lay_out`` puts into its order."""
+    weight, bias, *sums = weights
     geometry = (sliding.stride, sliding.pad, sliding.dilation)
     asked = (wanted, *(total is not None for total in sums))
     bias_shape = None if bias is None else list(bias.shape)
