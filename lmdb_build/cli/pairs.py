@@ -26,11 +26,10 @@ from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_sequence
 from loopclosure.places.source import (
     LAYOUTS,
+    PAIRED,
     POSE_FORM_HELP,
-    POSES,
     POSES_HELP,
     RECORDED,
-    TOPICS,
     Source,
     extract,
     is_recording,
@@ -42,17 +41,6 @@ from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands, above_zero, seed
 
 SEQUENCES = ("", *LAYOUTS)
-KINDS = {
-    "": (*POSES, *TOPICS, "truth", "camera"),
-    **dict.fromkeys(LAYOUTS, (*POSES, *TOPICS)),
-    "images": (*POSES, "truth", "camera"),
-    "traverses": ("references", "truth"),
-    "nordland": (),
-    "folders": ("references",),
-    "table": ("group", "index"),
-    "index": ("group", "track", "time", "max-gap"),
-    "singles": (),
-}
 NEEDED = {
     "images": ("truth",),
     "traverses": ("references", "truth"),
@@ -238,7 +226,7 @@ def _pairs(arguments: argparse.Namespace) -> None:
 
 def _source_text(text: str) -> Source:
     try:
-        found = read_source(text, KINDS)
+        found = read_source(text, PAIRED)
     except InputError as fault:
         raise argparse.ArgumentTypeError(str(fault)) from None
     kind = found.kind or ("images" if "truth" in found.settings else "")
@@ -268,7 +256,7 @@ def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
     if sequences:
         return _pose_source(arguments, sequences, root), root
     min_gap = None if arguments.min_gap is None else int(arguments.min_gap)
-    get = {name: first.get(name, str) for name in KINDS[kind]}
+    get = {name: first.get(name, str) for name in PAIRED[kind]}
     if kind in ("images", "traverses"):
         truth = Path(str(get["truth"]))
         if kind == "traverses":

@@ -17,7 +17,7 @@ from loopclosure.places import intrinsics
 from loopclosure.places.frames import read_bgr
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.pose_files import pose_form, read_poses
-from loopclosure.places.source import FRAMES, POSES, TOPICS
+from loopclosure.places.source import CLOSED, POSES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, write_closed_paths
 from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
@@ -80,7 +80,7 @@ def _close(a: argparse.Namespace) -> None:
         check_rerun()
     if a.seed is not None and a.drift is None:
         raise WrongUsage("--seed means nothing without --drift")
-    source = typed(a.source, {"": (*FRAMES, *POSES, *TOPICS)})
+    source = typed(a.source, CLOSED)
     frames = sequence(source, a.out)
     camera = intrinsics.from_text(a.camera) if a.camera else frames.camera
     if camera is None:

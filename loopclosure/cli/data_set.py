@@ -14,10 +14,10 @@ from loopclosure.places.overlap import FOV_DEG, ViewOverlap
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import benchmark_parts, layout_of, read_sequence
 from loopclosure.places.source import (
-    FRAMES,
+    DETECTED,
+    EVALUATED,
     LAYOUTS,
     POSE_FORM_HELP,
-    POSES,
     POSES_HELP,
     RECORDED,
     TOPICS,
@@ -32,17 +32,6 @@ from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import above_zero
 
-SEQUENCE = (*FRAMES, *POSES, "references")
-KINDS = {
-    "": (*SEQUENCE, *TOPICS, "truth"),
-    **dict.fromkeys(("tum", "euroc", "kitti", "video"), SEQUENCE),
-    "bag": (*SEQUENCE, *TOPICS),
-    "images": (*SEQUENCE, "truth"),
-    "fabmap": (*FRAMES, "truth", "camera", "coordinates"),
-    "traverses": (*FRAMES, "references", "truth"),
-    "nordland": FRAMES,
-    "pairs": FRAMES,
-}
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]..., for example tum:desk,stop=50%,stride=2.
 
 Truth from poses (KIND is seen from the files, or named):
@@ -120,7 +109,7 @@ def sequence(source: Source, out: str | Path, layout: str = "") -> ImageSequence
 
 def data_set(a: argparse.Namespace) -> datasets.DataSet:
     """Load the data set that the arguments describe."""
-    source = typed(a.source, KINDS)
+    source = typed(a.source, EVALUATED)
     truth, references = source.get("truth", str), source.get("references", str)
     kind = source.kind or ("images" if truth else "")
     posed = not kind or kind in LAYOUTS or (kind == "images" and "poses" in source.settings)
@@ -197,7 +186,7 @@ def warn_of_unreadable(recording: ImageSequence) -> ImageSequence:
 
 def recording_of(text: str, frames: Path) -> ImageSequence:
     """Open the frames of a source for the detector; those of a bag go to a folder ``frames``."""
-    source = typed(text, {"": (*FRAMES, *TOPICS)})
+    source = typed(text, DETECTED)
     path, (topic, pose_topic) = source.path, (source.get(name, str) or "" for name in TOPICS)
     if is_bag(path):
         path, summary = extract(path, frames, topic, pose_topic, bar)

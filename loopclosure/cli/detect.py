@@ -27,7 +27,7 @@ from loopclosure.methods.features import WhitenBy
 from loopclosure.places.frames import live_frames
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.pose_files import read_poses
-from loopclosure.places.source import FRAMES, TOPICS
+from loopclosure.places.source import DETECTED, FRAMES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
 from netspec.files.own_folder import inside
 from netspec.files.whole_file import write_whole
@@ -211,7 +211,7 @@ def _odometry(path: str, source: str, recording: ImageSequence) -> np.ndarray:
         warn(f"{path}: {doubt}")
     numbers = np.arange(len(recording)) if recording.numbers is None else recording.numbers
     untimed = read.stamps is None or recording.stamps is None
-    chosen = set(FRAMES) & set(typed(source, {"": (*FRAMES, *TOPICS)}).settings)
+    chosen = set(FRAMES) & set(typed(source, DETECTED).settings)
     if untimed and chosen and numbers[-1] < len(read.poses):
         return read.poses[numbers]
     return read.of_images(len(recording), recording.stamps, path)

@@ -135,6 +135,7 @@ def _total_said(loops: int, queries: int, given: Candidates) -> str:
         return "no frame has a candidate: the camera did not come back, or the drive is too short to tell"
     known = given.known()
     alike = np.argsort(-known.max(axis=1), kind="stable")[:TRIED]
+    alike = alike[np.isfinite(known[alike].max(axis=1))]  # fewer where few frames have a candidate
     least, ages = known[alike].max(axis=1).min(), given.queries[alike] - given.references[known[alike].argmax(axis=1)]
     recent = "" if given.two else f" --exclude-recent {max(0, ages.min() - 1)}"
     tried = f"detect --threshold {np.floor(1e3 * least) / 1e3:g}{recent} accepts the most alike, to be looked at"

@@ -28,6 +28,31 @@ TOPICS = ("topic", "pose-topic")
 Kinds = Mapping[str, Sequence[str]]  # the settings of each kind of source, "" for one whose kind is not named
 Listed = list[tuple[float, str]]  # the stamp in seconds and the file of each frame
 T = TypeVar("T")
+SEQUENCE = (*FRAMES, *POSES, "references")
+# The kinds of sources, and what may be set of each: for an evaluation (loopclosure evaluate) and for pairs of images
+# (lmdb-build pairs). None: that command does not take it.
+_KINDS: dict[str, tuple[Sequence[str] | None, Sequence[str] | None]] = {
+    "": ((*SEQUENCE, *TOPICS, "truth"), (*POSES, *TOPICS, "truth", "camera")),
+    "tum": (SEQUENCE, (*POSES, *TOPICS)),
+    "euroc": (SEQUENCE, (*POSES, *TOPICS)),
+    "kitti": (SEQUENCE, (*POSES, *TOPICS)),
+    "bag": ((*SEQUENCE, *TOPICS), (*POSES, *TOPICS)),
+    "video": (SEQUENCE, (*POSES, *TOPICS)),
+    "images": ((*SEQUENCE, "truth"), (*POSES, "truth", "camera")),
+    "traverses": ((*FRAMES, "references", "truth"), ("references", "truth")),
+    "nordland": (FRAMES, ()),
+    "fabmap": ((*FRAMES, "truth", "camera", "coordinates"), None),
+    "pairs": (FRAMES, None),
+    "folders": (None, ("references",)),
+    "table": (None, ("group", "index")),
+    "index": (None, ("group", "track", "time", "max-gap")),
+    "singles": (None, ()),
+}
+EVALUATED = {kind: settings for kind, (settings, _) in _KINDS.items() if settings is not None}
+PAIRED = {kind: settings for kind, (_, settings) in _KINDS.items() if settings is not None}
+# What detect and map take, and what close takes: one sequence, whose kind is seen from its files.
+DETECTED: Kinds = {"": (*FRAMES, *TOPICS)}
+CLOSED: Kinds = {"": (*FRAMES, *POSES, *TOPICS)}
 
 
 @dataclass(frozen=True)

@@ -445,3 +445,12 @@ def test_a_remembered_drive_is_decided_once_and_has_a_threshold_for_later(monkey
     single = np.array([online.add_descriptor(row).score for row in rows])
     others = single[~found.accepted].max()
     assert later == pytest.approx(single[found.accepted & (single > others)].min(), rel=1e-4)
+
+
+def test_the_advice_is_a_threshold_that_the_parser_takes() -> None:
+    """Where fewer frames have a candidate than are advised to be looked at, the threshold is one of theirs."""
+    scores = np.random.default_rng(0).normal(size=(30, 30)) - 5
+    allowed = np.zeros((30, 30), bool)
+    allowed[:3] = True
+    *_, total = answer(scores, allowed, True).reasons
+    assert re.search(r"--threshold -\d+(\.\d+)? accepts", total), total
