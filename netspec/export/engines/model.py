@@ -17,6 +17,7 @@ from netspec.errors import SpecError
 from netspec.export.engines.cache import entry, key_of
 from netspec.export.engines.choice import FP32, Choice
 from netspec.export.engines.runners import MODEL, RUNNERS, Arrays, Runner, Unable, open_runner, reason
+from netspec.files.own_folder import inside
 from netspec.files.whole_file import write_whole
 
 WARNINGS, DIFFERENCE = "warnings.txt", "bf16.txt"  # lines to say at each start
@@ -106,8 +107,8 @@ class Model:
         ]
         for line in lines:
             log.logger.warning(line)
-        with suppress(OSError):  # it is measured again
-            write_whole(place, "\n".join(lines), "backslashreplace")
+        with suppress(SpecError):  # it is measured again
+            write_whole(inside(self.folder, DIFFERENCE), "\n".join(lines), "backslashreplace")
 
 
 def _warn_again(path: Path) -> None:
