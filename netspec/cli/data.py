@@ -17,7 +17,7 @@ from netspec.terminal.parser import QUIET, Commands
 
 if TYPE_CHECKING:
     from netspec.data.records import Records
-    from netspec.data.survey import Survey
+    from netspec.inspect.check.survey import Survey
 
 SHOW, STAT = "show", "stat"
 SHOWN_FAULTS = 4  # which come first
@@ -55,7 +55,7 @@ def _add_data(commands: Commands) -> None:
 
 def _data(arguments: argparse.Namespace) -> int:
     from netspec.data.records import open_records, spread
-    from netspec.data.survey import survey
+    from netspec.inspect.check.survey import survey
 
     if arguments.what == SHOW:
         refuse(arguments, ("json",), "is for `data stat`")
@@ -74,7 +74,7 @@ def _data(arguments: argparse.Namespace) -> int:
 
 
 def _print_survey(arguments: argparse.Namespace, found: Survey) -> int:
-    from netspec.data.survey import as_json, as_lines
+    from netspec.inspect.check.survey import as_json, as_lines
 
     if arguments.json:
         print(json.dumps(as_json(found)))

@@ -239,7 +239,7 @@ def _add_fmt(commands: Commands) -> None:
 
 
 def _fmt(arguments: argparse.Namespace) -> int:
-    from netspec.proto.format import format_text
+    from netspec.inspect.check.format import format_text
     from netspec.proto.text import text_of
 
     status = DONE

@@ -14,8 +14,8 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from netspec.data.records import Record
-from netspec.data.survey import Survey, as_lines
 from netspec.files.figures import COLORS
+from netspec.inspect.check.survey import Survey, as_lines
 from netspec.inspect.draw.style import (
     FAULT,
     PALE,
@@ -36,7 +36,7 @@ CHANNEL_COLORS = {1: ("#555555",), 2: ("#0072B2", "#D55E00"), 3: ("#2b5fd9", "#2
 
 
 def sheet(records: Sequence[Record], found: Survey, name: str, images: int | None = None) -> Figure:
-    """Draw records as tiles below the statistics that :func:`netspec.data.survey.survey` found.
+    """Draw records as tiles below the statistics that :func:`netspec.inspect.check.survey.survey` found.
 
     ``images`` says how many images a record holds, side by side; by default two where it has 2 or 6 channels.
     """

@@ -11,7 +11,7 @@ from netspec.cli import main
 from netspec.data.blobs import from_array
 from netspec.errors import SpecError
 from netspec.inspect.check.compare import compare_files
-from netspec.proto.format import format_text
+from netspec.inspect.check.format import format_text
 from netspec.proto.schema import BlobProto, NetParameter
 from netspec.proto.text import parse_net, write_text
 from paths import last_parts, nets_as_found

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from netspec.cli import main
 from netspec.errors import SpecError
-from netspec.proto.format import WIDTH, format_text
+from netspec.inspect.check.format import WIDTH, format_text
 from netspec.proto.lexer import END, STRING, SYMBOL, Lexer
 from netspec.proto.text import parse_net_text, parse_solver_text, text_of
 from paths import GOLDEN, ROOT, SHARED, last_parts, nets_as_found
