@@ -24,8 +24,8 @@ from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
 from loopclosure.evaluate import Judgment
 from loopclosure.methods.auto import PRECISION, Auto
 from loopclosure.methods.base import Images, MethodResult, earlier
-from loopclosure.methods.decoys import settings
-from loopclosure.methods.seqslam import standardize, trajectory_costs
+from loopclosure.methods.lines import LENGTHS
+from loopclosure.methods.seqslam import SequenceSettings, standardize, trajectory_costs
 from loopclosure.places.frames import read_bgr, read_gray
 from loopclosure.progress import silent
 from netspec.files.whole_file import whole_file
@@ -152,10 +152,10 @@ def _best(scores: np.ndarray, drive: Drive, pairs: Pairs) -> tuple[float, str]:
     tried = {"single images": np.where(allowed, scores, np.nan)}
     distances = np.where(allowed, -scores, np.nan)
     scaled = standardize(distances)
-    for setting in settings(scores.shape[0], scores.shape[1], two):
-        assert setting.sequence is not None
-        costs = trajectory_costs(scaled if setting.standardized else distances, setting.sequence)
-        tried[str(setting)] = np.where(allowed, -costs, np.nan)
+    ratio = scores.shape[1] / scores.shape[0] if two else 1.0
+    for length in LENGTHS:
+        sequence = SequenceSettings(length, 0.8 * ratio, 1.2 * ratio, 0.1 * ratio, contrast=0)
+        tried[f"sequences of {length} frames"] = np.where(allowed, -trajectory_costs(scaled, sequence), np.nan)
     recalls = {name: _recall(matrix, truth) for name, matrix in tried.items()}
     check = GeometricCheck()
     for name in ("single images", max(recalls, key=lambda name: recalls[name])):

@@ -17,9 +17,11 @@ from loopclosure.detector.run import verdicts_said
 from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
-from loopclosure.methods.candidates import Candidates, candidates, far_apart
-from loopclosure.methods.decoys import Lines, Matches, best_setting
-from loopclosure.methods.geometry import Agree, kept, try_geometry, verify
+from loopclosure.methods.candidates import Candidates, Compared, candidates, far_apart
+from loopclosure.methods.decision import decide
+from loopclosure.methods.decoys import elsewhere
+from loopclosure.methods.geometry import Agree, Geometry, Matches, verify
+from loopclosure.methods.lines import Lines, best_lines, pool
 from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
 from loopclosure.places.pose_files import read_poses
@@ -53,61 +55,48 @@ class Answer:
 
 
 def answer(
-    scores: np.ndarray,
-    allowed: np.ndarray,
-    two: bool,
-    precision: float = PRECISION,
+    compared: Compared,
     check: GeometricCheck | None = None,
     agree: Agree | None = None,
+    precision: float = PRECISION,
     progress: Progress = silent,
-    far: np.ndarray | None = None,
-    stamps: np.ndarray | None = None,
-    visit: int | None = None,
 ) -> Answer:
-    """Decide which best matches of scores (Q, R), higher = more alike, are loops.
+    """Decide which best matches are loops.
 
-    allowed    (Q, R) bool: the candidates
-    two        two traverses, in the order of time each, or one sequence with itself
-    precision  the share of what is accepted that should be right
     check, agree  verification of a query and a reference, by number; None: there are no images. A
-               :class:`~loopclosure.detector.verification.Between` leaves out what is fixed in the images
-    far        (Q, R) bool: pairs that odometry puts far apart; they are no candidates, and show how others score
-    stamps     (Q,) seconds of the queries, NaN or None where not known
-    visit      in one sequence, a reference is a candidate of a query if it is more than so many frames older; None: if
-               in between the camera saw what is as unlike both as different places are
+                  :class:`~loopclosure.detector.verification.Between` leaves out what is fixed in the images
+    precision     the share of what is accepted that should be right
     """
     if not 0 < precision < 1:
         raise InputError(f"precision is {precision:g}; expected more than 0 and less than 1")
-    count, given = len(scores), candidates(scores, allowed, two, far, visit)
-    del scores, allowed, far  # what is left of them is in the candidates
-    lines = best_setting(given, precision)
+    given = candidates(compared)
+    decoys, age_said = elsewhere(given)
+    lines = best_lines(given, pool(given, decoys), precision)
     matches = Matches.of(given, lines, precision)
-    loops, said = matches.accepted, "verification: not tried, there are no images"
+    said = "verification: not tried, there are no images"
     if check is not None and agree is not None:
-        geometry = try_geometry(given, matches, check, agree)
-        said = geometry.said
-        if geometry.unlike is not None:
-            verify(given, lines, matches, geometry, progress)
-            loops = kept(matches, geometry, lines, precision)
-    rejected = np.where(
-        matches.accepted if lines is not None else matches.inliers >= 0, "not verified", "below threshold"
-    )
+        geometry = Geometry.of(given, check, agree)
+        verify(given, lines, matches, geometry, progress)
+        said = _verified_said(matches, geometry)
+    loops = decide(matches, lines)
+    rejected = np.where(matches.inliers >= 0, "not verified", "below threshold")
     verdicts = np.where(loops, "accepted", np.where(matches.there, rejected, "no candidate"))
-    results = _results(given, matches, verdicts.tolist(), np.full(count, np.nan) if stamps is None else stamps)
-    unknown = int(np.count_nonzero(matches.few & (matches.inliers <= 0)))
-    reasons = [*filter(None, [given.said]), _sequences_said(lines, given.others)]
-    reasons.append(said + (f"; {unknown} frames cannot be verified" if unknown else ""))
+    results = _results(given, matches, loops, verdicts.tolist(), compared.stamps)
+    reasons = [*filter(None, [given.said, age_said]), _sequences_said(lines, given.far), said]
     there = sum(bool(result.candidates) for result in results)
     reasons.append(_total_said(sum(map(bool, results)), there, given))
     return Answer(results, reasons)
 
 
-def _results(given: Candidates, matches: Matches, verdicts: list[str], stamps: np.ndarray) -> list[LoopResult]:
+def _results(
+    given: Candidates, matches: Matches, loops: np.ndarray, verdicts: list[str], stamps: np.ndarray | None
+) -> list[LoopResult]:
     """Return the result of each query of the whole drive: that of the frame that stands for it."""
     results = []
     for query, row in enumerate(given.stands):
-        match = int(given.references[matches.match[row]]) if matches.there[row] else -1
+        match = _match_between(given, matches, loops, query, row)
         score, inliers, verdict = float(matches.score[row]), int(matches.inliers[row]), verdicts[row]
+        stamp = np.nan if stamps is None else float(stamps[query])
         results.append(
             LoopResult(
                 query,
@@ -116,16 +105,38 @@ def _results(given: Candidates, matches: Matches, verdicts: list[str], stamps: n
                 verdict,
                 score,
                 inliers if inliers >= 0 and given.queries[row] == query else None,
-                None if np.isnan(stamps[query]) else float(stamps[query]),
+                None if np.isnan(stamp) else stamp,
             )
         )
     return results
 
 
-def _sequences_said(lines: Lines | None, others: str) -> str:
+def _match_between(given: Candidates, matches: Matches, loops: np.ndarray, query: int, row: int) -> int:
+    """Return the match of a frame of the whole drive, -1 without one: between those of the frames around it."""
+    if not matches.there[row]:
+        return -1
+    match, after = int(given.references[matches.match[row]]), row + 1
+    if query == given.queries[row] or after == len(loops) or not loops[[row, after]].all():
+        return match
+    following = int(given.references[matches.match[after]])
+    share = (query - given.queries[row]) / (given.queries[after] - given.queries[row])
+    return match + round(share * (following - match))
+
+
+def _verified_said(matches: Matches, geometry: Geometry) -> str:
+    tried = np.count_nonzero(matches.inliers >= 0)
+    same, few = np.count_nonzero(matches.inliers > 0), np.count_nonzero(matches.few & (matches.inliers <= 0))
+    unknown = f"; {few} frames cannot be verified" if few else ""
+    unlike = f"{round(geometry.common * geometry.tried)} of {geometry.tried} unlike pairs"
+    hidden = f" ({100 * geometry.hidden:.1f} % of the image never changes, and is left out)" if geometry.hidden else ""
+    return f"verification: {same} of {tried} matches and {unlike} show the same points{hidden}{unknown}"
+
+
+def _sequences_said(lines: Lines | None, far: np.ndarray | None) -> str:
+    others = "where the drive is read backwards" if far is None else "far apart in the odometry"
     if lines is None:
         return f"sequences: none is more alike than what is seen {others}, so images are compared one by one"
-    return f"{lines.setting}: a match counts if it is more alike than what is seen {others}"
+    return f"{lines}: a match counts if it is more alike than what is seen {others}"
 
 
 def _total_said(loops: int, queries: int, given: Candidates) -> str:
@@ -182,7 +193,8 @@ class Auto:
         agree = Between(self.check, self.pairs, images.queries.paths, images.database.paths)
         visit = None if self.visit < 0 else self.visit
         with timed(seconds, "choice and verification"):
-            decided = answer(found.scores, allowed, two, self.precision, self.check, agree, progress, far, visit=visit)
+            compared = Compared(found.scores, allowed, two, far, visit)
+            decided = answer(compared, self.check, agree, self.precision, progress)
         scores = np.full(found.scores.shape, np.nan)
         loops = np.flatnonzero(decided.accepted)
         scores[loops, decided.match[loops]] = [decided.results[query].score for query in loops]

@@ -1,4 +1,7 @@
-"""Which pairs can be loops at all: not those of one visit to a place, nor those that odometry puts far apart."""
+"""Step 1 of :mod:`loopclosure.methods.auto`: which pairs of frames can be loops at all.
+
+Not those of one visit to a place, nor those that odometry puts far apart. Frames of a camera that stands count once.
+"""
 
 from __future__ import annotations
 
@@ -16,19 +19,38 @@ AWAY = 2  # frames in a row
 STILL = 0.5  # of a usual step from frame to frame
 STOP = 8  # steps
 MOVES = 0.9  # the quantile of steps at which the search for a usual one begins
-ENOUGH = 0.5  # of the queries with a candidate must have frames far apart, for these to show how others score
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Frames that were compared, and what else is known of them.
+
+    scores   (Q, R), higher = more alike; queries and references are each in the order of time
+    allowed  (Q, R) bool: pairs that may be loops
+    two      two traverses; False: one drive, compared with itself
+    far      (Q, R) bool: pairs that odometry puts far apart; None without odometry
+    visit    of one drive: a reference is a candidate if it is more than so many frames older; None: found out
+    stamps   (Q,) seconds of the queries, NaN or None where not known
+    """
+
+    scores: np.ndarray
+    allowed: np.ndarray
+    two: bool
+    far: np.ndarray | None = None
+    visit: int | None = None
+    stamps: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Pairs (Q, R) that can be loops.
+    """Pairs (Q, R) that can be loops, of the frames in which the camera has moved.
 
     scores     higher = more alike
     allowed    which pairs are candidates
-    two        two traverses, or one sequence with itself
-    queries, references  the numbers of the frames that these are, in the whole drive
-    stands     (N,) for each query of the whole drive, the row of the frame that shows the same, or is it
-    different  pairs that are known to show different places; None: not known of enough queries
+    two        two traverses, or one drive with itself
+    queries, references  the numbers of these frames in the whole drive
+    stands     (N,) for each query of the whole drive, the row of the last of these frames that is not after it
+    far        pairs that odometry puts far apart; None without odometry
     said       how long a visit to a place lasts, in a sentence; empty for two traverses
     """
 
@@ -38,7 +60,7 @@ class Candidates:
     queries: np.ndarray
     references: np.ndarray
     stands: np.ndarray
-    different: np.ndarray | None = None
+    far: np.ndarray | None = None
     said: str = ""
 
     def known(self, queries: slice | int = slice(None)) -> np.ndarray:
@@ -46,52 +68,46 @@ class Candidates:
         return np.where(self.allowed[queries], self.scores[queries], -np.inf)
 
     @cached_property
+    def there(self) -> np.ndarray:
+        """Which queries (Q,) have a candidate."""
+        return self.allowed.any(axis=1)
+
+    @cached_property
     def single(self) -> np.ndarray:
         """The best candidate (Q,) of each query by its score alone; any where there is none."""
         blocks = (slice(first, first + BLOCK) for first in range(0, len(self.queries) or 1, BLOCK))
         return np.concatenate([self.known(block).argmax(axis=1) for block in blocks])
 
-    @property
-    def others(self) -> str:
-        """What shows how different places score."""
-        return "where the drive is read backwards" if self.different is None else "far apart in the odometry"
 
-
-def candidates(
-    scores: np.ndarray, allowed: np.ndarray, two: bool, far: np.ndarray | None, visit: int | None
-) -> Candidates:
-    """Return the pairs that can be loops, of frames in which the camera has moved.
-
-    The arguments are those of :func:`loopclosure.methods.auto.answer`.
-    """
-    if not two and visit is not None:
-        allowed = allowed & earlier(len(scores), visit)
-    queries, stands = moved(scores)
-    references = moved(scores.T)[0] if two else queries
+def candidates(compared: Compared) -> Candidates:
+    """Return the pairs that can be loops."""
+    scores, allowed, two, far = compared.scores, compared.allowed, compared.two, compared.far
+    if not two and compared.visit is not None:
+        allowed = allowed & earlier(len(scores), compared.visit)
+    queries = moved(scores)
+    references = moved(scores.T) if two else queries
+    stands = np.searchsorted(queries, np.arange(len(scores)), side="right") - 1
     if (len(queries), len(references)) != scores.shape:
         part = np.ix_(queries, references)
         scores, allowed, far = scores[part], allowed[part], None if far is None else far[part]
-    allowed, different, said = allowed & np.isfinite(scores), None, ""
+    allowed, said = allowed & np.isfinite(scores), ""
     if far is not None:
-        different, allowed = allowed & far, allowed & ~far
-        if np.count_nonzero(different.any(axis=1)) < ENOUGH * np.count_nonzero(allowed.any(axis=1)):
-            different = None
-    if visit is not None:
-        said = f"one visit to a place lasts {visit} frames, as was said"
+        far, allowed = allowed & far, allowed & ~far
+    if compared.visit is not None:
+        said = f"one visit to a place lasts {compared.visit} frames, as was said"
     elif not two:
         back, lasted = _returned(scores, allowed, queries)
         allowed &= back
         said = f"one visit to a place lasts {np.median(lasted):.0f} frames as a rule, {lasted.max()} at most"
-    return Candidates(scores, allowed, two, queries, references, stands, different, said)
+    return Candidates(scores, allowed, two, queries, references, stands, far, said)
 
 
-def moved(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frames, rows of scores (N, M), in which the camera has moved, and which of them each frame (N,) shows.
+def moved(scores: np.ndarray) -> np.ndarray:
+    """Return the frames, rows of scores (N, M), in which the camera has moved.
 
     Where a robot stands, for ``STOP`` steps or more that are on average less than ``STILL`` of a usual step, one frame
-    is taken while the others are within that of it: lines through all of them would lead past the place. They show the
-    same as that one, or as the next where that is more alike. The usual step is one of a robot that moves, though it
-    may stand for most of the time: the median of those that are no stop.
+    is taken while the others are within that of it: lines through all of them would lead past the place. The usual step
+    is one of a robot that moves, though it may stand for most of the time: the median of those that are no stop.
     """
 
     def step(a: int, b: int) -> float:
@@ -100,25 +116,21 @@ def moved(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     steps = np.array([step(i, i + 1) for i in range(len(scores) - 1)])
     if len(steps) < STOP:
-        return np.arange(len(scores)), np.arange(len(scores))
+        return np.arange(len(scores))
     means = np.convolve(steps, np.full(STOP, 1 / STOP), "valid")
     known = np.append(0.0, means[np.isfinite(means)])
     usual, before = np.quantile(known, MOVES), np.inf
     while usual < before:
         usual, before = np.median(known[known >= STILL * usual]), usual
     still = np.convolve(means < STILL * usual, np.ones(STOP)) > 0
-    taken, stands, first = list[int](), list[int](), 0
+    taken, first = list[int](), 0
     while first < len(scores):
         end = first + 1
         while end < len(scores) and still[end - 1] and step(first, end) < STILL * usual:
             end += 1
-        if end - first <= STOP:
-            end = first + 1
-        following = [end < len(scores) and step(i, end) < step(first, i) for i in range(first + 1, end)]
-        stands += [len(taken), *(len(taken) + later for later in following)]
         taken.append(first)
-        first = end
-    return np.array(taken), np.array(stands)
+        first = end if end - first > STOP else first + 1
+    return np.array(taken)
 
 
 def _returned(scores: np.ndarray, allowed: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.auto import PRECISION, Answer, answer
 from loopclosure.methods.base import BLOCK
-from loopclosure.methods.candidates import far_apart
+from loopclosure.methods.candidates import Compared, far_apart
 from loopclosure.places.frames import gray, read_gray
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.truth import Exclusion
@@ -145,8 +145,8 @@ def _among(
     far = None if odometry is None else far_apart(odometry[::step])
     visit = None if visit is None else visit // step
     allowed = np.ones((len(queries), len(references)), bool) if two else _earlier(stamps[::step], seconds)
-    rest = (two, precision, between.check, agree, progress, far, stamps[::step], visit)
-    answered = answer(_compared(detector, queries, references), allowed, *rest)
+    compared = Compared(_compared(detector, queries, references), allowed, two, far, visit, stamps[::step])
+    answered = answer(compared, between.check, agree, precision, progress)
     results = []
     for number in range(count):
         result = answered.results[number // step]

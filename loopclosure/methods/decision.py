@@ -1,0 +1,79 @@
+"""Step 5 of :mod:`loopclosure.methods.auto`: which matches are loops, by their lines and by their points."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from loopclosure.detector.verification import DOUBTLESS, SURE
+from loopclosure.methods.geometry import Matches
+from loopclosure.methods.lines import Lines
+
+WINDOW = 5  # references to each side of a line, and at least so many queries along it, where a loop has neighbors
+UNLIKELY = 0.05  # that so many matches in a row are not verified, at the share that is
+
+
+def decide(matches: Matches, lines: Lines | None) -> np.ndarray:
+    """Return the queries (Q,) whose matches are loops."""
+    if lines is None:
+        return matches.evidence >= SURE
+    pairs, verified = neighbors(matches.match, lines), matches.evidence >= 1
+    by_line = grown(matches.line, lines.above_decoys & (matches.match == lines.match), pairs)
+    loops = by_line & ~contradicted(by_line, verified, pairs, lines.sequence.length)
+    # From afar a place is seen before the camera is there: other queries fit it better.
+    loops |= lines.near & (matches.evidence >= DOUBTLESS)
+    return grown(loops, lines.near & verified, pairs)
+
+
+def grown(loops: np.ndarray, possible: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Return loops (Q,) with those of the ``possible`` ones that are neighbors of loops, and neighbors of these."""
+    loops = loops.copy()
+    earlier, later = pairs.T
+    while True:
+        beside = np.zeros_like(loops)
+        beside[later[loops[earlier]]] = True
+        beside[earlier[loops[later]]] = True
+        more = possible & beside & ~loops
+        if not more.any():
+            return loops
+        loops |= more
+
+
+def contradicted(loops: np.ndarray, verified: np.ndarray, pairs: np.ndarray, length: int) -> np.ndarray:
+    """Return the loops (Q,) of lines that their points contradict.
+
+    These are runs of matches, at an end of a stretch or all of it, of which none is verified though so many should be:
+    at the share of the stretch that is, or of all stretches where none is. A run longer than a line is several
+    lines, which tell enough; a shorter one may be the end of the line through the last place of a loop.
+    """
+    linked = pairs[loops[pairs].all(axis=1)]
+    links = coo_matrix((np.ones(len(linked)), linked.T), shape=(len(loops), len(loops)))
+    stretch = connected_components(links, directed=False)[1]
+    against = np.zeros_like(loops)
+    overall = np.mean(verified[loops]) if loops.any() else 0.0
+    for number in np.unique(stretch[loops]):
+        queries = np.flatnonzero(loops & (stretch == number))
+        found = np.flatnonzero(verified[queries])
+        if len(found):
+            share, runs = len(found) / (found[-1] - found[0] + 1), (queries[: found[0]], queries[found[-1] + 1 :])
+        else:
+            share, runs = overall, (queries,)
+        for run in runs:
+            if len(run) <= length and (1 - share) ** len(run) < UNLIKELY:
+                against[run] = True
+    return against
+
+
+def neighbors(match: np.ndarray, lines: Lines) -> np.ndarray:
+    """Return pairs (N, 2) of queries, the earlier first, whose matches lie on the line through one another.
+
+    The line has the length and the velocities of the search, and is ``WINDOW`` references wide to each side.
+    """
+    sequence, pairs = lines.sequence, []
+    for step in range(1, max(WINDOW, sequence.length // 2) + 1):
+        moved = match[step:] - match[:-step]
+        low, high = sequence.slowest * step - WINDOW, sequence.fastest * step + WINDOW
+        earlier = np.flatnonzero((moved >= low) & (moved <= high))
+        pairs.append(np.stack([earlier, earlier + step], axis=1))
+    return np.concatenate(pairs)
