@@ -1,5 +1,6 @@
 """Loops without settings: what sequences, decoys and verification decide, on drives whose truth is known."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -441,5 +442,5 @@ def test_the_advice_is_a_threshold_that_the_parser_takes() -> None:
     scores = np.random.default_rng(0).normal(size=(30, 30)) - 5
     allowed = np.zeros((30, 30), bool)
     allowed[:3] = True
-    *_, total = answer(scores, allowed, True).reasons
+    *_, total = answer(Compared(scores, allowed, True)).reasons
     assert re.search(r"--threshold -\d+(\.\d+)? accepts", total), total
