@@ -59,6 +59,10 @@ def load_weights(
             else:
                 with net_beside_numbers(each) as (message, file):
                     loaded |= _copy(partial(_from_message, net, message, each, file), faults.append)
+                    if faults and message.name and message.name != net.name:
+                        names = f'"{message.name}" (this one is "{net.name}")' if net.name else f'"{message.name}"'
+                        belong = f"these weights seem to belong to another net, {names}"
+                        faults[0] = SpecError(f"{belong}: {faults[0].message}", faults[0].where)
         except SpecError as fault:
             faults.append(fault)
         for fault in faults:

@@ -473,3 +473,16 @@ def test_equal_weights_make_equal_bytes(case: str, tmp_path: Path) -> None:
     load_weights(net, folder / "caffe.caffemodel")
     save_weights(net, tmp_path / "ours.caffemodel")
     assert (tmp_path / "ours.caffemodel").read_bytes() == (folder / "caffe.caffemodel").read_bytes()
+
+
+def test_weights_of_another_net_are_called_so(tmp_path: Path):
+    text = """name: "NAME"
+        layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 } } }
+        layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip" inner_product_param { num_output: SIZE } }"""
+    save_weights(net_of(text.replace("NAME", "AlexNet").replace("SIZE", "2")), tmp_path / "w.caffemodel")
+    with pytest.raises(SpecError) as fault:
+        load_weights(net_of(text.replace("NAME", "VGG").replace("SIZE", "3")), tmp_path / "w.caffemodel")
+    said = str(fault.value)
+    assert ': these weights seem to belong to another net, "AlexNet" (this one is "VGG"): cannot copy param 0' in said
+    with pytest.raises(SpecError, match=r"caffemodel: cannot copy param 0"):
+        load_weights(net_of(text.replace("NAME", "AlexNet").replace("SIZE", "3")), tmp_path / "w.caffemodel")
