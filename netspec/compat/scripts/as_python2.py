@@ -4,6 +4,9 @@ import builtins
 import io
 import math
 import numbers
+from functools import reduce as reduce
+from importlib import reload as reload
+from sys import intern as intern
 
 
 def py2_div(left, right):

@@ -16,12 +16,14 @@ import os
 import re
 import sys
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
 from typing import Any
 
 from netspec.compat.scripts.as_python2 import py2_bytes
+from netspec.compat.scripts.mended import TRANSLATED
 from netspec.terminal.commands import VARIABLE
 
 
@@ -117,6 +119,8 @@ def _numpy(np: Any) -> None:
         new = {"abs", "bool", "max", "min", "pow", "round"}  # `from numpy import *` left Python's own
         np.__all__ = [name for name in np.__all__ if name not in new]
     np.fromstring = _fromstring(np)
+    if hasattr(np, "histogram"):
+        np.histogram = _histogram(np.histogram)
     _let_threshold_be_nan(np)
 
 
@@ -135,6 +139,12 @@ def _warn_if_too_new(np: Any) -> None:
 def remedy(fault: BaseException) -> str:
     """Return what to do about a fault that an old program meets and a new one would not; or an empty string."""
     text = str(fault)
+    place = next((f for f in reversed(traceback.extract_tb(fault.__traceback__)) if f.filename in TRANSLATED), None)
+    if place and isinstance(fault, (TypeError, UnicodeError)):
+        return (
+            f"{place.filename}:{place.lineno} is Python 2, which took text for bytes and 2.0 for 2: write what is due "
+            "there, such as text.encode(), data.decode() or int(x)"
+        )
     np = sys.modules.get("numpy")
     one_element = "only 0-dimensional arrays can be converted", "setting an array element with a sequence"
     if np and _is_too_new(np) and text.startswith(one_element):
@@ -170,6 +180,15 @@ def _fromstring(np: Any) -> Callable[..., Any]:
         return np.frombuffer(py2_bytes(string), dtype, count).copy()
 
     return fromstring
+
+
+def _histogram(new: Callable[..., Any]) -> Callable[..., Any]:
+    """Return numpy.histogram with ``normed``, which is ``density`` now."""
+
+    def histogram(a: Any, bins: Any = 10, range: Any = None, normed: Any = None, *weights: Any, **named: Any) -> Any:
+        return new(a, bins, range, named.pop("density", normed), *weights, **named)
+
+    return histogram
 
 
 def _numpy_random(random: Any) -> None:

@@ -159,7 +159,8 @@ def _name(node: ast.AST) -> str:
 
 # ---- Translating ----
 
-_HELPERS = ("cmp", "file", "open", "round")  # builtins that are others in Python 2
+_BUILTINS_OF_2 = ("cmp", "file", "open", "round")  # those that are others in Python 2
+_HELPERS = (*_BUILTINS_OF_2, "py2_div", "py2_idiv", "reduce", "intern", "reload")  # what import_helpers imports
 _HOME = "netspec.compat.scripts.as_python2"
 _ALONE = "as_python2"  # by this name a translation that needs no netspec imports from itself
 _FILES = ("file", "open", _ALONE)  # what needs the functions and classes of files
@@ -168,8 +169,9 @@ _BYTES_IN_TEXT = re.compile(r"(?<!\\)((?:\\\\)*)\\x([89a-fA-F][0-9a-fA-F])")
 
 @functools.cache
 def translated(data: bytes, path: str, alone: bool = False) -> str:
-    """Return Python 2 source as Python 3; ``alone`` puts what it needs into the text, in the place of an import.
+    """Return Python 2 source as Python 3; ``alone`` puts what it needs into the text.
 
+    Otherwise :func:`import_helpers` imports it, where no line is added: the lines keep their numbers.
     Raises SyntaxError where it is not Python 2 either, SpecError where neither lib2to3 nor fissix is there.
     """
     package = _translator()
@@ -188,7 +190,7 @@ def translated(data: bytes, path: str, alone: bool = False) -> str:
     if "unicode_literals" not in tree.future_features:
         _mark_bytes(tree, package)
     helpers += _used_builtins(tree)
-    return _with_helpers(str(tree), helpers, alone)
+    return _with_helpers(str(tree), helpers) if alone else str(tree)
 
 
 @functools.cache
@@ -202,7 +204,9 @@ def _tool(package: str, home: str) -> Any:
     """Return 2to3, which takes files in memory from the module ``home``."""
     refactor = importlib.import_module(f"{package}.refactor")
     fixers = refactor.get_fixers_from_package(f"{package}.fixes")
-    tool = refactor.RefactoringTool([name for name in fixers if not name.endswith(".fix_import")])
+    without = ["import"] if home == _ALONE else ["import", "reduce", "intern", "reload"]  # these three insert a line
+    without = [f"{package}.fixes.fix_{name}" for name in without]
+    tool = refactor.RefactoringTool([name for name in fixers if name not in without])
     for fixer in (*tool.pre_order, *tool.post_order):
         if type(fixer).__name__ == "FixImports":
             fixer.mapping = {**fixer.mapping, "StringIO": home, "cStringIO": home}
@@ -293,32 +297,47 @@ def _is_float(node: Any) -> bool:
 
 def _used_builtins(tree: Any) -> list[str]:
     """Return which of the builtins that are others in Python 2 are used; x.open and file=f are no use of them."""
-    named = (leaf for leaf in tree.leaves() if leaf.value in (*_HELPERS, _ALONE))
+    named = (leaf for leaf in tree.leaves() if leaf.value in (*_BUILTINS_OF_2, _ALONE))
     used = {leaf.value for leaf in named if str(leaf.prev_sibling) != "." and str(leaf.next_sibling) != "="}
     return sorted(used)
 
 
-def _with_helpers(text: str, helpers: list[str], alone: bool) -> str:
+def import_helpers(tree: ast.Module) -> None:
+    """Let a translation that was parsed import what it needs."""
+    used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    if names := [ast.alias(name) for name in _HELPERS if name in used]:
+        first = _head(tree)
+        line = (tree.body[first - 1].end_lineno or 1) if first else 1
+        tree.body.insert(
+            first, ast.ImportFrom(_HOME, names, 0, lineno=line, end_lineno=line, col_offset=0, end_col_offset=0)
+        )
+
+
+def _head(tree: ast.Module) -> int:
+    """Return how many statements the docstring and the imports from __future__ are."""
+    for number, node in enumerate(tree.body):
+        docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and number == 0
+        if not docstring and not (isinstance(node, ast.ImportFrom) and node.module == "__future__"):
+            return number
+    return len(tree.body)
+
+
+def _with_helpers(text: str, helpers: list[str]) -> str:
     """Return a text with helpers, behind the docstring and the imports from __future__."""
     if not helpers:
         return text
-    line = f"from {_HOME} import {', '.join(helpers)}  # as Python 2 has it\n"
-    if alone:
-        named = {name for name in helpers if name not in _FILES}
-        if any(name.startswith("py2_") for name in helpers):
-            named.add("py2_is_whole")
-        if named != set(helpers) - {"py2_is_whole"}:
-            named |= {"py2_bytes", "py2_text", "Py2Bytes", "file", "StringIO", "open"}
-        functions = [value for name, value in vars(as_python2).items() if name in named]  # in the order of the file
-        parts = [inspect.getsource(function) for function in functions]
-        line = "\n\n".join(["import builtins\nimport io\nimport math\nimport numbers\nimport sys\n", *parts])
-        line += f"\n\nsys.modules[{_ALONE!r}] = sys.modules[__name__]\n\n" if _ALONE in helpers else "\n\n"
-    last = 0
-    for node in ast.parse(text).body:
-        docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and last == 0
-        if not docstring and not (isinstance(node, ast.ImportFrom) and node.module == "__future__"):
-            break
-        last = node.end_lineno or last
+    named = {name for name in helpers if name not in _FILES}
+    if any(name.startswith("py2_") for name in helpers):
+        named.add("py2_is_whole")
+    if named != set(helpers) - {"py2_is_whole"}:
+        named |= {"py2_bytes", "py2_text", "Py2Bytes", "file", "StringIO", "open"}
+    functions = [value for name, value in vars(as_python2).items() if name in named]  # in the order of the file
+    parts = [inspect.getsource(function) for function in functions]
+    line = "\n\n".join(["import builtins\nimport io\nimport math\nimport numbers\nimport sys\n", *parts])
+    line += f"\n\nsys.modules[{_ALONE!r}] = sys.modules[__name__]\n\n" if _ALONE in helpers else "\n\n"
+    tree = ast.parse(text)
+    first = _head(tree)
+    last = (tree.body[first - 1].end_lineno or 0) if first else 0
     lines = text.splitlines(keepends=True)
     if not last:  # behind the comments at the top: one may declare the encoding
         last = next((number for number, line in enumerate(lines) if not line.startswith("#")), 0)

@@ -29,7 +29,6 @@ from netspec.files.whole_file import write_whole
 
 MAIN = "__netspec_main__"  # by this name a worker imports the program
 RENAMED_METHODS = {"tostring": "tobytes"}  # of arrays, called without arguments
-_LOOK_AT_THEIR_CALLER = ("namedtuple", "Enum", "_getframe", "warn")  # a call in between would be it
 
 
 def write_translation(path: str, out: Path, always: bool) -> None:
@@ -82,7 +81,10 @@ class Reader(importlib.abc.MetaPathFinder):
         Raises SyntaxError where it is neither Python 3 nor Python 2, SpecError where Python 2 cannot be translated.
         """
         self.main = path
+        ours = path.startswith(str(Path(__file__).parents[3] / "netspec") + os.sep)  # netspec run -m netspec train
         self.python2 = self.always or python2.is_python2(data, path)
+        if ours:
+            return _compiled(data, path)
         kept = "--write-py3 FILE writes the translation"
         return self._code(data, path, self.python2, f"is Python 2, and runs translated to Python 3; {kept}")
 
@@ -186,7 +188,10 @@ def _compiled(source: str | bytes, path: str, is_python2: bool = False) -> CodeT
         linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of escapes in strings and the like: the script is old
-        tree = ast.fix_missing_locations(_GivingBack(is_python2).visit(ast.parse(source, path)))
+        tree = ast.parse(source, path)
+        if is_python2:
+            python2.import_helpers(tree)
+        tree = ast.fix_missing_locations(_Mending(is_python2).visit(tree))
         return compile(tree, path, "exec", dont_inherit=True)
 
 
@@ -210,43 +215,64 @@ def _generated(data: bytes, path: str) -> CodeType:
     return compile(_GENERATED.format(file.encode("latin1") if isinstance(file, str) else file), path, "exec")
 
 
-class _GivingBack(ast.NodeTransformer):
-    """Writes calls for what arrays could do: ``a.tostring()``, ``"%f" % a`` and ``float(a)`` of one element.
+#: Functions of these modules, and methods of these names, take bytes.
+_TAKE_BYTES = ("base64", "binascii", "hashlib", "struct", "zlib")
+_METHODS_WITH_BYTES = ("FromString", "MergeFromString", "ParseFromString")
+_WITH_SIZES = ("empty", "ones", "reshape", "resize", "zeros")  # their first argument, or all, is a size
 
-    In Python 2 also for what text, bytes and values of unlike types could do: see netspec/compat/scripts/mended.py.
+
+class _Mending(ast.NodeTransformer):
+    """Writes calls of netspec/compat/scripts/mended.py for what Python 3 or NumPy refuses, or understands otherwise.
+
+    These are ``a.tostring()``, ``"%f" % a`` and ``float(a)`` of one element; in Python 2 also text where bytes are due,
+    comparisons of unlike types, ``sort(cmp)``, and numbers with a point as sizes and in slices.
     """
 
     def __init__(self, is_python2: bool) -> None:
         self.is_python2 = is_python2
-        self.functions = {"float", "int"} | ({"bytearray", "sorted", "print"} if is_python2 else set())
+        self.with_bytes = {"bytearray"}  # and what is imported from the modules above
 
     def visit_ImportFrom(self, node: ast.ImportFrom) -> ast.AST:
-        if self.is_python2 and node.module in ("struct", "hashlib", "base64", "zlib", "binascii"):
-            self.functions.update(alias.asname or alias.name for alias in node.names)
+        if node.module in _TAKE_BYTES:
+            self.with_bytes.update(alias.asname or alias.name for alias in node.names)
         return node
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
         self.generic_visit(node)
         function = node.func
-        if isinstance(function, ast.Attribute):
-            if not node.args and not node.keywords:
-                function.attr = RENAMED_METHODS.get(function.attr, function.attr)
-            if self.is_python2 and function.attr in ("decode", "encode") and not node.keywords:
-                return ast.copy_location(_calling(MENDED.format(function.attr), function.value, *node.args), node)
-            of_math = getattr(function.value, "id", "") == "math"
-            mended = of_math or (self.is_python2 and function.attr not in _LOOK_AT_THEIR_CALLER)
-        else:
-            mended = isinstance(function, ast.Name) and function.id in self.functions
-        if mended and (node.args or node.keywords):
-            call = ast.Call(ast.Name(MENDED.format("call"), ast.Load()), [function, *node.args], node.keywords)
-            return ast.copy_location(call, node)
+        name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+        of = getattr(getattr(function, "value", None), "id", "")  # the module in module.function
+        if of == "math" or (not of and name in ("float", "int")):
+            node.args = [a if isinstance(a, ast.Starred) else _calling("number", a) for a in node.args]
+        elif isinstance(function, ast.Attribute) and not node.args and not node.keywords:
+            function.attr = RENAMED_METHODS.get(name, name)
+        return ast.copy_location(self._of_python2(node, name, of), node) if self.is_python2 else node
+
+    def _of_python2(self, node: ast.Call, name: str, of: str) -> ast.Call:
+        function, keywords = node.func, node.keywords
+        is_method = isinstance(function, ast.Attribute)
+        if is_method and name in ("decode", "encode") and not keywords:
+            return _calling(name, function.value, *node.args)
+        if is_method and name == "format" and (node.args or keywords):
+            return _calling(name, function.value, *node.args, keywords=keywords)
+        if (is_method and name == "sort" and (node.args or keywords)) or (not is_method and name == "sorted"):
+            return _calling("sort", function, *node.args, keywords=keywords)
+        if of in _TAKE_BYTES or name in (_METHODS_WITH_BYTES if is_method else self.with_bytes):
+            return _calling("bytes", function, *node.args, keywords=keywords)
+        if is_method and name in _WITH_SIZES:
+            starred = any(isinstance(argument, ast.Starred) for argument in node.args)
+            count = 0 if starred else len(node.args) if name == "reshape" else 1
+            node.args[:count] = [_calling("index", argument) for argument in node.args[:count]]
+        for keyword in keywords:
+            if keyword.arg in ("shape", "size"):
+                keyword.value = _calling("index", keyword.value)
         return node
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
         self.generic_visit(node)
         text = isinstance(node.left, ast.Constant) and isinstance(node.left.value, str)
         if text and isinstance(node.op, ast.Mod):
-            return ast.copy_location(_calling(MENDED.format("format"), node.left, node.right), node)
+            return ast.copy_location(_calling("percent", node.left, node.right), node)
         return node
 
     def visit_Slice(self, node: ast.Slice) -> ast.AST:
@@ -255,7 +281,7 @@ class _GivingBack(ast.NodeTransformer):
             for name in ("lower", "upper", "step"):
                 bound = getattr(node, name)
                 if bound is not None and not isinstance(getattr(bound, "value", None), int):
-                    setattr(node, name, _calling(MENDED.format("index"), bound))
+                    setattr(node, name, _calling("index", bound))
         return node
 
     def visit_Compare(self, node: ast.Compare) -> ast.AST:
@@ -264,9 +290,10 @@ class _GivingBack(ast.NodeTransformer):
         is_bare = isinstance(right, ast.List) or (isinstance(right, ast.Constant) and right.value is None)
         known = ("lt", "lte", "gt", "gte", *(("eq", "noteq") if is_bare else ()))
         if self.is_python2 and len(node.ops) == 1 and name in known:
-            return ast.copy_location(_calling(MENDED.format(re.sub("te$", "e", name)), node.left, right), node)
+            return ast.copy_location(_calling(re.sub("te$", "e", name), node.left, right), node)
         return node
 
 
-def _calling(name: str, *arguments: ast.expr) -> ast.Call:
-    return ast.Call(ast.Name(name, ast.Load()), list(arguments), [])
+def _calling(name: str, *arguments: ast.expr, keywords: Sequence[ast.keyword] = ()) -> ast.Call:
+    """Return a call of one of the functions of netspec/compat/scripts/mended.py."""
+    return ast.Call(ast.Name(MENDED.format(name), ast.Load()), list(arguments), list(keywords))

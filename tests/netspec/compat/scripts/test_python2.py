@@ -75,7 +75,7 @@ def test_with_either_translator(package: str, monkeypatch: pytest.MonkeyPatch, p
     source = (
         f"#{package}\nd = {{'a': 7}}\nfor k, v in d.iteritems(): print k, v/2,\nx = 3; x /= 2\nprint x, x/2.0, -x*5/2"
     )
-    assert python("-c", translated(source.encode(), "s.py")).stdout == "a 3 1 0.5 -3\n"
+    assert python("-c", translated(source.encode(), "s.py", alone=True)).stdout == "a 3 1 0.5 -3\n"
 
 
 def test_without_a_translator_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,8 +136,56 @@ def test_modules_around_a_program_are_python_2_with_it(run: Run, tmp_path: Path)
 
 def test_with_true_division_it_stays() -> None:
     text = translated(b"from __future__ import division\nprint 7/2, round(0.5)\n", "s.py")
-    assert "7/2" in text
-    assert "from netspec.compat.scripts.as_python2 import round  # as Python 2 has it\n" in text
+    assert text == "\nprint(7/2, round(0.5))\n"
+
+
+def test_a_call_that_raised_is_not_made_again_and_its_line_is_named(run: Run) -> None:
+    """What it did before it raised would be done twice."""
+    program = """import socket
+calls = []
+def faulty(data):
+    calls.append(data)
+    raise TypeError("a bytes-like object is required, not 'str'")
+class A:
+    faulty = staticmethod(faulty)
+try:
+    A.faulty('x')
+except TypeError:
+    print calls, reduce(lambda a, b: a + b, [1, 2]), 7 / 2
+socket.socketpair()[0].send(u'text')
+"""
+    done = run("s.py", s=program, rc=1)
+    assert done.stdout == "['x'] 3 3\n"
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("netspec run: ")
+    assert "s.py:12 is Python 2, which took text for bytes and 2.0 for 2: write what is due there, such as " in last
+
+
+def test_a_python_layer_in_python_2_is_trained(python: Run) -> None:
+    layer = """import caffe
+class L(caffe.Layer):
+    def setup(self, bottom, top):
+        print "set up", 7 / 2
+    def reshape(self, bottom, top): top[0].reshape(2, 3)
+    def forward(self, bottom, top): top[0].data[...] = 1
+    def backward(self, top, propagate_down, bottom): pass
+"""
+    net = """net_param {
+      layer { name: "d" type: "Python" top: "x" python_param { module: "lay" layer: "L" } }
+      layer { name: "ip" type: "InnerProduct" bottom: "x" top: "y" inner_product_param { num_output: 1 } }
+      layer { name: "l" type: "EuclideanLoss" bottom: "y" bottom: "y" top: "l" } }
+    base_lr: 0.1 lr_policy: "fixed" max_iter: 1 solver_mode: CPU snapshot_after_train: false"""
+    files = {"lay.py": layer, "s.prototxt": net}
+    words = ("-m", "netspec", "train", "s.prototxt", "--allow-python-layers")
+    assert "`netspec run --python2 -m netspec train ...` translates it" in python(*words, files=files, rc=1).stderr
+    done = python("-m", "netspec", "run", "--python2", *words)
+    assert done.stdout == "set up 3\n"
+    assert "__main__.py is Python 2" not in done.stderr
+
+
+def test_a_histogram_may_be_normed(run: Run) -> None:
+    s = "import numpy as np\nprint np.histogram([0, 1, 1, 1], bins=2, normed=True)[0].tolist()"
+    assert run("s.py", s=s).stdout == "[0.5, 1.5]\n"
 
 
 def test_modules_of_the_script_too_and_nothing_is_left_for_plain_python(run: Run, tmp_path: Path) -> None:
