@@ -152,8 +152,8 @@ def _check_solver(
     if described and described[0].label == TRAIN_NET:
         for net in nets[1:]:
             net.share_weights_with(nets[0])
-    for net, part in zip(nets, parts, strict=True):
-        part.faults = [*others(part.faults, unknown), *net.missing_inputs()]
+    for part in parts:
+        part.faults = others(part.faults, unknown)
     faults = gathered([*faults, *unknown])
     advice = [] if faults else findings(SETTINGS, solver, node)
     if not faults and not any(part.faults for part in parts):

@@ -113,6 +113,15 @@ def _sources(net: Net) -> Iterator[tuple[int, Any, str, str]]:
                 yield i, layer, name, source
 
 
+@rule("filled-by-script", SOLVER)
+def _filled_by_script(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
+    """A net whose inputs no layer fills can be trained by a script only; ``netspec train`` refuses it."""
+    for net in nets:
+        for fault in net.missing_inputs():
+            if fault.where:
+                yield fault.where, f"{fault.message}, or fill them from a script"
+
+
 @rule("untrained-in-test", SOLVER)
 def _untrained(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
     """A test net gets its weights from the training net, layer by layer, by name.

@@ -132,6 +132,44 @@ def test_check_needs_no_data_for_the_faults_of_prototxts(
     assert begin_with(without_warnings(run("check", "s.prototxt").err), faults)
 
 
+FILLED_BY_SCRIPT = {
+    "Input": (
+        'layer { name: "in" type: "Input" top: "data" input_param { shape { dim: 4 dim: 3 } } }',
+        'layer "in" (Input): nothing fills "data" during training; use a layer that reads data',
+    ),
+    "MemoryData": (
+        'layer { name: "in" type: "MemoryData" top: "data" top: "label"'
+        " memory_data_param { batch_size: 2 channels: 1 height: 1 width: 3 } }",
+        'layer "in" (MemoryData): has no data yet; call set_input_arrays',
+    ),
+}
+
+
+@pytest.mark.parametrize(("net", "message"), FILLED_BY_SCRIPT.values(), ids=FILLED_BY_SCRIPT)
+def test_a_net_that_a_script_fills_gets_a_warning(run: Run, net: str, message: str) -> None:
+    """Scripts of Caffe train such nets; ``netspec train`` refuses them."""
+    write(
+        **{
+            "net.prototxt": net + ' layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip" '
+            "inner_product_param { num_output: 2 } }"
+        }
+    )
+    checked = run("check", "s.prototxt")
+    assert checked.status == 0
+    (line,) = [line for line in checked.err.splitlines() if line.endswith("[filled-by-script]")]
+    assert line.startswith(f"warning: net.prototxt:1:1: {message}")
+    assert message in run("train", "s.prototxt").fault
+
+
+def test_a_test_net_of_other_shapes(run: Run) -> None:
+    test = NET.replace("num_output: 2", "num_output: 3")
+    assert test != NET
+    settings = 'test_net: "test.prototxt" test_iter: 1 test_interval: 1'
+    write(**{"s.prototxt": SOLVER + settings, "test.prototxt": test})
+    expected = 'layer "ip" (InnerProduct): cannot share weights with the training net: shapes'
+    assert expected in run("check", "s.prototxt").err
+
+
 SHAPES = {
     "HDF5Data": ["--shape", "data=1,2", "--shape", "label=1"],
     "Data": ["--shape", "data=1,3,6,8"],

@@ -70,8 +70,6 @@ def test_a_solver_and_its_nets_are_read_to_the_end():
         'layer "s" (Strange): LayerParameter has no field "strange_param";' + OWN,
         'layer "s" (Strange): unknown layer type "Strange"; `netspec layers` lists the known ones, '
         "docs/layer.md shows how to add one with --plugin FILE.py",
-        'layer "in" (Input): nothing fills "a" during training; use a layer that reads data '
-        "(Data, ImageData, HDF5Data, ...)",
     ]
     Path("solver.prototxt").write_text('fast: true\nnet: "net.prototxt"\nbase_lr: 1\nquick_mode { x: 1 }\n')
     assert [line.partition(": ")[2] for line in lines("solver.prototxt")] == [
