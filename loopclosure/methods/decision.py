@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from loopclosure.detector.verification import DOUBTLESS, SURE
 from loopclosure.methods.geometry import Matches
-from loopclosure.methods.lines import Lines
+from loopclosure.methods.lines import LEAST_ACCEPTED, Lines
 
 WINDOW = 5  # references to each side of a line, and at least so many queries along it, where a loop has neighbors
 UNLIKELY = 0.05  # that so many matches in a row are not verified, at the share that is
@@ -19,7 +19,10 @@ def decide(matches: Matches, lines: Lines | None) -> np.ndarray:
     if lines is None:
         return matches.evidence >= SURE
     pairs, verified = neighbors(matches.match, lines), matches.evidence >= 1
-    by_line = grown(matches.line, lines.above_decoys & (matches.match == lines.match), pairs)
+    label = stretches(matches.line, pairs)
+    many = np.bincount(label, matches.line)[label] >= LEAST_ACCEPTED
+    seeds = matches.line & (many | (np.bincount(label, verified & matches.line)[label] > 0))
+    by_line = grown(seeds, lines.above_decoys & (matches.match == lines.match), pairs)
     loops = by_line & ~contradicted(by_line, verified, pairs, lines.sequence.length)
     # From afar a place is seen before the camera is there: other queries fit it better.
     loops |= lines.near & (matches.evidence >= DOUBTLESS)
@@ -47,9 +50,7 @@ def contradicted(loops: np.ndarray, verified: np.ndarray, pairs: np.ndarray, len
     at the share of the stretch that is, or of all stretches where none is. A run longer than a line is several
     lines, which tell enough; a shorter one may be the end of the line through the last place of a loop.
     """
-    linked = pairs[loops[pairs].all(axis=1)]
-    links = coo_matrix((np.ones(len(linked)), linked.T), shape=(len(loops), len(loops)))
-    stretch = connected_components(links, directed=False)[1]
+    stretch = stretches(loops, pairs)
     against = np.zeros_like(loops)
     overall = np.mean(verified[loops]) if loops.any() else 0.0
     for number in np.unique(stretch[loops]):
@@ -63,6 +64,13 @@ def contradicted(loops: np.ndarray, verified: np.ndarray, pairs: np.ndarray, len
             if len(run) <= length and (1 - share) ** len(run) < UNLIKELY:
                 against[run] = True
     return against
+
+
+def stretches(loops: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Return the number of the stretch of each query (Q,): loops that are neighbors, or neighbors of these."""
+    linked = pairs[loops[pairs].all(axis=1)]
+    links = coo_matrix((np.ones(len(linked)), linked.T), shape=(len(loops), len(loops)))
+    return connected_components(links, directed=False)[1]
 
 
 def neighbors(match: np.ndarray, lines: Lines) -> np.ndarray:
