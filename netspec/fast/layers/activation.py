@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
 
 import torch
 import torch.nn.functional as F
 
-from netspec.exact import ALL, switch
+from netspec.exact import ALL
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Folds
 from netspec.fast.kernels import RELU, Finish, Inference, Kernel, Learning, Room, clip, finished
@@ -20,8 +19,6 @@ from netspec.layers.powers import AbsVal, Exp, Log, Power
 from netspec.run.recorded import Kernels
 
 _VECTORS = 2**12  # numbers: for fewer, one call of torch is faster than several
-
-Gradient = Callable[..., torch.Tensor]
 
 
 def _relu_folds(layer: ReLU) -> Folds:
@@ -78,32 +75,18 @@ def _learn_prelu(layer: PReLU, how: Learning) -> Kernels | None:
     return Kernels(forward, backward)
 
 
-def _learn_rounded(compute: Gradient, gradient: Gradient, layer: Rounded, how: Learning) -> Kernels:
-    """Return kernels of torch's function into ``out``, and of its gradient, of the top's and the top."""
-    if switch.applies(layer.context.options.exact, torch.empty(1)):
-        return _learn_as_caffe(layer, how)
-    rooms = (Room(), Room())
+def _learn_tanh(layer: TanH, how: Learning) -> Kernels | None:
+    if layer.context.options.exact == ALL:
+        return None
+    rooms, gradient = (Room(), Room()), torch.ops.aten.tanh_backward.grad_input
 
     def forward(x: torch.Tensor) -> torch.Tensor:
-        return compute(x, out=rooms[0].like(x))
+        return torch.tanh(x, out=rooms[0].like(x))
 
     def backward(diff: torch.Tensor) -> torch.Tensor:
         return gradient(diff, rooms[0].like(diff), grad_input=rooms[1].like(diff))
 
     return Kernels(forward, backward)
-
-
-def _learn_as_caffe(layer: Rounded, how: Learning) -> Kernels | None:
-    if not switch.applies(layer.context.options.exact, torch.empty(1)):
-        return None
-    bottom = top = torch.empty(0)
-
-    def forward(x: torch.Tensor) -> torch.Tensor:
-        nonlocal bottom, top
-        bottom, top = x, layer.as_caffe(x)
-        return top
-
-    return Kernels(forward, lambda diff: layer.caffes_gradient(bottom, top, diff))
 
 
 def _in_place(finish: Finish, layer: Rounded) -> Folds:
@@ -114,25 +97,14 @@ def _clip_folds(layer: Clip) -> Folds:
     return Folds(finish=clip(layer.low, layer.high) if layer.low <= layer.high else None)
 
 
-_ROUNDED = Entry(learning=_learn_as_caffe, fresh=True, any_layout=True)
 ENTRIES = {
     ReLU: Entry(learning=_learn_relu, folds=_relu_folds, fresh=True, any_layout=True),
     PReLU: Entry(_prelu, _learn_prelu, fresh=True, any_layout=True),
-    Sigmoid: Entry(
-        learning=partial(_learn_rounded, torch.sigmoid, torch.ops.aten.sigmoid_backward.grad_input),
-        folds=partial(_in_place, Finish("sigmoid", torch.sigmoid_)),
-        fresh=True,
-        any_layout=True,
-    ),
+    Sigmoid: Entry(folds=partial(_in_place, Finish("sigmoid", torch.sigmoid_)), fresh=True, any_layout=True),
     TanH: Entry(
-        learning=partial(_learn_rounded, torch.tanh, torch.ops.aten.tanh_backward.grad_input),
-        folds=partial(_in_place, Finish("tanh", torch.tanh_)),
-        fresh=True,
-        any_layout=True,
+        learning=_learn_tanh, folds=partial(_in_place, Finish("tanh", torch.tanh_)), fresh=True, any_layout=True
     ),
-    **dict.fromkeys((BNLL, ELU, Swish, Exp, Log), _ROUNDED),
-    Power: Entry(learning=_learn_as_caffe, any_layout=True),
     Clip: Entry(folds=_clip_folds, fresh=True, any_layout=True),
-    Threshold: Entry(fresh=True, any_layout=True),
-    AbsVal: Entry(fresh=True, any_layout=True),
+    Power: Entry(any_layout=True),
+    **dict.fromkeys((BNLL, ELU, Swish, Exp, Log, Threshold, AbsVal), Entry(fresh=True, any_layout=True)),
 }

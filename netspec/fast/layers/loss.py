@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,35 +13,11 @@ import torch.nn.functional as F
 
 from netspec.exact import SMALL_ITEM
 from netspec.exact.losses import class_sums
-from netspec.exact.sums import row_squares
 from netspec.fast.entry import Entry
 from netspec.fast.kernels import Learning
 from netspec.layers.loss.base import normalizer
-from netspec.layers.loss.losses import EuclideanLoss
 from netspec.layers.loss.scores import FLT_MIN, SoftmaxWithLoss
 from netspec.run.recorded import Kernels
-
-
-def _learn_euclidean(layer: EuclideanLoss, how: Learning) -> Kernels:
-    shape, other = layer.bottom_shapes
-    difference, found = torch.empty(shape), [torch.empty(shape) if wanted else None for wanted in how.wanted]
-    row, squares, exact = difference.view(1, -1), torch.empty(shape), layer.is_exact(difference)
-    count = torch.tensor(float(shape[0]))  # a number would be made a tensor at each pass
-    divisor = 2 * count
-
-    def forward(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-        torch.sub(a, b.reshape(shape), out=difference)
-        return (row_squares(row)[0] if exact else torch.square(difference, out=squares).sum()) / divisor
-
-    def backward(diff: torch.Tensor) -> Sequence[torch.Tensor | None]:
-        factor = diff / count  # twice diff / divisor, to the last bit
-        if found[0] is not None:
-            torch.mul(difference, factor, out=found[0])
-        if found[1] is not None:
-            torch.mul(difference, -factor, out=found[1])
-        return found[0], None if found[1] is None else found[1].view(other)
-
-    return Kernels(forward, backward)
 
 
 def _learn_softmax(layer: SoftmaxWithLoss, how: Learning) -> Kernels | None:
@@ -124,6 +100,5 @@ def _bound_cross_entropy(
 
 
 ENTRIES = {
-    EuclideanLoss: Entry(learning=_learn_euclidean),
     SoftmaxWithLoss: Entry(learning=_learn_softmax),
 }

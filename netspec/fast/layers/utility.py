@@ -9,7 +9,7 @@ from netspec.fast.entry import Entry
 from netspec.fast.kernels import Inference, Kernel, Learning, finished
 from netspec.layers.utility.arithmetic import Eltwise, Softmax
 from netspec.layers.utility.parts import Concat, Slice
-from netspec.layers.utility.shape import Flatten, Reshape, Split
+from netspec.layers.utility.shape import Split
 from netspec.run.recorded import Kernels
 
 
@@ -30,16 +30,6 @@ def _learn_eltwise(layer: Eltwise, how: Learning) -> Kernels | None:
 def _learn_concat(layer: Concat, how: Learning) -> Kernels:
     axis, sizes = layer.axis, [shape[layer.axis] for shape in layer.bottom_shapes]
     return Kernels(lambda *bottoms: torch.cat(bottoms, axis), lambda diff: diff.split(sizes, axis))
-
-
-def _reshape(layer: Flatten | Reshape, how: Inference) -> Kernel:
-    (top_shape,) = layer.top_shapes
-    return lambda x: x.reshape(top_shape)
-
-
-def _learn_reshape(layer: Flatten | Reshape, how: Learning) -> Kernels:
-    (shape,), (top_shape,) = layer.bottom_shapes, layer.top_shapes
-    return Kernels(lambda x: x.reshape(top_shape), lambda diff: diff.reshape(shape))
 
 
 def _split(layer: Split, how: Inference) -> Kernel:
@@ -64,7 +54,5 @@ ENTRIES = {
     Softmax: Entry(fresh=True, any_layout=True),
     Concat: Entry(learning=_learn_concat, fresh=lambda layer: len(layer.bottom_shapes) > 1, any_layout=True),
     Slice: Entry(any_layout=True),
-    Flatten: Entry(_reshape, _learn_reshape),
-    Reshape: Entry(_reshape, _learn_reshape),
     Split: Entry(_split, _learn_split),
 }

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from netspec.fast.layers.dialects import ENTRIES
 from netspec.net.net import Net
+from paths import ROOT
 
 BITS = "bw_layer_in: 6 fl_layer_in: 3 bw_layer_out: 8 fl_layer_out: 2 bw_params: 5 fl_params: 4"
 CONV = "convolution_param { num_output: 4 kernel_size: 3 weight_filler { type: 'xavier' } %s }"
@@ -18,6 +20,12 @@ LAYERS = {
     "bits of vectors": "type: 'FcRistretto' inner_product_param { num_output: 4 weight_filler { type: 'xavier' } }"
     f" quantization_param {{ {BITS} }}",
 }
+
+
+@pytest.mark.parametrize("path", ENTRIES)
+def test_an_entry_is_that_of_a_class(path: str) -> None:
+    module, _, name = path.rpartition(".")
+    assert f"class {name}(" in (ROOT / f"{module.replace('.', '/')}.py").read_text()
 
 
 @pytest.mark.parametrize("layer", LAYERS)
