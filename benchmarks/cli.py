@@ -93,12 +93,16 @@ def _add_settings(commands: Commands) -> None:
     parser.set_defaults(function=_settings)
     _add_data(parser)
     parser.add_argument("families", nargs="*", metavar="FAMILY", help="only the drives made of these (default: all)")
+    parser.add_argument("--halves", action="store_true", help="also the figures of each half of the roads and rooms")
 
 
 def _settings(arguments: argparse.Namespace) -> None:
-    from benchmarks.settings import run, summary
+    from benchmarks.settings import halves, run, summary
 
-    print(summary(run(arguments.data, arguments.work, arguments.families, partial(print, flush=True))))
+    results = run(arguments.data, arguments.work, arguments.families, partial(print, flush=True))
+    if arguments.halves:
+        print(halves(results))
+    print(summary(results))
 
 
 def _add_tables(commands: Commands) -> None:

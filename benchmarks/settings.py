@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.drives import Drive, drives
+from benchmarks.drives import FIRST_HALF, Drive, drives
 from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.run import load_describe
 from loopclosure.detector.verification import Agreement, GeometricCheck, Pairs
@@ -217,3 +217,21 @@ def summary(results: Sequence[Result]) -> str:
         f"{right} of {len(results)} drives with a precision of {PRECISION:g}; {enough} of {len(there)} with {ENOUGH:g} "
         f"of the best recall; on {sum(r.silent for r in there)} auto cannot tell"
     )
+
+
+def halves(results: Sequence[Result]) -> str:
+    """Say how both halves of the roads and rooms did, and their families, in lines."""
+    lines = []
+    for name, first in (("first half", True), ("second half", False)):
+        half = [result for result in results if (result.family in FIRST_HALF) == first]
+        for family in dict.fromkeys(result.family for result in half):
+            lines.append(f"  {family + ':':22}{_figures([r for r in half if r.family == family])}")
+        lines.append(f"{name + ':':24}{_figures(half)}")
+    return "\n".join(lines)
+
+
+def _figures(results: Sequence[Result]) -> str:
+    right = sum(not r.accepted or r.precision >= PRECISION for r in results)
+    recalls = [r.recall for r in results if r.loops]
+    mean = f"{np.mean(recalls):.2f}" if recalls else "-"
+    return f"{right} of {len(results)} drives with a precision of {PRECISION:g}; mean recall {mean}"

@@ -1,5 +1,6 @@
 """tools/bench settings: drives whose loops are known."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -34,6 +35,11 @@ def test_what_auto_should_reach() -> None:
     right = settings.Result("a", "b", 9, 8, 1.0, 0.8, 0.9, "", [])
     wrong = settings.Result("a", "b", 9, 8, 0.9, 0.8, 0.9, "", [])
     assert [r.good for r in (silent, right, wrong)] == [False, True, False]
+    half = replace(right, family=drives.FIRST_HALF[0])
+    first, second = settings.halves([half, silent, wrong]).split("first half:")
+    assert drives.FIRST_HALF[0] in first
+    assert second.split("\n")[0].split() == "1 of 1 drives with a precision of 0.99; mean recall 0.80".split()
+    assert "second half:            1 of 2 drives" in second
     said = settings.summary([silent, right, wrong])
     assert said == ("2 of 3 drives with a precision of 0.99; 2 of 3 with 0.7 of the best recall; on 1 auto cannot tell")
 
