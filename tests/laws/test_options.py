@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 import pytest
 
-from case_files import read_texts
 from lmdb_build.cli import main as lmdb_build_main
 from loopclosure.cli import main as loopclosure_main
 from paths import GOLDEN, ROOT
@@ -24,7 +23,77 @@ from paths import GOLDEN, ROOT
 NET, SOLVER, WEIGHTS = "train_val.prototxt", "solver.prototxt", "init.caffemodel"
 THUMBNAILS = "loopclosure.descriptors.thumbnails:Thumbnailer"
 # A command line of each way in which a command works; those of one command have the same options.
-WAYS = {program: text.splitlines() for program, text in read_texts("laws/ways.txt").items()}
+WAYS = {
+    "netspec": [
+        "check train_val.prototxt",
+        "check solver.prototxt",
+        "check init.caffemodel",
+        "train solver.prototxt",
+        "test --model train_val.prototxt --weights init.caffemodel --iterations 1",
+        "time --model train_val.prototxt --iterations 1",
+        "extract --model train_val.prototxt --weights init.caffemodel --blob feat --out f.npz",
+        "extract --model train_val.prototxt --weights init.caffemodel --blob feat --out f.npz --images images",
+        "export train_val.prototxt --to safetensors --out x.safetensors",
+        "export train_val.prototxt --to torch --out x.py",
+        "export train_val.prototxt --to onnx --out x.onnx",
+        "fold train_val.prototxt --weights init.caffemodel --out folded",
+        "draw train_val.prototxt --out net.svg",
+        "draw train_val.prototxt --out net.html",
+        "diff train_val.prototxt train_val.prototxt",
+        "fmt --check train_val.prototxt",
+        "fmt train_val.prototxt",
+        "lint train_val.prototxt",
+        "lint --rules",
+        "plot train.log --out p.png",
+        "plot train.log --out p.html",
+        "data stat pairs/test_lmdb",
+        "data show pairs/test_lmdb --out s.png",
+        "look filters init.caffemodel --out f.png",
+        "look maps train_val.prototxt --weights init.caffemodel --blob feat --image images/0.png --out m.png",
+        "look saliency train_val.prototxt --weights init.caffemodel --blob feat --image images/0.png --out s.png",
+        "look saliency train_val.prototxt --weights init.caffemodel --blob feat --image "
+        "images/0.png --to images/1.png --out s.png",
+        "look embedding features.npz --out e.png",
+        "bug-report train_val.prototxt",
+        "extract_features init.caffemodel train_val.prototxt feat features_lmdb 1 lmdb",
+        "device_query",
+        "upgrade_net_proto_text train_val.prototxt new.prototxt",
+        "upgrade_net_proto_text init.caffemodel new.prototxt",
+        "upgrade_net_proto_binary init.caffemodel new.caffemodel",
+        "upgrade_solver_proto_text solver.prototxt new.prototxt",
+        "layers",
+        "completion bash",
+        "install-caffe --build tree",
+        "remove-caffe --build tree",
+    ],
+    "lmdb_build": [
+        "walk walk --frames 3 --size 32x24",
+        "views images --out views --batches 1 --size 1 --view-size 16x12",
+        "sheet pairs.txt sheet.png",
+        "join joined.txt pairs.txt pairs.txt",
+        "convert ./ pairs.txt db",
+        "imageset ./ images.txt db",
+        "mean pairs/test_lmdb mean.binaryproto",
+        "compare solver.prototxt --no-train --out out",
+    ],
+    "loopclosure": [
+        "evaluate tum:walk/walk_1 --method thumbnails --exclude-frames 3 --out report",
+        "evaluate images:images,truth=truth.png --method thumbnails --exclude-frames 1 --out report",
+        "evaluate traverses:images,references=images --method thumbnails --out report",
+        "compare report/report.json reports/other/report.json --out both",
+        "detect walk/walk_1 --describe loopclosure.descriptors.thumbnails:Thumbnailer --exclude-recent 3 --out found",
+        "detect walk/walk_1 --describe loopclosure.descriptors.thumbnails:Thumbnailer --threshold "
+        "-1 --exclude-recent 3 --out found",
+        "detect walk/walk_1 --features walk.npz --threshold -1 --exclude-recent 1 --out found",
+        "detect --video walk.avi --describe loopclosure.descriptors.thumbnails:Thumbnailer --out found",
+        "close walk/walk_1 --loops loops.csv --drift 2 --out closed",
+        "close --graph loops.g2o --out closed",
+        "map build new walk/walk_1,limit=2",
+        "map add map walk/walk_1,limit=2",
+        "map query map walk/walk_1,limit=2 --out found",
+        "similarity features.npz --out s.npz",
+    ],
+}
 # Commands that this test does not start, and why.
 NOT_STARTED = {
     "netspec": {
