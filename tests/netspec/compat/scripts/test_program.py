@@ -1,6 +1,6 @@
 """``netspec run``: scripts and modules run as Python runs them, and ``import caffe`` finds netspec.
 
-Programs in the form of those that people have stand in programs.txt, three of them in Python 2.
+Programs in the form of those that people have stand in programs/, three of them in Python 2.
 """
 
 import shutil
@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import netspec
-from case_files import read_cases
 from dnn_program import HERE
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
@@ -23,8 +22,8 @@ from netspec.net.weights import write_binary
 pytestmark = pytest.mark.slow
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
-CASES = read_cases("netspec/compat/scripts/programs.txt")
-PROGRAMS = {name: case["program"] for name, case in CASES.items()}
+FOLDER = Path(__file__).parent
+PROGRAMS = {path.stem: path.read_text() for path in (FOLDER / "programs").glob("*.py")}
 WHO = "import sys; print(sys.argv, __name__, __file__, sys.path[0], __package__, __spec__ is None)"
 
 
@@ -95,7 +94,7 @@ TREE = "import sys\nsys.path.insert(0, 'python')\n"
 
 
 def test_python_files_of_a_caffe_tree_are_found_below_caffe(run: Run) -> None:
-    assert run("s.py", s=TREE + PROGRAMS["in a tree"], files=SOURCES).stdout == "two\n"
+    assert run("s.py", s=TREE + PROGRAMS["in_a_tree"], files=SOURCES).stdout == "two\n"
 
 
 @pytest.mark.parametrize(
@@ -113,7 +112,7 @@ def test_workers_that_are_started_anew_see_what_the_program_sees(
 
 
 def test_arrays_of_one_element_are_numbers(run: Run) -> None:
-    *printed, first, second, third = run("s.py", s=PROGRAMS["arrays of one element"]).stdout.splitlines()
+    *printed, first, second, third = run("s.py", s=PROGRAMS["arrays_of_one_element"]).stdout.splitlines()
     assert printed == ["1.00 a 1 1.0 2.0 1.0", "True"]
     assert first.startswith("%d format")
     assert second.startswith("float() argument must be")
@@ -153,18 +152,18 @@ def test_the_log_is_shown_once_and_as_the_environment_wants_it(run: Run) -> None
 
 
 def test_names_that_were_dropped_are_given_back_in_the_script_only(run: Run) -> None:
-    assert run("s.py", s=PROGRAMS["dropped names"]).stdout == "fine\n"
+    assert run("s.py", s=PROGRAMS["dropped_names"]).stdout == "fine\n"
     assert not hasattr(np, "float")
     assert not hasattr(np, "asscalar")
 
 
 def test_scikit_images_old_names(run: Run) -> None:
     pytest.importorskip("skimage")
-    assert run("s.py", s=PROGRAMS["old names of scikit-image"]).stdout == "(2, 3) True\n(2, 3, 3) (8, 12) (8, 12, 4)\n"
+    assert run("s.py", s=PROGRAMS["old_names_of_scikit_image"]).stdout == "(2, 3) True\n(2, 3, 3) (8, 12) (8, 12, 4)\n"
 
 
 def test_keys_of_databases_may_be_text(run: Run) -> None:
-    assert run("-minloglevel", "2", "s.py", s=PROGRAMS["keys as text"]).stdout == "[0, 1] 2\nTrue None\n[0. 1.]\n"
+    assert run("-minloglevel", "2", "s.py", s=PROGRAMS["keys_as_text"]).stdout == "[0, 1] 2\nTrue None\n[0. 1.]\n"
 
 
 def test_nothing_is_loaded_that_the_script_does_not_ask_for(run: Run) -> None:
@@ -212,7 +211,7 @@ def test_a_program_for_ssd_in_python_2(run: Run, tmp_path: Path) -> None:
 
 
 def test_a_cascade_over_an_image_pyramid_in_python_2(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "det1.prototxt").write_text(CASES["cascade"]["net"])
+    (tmp_path / "det1.prototxt").write_text((FOLDER / "nets" / "cascade.prototxt").read_text())
     net = netspec.load_net(tmp_path / "det1.prototxt", seed=1)
     write_binary(net, tmp_path / "det1.caffemodel")
     image = np.random.RandomState(3).randint(0, 256, (60, 80, 3)).astype(np.uint8)
