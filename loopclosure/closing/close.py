@@ -15,6 +15,7 @@ from loopclosure.closing.measure import Loop
 from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, Relative
 from loopclosure.detector.export import LOOP_SIGMAS, relative_pose, write_pose_graph
 from loopclosure.errors import InputError
+from loopclosure.places.same_place import MAX_DISTANCE_M
 from loopclosure.places.trajectory import Trajectory, write_trajectory
 from netspec.files.whole_file import write_csv
 
@@ -142,6 +143,8 @@ def summary(closed: Closed) -> list[str]:
     """Return what there is to say about a closed path, a sentence each."""
     used = int(np.count_nonzero(closed.accepted))
     lines = [f"{used} of {len(closed.loops)} loops used, {len(closed.loops) - used} contradict the others"]
+    if spot := one_spot(closed):
+        lines.append(spot)
     if closed.not_measured:
         lines.append(f"{closed.not_measured} more left out: fewer than 20 points agree with one relative pose")
     meanings = {
@@ -226,3 +229,19 @@ def turn_rmse_deg(path: Array, truth: Array) -> float:
     a, b = (Rotation.from_quat(poses[:, 3:]) for poses in (path, truth))
     common = (b * a.inv()).mean()
     return float(np.degrees(np.sqrt(np.mean(((common * a).inv() * b).magnitude() ** 2))))
+
+
+def one_spot(closed: Closed) -> str:
+    """Say that all loops that are used lie in one spot, and how far from it the path goes; empty if they do not."""
+    used = [edge for edge, accepted in zip(closed.edges, closed.accepted, strict=True) if accepted]
+    if not used:
+        return ""
+    ends = np.array([(edge.first, edge.second) for edge in used])
+    places = closed.poses[ends.ravel(), :3]
+    middle = places.mean(axis=0)
+    radius = np.linalg.norm(places - middle, axis=1).max()
+    away = np.linalg.norm(closed.poses[ends.min() : ends.max() + 1, :3] - middle, axis=1).max()
+    if radius > MAX_DISTANCE_M or away <= 2 * MAX_DISTANCE_M:
+        return ""
+    said = f"all loops lie in one spot, within {max(radius, 0.01):.2g} m"
+    return f"{said}; the path between them goes up to {away:.3g} m away, where no loop corrects it"

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from loopclosure.closing.close import aligned, ate_rmse_m, drifted, path_of, steps_between, turn_rmse_deg
+from loopclosure.closing.close import (
+    Closed,
+    aligned,
+    ate_rmse_m,
+    drifted,
+    one_spot,
+    path_of,
+    steps_between,
+    turn_rmse_deg,
+)
 from loopclosure.closing.graph import Edge, State, _Graph, solve
 from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, View, relative_view
 from loopclosure.detector.export import LOOP_SIGMAS, relative_pose
@@ -183,3 +192,13 @@ def test_the_camera_of_smaller_images_and_of_text() -> None:
     for wrong in ("517,516", "a,b,c,d", "0,1,2,3"):
         with pytest.raises(InputError):
             from_text(wrong)
+
+
+@pytest.mark.parametrize(("ends", "spot"), [([(0, 40), (1, 39)], True), ([(0, 40), (15, 25)], False), ([], False)])
+def test_loops_in_one_spot_are_said_to_be(ends: list[tuple[int, int]], spot: bool) -> None:
+    """A way out of 20 m and back; loops at its beginning alone, or in the middle too."""
+    poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (41, 1))
+    poses[:, 0] = 20 - np.abs(np.arange(41) - 20)
+    edges = [Edge(first, second, poses[0], np.eye(6)) for first, second in ends]
+    closed = Closed(np.arange(41), poses, poses, [], edges, [], np.ones(len(edges), bool), 0)
+    assert ("the path between them goes up to 19.5 m away" in one_spot(closed)) == spot
