@@ -160,11 +160,11 @@ def _check_numbers(dialect: Dialect) -> None:
         ranges = message.extension_ranges
         if not any(first <= number < last for first, last in ranges):
             theirs = message.fields_by_number.get(number)
-            whose = f'that of Caffe\'s "{theirs.name}"' if theirs else "kept for Caffe's own"
+            owner = f'that of Caffe\'s "{theirs.name}"' if theirs else "kept for Caffe's own"
             used = {n for each in (dialect, *_active.values()) for name, n in each.numbers() if name == full_name}
             free = next(n for first, _ in ranges for n in range(max(first, 2000), 2**29) if n not in used)
             advice = "files of text have no numbers, and the weights of a .caffemodel are read all the same"
-            fault = f'number {number} of {full_name} is {whose}; give "{field}" another, say {free}: {advice}'
+            fault = f'number {number} of {full_name} is {owner}; give "{field}" another, say {free}: {advice}'
             raise SpecError(fault, Where(dialect.declarations.name))
     for other in _active.values():
         for key in numbers.keys() & other.numbers().keys():

@@ -1,4 +1,4 @@
-"""Whose a layer is, where several forks have layers of one type: what only one of them has, in one table."""
+"""Finds out which fork a layer belongs to, if several forks define its type, by what only one of them has."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from netspec.layers.contract.base import Layer
 from netspec.proto.schema import TRAIN, given, value
 
-OTHERS = "forks have other layers of this type, and nothing here shows whose it is; it is computed "
+OTHERS = "several forks define this layer type, and the net does not show which one is meant; it is computed "
 
 
 def never(layer: Layer) -> bool:
@@ -19,11 +19,11 @@ def never(layer: Layer) -> bool:
 
 @dataclass(frozen=True)
 class Fork:
-    """The layers that one fork has of a type.
+    """One fork's definition of a layer type.
 
-    ``fields`` are those that only it has, in the layer (``norm_param``) or in a message of it (``bn_param.bn_mode``);
-    ``shows`` finds what else only its layers have. ``numbers`` says what it computes; "" where a fork before it does
-    the same.
+    ``fields`` are fields that only this fork has, in the layer (``norm_param``) or in one of its messages
+    (``bn_param.bn_mode``). ``shows`` checks for anything else that only this fork's layers have. ``numbers`` says what
+    the layer computes; it is "" if an earlier fork in the list computes the same.
     """
 
     dialect: str
@@ -32,16 +32,16 @@ class Fork:
     shows: Callable[[Layer], bool] = never
 
     def is_shown_by(self, layer: Layer) -> bool:
-        """Return whether a layer has what only this fork has."""
+        """Return whether a layer has something that only this fork has."""
         return any(_has(layer, field) for field in self.fields) or self.shows(layer)
 
 
 @dataclass(frozen=True)
 class Signature:
-    """The forks that have a type; the first is the default.
+    """The forks that define a layer type. The first one is the default.
 
-    All compute the same for a layer that is ``alike``. ``advice`` is the end of the warning, where it is not to name a
-    dialect. With ``loose``, the files of some forks have its blobs with other axes of size 1.
+    ``alike`` returns whether all forks compute the same for a layer. ``advice`` is the end of the warning, if it is
+    not the usual one that names dialects. ``loose``: in the files of some forks the blobs have other axes of size 1.
     """
 
     forks: tuple[Fork, ...]
@@ -56,7 +56,7 @@ def _has(layer: Layer, field: str) -> bool:
 
 
 def _has_no_outside_weights(layer: Layer) -> bool:
-    """Return whether a SmoothL1Loss is without weights and pixels, so that N is all that it could be divided by."""
+    """Return whether a SmoothL1Loss has neither weights nor pixels, so that every fork divides it by N."""
     shape = layer.bottom_shapes[0]
     return len(layer.bottom_shapes) == 2 and math.prod(shape[2:]) == 1 and _has(layer, "loss_weight")
 
@@ -142,8 +142,8 @@ SIGNATURES = {
 }
 
 
-def _decided(layer: Layer) -> str:
-    """Return the dialect whose layer this is; "" where nothing says so. Of several that are shown the last counts."""
+def _shown_fork(layer: Layer) -> str:
+    """Return the dialect that defines this layer, or "" if the net does not show it. The last of several wins."""
     signature = SIGNATURES[layer.type]
     if shown := [fork.dialect for fork in signature.forks if fork.is_shown_by(layer)]:
         return shown[-1]
@@ -154,24 +154,24 @@ def _decided(layer: Layer) -> str:
 
 
 def has_several(layer_type: str) -> bool:
-    """Return whether several dialects have a layer type, so that it shows none of them."""
+    """Return whether several dialects define a layer type."""
     return layer_type in SIGNATURES and len(SIGNATURES[layer_type].forks) > 1
 
 
 def is_loose(layer: Layer) -> bool:
-    """Return whether the files of some forks have a layer's blobs with other axes of size 1."""
+    """Return whether the blobs of a layer have other axes of size 1 in the files of some forks."""
     return layer.type in SIGNATURES and SIGNATURES[layer.type].loose
 
 
-def whose(layer: Layer) -> str:
-    """Return the dialect whose layer this is: the one that it shows, one that the net uses, or the default."""
-    return _decided(layer) or SIGNATURES[layer.type].forks[0].dialect
+def fork_of(layer: Layer) -> str:
+    """Return the dialect that defines this layer: the one it shows, or one that the net uses, or the default."""
+    return _shown_fork(layer) or SIGNATURES[layer.type].forks[0].dialect
 
 
 def doubt(layer: Layer) -> str:
-    """Return what to warn of where nothing shows whose a layer is, with what to write; "" where there is no doubt."""
+    """Return a warning, with advice, if the net does not show which fork's layer is meant; "" if it does."""
     own = type(layer).__module__.startswith(f"{__package__}.")  # not a user's layer of the same type
-    if not own or layer.type not in SIGNATURES or _decided(layer):
+    if not own or layer.type not in SIGNATURES or _shown_fork(layer):
         return ""
     signature = SIGNATURES[layer.type]
     if signature.advice:

@@ -20,14 +20,14 @@ import torch
 from netspec.exact.blas import gemm_routine, gemv_routine
 from netspec.exact.products import Axes, Filter
 
-SMALL = 2**14  # numbers that are copied sooner than shown
+SMALL = 2**14  # numbers: for smaller tensors a copy takes less time than making a view
 
 
 class Matrix:
-    """Shows tensors as matrices with so many columns, to BLAS, which takes them as transposed.
+    """Gives BLAS a transposed view of a tensor as a matrix with ``columns`` columns.
 
-    Memory that comes again has its view from the last time. A tensor whose numbers do not lie one after the other is
-    copied, and so is a small one that lies elsewhere each time: to make a view takes longer.
+    The view is kept for the next call with the same memory. A tensor that is not contiguous is copied. So is a small
+    tensor in other memory than last time, because a copy takes less time than a new view.
     """
 
     __slots__ = ("_columns", "_copy", "_place", "_shown", "_tensor")

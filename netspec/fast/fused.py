@@ -82,8 +82,8 @@ def spread_by_channel(
     pixels = frame[:, :, ::down, ::across]
     axes = zip(sliding.kernel, sliding.dilation, sliding.pad, strict=True)
     turned = replace(sliding, stride=(1, 1), pad=tuple(d * (k - 1) - p for k, d, p in axes))
-    apart = replace(how, memo=lambda name, make: how.memo(f"turned {name}", make))
-    convolve = convolution(framed, values_of(weight).flip(2, 3), bias, turned, channels, apart)
+    under_own_key = replace(how, memo=lambda name, make: how.memo(f"turned {name}", make))
+    convolve = convolution(framed, values_of(weight).flip(2, 3), bias, turned, channels, under_own_key)
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         pixels.copy_(maps)

@@ -30,7 +30,7 @@ from netspec.fast.table import entry_of, folds_of, inference_kernel, is_fresh
 from netspec.graph.options import PACK
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.learned import Seen, blobs_of, is_lent
+from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias
 from netspec.layers.contract.reading import changes_itself
 from netspec.process.heap import give_back_freed_memory
 from netspec.run.shapes import fitted
@@ -52,7 +52,7 @@ class PreparedLine:
     frozen: list[int]  # of the net's learned blobs: those whose values it holds
     seen: Seen  # these, as they were
     waiting: list[tuple[torch.Tensor, Seen]]  # those that were changing
-    memos: set[Any]  # the keys of what it keeps in memory beside the blobs
+    memos: set[Any]  # the keys of other tensors that it keeps in memory
     kept: int  # bytes that kernels keep for these shapes
     need: int  # bytes of the values that are alive at one time, at most, and of what kernels keep
 
@@ -62,7 +62,7 @@ class PreparedLine:
             return False
         if not self.waiting:
             return True
-        resting = [before.are([blob]) and not is_lent(blob) for blob, before in self.waiting]
+        resting = [before.are([blob]) and not may_have_alias(blob) for blob, before in self.waiting]
         self.waiting = [(blob, Seen([blob], values=True)) for blob, _ in self.waiting]
         return not any(resting)
 
@@ -133,7 +133,7 @@ class Prepared:
             self.made.popitem(last=False)
 
     def kept_bytes(self) -> int:
-        """Return the bytes that programs keep beside the learned blobs."""
+        """Return the bytes that programs keep in addition to the learned blobs."""
         values = [value for _, value in self.memos.values()]
         tensors = [blob for value in values for blob in (value.blobs if isinstance(value, Absorbed) else (value,))]
         own = sum(program.kept for program in self.made.values())
@@ -194,7 +194,7 @@ class Prepared:
     ) -> tuple[Kernel, str]:
         """Return what runs a step, and in which way: "by value", "as is", "packed" or "prepared".
 
-        The keys of the memos that it uses are added to ``memos``; ``keeps`` is told the bytes of the rest.
+        The keys of the memos that it uses are added to ``memos``; ``keeps`` is called with the bytes of the rest.
         """
         layer = layers[step.node]
         promised = layers[step.chain.last if step.chain else step.node]
@@ -235,7 +235,7 @@ class Prepared:
         found = set()
         for blob in self._blobs():
             before = self._seen.get(id(blob))
-            if (before and not before.are([blob])) or is_lent(blob):
+            if (before and not before.are([blob])) or may_have_alias(blob):
                 found.add(id(blob))
             self._seen[id(blob)] = Seen([blob], values=True)
         return found

@@ -143,7 +143,7 @@ def _shared_multipliers(net: NetParameter, source: SourceMap) -> dict[str, tuple
 class Backward:
     """What Caffe propagates backward: by layer, and by layer and bottom.
 
-    ``computed``: the bottoms whose gradient is computed, also where a layer does not heed propagate_down.
+    ``computed`` also has the bottoms that get a gradient because their layer ignores propagate_down.
     """
 
     layers: tuple[bool, ...]
@@ -156,12 +156,12 @@ def plan_backward(
     learns: Sequence[bool],
     has_loss: Sequence[Sequence[bool]],
     label_bottoms: Sequence[frozenset[int]],
-    unheeding: Sequence[frozenset[int]],
+    ignoring: Sequence[frozenset[int]],
 ) -> Backward:
     """Decide what needs backward computation, like Net::Init.
 
     ``learns[i]``: layer i has a parameter with a nonzero rate; ``has_loss[i][j]``: its top j has a loss weight (also
-    anonymous tops); ``label_bottoms[i]``: its bottoms that never receive a gradient; ``unheeding[i]``: those that
+    anonymous tops); ``label_bottoms[i]``: its bottoms that never receive a gradient; ``ignoring[i]``: those that
     receive one even with ``propagate_down: false``, which is of use where the layer that made them goes backward.
     """
     value_needs = [False] * len(plan.blobs)
@@ -203,7 +203,7 @@ def plan_backward(
     goes_on = {v: needs for node, needs in zip(plan.nodes, layer_needs, strict=True) for v in node.tops}
     computed = tuple(
         tuple(
-            need or (layer_needs[i] and j in unheeding[i] and goes_on.get(node.bottoms[j], False))
+            need or (layer_needs[i] and j in ignoring[i] and goes_on.get(node.bottoms[j], False))
             for j, need in enumerate(bottom_needs[i])
         )
         for i, node in enumerate(plan.nodes)

@@ -121,7 +121,7 @@ class BatchNorm(Layer):
         return top.relu_() if self.rectifies else top
 
     def normalized(self, data: torch.Tensor, normalize: Callable[..., Any], *options: Any) -> tuple[Any, torch.Tensor]:
-        """Return what torch's function ``normalize`` makes of a batch, and of which numbers; add up its statistics."""
+        """Normalize a batch by torch's function ``normalize``; return the result and its input. Add up statistics."""
         made, mean, variance = self._by_torch(data, normalize, options)
         if _far_from_zero(mean, variance, self.eps):
             # A constant taken off each channel changes neither the result nor the gradient, only the rounding.

@@ -1,4 +1,4 @@
-"""The layers of a plan made one after the other, their parameters shared, and what a net has to know of them.
+"""Makes the layers of a plan in order, connects shared parameters, and works out what the net needs to run.
 
 Caffe: Net::Init (src/caffe/net.cpp); the sites in the log calls are the lines of that file that print the same.
 """
@@ -31,14 +31,14 @@ from netspec.proto.schema import TEST
 from netspec.run.eager import last_uses
 
 BYTES = 4  # of a number: float32
-MUCH = 8  # a net that needs more than 1/8 of the limit is summed up before it is built
+UNCHECKED_SHARE = 8  # once a net has taken 1/8 of the limit, the need of the whole net is added up
 
 #: Fields of every layer, which the net reads.
 COMMON = frozenset(
     {"name", "type", "bottom", "top", "phase", "loss_weight", "param", "blobs", "propagate_down", "include", "exclude"}
 )
-#: These set how Caffe computes, not what: no result depends on them.
-HOW_NOT_WHAT = frozenset({"engine", "force_nd_im2col", "share_in_parallel", "stable_prod_grad"})
+#: Fields that choose an implementation in Caffe. No result depends on them.
+WITHOUT_EFFECT = frozenset({"engine", "force_nd_im2col", "share_in_parallel", "stable_prod_grad"})
 
 _Fields = tuple[str, ...]
 
@@ -55,10 +55,11 @@ class Learnable:
 
 
 class Assembly:
-    """The layers of a plan, ``layers[i]`` of its node i; those with errors are missing, if errors are collected.
+    """The layers of a plan. ``layers[i]`` belongs to node i; where errors are collected, faulty layers are missing.
 
-    ``shapes`` are those of the blobs, ``loss_weights[i][j]`` is the weight of layer i's top j; ``backward`` says what
-    needs backward computation, None where a layer is missing. ``options`` are those given, with the net's dialects.
+    ``shapes`` has the shape of each blob, and ``loss_weights[i][j]`` is the loss weight of top j of layer i.
+    ``backward`` says which layers need backward computation; it is None if a layer is missing. ``options`` are the
+    options given, with the dialects of the net added.
     """
 
     def __init__(self, plan: Plan, options: BuildOptions) -> None:
@@ -86,18 +87,18 @@ class Assembly:
             self.backward = self._finish(list(self.layers.values()))
 
     def _made(self, i: int) -> Layer | None:
-        """Return layer ``i``; None where it has a fault, which is reported, or one before it had."""
+        """Return layer ``i``. Return None if it has a fault, which is reported, or if a layer it depends on has one."""
         node, param = self._plan.nodes[i], self._plan.net.layer[i]
-        tie = _Tie(self._plan, i, partial(self._take, i))
+        this = _LayerInNet(self._plan, i, partial(self._take, i))
         log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
         cls = class_of(param, self.options)
         if cls is None:
-            self._report(SpecError(unknown_type(node.type), tie.at("type")))
+            self._report(SpecError(unknown_type(node.type), this.at("type")))
             return None
         if any(v not in self._values for v in node.bottoms):
             return None  # an error upstream was reported
         phase = self._plan.net.state.phase
-        context = Context(phase, self.options, self.random, tie.at, self._report, tie.created, tie.take)
+        context = Context(phase, self.options, self.random, this.at, self._report, this.created, this.take)
         try:
             layer = cls(param, [self._values[v] for v in node.bottoms], context)
         except SpecError as fault:
@@ -107,12 +108,12 @@ class Assembly:
             if not is_out_of_memory(fault):
                 raise
             there = f"this machine has {amount(memory())}"
-            raise SpecError(f"its blobs need more memory than there is: {there}", tie.at()) from None
-        tie.take_from = None
+            raise SpecError(f"its blobs need more memory than there is: {there}", this.at()) from None
+        this.take_from = None
         return layer
 
     def _set_up(self, i: int, layer: Layer) -> None:
-        """Note and log what layer ``i`` makes; connect its parameters."""
+        """Record and log the tops of layer ``i``, and connect its parameters."""
         node = self._plan.nodes[i]
         weights = _loss_weights(layer, self._report)
         self.layers[i] = layer
@@ -132,14 +133,14 @@ class Assembly:
         self.need.add(i, layer, BYTES * sum(item.parameter.numel() for item in self.learnable[owned:]))
 
     def _take(self, i: int, size: int) -> None:
-        """Let layer ``i`` take memory, in bytes, while the net is built.
+        """Let layer ``i`` take ``size`` bytes of memory while the net is built.
 
-        Raises SpecError where that, or what the whole net needs, is too much. Only a net that takes much is looked at
-        as a whole.
+        Raises SpecError if the layer or the whole net needs too much. The need of the whole net is computed only once
+        the layers have taken 1 / UNCHECKED_SHARE of the limit.
         """
         if (
             self._device.type == "meta"
-            or self.need.total + size <= (limit := limit_on(self._device, self.options.limit)) // MUCH
+            or self.need.total + size <= (limit := limit_on(self._device, self.options.limit)) // UNCHECKED_SHARE
         ):
             return
         if not self._surveyed:
@@ -148,13 +149,14 @@ class Assembly:
             raise self._too_much
         if self.need.parameters + size > limit:
             raise SpecError(
-                f"needs {amount(size)} of memory beside {self.need}; {limit_text(limit)}", _Tie(self._plan, i).at()
+                f"needs {amount(size)} of memory in addition to {self.need}; {limit_text(limit)}",
+                _LayerInNet(self._plan, i).at(),
             )
 
     def _survey(self) -> Need:
-        """Return what the net needs, from the shapes that are known so far, without memory, data or Python layers.
+        """Return what the net needs, computed from the shapes known so far, without memory, data or Python layers.
 
-        Layers are filled as they are made: the sum has to be known before, or a machine is full when it is found.
+        Making a layer also fills its memory, so the need must be known before the layers are made.
         """
         seen = replace(
             self.options,
@@ -203,14 +205,14 @@ class Assembly:
             log.info("net.cpp:467", f"Sharing parameters '{spec.name}' {place}")
 
     def _finish(self, layers: list[Layer]) -> Backward:
-        """Return and log which layers need backward computation, as decided by Caffe, and the outputs."""
+        """Return which layers need backward computation, by Caffe's rules. Log them, and the outputs of the net."""
         learns = []
         for node, layer in zip(self._plan.nodes, layers, strict=True):
             learns.append(any(_spec(node, layer, j).lr_mult for j in range(len(layer.blobs))))
         has_loss = [[bool(w) for w in weights] for weights in self.loss_weights]
         labels = [layer.label_bottoms for layer in layers]
-        unheeding = [ignores_propagate_down(layer) for layer in layers]
-        backward = plan_backward(self._plan, learns, has_loss, labels, unheeding)
+        ignoring = [ignores_propagate_down(layer) for layer in layers]
+        backward = plan_backward(self._plan, learns, has_loss, labels, ignoring)
         for node, needs in zip(reversed(self._plan.nodes), reversed(backward.layers), strict=True):
             if needs:
                 log.info("net.cpp:200", f"{node.name} needs backward computation.")
@@ -224,10 +226,10 @@ class Assembly:
         return backward
 
 
-class _Tie:
-    """What layer ``i`` knows of its net; ``take_from`` counts the memory that it takes, while the net is built.
+class _LayerInNet:
+    """Layer ``i`` as part of its net: its place in the file, and its log. ``take_from`` counts memory it takes.
 
-    It has slots and does not keep the net alive, because of nets of very many layers.
+    It has slots and does not keep the net alive, because a net may have very many layers.
     """
 
     __slots__ = ("_i", "_plan", "take_from")
@@ -245,7 +247,7 @@ class _Tie:
             self.take_from(size)
 
     def created(self, tops: int) -> None:
-        """Log what the layer reads, and its ``tops``: a loss may have one more than the prototxt names."""
+        """Log the layer's bottoms and tops. ``tops`` may be more than the prototxt names: a loss adds one."""
         node, blobs = self._plan.nodes[self._i], self._plan.blobs
         log.info("net.cpp:86", f"Creating Layer {node.name}")
         for v in node.bottoms:
@@ -279,19 +281,19 @@ def _loss_weights(layer: Layer, report: Report) -> list[float]:
 
 
 class Need:
-    """The memory that a net needs at least, in bytes, as far as the shapes of its layers are known.
+    """The least memory that a net needs, in bytes, as far as the shapes of its layers are known.
 
-    ``parameters`` counts shared ones once. ``tops`` is what tops need at one time: in phase TEST each is given up after
-    its last use, in phase TRAIN the backward pass needs them all. Tops that are in place, or that lie in their bottom's
-    memory, need nothing. ``ahead`` is what data layers read ahead. Gradients, the solver's history and what kernels
-    need for their work come on top.
+    ``parameters`` counts a shared parameter once. ``tops`` is the peak memory of the tops: in phase TEST a top is freed
+    after its last use, in phase TRAIN the backward pass needs all tops. A top that is computed in place, or that shares
+    the memory of its bottom, needs none. ``ahead`` is the memory of batches that data layers read ahead. Gradients, the
+    solver's history and the work memory of kernels are not counted.
     """
 
     def __init__(self, plan: Plan, last_uses: Sequence[Sequence[int]]) -> None:
         self.parameters = self.tops = self.ahead = 0
         self._plan = plan
         self._ends = last_uses if plan.net.state.phase == TEST else [()] * len(plan.nodes)
-        self._home: dict[int, int] = {}  # the value whose memory a value lies in
+        self._home: dict[int, int] = {}  # value -> the value that owns its memory
         self._sizes: dict[int, int] = {}
         self._users: dict[int, int] = {}
         self._alive = 0
@@ -299,11 +301,11 @@ class Need:
 
     @property
     def total(self) -> int:
-        """Bytes of all of it together."""
+        """The sum of the three, in bytes."""
         return self.parameters + self.tops + self.ahead
 
     def add(self, i: int, layer: Layer, parameters: int) -> None:
-        """Count layer ``i``, which comes after all that were counted, with its bytes of parameters."""
+        """Add layer ``i`` and its ``parameters`` bytes. Layers must be added in order."""
         node, made = self._plan.nodes[i], 0
         for j, (v, shape) in enumerate(zip(node.tops, layer.top_shapes, strict=False)):
             bottom = node.bottoms[j if node.in_place[j] else 0] if node.bottoms else -1
@@ -339,20 +341,20 @@ class Need:
         )
 
     def __str__(self) -> str:
-        """Return the sums for people."""
+        """Return the need as text for a message."""
         ahead = f", batches read ahead {amount(self.ahead)}" if self.ahead else ""
         return f"{amount(self.total)}: parameters {amount(self.parameters)}, tops {amount(self.tops)}{ahead}"
 
 
 def limit_on(device: torch.device, limit: int | None = None) -> int:
-    """Return the bytes that a net may need on a device: the limit that was chosen, or the device's memory."""
+    """Return how many bytes a net may need on a device: ``limit`` if given, or else the device's memory."""
     if limit is not None:
         return limit
     return torch.cuda.mem_get_info(device)[1] if device.type == "cuda" else memory()
 
 
 def limit_text(limit: int) -> str:
-    """Return what the limit is, and how to set another."""
+    """Return the words of a message that give the limit and say how to change it."""
     return f"the limit is {amount(limit)}, --limit SIZE sets another"
 
 
@@ -360,7 +362,7 @@ def limit_text(limit: int) -> str:
 
 
 def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
-    """Yield a line for each field without effect: its first place in the file, and the number of others."""
+    """Yield a warning for each field that has no effect: its first place in the file, and how many more there are."""
     found: dict[tuple[str, _Fields, str], list[int]] = {}
     for i, layer in enumerate(layers):
         for path, reason in _unused(layer):
@@ -377,7 +379,7 @@ def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
 
 
 def doubtful_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
-    """Yield a line for each type of layers of which nothing shows which fork's they are: the first of them."""
+    """Yield a warning for each layer type that several forks define, if the net does not show which fork is meant."""
     for doubt, i in forks().doubts(layers).items():
         yield f"{plan.source.at(i, layer=plan.nodes[i].name, type=plan.nodes[i].type)}: {doubt}"
 
@@ -385,7 +387,7 @@ def doubtful_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
 def _unused(layer: Layer) -> Iterator[tuple[_Fields, str]]:
     partly = {name.partition(".")[0] for name in layer.reads if "." in name}
     for field, value in layer.param.ListFields():
-        if field.name in COMMON or field.name in HOW_NOT_WHAT:
+        if field.name in COMMON or field.name in WITHOUT_EFFECT:
             continue
         if field.name not in layer.reads | partly:
             yield (field.name,), f"a layer of type {layer.type} does not read it"
@@ -396,7 +398,7 @@ def _unused(layer: Layer) -> Iterator[tuple[_Fields, str]]:
         for inner, inner_value in value.ListFields():
             path = f"{field.name}.{inner.name}"
             known = (whole and not inner.is_extension and path not in layer.ignores) or path in layer.reads
-            if not known and inner.name not in HOW_NOT_WHAT:
+            if not known and inner.name not in WITHOUT_EFFECT:
                 yield (field.name, inner.name), f"a layer of type {layer.type} does not read it"
             elif inner.message_type is not None and inner.message_type.full_name == "caffe.FillerParameter":
                 for filler in [inner_value] if isinstance(inner_value, Message) else inner_value:

@@ -1,6 +1,6 @@
 """From a prototxt to a runnable net: read, filter, insert splits, plan, build, load weights.
 
-A .caffemodel holds its layers with their weights: :func:`recover_net` is for weights whose prototxt is lost. What is in
+A .caffemodel holds its layers with their weights: :func:`recover_net` is for weights without a prototxt. What is in
 the file is the net as it ran, mostly a training: with Split layers, in one phase, reading a database.
 
 Caffe: Net::Init (src/caffe/net.cpp)

@@ -23,7 +23,7 @@ from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Plan, unblocked
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.context import device_of
-from netspec.layers.contract.reading import Fed, Restarts, TakesArrays
+from netspec.layers.contract.reading import NeedsInput, Restarts, TakesArrays
 from netspec.net.assembly import Assembly
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST
@@ -38,7 +38,7 @@ V = TypeVar("V")
 
 
 class ByName(dict[str, V]):
-    """Values by the name of a blob or layer. ``known``: names that the net has beside these, which a pass may keep."""
+    """Values by the name of a blob or layer. ``known``: other names of the net, which a forward pass could keep."""
 
     def __init__(self, kind: str, values: Mapping[str, V], known: Iterable[str] = ()) -> None:
         super().__init__(values)
@@ -92,7 +92,7 @@ class Net(torch.nn.Module):
         self.need, self.random = made.need, made.random
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
-        self._fed = [layer for layer in self.layers if isinstance(layer, Fed)]
+        self._need_input = [layer for layer in self.layers if isinstance(layer, NeedsInput)]
         self._given = [
             v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops
         ]
@@ -256,7 +256,7 @@ class Net(torch.nn.Module):
     def share_weights_with(self, other: Net) -> None:
         """Use the learnable blobs of ``other`` in the layers of equal names (Caffe: ShareTrainedLayersWith).
 
-        A layer whose blobs have different shapes there is a fault of this net.
+        It is a fault of this net if the blobs of a layer have other shapes there.
         """
         mine = {layer.param.name: layer for layer in self.layers}
         for theirs in other.layers:
@@ -288,7 +288,7 @@ class Net(torch.nn.Module):
 
     def missing_inputs(self) -> Iterator[SpecError]:
         """Yield an error for each layer that needs inputs: a solver gives no inputs to its nets."""
-        yield from filter(None, [layer.missing_input() for layer in self._fed])
+        yield from filter(None, [layer.missing_input() for layer in self._need_input])
 
     def restart_data(self) -> None:
         """Make every data layer start again at its first record."""

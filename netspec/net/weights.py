@@ -118,7 +118,7 @@ def _read_into(blob: torch.Tensor, values: blobs.Elsewhere) -> None:
 
 
 def _report_missing(net: Net, loaded: set[int], paths: list[str], strict: bool, some: bool) -> None:
-    """Warn of the layers of which a blob was not loaded, or report them; weights in the prototxt itself count."""
+    """Warn of layers with a blob that was not loaded, or report them. Weights in the prototxt count as loaded."""
     learning = [layer for layer in net.layers if len(layer.blobs)]
     missing = [
         layer for layer in learning if not layer.param.blobs and any(id(blob) not in loaded for blob in layer.blobs)
@@ -338,7 +338,7 @@ def _wrong_count(path: str, name: str, found: int, expected: int) -> SpecError:
 
 
 def _fits_loosely(layer: Layer, j: int, shape: tuple[int, ...]) -> bool:
-    """Return whether a file's blob differs in axes of size 1 only, for a layer of which forks differ in that."""
+    """Return whether a file's blob differs only in axes of size 1, in a layer type where forks differ in them."""
     return [n for n in shape if n != 1] == [n for n in layer.blob_shapes[j] if n != 1] and forks().is_loose(layer)
 
 

@@ -1,4 +1,4 @@
-"""Layers run one by one as they are, with gradients where torch records them; some of them together.
+"""Runs the layers of a net one by one, with gradients by autograd. Some layers run together with the next ones.
 
 Caffe's backward reads bottom and top from memory. If a later layer has overwritten them in place, it reads that layer's
 result. For example, if an in-place Sigmoid follows an in-place ReLU, every value is positive, and the ReLU passes every
@@ -23,7 +23,7 @@ from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
 
 
 class Eager:
-    """Runs the layers of a plan; every net can be run so.
+    """Runs the layers of a plan. Every net can be run this way.
 
     ``loss_weights[i][j]`` is the loss weight of layer i's top j. ``exact`` is as in netspec/exact.
     """
@@ -35,22 +35,22 @@ class Eager:
         self._losses = losses_of(loss_weights)
         self._last_uses = last_uses(plan)
         self.overwritten = [is_overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
-        self._apart = self._must_be_apart()
+        self._runs_alone = self._must_run_alone()
         self._lines: dict[frozenset[int], list[Step]] = {}  # by what is kept, of the last run
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
-        """Run all layers on the values ``given`` by the caller; the values ``kept`` are there afterwards."""
+        """Run all layers on the values ``given``. Return the loss and the values; those in ``kept`` are among them."""
         values: Values = dict(given)
         if kept not in self._lines:
             self._lines = {kept: self._line(kept)}
         return walk(self._lines[kept], values, self.exact, self._remembering()), values
 
     def one_by_one(self) -> list[Step]:
-        """Return a step for each layer but the inputs, all by themselves; no value ends."""
+        """Return one step for each layer, except the inputs. No step drops a value."""
         return [step._replace(ends=()) for i in range(len(self.layers)) for step in self._alone(i)]
 
     def _line(self, kept: frozenset[int]) -> list[Step]:
-        """Return the steps of runs that keep some values."""
+        """Return the steps of a run that keeps the values ``kept``."""
         nodes, steps = self.plan.nodes, list[Step]()
         for part in self.parts(kept):
             if len(part.members) == 1:
@@ -61,11 +61,11 @@ class Eager:
         return steps
 
     def parts(self, kept: frozenset[int] = frozenset()) -> list[Part]:
-        """Return the layers, those as one that may run as one where these values are kept."""
-        return parts_of(self.plan, self.layers, self._apart, kept)
+        """Return the layers in order, joined where the values ``kept`` allow it."""
+        return parts_of(self.plan, self.layers, self._runs_alone, kept)
 
     def _alone(self, i: int, kept: frozenset[int] = frozenset()) -> list[Step]:
-        """Return the step that runs layer ``i`` alone; none for an input, whose values are given."""
+        """Return the step that runs layer ``i`` alone. An input needs none, because its values are given."""
         node, layer = self.plan.nodes[i], self.layers[i]
         losses, ends = self._losses[i], self._ends(i, i, kept)
         if not layer.is_input:
@@ -73,7 +73,7 @@ class Eager:
         return [Step(i, lambda *tops: tops, node.tops, node.tops, losses, ends)] if losses or ends else []
 
     def _as_asked(self, i: int) -> Callable[..., tuple[torch.Tensor, ...]]:
-        """Return what runs a layer: without gradients for blocked bottoms; losses are float32 in every precision."""
+        """Return a function that runs layer ``i``: no gradients for blocked bottoms, and float32 for every loss."""
         layer, blocked = self.layers[i], self.plan.nodes[i].blocked
         if not layer.is_loss and not any(blocked):
             return layer.run
@@ -89,8 +89,8 @@ class Eager:
     def _ends(self, first: int, last: int, kept: frozenset[int]) -> tuple[int, ...]:
         return tuple(v for i in range(first, last + 1) for v in self._last_uses[i] if v not in kept)
 
-    def _must_be_apart(self) -> list[bool]:
-        """Return which layers must run by themselves, whatever they compute."""
+    def _must_run_alone(self) -> list[bool]:
+        """Return which layers can never be joined with others."""
         final, nodes = self.plan.final, self.plan.nodes
         read_again = {final[node.tops[0]] for node, is_read in zip(nodes, self.overwritten, strict=True) if is_read}
         return [
@@ -99,7 +99,7 @@ class Eager:
         ]
 
     def _remembering(self) -> Visit | None:
-        """Return a visit that keeps, for one run, what later layers leave in memory, where a gradient reads it."""
+        """Return a visit that keeps, for one run, what later layers write into memory that a gradient reads."""
         if not any(self.overwritten) or not torch.is_grad_enabled():
             return None
         plan, memories = self.plan, dict[int, Memory]()

@@ -41,11 +41,11 @@ class Part:
 
 
 def parts_of(
-    plan: Plan, layers: Sequence[Layer], apart: Sequence[bool], kept: Collection[int] = frozenset()
+    plan: Plan, layers: Sequence[Layer], alone: Sequence[bool], kept: Collection[int] = frozenset()
 ) -> list[Part]:
     """Return the layers of a plan, joined where one can do the work of those after it.
 
-    Layers that are ``apart`` are parts of their own. Nobody else reads a value within a part, and none is ``kept``.
+    A layer with ``alone`` set is never joined. A value inside a part has no other reader and is not in ``kept``.
     """
     readers = Counter(v for node in plan.nodes for v in node.bottoms)
 
@@ -55,7 +55,7 @@ def parts_of(
     parts: list[Part] = []
     for i, (node, layer) in enumerate(zip(plan.nodes, layers, strict=True)):
         before, one = parts[-1] if parts else None, None
-        if before and plan.nodes[before.last].tops == node.bottoms and not (apart[before.first] or apart[i]):
+        if before and plan.nodes[before.last].tops == node.bottoms and not (alone[before.first] or alone[i]):
             one = joined(before.layer, layer) if [*map(is_between, node.bottoms)] == [True] else None
         if before and one:
             parts[-1] = Part(before.first, i, one, (*before.members, layer))

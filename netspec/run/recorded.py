@@ -24,7 +24,7 @@ class Kernels(NamedTuple):
 def recorded(
     run: Callable[..., Sequence[torch.Tensor]], wanted: Sequence[bool], blobs: Sequence[torch.Tensor] = ()
 ) -> Kernels:
-    """Return the kernels of a layer whose gradients autograd computes; ``run`` is the layer's, with these blobs."""
+    """Return kernels for a layer, with gradients by autograd. ``run`` runs the layer with these blobs."""
     leaves: list[torch.Tensor] = []
     made: Sequence[torch.Tensor] = ()
 

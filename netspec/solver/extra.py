@@ -22,7 +22,7 @@ from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.files.whole_file import write_whole
 from netspec.layers.contract import reading
-from netspec.net.assembly import HOW_NOT_WHAT
+from netspec.net.assembly import WITHOUT_EFFECT
 from netspec.net.net import Net
 from netspec.net.sealed import FAULTS, Digest, damaged, sealed, shown, unsealed, whole_number
 from netspec.proto.schema import fields_of
@@ -39,7 +39,7 @@ _SOLVER_ASIDE = frozenset(  # what the log shows, what is written, and what is c
         *("snapshot", "snapshot_prefix", "snapshot_diff", "snapshot_format", "snapshot_after_train"),
     }
 )
-_LAYER_ASIDE = HOW_NOT_WHAT | {
+_LAYER_ASIDE = WITHOUT_EFFECT | {
     *("name", "bottom", "top", "blobs", "include", "exclude", "phase", "prefetch"),
     *("weight_filler", "bias_filler", "filler"),  # they have done their work
 }

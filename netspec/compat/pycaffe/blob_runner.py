@@ -21,9 +21,9 @@ from netspec import log
 from netspec.compat.pycaffe.tapes import (
     Bound,
     Tape,
-    apart,
     by_autograd,
     gradient_of,
+    not_shared,
     overwrites_shared,
     parameters,
     storages,
@@ -258,7 +258,7 @@ class BlobRunner:
                 if tensor.shape != blob.shape:
                     blob.reshape(*tensor.shape)
                 continue
-            blob.put_data(tensor if fresh else apart(tensor, taken))
+            blob.put_data(tensor if fresh else not_shared(tensor, taken))
             if not fresh:
                 taken |= storages([tensor])
         return self._no_loss if loss is None else loss
@@ -352,7 +352,7 @@ class BlobRunner:
         taken = storages(values or list(layer.blobs))
         for top, tensor, constant in zip(tops, made, kept, strict=True):
             if constant is None:
-                top.put_data(apart(tensor.detach(), taken))
+                top.put_data(not_shared(tensor.detach(), taken))
 
     def _record(self, i: int) -> Tape:
         """Run layer ``i`` by its kernels, or watched by autograd."""
@@ -445,4 +445,4 @@ class BlobRunner:
         found = (found,) if isinstance(found, torch.Tensor) else found
         for blob, leaf, diff, asked in zip(bottoms, tape.leaves, found, wanted, strict=True):
             if asked:
-                blob.diff_memory.put(apart(torch.zeros_like(leaf) if diff is None else diff, taken))
+                blob.diff_memory.put(not_shared(torch.zeros_like(leaf) if diff is None else diff, taken))

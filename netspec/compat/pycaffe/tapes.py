@@ -74,7 +74,7 @@ def storages(tensors: Sequence[torch.Tensor]) -> set[int]:
     return {tensor.untyped_storage().data_ptr() for tensor in tensors if tensor.device.type == "cpu"}
 
 
-def apart(tensor: torch.Tensor, taken: set[int]) -> torch.Tensor:
+def not_shared(tensor: torch.Tensor, taken: set[int]) -> torch.Tensor:
     """Return a tensor, or a copy of one that lies where others do."""
     aliased = tensor.device.type == "cpu" and tensor.untyped_storage().data_ptr() in taken
     return tensor.clone() if aliased else tensor

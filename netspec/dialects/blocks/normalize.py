@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from netspec.dialects.signatures import whose
+from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
@@ -62,7 +62,7 @@ class Normalize(Layer):
         fields, shape = given(self.param), self.bottom_shapes[0]
         if len(shape) < 2:
             raise self.error(f"found a bottom of shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
-        self.fork = whose(self)
+        self.fork = fork_of(self)
         self.across, self.eps, self.squares = self.fork == TSN, 0.0, True
         if self.fork == HAPPYNEAR:
             self._set_up_as_happynears(value(self.param, "normalize_param") if "normalize_param" in fields else None)

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
-from netspec.dialects.signatures import whose
+from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
@@ -79,7 +79,7 @@ class SmoothL1Loss(Loss):
 
     def found_fork(self) -> str:
         """Return whose layer it is."""
-        return whose(self)
+        return fork_of(self)
 
     @property
     @override

@@ -60,7 +60,7 @@ class EdgeMaps(ImageData):
         self.log_size(source, "image_labelmap_data_layer.cpp:105")
         return source
 
-    def shape_beside(self, data: Shape) -> Shape:
+    def second_shape(self, data: Shape) -> Shape:
         return (data[0], 1, *data[2:])
 
 

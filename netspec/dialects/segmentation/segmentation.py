@@ -118,7 +118,7 @@ class DenseImageData(ReadingLayer):
         height, width = (p.crop_height, p.crop_width) if p.crop_height else (p.new_height, p.new_width)
         return (self.batch_size, 3 if p.is_color else 1, height, width) if height else None
 
-    def shape_beside(self, data: Shape) -> Shape:
+    def second_shape(self, data: Shape) -> Shape:
         less = value(self.param, GROUP).label_divide_factor
         return (data[0], 1, *(size // less for size in data[2:]))
 

@@ -207,7 +207,7 @@ class AnnotatedData(Data):
         channels = 3 if p.force_color else 1 if p.force_gray else len(p.mean_value)
         return (self.batch_size, channels, *size) if size and (channels > 1 or p.force_gray) else None
 
-    def shape_beside(self, data: Shape) -> Shape:
+    def second_shape(self, data: Shape) -> Shape:
         """Return the shape of a single box, or of an image's boxes as YOLO has them."""
         centered = value(self.param, "annotated_data_param").yolo_data_type == 1
         return (self.batch_size, 1, MOST_BOXES, 5) if centered else (1, 1, 1, COLUMNS + 1)

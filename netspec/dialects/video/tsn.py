@@ -301,5 +301,5 @@ class VideoData(files.ReadingLayer):
         planes = 2 if p.modality == FLOW else 1 if p.grayscale else 3
         return (self.batch_size, planes * p.new_length * p.num_segments, height, width) if height else None
 
-    def shape_beside(self, data: Shape) -> Shape:
+    def second_shape(self, data: Shape) -> Shape:
         return (data[0], 1, 1, 1)

@@ -39,13 +39,13 @@ def key_of(files: Sequence[str | Path], options: Mapping[str, Any]) -> str:
 
 @cache
 def processor() -> str:
-    """Return what is known of the processor, for models that were optimized for one."""
-    told = platform.machine()
+    """Return a description of the processor, for models that are optimized for it."""
+    machine = platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
     except OSError:
-        return f"{told} {platform.processor()}"
-    return " ".join([told, *(line for line in lines if line.startswith(("model", "flags", "Features", "CPU part")))])
+        return f"{machine} {platform.processor()}"
+    return " ".join([machine, *(line for line in lines if line.startswith(("model", "flags", "Features", "CPU part")))])
 
 
 @cache
@@ -72,10 +72,10 @@ def _digest(path: str | Path) -> str:
 
 
 def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, bool]:
-    """Return the folder of a key, and whether it was made: ``make`` fills an empty folder where it is missing.
+    """Return the folder of a key, and whether it is new. A missing one is made, and ``make`` fills it.
 
-    One whose files are not as they were made is moved aside, with a warning, and made again. Raises OSError where the
-    folder cannot be written.
+    An entry with damaged files is moved to another name, with a warning, and made again. Raises OSError if the folder
+    cannot be written.
     """
     place = folder / key
     if place.is_dir():
@@ -105,7 +105,7 @@ def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, b
 
 
 def _is_whole(place: Path) -> bool:
-    """Say whether the files of an entry are as they were made; others may have come since."""
+    """Return whether the files of an entry are unchanged. Files that were added later do not count."""
     try:
         digests = json.loads((place / DIGESTS).read_bytes())
         return all(_digest(place / name) == digest for name, digest in digests.items())

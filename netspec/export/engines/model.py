@@ -1,4 +1,4 @@
-"""A net as an engine runs it: exported once, kept in the cache, opened."""
+"""A net that an engine runs: exported once, kept in the cache, and opened."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from netspec.export.engines.runners import MODEL, RUNNERS, Arrays, Runner, Unabl
 from netspec.files.own_folder import inside
 from netspec.files.whole_file import write_whole
 
-WARNINGS, DIFFERENCE = "warnings.txt", "bf16.txt"  # lines to say at each start
-Export = Callable[[Path], None]  # writes the ONNX model to a path, its weights beside it
+WARNINGS, DIFFERENCE = "warnings.txt", "bf16.txt"  # lines that are logged each time the model is opened
+Export = Callable[[Path], None]  # writes the ONNX model to a path, with its weights in the same folder
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Origin:
 
 
 class Model:
-    """A net in an engine. ``origin`` None: what it is made of is not known, and it is not kept.
+    """A net, exported to an engine. If ``origin`` is None, the exported model is not kept in the cache.
 
-    ``export`` is called where the cache has no such model; what it warns of is warned of again at each later opening.
-    Raises Unable for what the engine cannot run, and SpecError for a file that cannot be read.
+    ``export`` is called if the cache does not have the model. Its warnings are kept, and logged again each time the
+    model is opened. Raises Unable for a net that the engine cannot run, and SpecError for a file that cannot be read.
     """
 
     def __init__(self, choice: Choice, origin: Origin | None, export: Export) -> None:
@@ -44,7 +44,7 @@ class Model:
         self._kept: tempfile.TemporaryDirectory[str] | None = None  # where the cache does not
         self.folder = self._made(origin, export)
         self._runner, precision = self._opened(choice.precision)
-        self._told = precision == FP32
+        self._difference_shown = precision == FP32
 
     def run(self, inputs: Arrays) -> dict[str, np.ndarray]:
         """Return the outputs, float32 by name, for inputs by name.
@@ -52,9 +52,9 @@ class Model:
         Raises Unable where the library fails. In bf16 the first pass measures how far outputs are from those in fp32.
         """
         found = _run(self._runner, inputs)
-        if not self._told:
-            self._told = True
-            self._tell_difference(inputs, found)
+        if not self._difference_shown:
+            self._difference_shown = True
+            self._show_difference(inputs, found)
         return found
 
     def _made(self, origin: Origin | None, export: Export) -> Path:
@@ -62,13 +62,13 @@ class Model:
         given = {"engine": self.choice.engine, **runner.identity()}
 
         def make(folder: Path) -> None:
-            with _warnings() as told:
+            with _warnings() as warnings:
                 _export(export, folder / MODEL)
             try:
                 runner.prepare(folder)
             except Exception as fault:  # each library has its own
                 raise Unable(reason(fault)) from None
-            (folder / WARNINGS).write_text("\n".join(told), "utf-8", "backslashreplace")
+            (folder / WARNINGS).write_text("\n".join(warnings), "utf-8", "backslashreplace")
 
         if self.choice.cache is not None and origin is not None:
             key = key_of(origin.files, {**origin.options, **given})
@@ -95,8 +95,8 @@ class Model:
             log.logger.warning(f"precision {precision}: {fault}; {self.choice.engine} runs it in {FP32}")
             return open_runner(self.choice.engine, self.folder, FP32), FP32
 
-    def _tell_difference(self, inputs: Arrays, found: Arrays) -> None:
-        """Say how far bf16 is from fp32: measured once, on the first inputs, and kept with the model."""
+    def _show_difference(self, inputs: Arrays, found: Arrays) -> None:
+        """Log how far bf16 is from fp32. It is measured once, on the first inputs, and kept with the model."""
         place = self.folder / DIFFERENCE
         if place.exists():
             return _warn_again(place)
@@ -112,7 +112,7 @@ class Model:
 
 
 def _warn_again(path: Path) -> None:
-    """Say the lines of a file; an older netspec kept none."""
+    """Log the lines of a file, which is missing in the cache of an older netspec."""
     with suppress(OSError):
         for line in path.read_text("utf-8", "replace").splitlines():
             log.logger.warning(line)
@@ -141,11 +141,11 @@ def _difference(found: np.ndarray, exact: np.ndarray) -> float:
 @contextmanager
 def _warnings() -> Iterator[list[str]]:
     """Yield a list that gets the warnings of the block."""
-    told: list[str] = []
+    warnings: list[str] = []
     handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: told.append(record.getMessage()) if record.levelno == logging.WARNING else None
+    handler.emit = lambda record: warnings.append(record.getMessage()) if record.levelno == logging.WARNING else None
     log.logger.addHandler(handler)
     try:
-        yield told
+        yield warnings
     finally:
         log.logger.removeHandler(handler)

@@ -1,4 +1,4 @@
-"""An engine as one of the runners of a net: it computes forward passes, all else is the net's."""
+"""An engine as a runner of a net: it computes the forward passes, and the net does everything else."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import torch
 from netspec.data.blobs import Shape
 from netspec.export.engines.choice import TORCH, Choice
 from netspec.export.engines.model import Model, Origin
-from netspec.export.engines.runners import Unable, tell_unable
+from netspec.export.engines.runners import Unable, warn_unable
 from netspec.export.formats.convert import Source
 from netspec.export.formats.onnx import export_onnx
 from netspec.graph.options import BuildOptions
-from netspec.layers.contract.learned import Seen, blobs_of, is_lent
+from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias
 from netspec.layers.contract.reading import reads_data
 from netspec.net.net import Net
 from netspec.proto.schema import PHASE_NAMES, TEST
@@ -26,7 +26,7 @@ from netspec.run.walk import Result, losses_of, walk, weighted_sum
 
 
 def write_model(net: Net, path: Path, blobs: Iterable[str] = ()) -> None:
-    """Write a net; besides its outputs the model has those of ``blobs`` that are not inputs.
+    """Write a net as an ONNX model. Those of ``blobs`` that are not inputs become outputs too.
 
     Raises SpecError where a layer cannot be exported, and Unable for a blob that the model does not have.
     """
@@ -51,10 +51,10 @@ Write = Callable[[Path, Sequence[str]], None]  # exports the net to a path, with
 def with_engine(net: Net, choice: Choice, path: str | Path, weights: Iterable[str | Path]) -> Net:
     """Let the chosen engine run a net that was read from ``path`` and ``weights``; return the net.
 
-    Torch does by choice, or where a warning says what the engine cannot do.
+    Torch runs the net if it was chosen, or if the engine cannot run it; a warning says why.
     """
     if choice.engine == TORCH:
-        tell_unable(choice, "")
+        warn_unable(choice, "")
         return net
     weights = list(weights)
     reason = ""
@@ -63,7 +63,7 @@ def with_engine(net: Net, choice: Choice, path: str | Path, weights: Iterable[st
     elif net.device.type != "cpu":
         reason = f"it runs on the CPU, this net is on {net.device}"
     if reason:
-        tell_unable(choice, reason)
+        warn_unable(choice, reason)
         return net
     origin = Origin([path, *weights], {"level": net.options.level or 0, "stages": tuple(net.options.stages)})
     net.runners.insert(0, Engine(net, choice, origin if weights else None, _writer(net, Path(path))))
@@ -71,12 +71,12 @@ def with_engine(net: Net, choice: Choice, path: str | Path, weights: Iterable[st
 
 
 class Engine:
-    """Runs a net by an engine, as one of its runners; it keeps the plan and the layers, which read data, of ``net``.
+    """Runs a net by an engine. It keeps the plan of ``net``, and its layers, because they read the data.
 
-    ``origin`` says of which files it is made, None where its parameters are random; ``write`` exports it. Outputs carry
-    no gradient; a pass whose input asks for one is torch's, and so is every pass once the engine turned out to be
-    unable. Where parameters were changed the net is exported again. While an alias of a parameter is alive
-    (``.data``, an array), a change might go unnoticed, so torch runs the net.
+    ``origin`` names the files that the net is made from; it is None if the parameters are random. ``write`` exports the
+    net. Outputs have no gradient. Torch runs a pass if an input requires a gradient, and every pass after the engine
+    has failed. After a change of the parameters the net is exported again. While an alias of a parameter is alive
+    (``.data``, an array), a change could be missed, so torch runs the net.
     """
 
     def __init__(self, net: Net, choice: Choice, origin: Origin | None, write: Write) -> None:
@@ -94,27 +94,27 @@ class Engine:
         self._model: Model | None = None
         self._opened_for: tuple[str, ...] = ()  # the blobs that the model has
         self._loaded = self._exported = self._seen()  # the learned blobs as they were then
-        self._unable, self._told = False, False
+        self._unable, self._warned = False, False
         self._fits: tuple[dict[int, Shape], dict[int, Shape]] = {}, {}  # of the inputs at the last pass, of all values
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
-        """Run the net on the values of its inputs; None where torch has to."""
-        if self._unable or any(value.requires_grad for value in given.values()) or self._are_lent():
+        """Run the net on the values of its inputs. Return None if torch must run it."""
+        if self._unable or any(value.requires_grad for value in given.values()) or self._may_change_unseen():
             return None
         try:
             return self._pass(given, kept)
         except Unable as fault:
-            tell_unable(self._choice, str(fault))
+            warn_unable(self._choice, str(fault))
             self._unable = True
             return None
 
-    def _are_lent(self) -> bool:
-        """Return whether an alias could change the parameters; warn once."""
-        lent = any(map(is_lent, self._blobs()))
-        if lent and not self._told:
-            self._told = True
-            tell_unable(self._choice, "parameters may change unseen while their memory is held, by .data or an array")
-        return lent
+    def _may_change_unseen(self) -> bool:
+        """Return whether the parameters could be changed through an alias. Warn the first time."""
+        aliased = any(map(may_have_alias, self._blobs()))
+        if aliased and not self._warned:
+            self._warned = True
+            warn_unable(self._choice, "a program could change parameters by .data or an array that it holds")
+        return aliased
 
     def _pass(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
         names = self._plan.blobs
@@ -144,7 +144,7 @@ class Engine:
         return Seen(self._blobs(), values=True)
 
     def _current(self, blobs: tuple[str, ...]) -> Model:
-        """Return the model of the net as it is, with these blobs."""
+        """Return the model of the net with its present parameters and these blobs."""
         if self._model is None or self._opened_for != blobs or not self._exported.are(self._blobs()):
             computed, as_loaded = [blob for blob in blobs if blob not in self._built], self._loaded.are(self._blobs())
             origin = self._origin(blobs) if as_loaded else None
@@ -155,7 +155,7 @@ class Engine:
         return self._model
 
     def _origin(self, blobs: tuple[str, ...]) -> Origin | None:
-        """Return what the net is made of; None where its parameters are not those of files."""
+        """Return the files and options that the net is made from; None if its parameters are not those of files."""
         if self._from is None and self._blobs():
             return None
         files, options = (self._from.files, self._from.options) if self._from else ([], {})
@@ -163,7 +163,7 @@ class Engine:
 
 
 def _writer(net: Net, path: Path) -> Write:
-    """Return what exports a net as it is, read from ``path``; it does not keep the net alive."""
+    """Return a function that exports ``net``, which was read from ``path``. It does not keep the net alive."""
     held, chosen = weakref.ref(net), net.options
     readers = [blob for layer in net.layers if reads_data(layer) for blob in layer.param.top]
 

@@ -1,6 +1,6 @@
 """The libraries that run an exported model: how each prepares it once, opens it, and runs it.
 
-The weights are in a file beside the model, which both libraries map into memory instead of reading it.
+The weights are in a file next to the model. Both libraries map it into memory instead of reading it.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class Unable(Exception):
     """An engine cannot run this net, or not in this way; the text says why."""
 
 
-def tell_unable(choice: Choice, reason: str) -> None:
-    """Warn that torch runs a net in the place of the chosen engine, or in fp32, if there is a reason."""
+def warn_unable(choice: Choice, reason: str) -> None:
+    """Warn that torch runs the net instead of the chosen engine, if there is a reason, and that it does so in fp32."""
     if reason:
         log.logger.warning(f"engine {choice.engine}: {reason}; torch runs the net")
     if choice.precision != FP32:
@@ -93,9 +93,9 @@ def threads() -> int:
     """Return how many threads a pass may use: as many as torch would."""
     if torch := sys.modules.get("torch"):
         return torch.get_num_threads()
-    told = os.environ.get("OMP_NUM_THREADS", "")
-    if told.isdigit() and int(told) > 0:
-        return int(told)
+    given = os.environ.get("OMP_NUM_THREADS", "")
+    if given.isdigit() and int(given) > 0:
+        return int(given)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -57,15 +57,15 @@ class Source:
 
     def metadata(self) -> dict[str, str]:
         """Return where an exported net comes from."""
-        told = {"prototxt": self.file.name, "prototxt.sha256": _sha256(self.file), "phase": self.phase}
+        found = {"prototxt": self.file.name, "prototxt.sha256": _sha256(self.file), "phase": self.phase}
         if self.weights:
-            told["weights"] = ",".join(path.name for path in self.weights)
-            told["weights.sha256"] = ",".join(_sha256(path) for path in self.weights)
+            found["weights"] = ",".join(path.name for path in self.weights)
+            found["weights.sha256"] = ",".join(_sha256(path) for path in self.weights)
         if self.options.level:
-            told["level"] = str(self.options.level)
+            found["level"] = str(self.options.level)
         if any(self.options.stages):
-            told["stages"] = ",".join(self.options.stages)
-        return {**told, "version": version()}
+            found["stages"] = ",".join(self.options.stages)
+        return {**found, "version": version()}
 
     @property
     def origin(self) -> str:

@@ -47,7 +47,7 @@ def export_onnx(
 ) -> list[str]:
     """Write a net, with its weights as they are, as an ONNX model; return notes for its user, in lines.
 
-    Weights of more than ``largest`` bytes are in a file beside it, ``path`` with ``.data`` appended.
+    Weights of more than ``largest`` bytes are in a file next to it: ``path`` with ``.data`` appended.
     Raises SpecError where a layer cannot be written, or the file.
     """
     writer, notes = _written(net, preprocess)
@@ -60,7 +60,7 @@ def export_onnx(
         with unfinished_data.open("wb") as file:
             model = writer.model(metadata or {}, _DataFile(file, data.name))
         unfinished.write_bytes(model.SerializeToString())
-    return [*notes, f"the weights are in {data.name}, beside the model"]
+    return [*notes, f"the weights are in {data.name}, next to the model"]
 
 
 def onnx_model(
@@ -78,7 +78,7 @@ def _written(net: Net, preprocess: Preprocess | None) -> tuple[_Writer, list[str
 
 
 class _DataFile:
-    """The file beside a model that has its large weights; the model knows it as ``name``."""
+    """The file with the large weights of a model. The model refers to it by ``name``."""
 
     def __init__(self, file: BinaryIO, name: str) -> None:
         self.file, self.name = file, name
@@ -163,13 +163,13 @@ class _Writer:
 
     # The model
 
-    def model(self, metadata: Mapping[str, str], beside: _DataFile | None = None) -> Any:
-        """Return the whole model; its large weights are written into the file ``beside``."""
+    def model(self, metadata: Mapping[str, str], data_file: _DataFile | None = None) -> Any:
+        """Return the model. Its large weights are written to ``data_file``, if there is one."""
         onnx, net = _onnx(), self.net
         renamed = self._name_values()
         outputs = [_value_info(name, np.float32, self.symbols(v)) for name, v in net.plan.outputs.items()]
         used = {name for node in self.nodes for name in node.input}
-        stored = [_tensor(name, array, beside) for name, array in self.initializers.items() if name in used]
+        stored = [_tensor(name, array, data_file) for name, array in self.initializers.items() if name in used]
         graph = onnx.helper.make_graph(self.nodes, net.name or "net", self.inputs, outputs, stored)
         model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", OPSET)])
         model.ir_version = IR_VERSION
@@ -184,9 +184,9 @@ class _Writer:
         return model
 
     def _name_values(self) -> dict[str, str]:
-        """Give values the names of their blobs; return, for those that cannot have it, name -> layer and blob.
+        """Name the values after their blobs. Return name -> description for those that need another name.
 
-        Of the values of a blob that layers change in place, the last one has the blob's name.
+        If layers change a blob in place, its last value gets the name of the blob.
         """
         plan = self.net.plan
         layer_of = {v: node.name for node in plan.nodes for v in node.tops}
@@ -195,7 +195,7 @@ class _Writer:
         }
         inputs = {info.name for info in self.inputs}
         new_names: dict[str, str] = {}
-        told: dict[str, str] = {}
+        descriptions: dict[str, str] = {}
         taken = set(inputs)
         for v in reversed(range(len(plan.blobs))):
             old, blob = self.values[v], plan.blobs[v]
@@ -208,24 +208,24 @@ class _Writer:
             name = blob
             if blob in taken:
                 name = self.unique(f"{blob}_of_{layer_of[v]}")
-                told[name] = f'blob "{blob}" as layer "{layer_of[v]}" leaves it'
+                descriptions[name] = f'blob "{blob}" as layer "{layer_of[v]}" leaves it'
             taken.add(name)
             new_names[old] = name
         for node in self.nodes:
             node.input[:] = [new_names.get(name, name) for name in node.input]
             node.output[:] = [new_names.get(name, name) for name in node.output]
-        return told
+        return descriptions
 
 
-def _tensor(name: str, array: np.ndarray, beside: _DataFile | None) -> Any:
+def _tensor(name: str, array: np.ndarray, data_file: _DataFile | None) -> Any:
     onnx = _onnx()
     tensor = onnx.TensorProto(name=name, dims=array.shape, data_type=DTYPES[array.dtype])
     array = np.ascontiguousarray(array)
-    if beside is None or array.nbytes < LARGE:
+    if data_file is None or array.nbytes < LARGE:
         tensor.raw_data = array.tobytes()
         return tensor
     tensor.data_location = onnx.TensorProto.EXTERNAL
-    for key, value in beside.write(array).items():
+    for key, value in data_file.write(array).items():
         tensor.external_data.add(key=key, value=value)
     return tensor
 

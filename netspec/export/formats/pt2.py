@@ -83,7 +83,7 @@ def _made(net: Net) -> tuple[nn.Module, NetShapes]:
 
 
 class _Defined(nn.Module):
-    """A module by its definition, whose expressions are computed one by one."""
+    """A module that evaluates the expressions of a definition one by one."""
 
     def __init__(self, definition: Definition, expected: Mapping[str, tuple[int | str, ...]]) -> None:
         super().__init__()

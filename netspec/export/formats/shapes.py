@@ -22,7 +22,7 @@ WORDS = {"N": "batch", "H": "height", "W": "width"}
 
 
 def _other_sizes(size: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return sizes of which one must be possible for a size to be called free, and more to find what varies."""
+    """Return sizes to try (a size is free if one of them is possible), and further ones to find what varies."""
     return (2 * size, 3 * size, size + 32), (size + 7, size + 1)
 
 

@@ -1,4 +1,4 @@
-"""``--to torch``: a net as the source of a PyTorch module, with its weights beside it.
+"""``--to torch``: a net as the source of a PyTorch module, with its weights in a file next to it.
 
 The source reads as if a person had written it: submodules named after the layers, no trace of this
 project but the line that says where it came from. It computes what the net computes.
@@ -36,7 +36,7 @@ from netspec.net.net import Net
 
 
 def export_torch(net: Net, path: str | Path, origin: str = "a prototxt") -> list[str]:
-    """Write a net as PyTorch source, and its weights beside it in ``.safetensors``; return notes for its user.
+    """Write a net as PyTorch source, and its weights to a ``.safetensors`` file next to it; return notes for the user.
 
     ``origin`` says in the source where it came from. Raises SpecError where a layer cannot be written, or a file.
     """
@@ -48,7 +48,7 @@ def export_torch(net: Net, path: str | Path, origin: str = "a prototxt") -> list
     with whole_file(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
         write_tensors(state, weights, {"format": "pt", "source": origin})
-    return [*notes, f"the weights are in {weights.name}, beside the module"]
+    return [*notes, f"the weights are in {weights.name}, next to the module"]
 
 
 def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: Mapping[str, str]) -> None:

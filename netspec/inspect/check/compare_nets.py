@@ -16,7 +16,7 @@ from netspec.proto.source_map import SourceMap
 
 _WIRING = ("name", "bottom", "top", "param", "blobs", "phase", "include", "exclude", "propagate_down", "loss_weight")
 _NOT_THE_NET = ("layer", "layers", "state", "input", "input_shape", "input_dim")
-LOSS = "Loss"  # how the types of layers end whose first top has loss weight 1 where none is given
+LOSS = "Loss"  # the end of the names of types with a default loss weight of 1
 Key = tuple[str, int]  # a layer's name, and which of the layers of that name it is
 
 
@@ -42,7 +42,7 @@ def compare_nets(first: tuple[NetParameter, SourceMap], second: tuple[NetParamet
 
 
 def compare_in_state(first: tuple[NetParameter, SourceMap], second: tuple[NetParameter, SourceMap]) -> Differences:
-    """Yield what differs between two nets whose ``state`` is set."""
+    """Yield the differences between two nets, each filtered by its ``state``."""
     (net, source), (other_net, other_source) = second, first
     yield from differences(other_net, net, source.net, other_source.net, _NOT_THE_NET)
     old, new = (_seen(*each) for each in (first, second))
@@ -79,7 +79,7 @@ def _keys(names: Iterable[str]) -> list[Key]:
 
 
 def _matched(old: _Seen, new: _Seen) -> dict[Key, Key]:
-    """Return which layer of the second net is which of the first: by name; of the others those set alike, in order."""
+    """Match the layers of the second net to those of the first: by name, or else by equal settings, in order."""
     names = {key: key for key in old.keys if key in new.keys}
     left = [key for key in new.keys if key not in names]
     for key in old.keys:
@@ -144,11 +144,11 @@ def _reads(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> 
         was = (names.get(maker, maker), top) if a >= 0 else None
         now = new.makers.get(b)
         if was != now:
-            told = f"bottom {k} is {_told(new, now)}, was {_told(old, old.makers.get(a))}"
-            yield Difference(here.find("bottom", k), told, there.find("bottom", k))
+            message = f"bottom {k} is {_maker_text(new, now)}, was {_maker_text(old, old.makers.get(a))}"
+            yield Difference(here.find("bottom", k), message, there.find("bottom", k))
 
 
-def _told(seen: _Seen, maker: tuple[Key, int] | None) -> str:
+def _maker_text(seen: _Seen, maker: tuple[Key, int] | None) -> str:
     if maker is None:
         return "a blob that no layer makes"
     (name, _), top = maker
@@ -157,7 +157,7 @@ def _told(seen: _Seen, maker: tuple[Key, int] | None) -> str:
 
 
 def _params(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
-    """Yield other multipliers, and parameters that are shared with others than before."""
+    """Yield changed multipliers, and parameters that are now shared with other layers."""
     one, other = old.plan.net.layer[i], new.plan.net.layer[j]
     there, here = old.plan.source.layers[i], new.plan.source.layers[j]
     for k in range(max(len(one.param), len(other.param))):
@@ -167,8 +167,8 @@ def _params(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) ->
             yield replace(each, message=f"param {k}: {each.message}")
         was, now = _owner(old, i, k), _owner(new, j, k)
         if (was and (names.get(was[0], was[0]), was[1])) != now:
-            told = f"param {k} is {_shared(now)}, was {_shared(was)}"
-            yield Difference(places[0].where, told, places[1].where)
+            message = f"param {k} is {_shared(now)}, was {_shared(was)}"
+            yield Difference(places[0].where, message, places[1].where)
 
 
 def _owner(seen: _Seen, i: int, k: int) -> tuple[Key, int] | None:

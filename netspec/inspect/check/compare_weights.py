@@ -14,7 +14,7 @@ Weights = dict[str, tuple[np.ndarray, ...]]
 
 
 def compare_weights(first: str | Path, second: str | Path, tolerance: float = 0.0) -> Differences:
-    """Yield the blobs whose values differ by more than ``tolerance``, and what only one file has.
+    """Yield the blobs that differ by more than ``tolerance``, and the blobs that only one file has.
 
     Layers belong together by name. Shapes that differ only in axes of size 1 in front are equal. Raises SpecError for
     a file that is neither a .caffemodel nor a .caffemodel.h5.
@@ -50,13 +50,15 @@ def _difference(was: np.ndarray, now: np.ndarray, tolerance: float) -> str:
         return f"shape is {_times(now)}, was {_times(was)}"
     a, b = was.reshape(-1).astype(np.float64), now.reshape(-1).astype(np.float64)
     with np.errstate(invalid="ignore"):
-        apart = np.abs(a - b)
-        apart = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.where(np.isnan(apart), np.inf, apart))
-    count = int((apart > tolerance).sum())
+        difference = np.abs(a - b)
+        difference = np.where(
+            (a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.where(np.isnan(difference), np.inf, difference)
+        )
+    count = int((difference > tolerance).sum())
     if not count:
         return ""
     largest = np.abs(a[np.isfinite(a)]).max(initial=0.0)
-    changed = apart[apart > tolerance]
+    changed = difference[difference > tolerance]
     return (
         f"{count} of {a.size} values differ, by {changed.mean():.3g} in the mean and {changed.max():.3g} at most; "
         f"the largest was {largest:.3g}"

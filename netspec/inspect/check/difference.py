@@ -13,8 +13,8 @@ from netspec.proto.schema import Field, fields_of
 from netspec.proto.source_map import Place
 from netspec.proto.writer import scalar_text
 
-#: Fields whose absence means something else than their default.
-TOLD_BY_PRESENCE = {
+#: Fields that mean something else when absent than when set to their default.
+PRESENCE_MATTERS = {
     ("caffe.BatchNormParameter", "use_global_stats"),
     ("caffe.LossParameter", "ignore_label"),
     ("caffe.LossParameter", "normalization"),
@@ -23,7 +23,7 @@ TOLD_BY_PRESENCE = {
     ("caffe.PReLUParameter", "filler"),
     ("caffe.ScaleParameter", "filler"),
 }
-#: Fields of windows, the two fields that say the same by side, and the default.
+#: Fields of windows: the two fields that give the same for each side, and the default.
 WINDOWS = {
     "kernel_size": ("kernel_h", "kernel_w", 0),
     "stride": ("stride_h", "stride_w", 1),
@@ -91,10 +91,10 @@ def _in_field(first: Any, second: Any, here: Place, there: Place, field: Field) 
     name = field.name
     places = here.find(name), there.find(name)
     one, other = field.get(first), field.get(second)
-    by_presence = (first.DESCRIPTOR.full_name, name) in TOLD_BY_PRESENCE
+    by_presence = (first.DESCRIPTOR.full_name, name) in PRESENCE_MATTERS
     if by_presence and field.present(first) != field.present(second):
-        told = [_told(field, m) if field.present(m) else ABSENT for m in (first, second)]
-        yield Difference(places[0], f"{name} is {told[1]}, was {told[0]}", places[1])
+        shown = [_value_text(field, m) if field.present(m) else ABSENT for m in (first, second)]
+        yield Difference(places[0], f"{name} is {shown[1]}, was {shown[0]}", places[1])
     elif field.type == Declared.TYPE_MESSAGE and field.repeated:
         if len(one) != len(other):
             yield Difference(places[0], f"{len(other)} {name} {{ }}, were {len(one)}", places[1])
@@ -104,7 +104,9 @@ def _in_field(first: Any, second: Any, here: Place, there: Place, field: Field) 
         if field.present(first) or field.present(second):
             yield from differences(one, other, child(here, name), child(there, name))
     elif list(one) != list(other) if field.repeated else one != other and not (one != one and other != other):
-        yield Difference(places[0], f"{name} is {_told(field, second)}, was {_told(field, first)}", places[1])
+        yield Difference(
+            places[0], f"{name} is {_value_text(field, second)}, was {_value_text(field, first)}", places[1]
+        )
 
 
 def child(place: Place, name: str, index: int = 0) -> Place:
@@ -126,7 +128,7 @@ def _times(sizes: tuple[int, ...]) -> str:
     return "x".join(map(str, sizes))
 
 
-def _told(field: Field, message: Any) -> str:
+def _value_text(field: Field, message: Any) -> str:
     value = field.get(message)
     if field.type == Declared.TYPE_MESSAGE:
         return "given"
@@ -135,6 +137,6 @@ def _told(field: Field, message: Any) -> str:
 
 
 def labeled(difference: Difference, layer: Any) -> Difference:
-    """Return a difference whose place names the layer it belongs to."""
+    """Return the difference with the layer's name and type added to its place."""
     where = Where(difference.where.file, difference.where.line, difference.where.column, layer.name, layer.type)
     return Difference(where, difference.message, difference.other)

@@ -1,4 +1,4 @@
-"""What a file has that neither Caffe nor a known dialect has: one line for each field and layer type."""
+"""Reports fields and layer types that neither Caffe nor a known dialect has, one line for each."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ def unknown_types(net: NetParameter, source: SourceMap) -> Iterator[ForkFault]:
 
 
 def python_layers(net: NetParameter, source: SourceMap) -> Iterator[SpecError]:
-    """Yield a fault for each layer whose Python code may not run: where another is unknown, it may not be built."""
+    """Yield a fault for each layer with Python code that may not run, for nets that cannot be built."""
     for i, layer in enumerate(net.layer):
         if fault := getattr(class_of(layer), "not_allowed", None):
             yield SpecError(fault, source.at(i, "type", layer=layer.name, type=layer.type))
 
 
 def gathered(faults: Sequence[SpecError]) -> list[SpecError]:
-    """Return the faults, with one for each unknown field or layer type, in the place of the first.
+    """Return the faults with those of the same unknown field or layer type joined, at the place of the first.
 
-    A fault is counted once, though several nets of a solver have it.
+    A fault that several nets of a solver have counts once.
     """
     groups: dict[object, list[SpecError]] = {}
     for fault in {(fault.message, fault.where): fault for fault in faults}.values():
@@ -43,7 +43,7 @@ def gathered(faults: Sequence[SpecError]) -> list[SpecError]:
 
 
 def others(faults: Sequence[SpecError], unknown: Sequence[SpecError]) -> list[SpecError]:
-    """Return the faults but for those that may only follow from something unknown in their layer."""
+    """Return the faults without those that an unknown field or type in the same layer may have caused."""
     places = {(fault.where.file, fault.where.layer) for fault in unknown if fault.where and fault.where.layer}
     own = [fault for fault in faults if fault.where and (fault.where.file, fault.where.layer) in places]
     return [fault for fault in faults if fault not in own or fault.message.startswith("unknown bottom blob")]

@@ -45,7 +45,7 @@ def _transforms(net: NetParameter, source: SourceMap) -> Said:
                 line = source.layers[other].where.line
                 yield (
                     source.at(i, "transform_param", name, layer=layer.name, type=layer.type),
-                    f'{name} is {_told(here)} here, and {_told(there)} in line {line}, where "{layer.top[0]}" of '
+                    f'{name} is {_as_text(here)} here, and {_as_text(there)} in line {line}, where "{layer.top[0]}" of '
                     "another phase is read; give both the same",
                 )
 
@@ -269,6 +269,6 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, (str, float, int)) else tuple(value)
 
 
-def _told(value: Any) -> str:
+def _as_text(value: Any) -> str:
     values = value if isinstance(value, tuple) else (value,)
     return " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in values) or "absent"

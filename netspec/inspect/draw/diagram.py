@@ -1,7 +1,7 @@
 """What a picture of a net shows: its layers as boxes, its blobs as wires, with shapes and costs.
 
-Both phases are in one diagram. A layer that computes in place, on a blob that nobody else reads before, belongs to the
-box of the layer that made the blob.
+Both phases are in one diagram. A layer that computes in place is in the box of the layer that made
+the blob, if no other layer reads the blob before.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ Output = tuple[int, int]  # a box and which of its tops
 
 @dataclass(frozen=True)
 class Attached:
-    """A layer in place, in the box of the layer whose top it changes."""
+    """A layer that computes in place. It is drawn in the box of the layer that made its blob."""
 
     name: str
     type: str
@@ -91,12 +91,12 @@ class Attached:
 
 @dataclass(frozen=True)
 class Box:
-    """A layer.
+    """A layer, as it is drawn.
 
-    ``kind`` is the room of netspec.layers that has it. ``phases`` are those that it is in, empty for all that are
-    drawn. ``weights`` is how many numbers it learns that are its own, ``owner`` the layer whose parameters it uses,
-    ``work`` its multiply-adds in one forward pass, ``text`` its prototxt with that of the attached layers. ``same``
-    is equal in layers that differ in names only.
+    ``kind`` is the room of netspec.layers that defines it. ``phases`` are the phases that have it, or empty if all
+    drawn phases do. ``weights`` counts its own learned numbers; ``owner`` is the layer that it shares parameters with.
+    ``work`` is its multiply-adds in one forward pass. ``text`` is its prototxt and that of the attached layers.
+    ``same`` is equal for layers that differ only in names.
     """
 
     name: str
@@ -179,12 +179,12 @@ def _look(net: NetParameter, source: SourceMap, phase: str, options: BuildOption
 def _merged(net: NetParameter, source: SourceMap, seen: Sequence[_Seen], faults: tuple[SpecError, ...]) -> Diagram:
     """Return the phases in one diagram."""
     phases_of: dict[int, list[str]] = {}
-    apart: set[int] = set()  # layers that are boxes of their own in some phase
+    boxed: set[int] = set()  # layers that have a box of their own in some phase
     for one in seen:
         for number in one.numbers:
             phases_of.setdefault(number, []).append(one.phase)
-        apart.update(number for number, alone in zip(one.numbers, _alone(one.plan), strict=True) if alone)
-    index = {number: k for k, number in enumerate(sorted(apart))}
+        boxed.update(number for number, alone in zip(one.numbers, _alone(one.plan), strict=True) if alone)
+    index = {number: k for k, number in enumerate(sorted(boxed))}
     reads: list[list[Output]] = [[] for _ in index]
     attached: list[dict[int, None]] = [{} for _ in index]
     for one in seen:

@@ -87,7 +87,7 @@ def _clusters(diagram: Diagram, nodes: Sequence[str], blocks: Iterable[Block], u
 
 
 def _ties(diagram: Diagram, nodes: Sequence[str], shown: Sequence[int]) -> Iterator[str]:
-    """Yield a dashed line between each box and the one whose parameters it uses."""
+    """Yield a dashed line between two boxes for each layer that uses the parameters of another."""
     number = {diagram.boxes[k].name: k for k in shown}
     for k in shown:
         owner = number.get(diagram.boxes[k].owner)

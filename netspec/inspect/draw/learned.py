@@ -46,7 +46,7 @@ def filters_figure(filters: np.ndarray, title: str, of_images: bool = True, rgb:
         columns = shown.shape[1]
     words = f"{title}: {times(filters.shape)}"
     if len(shown) < len(filters) or shown.shape[1] < filters.shape[1]:
-        words += f", of which {times(shown.shape[:2])} are shown"
+        words += f" ({times(shown.shape[:2])} of them shown)"
     if not in_color and filters.shape[1] > images:
         words += "; a row is a filter, a column an input channel"
     scale = None if in_color else ("RdBu_r", -limit, limit)
@@ -54,9 +54,9 @@ def filters_figure(filters: np.ndarray, title: str, of_images: bool = True, rgb:
 
 
 def maps_figure(maps: np.ndarray, image: np.ndarray, title: str) -> Figure:
-    """Draw the maps (C, H, W) of a blob, or its numbers (D,), beside the image (H, W, 3) or (H, W) it was computed of.
+    """Draw the maps (C, H, W) or numbers (D,) of a blob, next to the image (H, W, 3) or (H, W) it is computed from.
 
-    All maps have one scale; its ends leave out the half percent of values that are greatest, and smallest.
+    All maps have the same scale. It leaves out the largest and the smallest half percent of the values.
     """
     if maps.ndim < 3 or maps.shape[-2:] == (1, 1):
         return _numbers(maps.reshape(-1), image, title)
@@ -65,7 +65,7 @@ def maps_figure(maps: np.ndarray, image: np.ndarray, title: str) -> Figure:
     low, high = np.percentile(finite, [0.5, 99.5]) if finite.size else (0.0, 1.0)
     words = f"{title}: {times(maps.shape)}"
     count = int(np.prod(maps.shape[:-2]))
-    words += f", of which {len(shown)} are shown" if count > len(shown) else ""
+    words += f" ({len(shown)} of them shown)" if count > len(shown) else ""
     still = int((np.ptp(maps.reshape(count, -1), axis=1) == 0).sum())
     words += f"; {still} of one value everywhere" if still else ""
     columns = min(_TILES_WIDE, int(np.ceil(np.sqrt(len(shown)))))
@@ -153,15 +153,19 @@ def _mosaic(
         whole[top : top + height, left : left + width] = tile
     if scale is None:
         whole = np.where(np.isnan(whole), 1.0, whole)
-    beside = 0 if image is None else 2.2
-    drawn = WIDTH - beside - 0.3
+    image_width = 0 if image is None else 2.2
+    drawn = WIDTH - image_width - 0.3
     lines = textwrap.wrap(title, 105)
-    high = max(drawn * whole.shape[0] / whole.shape[1], 1.6 if beside else 0.4)
+    high = max(drawn * whole.shape[0] / whole.shape[1], 1.6 if image_width else 0.4)
     with matplotlib.rc_context(STYLE):
         size = (WIDTH, high + (_BAR if scale else 0.2) + 0.2 * len(lines))
         figure = Figure(figsize=size, layout="constrained")
         figure.suptitle("\n".join(lines), fontsize=10, parse_math=False, x=0.01, ha="left")
-        axes = figure.subplots(1, 2, squeeze=False, width_ratios=(beside, drawn))[0] if beside else [figure.subplots()]
+        axes = (
+            figure.subplots(1, 2, squeeze=False, width_ratios=(image_width, drawn))[0]
+            if image_width
+            else [figure.subplots()]
+        )
         if image is not None:
             axes[0].imshow(rgb_of(image))
             axes[0].set_title("image")
@@ -193,8 +197,8 @@ def _numbers(values: np.ndarray, image: np.ndarray, title: str) -> Figure:
         axis.axhline(0, color="black", linewidth=0.6)
         axis.margins(x=0.01)
         greatest = np.argsort(-values)[:5]
-        told = ", ".join(f"{k} ({number(float(f'{values[k]:.3g}'))})" for k in greatest)
-        words = textwrap.wrap(f"{title}: {len(values)} values; greatest: {told}", 105)
+        listed = ", ".join(f"{k} ({number(float(f'{values[k]:.3g}'))})" for k in greatest)
+        words = textwrap.wrap(f"{title}: {len(values)} values; greatest: {listed}", 105)
         figure.suptitle("\n".join(words), fontsize=10, parse_math=False, x=0.01, ha="left")
         return figure
 

@@ -1,4 +1,4 @@
-"""Pictures as HTML files that need no others, whose values are all escaped."""
+"""Writes pictures as HTML pages that need no other files. All values are escaped."""
 
 from __future__ import annotations
 

@@ -86,8 +86,8 @@ def _tile_size(usual: np.ndarray | None) -> tuple[float, float]:
 def _fault_lines(found: Survey) -> list[str]:
     if not found.num_faults:
         return ["faults: none"]
-    told = [f"  {fault.key}: {fault.text}" for fault in found.faults[:3]]
-    return [f"faults: {found.num_faults:,} records that a data layer refuses", *told]
+    examples = [f"  {fault.key}: {fault.text}" for fault in found.faults[:3]]
+    return [f"faults: {found.num_faults:,} records that a data layer refuses", *examples]
 
 
 def _draw_head(figure: Figure, whole: Axes, lines: Sequence[str], found: Survey, height: float, head: float) -> None:

@@ -104,7 +104,7 @@ def images_in(values: np.ndarray) -> int:
 
 
 def what_is_shown(values: np.ndarray) -> str:
-    """Return a word on values (C, H, W) whose picture does not show all channels as they are; "" for others."""
+    """Return a note if a picture of values (C, H, W) cannot show the channels themselves; "" if it can."""
     if values.shape[1:] == (1, 1) and len(values) > 4:
         return f"vectors of {len(values)} numbers as blocks"
     return f"{times(values.shape)}, the mean of the channels" if len(values) not in (1, 3, 4) else ""

@@ -20,7 +20,7 @@ from netspec.inspect.logs.training_log import Curve, TrainingLog, shown_range, s
 from netspec.log import logger
 
 WIDTH, LOSS_HEIGHT, HEIGHT = 9.0, 3.4, 2.3  # inches
-MOST_POINTS = 2000  # of a curve, of which more cannot be seen
+MOST_POINTS = 2000  # of a curve; more cannot be seen in a picture
 MOST_ELEMENTS = 6  # of an output blob; blobs of more numbers are left out
 LEGEND_WIDTH = 100  # characters
 MARKERS = "osDv^<>"
@@ -32,12 +32,12 @@ _DASHED = (0, (4, 2))
 class Look:
     """How curves are drawn: the window of the smoothing in points (None: a 25th of them), and a logarithmic axis.
 
-    Tests that are at least ``apart`` iterations apart get markers.
+    Tests get markers if ``marker_distance`` iterations or more lie between them.
     """
 
     smooth: int | None = None
     log: bool = False
-    apart: float = 0.0
+    marker_distance: float = 0.0
 
 
 def training_figure(logs: Sequence[TrainingLog], look: Look | None = None) -> Figure:
@@ -46,7 +46,7 @@ def training_figure(logs: Sequence[TrainingLog], look: Look | None = None) -> Fi
     The loss of training is pale as it is and strong smoothed; tests are dashed, with markers. The parts have ids, such
     as ``run0-raw``, so that a page can hide them.
     """
-    look = replace(look or Look(), apart=max((log.iteration for log in logs), default=0) / MOST_MARKERS)
+    look = replace(look or Look(), marker_distance=max((log.iteration for log in logs), default=0) / MOST_MARKERS)
     others = other_outputs(logs)
     rates = any(len(log.rate) for log in logs)
     heights = [LOSS_HEIGHT] + [HEIGHT] * (len(others) + rates)
@@ -120,7 +120,7 @@ def _draw_output(axis: Axes, log: TrainingLog, name: str, number: int, look: Loo
 
 def _draw_test(axis: Axes, curve: Curve, number: int, net: int, look: Look) -> None:
     x, y = curve.arrays()
-    marker = MARKERS[net % len(MARKERS)] if len(x) < 2 or np.median(np.diff(x)) >= look.apart else ""
+    marker = MARKERS[net % len(MARKERS)] if len(x) < 2 or np.median(np.diff(x)) >= look.marker_distance else ""
     color = COLORS[number % len(COLORS)]
     _line(axis, x, y, f"run{number}-test", color=color, linestyle=_DASHED, linewidth=1.1, marker=marker, markersize=4)
 

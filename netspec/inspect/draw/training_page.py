@@ -20,11 +20,11 @@ _FEW = 6  # test outputs that the cursor reads
 
 def training_page(logs: Sequence[TrainingLog], figure: Figure, title: str) -> str:
     """Return the page; ``figure`` is the picture of the runs. It needs nothing from elsewhere."""
-    told = [summary(log) for log in logs]
-    columns = list(dict.fromkeys(name for line in told for name in line))
+    summaries = [summary(log) for log in logs]
+    columns = list(dict.fromkeys(name for line in summaries for name in line))
     shown = [
         {"name": log.name, "color": COLORS[number % len(COLORS)], "cells": [line.get(column, "") for column in columns]}
-        for number, (log, line) in enumerate(zip(logs, told, strict=True))
+        for number, (log, line) in enumerate(zip(logs, summaries, strict=True))
     ]
     drawing = svg(figure)
     return page(

@@ -114,7 +114,7 @@ def _numbers(names: list[str] | None, known: dict[str, int], size: int, count: i
         return list(range(count))
     for name in names:
         if name not in known:
-            raise SpecError(f'has no image "{name}", of which there is a descriptor', Where(str(path)))
+            raise SpecError(f'has no image "{name}", but there is a descriptor of it', Where(str(path)))
     return [known[name] for name in names]
 
 

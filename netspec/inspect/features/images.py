@@ -18,7 +18,7 @@ from netspec.data.datum import decode_pixels, planar
 from netspec.errors import SpecError, Where
 from netspec.export.engines.choice import TORCH, Choice
 from netspec.export.engines.model import Model, Origin
-from netspec.export.engines.runners import Unable, tell_unable
+from netspec.export.engines.runners import Unable, warn_unable
 from netspec.files.image_list import ImageList
 from netspec.files.opencv import cv2
 from netspec.graph.filter import filter_net, is_input, prune, shapes_of_input, with_state
@@ -55,11 +55,12 @@ class ImageInput:
 
 
 class ImageNet:
-    """The part of a net that computes ``blob`` from images, and what is done to their pixels before.
+    """The part of a net that computes ``blob`` from images, and how their pixels are prepared.
 
-    The net is the prototxt ``model`` in phase TEST. ``weights`` are files, the last one winning; something in them must
-    fit. ``choice`` is the engine that runs the net: with another than torch, whose model the cache has, torch is not
-    imported. Raises SpecError for faults of the files; warns where the weights were trained on other pixels.
+    The net is the prototxt ``model`` in phase TEST. ``weights`` are files; a later one overrides an earlier one, and
+    at least one layer must get weights. ``choice`` is the engine that runs the net. If it is not torch, and the cache
+    has the model, torch is not imported. Raises SpecError for faults of the files. Warns if the weights were trained
+    on pixels that were prepared in another way.
     """
 
     def __init__(
@@ -114,7 +115,7 @@ class ImageNet:
 
     def _use_torch(self, reason: str) -> None:
         """Run the net by torch; ``reason`` says why the chosen engine does not."""
-        tell_unable(self._choice, reason)
+        warn_unable(self._choice, reason)
         self._model, self._net = None, self._build()
         self._net.keep = [self.blob]
 

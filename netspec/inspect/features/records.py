@@ -112,13 +112,13 @@ def extract_features(net: Net, blobs: Sequence[str], databases: Sequence[str], b
                     datum = array_to_datum(value.reshape(shape))
                     writer.put(b"%010d" % (written + n), datum.SerializeToString())
             if (written + rows) // COMMITTED > written // COMMITTED:
-                _tell(written + rows, blobs)
+                _log_count(written + rows, blobs)
             written += rows
     if written % COMMITTED:
-        _tell(written, blobs)
+        _log_count(written, blobs)
     log.error("extract_features.cpp:181", "Successfully extracted the features!")
 
 
-def _tell(count: int, blobs: Sequence[str]) -> None:
+def _log_count(count: int, blobs: Sequence[str]) -> None:
     for name in blobs:
         log.error("extract_features.cpp:176", f"Extracted features of {count} query images for feature blob {name}")

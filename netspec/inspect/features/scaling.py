@@ -75,8 +75,8 @@ class Scaling:
     def __str__(self) -> str:
         values = self.mean.reshape(-1)
         channels = values[:1] if np.all(values == values[0]) else values
-        told = ", ".join(f"{value:g}" for value in channels) if len(channels) <= 3 else "a mean image"
-        mean = f", minus {told}" if np.any(values) else ""
+        subtracted = ", ".join(f"{value:g}" for value in channels) if len(channels) <= 3 else "a mean image"
+        mean = f", minus {subtracted}" if np.any(values) else ""
         raw_scale, scale = (f", times {factor:g}" if factor != 1 else "" for factor in (self.raw_scale, self.scale))
         return f"0 to 255{raw_scale}{mean}{scale} ({self.source})"
 

@@ -1,7 +1,7 @@
 """The nets that come with the package, by name, as describers for a loop-closure detector.
 
 ``prototxt/`` is their one source: building the wheel copies it into this package (setup.py); in an editable
-installation or a checkout it lies beside the package. The entry points ``loopclosure.describers`` of pyproject.toml
+installation or a checkout it is next to the package. The entry points ``loopclosure.describers`` of pyproject.toml
 name the functions here. To recommend another net, change :data:`DEFAULT` or :data:`SMALL`, and what setup.py copies
 follows.
 """

@@ -264,25 +264,25 @@ def _number(text: str) -> float:
     return math.copysign(math.inf, value) if abs(value) > _GREATEST else value
 
 
-_FEW = 6  # outputs of test nets that are told
+_MOST_OUTPUTS = 6  # of each test net in a summary
 
 
 def summary(log: TrainingLog) -> dict[str, str]:
     """Return, by name: state, iterations, the last losses and test outputs, the least test loss, iter/s."""
-    told = {"state": "unfinished" if log.state == RUNNING else log.state, "iterations": f"{log.iteration:,}"}
+    found = {"state": "unfinished" if log.state == RUNNING else log.state, "iterations": f"{log.iteration:,}"}
     if log.loss.last is not None:
-        told["last loss"] = number(log.loss.last)
+        found["last loss"] = number(log.loss.last)
     for net, curves in log.tests.items():
         label = log.test_label(net)
-        for name, curve in list(curves.items())[:_FEW]:
-            told[f"{label} {name}"] = number(curve.values[-1])
+        for name, curve in list(curves.items())[:_MOST_OUTPUTS]:
+            found[f"{label} {name}"] = number(curve.values[-1])
             finite = [value for value in curve.values if math.isfinite(value)]
             if name in log.losses and finite:
                 least = min(finite)
-                told[f"least {label} {name}"] = f"{number(least)} at {curve.iterations[curve.values.index(least)]:,}"
+                found[f"least {label} {name}"] = f"{number(least)} at {curve.iterations[curve.values.index(least)]:,}"
     if speed := iterations_per_second(log):
-        told["iter/s"] = number(float(f"{speed:.3g}"))
-    return told
+        found["iter/s"] = number(float(f"{speed:.3g}"))
+    return found
 
 
 def iterations_per_second(log: TrainingLog) -> float | None:

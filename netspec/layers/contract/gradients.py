@@ -38,14 +38,14 @@ class OwnGradients(Protocol):
         ...
 
 
-class Unheeding(Protocol):
-    """A layer that does not look at ``propagate_down`` in its backward pass."""
+class IgnoresPropagateDown(Protocol):
+    """A layer that ignores ``propagate_down`` in its backward pass."""
 
     ignores_propagate_down: frozenset[int]  # the bottoms that get a gradient even where it is false
 
 
 def gradient_reads(layer: Layer) -> frozenset[str]:
-    """Return what a layer's gradient reads, nothing where autograd keeps what it needs."""
+    """Return what a layer's gradient reads from memory; nothing if autograd keeps all that it needs."""
     return getattr(layer, "gradient_reads", NOTHING)
 
 
@@ -57,7 +57,7 @@ def ignores_propagate_down(layer: Layer) -> frozenset[int]:
 def gradients_from_memory(
     layer: Layer, bottoms: Sequence[torch.Tensor], top: torch.Tensor, diff: torch.Tensor
 ) -> tuple[torch.Tensor, ...]:
-    """Return the gradients of a layer's bottoms; for layers whose gradient reads something."""
+    """Return the gradients of the bottoms of a layer that computes them from memory, as Caffe does."""
     if len(bottoms) > 1:
         return offered(layer, "caffes_gradients")(bottoms, top, diff)
     return (offered(layer, "caffes_gradient")(bottoms[0], top, diff),)

@@ -98,8 +98,8 @@ def _counts(blobs: Sequence[Any]) -> list[tuple[int, int]]:
         return [(0 if b.is_inference() else b._version, getattr(b, "handed_out", 0)) for b in blobs]
 
 
-def is_lent(blob: torch.Tensor) -> bool:
-    """Return whether an alias of a blob's memory is alive, or might be, through which it could be changed."""
+def may_have_alias(blob: torch.Tensor) -> bool:
+    """Return whether a blob could be changed through an alias of its memory that is, or may be, alive."""
     if not isinstance(blob, Learned):
         return True
     if blob.handed_out == 0:

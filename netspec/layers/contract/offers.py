@@ -1,4 +1,4 @@
-"""What a layer may offer beside its forward pass, each thing by an attribute that the class defines.
+"""What a layer may offer in addition to its forward pass, each by an attribute that its class defines.
 
 exporting.py  to_onnx, to_torch, passes_on: the layer in another form
 gradients.py  caffes_gradient: the gradient from what lies in memory

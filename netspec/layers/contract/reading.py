@@ -49,8 +49,8 @@ class Waits(Protocol):
 
 
 @runtime_checkable
-class Fed(Protocol):
-    """A layer that a program gives its data."""
+class NeedsInput(Protocol):
+    """A layer that gets its data from a program."""
 
     def missing_input(self) -> SpecError | None:
         """Return an error if a solver cannot run the layer, because a program must first give it data."""

@@ -117,9 +117,9 @@ class ReadingLayer(Layer):
         data = given.get(self.param.top[0]) or self.known_shape()
         if data is None:
             raise self.shape_wanted(self.param.top[0], f"{self.batch_size},C,H,W")
-        return [data, *(given.get(top) or self.shape_beside(data) for top in self.param.top[1:])]
+        return [data, *(given.get(top) or self.second_shape(data) for top in self.param.top[1:])]
 
-    def shape_beside(self, data: Shape) -> Shape:
+    def second_shape(self, data: Shape) -> Shape:
         """Return the shape of what goes with the first top, of shape ``data``: a label for each image."""
         return data[:1]
 

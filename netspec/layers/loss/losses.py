@@ -265,15 +265,15 @@ def sigmoid_loss(scores, targets):
 def contrastive_loss(a, b, similar, margin):
     """Return the mean over pairs of d**2 / 2, if not similar of max(margin - d, 0)**2 / 2."""
     squared = (a - b).flatten(1).square().sum(1)
-    apart = F.relu(margin - squared.sqrt()).square()
-    return torch.where(similar.flatten().long() != 0, squared, apart).mean() / 2
+    dissimilar = F.relu(margin - squared.sqrt()).square()
+    return torch.where(similar.flatten().long() != 0, squared, dissimilar).mean() / 2
 
 
 def legacy_contrastive_loss(a, b, similar, margin):
     """Return the mean over pairs of d**2 / 2, if not similar of max(margin - d**2, 0) / 2."""
     squared = (a - b).flatten(1).square().sum(1)
-    apart = F.relu(margin - squared)
-    return torch.where(similar.flatten().long() != 0, squared, apart).mean() / 2
+    dissimilar = F.relu(margin - squared)
+    return torch.where(similar.flatten().long() != 0, squared, dissimilar).mean() / 2
 
 
 def hinge_loss(scores, labels, norm):

@@ -21,7 +21,7 @@ from typing_extensions import override
 Shape = tuple[int, ...]
 
 
-def _nobody() -> np.ndarray | None:
+def _no_view() -> np.ndarray | None:
     return None
 
 
@@ -38,7 +38,7 @@ class Memory:
         self.dtype = torch.float32
         self._fresh: torch.Tensor | None = None  # what a layer has put here since a view was last asked for
         self._flat: torch.Tensor | None = None  # what views show, one axis, in main memory
-        self._seen: Callable[[], np.ndarray | None] = _nobody  # the array that all views are views of, while any lives
+        self._seen: Callable[[], np.ndarray | None] = _no_view  # the array that all views are views of, while any lives
         self._uploaded: torch.Tensor | None = None  # ``_flat`` on the GPU
 
     def reserve(self, count: int) -> None:
@@ -46,7 +46,7 @@ class Memory:
         if count > self.capacity:
             self.capacity = count
             self._fresh = self._flat = self._uploaded = None
-            self._seen = _nobody
+            self._seen = _no_view
 
     def view(self, shape: Shape) -> np.ndarray:
         """Return a view of the first numbers."""
@@ -95,7 +95,7 @@ class Memory:
     def leave_views(self) -> None:
         """Go on in other memory with the same content, if there are views; they no longer change."""
         if self.is_watched() and self._flat is not None:
-            self._flat, self._seen = self._flat.clone(), _nobody
+            self._flat, self._seen = self._flat.clone(), _no_view
 
     def is_watched(self) -> bool:
         """Return whether there is a view, which must show what layers compute."""
@@ -104,7 +104,7 @@ class Memory:
     def cast(self, dtype: torch.dtype) -> None:
         """Hold numbers of another precision, zeros at first."""
         if dtype != self.dtype:
-            self.dtype, self._fresh, self._flat, self._uploaded, self._seen = dtype, None, None, None, _nobody
+            self.dtype, self._fresh, self._flat, self._uploaded, self._seen = dtype, None, None, None, _no_view
 
     def _settled(self, count: int) -> torch.Tensor:
         """Return the memory that views show, with what was put last."""

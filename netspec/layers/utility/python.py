@@ -40,7 +40,7 @@ class _Call(torch.autograd.Function):
 
 
 class _Phase(int):
-    """Caffe's number of a phase, of which the text is the name, as in rbgirshick/caffe-fast-rcnn and yjxiong/caffe."""
+    """Caffe's number of a phase. Its text is the name, as in rbgirshick/caffe-fast-rcnn and yjxiong/caffe."""
 
     def __str__(self) -> str:
         return PHASE_NAMES[self]
@@ -134,8 +134,8 @@ class Python(Layer):
     def resume(self, state: Mapping[str, Any]) -> None:
         if not (hasattr(self.code, "running_state") and hasattr(self.code, "resume")):
             remedy = "give its class running_state() and resume(state)"
-            told = f"what the code remembers besides its blobs is not restored; if that matters, {remedy}"
-            log.logger.warning(str(self.error(told, "python_param")))
+            message = f"only the blobs of the Python layer are restored; if its code has other state, {remedy}"
+            log.logger.warning(str(self.error(message, "python_param")))
         elif state["code"]:
             try:
                 found = json.loads(state["code"])

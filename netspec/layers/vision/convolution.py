@@ -113,7 +113,7 @@ class Convolution(SlidingFilter):
         if self.reads_padding_alone:
             maps = F.pad(maps, [p for p in reversed(sliding.pad) for _ in range(2)])
             sliding = replace(sliding, pad=(0,) * len(sliding.pad))
-        if not torch.is_grad_enabled():  # weights would be laid out anew for each product
+        if not torch.is_grad_enabled():  # in channels_last, weights would be copied for each product
             return convolution(of_one_channel(maps), weight, bias, sliding, self.group)
         lay_out = channels_side_by_side if maps.numel() > 2 * weight.numel() else map_by_map
         return self.convolved(maps, weight, bias, sliding, lay_out)

@@ -63,7 +63,7 @@ def test_onnx(onnx: Any, net: Net, run: Run) -> None:
 def test_torch(net: Net, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     result = run("export", MODEL, "--weights", WEIGHTS, "--to", "torch", "--out", "exported_cli.py")
     assert result.status == 0
-    assert result.err == "note: the weights are in exported_cli.safetensors, beside the module\n"
+    assert result.err == "note: the weights are in exported_cli.safetensors, next to the module\n"
     monkeypatch.syspath_prepend(".")
     import exported_cli  # type: ignore
 

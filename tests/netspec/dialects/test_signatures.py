@@ -26,7 +26,7 @@ def test_the_table_names_dialects_types_and_fields_that_there_are(kind: str) -> 
 
 def test_a_layer_that_nothing_decides_is_in_doubt(caplog: pytest.LogCaptureFixture) -> None:
     netspec.layer('type: "DiceCoefLoss"', (2, 3), (2, 3))
-    assert "forks have other layers of this type" in caplog.text
+    assert "several forks define this layer type" in caplog.text
 
 
 OWN = """

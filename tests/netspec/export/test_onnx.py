@@ -167,7 +167,7 @@ def test_large_weights_are_in_a_file_beside_the_model(net_of: Callable[..., Net]
     text = 'layer { name: "ip" type: "InnerProduct" bottom: "conv" top: "ip" inner_product_param { num_output: 20 } }'
     net = trained(net_of(IMAGE + CONV + text))
     notes = export_onnx(net, tmp_path / "net.onnx", largest=10_000)
-    assert notes[-1] == "the weights are in net.onnx.data, beside the model"
+    assert notes[-1] == "the weights are in net.onnx.data, next to the model"
     assert (tmp_path / "net.onnx").stat().st_size < 5_000 < (tmp_path / "net.onnx.data").stat().st_size
     inputs = random_inputs(net)
     assert_same(in_onnxruntime(str(tmp_path / "net.onnx"), inputs), here(net, inputs))

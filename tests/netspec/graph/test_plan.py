@@ -84,8 +84,8 @@ def _needs(propagate: str, force: str = "") -> tuple[tuple[bool, ...], tuple[tup
     learns = [node.type == "InnerProduct" for node in made.nodes]
     losses = [[name == "loss"] * len(node.tops) for name, node in zip(names, made.nodes, strict=True)]
     labels = [frozenset({1}) if name == "loss" else frozenset() for name in names]
-    unheeding = [frozenset[int]()] * len(names)
-    backward = plan_backward(made, learns, losses, labels, unheeding)
+    ignoring = [frozenset[int]()] * len(names)
+    backward = plan_backward(made, learns, losses, labels, ignoring)
     by_name = dict(zip(names, backward.layers, strict=True))
     return tuple(by_name[name] for name in ("low", "high", "loss", "aside")), backward.bottoms
 

@@ -46,7 +46,7 @@ def passed(net: Net, data: torch.Tensor) -> list[torch.Tensor]:
 def test_together_they_compute_what_each_computes(net_of, text: str) -> None:
     data = torch.randn(4, 3, 40, 40, generator=torch.Generator().manual_seed(1))
     together, alone = net_of(text, phase=0, exact="none"), net_of(text, phase=0, exact="none")
-    alone.eager._apart = [True] * len(alone.layers)
+    alone.eager._runs_alone = [True] * len(alone.layers)
     for mine, theirs in zip(passed(together, data), passed(alone, data), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-3)
 

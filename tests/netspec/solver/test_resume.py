@@ -281,7 +281,7 @@ def test_what_a_python_layer_forgets_is_said(warnings: Callable[[], list[str]]) 
     _, state = load_solver("solver.prototxt", allow_python=True).snapshot()
     load_solver("solver.prototxt", snapshot=state, allow_python=True)
     (said,) = {line for line in warnings() if "not restored" in line}
-    assert 'layer "c" (Python): what the code remembers besides its blobs is not restored' in said
+    assert 'layer "c" (Python): only the blobs of the Python layer are restored' in said
 
 
 def test_a_python_layer_that_remembers_what_json_cannot_hold() -> None:

@@ -10,7 +10,7 @@ import torch
 
 from case_files import read_cases
 from netspec.errors import SpecError
-from netspec.layers.contract.reading import Fed
+from netspec.layers.contract.reading import NeedsInput
 from netspec.load import load_solver
 from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter
@@ -174,7 +174,7 @@ def test_a_step_asks_no_layer_what_it_is(make, monkeypatch: pytest.MonkeyPatch) 
     def refuse(protocol: type, layer: object) -> bool:
         raise AssertionError(f"{protocol.__name__} was asked for")
 
-    monkeypatch.setattr(type(Fed), "__instancecheck__", refuse)
+    monkeypatch.setattr(type(NeedsInput), "__instancecheck__", refuse)
     solver.step(1)
     assert solver.iteration == 2
 
