@@ -1,7 +1,6 @@
 """Fold layers that only scale, shift or copy into the layers before them.
 
-The pass knows no layer type. Its callers say of each layer whether it is an affine map of its channels, can take one
-on, or hands its bottom on unchanged; fold.py asks the layers.
+This module knows no layer types. Its callers say what each layer can do (:class:`Roles`); fold.py asks the layers.
 """
 
 from __future__ import annotations
@@ -14,12 +13,16 @@ from netspec.graph.plan import Plan, origins
 
 @dataclass(frozen=True)
 class Roles:
-    """What each layer of a plan is, by its index.
+    """What each layer of a plan can do, by its index.
 
-    ``absorbs``: it can scale and shift its top's channels; ``affine``: that is all it does to its one bottom;
-    ``absorbs_before``: it can do so to its bottom's channels before its own work; ``passes_on``: its tops are its
-    bottom; ``finishes``: it can be computed in place, at the end of the step before; ``fresh``: its top is memory of
-    its own. Only :func:`netspec.fast.steps.schedule` reads the last two.
+    - ``absorbs``: it can also scale and shift the channels of its top.
+    - ``absorbs_before``: it can also scale and shift the channels of its bottom, before its own work.
+    - ``affine``: it only scales and shifts the channels of its single bottom.
+    - ``passes_on``: it returns its bottom unchanged.
+    - ``finishes``: it can be computed in place, at the end of the step before it.
+    - ``fresh``: its top has memory of its own.
+
+    Only :func:`netspec.fast.steps.schedule` reads the last two.
     """
 
     absorbs: Sequence[bool]
@@ -32,19 +35,19 @@ class Roles:
 
 @dataclass(frozen=True)
 class Chain:
-    """A layer that stays and those whose work it does, in running order: it is the first of them, or the last."""
+    """Layers in running order that one of them, the first or the last, computes. The others are not run."""
 
     keeper: int
     folded: tuple[int, ...]
 
     @property
     def last(self) -> int:
-        """The layer whose top is the chain's."""
+        """The last layer of the chain, which makes its top."""
         return max(self.keeper, *self.folded)
 
 
 def find_chains(plan: Plan, roles: Roles, kept: Collection[int] = ()) -> list[Chain]:
-    """Return the chains of a plan; no value within one is read by another layer, put out by the net, or ``kept``."""
+    """Return the chains of a plan. A value inside a chain has no other reader, and is no output and not ``kept``."""
     origin = origins(plan, roles.passes_on)
     readers: dict[int, list[int]] = {}
     for i, node in enumerate(plan.nodes):
@@ -53,7 +56,7 @@ def find_chains(plan: Plan, roles: Roles, kept: Collection[int] = ()) -> list[Ch
     put_out = {origin[v] for v in (*plan.outputs.values(), *kept)}
 
     def follower(i: int) -> int | None:
-        """Return the affine layer that alone reads the only top of layer ``i``."""
+        """Return the affine layer that is the only reader of the only top of layer ``i``."""
         tops = plan.nodes[i].tops
         if len(tops) != 1 or origin[tops[0]] in put_out:
             return None

@@ -1,4 +1,4 @@
-"""What is known of a class of layers that makes it faster: one entry for each class, in the files of layers/."""
+"""The kernels that make a class of layers faster: one entry for each class, in the files of layers/."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from netspec.run.recorded import Kernels
 
 @dataclass(frozen=True)
 class Entry:
-    """What is faster than ``forward`` and autograd; each function gets a layer of the class, at its present shapes.
+    """Functions that make kernels for a class of layers. Each takes a layer of the class, at its present shapes.
 
-    ``inference`` returns the kernel of a run without gradients, ``learning`` those of one with them: None where
-    ``forward``, and autograd, are as good. ``folds`` returns what the layer is to its neighbors. ``fresh`` says whether
-    its one top is memory of its own, not a bottom's; ``any_layout``: its kernel, or ``forward``, takes bottoms whose
-    channels lie side by side (channels_last).
+    ``inference`` returns the kernel for runs without gradients, and ``learning`` the kernels for training. They return
+    None where ``forward`` and autograd are as good. ``folds`` returns how the layer can be joined with its neighbors.
+    ``fresh`` says whether its single top has memory of its own. ``any_layout``: the kernel, or ``forward``, also takes
+    bottoms in channels_last.
     """
 
     inference: Callable[[Any, Inference], Kernel | None] = lambda layer, how: None

@@ -1,7 +1,6 @@
 """Kernels of oneDNN that torch's compiler uses: weights laid out in advance, an activation in the same pass.
 
-They take and return maps whose channels lie side by side (channels_last). Where torch does not have them, the usual
-functions do the same.
+They take and return maps in channels_last. Where torch does not have them, the usual functions are used.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from netspec.layers.contract.base import Shape
 from netspec.layers.contract.learned import values_of
 
 _NEEDED = ("_convolution_pointwise", "_linear_pointwise", "_convolution_transpose_pointwise")
-_DIVIDED, _ROWS = 2**20, 64  # numbers of a matrix whose product is divided, and rows of a part, at least
+_DIVIDED, _ROWS = 2**20, 64  # the least size of a matrix that is divided among threads, and the least rows of a part
 
 
 def _ops() -> Any:
@@ -28,7 +27,7 @@ def _ops() -> Any:
 
 
 def suits(weight: torch.Tensor) -> bool:
-    """Return whether there are such kernels for weights like these."""
+    """Return whether oneDNN's kernels take these weights."""
     here = weight.device.type == "cpu" and weight.dtype == torch.float32 and weight.numel() > 0
     return here and torch.backends.mkldnn.is_available() and all(hasattr(_ops(), name) for name in _NEEDED)
 
@@ -54,7 +53,7 @@ def deconvolution(
 ) -> Kernel:
     """Return a transposed convolution of maps (N, C, H, W) by fixed weights (C, num_output, kernel_h, kernel_w).
 
-    An activation is another pass here: in the same one oneDNN falls back to a slow kernel.
+    An activation is a separate pass here, because with one oneDNN falls back to a slow kernel.
     """
     geometry = [list(sliding.pad), [0, 0], list(sliding.stride), list(sliding.dilation), 1]
     call = _ops()._convolution_transpose_pointwise.default
@@ -72,8 +71,8 @@ def spread_by_channel(
 ) -> Kernel:
     """Return a transposed convolution by weights (C, 1, kernel_h, kernel_w), each channel of (N, C, H, W) by itself.
 
-    oneDNN's own is slow. A convolution does the same on maps with ``stride`` - 1 zeros between the pixels, with the
-    filters turned around.
+    oneDNN's own kernel is slow. A convolution with mirrored filters, on maps with ``stride`` - 1 zeros between the
+    pixels, computes the same.
     """
     (count, channels, *size), (down, across) = shape, sliding.stride
     framed = (count, channels, (size[0] - 1) * down + 1, (size[1] - 1) * across + 1)
@@ -97,9 +96,9 @@ def _kept(bias: torch.Tensor | None, how: Inference) -> torch.Tensor | None:
 
 
 def _laid_out(reorder: Any, weight: torch.Tensor, geometry: Sequence[Any], shape: Shape, how: Inference) -> Any:
-    """Return filters as oneDNN wants them for maps of this shape; in another layout it may be ten times as slow.
+    """Return filters in the layout that oneDNN prefers for maps of this shape. Others may be ten times as slow.
 
-    Shapes that want the same layout share it.
+    Shapes that prefer the same layout share the memory.
     """
     name = f"{reorder} {tuple(weight.shape)} {geometry}"
 
@@ -114,7 +113,7 @@ def _laid_out(reorder: Any, weight: torch.Tensor, geometry: Sequence[Any], shape
 
 def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Inference) -> Kernel:
     """Return the product of vectors (M, K) with fixed weights (num_output, K)."""
-    name = f"rows {tuple(weight.shape)} {weight.stride()}"  # of a shared matrix one layer may take the transpose
+    name = f"rows {tuple(weight.shape)} {weight.stride()}"  # a layer may use the transpose of another's
     weight = how.memo(name, lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))
     bias = _kept(bias, how)
     call, (operation, rest) = _ops()._linear_pointwise.default, _within(how.finish)
@@ -122,17 +121,19 @@ def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Inference) -> 
 
 
 def vector_product(weight: torch.Tensor, bias: torch.Tensor | None) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return the product of one vector (1, K) with weights (num_output, K), whose rows threads divide among themselves.
+    """Return a function that multiplies one vector (1, K) with weights (num_output, K), on several threads.
 
-    One thread does not read large weights as fast as memory gives them, and torch takes one. MKL sums up four rows at a
-    time, so parts that begin at multiples of four get the bits of the whole; whether they do is tried first.
+    Torch uses one thread, which cannot read large weights at the full speed of memory. MKL sums up four rows at a time,
+    so parts that begin at multiples of four give the same bits as the whole. The function checks this first.
     """
     count, length = weight.shape
     same_bits: dict[int, bool] = {}  # by number of parts
 
     def divided(vector: torch.Tensor, parts: int) -> torch.Tensor:
         step = count // (4 * parts) * 4
-        most = count - (parts - 1) * step  # of the last part, and of all: what is beyond their own rows is dropped
+        most = (
+            count - (parts - 1) * step
+        )  # rows of the last part; all parts compute as many, and the surplus is dropped
         rows = weight.as_strided((parts, length, most), (step * length, 1, length))
         found = torch.bmm(vector.expand(parts, 1, length), rows)[:, 0]
         top = torch.cat([found[:-1, :step].reshape(-1), found[-1]]).view(1, count)
@@ -151,7 +152,7 @@ def vector_product(weight: torch.Tensor, bias: torch.Tensor | None) -> Callable[
 
 
 def _within(finish: Finish | None) -> tuple[tuple[str, list[float]], Finish | None]:
-    """Return what a kernel does to its top itself, and what is left to do then."""
+    """Return the operation that oneDNN's kernel applies itself, and what must be applied after it."""
     if finish is None or finish.operation is None:
         return ("none", []), finish
     name, numbers = finish.operation

@@ -1,8 +1,8 @@
-"""What kernels are made of: how a layer is run again and again at its present shapes.
+"""The types that kernels share. A kernel runs a layer again and again at fixed shapes.
 
-A layer has kernels of its own (layers/) where something is faster than its ``forward`` and autograd. Both compute the
-same numbers: kernels call the same functions with less work around them, with learned blobs in another form, or with
-memory that is kept from run to run, as Caffe's blobs are.
+A layer has its own kernels (layers/) where they are faster than its ``forward`` and autograd. They compute the same
+numbers: they call the same functions with less overhead, with learned blobs in another layout, or with memory that is
+kept from run to run, as Caffe's blobs are.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from netspec.fast.bound import BoundColumns, BoundVectors
 from netspec.layers.contract.base import Layer
 from netspec.run.recorded import Diff
 
-Kernel = Callable[..., Any]  # bottoms to a top, or to a tuple of tops
+Kernel = Callable[..., Any]  # takes the bottoms; returns the top, or a tuple of tops
 
 
 @dataclass(frozen=True)
 class Finish:
-    """A map from number to number, known by its name; ``change`` does it to its argument in place, and returns it.
+    """An elementwise function. ``change`` applies it to a tensor in place, and returns the tensor.
 
-    ``operation``: its name and numbers in the kernels of oneDNN, where these compute the same bits, NaN aside.
+    ``operation`` is its name and arguments in oneDNN's kernels, if they compute the same bits (except for NaN).
     """
 
     name: str
@@ -38,21 +38,23 @@ RELU = Finish("relu", F.relu_, ("relu", ()))
 
 
 def clip(low: float, high: float) -> Finish:
-    """Return the map max(low, min(x, high)), for ``low`` up to ``high``."""
+    """Return the function max(low, min(x, high)). ``low`` must not exceed ``high``."""
     return Finish(f"clip {low} {high}", lambda x: x.clamp_(low, high), ("hardtanh", (low, high)))
 
 
 @dataclass(frozen=True)
 class Inference:
-    """What is known when the kernel of a layer is made for runs without gradients.
+    """How to make the kernel of a layer for runs without gradients.
 
-    ``finish`` is to be done in place to the top; the first bottom may be overwritten where ``reuse``. What a kernel
-    makes of the blobs for all shapes it gets by ``memo(name, make)``, which makes it once; weights may be laid out for
-    a kernel where ``pack``. The top may be memory that the next run overwrites, unless it ``lasts``. ``keeps`` is
-    called with the bytes of what the kernel keeps for its shapes.
+    - ``finish``: is applied to the top in place.
+    - ``reuse``: the kernel may overwrite the first bottom.
+    - ``memo(name, make)``: returns what ``make`` returns, and calls it only once for kernels of all shapes.
+    - ``pack``: weights may be stored in the layout that the kernel prefers.
+    - ``lasts``: the next run must not overwrite the top.
+    - ``keeps``: must be called with the number of bytes that the kernel keeps for its shapes.
 
-    Only this kernel uses the layer from now on, at these shapes. It may keep the blobs in another form, copied: after a
-    write to them it is made again; it may keep no alias of them.
+    From now on only this kernel uses the layer, at these shapes. The kernel may keep copies of the blobs, because a new
+    kernel is made after a write to them. It must not keep an alias of them.
     """
 
     finish: Finish | None = None
@@ -65,13 +67,15 @@ class Inference:
 
 @dataclass(frozen=True)
 class Learning:
-    """What is known when the kernels of a layer are made for a net that learns.
+    """How to make the kernels of a layer for a net that trains.
 
-    ``wanted[i]`` says whether bottom i's gradient is asked for; ``sums[j]`` is where that of learnable blob j is added
-    up, in the blob's shape, None where it is not learned. Both kernels run without autograd, in turns, and BLAS uses
-    one thread. The backward kernel gets None for a top without a gradient, though never for all tops. Tensors that a
-    kernel returns are good until its next call. Where the net is ``steady``, bottoms do not change before the backward
-    kernel has run; otherwise it reads them again, as Caffe's does.
+    - ``wanted[i]``: whether the gradient of bottom i is needed.
+    - ``sums[j]``: the tensor to which the gradient of learnable blob j is added; None if it is not learned.
+    - ``steady``: bottoms do not change before the backward kernel has run. Otherwise it must read them again, as
+      Caffe's does.
+
+    The two kernels run in turn, without autograd, and BLAS uses one thread. The backward kernel gets None for a top
+    without a gradient, but never for all tops. A tensor that a kernel returns is valid until its next call.
     """
 
     wanted: tuple[bool, ...]
@@ -80,7 +84,7 @@ class Learning:
 
 
 def finished(kernel: Kernel, finish: Finish | None) -> Kernel:
-    """Return a kernel of one top followed by what changes it in place."""
+    """Return a kernel of one top that also applies ``finish`` to it in place."""
     if finish is None:
         return kernel
     change = finish.change
@@ -93,27 +97,27 @@ def finished(kernel: Kernel, finish: Finish | None) -> Kernel:
 
 
 def copies(blobs: Sequence[torch.Tensor], how: Inference) -> list[torch.Tensor]:
-    """Return copies of a layer's blobs, the same ones for all shapes."""
+    """Return copies of a layer's blobs. Kernels of all shapes share them."""
     copy = partial(torch.clone, memory_format=torch.contiguous_format)
     return [how.memo(f"copy {i}", partial(copy, blob)) for i, blob in enumerate(blobs)]
 
 
 def overwriting(bound: BoundVectors | BoundColumns, how: Inference) -> Kernel:
-    """Return the kernel of a layer of one top, whose memory its next run overwrites."""
+    """Return the kernel of a layer of one top. Its next run overwrites the memory of the top."""
     how.keeps(bound.nbytes)
     kernel = finished(bound.forward, how.finish)
     return (lambda *bottoms: kernel(*bottoms).clone()) if how.lasts else kernel
 
 
 def weight_and_bias(layer: Layer, how: Learning) -> tuple[tuple[torch.Tensor, torch.Tensor | None], tuple[Diff, Diff]]:
-    """Return the values of blobs 0 and 1, and where their gradients are added up; blob 1 may be missing."""
+    """Return blobs 0 and 1, and the tensors to which their gradients are added. Blob 1 may be missing."""
     values = layer.values()
     has_bias = len(values) > 1
     return (values[0], values[1] if has_bias else None), (how.sums[0], how.sums[1] if has_bias else None)
 
 
 class Room:
-    """Memory for a result, made when the first is known and kept: ``room.like(x)`` has the shape and order of ``x``."""
+    """Memory for a result. ``room.like(x)`` returns memory with the shape and strides of ``x``, always the same."""
 
     __slots__ = ("_kept",)
 

@@ -1,4 +1,4 @@
-"""What a net is given to run faster."""
+"""The object that a net is given to run faster."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from netspec.run.walk import weighted_sum
 
 @dataclass(frozen=True)
 class Fast:
-    """The speed of this folder (:class:`netspec.run.speed.Speed`)."""
+    """Makes nets faster with the kernels of this package (implements :class:`netspec.run.speed.Speed`)."""
 
     def prepared(self, eager: Eager, passes: Collection[str]) -> Prepared:
-        """Return the runner of passes without gradients."""
+        """Return the runner for passes without gradients."""
         return Prepared(eager.plan, eager.layers, eager.loss_weights, eager.exact, passes)
 
     def trainer(self, eager: Eager, largest: float | None) -> TrainingStep | str:
-        """Return the prepared kernels that train a net, or the reason why it has none."""
+        """Return the prepared training step of a net, or the reason why it has none."""
         parts = eager.parts()
         if why := obstacle(eager.plan, parts, LARGEST if largest is None else largest):
             return why
@@ -33,13 +33,13 @@ class Fast:
         return TrainingStep(eager.plan, parts, eager.loss_weights, eager.overwritten, weighted)
 
     def is_fresh(self, layer: Layer) -> bool:
-        """Return whether the top of a prepared layer is memory of its own."""
+        """Return whether the top of a prepared layer has memory of its own."""
         return is_fresh(layer)
 
     def learns(self, layer: Layer) -> bool:
-        """Return whether a layer has kernels of its own."""
+        """Return whether a layer has its own kernels for training."""
         return learns_alone(layer, steady=False)
 
     def kernels(self, layer: Layer, wanted: Sequence[bool], sums: Sequence[Diff]) -> Kernels | None:
-        """Return the kernels of a layer whose bottoms may change before it goes backward."""
+        """Return the training kernels of a layer. Its bottoms may change before the backward pass."""
         return learning_kernels(layer, Learning(tuple(wanted), tuple(sums), steady=False))

@@ -1,11 +1,11 @@
-"""Passes for inference: the steps of a plan, without what does nothing, with what others do in the same pass.
+"""Plans the steps of inference, with these passes over the layers of a net:
 
-``fold``   what scales and shifts channels becomes part of the weights of the layer before or after it
+``fold``   a layer that scales and shifts channels becomes part of the weights of the layer before or after it
 ``fuse``   an activation is computed in place, on the top of the layer before it
-``skip``   layers that hand their bottom on are not run
-``pack``   weights are laid out in advance (fused.py)
+``skip``   a layer that returns its bottom unchanged is not run
+``pack``   weights are stored in the layout that kernels prefer (fused.py)
 
-They know no layer type: :class:`Roles` says of each layer what it can do.
+The passes know no layer types: :class:`Roles` says what each layer can do.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ from netspec.graph.plan import Plan, origins
 class PlannedStep:
     """One kernel of a run: layer ``node`` with its ``chain`` folded in, then layer ``finish`` in place on its top.
 
-    ``bottoms`` and ``tops`` are values; ``reuse``: nobody else needs the memory of the first bottom; ``ends``: values
-    that are not needed after it; ``lasts``: after the run somebody may look at the memory of its tops.
+    - ``bottoms``, ``tops``: value numbers.
+    - ``reuse``: the kernel may overwrite its first bottom.
+    - ``ends``: values that are not needed after this step.
+    - ``lasts``: its tops are still read after the run.
     """
 
     node: int
@@ -38,7 +40,7 @@ class PlannedStep:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Steps in running order; ``origin[v]`` is the value that stands for value v."""
+    """Steps in running order. Value v is computed as value ``origin[v]``."""
 
     steps: tuple[PlannedStep, ...]
     origin: tuple[int, ...]
@@ -51,9 +53,9 @@ def schedule(
     kept: Collection[int],
     passes: Collection[str],
 ) -> Schedule:
-    """Return the steps that compute the values ``kept`` and the net's outputs, and run every layer, once.
+    """Return the steps that compute the values ``kept`` and the outputs of the net. Every layer runs once.
 
-    The values ``given`` are there before the first step.
+    The values ``given`` are known before the first step.
     """
     finishes, fresh = roles.finishes, roles.fresh
     passes_on = roles.passes_on if SKIP in passes else [False] * len(plan.nodes)
@@ -93,7 +95,7 @@ def _readers(plan: Plan, origin: Sequence[int], passes_on: Sequence[bool]) -> di
 def _with_ends(
     steps: Sequence[PlannedStep], fresh: Sequence[bool], lasting: Collection[int], reusing: bool
 ) -> list[PlannedStep]:
-    """Return the steps with what ends with them, and what may be overwritten: memory that no view shows."""
+    """Return the steps with ``ends`` and ``reuse`` set. Memory that a view may show is not reused."""
     last = {v: s for s, step in enumerate(steps) for v in (*step.bottoms, *step.tops)}
     owned, shown = set[int](), set(lasting)
     for step in reversed(steps):

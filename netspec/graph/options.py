@@ -1,4 +1,4 @@
-"""What is chosen when a net is built: one object, from the caller to the Context of each layer. It needs no torch."""
+"""The options for building a net. Each layer gets them in its Context. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -16,21 +16,24 @@ FOLD, FUSE, SKIP, PACK = PASSES = ("fold", "fuse", "skip", "pack")  # netspec/fa
 class BuildOptions:
     """How a net is built.
 
-    Of the layers those are built whose rules fit ``level`` and ``stages``, besides the phase; level None leaves the one
-    that the prototxt has. ``device`` is torch's name of where its blobs are; on "meta" they have shapes and no values.
-    ``seed`` None draws one; ``open_data`` False opens no data (``given_shapes``: the tops of data layers, by blob). No
-    layer writes a file on "meta", nor without ``write_files``; ``allow_python`` lets Python layers run code. This net
-    is number ``rank`` of ``ranks`` nets that train in parallel: its data layers read their share of the records, and
-    draw from ``data_seed``, which must be the same for all ranks (None: from ``seed``).
-    ``exact`` sets which sums equal Caffe's in every bit: "none", "small" or "all" (netspec/exact/__init__.py).
-    ``accumulate_in_place`` makes layers add the gradients that they sum up to ``grad`` themselves, like Caffe
-    (netspec/exact/accumulate.py); hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP then do not see
-    these gradients.
-    ``speed`` makes the net faster (:class:`netspec.run.speed.Speed`; None: nothing does); ``passes`` are what it may do
-    to a net of phase TEST that runs without gradients (netspec/fast/steps.py).
-    Weights must have every layer of the net if ``strict``. The net may need ``limit`` bytes of memory (None: what there
-    is on its device). ``dialects`` are those of Caffe's forks that the net uses; what its text says is added. One text
-    where several are meant is one of them. Raises SpecError for an ``exact`` or a pass that there is not.
+    - ``level``, ``stages``: which layers are built, together with the phase. Level None: that of the prototxt.
+    - ``device``: where the blobs are, by torch's name. On "meta" they have shapes and no values.
+    - ``seed``: of random numbers. None: a random seed.
+    - ``open_data``: False opens no data; ``given_shapes`` then has the shapes of the tops of data layers, by blob.
+    - ``write_files``: False lets no layer write a file. On "meta" none does either.
+    - ``allow_python``: whether Python layers may run code.
+    - ``rank``, ``ranks``: the index and number of nets that train in parallel. Data layers read their share of records.
+    - ``data_seed``: of data layers, the same for all ranks. None: ``seed`` is used.
+    - ``exact``: which sums equal Caffe's in every bit: "none", "small" or "all" (netspec/exact/__init__.py).
+    - ``accumulate_in_place``: layers add their gradients to ``grad`` themselves, like Caffe
+      (netspec/exact/accumulate.py). Hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP do not see them.
+    - ``speed``: makes the net faster (:class:`netspec.run.speed.Speed`). None: nothing does.
+    - ``passes``: what ``speed`` may do to a net in phase TEST without gradients (netspec/fast/steps.py).
+    - ``strict``: files of weights must have every layer of the net.
+    - ``limit``: the memory in bytes that the net may need. None: the memory of its device.
+    - ``dialects``: of Caffe's forks that the net uses, in addition to those that its prototxt names.
+
+    A single string is accepted for a tuple of one. Raises SpecError for an unknown ``exact`` or pass.
     """
 
     device: str = "cpu"

@@ -1,7 +1,7 @@
-"""Layers in a row that are one: where a net learns, one layer may do the work of those after it.
+"""Joins consecutive layers, when a net trains, into one layer that does the work of all of them.
 
-It reads the blobs of all in each run. BatchNorm, Scale and ReLU are one kernel of torch's, which rounds once where they
-round thrice: so this is part of what a training computes.
+The joined layer reads the blobs of all its layers in each run. BatchNorm, Scale and ReLU become one kernel of torch,
+which rounds once instead of three times. The results of a training therefore depend on it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from netspec.layers.contract.joining import joined
 
 @dataclass(frozen=True)
 class Part:
-    """Layers in a row, ``members``, from node ``first`` to node ``last``; ``layer`` does the work of all."""
+    """Consecutive layers, ``members``, from node ``first`` to node ``last``. ``layer`` does the work of all of them."""
 
     first: int
     last: int
@@ -28,11 +28,11 @@ class Part:
 
     @property
     def blobs(self) -> list[torch.Tensor]:
-        """The learnable blobs of all."""
+        """The learnable blobs of all members."""
         return [blob for layer in self.members for blob in layer.blobs]
 
     def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Run all, one after the other where hooks look at one."""
+        """Run the joined layer, or the members one by one if a member has hooks."""
         if len(self.members) > 1 and any(layer._forward_hooks for layer in self.members):
             for layer in self.members:
                 bottoms = layer.run(*bottoms)
@@ -43,7 +43,7 @@ class Part:
 def parts_of(
     plan: Plan, layers: Sequence[Layer], alone: Sequence[bool], kept: Collection[int] = frozenset()
 ) -> list[Part]:
-    """Return the layers of a plan, joined where one can do the work of those after it.
+    """Return the layers of a plan in order, with consecutive layers joined where possible.
 
     A layer with ``alone`` set is never joined. A value inside a part has no other reader and is not in ``kept``.
     """

@@ -1,4 +1,4 @@
-"""A layer as a pair of functions, one forward and one backward, by autograd of this layer alone."""
+"""Makes a pair of functions, forward and backward, from one layer, with autograd."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 import torch
 
 Diff = torch.Tensor | None
-Backward = Callable[..., Any]  # the tops' gradients to the bottom's gradient, or to a tuple, one per bottom
+Backward = Callable[..., Any]  # takes the tops' gradients; returns the bottom's gradient, or a tuple of one per bottom
 
 
 class Kernels(NamedTuple):
-    """What runs a layer that learns: ``forward`` takes bottoms to a top, or to a tuple of tops.
+    """The two functions that run a layer in training.
 
-    ``backward`` takes the tops' gradients to the bottom's, or to a tuple, one per bottom.
+    ``forward`` takes the bottoms and returns the top, or a tuple of tops. ``backward`` takes the gradients of the tops
+    and returns the gradient of the bottom, or a tuple with one for each bottom.
     """
 
     forward: Callable[..., Any]

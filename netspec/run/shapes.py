@@ -1,4 +1,4 @@
-"""Which shapes the values of a net have for inputs of other shapes: each layer says so, or refuses."""
+"""Works out the shapes of all values of a net for inputs of other shapes."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from netspec.layers.contract.reading import changes_itself
 def fitted(
     plan: Plan, layers: Sequence[Layer], given: Mapping[int, Shape]
 ) -> tuple[list[Layer | None], dict[int, Shape]]:
-    """Return copies of the layers, fitted to values of the shapes ``given``, and the shapes of all values.
+    """Return copies of the layers, reshaped for values of the shapes ``given``, and the shapes of all values.
 
-    None and no shape is there where shapes follow only from values. Layers that remember something are no copies, and
-    what follows on them is not fitted either. Raises SpecError where a layer cannot take its bottoms.
+    A shape that depends on values is left out. The copy of a layer is None if a shape of its bottoms is unknown, or if
+    the layer keeps state between passes. Raises SpecError if a layer cannot take its bottoms.
     """
     shapes = dict(given)
     found: list[Layer | None] = []

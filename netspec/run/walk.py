@@ -1,4 +1,4 @@
-"""The loop that runs a net: step by step, each a function of values that others made."""
+"""The loop that runs a net step by step. Each step computes new values from earlier ones."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from netspec.exact.sums import RowSums
 from netspec.exact.switch import applies
 
 Values = dict[int, torch.Tensor]  # by value number of a Plan
-Result = tuple[torch.Tensor | None, Values]  # the weighted sum of the losses, if there are any, and what was computed
+Result = tuple[torch.Tensor | None, Values]  # the weighted sum of the losses (None: no losses), and all values
 
 
 class Step(NamedTuple):
-    """One piece of a run: ``run`` takes the values ``bottoms`` and returns the values ``tops``, one or a tuple.
+    """One step of a run. ``run`` takes the values ``bottoms`` and returns the values ``tops``, one or a tuple.
 
-    ``node`` is the number of the last layer that it runs. ``losses`` are the tops, by their place, that the net's loss
-    sums up, with their weights; after the step the values ``ends`` are not needed any more.
+    ``node`` is the index of the last layer that the step runs. ``losses`` are pairs of a top's index and its loss
+    weight. The values ``ends`` are not needed after the step.
     """
 
     node: int
@@ -33,29 +33,29 @@ class Runner(Protocol):
     """One way to run a net."""
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
-        """Run the net on the values of its inputs; the values ``kept`` are there afterwards.
+        """Run the net on the values ``given`` for its inputs. The returned values include ``kept``.
 
-        None where this runner cannot: now, or at all.
+        Returns None if this runner cannot run the net, in this pass or ever.
         """
         ...
 
 
-Visit = Callable[[Step, list[torch.Tensor]], Any]  # runs a step on its bottoms; returns what it returns
+Visit = Callable[[Step, list[torch.Tensor]], Any]  # runs a step on its bottoms, and returns its tops
 
 
-Losses = list[tuple[tuple[int, float], ...]]  # by layer: the tops that are losses, by their place, and their weights
+Losses = list[tuple[tuple[int, float], ...]]  # by layer: pairs of a top's index and its loss weight
 
 
 def losses_of(loss_weights: Sequence[Sequence[float]]) -> Losses:
-    """Return which tops are losses, where ``loss_weights[i][j]`` is the loss weight of layer i's top j."""
+    """Return the tops with a nonzero weight; ``loss_weights[i][j]`` is the loss weight of top j of layer i."""
     return [tuple((j, weight) for j, weight in enumerate(row) if weight) for row in loss_weights]
 
 
 def walk(steps: Iterable[Step], values: Values, exact: str, visit: Visit | None = None) -> torch.Tensor | None:
-    """Run the steps in their order, on ``values`` and into them; return the weighted sum of the losses, if any.
+    """Run the steps in order, reading and writing ``values``. Return the weighted sum of the losses, or None.
 
-    ``exact`` says which sums are Caffe's to the last bit (netspec/exact). ``visit`` is called in the place of each
-    step's own ``run``.
+    ``exact`` says which sums equal Caffe's in every bit (netspec/exact). ``visit`` is called instead of each step's
+    own ``run``.
     """
     loss: torch.Tensor | None = None
     for step in steps:
