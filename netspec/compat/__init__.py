@@ -1,1 +1,1 @@
-"""Programs that were written for others: Caffe's Python interface, its scripts in Python 2, OpenCV's ``cv2.dnn``."""
+"""Runs programs written for other libraries: Caffe's Python interface, scripts in Python 2, OpenCV's ``cv2.dnn``."""

@@ -33,7 +33,7 @@ __all__ = [
     "shrinkCaffeModel",
 ]
 
-#: OpenCV 4's constants, some of which OpenCV 5 left out: each list from 0 on.
+#: OpenCV 4's constants, numbered from 0 in each list. OpenCV 5 lacks some of them.
 _CONSTANTS = {
     "DNN_BACKEND": "DEFAULT HALIDE INFERENCE_ENGINE OPENCV VKCOM CUDA WEBNN TIMVX CANN",
     "DNN_TARGET": "CPU OPENCL OPENCL_FP16 MYRIAD VULKAN FPGA CUDA CUDA_FP16 HDDL NPU CPU_FP16",

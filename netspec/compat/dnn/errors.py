@@ -1,4 +1,4 @@
-"""The one error of this room: OpenCV's and netspec's at once, so that ``except cv2.error`` still works."""
+"""The error of this package. It is an error of OpenCV and of netspec, so that ``except cv2.error`` works."""
 
 from __future__ import annotations
 

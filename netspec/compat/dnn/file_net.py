@@ -1,4 +1,4 @@
-"""What a net tells of itself without running: its layers, their shapes and costs, and what it does not do.
+"""What is known of a net without running it: its layers, their shapes and costs.
 
 OpenCV: modules/dnn/src/net_impl.cpp (4.12)
 """
@@ -26,10 +26,10 @@ Shapes = list[Shape]
 
 
 class FileNet:
-    """The net of Caffe's files behind a Net: its layers under OpenCV's names and numbers, and what is built of them.
+    """The net that a Net reads from Caffe's files: its layers by OpenCV's names and numbers, and built nets.
 
-    Without files there are no layers. ``declared`` are the shapes of its inputs, ``shown`` their names, which
-    setInputsNames may change, and ``values`` what they were given.
+    Without files it has no layers. ``declared`` are the shapes of its inputs, ``shown`` their names, which
+    setInputsNames may change, and ``values`` the arrays that were set.
     """
 
     def __init__(self, files: CaffeFiles | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Model and its kin: from an image to classes, boxes or a mask, as cv2.dnn's classes of these names.
+"""Model and its subclasses, which compute classes, boxes or a mask from an image, as in cv2.dnn.
 
 OpenCV: modules/dnn/src/model.cpp (4.12)
 """
@@ -19,9 +19,9 @@ Array = np.ndarray
 
 
 class Model:
-    """A net with what is done to an image before it: ``Model(net)``, or ``Model(weights, prototxt)`` in either order.
+    """A net with the preparation of images: ``Model(net)``, or ``Model(weights, prototxt)`` in either order.
 
-    The input is (pixel - mean) scale, of the image resized to ``size`` (width, height), where one is set. ``mean`` and
+    The image is resized to ``size`` (width, height), if it is set. The input is then (pixel - mean) scale. ``mean`` and
     ``scale`` are by channel of the input, so R, G, B where swapRB is set.
     """
 
@@ -66,7 +66,7 @@ class Model:
         self.setInputScale(scale).setInputSize(size).setInputMean(mean).setInputSwapRB(swapRB).setInputCrop(crop)
 
     def setOutputNames(self, outNames: Sequence[str]) -> Model:
-        """Set the layers whose tops :meth:`predict` gives: by default those that no layer reads."""
+        """Set the layers that :meth:`predict` returns the tops of. Default: those that no other layer reads."""
         self._outputs = tuple(outNames)
         return self
 
@@ -102,7 +102,7 @@ class Model:
 
 
 class ClassificationModel(Model):
-    """A net whose one output has a score for each class."""
+    """A net with one output: a score for each class."""
 
     def __init__(self, model: Any, config: str | os.PathLike[str] = "") -> None:
         super().__init__(model, config)
@@ -128,7 +128,7 @@ class ClassificationModel(Model):
 
 
 class SegmentationModel(Model):
-    """A net whose one output (1, classes, H, W) has a score for each class and pixel."""
+    """A net with one output (1, classes, H, W): a score for each class and pixel."""
 
     def segment(self, frame: Array, mask: Any = None) -> Array:
         """Return the class of the highest score of each pixel, the first of equals: (H, W) uint8."""

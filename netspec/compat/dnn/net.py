@@ -86,11 +86,11 @@ class Net:
         return sum((entry.type or "__NetInputLayer__") == layerType for entry in self._caffe.table)
 
     def getUnconnectedOutLayers(self) -> Array:
-        """Return the numbers of the layers whose tops no layer reads: (n,) int32."""
+        """Return the numbers of the layers with no top that another layer reads: (n,) int32."""
         return np.array(unconnected(self._caffe.files.net, self._caffe.table) if self._caffe.files else [], np.int32)
 
     def getUnconnectedOutLayersNames(self) -> tuple[str, ...]:
-        """Return the names of the layers whose tops no layer reads."""
+        """Return the names of the layers with no top that another layer reads."""
         return tuple(self._caffe.table[number].name for number in self.getUnconnectedOutLayers())
 
     def dump(self) -> str:
@@ -366,7 +366,7 @@ class Net:
 
 
 def _learns(files: CaffeFiles) -> Iterable[bool]:
-    """Yield, for each layer whose type has weights, whether the prototxt does not hold them itself."""
+    """Yield, for each layer with weights, whether they must come from a file, because the prototxt has none."""
     learning = ("Convolution", "Deconvolution", "InnerProduct", "ConvolutionDepthwise", "DepthwiseConvolution")
     return (layer.type in learning and not layer.blobs for layer in files.net.layer)
 

@@ -1,7 +1,7 @@
-"""Which layers a net has in OpenCV's eyes, and under which names and numbers.
+"""The layers of a net as OpenCV counts and names them.
 
-Layer 0, "_input", stands for all inputs. A Convolution gets the name of its top, one layer for each top; a name that
-occurs again gets a number behind it; an Axpy becomes two layers.
+Layer 0, "_input", stands for all inputs. A Convolution has the name of its top, and is one layer for each top. A name
+that occurs again gets a number at its end. An Axpy becomes two layers.
 OpenCV: modules/dnn/src/caffe/caffe_importer.cpp (4.12)
 """
 
@@ -62,7 +62,7 @@ def _numbered(name: str, seen: Counter[str]) -> str:
 
 
 def edges(net: NetParameter, table: Sequence[Entry]) -> list[tuple[int, int]]:
-    """Return which layer reads a top of which other, as pairs of numbers (of the layer read, of its reader)."""
+    """Return a pair of numbers (layer, reader) for each layer that reads a top of another."""
     producer: dict[str, int] = {}
     found: list[tuple[int, int]] = []
     entries: dict[int, list[int]] = {}
@@ -79,7 +79,7 @@ def edges(net: NetParameter, table: Sequence[Entry]) -> list[tuple[int, int]]:
 
 
 def unconnected(net: NetParameter, table: Sequence[Entry]) -> list[int]:
-    """Return the numbers of the layers of which no other layer reads any top."""
+    """Return the numbers of the layers with no top that another layer reads."""
     read = {number for number, _ in edges(net, table)}
     return [number for number in range(len(table)) if number not in read]
 

@@ -1,8 +1,8 @@
-"""Forward and backward passes through the memory of a net's blobs, layer by layer, as Caffe makes them.
+"""Runs forward and backward passes layer by layer through the memory of a net's blobs, as Caffe does.
 
-A net of netspec hands tensors from layer to layer, and autograd goes backward through all of them. Scripts of pycaffe
-read and write the blobs between two layers' runs: so here each layer reads its bottoms' memory and writes its tops',
-and each layer's backward reads the diffs of its tops, and what it needs of the data, from that memory.
+In a net of netspec, tensors go from layer to layer, and autograd computes the gradients of all layers. Scripts for
+pycaffe read and write blobs between the runs of two layers. So here each layer reads the memory of its bottoms and
+writes that of its tops. Its backward pass reads the diffs of its tops, and the data that it needs, from that memory.
 
 Caffe: Net::ForwardFromTo, Net::BackwardFromTo, Net::Reshape (src/caffe/net.cpp)
 """
@@ -46,10 +46,10 @@ Hook = Callable[[int], object]
 
 
 class BlobRunner:
-    """The blobs of a net and the passes through them.
+    """The blobs of a net, and the passes that use them.
 
-    ``names`` and ``blobs`` run in step, in Caffe's order; ``bottoms[i]`` and ``tops[i]`` are the blobs of layer i,
-    ``params[i]`` its learnable blobs. ``hooks`` are called with a layer's number, before and after its runs.
+    ``names[k]`` is the name of ``blobs[k]``, in Caffe's order. ``bottoms[i]`` and ``tops[i]`` are the blobs of layer i,
+    ``params[i]`` its learnable blobs. ``hooks`` are called with the index of a layer before and after it runs.
     """
 
     def __init__(self, net: Net) -> None:
@@ -62,8 +62,8 @@ class BlobRunner:
             f"{when}_{which}": [] for when in ("before", "after") for which in ("forward", "backward")
         }
         self._lock = threading.RLock()
-        self._last: threading.Thread | None = None  # the one that ran a forward pass last
-        self._overtaken = weakref.WeakSet[threading.Thread]()  # those that did before
+        self._last: threading.Thread | None = None  # which ran the last forward pass
+        self._overtaken = weakref.WeakSet[threading.Thread]()  # which ran earlier ones
         self._layers: list[Layer] = list(net.layers)
         self.params = [parameters(layer) for layer in self._layers]
         self._tapes: list[Tape | None] = [None] * len(self._layers)
@@ -80,7 +80,7 @@ class BlobRunner:
         self._records = [self._is_recorded(i) for i in range(len(self._layers))]
         self._has_kernels = [self._can_bind(i) for i in range(len(self._layers))]
         self._keeps = ["kept" in gradient_reads(layer) and self._is_asked(i) for i, layer in enumerate(self._layers)]
-        self._read: list[torch.Tensor | None] = [None] * len(self._layers)  # what those read in their last pass
+        self._read: list[torch.Tensor | None] = [None] * len(self._layers)  # what each read in its last pass
         for i in range(len(self._layers)):
             self._set_up(i)
         self._prepares = self._can_prepare()
@@ -115,7 +115,7 @@ class BlobRunner:
         self.top_ids.append(tops)
 
     def _set_up(self, i: int) -> None:
-        """Write what Caffe writes when it makes the layer."""
+        """Write the data that Caffe writes when it creates the layer."""
         layer = self._layers[i]
         if isinstance(layer, Python) and layer.code:
             layer.bottom[:], layer.top[:] = self.bottoms[i], self.tops[i]
@@ -127,9 +127,9 @@ class BlobRunner:
             top.diff_memory.put(torch.full(top.shape, weight, device=self.net.device))
 
     def _ends(self) -> tuple[list[tuple[int, int]], list[tuple[int, Blob, bool, bool]]]:
-        """Return the inputs, each a value and its blob; and the last value of every other blob.
+        """Return the inputs as pairs of value and blob, and the last value of every other blob.
 
-        With each of these: whether it lies where another blob does, and whether it is in memory of its own.
+        The latter also say whether the blob shares memory with another, and whether the value has memory of its own.
         """
         given: list[tuple[int, int]] = []
         results: dict[int, tuple[int, Blob, bool, bool]] = {}
@@ -142,23 +142,23 @@ class BlobRunner:
         return given, list(results.values())
 
     def _is_fresh(self, layer: Layer) -> bool:
-        """Return whether the top of a prepared layer is memory of its own, not a bottom's."""
+        """Return whether the top of a prepared layer has memory of its own, and not a bottom's."""
         speed = self.net.options.speed
         return speed is not None and speed.is_fresh(layer)
 
     def _is_recorded(self, i: int) -> bool:
-        """Return whether autograd is to watch layer ``i`` run; the others' backward reads memory alone."""
+        """Return whether autograd records layer ``i``. Other layers' backward passes need only the blobs' memory."""
         layer = self._layers[i]
         from_memory = isinstance(layer, Python) or layer.shares or gradient_reads(layer)
         return self._is_asked(i) and not from_memory
 
     def _is_asked(self, i: int) -> bool:
-        """Return whether a gradient of layer ``i`` is asked for, of a bottom or of a learnable blob."""
+        """Return whether a gradient of a bottom or a learnable blob of layer ``i`` is needed."""
         plan = self.net.backward_plan
         return plan.layers[i] and (any(plan.computed[i]) or any(blob.requires_grad for blob in self._layers[i].blobs))
 
     def _can_bind(self, i: int) -> bool:
-        """Return whether layer ``i`` has kernels of its own for what autograd would watch."""
+        """Return whether layer ``i`` has its own training kernels, so that autograd is not needed."""
         layer, speed = self._layers[i], self.net.options.speed
         return (
             speed is not None
@@ -173,10 +173,10 @@ class BlobRunner:
 
     @contextmanager
     def used(self, forward: bool = True) -> Iterator[None]:
-        """Let one thread at a time use the net within the block, to run forward or backward.
+        """A block in which only one thread uses the net, for a forward or backward pass.
 
-        What a thread looks at then stays as it is when another runs the net. Raises RuntimeError for a backward pass
-        through what another thread's forward pass has left.
+        Arrays that a thread holds do not change when another thread runs the net. Raises RuntimeError for a backward
+        pass after the forward pass of another thread.
         """
         with self._lock:
             thread = threading.current_thread()
@@ -193,7 +193,7 @@ class BlobRunner:
             yield
 
     def _leave_views(self) -> None:
-        """Leave what passes compute to those who look at it; they go on in other memory."""
+        """Leave the present memory to the views of it. Later passes use other memory."""
         written = {id(self.blobs[b].data_memory) for _, b in self._given}
         written |= {id(self.blobs[self.names.index(name)].diff_memory) for name in self.net.outputs}
         memories = {id(each): each for blob in self.blobs for each in (blob.data_memory, blob.diff_memory)}
@@ -204,14 +204,14 @@ class BlobRunner:
         self.net.forget_trainer()
 
     def forget(self, kernels: bool) -> None:
-        """Forget the runs of layers: a later backward pass takes what their blobs hold now; and their kernels."""
+        """Forget the recorded runs, so that a later backward pass reads the present blobs. ``kernels``: those too."""
         self._tapes = [None] * len(self._layers)
         if kernels:
             self._bound = [None] * len(self._layers)
 
     @torch.no_grad()
     def forward(self, start: int, end: int) -> torch.Tensor:
-        """Run layers ``start`` to ``end``, both included; return the weighted sum of their losses, a scalar."""
+        """Run layers ``start`` to ``end`` (inclusive). Return the weighted sum of their losses, a scalar."""
         self.upload()
         hooked = self.hooks["before_forward"] or self.hooks["after_forward"]
         if self._prepares and (start, end) == (0, len(self._layers) - 1) and not hooked:
@@ -221,7 +221,7 @@ class BlobRunner:
         return self._no_loss if loss is None else loss
 
     def _steps(self, which: str, numbers: Iterable[int]) -> Iterator[Step]:
-        """Yield the forward or backward passes of layers through memory, and what hooks do before and after them."""
+        """Yield the forward or backward passes of layers, with the hooks before and after them."""
         run = self._forward if which == "forward" else self._backward
         for i in numbers:
             for hook in self.hooks[f"before_{which}"]:
@@ -232,7 +232,7 @@ class BlobRunner:
                 yield Step(i, partial(hook, i), (), ())
 
     def _can_prepare(self) -> bool:
-        """Return whether a whole pass may run as netspec's own: only its results matter, blob by blob."""
+        """Return whether a whole pass may run without blobs, because only the final content of each blob matters."""
         return (
             self.net.prepared is not None
             and self.net.device.type == "cpu"
@@ -245,7 +245,7 @@ class BlobRunner:
         )
 
     def _forward_prepared(self) -> torch.Tensor:
-        """Run the whole net as netspec does (netspec/fast/prepared.py), and put what it computes where views look."""
+        """Run the whole net with prepared kernels (netspec/fast/prepared.py), and put the results into the blobs."""
         assert self.net.prepared is not None
         given = {v: self.blobs[b].data_memory.tensor(self.blobs[b].shape) for v, b in self._given}
         found = self.net.prepared.run(given, self._final_values)
@@ -265,21 +265,22 @@ class BlobRunner:
 
     @torch.no_grad()
     def backward(self, start: int, end: int) -> None:
-        """Run the backward passes of layers ``start`` down to ``end``, both included, from the diffs of their tops.
+        """Run the backward passes of layers ``start`` down to ``end`` (inclusive), from the diffs of their tops.
 
-        Bottoms' diffs are overwritten, those of learnable blobs added to. Layers that need none are passed over.
+        The diffs of bottoms are overwritten; those of learnable blobs are added to. Layers that need no backward pass
+        are skipped.
         """
         self.upload()
         with one_thread() if any(self._has_kernels) else nullcontext():
             walk(self._steps("backward", range(start, end - 1, -1)), {}, self.net.options.exact)
 
     def reshape(self) -> None:
-        """Give every blob the shape that follows from those of the inputs, and compute nothing."""
+        """Give every blob the shape that follows from the shapes of the inputs. Nothing is computed."""
         for i in range(len(self._layers)):
             self._reshape(i)
 
     def share_with(self, other: BlobRunner) -> None:
-        """Use the learnable blobs of another net (Caffe: ShareTrainedLayersWith); their gradients stay apart."""
+        """Use the learnable blobs of another net (Caffe: ShareTrainedLayersWith). Gradients are not shared."""
         other.upload()
         mine = {layer.param.name: layer for layer in reversed(self._layers)}
         for theirs in other._layers:
@@ -295,14 +296,14 @@ class BlobRunner:
 
     @torch.no_grad()
     def clear_param_diffs(self) -> None:
-        """Set the gradients of all learnable blobs to 0, where they are."""
+        """Set the gradients of all learnable blobs to 0 in place."""
         self.upload()
         for learnable in self.net.learnable:
             if learnable.parameter.grad is not None:
                 learnable.parameter.grad.zero_()
 
     def upload(self) -> None:
-        """Bring to the GPU what scripts wrote to learnable blobs, before anything else reads or writes these."""
+        """Copy to the GPU what scripts wrote to learnable blobs, before they are used."""
         if self.net.device.type != "cpu":
             for blobs in self.params:
                 for blob in blobs:
@@ -324,7 +325,7 @@ class BlobRunner:
                 top.reshape(*shape)
 
     def _forward(self, i: int) -> tuple[torch.Tensor, ...]:
-        """Run layer ``i``; return its losses as they are in memory."""
+        """Run layer ``i``, and return its losses from the memory of its tops."""
         self._compute(i)
         return tuple([top.data_memory.tensor(top.shape) for top, _ in self._losses[i]])
 
@@ -355,7 +356,7 @@ class BlobRunner:
                 top.put_data(not_shared(tensor.detach(), taken))
 
     def _record(self, i: int) -> Tape:
-        """Run layer ``i`` by its kernels, or watched by autograd."""
+        """Run layer ``i`` by its kernels, or with autograd."""
         if bound := self._kernels(i):
             forward, backward = bound.kernels
             values = [blob.data_memory.tensor(blob.shape) for blob in self.bottoms[i]]
@@ -374,7 +375,7 @@ class BlobRunner:
         return Tape(leaves, holders, made, partial(by_autograd, leaves, made))
 
     def _kernels(self, i: int) -> Bound | None:
-        """Return the kernels of layer ``i`` at its present shapes, None where autograd is to watch it."""
+        """Return the kernels of layer ``i`` for its present shapes, or None if autograd must record it."""
         layer, bound = self._layers[i], self._bound[i]
         if not self._has_kernels[i]:
             return None
@@ -391,9 +392,9 @@ class BlobRunner:
         return bound
 
     def _tape(self, i: int) -> Tape:
-        """Return the record of the last forward pass of layer ``i``, its bottoms' values as they are now in memory.
+        """Return the record of the last forward pass of layer ``i``, with the present values of its bottoms.
 
-        If the layer has not run at these shapes, it is run first, with no effect on the net.
+        If the layer has not run with these shapes, it is run first, without an effect on the net.
         """
         tape, bottoms = self._tapes[i], self.bottoms[i]
         if tape is None or any(leaf.shape != blob.shape for leaf, blob in zip(tape.leaves, bottoms, strict=True)):
@@ -409,7 +410,7 @@ class BlobRunner:
         return tape
 
     def _is_in_place(self, i: int, blob: Blob) -> bool:
-        """Return whether layer ``i`` writes over one of its bottoms: then it has kept what its gradient needs."""
+        """Return whether layer ``i`` overwrites a bottom. It has then kept what its gradient needs."""
         return any(top is blob for top in self.tops[i])
 
     def _backward(self, i: int) -> None:

@@ -1,4 +1,4 @@
-"""``debug_info`` of a solver whose passes go through the memory of blobs.
+"""``debug_info`` for solvers that run passes through the memory of blobs.
 
 Caffe: Net::ForwardDebugInfo, Net::BackwardDebugInfo, Net::Backward (src/caffe/net.cpp)
 """
@@ -14,7 +14,7 @@ from netspec.solver.debug import log_all_params, log_bottom_diff, log_param_diff
 
 @contextmanager
 def debug_info(runner: BlobRunner) -> Iterator[None]:
-    """Log the mean absolute values of what passes forward and backward within the block."""
+    """A block that logs the mean absolute values of data and diffs, in each forward and backward pass."""
     net = runner.net
     ran_backward = False
 

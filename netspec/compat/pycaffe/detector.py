@@ -1,4 +1,4 @@
-"""A net that looks at windows of images. Caffe: python/caffe/detector.py."""
+"""A net that classifies windows of images. Caffe: python/caffe/detector.py."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ class Detector(Net):
         ]
 
     def detect_selective_search(self, image_fnames: Sequence[str]) -> list[dict[str, Any]]:
-        """Return what ``detect_windows`` does, for windows that selective search proposes.
+        """Return the result of ``detect_windows`` for the windows that selective search proposes.
 
-        Needs the module selective_search_ijcv_with_python, which its authors publish apart, and MATLAB.
+        Needs the module selective_search_ijcv_with_python, which must be installed separately, and MATLAB.
         """
         search = importlib.import_module("selective_search_ijcv_with_python")
         names = [os.path.abspath(name) for name in image_fnames]

@@ -1,6 +1,6 @@
-"""Errors of programs that were written for pycaffe: where Caffe would end the process, an exception with its words.
+"""Errors for programs written for pycaffe. Where Caffe would abort, an exception has Caffe's message.
 
-What the code of a Python layer raises while a net is built passes through as it is.
+Exceptions of the code of a Python layer, while a net is built, are raised unchanged.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _LABELS = (
     "e.g., if softmax axis == 1 and prediction shape is (N, C, H, W), label count (number of labels) must be N*H*W, "
     "with integer values in {{0, 1, ..., C-1}}."
 )
-#: What our messages say, and the check of Caffe's that fails there.
+#: Our messages, and the check in Caffe that fails for the same fault.
 _CHECKS = [
     (r'unknown layer type "(.*?)"', "registry.count(type) == 1 (0 vs. 1) Unknown layer type: {0}"),
     (
@@ -45,14 +45,14 @@ _WORDS = [(r'unknown bottom blob "(.*?)"', "Unknown bottom blob '{0}' (layer '{l
 
 
 class CheckError(SpecError):
-    """A fault at which Caffe ends the process. The text has the check that fails there, after our own sentence."""
+    """A fault for which Caffe aborts. The text is our message, followed by the check that fails in Caffe."""
 
 
 @contextmanager
 def caffes_errors() -> Iterator[None]:
-    """Raise a :class:`CheckError` for a SpecError of which Caffe's words are known.
+    """Turn a SpecError into a :class:`CheckError` if Caffe's message for the fault is known.
 
-    The exception that a Python layer's code has raised comes in place of the fault that netspec makes of it.
+    If the code of a Python layer raised an exception, that exception is raised instead of the SpecError.
     """
     try:
         yield

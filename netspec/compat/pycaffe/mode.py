@@ -1,4 +1,4 @@
-"""What holds for all nets to come: the device, the seed, and which of several processes this is.
+"""Settings for all nets built from now on: the device, the seed, and the rank of this process.
 
 Caffe: class Caffe (include/caffe/common.hpp)
 """
@@ -24,7 +24,7 @@ class _Mode:
     device: int = 0
     warned: bool = False
     seed: int | None = None
-    nets: int = 0  # made since the seed was set
+    nets: int = 0  # built since the seed was set
     exact: str = SMALL
     multiprocess: bool = False
     solver_count: int = 1
@@ -36,12 +36,12 @@ _mode = _Mode()
 
 
 def set_mode_cpu() -> None:
-    """Make nets that are built from now on run on the CPU."""
+    """Use the CPU for nets that are built from now on."""
     _mode.gpu = False
 
 
 def set_mode_gpu() -> None:
-    """Make nets that are built from now on run on the GPU; on the CPU, with one warning, where torch finds none."""
+    """Use the GPU for nets that are built from now on; without a GPU use the CPU, with one warning."""
     _mode.gpu = torch.cuda.is_available()
     if not _mode.gpu and not _mode.warned:
         _mode.warned = True
@@ -61,7 +61,7 @@ def device() -> torch.device:
 
 
 def set_random_seed(seed: int) -> None:
-    """Make random draws begin anew: fillers of the nets to come, Dropout and the like of those that are there."""
+    """Set the seed of random numbers: for fillers of later nets, and for Dropout and the like in present ones."""
     _mode.seed, _mode.nets = int(seed), 0
     for random in _mode.draws:
         random.restart(_mode.seed)
@@ -76,18 +76,18 @@ def next_seed() -> int | None:
 
 
 def solver_seed() -> int | None:
-    """Return the seed of the next solver: processes side by side must draw the order of their records alike."""
+    """Return the seed of the next solver. Parallel processes need the same one, for the same order of records."""
     seed = next_seed()
     return 0 if seed is None and multiprocess() else seed
 
 
 def follow_seed(random: Random) -> None:
-    """Make a net's draws begin anew when a seed is set."""
+    """Restart the random numbers of a net whenever a seed is set."""
     _mode.draws.add(random)
 
 
 def set_exact(choice: str) -> None:
-    """Say whose sums are Caffe's to the last bit, in nets that are built from now on: "none", "small" or "all".
+    """Set which sums equal Caffe's in every bit, in nets built from now on: "none", "small" or "all".
 
     Not of Caffe; see netspec/exact/__init__.py.
     """
@@ -96,44 +96,44 @@ def set_exact(choice: str) -> None:
 
 
 def exact() -> str:
-    """Return what :func:`set_exact` was told last."""
+    """Return the choice of the last call of :func:`set_exact`."""
     return _mode.exact
 
 
 def build_options() -> BuildOptions:
-    """Return how the next net is built."""
+    """Return the options for the next net."""
     return BuildOptions(
         str(device()), next_seed(), allow_python=True, exact=_mode.exact, accumulate_in_place=True, speed=speed()
     )
 
 
 def set_multiprocess(value: bool) -> None:
-    """Say whether several processes train side by side."""
+    """Set whether several processes train in parallel."""
     _mode.multiprocess = bool(value)
 
 
 def multiprocess() -> bool:
-    """Return whether several processes train side by side."""
+    """Return whether several processes train in parallel."""
     return _mode.multiprocess and _mode.solver_count > 1
 
 
 def set_solver_count(count: int) -> None:
-    """Say how many solvers train side by side."""
+    """Set the number of solvers that train in parallel."""
     _mode.solver_count = int(count)
 
 
 def set_solver_rank(rank: int) -> None:
-    """Say which of the solvers that train side by side this process has; 0 is the root."""
+    """Set the rank of this process among the parallel solvers; 0 is the root."""
     _mode.solver_rank = int(rank)
 
 
 def solver_count() -> int:
-    """Return how many solvers train side by side."""
+    """Return the number of solvers that train in parallel."""
     return _mode.solver_count
 
 
 def solver_rank() -> int:
-    """Return which of the solvers that train side by side this process has."""
+    """Return the rank of this process among the parallel solvers."""
     return _mode.solver_rank
 
 

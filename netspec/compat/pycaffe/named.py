@@ -1,4 +1,4 @@
-"""Ordered dictionaries whose keys are names of a prototxt, and which scripts of Python 2 can read."""
+"""Ordered dictionaries by names of a prototxt, with the methods that scripts in Python 2 use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Named(OrderedDict[str, T]):
-    """An OrderedDict that says which names there are when it is asked for another."""
+    """An OrderedDict that lists its names in the error for an unknown one."""
 
     def __init__(self, what: str = "name", items: Any = ()) -> None:
         self.what = what

@@ -92,7 +92,7 @@ def to_proto(*tops: Top) -> Any:
 
 
 class NetSpec:
-    """A net whose blobs and layers have the names of the attributes, or keys, that they are assigned to."""
+    """A net. Blobs and layers get the name of the attribute, or key, that they are assigned to."""
 
     tops: dict[str, Any]
 

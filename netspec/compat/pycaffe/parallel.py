@@ -1,4 +1,4 @@
-"""Several processes that train side by side, as Caffe's python/train.py starts them; and a stopwatch.
+"""Training in several parallel processes, as Caffe's python/train.py starts them; and a timer.
 
 Caffe's NCCL class averages the gradients of all solvers; here torch.distributed does, on GPUs through the NCCL library.
 
@@ -22,7 +22,7 @@ from netspec.solver.replicas import Replicas
 
 
 def has_nccl() -> bool:
-    """Return whether torch has NVIDIA's NCCL. Without it several processes train side by side too, on CPUs."""
+    """Return whether torch has NVIDIA's NCCL. Without it, processes train in parallel on CPUs."""
     return distributed.is_available() and distributed.is_nccl_available()
 
 
@@ -52,7 +52,7 @@ class NCCL:
         self._replicas.begin()
 
     def on_start(self) -> None:
-        """Do nothing: the weights are alike."""
+        """Do nothing: all processes have the same weights."""
 
     def on_gradients_ready(self) -> None:
         """Replace each gradient by the mean of all processes' gradients."""
@@ -63,7 +63,7 @@ class NCCL:
 
 
 class Timer:
-    """A stopwatch: ``start``, ``stop``, and ``ms``, the milliseconds between."""
+    """A timer. ``ms`` is the time between ``start`` and ``stop`` in milliseconds."""
 
     def __init__(self) -> None:
         self._began = 0.0

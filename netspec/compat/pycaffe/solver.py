@@ -35,17 +35,17 @@ Outputs = dict[str, torch.Tensor]
 
 
 class _Training(core_solver.Solver):
-    """A training whose passes go through the memory of the nets' blobs, as far as somebody can look at it.
+    """A training that fills the memory of the nets' blobs whenever a script could read it.
 
-    ``is_watched``: blobs are filled in every iteration, for functions of a script or Python layers may look at them,
-    or a pass reads what a script wrote to them.
+    ``is_watched``: blobs are filled in every iteration, because callbacks or Python layers may read them, or because a
+    pass reads what a script wrote to them.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
         self.net.largest_trained = math.inf  # blobs keep all tops in any case
-        self._whole: WholeRun | None = None  # which the first pass may show to be possible
+        self._whole: WholeRun | None = None  # set after the first pass, if it is possible
         self.is_watched = bool(self.net.inputs) or any(
             isinstance(layer, Python)
             or (isinstance(layer, Constant) and any(top is not None for top in layer.filled_once()))
@@ -61,17 +61,17 @@ class _Training(core_solver.Solver):
 
     @override
     def check_inputs(self) -> None:
-        """Do nothing: a net's inputs are what its input blobs hold."""
+        """Do nothing: the inputs of a net are the contents of its input blobs."""
 
     @override
     def clear_gradients(self) -> None:
-        """Zero the gradients where they are: views of them stay valid."""
+        """Set the gradients to 0 in place, so that views of them stay valid."""
         self.shown[self.net].runner.upload()
         super().clear_gradients()
 
     @override
     def forward_backward(self) -> tuple[torch.Tensor, Outputs]:
-        """Run forward and backward; only the last pass of several, and one that somebody watches, fills the blobs."""
+        """Run forward and backward. The blobs are filled in the last pass of several, and if ``is_watched``."""
         seen, runner = self.is_watched or self.param.debug_info, self.shown[self.net].runner
         if not seen and (passed := self._whole.run() if self._whole else self.to_come and self.net.forward_backward()):
             return passed
@@ -93,19 +93,19 @@ class _Training(core_solver.Solver):
 
     @override
     def apply_update(self) -> None:
-        """Move the weights, from the values and gradients that scripts may have written."""
+        """Update the weights. Scripts may have written to the values and gradients."""
         self.shown[self.net].runner.upload()
         super().apply_update()
 
     @override
     def test_all(self) -> None:
-        """Test, in the root's process."""
+        """Run the tests, in the root process only."""
         if mode.root_solver():
             super().test_all()
 
     @override
     def snapshot(self) -> tuple[str, str]:
-        """Take a snapshot, in the root's process."""
+        """Write a snapshot, in the root process only."""
         self.shown[self.net].runner.upload()
         return super().snapshot() if mode.root_solver() else ("", "")
 
@@ -113,8 +113,8 @@ class _Training(core_solver.Solver):
 class Solver:
     """A training, from a solver's prototxt: ``get_solver(file)``, or ``SGDSolver(file)`` whatever type the file has.
 
-    ``net`` and ``test_nets`` are live: their blobs hold what the last iteration left in them, their parameters' diffs
-    what it subtracted. Raises SpecError (a ValueError) for every fault of the files.
+    The blobs of ``net`` and ``test_nets`` have the content of the last iteration; the diffs of parameters are the
+    updates that it subtracted. Raises SpecError (a ValueError) for every fault of the files.
     """
 
     type_name: ClassVar[str] = ""
@@ -129,7 +129,7 @@ class Solver:
             param.type = self.type_name
         with caffes_errors():
             build = BuildOptions(seed=mode.solver_seed(), allow_python=True, exact=mode.exact(), speed=speed())
-            # nan: as Caffe goes on: a script may look for itself
+            # nan: training goes on, as in Caffe; a script may check the loss itself
             options = TrainingOptions(build, [mode.device()], nan="warn")
             self._training = _Training(param, node, options)
         self._callbacks: list[tuple[Callable[[], object], Callable[[], object]]] = []
@@ -149,21 +149,21 @@ class Solver:
 
     @property
     def iter(self) -> int:
-        """How many updates were done."""
+        """The number of updates so far."""
         return self._training.iteration
 
     @property
     def param(self) -> Any:
-        """The settings, a SolverParameter; what is changed there holds from the next iteration on."""
+        """The settings, a SolverParameter. Changes take effect in the next iteration."""
         return self._training.param
 
     @property
     def lr(self) -> float:
-        """The learning rate of the iteration to come."""
+        """The learning rate of the next iteration."""
         return self._training.learning_rate
 
     def solve(self, resume_file: FilePath | None = None) -> None:
-        """Train up to max_iter, from a .solverstate on where one is given."""
+        """Train up to max_iter, starting from a .solverstate if one is given."""
         if resume_file:
             log.info("solver.cpp:296", f"Restoring previous solver status from {os.fsdecode(resume_file)}")
             self.restore(resume_file)
@@ -171,17 +171,17 @@ class Solver:
             self._training.solve()
 
     def step(self, iterations: int) -> None:
-        """Train for some iterations."""
+        """Run a number of iterations."""
         with caffes_errors():
             self._training.step(int(iterations))
 
     def restore(self, state_file: FilePath) -> None:
-        """Go on from a .solverstate, and from its weights."""
+        """Restore the state of a .solverstate, and its weights."""
         self.net.runner.upload()
         self._training.restore(os.fsdecode(state_file))
 
     def snapshot(self) -> None:
-        """Write the weights and the state, as snapshot_prefix says."""
+        """Write the weights and the state to files named by snapshot_prefix."""
         self._training.snapshot()
 
     def share_weights(self, net: Net) -> None:
@@ -189,7 +189,7 @@ class Solver:
         net.share_with(self.net)
 
     def apply_update(self) -> None:
-        """Move the weights by the gradients that are there, and count an iteration unless it is counted already."""
+        """Update the weights with the present gradients. Count an iteration if it is not counted yet."""
         self._training.apply_update()
         self._training.iteration -= self._counted
         self._counted = False
@@ -200,9 +200,9 @@ class Solver:
         self._counted = True
 
     def add_callback(self, on_start: Any, on_gradients_ready: Callable[[], object] | None = None) -> None:
-        """Call two functions at each iteration: before its runs, and between them and the update.
+        """Call two functions in each iteration: before its passes, and between them and the update.
 
-        An object that has ``on_start`` and ``on_gradients_ready`` may stand for both, as a :class:`NCCL` does.
+        An object with the methods ``on_start`` and ``on_gradients_ready`` may replace both, as :class:`NCCL` does.
         """
         self._training.is_watched = True
         whole = on_gradients_ready is None

@@ -1,4 +1,4 @@
-"""What :class:`netspec.pycaffe.blob_runner.BlobRunner` keeps of a layer's run, and where tensors lie."""
+"""The records that :class:`netspec.pycaffe.blob_runner.BlobRunner` keeps of layers, and the memory of tensors."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from netspec.run.recorded import Kernels
 
 @dataclass(frozen=True)
 class Tape:
-    """One run of a layer: what it read, the tensors that held it, what it returned, and its gradients from the tops'.
+    """The record of one run of a layer: its inputs, the tensors that hold them, its outputs, and its backward function.
 
-    Autograd has watched it, and read copies; or it was run by kernels, which read the tensors themselves.
+    With autograd the inputs are copies. With kernels they are the tensors themselves.
     """
 
     leaves: list[torch.Tensor]
@@ -31,9 +31,9 @@ class Tape:
 
 @dataclass(frozen=True)
 class Bound:
-    """The kernels of a layer for bottoms of these shapes, and its learnable blobs as they were when they were made.
+    """The kernels of a layer for bottoms of these shapes, and the learnable blobs that they were made for.
 
-    ``learn[j]`` says whether blob j's gradient is added up.
+    ``learn[j]`` says whether the gradient of blob j is computed.
     """
 
     shapes: list[tuple[int, ...]]
@@ -45,7 +45,7 @@ class Bound:
 def by_autograd(
     leaves: Sequence[torch.Tensor], made: Sequence[torch.Tensor], *diffs: torch.Tensor
 ) -> list[torch.Tensor | None]:
-    """Return the gradients of what autograd saw a layer read, from those of what it returned."""
+    """Return the gradients of a layer's inputs by autograd, from the gradients of its outputs."""
     ends = [(top, diff) for top, diff in zip(made, diffs, strict=True) if top.requires_grad]
     if ends:
         torch.autograd.backward([top for top, _ in ends], [diff for _, diff in ends], retain_graph=True)
@@ -57,7 +57,7 @@ def by_autograd(
 
 @contextmanager
 def undisturbed(layer: Layer) -> Iterator[None]:
-    """Let a layer run within the block and leave no trace: not in its blobs, in what it remembers, nor in draws."""
+    """A block in which a layer runs without lasting effects on its blobs, its state, or random numbers."""
     blobs, remembered = [blob.detach().clone() for blob in layer.blobs], dict(vars(layer))
     with layer.context.random.undisturbed():
         try:
@@ -70,12 +70,12 @@ def undisturbed(layer: Layer) -> Iterator[None]:
 
 
 def storages(tensors: Sequence[torch.Tensor]) -> set[int]:
-    """Return where tensors lie in main memory. (What views show of a GPU's tensors is a copy.)"""
+    """Return the addresses of tensors in main memory. (Views of tensors on a GPU show a copy.)"""
     return {tensor.untyped_storage().data_ptr() for tensor in tensors if tensor.device.type == "cpu"}
 
 
 def not_shared(tensor: torch.Tensor, taken: set[int]) -> torch.Tensor:
-    """Return a tensor, or a copy of one that lies where others do."""
+    """Return the tensor, or a copy of it if its memory is in ``taken``."""
     aliased = tensor.device.type == "cpu" and tensor.untyped_storage().data_ptr() in taken
     return tensor.clone() if aliased else tensor
 
@@ -91,14 +91,14 @@ def parameters(layer: Layer) -> BlobVec:
 
 
 def gradient_of(parameter: torch.Tensor) -> torch.Tensor:
-    """Return where a parameter's gradient is summed up; passes add to it and never replace it."""
+    """Return the gradient of a parameter. Passes add to it, and never replace it."""
     if parameter.grad is None:
         parameter.grad = torch.zeros_like(parameter, memory_format=torch.contiguous_format)
     return parameter.grad
 
 
 def overwrites_shared(nodes: Sequence[Node], tops: Sequence[Sequence[Blob]]) -> bool:
-    """Return whether a layer works in place on memory that is already another blob's too."""
+    """Return whether a layer computes in place on memory that another blob shares."""
     sharing: dict[int, set[int]] = {}
     for node, blobs in zip(nodes, tops, strict=True):
         for top, in_place in zip(blobs, node.in_place, strict=False):

@@ -1,3 +1,3 @@
-"""The Caffe whose interface this is."""
+"""The version of Caffe that this interface follows."""
 
 __version__ = "1.0.0"

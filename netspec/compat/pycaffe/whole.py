@@ -1,7 +1,7 @@
-"""A solver's pass as netspec makes it, after which the blobs show what passes from layer to layer leave in them.
+"""Runs a solver's pass with netspec's kernels, and leaves the blobs with the content of a pass layer by layer.
 
-netspec's kernels keep what they compute until their next pass. So the blobs are given that memory, and nothing is
-copied but for views that a script holds (netspec/layers/utility/live_blobs.py).
+The kernels keep their results until their next pass. The blobs get that memory, so only views that a script holds
+need a copy (netspec/layers/utility/live_blobs.py).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from netspec.graph.plan import AUTOMATIC
 from netspec.layers.contract.gradients import gradient_reads
 from netspec.layers.utility.live_blobs import Blob
 
-LARGE = 2**22  # numbers in all blobs: of more, two sets of kernels take too much memory
+LARGE = 2**22  # numbers in all blobs: in a larger net, two sets of kernels take too much memory
 Passed = tuple[torch.Tensor, dict[str, torch.Tensor]]
 
 
@@ -26,16 +26,15 @@ class WholeRun:
     def __init__(self, runner: BlobRunner) -> None:
         self._runner, self._net = runner, runner.net
         self._is_large = sum(blob.count for blob in runner.blobs) > LARGE
-        # of several that are written to one memory, the last
+        # the last of several that are written to the same memory
         self._tops = list({id(blob.data_memory): (v, blob) for v, blob in self._written()}.values())
         self._diffs = list({id(blob.diff_memory): (v, blob) for v, blob in self._reached()}.values())
 
     @staticmethod
     def suits(runner: BlobRunner) -> bool:
-        """Say whether blobs would show all that passes from layer to layer leave in them.
+        """Return whether a whole pass leaves the same content in the blobs as one layer by layer. Call it after a pass.
 
-        Not so where layers run as one, and where a layer draws (call it after a pass): a backward pass by itself needs
-        what was drawn.
+        It does not if layers are joined. Nor if a layer draws random numbers, which a separate backward pass needs.
         """
         net = runner.net
         return not (
@@ -47,7 +46,7 @@ class WholeRun:
         )
 
     def run(self) -> Passed | None:
-        """Run the net, and show what it computed; None where the layers must run one by one."""
+        """Run the net and fill the blobs. Return None if the layers must run one by one."""
         if any(self._runner.hooks.values()):
             return None
         step = self._net.trainer()
@@ -67,13 +66,13 @@ class WholeRun:
         return passed
 
     def _written(self) -> Iterator[tuple[int, Blob]]:
-        """Yield values and the blobs that hold them, as they are written in a forward pass."""
+        """Yield pairs of a value and its blob, in the order of a forward pass."""
         for node, layer, tops in zip(self._net.plan.nodes, self._net.layers, self._runner.tops, strict=True):
             if "data" not in layer.shares:
                 yield from zip(node.tops, tops, strict=True)
 
     def _reached(self) -> Iterator[tuple[int, Blob]]:
-        """Yield values and the blobs of their gradients, as they are written in a backward pass."""
+        """Yield pairs of a value and the blob of its gradient, in the order of a backward pass."""
         plan, runner = self._net.backward_plan, self._runner
         every = zip(self._net.plan.nodes, self._net.layers, runner.bottoms, plan.layers, plan.computed, strict=True)
         for node, layer, bottoms, reached, wanted in reversed(list(every)):
