@@ -1,12 +1,12 @@
 '''Dialects: the layers of Caffe's forks, one file each, with what they add to the schema.
 
-A prototxt that uses what Caffe does not have switches on the dialects that have it: netspec's own (the files in this
-folder), and those that installed packages offer (entry points of the group ``netspec.dialects``). ``--plugin FILE.py``
-on the command line, or ``netspec.use_dialect("FILE.py")``, adds one from a file, for every net of the process. The
-fields that dialects add are known to the whole process from then on, since protobuf has one schema in it; layers in the
-place of Caffe's are those of the nets that use the dialect (BuildOptions.dialects). A field or a layer type that
-several dialects have is an error, and ``--plugin NAME`` says which is meant. Whose a layer is, where forks have
-different layers of one type, is decided in one table: netspec/dialects/signatures.py.
+A prototxt with fields or layers that Caffe does not have switches on the dialects that define them: netspec's own (the
+files in this folder), and those of installed packages (entry points of the group ``netspec.dialects``). To add a
+dialect from a file, for every net of the process, pass ``--plugin FILE.py`` on the command line, or call
+``netspec.use_dialect("FILE.py")``. The whole process then knows the new fields, because protobuf has one schema for a
+process. A layer that replaces one of Caffe's is used only in nets that use the dialect (BuildOptions.dialects). A field
+or layer type that several dialects define is an error; ``--plugin NAME`` chooses one. If forks define different layers
+of one type, the table in netspec/dialects/signatures.py decides which one is meant.
 
 To write one, put this into a file, say ``doubling.py``, and pass ``--plugin doubling.py``::
 
@@ -38,13 +38,12 @@ To write one, put this into a file, say ``doubling.py``, and pass ``--plugin dou
         def forward(self, data):
             return data * value(self.param, "times_param").factor
 
-``DECLARATIONS`` is in the language of caffe.proto (netspec/dialects/registry.py): messages as they stand in the
-fork, new fields of Caffe's messages in ``extend``; one plain string. A layer is as Caffe's own are
-(netspec/layers/contract/base.py);
-``@register`` has its type and the fields of LayerParameter that it reads: a net warns of fields that no layer reads.
-``@replace("Dropout", ...)`` of netspec/dialects/layers.py puts a subclass in the place of one of Caffe's layers, to
-honor a field that the fork added to it, in nets that use the dialect. To offer a dialect with a package, name its
-module in that package's pyproject.toml::
+``DECLARATIONS`` is one string in the language of caffe.proto (netspec/dialects/registry.py): the messages of the fork,
+and new fields of Caffe's messages in ``extend``. A layer is written like Caffe's own
+(netspec/layers/contract/base.py). ``@register`` gets its type and the fields of LayerParameter that it reads: a net
+warns of fields that no layer reads. ``@replace("Dropout", ...)`` of netspec/dialects/layers.py replaces one of Caffe's
+layers by a subclass, in nets that use the dialect, to support a field that the fork added to it. To offer a dialect
+with a package, name its module in that package's pyproject.toml::
 
     [project.entry-points."netspec.dialects"]
     doubling = "mypackage.doubling"
@@ -58,10 +57,10 @@ from netspec.dialects.files import find_file, switch_on
 
 
 def use_dialect(name: str | Path) -> None:
-    """Add the fields and layers of a dialect, given by its name or the path of its file, for the whole process.
+    """Add the fields and layers of a dialect to the whole process. ``name`` is its name, or the path of its file.
 
-    Does nothing where it is there already. Raises SpecError where there is no such dialect, its file has a fault, or
-    Caffe or another dialect has one of its fields or layer types.
+    Does nothing if it was added before. Raises SpecError if there is no such dialect, if its file has a fault, or if
+    Caffe or another dialect already has one of its fields or layer types.
     """
     from netspec.dialects.layers import use_everywhere  # it needs torch
 

@@ -1,4 +1,4 @@
-"""What netspec asks of forks (netspec/proto/forks.py), answered from the dialects."""
+"""Implements the questions about forks in netspec/proto/forks.py with the dialects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAMED = re.compile(r"^[ \t]*#[ \t]*dialect:[ \t]*(\w+)[ \t]*\r?$", re.MULTILINE)
 
 
 class Dialects(Forks):
-    """The dialects of this folder, those of installed packages, and those that a user switched on."""
+    """The dialects of this folder, of installed packages, and of files that a user named."""
 
     new_layer = "docs/layer.md shows how to add one with --plugin FILE.py"
     new_field = "docs/layer.md shows how to add a fork's with --plugin FILE.py"
@@ -43,7 +43,7 @@ class Dialects(Forks):
 
     @override
     def add_field(self, message: str, field: str, text: str, start: int, file: str) -> bool:
-        """Of several dialects that have the field, the one is meant whose message alone has the fields given in it."""
+        """If several dialects have the field, choose the only one with a message that has the given inner fields."""
         dialects = self.with_field(message, field)
         if len(dialects) > 1:
             inside = set(re.findall(r"\w+", text[start : text.find("}", start)]))

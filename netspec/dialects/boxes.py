@@ -1,4 +1,4 @@
-"""Boxes as SSD's layers handle them: what overlaps, what is encoded, matched and suppressed.
+"""Functions for the boxes of SSD's layers: overlap, encoding, matching and suppression.
 
 A box is (xmin, ymin, xmax, ymax) in parts of the image, so 0 to 1 within it. Arrays are float32, as the fork's boxes.
 Fork: weiliu89/caffe (ssd), src/caffe/util/bbox_util.cpp
@@ -19,7 +19,7 @@ Array = np.ndarray
 
 CORNER, CENTER_SIZE, CORNER_SIZE = 1, 2, 3  # ssd.py: enum PriorBoxParameter.CodeType
 NO_MATCH, LEFT_OUT = -1, -2  # instead of the index of a matched box
-LEAST_OVERLAP = 1e-6  # less is none
+LEAST_OVERLAP = 1e-6  # a smaller overlap counts as none
 LEAST_SIZE = 1e-5  # smaller boxes do not take part in suppress_all
 
 
@@ -29,9 +29,9 @@ def as_array(tensor: torch.Tensor) -> Array:
 
 
 def check_predictions(layer: Layer, bottom_shapes: Sequence[Shape], kinds: int, classes: int) -> int:
-    """Return how many priors there are; refuse boxes of so many kinds, or confidences, that do not suit them.
+    """Return the number of priors. Raise SpecError if the sizes of boxes or confidences do not fit it.
 
-    The bottoms are boxes, confidences and priors.
+    The bottoms are boxes, confidences and priors. There are ``kinds`` boxes for each prior.
     """
     loc, conf, prior = bottom_shapes[:3]
     if prior[:2] != (1, 2) or math.prod(prior) % 8:
@@ -93,7 +93,7 @@ def encode(boxes: Array, priors: Array, variances: Array | None, code: int) -> A
 
 @np.errstate(over="ignore", invalid="ignore")
 def decode(codes: Array, priors: Array, variances: Array | None, code: int) -> Array:
-    """Return the boxes (n, 4) of which :func:`encode` makes ``codes``."""
+    """Return the boxes (n, 4) that :func:`encode` turns into ``codes``."""
     (low, high), (extent, center) = _corners(priors), _centers(priors)
     if variances is not None:
         codes = codes * variances

@@ -1,7 +1,7 @@
 """Parses the .proto language, as far as Caffe's schema and those of its forks use it, into descriptors.
 
-Messages, enums in them or beside them, optional, repeated and required fields with ``default`` and ``packed``, and
-``extend``. protoc does the same and more; this parser is for the additions of forks, which are added at run time.
+It supports messages, enums inside or outside of them, optional, repeated and required fields with ``default`` and
+``packed``, and ``extend``. protoc does more; this parser is for the additions of forks, which are added at run time.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ GROUP = "netspec.dialects"  # of entry points: other packages' dialects, a name 
 
 @dataclass(frozen=True)
 class DialectFile:
-    """A file that was not read yet. ``module`` is its name for Python's import, "" for a file given by its path."""
+    """A file that was not read yet. ``module`` is its name for import, or "" for a file that is given by its path."""
 
     name: str
     path: Path

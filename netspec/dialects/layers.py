@@ -1,4 +1,4 @@
-"""The layers of the dialects: which dialect has a type, which class it puts in the place of one of Caffe's."""
+"""The layers of the dialects: which dialect defines a type, and which classes replace layers of Caffe."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _owners: dict[str, str] = {}  # layer type -> the dialect that has it; Caffe's o
 Wants = Callable[[LayerParameter], bool]
 _replacing: dict[str, dict[str, tuple[type[Layer], Wants]]] = {}  # layer type of Caffe's -> dialect -> class, for which
 _everywhere: set[str] = set()  # dialects that count for every net of the process: a user asked for them
-_loading = ""  # the dialect whose file is run now
+_loading = ""  # the dialect that is being loaded
 L = TypeVar("L", bound=type[Layer])
 
 
@@ -46,9 +46,9 @@ def replace(type_name: str, *reads: str, where: Wants = lambda param: True) -> C
 
 
 def dialects_of(net: NetParameter) -> set[str]:
-    """Return the dialects that count for a net: those whose fields and layer types it has, and those for every net.
+    """Return the dialects that a net uses: those of its fields and layer types, and those switched on for every net.
 
-    A layer of a type that several forks have shows none of them (netspec/dialects/signatures.py).
+    A layer type that several forks define does not show which one is used (netspec/dialects/signatures.py).
     """
     types = {layer.type for layer in net.layer}
     shown = {each for each in types if layer_class(each) and not has_several(each)}
@@ -59,7 +59,7 @@ def dialects_of(net: NetParameter) -> set[str]:
 
 
 def _dialects_in(message: Message) -> set[str]:
-    """Return the dialects whose fields a message, or one inside it, has."""
+    """Return the dialects that define a field of a message, or of a message inside it."""
     found: set[str] = set()
     fields: Any = message.ListFields()
     for field, value in fields:
@@ -72,13 +72,13 @@ def _dialects_in(message: Message) -> set[str]:
 
 
 def use_everywhere(dialect: str) -> None:
-    """Let the layers of a dialect count for every net that this process builds from now on."""
+    """Use the layers of a dialect in every net that this process builds from now on."""
     run_dialects()
     _everywhere.add(dialect)
 
 
 def register_type(layer_type: str) -> None:
-    """Register the layers of the dialects that were switched on, and of the one that alone has a layer type."""
+    """Register the layers of the dialects that were switched on, and of the only dialect that defines a layer type."""
     run_dialects()
     if registered(layer_type) is None:
         announce_known()

@@ -1,4 +1,4 @@
-"""Layers of forks some of whose blobs are never learned, such as moving averages."""
+"""Base of layers with blobs that are never learned, such as moving averages."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from netspec.layers import Layer
 
 
 class NotLearned(Layer):
-    """A base for such layers."""
+    """Base of layers that set lr_mult and decay_mult of some blobs to 0."""
 
-    not_learned: frozenset[int] = frozenset()  # blobs whose lr_mult and decay_mult are 0, whatever the prototxt has
+    not_learned: frozenset[int] = frozenset()  # indices of these blobs; the prototxt cannot change it
 
     @override
     def param_spec(self, j: int, given: Param | None) -> Param:

@@ -173,7 +173,7 @@ def _check_numbers(dialect: Dialect) -> None:
 
 
 def _add(file: FileDescriptorProto) -> None:
-    """Add a dialect's file to the pool, the new fields of each message in a scope of their own: names may be alike."""
+    """Add a dialect's file to the pool. The new fields of each message have their own scope, so names may repeat."""
     scoped = FileDescriptorProto()
     scoped.CopyFrom(file)
     del scoped.extension[:]
@@ -218,7 +218,7 @@ def dialects_with_field(message: str, field: str) -> tuple[str, ...]:
 
 
 def dialects_with_inner_fields(dialects: Sequence[str], names: set[str]) -> tuple[str, ...]:
-    """Return those of some known dialects whose messages have most of these fields: none where they have none."""
+    """Return those of the dialects with messages that have the most of these fields; none if they have none."""
     found = {name: len(_known[name].inner_fields() & names) for name in dialects}
     most = max(found.values())
     return tuple(name for name, count in found.items() if count == most > 0)
@@ -246,7 +246,7 @@ def advice_of(dialect: str) -> str:
 
 
 def advice_for(name: str, dialects: tuple[str, ...]) -> str:
-    """Return a hint at the known dialects that have a field or layer type, or an empty string."""
+    """Return advice that names the known dialects with a field or layer type, or an empty string."""
     if not dialects:
         return ""
     names = " and ".join(f'"{d}"' for d in dialects)

@@ -1,6 +1,6 @@
 """Building blocks that many forks added, for classification and segmentation: SENet, PSPNet, SegNet, MobileNet, ...
 
-Where two forks have different layers of one name (BN, Upsample), the fields that are given say which is meant.
+If two forks have different layers with the same type (BN, Upsample), the fields that are set show which is meant.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""DenseNet in one layer, which keeps no copy of the maps that it puts side by side. Fork: Tongcheng/caffe."""
+"""A block of DenseNet as one layer, without copies of the maps that it concatenates. Fork: Tongcheng/caffe."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ class Convolution(convolution.Convolution):
         holes = [name for name in ("hole", "hole_h", "hole_w") if has(param, name)]
         if holes and (param.dilation or holes not in (["hole"], ["hole_h", "hole_w"])):
             message = f"expected dilation, or hole, or both hole_h and hole_w; found {' and '.join(holes)}"
-            raise self.error(message + (" beside dilation" if param.dilation else ""), GROUP, holes[0])
+            raise self.error(message + (" and dilation" if param.dilation else ""), GROUP, holes[0])
         if holes:
             self.dilation = tuple(value(param, name) for name in holes * (self.spatial_axes // len(holes)))
             if min(self.dilation, default=1) < 1:

@@ -1,4 +1,4 @@
-"""Normalize, under which several forks have layers of other numbers: SSD's, that of TSN, and happynear's."""
+"""Normalize, a layer type that computes different things in several forks: SSD, TSN, and happynear's Caffe."""
 
 from __future__ import annotations
 

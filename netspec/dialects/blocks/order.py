@@ -1,4 +1,4 @@
-"""Axes in another order: what SSD's Permute and CRNN's Transpose have in common."""
+"""The base of layers that permute axes: SSD's Permute and CRNN's Transpose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 class Reordered(Layer):
-    """Base of the layers whose top's axis i is the bottom's axis ``order``[i]."""
+    """Base of layers that permute axes: axis i of the top is axis ``order[i]`` of the bottom."""
 
     order: list[int]
 

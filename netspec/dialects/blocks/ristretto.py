@@ -61,7 +61,7 @@ def power_of_two(x: torch.Tensor, least: int, most: int) -> torch.Tensor:
 
 
 class _Quantized(Layer):
-    """What the layers have in common: bottoms, blobs and tops are rounded as quantization_param says."""
+    """Base of the layers. Bottoms, blobs and tops are rounded as quantization_param says."""
 
     not_exported = "its numbers are rounded to few bits"
 

@@ -1,1 +1,1 @@
-"""Nets that tell faces apart: their normalization and losses."""
+"""Layers for face recognition: normalization and losses."""

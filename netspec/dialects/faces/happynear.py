@@ -1,7 +1,7 @@
-"""happynear/caffe-windows, which recognizes faces: Normalize without a scale (blocks/normalize.py), losses, margins.
+"""happynear/caffe-windows, for face recognition: Normalize without a scale (blocks/normalize.py), losses, margins.
 
 Its BN keeps 1 / std in blobs[3] (segmentation/segnet.py), as do wy1iu/LargeMargin_Softmax_Loss and Cysu/caffe, branch
-domain-guided-dropout. Where no field shows whose a layer is, the dialect has to be named.
+domain-guided-dropout. If no field shows the fork, the dialect must be named.
 """
 
 from __future__ import annotations
@@ -282,7 +282,7 @@ class FocalLoss(Loss, Classified):
 
 @register("Flip", "flip_param")
 class Flip(Layer):
-    """Turn maps around: from right to left unless flip_width is false, from bottom to top with flip_height.
+    """Mirror maps: horizontally unless flip_width is false, and vertically if flip_height is true.
 
     bottom[0]  (N, C, H, W)
     top[0]     the same shape
@@ -388,7 +388,7 @@ class Cosine(Layer):
 
 
 class _Arccos(torch.autograd.Function):
-    """The arc cosine, whose gradient is that of 0.99 above it."""
+    """The arc cosine. Above 0.99 its gradient is the one at 0.99."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:

@@ -1,1 +1,1 @@
-"""R-CNN: regions of interest, and what Faster R-CNN and R-FCN have in Python."""
+"""R-CNN: layers for regions of interest, and the Python layers of Faster R-CNN and R-FCN."""

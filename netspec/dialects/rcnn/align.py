@@ -1,4 +1,4 @@
-"""ROIAlign: regions read between the pixels. Two forks' are here, which read at other places."""
+"""ROIAlign: pools regions by interpolation between pixels. Two forks do so at different points."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ CASCADE, ALIGN = "roi_pooling_param", "roi_align_param"
 
 
 class ROIAlign(RegionPooling):
-    """Read each region of a map between the pixels, by bilinear interpolation.
+    """Pool each region of a map, with bilinear interpolation between pixels.
 
-    With pad_ratio in roi_pooling_param it is Cascade R-CNN's: a region, grown by so much of its length on each side,
-    has (pooled_h + 1) x (pooled_w + 1) points, the corners of its bins, of which a Pooling takes the mean; a point
-    outside the map is 0, and so is all of a region that ends before it begins. Else it is Detectron's: the mean of
-    sampling_ratio^2 points in each bin, or where that is not given of one for each pixel of a bin's sides; a region is
-    one pixel long at least.
+    With pad_ratio in roi_pooling_param it is the layer of Cascade R-CNN. A region grows on each side by pad_ratio times
+    its length. It is read at (pooled_h + 1) x (pooled_w + 1) points, the corners of its bins. A Pooling layer then
+    takes their means. Points outside the map are 0, and so is a region that ends before it begins. Otherwise it is the
+    layer of Detectron: the mean of sampling_ratio^2 points in each bin. Without sampling_ratio, each side of a bin has
+    a point for each of its pixels. A region is at least one pixel long.
 
     bottom[0]  the map (N, C, H, W)
     bottom[1]  regions (R, 5): image, x1, y1, x2, y2; gets no gradient

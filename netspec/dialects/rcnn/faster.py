@@ -1,8 +1,8 @@
-"""Faster R-CNN's layers that py-faster-rcnn has as Python code: images, proposals, and what both heads learn.
+"""Layers of Faster R-CNN that are Python code in py-faster-rcnn: images, proposals, and the targets of both heads.
 
-A Python layer of these modules and classes runs here without running anybody's code. What the code reads from its
-configuration has the values of experiments/cfgs/faster_rcnn_end2end.yml. A box is (x1, y1, x2, y2) in pixels, both
-corners included. Random choices are the net's, not numpy's.
+A Python layer with one of these modules and classes runs here without foreign code. The settings are those of
+experiments/cfgs/faster_rcnn_end2end.yml. A box is (x1, y1, x2, y2) in pixels, both corners included. Random numbers
+come from the net, not from numpy.
 Fork: rbgirshick/py-faster-rcnn, lib/rpn, lib/roi_data_layer; peteanderson80/bottom-up-attention, which has attributes
 """
 
@@ -81,7 +81,7 @@ def targets(boxes: Array, truth: Array) -> Array:
 
 
 class _Sampling(Layer):
-    """A layer that chooses at random, and passes no gradient on."""
+    """Base of layers that choose at random. They have no gradient."""
 
     not_exported = "it is for training, and chooses at random"
 
@@ -100,7 +100,7 @@ class _Sampling(Layer):
 
 
 class AnchorTarget(_Sampling):
-    """Say which anchors show an object, and where it lies beside them.
+    """Label the anchors that show an object, and compute the offsets from anchor to object.
 
     An anchor within the image is an object if it overlaps a true box by 0.7 or more, or most of all anchors;
     background if it overlaps none by 0.3. Of both together 256 are chosen, at most half of them objects.
@@ -160,7 +160,7 @@ class AnchorTarget(_Sampling):
 
 
 class ProposalTarget(_Sampling):
-    """Choose regions to learn from, and say what they show and where it lies beside them.
+    """Choose regions for training, and compute their classes and the offsets from region to object.
 
     128 of the proposals and the true boxes: at most a quarter that overlap a true box by half or more, the rest
     background. With num_attr_classes (bottom-up attention) 64, at most half of them objects.
@@ -250,7 +250,7 @@ class RoIData(_Sampling):
 
     The short side is scaled to 600 pixels, the long one at most to 1000. ``net.layers[0].set_roidb(entries)`` gives
     the images: each entry is a dict with "image" (a path), "boxes" (n, 4), "gt_classes" (n,) and, if it is mirrored,
-    "flipped": True, its boxes being mirrored already; with "gt_attributes" (n, 16) these stand beside the boxes.
+    "flipped": True, with boxes that are mirrored already. "gt_attributes" (n, 16) are added to the boxes.
 
     top[0]     the image (1, 3, H, W): blue, green, red, minus their means
     top[1]     its height, width and scale (1, 3)
@@ -270,7 +270,7 @@ class RoIData(_Sampling):
 
     @property
     def code(self) -> RoIData:
-        """What ``net.layers[0]`` of pycaffe is, as in the fork, where this layer is Python code."""
+        """The object that ``net.layers[0]`` of pycaffe returns; in the fork the layer is Python code."""
         return self
 
     def set_roidb(self, entries: Sequence[Mapping[str, Any]]) -> None:
@@ -314,7 +314,7 @@ class RoIData(_Sampling):
 
 
 def scaled(image: Array) -> tuple[Array, float]:
-    """Return an image (H, W, 3) of which the short side is 600 pixels, or the long one 1000, and the scale."""
+    """Scale an image (H, W, 3) to a short side of 600 pixels, or a long side of 1000; return it and the scale."""
     short, long = sorted(image.shape[:2])
     scale = min(SHORTEST / short, LONGEST / long)
     return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR), scale

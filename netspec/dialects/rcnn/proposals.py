@@ -56,6 +56,6 @@ def suppress(boxes: Array, threshold: float, most: int) -> list[int]:
         width = np.minimum(rows[2, 0], x2) - np.maximum(rows[0, 0], x1) + 1
         height = np.minimum(rows[3, 0], y2) - np.maximum(rows[1, 0], y1) + 1
         shared = np.maximum(width, 0) * np.maximum(height, 0)
-        apart = np.flatnonzero(shared / (areas[0] + areas[1:] - shared) <= np.float32(threshold)) + 1
-        left, rows, areas = left[apart], rows[:, apart], areas[apart]
+        far = np.flatnonzero(shared / (areas[0] + areas[1:] - shared) <= np.float32(threshold)) + 1
+        left, rows, areas = left[far], rows[:, far], areas[far]
     return kept

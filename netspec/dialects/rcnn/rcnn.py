@@ -176,9 +176,9 @@ class Proposal(Layer):
     """Propose regions: anchors moved by what is predicted, the best of those that do not overlap.
 
     An anchor for each ``ratio`` (height / width; 0.5, 1, 2) and each ``scale`` (8, 16, 32) of base_size pixels lies at
-    every feat_stride pixels. Of the pre_nms_topn of highest score, at most post_nms_topn stay, none of which overlaps a
-    better one by more than nms_thresh. Boxes with a side below min_size times the image's scale count as score 0. There
-    may be fewer regions than the top's declared shape says.
+    every feat_stride pixels. From the pre_nms_topn boxes of highest score, those that overlap a better one by more than
+    nms_thresh are removed, and at most post_nms_topn stay. A box with a side below min_size times the image's scale
+    counts as score 0. There may be fewer regions than the top's declared shape says.
 
     bottom[0]  scores (1, 2 A, H, W): background, then object, of the A anchors
     bottom[1]  (1, 4 A, H, W): dx, dy, log dw, log dh of each anchor
@@ -237,7 +237,7 @@ class Proposal(Layer):
 
 @register("rpn.proposal_layer.ProposalLayer", "python_param")
 class ProposalLayer(Proposal):
-    """Proposal with the settings of py-faster-rcnn, whose Python layer rpn.proposal_layer.ProposalLayer it is.
+    """Proposal with the settings of py-faster-rcnn. It replaces the Python layer rpn.proposal_layer.ProposalLayer.
 
     In training 2000 of 12000 regions stay, in testing 300 of 6000; param_str has feat_stride, scales, ratios.
 

@@ -1,4 +1,4 @@
-"""Regions of an image, as the layers take them that pool the part of a map that each covers."""
+"""The base of layers that pool the part of a map that each region covers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The smooth L1 loss of boxes, of which each detector's fork has one: Fast R-CNN, SSD, R-FCN."""
+"""The smooth L1 loss of boxes, in the versions of several forks: Fast R-CNN, SSD, R-FCN."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def divisor(layer: Layer, items: int, each: int, valid: torch.Tensor | None) -> 
 
 
 class _Weighted(torch.autograd.Function):
-    """weight x, whose gradient leaves the weight out: R-FCN's, which was trained with weights of 0 and 1."""
+    """weight x, with a gradient that leaves out the weight, as in R-FCN (its weights are 0 and 1)."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
@@ -78,7 +78,7 @@ class SmoothL1Loss(Loss):
         self.knee = 1 / (sigma * sigma)
 
     def found_fork(self) -> str:
-        """Return whose layer it is."""
+        """The dialect that defines this layer."""
         return fork_of(self)
 
     @property

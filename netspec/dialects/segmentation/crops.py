@@ -55,10 +55,10 @@ EDGES = "; SigmoidCrossEntropyLoss is computed as Caffe's: HED's and RCF's, whic
 
 
 def align_crops(plan: Plan, dialects: Collection[str]) -> Iterator[str]:
-    """Give each Crop without crop_param the offsets of HED's branch, where the net is one for it; yield warnings.
+    """Give each Crop without crop_param the offsets of HED's branch, if the net is made for it; yield warnings.
 
-    It is one where the dialect is named, or where a convolution on the way pads with more than its kernel covers, which
-    only such a Crop takes off again.
+    It is if the dialect is named, or if the padding of a convolution before it exceeds its kernel, because only such a
+    Crop removes the surplus again.
     """
     makers = {value: i for i, node in enumerate(plan.nodes) for value in node.tops}
     found: dict[str, list[int]] = {}
@@ -83,7 +83,7 @@ def align_crops(plan: Plan, dialects: Collection[str]) -> Iterator[str]:
 def _offsets(plan: Plan, makers: dict[int, int], crop: int) -> tuple[list[int], bool] | None:
     """Return the offsets of a Crop's rows and columns, and whether a convolution pads beyond its kernel.
 
-    None where the bottoms are not connected, of unlike scales, or not a whole number of pixels apart.
+    None if the bottoms are not connected, have different scales, or if the offset is not a whole number of pixels.
     """
     first, second = (_ancestors(plan, makers, value) for value in plan.nodes[crop].bottoms)
     common = next((value for value in second if value in first), None)

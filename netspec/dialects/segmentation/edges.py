@@ -1,4 +1,4 @@
-"""Nets that find edges (HED, RCF): images with edge maps, and a loss in which edges weigh as much as all else.
+"""Nets that find edges (HED, RCF): images with edge maps, and a loss that balances edges and background.
 
 Forks: s9xie/hed (Xie and Tu, Holistically-Nested Edge Detection, ICCV 2015), yun-liu/rcf (Liu et al., Richer
 Convolutional Features for Edge Detection, CVPR 2017)
@@ -65,12 +65,12 @@ class EdgeMaps(ImageData):
 
 
 class Balanced(SigmoidCrossEntropyLoss):
-    """Base of the two losses: the cross entropy of each image, its edges weighed by the share of all else, and so back.
+    """Base of the two losses: the cross entropy of each image, balanced between edges and background.
 
-    What is neither 1 nor 0 does not count. There is no normalization but by N.
+    Edges are weighted by the share of background pixels, and background pixels by the share of edges. Labels other than 1 and 0 do not count. The sum is divided by N only.
     """
 
-    of_others: ClassVar[float]  # what all that is no edge is weighed by besides
+    of_others: ClassVar[float]  # an additional weight of background pixels
     not_exported = "it is for training"
 
     def forward(self, x: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:

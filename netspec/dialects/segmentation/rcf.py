@@ -1,6 +1,6 @@
 """RCF: edges are 1 where more than half of all people marked them; what fewer marked does not count.
 
-Both forks give Caffe's SigmoidCrossEntropyLoss another meaning, each its own, without a field that says so.
+HED and RCF each change the meaning of Caffe's SigmoidCrossEntropyLoss, without a field that shows it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from netspec.dialects.segmentation.edges import Balanced, EdgeMaps
 from netspec.dialects.segmentation.pairs import Array
 from netspec.layers import register
 
-DECLARATIONS = ""  # no field says whose the file is: it has to be named
+DECLARATIONS = ""  # no field shows that a file is for this fork: the dialect must be named
 
 
 @register("ImageLabelmapData", "image_data_param", "transform_param", "data_param.prefetch")

@@ -53,7 +53,7 @@ def wrong_settings(transform: Any, samplers: Sequence[Any], at: Callable[..., Wh
             yield fault("height and width must both be above 0", "transform_param", "resize_param", i)
     if len(resizes) > 1 and abs(sum(resize.prob for resize in resizes) - 1) > ABOUT:
         total = sum(resize.prob for resize in resizes)
-        message = f"found {len(resizes)} resize_param whose prob add up to {total:g}, expected 1"
+        message = f"found {len(resizes)} resize_param with a sum of prob of {total:g}, expected 1"
         yield fault(message, "transform_param", "resize_param")
     if has(transform, "expand_param"):
         if value(transform, "expand_param").max_expand_ratio <= 1:

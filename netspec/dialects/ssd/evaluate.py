@@ -146,7 +146,7 @@ class DetectionEvaluate(Layer):
 
 
 def average_precision(found: Array, true: float, version: str = INTEGRAL) -> float:
-    """Return the average precision of detections (confidence, right, wrong) of which ``true`` could be right.
+    """Return the average precision of detections (confidence, right, wrong) for ``true`` objects.
 
     "11point" is the mean of the best precision at recalls of 0, 0.1, ... 1 (VOC 2007), "MaxIntegral" the area under the
     best precision at each recall or above (VOC 2012), "Integral" that under the precision itself.

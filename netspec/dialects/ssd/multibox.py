@@ -94,10 +94,10 @@ def mine(
 ) -> tuple[Array, Array]:
     """Return the matches (n, p) that are kept, and which priors (n, p) are trained as background.
 
-    MAX_NEGATIVE keeps all matches, and of the other priors those of greatest loss, neg_pos_ratio times as many.
-    HARD_EXAMPLE keeps the sample_size priors of greatest loss, matched or not. With an nms_param, first those are
-    suppressed whose ``boxes(image)`` overlap one of greater loss; without its top_k none is left, as in the fork. An
-    image without a true box trains nothing.
+    MAX_NEGATIVE keeps all matches, and neg_pos_ratio times as many other priors, those of the greatest loss.
+    HARD_EXAMPLE keeps the sample_size priors of the greatest loss, matched or not. With an nms_param, priors are first
+    removed if their ``boxes(image)`` overlap one of greater loss; without its top_k none is left, as in the fork. An
+    image without a true box is not used.
     """
     kept, negative = found.copy(), np.zeros(found.shape, bool)
     for i in range(len(found)):

@@ -24,7 +24,7 @@ class PriorBox(Layer):
     For each min_size: a square of it; with max_sizes a square of sqrt(min_size max_size); then for each aspect_ratio
     r, and 1 / r with ``flip``, min_size sqrt(r) by min_size / sqrt(r). Sizes are cut to whole pixels. Centers are at
     (index + offset) step; where they are not given, the step is image / map and the image is bottom[1]. With
-    denser_prior_boxes (TextBoxes++) each box is followed by one whose center is at (row + 1) step.
+    denser_prior_boxes (TextBoxes++) each box is followed by one with its center at (row + 1) step.
 
     bottom[0]  the map (N, C, H, W)
     bottom[1]  the image (N, C', H', W'); not needed where img_size, or img_h and img_w, are given

@@ -82,7 +82,7 @@ SUBTRACT, NEAREST, CUBIC, AREA, NOT_A_NUMBER, SUBTRACTED = 1, 1, 3, 4, 2, 4  # v
 
 
 class _OfMaps(Layer):
-    """A layer that is not exported, and of which all bottoms have four axes."""
+    """Base of layers that cannot be exported. All bottoms have four axes."""
 
     not_exported = "FlowNet's layers have no counterpart there"
     same: ClassVar[slice]  # the axes in which both bottoms are alike
@@ -277,7 +277,9 @@ class Accum(_OfMaps):
         p = value(self.param, "accum_param")
         self.read = len(bottom_shapes) - p.have_reference
         if not self.read:
-            raise self.error("found one bottom, expected maps before the one whose size is taken", "bottom")
+            raise self.error(
+                "found one bottom, expected the maps to resize, and then the maps that have the new size", "bottom"
+            )
         size = [max(sides) for sides in zip(*(shape[2:] for shape in bottom_shapes), strict=True)]
         wanted = [p.top_height, p.top_width]
         if p.size_divisible_by:
@@ -302,7 +304,7 @@ class Downsample(_OfMaps):
     Pixels that are nan are left out; where they have more than half the weight of the others, the top is nan.
 
     bottom[0]  (N, C, H, W)
-    bottom[1]  optional: maps whose size is taken, in place of top_height and top_width
+    bottom[1]  optional: maps that have the new size, instead of top_height and top_width
     top[0]     (N, C, top_height, top_width); brings no gradient, as in the fork
     Fork: src/caffe/layers/downsample_layer.cu
     """

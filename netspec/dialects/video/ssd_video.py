@@ -112,8 +112,8 @@ class VideoSource:
 class VideoData(ReadingLayer):
     """Read the frames of a video from its first, or of a camera. Before each frame skip_frames others are left out.
 
-    Frames are resized (resize_param), cropped, mirrored. The end of a video is an error, whose line says so: a batch
-    that the frames do not fill is not given.
+    Frames are resized (resize_param), cropped, mirrored. The end of a video is an error; its message says so. The
+    last batch is dropped if it is not full.
 
     top[0]  transformed frames (batch_size of data_param, 3, H, W)
     top[1]  labels (batch_size,), all 0; may be left out

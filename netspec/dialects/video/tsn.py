@@ -63,7 +63,7 @@ GROUP, RGB, FLOW = "video_data_param", 0, 1
 WINDOWS = ("fix_crop", "multi_scale", "scale_ratios", "max_distort", "is_flow", "more_fix_crop")
 TRANSFORM = ("transform_param", *(f"transform_param.{name}" for name in WINDOWS))
 RATIOS = (1.0, 0.875, 0.75, 0.66)  # of the windows' sides to the image's shorter one, unless scale_ratios are given
-NEAR = 3  # a window whose side differs by less from crop_size has that side
+NEAR = 3  # a side of a window that differs by less from crop_size becomes crop_size
 CORNERS = ((0, 0), (0, 4), (4, 0), (4, 4), (2, 2))  # where fix_crop puts a window, in quarters of the room around it
 MORE_CORNERS = ((0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3))
 

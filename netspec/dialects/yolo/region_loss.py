@@ -22,7 +22,7 @@ OBJECT, CLASSES = 4, 5  # where they begin among the numbers of a box; x, y, wid
 
 
 class _DarknetLoss(Loss):
-    """Base of the losses: what each number of a map is to be moved by is told by ``_moves``."""
+    """Base of the losses. ``_moves`` returns by how much each number of a map should change."""
 
     group: str
     not_exported = "it is for training"
@@ -188,7 +188,7 @@ class Yolov3(_DarknetLoss):
         return moves
 
     def _like(self, like: Array) -> list[int]:
-        """Return which of ``mask`` a true box is for; the fork leaves out that of which the best one's index tells."""
+        """Return which anchors of ``mask`` a true box is for. Like the fork, leave out the index of the best one."""
         best = int(like.argmax()) if like.max() > 0 else -1
         first = [self.mask.index(best)] if best in self.mask else []
         left_out = first[0] if first else best
@@ -210,7 +210,7 @@ class Yolov3(_DarknetLoss):
         move[OBJECT] = -(1 - share[OBJECT]) * np.float32(p.object_scale if p.use_logic_gradient else 1)
         wanted, classes, eps = np.zeros(p.num_class, np.float32), share[CLASSES:], p.label_smooth_eps
         wanted[label] = 1
-        if move[CLASSES + label]:  # an earlier true box was for this anchor: its class stays beside
+        if move[CLASSES + label]:  # an earlier true box was for this anchor: its class is kept too
             step = p.class_scale * ((1 - eps) + eps / 2 - classes[label])
             move[CLASSES + label] = -step
         elif p.use_focal_loss:

@@ -198,7 +198,7 @@ class YoloDetectionOutput(_YoloOutput):
 
 @register("Yolov3DetectionOutput", "yolov3_detection_output_param")
 class Yolov3DetectionOutput(_YoloOutput):
-    """Turn YOLO v3's maps into detections: of each box every class whose probability, times the object's, is enough.
+    """Turn YOLO v3's maps into detections: classes of boxes with a sufficient class times object probability.
 
     Map i has the prior boxes that ``mask`` names in its i-th part; their ``biases`` count in pixels of an image of
     ``anchors_scale``[i] times the map's size.

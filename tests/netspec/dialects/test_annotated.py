@@ -295,7 +295,7 @@ def test_of_several_sizes_one_is_drawn_for_ten_batches(tmp_path: Path) -> None:
     seen = [batch_of(layer)[0].shape[2] for _ in range(80)]
     assert set(seen) == {6, 9}
     assert all(len(set(seen[i : i + 10])) == 1 for i in range(0, 80, 10))
-    with pytest.raises(SpecError, match="found 2 resize_param whose prob add up to 2, expected 1"):
+    with pytest.raises(SpecError, match="found 2 resize_param with a sum of prob of 2, expected 1"):
         reading(source, sizes.replace("0.5", "1"))
 
 
