@@ -1,1 +1,1 @@
-"""Ways to look at nets, trainings and their files without changing them."""
+"""Tools that inspect nets, trainings and their files without changing them."""

@@ -67,7 +67,8 @@ class EdgeMaps(ImageData):
 class Balanced(SigmoidCrossEntropyLoss):
     """Base of the two losses: the cross entropy of each image, balanced between edges and background.
 
-    Edges are weighted by the share of background pixels, and background pixels by the share of edges. Labels other than 1 and 0 do not count. The sum is divided by N only.
+    Edges are weighted by the share of background pixels, and background pixels by the share of edges. Labels other
+    than 1 and 0 do not count. The sum is divided by N only.
     """
 
     of_others: ClassVar[float]  # an additional weight of background pixels

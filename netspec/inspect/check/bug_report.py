@@ -1,4 +1,4 @@
-"""What a report of a fault needs: versions, the machine, and of each file its text and what ``netspec check`` says."""
+"""The contents of a bug report: versions, the machine, and each file's text and output of ``netspec check``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _LOG = re.compile(r"^[IWEF]\d{4,8} \d\d:\d\d:", re.M)
 
 
 def bug_report(paths: list[str]) -> str:
-    """Return the report as Markdown; of each path what it is, or why it cannot be read."""
+    """Return the report as Markdown. For each path it says what it is, or why it cannot be read."""
     parts = ["## Machine", *_block(_machine())]
     for path in paths:
         parts += ["", f"## {printable(path)}", *_about(Path(path))]
@@ -47,7 +47,7 @@ def _machine() -> Iterator[str]:
 
 
 def _about(path: Path) -> Iterator[str]:
-    """Yield what a file is, without its weights; of a large one little is read, of a pipe or a device nothing."""
+    """Yield a description of a file without its weights. Only the start of a large file is read, and no device."""
     try:
         size = path.stat().st_size
         if not path.is_file():
@@ -80,7 +80,7 @@ def _text(path: Path, text: str, size: int) -> Iterator[str]:
 
 
 def _checked(path: Path) -> Iterator[str]:
-    """Yield what ``netspec check`` says of a file, without opening data."""
+    """Yield the output of ``netspec check`` for a file, without opening data."""
     with log.silent(), redirect_stderr(StringIO()):
         found = check_file(path)
     faults = dict.fromkeys(str(fault) for part in found for fault in part.faults)

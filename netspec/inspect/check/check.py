@@ -1,9 +1,9 @@
-"""What a file builds: shapes, parameters, memory, multiply-adds; and all errors in it at once.
+"""Checks a net or solver: its shapes, parameters, memory and multiply-adds, and all of its errors at once.
 
-Whatever a training would refuse before its first iteration is found here, without writing anything and, unless asked,
-without opening data. Unknown fields of a text file are reported all at once with what is wrong elsewhere in it; of the
-layers that have them nothing more is said. Of other faults of its text the first is reported, of one layer's own
-settings too.
+It finds every fault that would stop a training before its first iteration. Nothing is written, and data is opened only
+if asked. All unknown fields are reported, together with the faults in other layers; a layer with an unknown field is
+not checked further. Of syntax errors in the text, and of faults in the settings of one layer, only the first is
+reported.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from netspec.solver.options import choose_device
 
 @dataclass
 class Checked:
-    """One net of the file, named by ``label``; ``advice`` lists what is legal but likely wrong.
+    """The result for one net of the file, named by ``label``. ``advice`` lists what is legal but likely wrong.
 
-    A solver comes first: its label is its path, and it has no net.
+    The result for a solver itself comes first. Its label is the path of the file, and it has no net.
     """
 
     label: str
@@ -52,16 +52,16 @@ ON_META = BuildOptions("meta", open_data=False, passes=())  # shapes only, and n
 def check_file(
     path: str | Path, phase: PhaseValue = TEST, options: BuildOptions = ON_META, weights: str | None = None
 ) -> list[Checked]:
-    """Check a net for a phase, level and stages; or a solver and all its nets, where the training net gets these.
+    """Check a net for a phase, level and stages; or a solver and all its nets (level and stages: the training net's).
 
-    Of a .caffemodel, the net inside it is checked (:func:`netspec.net.build.recover_net`).
+    For a .caffemodel, the net inside it is checked (:func:`netspec.net.build.recover_net`).
 
-    ``weights``, paths separated by commas, are what a training would begin with, in the place of a solver's own. A file
-    that cannot be read comes alone, without a net. On another device than "meta" a net gets memory, so that
-    :func:`netspec.inspect.check.plan.plan_text` can tell how it runs.
+    ``weights`` are paths separated by commas, for the start of a training; they replace those of the solver. A file
+    that cannot be read gives one result without a net. On a device other than "meta" a net gets memory, as
+    :func:`netspec.inspect.check.plan.plan_text` needs it.
     """
     given = [weights] if weights else []
-    if Path(path).suffix == ".caffemodel" or is_net_binary(path):  # a damaged one too: its reader tells
+    if Path(path).suffix == ".caffemodel" or is_net_binary(path):  # also a damaged one: its reader reports the damage
         return [_check_weights(path, options)]
     unknown: list[SpecError] = []
     try:
@@ -89,7 +89,7 @@ def _unknown_layers(net: NetParameter, source: SourceMap, options: BuildOptions)
 
 
 def _reach(faults: Sequence[SpecError]) -> tuple[int, int]:
-    """Return how far into a file a reader came; the file is a net or a solver, whichever is read further."""
+    """Return how far a file could be read. It is taken for a net or a solver, whichever can be read further."""
     where = faults[-1].where
     return (where.line, where.column) if where else (0, 0)
 

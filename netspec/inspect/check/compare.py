@@ -1,4 +1,4 @@
-"""What differs between two nets, two solvers or two files of weights: by meaning, not by text. No torch."""
+"""Compares two nets, two solvers or two files of weights by their meaning, not by their text. Does not use torch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NETS = ("net", "net_param", "train_net", "train_net_param", "test_net", "test_n
 
 
 def compare_files(first: str | Path, second: str | Path, tolerance: float = 0.0) -> Differences:
-    """Yield what differs between two nets, two solvers or two files of weights.
+    """Yield the differences between two nets, two solvers or two files of weights.
 
     ``tolerance`` is for the values of weights. Raises SpecError for files that cannot be read or are of two kinds.
     """
@@ -35,7 +35,7 @@ def compare_files(first: str | Path, second: str | Path, tolerance: float = 0.0)
 
 
 def _read(path: str | Path) -> tuple[Any, ...]:
-    """Return the kind of a file; of a net and a solver also the message and its places."""
+    """Return the kind of a file, and for a net or a solver also the message and its places."""
     named = Path(path).suffix in (".caffemodel", ".h5")  # a damaged one too: its own reader says what is wrong
     if Path(path).is_file() and (named or is_net_binary(path) or head_of(path).startswith(HDF5)):
         return (WEIGHTS,)
@@ -49,7 +49,7 @@ def _read(path: str | Path) -> tuple[Any, ...]:
 
 
 def _compare_solvers(first: tuple[Any, Place], second: tuple[Any, Place]) -> Differences:
-    """Yield other settings, and what differs in the nets; where these lie means nothing, if they can be read."""
+    """Yield the differences between the settings, and between the nets. Paths of nets that can be read do not count."""
     (one, there), (other, here) = first, second
     yield from differences(one, other, here, there, _NETS)
     faults: list[SpecError] = []

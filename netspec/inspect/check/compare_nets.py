@@ -1,4 +1,4 @@
-"""Two nets: their layers by name, what each reads, what it is set to, with whom it shares parameters."""
+"""Compares two nets layer by layer: the blobs that each reads, its settings, and its shared parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from netspec.proto.source_map import SourceMap
 _WIRING = ("name", "bottom", "top", "param", "blobs", "phase", "include", "exclude", "propagate_down", "loss_weight")
 _NOT_THE_NET = ("layer", "layers", "state", "input", "input_shape", "input_dim")
 LOSS = "Loss"  # the end of the names of types with a default loss weight of 1
-Key = tuple[str, int]  # a layer's name, and which of the layers of that name it is
+Key = tuple[str, int]  # a layer's name, and its index among the layers of that name
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class _Seen:
 
 
 def compare_nets(first: tuple[NetParameter, SourceMap], second: tuple[NetParameter, SourceMap]) -> Differences:
-    """Yield what differs in phase TRAIN, in phase TEST, or in both."""
+    """Yield the differences in phase TRAIN, in phase TEST, or in both."""
     by_phase = []
     for phase in (TRAIN, TEST):
         one, other = ((with_state(net, phase), source) for net, source in (first, second))
@@ -100,7 +100,7 @@ def _alike(old: _Seen, i: int, new: _Seen, j: int) -> bool:
 
 
 def _layers(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
-    """Yield what differs between two layers that belong together."""
+    """Yield the differences between two matched layers."""
     one, other = old.plan.net.layer[i], new.plan.net.layer[j]
     there, here = old.plan.source.layers[i], new.plan.source.layers[j]
     found = [
@@ -133,7 +133,7 @@ def _own(old: Node, new: Node, one: Any, other: Any, here: Any, there: Any) -> D
 
 
 def _reads(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
-    """Yield other inputs: those that another layer, or another of its tops, has made."""
+    """Yield the bottoms that come from another layer, or from another top of it."""
     before, after = old.plan.nodes[i], new.plan.nodes[j]
     there, here = old.plan.source.layers[i], new.plan.source.layers[j]
     if len(before.bottoms) != len(after.bottoms):
@@ -184,7 +184,7 @@ def _shared(owner: tuple[Key, int] | None) -> str:
 
 
 def _rules(first: tuple[NetParameter, SourceMap], second: tuple[NetParameter, SourceMap]) -> Differences:
-    """Yield other rules about levels and stages: phases are looked at by what they give."""
+    """Yield changed rules about levels and stages. Rules about phases show in the layers of each phase."""
     old = {key: i for i, key in enumerate(_keys(layer.name for layer in first[0].layer))}
     for j, key in enumerate(_keys(layer.name for layer in second[0].layer)):
         i, layer = old.get(key), second[0].layer[j]

@@ -1,4 +1,4 @@
-"""Two files of weights: which layers' numbers differ, and by how much."""
+"""Compares two files of weights: the layers with different values, and by how much they differ."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Weights = dict[str, tuple[np.ndarray, ...]]
 def compare_weights(first: str | Path, second: str | Path, tolerance: float = 0.0) -> Differences:
     """Yield the blobs that differ by more than ``tolerance``, and the blobs that only one file has.
 
-    Layers belong together by name. Shapes that differ only in axes of size 1 in front are equal. Raises SpecError for
+    Layers are matched by name. Shapes that differ only in leading axes of size 1 are equal. Raises SpecError for
     a file that is neither a .caffemodel nor a .caffemodel.h5.
     """
     old, new = read_weights(first), read_weights(second)

@@ -1,4 +1,4 @@
-"""What differs between two messages of one kind, field by field: an absent field counts as its default."""
+"""Compares two messages of the same type field by field. An absent field counts as its default."""
 
 from __future__ import annotations
 
@@ -36,9 +36,10 @@ ABSENT = "absent"
 
 @dataclass(frozen=True)
 class Difference:
-    """What is otherwise in the second file than in the first, as a line of text.
+    """One difference between two files, as a line of text.
 
-    ``where`` is the place, ``other`` the place in the first file where there is one in both.
+    ``where`` is its place in the second file, or in the first if it has none there. ``other`` is the place in the first
+    file, if there is one in both.
     """
 
     where: Where
@@ -58,10 +59,10 @@ Differences = Iterator[Difference]
 
 
 def differences(first: Any, second: Any, here: Place, there: Place, ignored: Collection[str] = ()) -> Differences:
-    """Yield what ``second`` has otherwise than ``first``; ``here`` is the place of ``second``, ``there`` of ``first``.
+    """Yield the differences of ``second`` from ``first``; ``here`` is the place of ``second``, ``there`` of ``first``.
 
-    The fields ``ignored`` are those of the outermost message. Spellings that mean the same are equal: ``kernel_h`` and
-    ``kernel_w`` for ``kernel_size``, one number for several equal ones, ``concat_dim`` for ``axis``.
+    The fields ``ignored`` are fields of the outermost message. Spellings with the same meaning are equal: ``kernel_h``
+    and ``kernel_w`` for ``kernel_size``, one number for several equal ones, ``concat_dim`` for ``axis``.
     """
     done = set(ignored)
     fields = fields_of(first.DESCRIPTOR)
@@ -110,7 +111,7 @@ def _in_field(first: Any, second: Any, here: Place, there: Place, field: Field) 
 
 
 def child(place: Place, name: str, index: int = 0) -> Place:
-    """Return the place of a message in a field, or that of the message around it where it is not there."""
+    """Return the place of a message in a field, or the place of the outer message if it is absent."""
     children = place.fields.get(name, ())
     return children[index] if index < len(children) else Place(place.where)
 

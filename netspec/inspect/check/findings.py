@@ -1,7 +1,8 @@
-"""What rules find in a file: legal, but likely a mistake. Rules have names, so that a comment can silence them.
+"""Rules that find likely mistakes in a file that is legal. Each rule has a name, so that a comment can silence it.
 
-``# lint: ignore=NAME`` (several separated by commas) holds for its line; alone on a line, for the next one. On the line
-where a layer begins it holds for the whole layer, on the first line of a file for what concerns the file as a whole.
+The comment ``# lint: ignore=NAME`` (several names with commas) applies to its line, or to the next line if it stands
+alone. On the first line of a layer it applies to the whole layer. On the first line of a file it applies to findings
+about the whole file.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ UNKNOWN_RULE = "unknown-rule"
 
 _COMMENT = re.compile(r"#\s*lint:\s*ignore\s*=\s*([\w-]+(?:\s*,\s*[\w-]+)*)")
 
-Said = Iterator[tuple[Where, str]]  # where, and what was found with what to do
+Said = Iterator[tuple[Where, str]]  # the place, and the message: what was found and what to do
 F = TypeVar("F", bound=Callable[..., Said])
 
 
@@ -40,7 +41,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule: its name, why it is there, and how it looks.
+    """A rule: its name, its reason, and the function that applies it.
 
     ``looks_at`` is TEXT (the whole net, all phases), PLAN (the net of one phase, shapes unknown), NET (that net,
     built), SETTINGS (a solver alone) or SOLVER (a solver with its built nets, the training net first).
@@ -56,7 +57,7 @@ RULES: dict[str, Rule] = {}
 
 
 def rule(name: str, looks_at: str) -> Callable[[F], F]:
-    """Decorator: make a generator of findings a rule; its docstring says why the rule is there."""
+    """Decorator that registers a generator of findings as a rule. Its docstring is the reason for the rule."""
 
     def add(find: F) -> F:
         assert name not in RULES, f"two rules are called {name}"
@@ -67,7 +68,7 @@ def rule(name: str, looks_at: str) -> Callable[[F], F]:
 
 
 def findings(looks_at: str, *subject: object) -> list[Finding]:
-    """Return what all rules of one kind find."""
+    """Return the findings of all rules for ``looks_at``."""
     return [
         Finding(each.name, where, message)
         for each in RULES.values()
@@ -77,7 +78,7 @@ def findings(looks_at: str, *subject: object) -> list[Finding]:
 
 
 def said_once(found: Iterable[Finding]) -> list[str]:
-    """Return a line for each finding; of equal ones in other places of a file the first has the lines of all."""
+    """Return a line for each finding. Equal findings in one file become one, which lists the lines of all."""
     places: dict[tuple[str, str, str], list[Finding]] = {}
     for each in found:
         alike = places.setdefault((each.where.file, each.rule, each.message), [])
@@ -94,7 +95,7 @@ def said_once(found: Iterable[Finding]) -> list[str]:
 def said_as_json(faults: Iterable[SpecError], found: Iterable[Finding]) -> dict[str, list[dict[str, Any]]]:
     """Return ``faults`` and ``warnings``, each a list of file, line, column, layer, type, message; and the rule.
 
-    Lines and columns begin at 1; 0 is a place that is not known.
+    Lines and columns start at 1; 0 means unknown.
     """
     return {
         "faults": [{**_place(fault.where or Where("")), "message": fault.message} for fault in faults],
@@ -107,7 +108,7 @@ def _place(where: Where) -> dict[str, Any]:
 
 
 def not_ignored(found: Iterable[Finding], file: str, layers: Sequence[Place] = ()) -> list[Finding]:
-    """Return the findings without those that a comment of the file silences, and those about such comments.
+    """Return the findings that no comment in the file silences, and findings about such comments.
 
     ``layers`` are the places of the net's layers.
     """

@@ -1,4 +1,4 @@
-"""``netspec lint``: what the rules find in a file, in all its phases."""
+"""``netspec lint``: applies the rules to a file in all its phases."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from netspec.proto.schema import TEST, TRAIN, PhaseValue
 
 @dataclass
 class Linted:
-    """What is found in a file.
+    """The findings in a file.
 
-    ``faults`` keep a net from being built. ``unknown`` ask for shapes; until they are given, rules that need them are
-    not applied. A file that is not ``readable`` has faults only. ``nets`` are what was built.
+    ``faults`` are errors that prevent a net from being built. ``unknown`` ask for shapes; rules that need these shapes
+    were not applied. A file that is not ``readable`` has only faults. ``nets`` are the nets that were built.
     """
 
     found: list[Finding] = field(default_factory=list)
@@ -31,7 +31,7 @@ class Linted:
 def lint_file(path: str | Path, options: BuildOptions = ON_META) -> Linted:
     """Apply the rules to a net in both phases, or to a solver and its nets; arguments as for check_file.
 
-    A phase for which a net has no data layer is left out where the other has one.
+    A phase without a data layer is skipped if the other phase has one.
     """
 
     def check(phase: PhaseValue) -> list[Checked]:
@@ -52,6 +52,6 @@ def lint_file(path: str | Path, options: BuildOptions = ON_META) -> Linted:
 
 
 def _lacks_data(part: Checked) -> bool:
-    """Say whether each layer that is left in a phase reads what another makes."""
+    """Return whether every layer of a phase reads the top of another layer."""
     nodes = part.net.plan.nodes if part.net else ()
     return bool(nodes) and all(node.bottoms for node in nodes)

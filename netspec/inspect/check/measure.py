@@ -1,4 +1,4 @@
-"""Runs of a whole net that only measure: ``caffe test`` and ``caffe time`` (Caffe: tools/caffe.cpp)."""
+"""Runs a net to measure it: ``caffe test`` and ``caffe time`` (Caffe: tools/caffe.cpp)."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def time_forward(net: Net, iterations: int) -> None:
 
 
 def _milliseconds(iterations: int, what: str, run: Callable[[], object]) -> float:
-    """Call a function so often; log the time of each call and return that of all."""
+    """Call a function ``iterations`` times. Log the time of each call, and return the total."""
     info("caffe.cpp:365", "*** Benchmark begins ***")
     info("caffe.cpp:366", f"Testing for {iterations} iterations.")
     began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""The rules for nets. Their docstrings say why they are there; ``netspec lint --rules`` prints them."""
+"""The rules for nets. Their docstrings give the reasons; ``netspec lint --rules`` prints them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ AXES = {  # how many axes the bottoms of a layer may have in Caffe, where it has
     "SigmoidCrossEntropyLoss": (1, 32),
 }
 STOCHASTIC = 2  # caffe.proto: PoolingParameter.PoolMethod
-BEFORE_NET = ("mean_value", "mean_file", "scale")  # of transform_param: what changes all images alike
+BEFORE_NET = ("mean_value", "mean_file", "scale")  # fields of transform_param that change all images in the same way
 
 
 @rule("transform-differs", TEXT)
@@ -248,7 +248,7 @@ def _loss_weights(plan: Plan) -> list[list[float]]:
 
 
 def _is_training(plan: Plan) -> bool:
-    """Say whether something is learned: phase TRAIN, and a loss."""
+    """Return whether the net trains: it is in phase TRAIN and has a loss."""
     classes = (layer_class(node.type) for node in plan.nodes)
     has_loss = any(cls is not None and cls.is_loss for cls in classes) or any(map(any, _loss_weights(plan)))
     return plan.net.state.phase == TRAIN and has_loss

@@ -1,4 +1,4 @@
-"""How a net of phase TEST runs without gradients, as text: which layers run together, by which kernels."""
+"""Shows how a net in phase TEST runs without gradients: which layers run together, and with which kernels."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BFLOAT16 = {True: "yes", False: "no", None: "unknown"}
 
 
 def plan_text(net: Net) -> str:
-    """Return one line per step, and what the kinds of steps mean; data is not opened.
+    """Return one line per step, and an explanation of the kinds of steps. Data is not opened.
 
     The net must have been built with memory for its weights.
     """

@@ -1,4 +1,4 @@
-"""The rules for solvers. Their docstrings say why they are there; ``netspec lint --rules`` prints them."""
+"""The rules for solvers. Their docstrings give the reasons; ``netspec lint --rules`` prints them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is in a database: counts, labels, statistics of the values, and what is wrong."""
+"""Examines a database: counts, labels, statistics of the values, and faults."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from netspec.data.records import Record, Records
 from netspec.files.limits import amount
 
 Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm: wraps an iterable
-_MOST_FAULTS = 100  # that are kept by name; all are counted
+_MOST_FAULTS = 100  # that are kept with their keys; all are counted
 MOST_LABELS = 8  # that are listed one by one
-_SORTED = 100  # so many records in the order of their labels are not by chance
+_SORTED = 100  # with so many records, the order of labels is no coincidence
 
 
 @dataclass
@@ -62,7 +62,7 @@ class Channels:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a record: its number and its key, and one line."""
+    """A faulty record: its number, its key, and a line that describes the fault."""
 
     number: int
     key: str
@@ -71,10 +71,10 @@ class Fault:
 
 @dataclass
 class Survey:
-    """What :func:`survey` found.
+    """The result of :func:`survey`.
 
-    ``records`` were looked at of ``total``. ``forms`` counts records by storage and shape, ``labels`` by label.
-    ``faults`` are records that a data layer would refuse; ``notes`` say what is worth a look.
+    ``records`` of ``total`` records were read. ``forms`` counts records by storage and shape, ``labels`` by label.
+    ``faults`` are records that a data layer would refuse. ``notes`` mention anything else that is unusual.
     """
 
     total: int
@@ -90,7 +90,7 @@ class Survey:
 
 
 def survey(records: Records, numbers: Sequence[int], progress: Progress = iter) -> Survey:
-    """Look at the records of these numbers."""
+    """Examine the records with these numbers."""
     found = Survey(len(records))
     watch = _Watch(found)
     for number in progress(numbers):
@@ -112,7 +112,7 @@ def survey(records: Records, numbers: Sequence[int], progress: Progress = iter) 
 
 
 class _Watch:
-    """Remembers what later records are compared with."""
+    """Keeps what is needed to compare later records with earlier ones."""
 
     def __init__(self, found: Survey) -> None:
         self._found = found
@@ -122,7 +122,7 @@ class _Watch:
         self._flat = 0
 
     def fault(self, record: Record) -> str:
-        """Return what is wrong with a record that can be read."""
+        """Return the fault of a record that can be read; "" if it has none."""
         values = record.values
         assert values is not None
         if self._first is None:
@@ -136,7 +136,7 @@ class _Watch:
         return ""
 
     def see(self, record: Record, sound: bool) -> None:
-        """Count a record; of ``sound`` ones the values too."""
+        """Count a record. If it is ``sound``, also add its values to the statistics."""
         values = record.values
         if values is None:
             self._found.forms[record.kind] += 1
@@ -150,7 +150,7 @@ class _Watch:
         self._labels.append(np.nan if record.label is None else record.label)
 
     def notes(self) -> Iterable[str]:
-        """Yield what is worth a look."""
+        """Yield notes about anything unusual."""
         labels = np.array(self._labels)
         _, place, counts = np.unique(np.array(self._hashes, np.uint64), return_inverse=True, return_counts=True)
         if (twice := int((counts - 1).sum())) > 0:
@@ -170,7 +170,7 @@ class _Watch:
 
 
 def as_json(found: Survey) -> dict[str, Any]:
-    """Return the survey for programs."""
+    """Return the survey as a dictionary for JSON."""
     channels = found.channels
     return {
         "records": found.total,
@@ -192,7 +192,7 @@ def as_json(found: Survey) -> dict[str, Any]:
 
 
 def as_lines(found: Survey, name: str) -> list[str]:
-    """Return the survey for people."""
+    """Return the survey as lines of text."""
     looked = "" if found.records == found.total else f", looked at {found.records:,} spread over them"
     lines = [f"{name}: {found.total:,} records{looked}, {amount(found.size)} of values"]
     lines += [f"  {count:>9,}  {form}" for form, count in found.forms.most_common(10)]

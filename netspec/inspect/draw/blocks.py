@@ -1,4 +1,4 @@
-"""Parts of a net that repeat one after the other, such as the blocks of a residual net."""
+"""Finds repeated parts of a net, such as the blocks of a residual net."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 
 from netspec.inspect.draw.diagram import Diagram, Output
 
-LEAST_SAVED = 4  # boxes that folding must spare
+LEAST_SAVED = 4  # boxes that folding a block must save
 LONGEST = 300  # boxes of a block
 
 
 @dataclass(frozen=True)
 class Block:
-    """``copies`` times the ``length`` boxes from ``first`` on, each copy fed by one blob and giving one.
+    """A repeated part: ``copies`` copies of ``length`` boxes, from box ``first`` on. Each has one input and one output.
 
-    ``entry`` is what the first copy reads; ``exit`` is a box of the first copy and its top: what each copy gives.
+    ``entry`` is the output that the first copy reads. ``exit`` is the output of the first copy: a box and its top.
     """
 
     first: int
@@ -31,12 +31,12 @@ class Block:
 
     @property
     def last(self) -> Output:
-        """What the last copy gives."""
+        """The output of the last copy."""
         return self.exit[0] + self.length * (self.copies - 1), self.exit[1]
 
 
 def find_blocks(diagram: Diagram) -> list[Block]:
-    """Return what repeats, in order; none overlap. Of those that begin at a box the one that spares most is taken."""
+    """Return the repeated parts in order, without overlaps. Of several at one box, the one that saves most is used."""
     kinds: dict[object, int] = {}
     same = [
         kinds.setdefault((box.type, box.same, box.shapes, bool(box.owner), box.work), len(kinds))
@@ -64,7 +64,7 @@ def find_blocks(diagram: Diagram) -> list[Block]:
 
 
 def _copies(diagram: Diagram, same: Sequence[int], first: int, length: int) -> int:
-    """Return how often the ``length`` boxes from ``first`` on are there by their kinds alone, whatever their wires."""
+    """Return how often the ``length`` boxes from ``first`` on repeat, by their kinds only, not by their wires."""
     second = first + length
     if same[first] != same[second] or not all(first <= source < second for source, _ in diagram.reads[second]):
         return 1  # a copy begins with what the copy before gives
@@ -75,7 +75,7 @@ def _copies(diagram: Diagram, same: Sequence[int], first: int, length: int) -> i
 
 
 def _longest(diagram: Diagram, readers: dict[Output, list[int]], first: int, length: int, copies: int) -> Block | None:
-    """Return the block with as many copies as are wired alike, one behind the other."""
+    """Return the block with as many consecutive copies as have the same wires."""
     within = range(first, first + length)
     entries = {output for k in within for output in diagram.reads[k] if output[0] < first}
     given = {
@@ -96,7 +96,7 @@ def _longest(diagram: Diagram, readers: dict[Output, list[int]], first: int, len
 
 
 def _is_alike(diagram: Diagram, readers: dict[Output, list[int]], block: Block, copy: int) -> bool:
-    """Say whether a copy is wired as the first one, with the exit of the copy before it as its entry."""
+    """Return whether a copy has the same wires as the first one, and reads the exit of the copy before it."""
     first, length, entry, exit_ = block.first, block.length, block.entry, block.exit
     shift = copy * length
     before = (exit_[0] + shift - length, exit_[1])
@@ -109,5 +109,5 @@ def _is_alike(diagram: Diagram, readers: dict[Output, list[int]], block: Block, 
             leaves = any(reader >= end for reader in readers.get((k + shift, j), ()))
             if leaves != ((k, j) == exit_) and not ((k, j) == exit_ and not readers.get((k + shift, j))):
                 return False
-    # What the copy before gives must be read by this copy only.
+    # Only this copy may read the output of the copy before it.
     return all(reader < first + length + shift for reader in readers.get(before, ()))

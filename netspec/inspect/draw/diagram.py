@@ -1,4 +1,4 @@
-"""What a picture of a net shows: its layers as boxes, its blobs as wires, with shapes and costs.
+"""Works out what a picture of a net shows: layers as boxes, blobs as wires, with shapes and costs.
 
 Both phases are in one diagram. A layer that computes in place is in the box of the layer that made
 the blob, if no other layer reads the blob before.
@@ -36,7 +36,7 @@ USUAL = (("group", "1"), ("dilation", "1"))
 
 
 def settings_text(layer: Any) -> str:
-    """Return what the prototxt says of a layer's own settings; messages in them (fillers, lists of shapes) are not."""
+    """Return the layer's own settings in the prototxt, without inner messages (fillers, lists of shapes)."""
     words: list[str] = []
     for name, field in fields_of(layer.DESCRIPTOR).items():
         if name.endswith(OWN) and name not in COMMON and not field.repeated and field.present(layer):
@@ -75,7 +75,7 @@ def _value(field: Any, value: Any) -> str:
     return separator.join(each if isinstance(each, str) else scalar_text(field, each) for each in values)
 
 
-Output = tuple[int, int]  # a box and which of its tops
+Output = tuple[int, int]  # a box, and the index of its top
 
 
 @dataclass(frozen=True)
@@ -116,9 +116,9 @@ class Box:
 
 @dataclass(frozen=True)
 class Diagram:
-    """Boxes in the net's order, and the outputs that each reads, in the order of its bottoms.
+    """Boxes in the order of the net, and the outputs that each reads, in the order of its bottoms.
 
-    ``faults`` are what keeps parts of the net from being built: shapes and costs are missing there.
+    ``faults`` are the errors in parts of the net that could not be built. Shapes and costs are missing there.
     """
 
     name: str
@@ -130,7 +130,7 @@ class Diagram:
 
 @dataclass
 class _Seen:
-    """A net in one phase: ``numbers[i]`` is which layer of the file layer ``i`` of the plan is."""
+    """A net in one phase. Layer ``i`` of the plan is layer ``numbers[i]`` of the file."""
 
     phase: str
     plan: Plan
@@ -141,7 +141,7 @@ class _Seen:
 def diagram_of(
     net: NetParameter, source: SourceMap, phases: Sequence[PhaseValue], options: BuildOptions | None = None
 ) -> Diagram:
-    """Return the diagram of an upgraded net in the given phases; nothing is written, and no memory is used."""
+    """Return the diagram of an upgraded net in the given phases. No file is written; blobs get no memory."""
     faults: list[SpecError] = []
     options = replace(options or BuildOptions(open_data=False), device="meta", seed=0, write_files=False, passes=())
     with log.silent():
@@ -177,7 +177,7 @@ def _look(net: NetParameter, source: SourceMap, phase: str, options: BuildOption
 
 
 def _merged(net: NetParameter, source: SourceMap, seen: Sequence[_Seen], faults: tuple[SpecError, ...]) -> Diagram:
-    """Return the phases in one diagram."""
+    """Return one diagram of all phases."""
     phases_of: dict[int, list[str]] = {}
     boxed: set[int] = set()  # layers that have a box of their own in some phase
     for one in seen:
@@ -228,9 +228,9 @@ def _merged(net: NetParameter, source: SourceMap, seen: Sequence[_Seen], faults:
 
 
 def _alone(plan: Plan) -> list[bool]:
-    """Say of each layer whether it is a box of its own.
+    """Return for each layer whether it has a box of its own.
 
-    It is not where it computes in place what only it reads, and its bottom is the one top of its maker.
+    It has none if it computes in place, is the only reader of its bottom, and its bottom is the only top of its layer.
     """
     readers = [0] * len(plan.blobs)
     maker: dict[int, int] = {}
@@ -248,7 +248,7 @@ def _alone(plan: Plan) -> list[bool]:
 
 
 def _with_costs(box: Box, numbers: Sequence[int], seen: Sequence[_Seen], tops: int) -> Box:
-    """Return the box with shapes, weights and work; where the phases differ, the work is that of the first."""
+    """Return the box with shapes, weights and work. If phases differ, the work is that of the first."""
     shapes: list[list[Shape]] = [[] for _ in range(tops)]
     work, weights, owner = 0, 0, ""
     for one in reversed(seen):
@@ -283,7 +283,7 @@ def _one_shape(sizes: Sequence[object]) -> str:
 
 
 def kind_of(type_name: str) -> str:
-    """Return the room of netspec.layers that has a type, e.g. "vision.convolution"; "dialect"; or empty."""
+    """Return the module of netspec.layers that defines a type, e.g. "vision.convolution"; "dialect"; or ""."""
     cls = layer_class(type_name)
     if cls is None:
         return ""

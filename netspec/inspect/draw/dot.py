@@ -34,7 +34,7 @@ BARE_TABLE = '<TABLE BORDER="0" CELLBORDER="0" CELLSPACING="0" CELLPADDING="0">'
 
 
 def dot_of(diagram: Diagram, unfolded: bool = False) -> str:
-    """Return the text of a graph. Blocks that repeat are drawn once, in a frame, or as often as they stand there.
+    """Return the text of a graph. Repeated blocks are drawn once, in a frame, or in full if ``unfolded``.
 
     The element of box ``k`` in an SVG has the class ``layer-k``.
     """
@@ -60,7 +60,7 @@ def dot_of(diagram: Diagram, unfolded: bool = False) -> str:
 
 
 def _nodes(diagram: Diagram) -> list[str]:
-    """Return the name of each box's node, in quotes: that of the layer, with a number where several have it."""
+    """Return the name of each box's node, in quotes: the name of the layer, with a number if it repeats."""
     names: dict[str, None] = {}
     for box in diagram.boxes:
         name, count = printable(box.name), 1
@@ -77,7 +77,7 @@ def _first_copy(block: Block, k: int) -> int:
 
 
 def _clusters(diagram: Diagram, nodes: Sequence[str], blocks: Iterable[Block], unfolded: bool) -> Iterator[str]:
-    """Yield a frame around each block, with what it stands for."""
+    """Yield a frame around each block, with the number of copies."""
     for number, block in enumerate(blocks):
         first, last = (diagram.boxes[k].name for k in (block.first, block.boxes.stop - block.length))
         title = _text(f"{block.copies} × the same: {printable(first)} … {printable(last)}", SMALL, "#243b53")
@@ -96,7 +96,7 @@ def _ties(diagram: Diagram, nodes: Sequence[str], shown: Sequence[int]) -> Itera
 
 
 def _header(diagram: Diagram) -> str:
-    """Return the title, the sums and the legend."""
+    """Return the title, the totals and the legend."""
     layers = sum(1 + len(box.attached) for box in diagram.boxes)
     sums = [f"{layers} layers"]
     if weights := sum(box.weights for box in diagram.boxes):
@@ -132,7 +132,7 @@ def _table(diagram: Diagram, k: int, most: int) -> str:
 
 
 def _lines(box: Box) -> Iterator[str]:
-    """Yield what stands in a box, from top to bottom."""
+    """Yield the lines of text in a box, from top to bottom."""
     badges = "".join(f" {_badge(phase)}" for phase in box.phases)
     yield _text(shortened(printable(box.name)), NAME, INK, bold=True) + badges
     yield _text(shortened(printable(" ".join(filter(None, (box.type, box.settings))))), SMALL, PALE)
@@ -145,7 +145,7 @@ def _lines(box: Box) -> Iterator[str]:
 
 
 def _tops(diagram: Diagram, k: int) -> list[str]:
-    """Return what stands below a box: the shape of each top, and its name where that is not the layer's."""
+    """Return the text for each top below a box: its shape, and its name if it is not the layer's."""
     box, tops = diagram.boxes[k], diagram.tops[k]
     shapes = [*box.shapes, *[""] * (len(tops) - len(box.shapes))]
     named = [printable(top) if top != box.name or len(tops) > 1 else "" for top in tops]
@@ -189,7 +189,7 @@ def _text(text: str, size: int, color: str, bold: bool = False) -> str:
 
 
 def color_of(kind: str) -> tuple[str, str]:
-    """Return what a kind of layers is called, and its color."""
+    """Return the name of a kind of layers, and its color."""
     return next(COLORS[room] for room in COLORS if not room or kind == room or kind.startswith(f"{room}."))
 
 
@@ -202,5 +202,5 @@ def amount_text(number: int) -> str:
 
 
 def shortened(text: str, most: int = LONGEST) -> str:
-    """Return a text of at most ``most`` characters: its middle is left out where it must be."""
+    """Return a text of at most ``most`` characters. The middle of a longer text is left out."""
     return text if len(text) <= most else f"{text[: most // 2]}…{text[len(text) - most // 2 + 1 :]}"

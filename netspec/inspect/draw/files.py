@@ -1,4 +1,4 @@
-"""From a prototxt to a file with its picture."""
+"""Writes the picture of a net to a file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.nets import solver_nets
 
-MANY = 5000  # boxes; so many are drawn in half a minute
+MANY = 5000  # boxes, which take about half a minute to draw
 
 
 def write_picture(
@@ -28,8 +28,8 @@ def write_picture(
 ) -> Diagram:
     """Draw the net of a file, or the training net of a solver, as SVG, PNG or HTML by the ending of ``out``.
 
-    Of a .caffemodel the net inside it is drawn. Returns what was drawn; its faults keep parts of the net from being
-    built: the picture has no shapes there. Raises SpecError for a file that cannot be read, or without Graphviz.
+    For a .caffemodel, the net inside it is drawn. Returns the diagram. Its faults are the errors in parts that could
+    not be built; the picture has no shapes there. Raises SpecError for a file that cannot be read, or without Graphviz.
     """
     diagram = diagram_of(*_net_of(path, options), phases, options)
     if len(diagram.boxes) > MANY:

@@ -1,6 +1,6 @@
-"""Graphviz as a program: it lays out a graph and draws it as SVG or PNG.
+"""Runs Graphviz, which lays out a graph and draws it as SVG or PNG.
 
-The package graphviz-pure brings it; a ``dot`` that is installed does as well.
+The package graphviz-pure contains it. An installed ``dot`` works as well.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ import sysconfig
 
 from netspec.errors import SpecError
 
-PNG_DPI = 144  # of a picture whose text has 10 points
+PNG_DPI = 144  # for text of 10 points
 
 
 def render(text: str, kind: str) -> bytes:
     """Return the picture of a graph in DOT, of a kind that Graphviz has, such as "svg", "png" or "pdf".
 
-    Raises SpecError where there is no Graphviz, or none that can draw this graph as this kind.
+    Raises SpecError if Graphviz is missing, or cannot draw this graph as this kind.
     """
     scripts = sysconfig.get_path("scripts")
     brought = shutil.which("graphviz-pure", path=scripts) or shutil.which("graphviz-pure")

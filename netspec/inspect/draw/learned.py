@@ -73,7 +73,7 @@ def maps_figure(maps: np.ndarray, image: np.ndarray, title: str) -> Figure:
 
 
 def saliency_figure(images: Sequence[np.ndarray], maps: Sequence[np.ndarray], title: str) -> Figure:
-    """Draw for each image (H, W, 3) BGR or (H, W), uint8, its saliency (h, w): image, map, and both together."""
+    """Draw the saliency (h, w) of each image (H, W, 3) BGR or (H, W), uint8: the image, the map, and both together."""
     with matplotlib.rc_context(STYLE):
         ratio = images[0].shape[0] / images[0].shape[1]
         lines = textwrap.wrap(title, 110)
@@ -107,9 +107,9 @@ def embedding_figure(
     labels: Sequence[float | None] | None = None,
     images: Mapping[int, np.ndarray] | None = None,
 ) -> Figure:
-    """Draw points (N, 2), those with an image (BGR or gray, uint8) as that where there is room.
+    """Draw points (N, 2). Points with an image (BGR or gray, uint8) are drawn as the image if there is room.
 
-    Colors are those of ``labels``; without, they go by the points' order.
+    Colors show the ``labels``, or without them the order of the points.
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, WIDTH * 0.86), layout="constrained")
@@ -230,7 +230,7 @@ def _point_colors(
 def _put_images(
     axis: Axes, points: np.ndarray, colors: Sequence[tuple[float, ...] | str], images: Mapping[int, np.ndarray]
 ) -> None:
-    """Put images at their points, one after the other, where none lies yet."""
+    """Put images at their points, one after the other, without overlaps."""
     places = axis.transData.transform(points) / axis.figure.dpi  # inches
     taken: list[tuple[np.ndarray, np.ndarray]] = []  # middles and sizes
     for index in _spread_order(places, list(images)):
@@ -250,7 +250,7 @@ def _put_images(
 
 
 def _spread_order(places: np.ndarray, chosen: list[int]) -> list[int]:
-    """Return the points so that each is far from those before it: the outer ones first."""
+    """Return the points in an order in which each is far from those before it, the outer ones first."""
     if not chosen:
         return []
     spots = places[chosen]

@@ -15,7 +15,7 @@ from netspec.inspect.draw.graphviz import render
 
 
 def page(template: str, **values: object) -> str:
-    """Return the page that a template makes of these values."""
+    """Return the page of a template with these values."""
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
     return environment.get_template(template).render(**values)
 
@@ -31,6 +31,6 @@ def net_page(diagram: Diagram) -> str:
 
 
 def _svg_element(diagram: Diagram, unfolded: bool) -> Markup:
-    """Return a drawing as an element of a page, without ids, since two drawings on a page must not share any."""
+    """Return a drawing as an element of a page, without ids, because two drawings on a page must not share ids."""
     svg = render(dot_of(diagram, unfolded), "svg").decode()
     return Markup(re.sub(r' id="[^"]*"', "", svg[svg.index("<svg") :]))

@@ -1,4 +1,4 @@
-"""A sheet of records: images with keys and labels, the statistics of the database, and what is wrong with it."""
+"""Draws a sheet of records: images with keys and labels, statistics of the database, and its faults."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def sheet(records: Sequence[Record], found: Survey, name: str, images: int | Non
 
 
 def _usual(records: Sequence[Record]) -> np.ndarray | None:
-    """Return the values of a record of the most frequent shape; None where none can be read."""
+    """Return the values of a record with the most frequent shape; None if no record can be read."""
     by_shape = {record.values.shape: record.values for record in records if record.values is not None}
     counts = Counter(record.values.shape for record in records if record.values is not None)
     return by_shape[counts.most_common(1)[0][0]] if counts else None

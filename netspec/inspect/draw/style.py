@@ -1,4 +1,4 @@
-"""How pictures look and are written; arrays as tiles of a picture."""
+"""The style of pictures, how they are written, and arrays as tiles of a picture."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ STYLE: dict[Any, Any] = {
     "axes.titlelocation": "left",
     "axes.formatter.useoffset": False,
     "figure.dpi": DPI,
-    "svg.fonttype": "none",  # text stays text: it can be read aloud, searched and copied
-    "svg.hashsalt": "netspec",  # the same picture is the same file
+    "svg.fonttype": "none",  # text stays text, so that it can be searched, copied and read by screen readers
+    "svg.hashsalt": "netspec",  # equal pictures give equal files
 }
 
 
@@ -58,7 +58,7 @@ def svg(figure: Figure) -> str:
 
 
 def text_at(axis: Axes, x: float, y: float, text: str, **options: Any) -> None:
-    """Write a text that is no formula, in the coordinates of the data."""
+    """Write a text at data coordinates, without parsing formulas."""
     axis.text(x, y, text, parse_math=False, **options)
 
 
@@ -92,7 +92,7 @@ def as_picture(values: np.ndarray) -> np.ndarray:
 
 
 def split(values: np.ndarray, images: int) -> list[np.ndarray]:
-    """Return the images (C / images, H, W) that a record (C, H, W) holds, all of it if it cannot hold so many."""
+    """Return the images (C / images, H, W) of a record (C, H, W), or the whole record if C cannot be divided."""
     if images > 1 and len(values) % images == 0:
         return np.split(values, images)
     return [values]
@@ -127,7 +127,7 @@ def draw_tile(axis: Axes, picture: np.ndarray, left: float, bottom: float, width
 
 
 def _block(vector: np.ndarray) -> np.ndarray:
-    """Return a vector as rows of a block that is about as wide as high; what is left over is the least value."""
+    """Return a vector as a block of about equal width and height, filled up with the least value."""
     columns = int(np.ceil(np.sqrt(len(vector))))
     rows = -(-len(vector) // columns)
     block = np.full(rows * columns, vector.min() if len(vector) else 0, vector.dtype)

@@ -1,4 +1,4 @@
-"""Curves of trainings: losses, outputs of tests, rates; several runs in one picture."""
+"""Draws the curves of trainings: losses, test outputs and rates, with several runs in one picture."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class Look:
 def training_figure(logs: Sequence[TrainingLog], look: Look | None = None) -> Figure:
     """Draw trainings, each in its color: a panel of losses, one for each other output, one for the rate.
 
-    The loss of training is pale as it is and strong smoothed; tests are dashed, with markers. The parts have ids, such
-    as ``run0-raw``, so that a page can hide them.
+    The training loss is drawn pale, and its smoothed curve strong. Tests are dashed, with markers. The parts have ids,
+    such as ``run0-raw``, so that a page can hide them.
     """
     look = replace(look or Look(), marker_distance=max((log.iteration for log in logs), default=0) / MOST_MARKERS)
     others = other_outputs(logs)
@@ -80,7 +80,7 @@ def training_figure(logs: Sequence[TrainingLog], look: Look | None = None) -> Fi
 
 
 def other_outputs(logs: Sequence[TrainingLog]) -> list[str]:
-    """Return the outputs that get a panel: no losses, and no single numbers of long blobs."""
+    """Return the outputs that get a panel: all except losses and the elements of long blobs."""
     found: dict[str, None] = {}
     for log in logs:
         for curves in (log.train, *log.tests.values()):
@@ -146,7 +146,7 @@ def _line(axis: Axes, x: np.ndarray, y: np.ndarray, name: str, **options: object
 
 
 def _scale_losses(axis: Axes, logs: Sequence[TrainingLog], look: Look) -> None:
-    """Show the whole range but for a few outliers."""
+    """Show the whole range, except for a few outliers."""
     tests = [curves[name] for log in logs for curves in log.tests.values() for name in log.losses & set(curves)]
     curves = [curve.arrays()[1] for curve in [*(log.loss for log in logs), *tests]]
     if look.log and any((curve > 0).any() for curve in curves):
@@ -161,7 +161,7 @@ def _scale_losses(axis: Axes, logs: Sequence[TrainingLog], look: Look) -> None:
 
 
 def _scale_rates(axis: Axes, logs: Sequence[TrainingLog]) -> None:
-    """Use a logarithmic axis where rates differ by more than ten times."""
+    """Use a logarithmic axis if rates differ by more than a factor of ten."""
     rates = [rate for log in logs for rate in log.rate.values if math.isfinite(rate) and rate > 0]
     if rates and max(rates) > 10 * min(rates):
         axis.set_yscale("log")

@@ -19,7 +19,7 @@ _FEW = 6  # test outputs that the cursor reads
 
 
 def training_page(logs: Sequence[TrainingLog], figure: Figure, title: str) -> str:
-    """Return the page; ``figure`` is the picture of the runs. It needs nothing from elsewhere."""
+    """Return the page, which needs no other files. ``figure`` is the picture of the runs."""
     summaries = [summary(log) for log in logs]
     columns = list(dict.fromkeys(name for line in summaries for name in line))
     shown = [
@@ -40,7 +40,7 @@ def training_page(logs: Sequence[TrainingLog], figure: Figure, title: str) -> st
 
 
 def _horizontal(figure: Figure) -> dict[str, float]:
-    """Return where the panels begin and end, as shares of the picture's width, and the iterations that are there."""
+    """Return the left and right ends of the panels, as shares of the picture's width, and the iterations there."""
     panel = figure.axes[0]
     place, (first, last) = panel.get_position(), panel.get_xlim()
     return {"left": place.x0, "right": place.x1, "first": first, "last": last}
@@ -64,7 +64,7 @@ def _points(curve: Curve) -> list[tuple[int, float | None]]:
 
 
 def describe(logs: Sequence[TrainingLog]) -> str:
-    """Return in words what the picture shows."""
+    """Return a description of the picture in words."""
     lines = []
     for log in logs:
         cells = ", ".join(f"{name} {value}" for name, value in summary(log).items())

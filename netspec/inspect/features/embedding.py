@@ -1,4 +1,4 @@
-"""Descriptors in two dimensions, and the images that they were computed of, small, by name or key."""
+"""Projects descriptors to two dimensions, and reads thumbnails of their images by name or key."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from netspec.inspect.features.images import read_pixels
 
 PCA, TSNE = "pca", "tsne"
 _BESIDE = ("stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms", "names", "keys")
-_PERPLEXITY = 30.0  # of t-SNE: about how many neighbors a point has
+_PERPLEXITY = 30.0  # of t-SNE: the approximate number of neighbors of a point
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def read_features(path: str | Path, array: str = "") -> Features:
 
 
 def in_plane(values: np.ndarray, method: str = PCA) -> tuple[np.ndarray, str]:
-    """Return descriptors (N, D) as points (N, 2), and a sentence that says what the plane is.
+    """Return descriptors (N, D) as points (N, 2), and a sentence that describes the plane.
 
     The signs of principal components are chosen so that the entry of greatest size is positive; t-SNE starts from them.
     """
@@ -72,7 +72,7 @@ SIDE = 112  # pixels on the longer side
 
 @dataclass(frozen=True)
 class Thumbnails:
-    """Images, uint8 BGR or gray, by the number of their descriptor; the labels of all, where the source has some."""
+    """Images, uint8 BGR or gray, by the index of their descriptor; and all labels, if the source has them."""
 
     images: dict[int, np.ndarray]
     labels: list[float | None] | None = None

@@ -43,9 +43,9 @@ BATCH = 16  # images per forward pass
 class ImageInput:
     """How images become the input of a net.
 
-    ``shape`` (N, C, H, W) of the input ``blob`` is read off the net where it is None: from its Input layer, or from the
-    first record of its data layer. ``zooms`` are the views of each image. ``steps``, if any are given, are done to the
-    pixels in the place of what the data layer's transform_param says.
+    ``shape`` (N, C, H, W) is that of the input ``blob``. None: it is taken from the net's Input layer, or from the
+    first record of its data layer. ``zooms`` are the views of each image. ``steps``, if given, replace the
+    transform_param of the data layer.
     """
 
     blob: str = "data"
@@ -114,7 +114,7 @@ class ImageNet:
             self._use_torch(str(fault))
 
     def _use_torch(self, reason: str) -> None:
-        """Run the net by torch; ``reason`` says why the chosen engine does not."""
+        """Let torch run the net. ``reason`` says why the chosen engine does not."""
         warn_unable(self._choice, reason)
         self._model, self._net = None, self._build()
         self._net.keep = [self.blob]
@@ -131,7 +131,7 @@ class ImageNet:
 
     @cached_property
     def fingerprint(self) -> str:
-        """A hash of what decides the blob: net and weights of the files, what is done to images; not the engine."""
+        """A hash of everything that determines the blob, except the engine: net, weights, and preparation of images."""
         s = self.scaling
         done = f"{self.input} {self.blob} {self.shape} {self.zooms} {s.mean.tolist()} {s.scale} {s.raw_scale} {s.swap}"
         digest = hashlib.sha256(self._read.SerializeToString(deterministic=True) + done.encode())
@@ -144,12 +144,12 @@ class ImageNet:
         return self.values(self.inputs(images)).reshape(len(images), -1)
 
     def inputs(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """Return what the net gets of images: the input blob (N V, C, H, W) float32, the views of each in order."""
+        """Return the input blob (N V, C, H, W) float32 for N images: the V views of each in order."""
         views = [fitted(middle(image, zoom), self.shape) for image in images for zoom in self.zooms]
         return self.scaling(np.stack(views)).astype(np.float32)
 
     def values(self, data: np.ndarray) -> np.ndarray:
-        """Return the blob (N V, ...) float32 in its own shape, of what :meth:`inputs` returned."""
+        """Return the blob (N V, ...) float32, in its own shape, for a result of :meth:`inputs`."""
         if self._model is not None:
             try:
                 return self._model.run({self.input: data})[self.blob]
@@ -161,7 +161,7 @@ class ImageNet:
             return self.differentiable(torch.from_numpy(data)).cpu().numpy()
 
     def differentiable(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the blob as torch computes it, so that its gradient can be taken; of another engine there is none."""
+        """Return the blob with a gradient. It is computed by torch, whatever the engine is."""
         assert self._net is not None, "torch runs this net"
         self._net(**{self.input: data})
         return self._net.blobs[self.blob]

@@ -1,4 +1,4 @@
-"""Which pixels of an image matter for a blob: the size of the gradient.
+"""Computes which pixels of an image matter for a blob, by the size of the gradient.
 
 Simonyan, Vedaldi, Zisserman: Deep Inside Convolutional Networks (2014), section 3; averaged over noisy copies:
 Smilkov et al.: SmoothGrad (2017).
@@ -14,15 +14,15 @@ import torch
 from netspec.errors import SpecError, Where
 from netspec.inspect.features.images import ImageNet
 
-NOISE = 0.1  # its deviation, of the range of the input's values
+NOISE = 0.1  # standard deviation, as a share of the range of the input
 
 
 def of_unit(
     net: ImageNet, image: np.ndarray, unit: int | None = None, samples: int = 16
 ) -> tuple[np.ndarray, int, float]:
-    """Return the saliency (H, W) of an image, uint8 BGR, for one number of the blob, the number's index and value.
+    """Return the saliency (H, W) of an image, uint8 BGR, for one number of the blob, and its index and value.
 
-    ``unit`` counts through the blob's values; None: the greatest one. The saliency is the greatest absolute gradient
+    ``unit`` is the flat index of the number; None: the greatest one. The saliency is the greatest absolute gradient
     over the channels, averaged over ``samples`` copies of the input with noise; one sample has no noise. Raises
     SpecError where the blob has no such unit.
     """

@@ -1,4 +1,4 @@
-"""What is done to an image's numbers before a net sees it: Caffe's Transformer, or the data layer's transform_param.
+"""Scales the pixels of an image for a net: like Caffe's Transformer, or like the data layer's transform_param.
 
 Caffe: Transformer.preprocess (python/caffe/io.py), DataTransformer::Transform (src/caffe/data_transformer.cpp)
 """
@@ -55,7 +55,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Scaling:
-    """(raw_scale x - mean) * scale of images (N, C, H, W), their channels reversed before that with ``swap``.
+    """(raw_scale x - mean) * scale for images (N, C, H, W). With ``swap``, their channels are reversed first.
 
     ``mean`` broadcasts against (C, H, W). ``source`` says where it comes from.
     """
@@ -67,7 +67,7 @@ class Scaling:
     swap: bool = False
 
     def __call__(self, images: np.ndarray) -> np.ndarray:
-        """Return the numbers that the net gets."""
+        """Return the input of the net."""
         images = images[:, ::-1] if self.swap else images
         images = images if self.raw_scale == 1 else images * np.float32(self.raw_scale)
         return (images - self.mean) * self.scale

@@ -36,7 +36,7 @@ def default(**options: Any) -> Any:
 
 
 def small(**options: Any) -> Any:
-    """Return the net for small computers, likewise."""
+    """Return the net for small computers, as a Describer with these keywords."""
     return _describer(SMALL, options)
 
 

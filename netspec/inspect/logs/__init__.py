@@ -1,1 +1,1 @@
-"""Trainings, as their logs tell them (Caffe's logs too): loss, outputs, rate and speed."""
+"""Reads the logs of trainings, Caffe's too: loss, outputs, rate and speed."""

@@ -31,7 +31,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Weights as they were after ``iteration`` updates; ``path`` is as the solver wrote it."""
+    """The weights after ``iteration`` updates. ``path`` is the path that the solver wrote."""
 
     iteration: int
     path: str
@@ -45,7 +45,7 @@ class Scores:
     snapshots: list[Snapshot] = field(default_factory=list)
 
     def before(self, iteration: int) -> Scores:
-        """Return what stays valid for a training that is resumed from the snapshot at ``iteration``."""
+        """Return the scores that remain valid if the training is resumed from the snapshot at ``iteration``."""
         return Scores(
             [test for test in self.tests if (test.iteration or 0) < iteration],
             [snapshot for snapshot in self.snapshots if snapshot.iteration <= iteration],

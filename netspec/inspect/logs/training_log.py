@@ -18,7 +18,7 @@ from netspec.errors import SpecError, Where
 from netspec.log import number
 
 _POINTS_OF_WINDOW = 25  # a curve is smoothed over this part of its points
-_USUAL, _MANY = 98, 20  # percent of the values that are not left out of a drawing, where there are so many
+_USUAL, _MANY = 98, 20  # the percentage of values that a drawing shows, if there are at least so many
 
 
 @dataclass
