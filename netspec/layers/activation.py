@@ -22,7 +22,7 @@ from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 class Activation(Layer):
-    """Base of the layers whose top has its bottom's shape."""
+    """Base of layers with a top of the same shape as the bottom."""
 
     onnx_op: ClassVar[str]  # of a layer without settings, and its expression in torch
     torch_call: ClassVar[str]
@@ -38,17 +38,17 @@ class Activation(Layer):
 
 
 class Rounded(Activation):
-    """Base of the activations that torch's functions round otherwise than the C library's, which Caffe calls."""
+    """Base of activations that torch rounds differently from the C library, which Caffe calls."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return Pointwise.apply(x, self.as_caffe, self.caffes_gradient) if self.is_exact(x) else self.as_torch(x)
 
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the activated bottom by torch's functions, whose gradients autograd knows."""
+        """Return the activated bottom by torch's functions, with gradients by autograd."""
         return self.compute(x, torch)
 
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the activated bottom, each step rounded as Caffe's."""
+        """Return the activated bottom, with each step rounded as in Caffe."""
         return self.compute(x, libm)
 
     def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:

@@ -1,1 +1,1 @@
-"""What a layer is, and what it may offer besides: the base class, the registry, and one page for each offer."""
+"""The base class of layers, the registry, and one module for each optional feature of a layer."""

@@ -1,11 +1,11 @@
-"""What every layer is: a module built from a LayerParameter and the shapes of its bottoms.
+"""The base class of layers: a module built from a LayerParameter and the shapes of its bottoms.
 
-A layer is complete when its constructor returns: its learnable blobs exist and are filled, and ``top_shapes`` says,
-by integer arithmetic alone, what ``forward`` will return.
+A layer is complete when its constructor returns: its learnable blobs exist and are filled. ``top_shapes`` has the
+shapes that ``forward`` will return; they are computed by integer arithmetic only.
 
-A new layer, a dialect's too, needs ``setup`` (where it has anything to read or learn), ``reshape`` and ``forward``.
-``construct``, and ``ReadingLayer.open``, exist only so that a line of the log stands where Caffe's does: Caffe opens a
-database in a layer's constructor, before it logs the layer's bottoms and tops, and reads its first record after that.
+A new layer, also of a dialect, needs ``reshape`` and ``forward``, and ``setup`` if it has settings or learnable blobs.
+``construct`` and ``ReadingLayer.open`` exist only for the order of the log: Caffe opens a database in a layer's
+constructor, before it logs the layer's bottoms and tops, and reads the first record after that.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def shape_string(shape: Sequence[int]) -> str:
 
 
 _PLAIN = frozenset({bool, int, float, str, tuple, list})
-_NO_BLOBS = torch.nn.ParameterList()  # of all layers without blobs; stays empty
+_NO_BLOBS = torch.nn.ParameterList()  # shared by all layers without blobs; stays empty
 
 
 class Layer(torch.nn.Module):
@@ -53,14 +53,14 @@ class Layer(torch.nn.Module):
     bottoms: ClassVar[tuple[int, int | None]] = (1, 1)  # fewest and most (None: any number)
     tops: ClassVar[tuple[int, int | None]] = (1, 1)
     same_tops: ClassVar[bool] = False  # as many tops as bottoms
-    is_loss: ClassVar[bool] = False  # a missing top is made, and default_loss_weight is 1
+    is_loss: ClassVar[bool] = False  # a missing top is added, and default_loss_weight is 1
     is_input: ClassVar[bool] = False  # its tops are given by the caller
     label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
     reads: ClassVar[frozenset[str]] = frozenset()  # its own fields of LayerParameter; set where it is registered
-    ignores: frozenset[str] = frozenset()  # of these, what has no effect, e.g. "data_param.scale"
-    shares: frozenset[str] = frozenset()  # of "data", "diff": its tops lie where its bottom lies, in Caffe's memory
-    counted_axis: ClassVar[int | None] = None  # the tops' axis whose size only a forward pass finds out
-    promises: ClassVar[bool] = True  # its tops have the shapes that ``reshape`` returned, but for ``counted_axis``
+    ignores: frozenset[str] = frozenset()  # those of ``reads`` that have no effect, e.g. "data_param.scale"
+    shares: frozenset[str] = frozenset()  # "data", "diff": what its tops share with its bottom in Caffe's memory
+    counted_axis: ClassVar[int | None] = None  # the axis of the tops with a size that is known only after forward
+    promises: ClassVar[bool] = True  # its tops have the shapes that ``reshape`` returned, except in ``counted_axis``
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
         super().__init__()
@@ -80,14 +80,14 @@ class Layer(torch.nn.Module):
 
     @override
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set plain values, which a module need not register, without its search for what they may be: it is slow."""
+        """Set plain values directly, because torch's check for modules and parameters is slow."""
         if type(value) in _PLAIN:
             object.__setattr__(self, name, value)
         else:
             super().__setattr__(name, value)
 
     def construct(self) -> None:
-        """Do what Caffe does in the layer's constructor, where that shows in the log."""
+        """Do what Caffe does in the layer's constructor, if it shows in the log."""
 
     def setup(self) -> None:
         """Read the parameters and add the learnable blobs."""
@@ -101,9 +101,9 @@ class Layer(torch.nn.Module):
 
     @property
     def small(self) -> bool | None:
-        """Whether the layer is so small, at its present shapes, that Caffe's order of sums costs next to nothing.
+        """Whether the layer is so small, at its present shapes, that summing in Caffe's order costs almost no time.
 
-        None: it has no sums that ``exact: small`` is about.
+        None: ``exact: small`` does not apply to this layer.
         """
         return None
 
@@ -136,25 +136,25 @@ class Layer(torch.nn.Module):
         return tops
 
     def check_promise(self, tops: Sequence[torch.Tensor]) -> None:
-        """Raise SpecError where a pass returned tops of other shapes than ``reshape`` did."""
+        """Raise SpecError if the tops of a pass have other shapes than ``reshape`` returned."""
         found = [tuple(top.shape) if isinstance(top, torch.Tensor) else None for top in tops]
         if self.promises and list(map(self._counted, found)) != list(map(self._counted, self.top_shapes)):
             one, other = (" and ".join(map(str, shapes)) or "no top" for shapes in (found, self.top_shapes))
             raise self.error(f"forward returned a top of shape {one}, but reshape promised {other}", "type")
 
     def _counted(self, shape: Shape | None) -> Shape | None:
-        """Return a shape without the size that only a pass finds out."""
+        """Return a shape without the size of ``counted_axis``."""
         axis = self.counted_axis
         return shape if shape is None or axis is None else (*shape[:axis], *shape[axis + 1 :])
 
     def fit(self, bottom_shapes: list[Shape]) -> None:
-        """Reshape for bottoms of these shapes, if they are others than before."""
+        """Reshape for bottoms of these shapes, if they have changed."""
         if bottom_shapes != self.bottom_shapes:
             self.bottom_shapes, self._kept_promise = bottom_shapes, False
             try:
                 self.top_shapes = [tuple(s) for s in self.reshape(bottom_shapes)]
             except SpecError:
-                self.bottom_shapes = []  # whatever comes next is checked again
+                self.bottom_shapes = []  # the next shapes are checked again
                 raise
 
     def add_blob(self, shape: Sequence[int], filler: Any = None, value: float = 0.0) -> None:
@@ -181,7 +181,7 @@ class Layer(torch.nn.Module):
         return tensor if tensor.shape == self.blob_shapes[index] else tensor.view(self.blob_shapes[index])
 
     def param_spec(self, j: int, given: Param | None) -> Param:
-        """Return how blob ``j`` is learned: as ``given`` by the prototxt, or without that at the plain rate."""
+        """Return how blob ``j`` is learned: as ``given`` by the prototxt, or else with multipliers of 1."""
         return given or Param("", 1.0, 1.0, False, None)
 
     @property
@@ -194,7 +194,7 @@ class Layer(torch.nn.Module):
         return [values_of(self.blob(j)) for j in range(len(self.blobs))]
 
     def possible(self, shape: Sequence[int]) -> Shape:
-        """Return a shape as a tuple; refuse one with a negative size, or of more axes or numbers than Caffe's."""
+        """Return a shape as a tuple. Raise SpecError for a negative size, or for more axes or numbers than in Caffe."""
         if min(shape, default=0) < 0:
             raise self.error(f"found shape {tuple(shape)}, expected no negative size")
         if len(shape) > MOST_AXES:
@@ -204,7 +204,7 @@ class Layer(torch.nn.Module):
         return tuple(shape)
 
     def _reshaped(self, bottom_shapes: list[Shape]) -> list[Shape]:
-        """Return what ``reshape`` says, if that is one possible shape for each top."""
+        """Return the result of ``reshape``, after checking that it has a possible shape for each top."""
         shapes: Any = self.reshape(bottom_shapes)
         if not isinstance(shapes, Sequence) or not all(isinstance(shape, Sequence) for shape in shapes):
             raise self.error(f"reshape returned {shapes!r}, expected one shape for each top, such as [(2, 3)]", "type")
@@ -213,7 +213,7 @@ class Layer(torch.nn.Module):
         return [self.possible(shape) for shape in shapes]
 
     def refuse(self, faults: Iterable[SpecError]) -> None:
-        """Report all of these errors; if there are any, the layer is not built."""
+        """Report all of these errors. If there are any, the layer is not built."""
         found = list(faults)
         for fault in found[:-1]:
             self.context.report(fault)
@@ -231,7 +231,7 @@ class Layer(torch.nn.Module):
         return axis % len(shape)
 
     def _path_to(self, message: Any) -> tuple[str, ...]:
-        """Return where one of the layer's fields has this message: ``("convolution_param", "weight_filler")``."""
+        """Return the path of this message in the layer's fields: ``("convolution_param", "weight_filler")``."""
         for outer, settings in self.param.ListFields():
             for inner, value in settings.ListFields() if hasattr(settings, "ListFields") else ():
                 if value is message:
@@ -262,6 +262,6 @@ def is_in_place(layer: Layer) -> bool:
 
 
 def refuse_in_place(layer: Layer) -> None:
-    """Raise a SpecError where a layer's first top is its first bottom; called by the layers for which Caffe does so."""
+    """Raise a SpecError if a layer's first top is its first bottom. For layers where Caffe refuses it too."""
     if is_in_place(layer):
         raise layer.error("may not work in place, as in Caffe; give its top another name", "top")

@@ -1,4 +1,4 @@
-"""What a layer knows of the net around it: its phase, how the net is built, its random draws."""
+"""The context of a layer in its net: the phase, the options of the net, and random numbers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from netspec.proto.schema import TEST
 
 
 def device_of(name: str | torch.device) -> torch.device:
-    """Return torch's device of a name. Raises SpecError for a name that is none, and for a GPU that is not here."""
+    """Return torch's device with a name. Raises SpecError for an unknown name, and for a GPU that is missing."""
     try:
         device = torch.device(name)
         own = torch._C._get_privateuse1_backend_name()  # a device that another package adds to torch
@@ -30,25 +30,25 @@ def device_of(name: str | torch.device) -> torch.device:
 
 
 def nowhere(*path: str | int) -> Where:
-    """Return the place of a layer that no file has."""
+    """Return the place of a layer that is not in a file."""
     return Where("<layer>")
 
 
 class Random:
-    """The net's random draws, reproducible from one seed; one generator a device."""
+    """The random numbers of a net, reproducible from one seed, with one generator per device."""
 
     def __init__(self, seed: int) -> None:
         self.restart(seed)
 
     def restart(self, seed: int) -> None:
-        """Begin again, from another seed."""
+        """Restart from another seed."""
         self.seed = seed
         self._part: str | None = None
         self._generators: dict[str, torch.Generator] = {}
-        self._begun: set[str] = set()  # the generators that draw for this part
+        self._begun: set[str] = set()  # the generators that were used in this part of a run
 
     def begin(self, what: str) -> None:
-        """Go on with draws that follow from the seed and the name of a part of a run, whatever was drawn before."""
+        """Begin a part of a run. Its numbers depend only on the seed and the name of the part."""
         self._part = what
         self._begun.clear()
 
@@ -64,12 +64,12 @@ class Random:
 
     @property
     def has_drawn(self) -> bool:
-        """Whether something was drawn for this part."""
+        """Whether random numbers were drawn in this part."""
         return bool(self._begun)
 
     @contextmanager
     def undisturbed(self) -> Iterator[None]:
-        """Let draws within the block be drawn again after it."""
+        """A block after which the same random numbers are drawn again."""
         states, begun = {key: each.get_state() for key, each in self._generators.items()}, set(self._begun)
         try:
             yield
@@ -81,12 +81,12 @@ class Random:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a layer may know of the net around it: ``phase``, how it is built, ``random`` draws of its own.
+    """What a layer knows of its net: the ``phase``, the ``options``, and ``random`` numbers.
 
-    Where ``options.open_data`` is false, a layer that reads files must not: its tops' shapes are in
+    If ``options.open_data`` is false, a layer must not open its files. The shapes of its tops are then in
     ``options.given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``.
-    ``at(*path)`` is the place in the prototxt of a field of this layer; ``report`` gets the faults after which building
-    can go on (the default raises the first).
+    ``at(*path)`` is the place in the prototxt of a field of this layer. ``report`` is called with faults after which
+    building can go on (the default raises the first one).
     """
 
     phase: int = TEST
@@ -94,12 +94,14 @@ class Context:
     random: Random = field(default_factory=lambda: Random(0))
     at: Callable[..., Where] = nowhere
     report: Report = raise_fault
-    created: Callable[[int], None] = lambda tops: None  # called when ``construct`` has run: for the order of the log
-    take: Callable[[int], None] = lambda size: None  # called before memory is taken, in bytes: it may refuse
+    created: Callable[[int], None] = lambda tops: None  # called after ``construct``, for the order of the log
+    take: Callable[[int], None] = lambda size: (
+        None
+    )  # called before memory is taken, with the bytes; may raise SpecError
 
     @property
     def device(self) -> torch.device:
-        """Where blobs are made."""
+        """The device of the blobs."""
         return torch.device(self.options.device)
 
     @property

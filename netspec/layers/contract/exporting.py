@@ -1,4 +1,4 @@
-"""How a layer is written in another form: netspec/export asks, with a writer of netspec/layers/contract/targets.py."""
+"""The methods that netspec/export calls to export a layer, with a writer of netspec/layers/contract/targets.py."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class PassesOn(Protocol):
 
 
 class Exported(Protocol):
-    """A layer that can be exported. What it writes must compute what ``forward`` computes, at every free size."""
+    """A layer that can be exported. Its exported form must compute the same as ``forward``, at every free size."""
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
         """Write the layer into an ONNX graph, given the values of its bottoms; return those of its tops."""
@@ -33,7 +33,7 @@ class Exported(Protocol):
 
 
 def export(layer: Layer, writer: OnnxGraph | TorchCode, target: str, *bottoms: str) -> str | Sequence[str]:
-    """Write a layer for ``ONNX`` or ``PyTorch``; return the values of its tops. Raises SpecError where it cannot be."""
+    """Write a layer for ``ONNX`` or ``PyTorch``; return the values of its tops. Raises SpecError if it cannot."""
     write = offered(layer, "to_onnx" if target == "ONNX" else "to_torch")
     if write is None:
         raise refusal(layer, target)
@@ -46,6 +46,6 @@ def passes_on(layer: Layer) -> bool:
 
 
 def refusal(layer: Layer, target: str, reason: str = "") -> SpecError:
-    """Return the error of a layer that cannot be exported: for this reason, or the one its class has."""
+    """Return the error for a layer that cannot be exported, with this reason or the one of its class."""
     reason = reason or getattr(layer, "not_exported", "its class does not define it")
     return layer.error(f"cannot be exported to {target}: {reason}")

@@ -28,7 +28,7 @@ def fill(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
 
 
 def draw(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    """Return what :func:`fill` does, for a filler and a shape that were checked."""
+    """Do the same as :func:`fill`, for a filler and a shape that were checked."""
     return _FILLERS[filler.type].draw(filler, shape, generator)
 
 
@@ -75,7 +75,7 @@ def _check_axis(filler: Any, shape: Shape) -> None:
 
 
 def constant(shape: Shape, value: float, device: torch.device | str = "cpu") -> torch.Tensor:
-    """Return a tensor of equal numbers. Zeros cost no time: the system gives them with the memory, when it is used."""
+    """Return a tensor of equal numbers. Zeros cost no time, because new memory from the system is zero."""
     if value == 0:
         return torch.zeros(shape, dtype=torch.float32, device=device)
     return torch.full(shape, value, dtype=torch.float32, device=device)
@@ -108,7 +108,7 @@ def _bilinear(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Te
 
 
 def _fan(filler: Any, shape: Shape) -> float:
-    """Return the count that the variance is divided by: Caffe's fans are counts of the blob, not of the layer.
+    """Return the count that the variance is divided by. Caffe computes it from the blob, not from the layer.
 
     So fan_out is ``num_output`` for an InnerProduct, and wrong by the factor ``group`` for a grouped convolution.
     """
@@ -127,7 +127,7 @@ def _draw_normal(shape: Shape, mean: float, std: float, generator: torch.Generat
 
 
 class _Filler(NamedTuple):
-    """What makes the values; the fields of FillerParameter, besides ``type``, that it reads; what it refuses."""
+    """A filler: its function, the fields of FillerParameter that it reads in addition to ``type``, and its check."""
 
     draw: Callable[[Any, Shape, torch.Generator], torch.Tensor]
     reads: tuple[str, ...] = ()
@@ -147,5 +147,5 @@ _FILLERS = {
     ),
     "bilinear": _Filler(_bilinear, (), _check_bilinear),
 }
-#: The fields that mean something to each filler.
+#: The fields that each filler reads.
 READS = {name: filler.reads for name, filler in _FILLERS.items()}

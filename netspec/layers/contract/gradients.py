@@ -1,4 +1,4 @@
-"""Layers that compute gradients from what is in memory at the time of the backward pass, as Caffe does."""
+"""Layers that compute gradients, like Caffe, from the content of memory at the time of the backward pass."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ NOTHING: frozenset[str] = frozenset()
 
 
 class OwnGradient(Protocol):
-    """A layer of one bottom and top whose gradient reads memory: see netspec/run/eager.py."""
+    """A layer with one bottom and one top that computes its gradient from memory: see netspec/run/eager.py."""
 
     gradient_reads: frozenset[str]  # of "bottom", "sign" (of it), "top", "kept" (the bottom of the forward pass)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        """Return the bottom's gradient as Caffe computes it, step by step, from the data in memory at backward.
+        """Return the bottom's gradient with Caffe's steps, from the data in memory at the backward pass.
 
-        A layer that works in place gets one tensor as its bottom and its top.
+        A layer that works in place gets the same tensor as its bottom and its top.
         """
         ...
 
 
 class OwnGradients(Protocol):
-    """A layer of several bottoms and one top whose gradient reads memory; it does not work in place."""
+    """A layer with several bottoms and one top that computes its gradients from memory. It is never in place."""
 
     gradient_reads: frozenset[str]  # "top"
 
     def caffes_gradients(
         self, bottoms: Sequence[torch.Tensor], top: torch.Tensor, diff: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """Return the bottoms' gradients as Caffe computes them from the data in memory at backward."""
+        """Return the bottoms' gradients with Caffe's steps, from the data in memory at the backward pass."""
         ...
 
 

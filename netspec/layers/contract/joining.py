@@ -1,4 +1,4 @@
-"""Layers in a row that one of them does in one: netspec/run/parts.py asks where a net learns."""
+"""Consecutive layers that one layer can compute together. netspec/run/parts.py uses it in training."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from netspec.layers.contract.offers import call
 
 
 class Joins(Protocol):
-    """A layer that may do the work of those after it as well."""
+    """A layer that can also do the work of layers after it."""
 
     def joined_with(self, after: Layer) -> Layer | None:
-        """Return a layer that does the work of this one and then of another, with the blobs of both; or None."""
+        """Return a layer that does the work of this layer and of ``after``, with the blobs of both; or None."""
         ...
 
 
 class Joined(Protocol):
-    """A layer whose work another may do."""
+    """A layer that the layer before it may be able to compute."""
 
     @property
     def joins_as(self) -> str:
-        """What it is to a layer before it: "relu", max(x, 0); "scale", learned factors and biases of the channels."""
+        """What the layer computes: "relu" is max(x, 0); "scale" has learned factors and biases of the channels."""
         ...
 
 
 def joined(first: Layer, after: Layer) -> Layer | None:
-    """Return the layer that does the work of both, None where nothing does."""
+    """Return a layer that does the work of both, or None."""
     return call(first, "joined_with", after)

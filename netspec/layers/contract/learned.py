@@ -1,7 +1,7 @@
-"""A layer's learned blobs: they record when their memory was handed out; and :class:`Seen`, whether they are as before.
+"""Learned blobs that count how often an alias of their memory was handed out; :class:`Seen` detects changes.
 
-Torch counts the writes to a tensor, but not those to what ``data`` and ``detach`` hand out, nor those of numpy. What a
-net keeps of its weights in another form, folded or laid out for a kernel, must follow all of them.
+Torch counts the writes to a tensor, but not the writes through ``data``, ``detach`` or numpy. A net that keeps copies
+of its weights in another form, folded or in the layout of a kernel, must notice all of them.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ class Learned(torch.nn.Parameter):
 
 
 def values_of(blob: torch.Tensor) -> torch.Tensor:
-    """Return a blob's values without gradients, for reading: this does not count as handing them out."""
+    """Return a blob's values without gradients, for reading only. This does not count as handing out an alias."""
     return torch.Tensor.detach(blob)
 
 
 def blobs_of(layers: Iterable[torch.nn.Module]) -> Callable[[], list[Any]]:
-    """Return what lists the learned blobs of layers as they are at that time.
+    """Return a function that lists the present learned blobs of the layers.
 
-    To iterate over ParameterLists takes longer than a run of a small net.
+    It is fast: iterating over ParameterLists takes longer than a run of a small net.
     """
     owners = [layer.blobs._parameters for layer in layers]  # pyright: ignore[reportAttributeAccessIssue]
     places = [(owner, name) for owner in owners for name in owner]
@@ -65,10 +65,10 @@ def blobs_of(layers: Iterable[torch.nn.Module]) -> Callable[[], list[Any]]:
 
 
 class Seen:
-    """Learned blobs as they were when something was made for them.
+    """The state of learned blobs at the time when kernels were made for them.
 
-    What was made reads and writes their memory, and that of their gradients. Or it holds their ``values`` in another
-    form: then a write to them counts, too, and that their memory was handed out.
+    The kernels use the memory of the blobs and of their gradients, so replaced memory is a change. With ``values``, the
+    kernels hold copies of the values. Then a write to a blob, or a new alias of its memory, is a change as well.
     """
 
     __slots__ = ("_addresses", "_blobs", "_counts", "_gradients", "_values")
@@ -80,7 +80,7 @@ class Seen:
         self._counts = _counts(self._blobs) if values else []
 
     def are(self, blobs: Sequence[torch.Tensor]) -> bool:
-        """Return whether these are the same blobs, and as they were."""
+        """Return whether these are the same blobs, without a change."""
         if len(blobs) != len(self._blobs) or not all(map(is_, blobs, self._blobs)):
             return False
         if [blob.data_ptr() for blob in blobs] != self._addresses:
@@ -94,7 +94,7 @@ def _counts(blobs: Sequence[Any]) -> list[tuple[int, int]]:
     """Return how often each blob was written to, and how often its memory was handed out."""
     try:
         return [(blob._version, blob.handed_out) for blob in blobs]
-    except (AttributeError, RuntimeError):  # of other classes, or of inference mode, where torch counts no writes
+    except (AttributeError, RuntimeError):  # other classes, or inference mode, in which torch counts no writes
         return [(0 if b.is_inference() else b._version, getattr(b, "handed_out", 0)) for b in blobs]
 
 

@@ -1,11 +1,11 @@
 """What a layer may offer in addition to its forward pass, each by an attribute that its class defines.
 
 exporting.py  to_onnx, to_torch, passes_on: the layer in another form
-gradients.py  caffes_gradient: the gradient from what lies in memory
-joining.py    joined_with, joins_as: layers in a row that one of them does in one
-reading.py    running_state, restart, and the like: records, and what goes on from one pass to the next
+gradients.py  caffes_gradient: the gradient from the content of memory
+joining.py    joined_with, joins_as: consecutive layers that one layer computes
+reading.py    running_state, restart, and the like: records, and state that is kept between passes
 
-:class:`netspec.layers.contract.base.Layer` knows none of them. One function finds what is offered: :func:`offered`.
+:class:`netspec.layers.contract.base.Layer` has none of them. :func:`offered` returns one if a layer has it.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ def _has(cls: type[Layer], name: str) -> bool:
 
 
 def offered(layer: Layer, name: str) -> Any:
-    """Return an attribute that tells of a layer's forward pass, or does the same; None where its class has none."""
+    """Return an attribute that belongs to a layer's forward pass, or None if its class has none."""
     return getattr(layer, name) if _has(type(layer), name) else None
 
 
 def call(layer: Layer, name: str, *arguments: Any) -> Any:
-    """Return what an offered method returns; None where the class has none."""
+    """Call an offered method and return its result, or None if the class has none."""
     method = offered(layer, name)
     return None if method is None else method(*arguments)

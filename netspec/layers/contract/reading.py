@@ -1,4 +1,4 @@
-"""Layers that read records, and layers that remember something from one pass to the next."""
+"""Layers that read records, and layers that keep state between passes."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ State = dict[str, int | str | tuple[torch.Tensor, ...]]
 
 @runtime_checkable
 class Remembers(Protocol):
-    """A layer that has more than its blobs to go on from."""
+    """A layer with state in addition to its blobs."""
 
     def running_state(self) -> State:
-        """Return what the layer remembers from one pass to the next, besides its blobs."""
+        """Return the state that the layer keeps between passes, without its blobs."""
         ...
 
     def resume(self, state: Mapping[str, Any]) -> None:
-        """Remember what :meth:`running_state` returned. Raises SpecError where a value is impossible."""
+        """Restore a result of :meth:`running_state`. Raises SpecError for an impossible value."""
         ...
 
 
@@ -38,9 +38,9 @@ class Restarts(Protocol):
 
 @runtime_checkable
 class Waits(Protocol):
-    """A layer whose records are made by other threads."""
+    """A layer that gets its records from other threads."""
 
-    ahead: int  # bytes of batches that it reads before they are asked for
+    ahead: int  # bytes of batches that are read ahead
 
     @property
     def waited(self) -> float:
@@ -59,7 +59,7 @@ class NeedsInput(Protocol):
 
 @runtime_checkable
 class TakesArrays(Protocol):
-    """A layer whose records are arrays of a program."""
+    """A layer that reads its records from arrays of a program."""
 
     def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
         """Take images (n, C, H, W) and labels (n,). Raises SpecError for other shapes."""
@@ -68,21 +68,21 @@ class TakesArrays(Protocol):
 
 @runtime_checkable
 class Constant(Protocol):
-    """A layer some of whose tops are written when it is made and never again."""
+    """A layer with tops that are filled once, when it is built."""
 
     def filled_once(self) -> Sequence[torch.Tensor | None]:
-        """Return these by top; an empty dict if there are none."""
+        """Return for each top its constant values, or None; an empty sequence if no top is constant."""
         ...
 
 
 @runtime_checkable
 class Scores(Protocol):
-    """A layer whose top, in a test, is not averaged over the batches."""
+    """A layer with its own score of a test, instead of the mean of its top over the batches."""
 
     solver_reads: frozenset[str]  # a fork's fields of the solver that ``score`` reads
 
     def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
-        """Return what the tops of all batches of a test say together.
+        """Return the scores of a test from the tops of all its batches.
 
         ``solver`` is the SolverParameter, None where there is no solver.
         """
@@ -90,38 +90,38 @@ class Scores(Protocol):
 
 
 def reads_data(layer: Layer | type[Layer]) -> bool:
-    """Return whether a layer's tops are records; exported nets take them as inputs."""
+    """Return whether a layer's tops are records. They are inputs of an exported net."""
     return getattr(layer, "reads_data", False)
 
 
 def takes_shapes(layer: type[Layer]) -> bool:
-    """Return whether ``--shape`` may tell the shapes of a layer's tops although it has bottoms."""
+    """Return whether ``--shape`` may set the shapes of the tops, although the layer has bottoms."""
     return getattr(layer, "takes_shapes", False)
 
 
 def channels_read(param: Any, layer: type[Layer] | None) -> int:
-    """Return the channels of a layer's bottoms that the filters in its LayerParameter have; 0 where it has none."""
+    """Return the number of channels of the bottoms that the filters in a LayerParameter need; 0 without filters."""
     read = getattr(layer, "channels_read", None)
     return read(param) if read and param.blobs else 0
 
 
 def changes_itself(layer: Layer) -> bool:
-    """Return whether a pass changes more than a layer's tops, so that it can be neither prepared nor run on a copy."""
+    """Return whether a layer changes its state in a pass. It can then be neither prepared nor copied."""
     return getattr(layer, "remembers", False)
 
 
 def bytes_ahead(layer: Layer) -> int:
-    """Return the bytes of the batches that a layer reads before they are asked for."""
+    """Return the bytes of the batches that a layer reads ahead."""
     return layer.ahead if isinstance(layer, Waits) else 0
 
 
 def running_state(layer: Layer) -> State:
-    """Return what a layer remembers from one pass to the next, besides its blobs."""
+    """Return the state that a layer keeps between passes, without its blobs."""
     return layer.running_state() if isinstance(layer, Remembers) else {}
 
 
 def resume(layer: Layer, state: Mapping[str, Any]) -> None:
-    """Let a layer remember what :func:`running_state` returned. Raises SpecError if that does not fit."""
+    """Restore a result of :func:`running_state`. Raises SpecError if it does not fit the layer."""
     found, mine = (
         ", ".join(f"{name} ({type(value).__name__})" for name, value in sorted(each.items()))
         for each in (state, running_state(layer))

@@ -1,4 +1,4 @@
-"""The one registry: layer type, as a prototxt writes it, to class."""
+"""The registry of layers: from the type in a prototxt to the class."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ L = TypeVar("L", bound=type[Layer])
 
 
 def register(type_name: str, *reads: str) -> Callable[[L], L]:
-    """Class decorator: make a layer known under the type that prototxt files use.
+    """Class decorator: register a layer under the type that prototxt files use.
 
     ``reads`` are the fields of LayerParameter that are the layer's own, e.g. ``"pooling_param"``; a net warns of all
     others (netspec/net/assembly.py).
@@ -38,14 +38,14 @@ def registered(type_name: str) -> type[Layer] | None:
 
 
 def layer_class(type_name: str) -> type[Layer] | None:
-    """Return the class of a layer type, or None. A type that one known fork has is registered first."""
+    """Return the class of a layer type, or None. If one known fork defines the type, it is registered first."""
     if type_name not in _LAYERS:
         forks().register_type(type_name)
     return _LAYERS.get(type_name)
 
 
 def class_of(param: LayerParameter, options: BuildOptions | None = None) -> type[Layer] | None:
-    """Return the class of a layer, or None: that of its type, where ``options.dialects`` have no other for it."""
+    """Return the class of a layer, or None: that of ``options.dialects`` for it, or else that of its type."""
     return forks().class_of(param, options) or layer_class(param.type)
 
 
@@ -55,7 +55,7 @@ def layer_types() -> list[str]:
 
 
 def unknown_type(type_name: str) -> str:
-    """Return the sentence that says that a type is unknown, and what may be meant or which fork has it."""
+    """Return the message for an unknown type, with a similar type or the fork that defines it."""
     known = forks()
     advice = known.advice(type_name, known.with_type(type_name))
     close = did_you_mean(type_name, sorted({*layer_types(), *known.layer_types()}), near=True) or ";"

@@ -1,6 +1,6 @@
-"""What a layer writes itself into when it is exported; netspec/export has the writers.
+"""The interfaces that layers use to export themselves. netspec/export implements them.
 
-Layers know these two protocols and no library of the other side.
+Layers use only these two protocols, and no library of the target.
 """
 
 from __future__ import annotations

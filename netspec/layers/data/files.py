@@ -28,7 +28,12 @@ from netspec.layers.contract.registry import register
 from netspec.proto.schema import PHASE_NAMES, value
 
 BACKENDS = ("leveldb", "lmdb")  # caffe.proto: enum DataParameter.DB
-MOVED = ("scale", "mean_file", "crop_size", "mirror")  # to transform_param, so in a current layer they mean nothing
+MOVED = (
+    "scale",
+    "mean_file",
+    "crop_size",
+    "mirror",
+)  # fields that moved to transform_param; in a current layer they have no effect
 MOST_AT_ONCE = 1 << 16  # numbers in the batches that a thread makes at once, and at most 32 batches
 Batch = tuple[tuple[torch.Tensor, ...], int]
 T = TypeVar("T")
@@ -37,8 +42,8 @@ T = TypeVar("T")
 class ReadingLayer(Layer):
     """Base of the layers that read records from files, some batches ahead of the net.
 
-    Files are opened in the constructor, threads start at the first forward pass. Where no data may be opened, or the
-    first top's shape is given, the tops' shapes are those given, or those that the prototxt fixes.
+    Files are opened in the constructor. Threads start at the first forward pass. If data must not be opened, or the
+    shape of the first top is given, the shapes of the tops are the given ones, or those that the prototxt determines.
     """
 
     bottoms = (0, 0)
@@ -55,15 +60,15 @@ class ReadingLayer(Layer):
         return dict(self.__dict__)
 
     def open(self) -> Source | None:
-        """Open the files; None where :meth:`attempt` met a fault."""
+        """Open the files. Return None if :meth:`attempt` caught an error."""
         raise NotImplementedError
 
     def known_shape(self) -> Shape | None:
-        """Return the first top's shape where the prototxt alone says it."""
+        """Return the shape of the first top, if the prototxt determines it."""
         return None
 
     def wrong_settings(self) -> Iterator[SpecError]:
-        """Yield what is wrong whatever the files hold."""
+        """Yield the errors in the settings that do not depend on the files."""
         p = value(self.param, self.group)
         if p.batch_size <= 0:
             yield self.error(f"batch_size must be above 0, found {p.batch_size}", self.group, "batch_size")
@@ -71,14 +76,14 @@ class ReadingLayer(Layer):
             yield self.error("source is missing; set it to the path of the data", self.group, "source")
 
     def construct(self) -> None:
-        """Look at the settings; faults are gathered, so that all are reported. Files are opened if there are none."""
+        """Check the settings and collect all errors. If there are none, open the files."""
         self.faults = list(self.wrong_settings())
         self._sound = not self.faults
         given = any(top in self.context.options.given_shapes for top in self.param.top[:1])
         self.opens_data = self.context.options.open_data and not given
 
     def attempt(self, function: Callable[..., T], *arguments: Any) -> T | None:
-        """Return what a function returns, None where it raises a SpecError, which is kept."""
+        """Return the result of a function. If it raises a SpecError, keep the error and return None."""
         try:
             return function(*arguments)
         except SpecError as fault:
@@ -120,7 +125,7 @@ class ReadingLayer(Layer):
         return [data, *(given.get(top) or self.second_shape(data) for top in self.param.top[1:])]
 
     def second_shape(self, data: Shape) -> Shape:
-        """Return the shape of what goes with the first top, of shape ``data``: a label for each image."""
+        """Return the shape of the second top, for a first top of shape ``data``: a label for each image."""
         return data[:1]
 
     def shape_wanted(self, blob: str, example: str) -> SpecError:
@@ -134,18 +139,18 @@ class ReadingLayer(Layer):
 
     @property
     def source(self) -> Source:
-        """Where the batches come from, for a layer that opened its data."""
+        """The source of the batches, for a layer that opened its data."""
         assert self._source is not None, "built without opening data"
         return self._source
 
     @property
     def num_records(self) -> int:
-        """How many records there are (0: the data is not open); a batch may read past the last, on from the first."""
+        """The number of records (0: the data is not open). After the last record a batch continues with the first."""
         return self._source.cursor.count if self._source else 0
 
     @property
     def iteration(self) -> int:
-        """The iteration whose batch the next forward pass returns."""
+        """The iteration of the batch that the next forward pass returns."""
         return self._feed.position if self._feed else 0
 
     @property
@@ -184,13 +189,13 @@ class ReadingLayer(Layer):
         return tuple(top.to(self.context.device, non_blocking=True) for top in tops)
 
     def log_restart(self) -> None:
-        """Say that the last record was passed, where Caffe says so."""
+        """Log that the last record was passed, if Caffe logs it."""
 
     # What the subclasses share
 
     @property
     def draws(self) -> Draws:
-        """What this layer draws; a TRAIN and a TEST layer may share their name."""
+        """The random numbers of this layer. A TRAIN and a TEST layer may have the same name."""
         options, stream = self.context.options, f"{self.param.name}/{PHASE_NAMES[self.phase]}"
         return Draws(self.context.data_seed, stream, options.rank, options.ranks)
 
@@ -201,11 +206,11 @@ class ReadingLayer(Layer):
 
     @property
     def place(self) -> Where:
-        """Where the prototxt names the data."""
+        """The place in the prototxt that names the data."""
         return self.context.at(self.group, "source")
 
     def cursor(self, count: int, rand_skip: int = 0, shuffle: bool = False, kind: type[Cursor] = Cursor) -> Cursor:
-        """Return the order in which ``count`` records are read, without the first few where ``rand_skip`` is given."""
+        """Return the order in which ``count`` records are read. ``rand_skip`` skips some of the first ones."""
         draws = self.draws
         skip = draw_skip(rand_skip, draws.seed, draws.stream)
         if rand_skip:
@@ -220,7 +225,7 @@ class ReadingLayer(Layer):
 
 
 def _make(source: Source, num_tops: int, pinned: bool, iteration: int, count: int) -> list[Batch]:
-    """Make batches, in whatever thread; page-locked where they go to a GPU, so that the copy need not wait.
+    """Make batches, in any thread. For a GPU they are page-locked, so that the copy is asynchronous.
 
     It has no reference to the layer, so that an unused layer is deleted at once, and its threads are stopped.
     """
@@ -266,7 +271,7 @@ class Data(ReadingLayer):
         return source
 
     def known_shape(self) -> Shape | None:
-        """Return a shape where crop_size gives height and width, and one mean_value a channel their number."""
+        """Return the shape if crop_size gives height and width, and several mean_value the number of channels."""
         p = self.param.transform_param
         if p.crop_size and len(p.mean_value) > 1:
             return (self.batch_size, len(p.mean_value), p.crop_size, p.crop_size)
@@ -314,7 +319,7 @@ class ImageData(ReadingLayer):
         return source
 
     def known_shape(self) -> Shape | None:
-        """Return the shape where crop_size, or new_height and new_width, give height and width."""
+        """Return the shape if crop_size, or new_height and new_width, give height and width."""
         p, crop = self.param.image_data_param, self.param.transform_param.crop_size
         height, width = (crop, crop) if crop else (p.new_height, p.new_width)
         return (self.batch_size, 3 if p.is_color else 1, height, width) if height else None
@@ -361,6 +366,6 @@ class WindowData(ReadingLayer):
         return WindowSource(p, transform, file, mean, context.at, self.draws)
 
     def known_shape(self) -> Shape:
-        """Return the shape; the prototxt says all of it."""
+        """Return the shape, which the prototxt determines."""
         crop: int = self.param.transform_param.crop_size
         return (self.batch_size, 3, crop, crop)

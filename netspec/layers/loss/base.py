@@ -33,7 +33,7 @@ class Loss(Layer):
 
 
 class Floor(torch.autograd.Function):
-    """max(x, floor) whose gradient also passes below the floor, as in Caffe's losses."""
+    """max(x, floor), with a gradient that also passes below the floor, as in Caffe's losses."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, floor: float) -> torch.Tensor:
@@ -101,7 +101,7 @@ class Classified(Layer):
 
 
 class ClassLoss(Loss, Classified):
-    """Base of the losses of scores all of whose axes but the first are the classes."""
+    """Base of losses of scores, in which all axes but the first are the classes."""
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shapes = super().reshape(bottom_shapes)

@@ -254,7 +254,7 @@ class MultinomialLogisticLoss(ClassLoss):
 
 @register("Accuracy", "accuracy_param")
 class Accuracy(Classified):
-    """The share of predictions whose label is among the top_k scores; a tie with the label's score counts against it.
+    """The share of predictions with their label among the top_k scores. A tie with the label's score counts against it.
 
     It is 0 where every label is ignored. No gradient.
 

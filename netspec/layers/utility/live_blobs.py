@@ -1,8 +1,8 @@
-"""Blobs as pycaffe shows them: ``data`` and ``diff`` are numpy views of memory that lives on from pass to pass.
+"""Blobs for pycaffe: ``data`` and ``diff`` are numpy views of memory that is kept from pass to pass.
 
-A piece of memory grows and never shrinks: a blob of a smaller shape uses its front. A view shows what the
-next pass writes. Copying every blob into that memory would slow down each pass, so a tensor that a layer returns is
-kept as it is, and copied, or made the memory itself, when a view is asked for.
+The memory grows and never shrinks: a blob of a smaller shape uses its front. A view shows what the next pass writes.
+Copying every blob into that memory would slow down each pass. So a tensor that a layer returns is kept, and it is only
+copied, or becomes the memory itself, when a view is needed.
 
 Caffe: include/caffe/blob.hpp, src/caffe/syncedmem.cpp, python/caffe/_caffe.cpp
 """
@@ -26,23 +26,23 @@ def _no_view() -> np.ndarray | None:
 
 
 class Memory:
-    """One piece of memory (Caffe: SyncedMemory), ``capacity`` numbers long, zeros at first.
+    """Memory for ``capacity`` numbers (Caffe: SyncedMemory), zeros at first.
 
-    ``view`` shows it, ``tensor`` is its content for layers to read, ``put`` gives it what a layer has computed. On a
-    GPU a view shows what was there when ``view`` was called, and what is written to it then takes effect, as in Caffe.
+    ``view`` returns a view of it, ``tensor`` its content for layers to read, and ``put`` stores the result of a layer.
+    On a GPU a view shows the content at the time of the call of ``view``, and writes to it take effect, as in Caffe.
     """
 
     def __init__(self) -> None:
         self.capacity = 0
         self.device = torch.device("cpu")
         self.dtype = torch.float32
-        self._fresh: torch.Tensor | None = None  # what a layer has put here since a view was last asked for
+        self._fresh: torch.Tensor | None = None  # what a layer stored after the last call of ``view``
         self._flat: torch.Tensor | None = None  # what views show, one axis, in main memory
-        self._seen: Callable[[], np.ndarray | None] = _no_view  # the array that all views are views of, while any lives
+        self._seen: Callable[[], np.ndarray | None] = _no_view  # the base of all views, while there is one
         self._uploaded: torch.Tensor | None = None  # ``_flat`` on the GPU
 
     def reserve(self, count: int) -> None:
-        """Make room for ``count`` numbers; memory that grows is new memory, of zeros."""
+        """Make room for ``count`` numbers. Memory that grows is replaced by zeros."""
         if count > self.capacity:
             self.capacity = count
             self._fresh = self._flat = self._uploaded = None
@@ -60,7 +60,7 @@ class Memory:
         return array[:count].reshape(shape)
 
     def tensor(self, shape: Shape) -> torch.Tensor:
-        """Return the first numbers, on the device; who reads the tensor must not write to it."""
+        """Return the first numbers on the device. The caller must not write to the tensor."""
         count = math.prod(shape)
         holder = self.holder(count)
         if holder.shape == shape:
@@ -68,7 +68,7 @@ class Memory:
         return (holder if holder.numel() == count else holder.view(-1)[:count]).view(shape)
 
     def holder(self, count: int) -> torch.Tensor:
-        """Return the tensor that holds the first ``count`` numbers; while it is the same one, so are they."""
+        """Return the tensor that holds the first ``count`` numbers. They have not moved while it is the same tensor."""
         if self._fresh is not None and self._fresh.numel() == count:
             return self._fresh
         flat = self._settled(count)
@@ -79,7 +79,7 @@ class Memory:
         return self._uploaded
 
     def put(self, tensor: torch.Tensor) -> None:
-        """Take what a layer has computed; it belongs to the memory from now on."""
+        """Store the result of a layer. The tensor belongs to the memory from now on."""
         self.reserve(tensor.numel())
         if tensor.dtype != self.dtype:
             self.cast(tensor.dtype)
@@ -93,12 +93,12 @@ class Memory:
                 self._flat = None
 
     def leave_views(self) -> None:
-        """Go on in other memory with the same content, if there are views; they no longer change."""
+        """Move the content to other memory if there are views, so that they no longer change."""
         if self.is_watched() and self._flat is not None:
             self._flat, self._seen = self._flat.clone(), _no_view
 
     def is_watched(self) -> bool:
-        """Return whether there is a view, which must show what layers compute."""
+        """Return whether there is a view, which must show the results of layers."""
         return self.device.type == "cpu" and self._seen() is not None
 
     def cast(self, dtype: torch.dtype) -> None:
@@ -120,7 +120,7 @@ class Memory:
         return self._flat
 
     def _is_all(self, tensor: torch.Tensor) -> bool:
-        """Return whether a tensor can be the memory itself: of its size, and alone in its storage."""
+        """Return whether a tensor can be the memory itself: it has the size, and its storage to itself."""
         whole = tensor.device.type == "cpu" and tensor.numel() == self.capacity and not tensor.is_inference()
         return whole and tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
 
@@ -128,7 +128,7 @@ class Memory:
 class BorrowedMemory(Memory):
     """The memory of a tensor that a net or a solver owns: a learnable blob's values, or their gradient.
 
-    ``find`` returns the tensor. On a GPU views show a copy, which :meth:`upload` brings back.
+    ``find`` returns the tensor. On a GPU views show a copy, which :meth:`upload` copies back.
     """
 
     def __init__(self, find: Callable[[], torch.Tensor], capacity: int) -> None:
@@ -166,21 +166,21 @@ class BorrowedMemory(Memory):
 
     @torch.no_grad()
     def upload(self) -> None:
-        """Bring what views were written to since to the GPU."""
+        """Copy to the GPU what was written to views."""
         if self._written and self._copy is not None:
             self._find().detach().copy_(self._copy)
         self._written = False
 
 
 def _write(flat: torch.Tensor, tensor: torch.Tensor) -> None:
-    """Write a tensor to the front of memory; what autograd has saved of it changes too, as what Caffe reads does."""
+    """Write a tensor to the front of memory. Tensors that autograd has saved change too, as in Caffe."""
     flat.data[: tensor.numel()].copy_(tensor.detach().reshape(-1))
 
 
 class Blob:
     """An array and its gradient; ``data`` and ``diff`` are live views, read and written in place.
 
-    ``data_memory`` and ``diff_memory`` may be another blob's too (Caffe: ShareData, ShareDiff).
+    Blobs may share ``data_memory`` and ``diff_memory`` (Caffe: ShareData, ShareDiff).
     """
 
     def __init__(self, shape: Shape = (), data: Memory | None = None, diff: Memory | None = None) -> None:
@@ -207,7 +207,7 @@ class Blob:
 
     @property
     def count(self) -> int:
-        """How many values there are."""
+        """The number of values."""
         return math.prod(self._shape)
 
     @property
@@ -220,7 +220,7 @@ class Blob:
     width = property(lambda self: self._legacy_axis(3))
 
     def reshape(self, *shape: int) -> None:
-        """Take another shape, at once; the values stay where they are, those of memory that has to grow are 0."""
+        """Change the shape. The values stay in place; if the memory has to grow, they become 0."""
         axes = tuple(operator.index(size) for size in shape)
         if min(axes, default=0) < 0:
             raise ValueError(f"Check failed: shape[i] >= 0: found shape {axes}, expected no negative size")
@@ -231,7 +231,7 @@ class Blob:
         self.diff_memory.reserve(self.count)
 
     def put_data(self, tensor: torch.Tensor) -> None:
-        """Take values, and their shape, that a layer has computed."""
+        """Store the values that a layer has computed, and their shape."""
         if tensor.shape != self._shape:
             self.reshape(*tensor.shape)
         self.data_memory.put(tensor)

@@ -216,7 +216,7 @@ class BatchReindex(Layer):
 
 @register("Filter")
 class Filter(Layer):
-    """Keep the items whose selector is not 0; how many there are shows only at run time.
+    """Keep the items with a selector other than 0. Their number is known only at run time.
 
     bottom[i]  (N, ...)
     bottom[-1] the selector (N,) or (N, 1, ...)

@@ -1,4 +1,4 @@
-"""What ``import caffe`` gives to the code of a Python layer where no pycaffe is installed: Layer, TRAIN, TEST.
+"""A stand-in for pycaffe, for the code of Python layers that imports ``caffe``: Layer, TRAIN, TEST.
 
 Caffe: python/caffe/_caffe.cpp
 """
@@ -21,7 +21,7 @@ TRAIN, TEST = 0, 1
 
 
 class Layer:
-    """Base of the layers that people write: they add forward(bottom, top), backward(top, propagate_down, bottom)."""
+    """Base of users' layers, which add forward(bottom, top) and backward(top, propagate_down, bottom)."""
 
     param_str: str
     phase: int
@@ -32,7 +32,7 @@ class Layer:
         self.blobs = BlobVec()
 
     def setup(self, bottom: list[Blob], top: list[Blob]) -> None:
-        """Do what is to be done once."""
+        """Prepare the layer; called once."""
 
     def reshape(self, bottom: list[Blob], top: list[Blob]) -> None:
         """Give the tops their shapes."""
@@ -46,14 +46,14 @@ _home = __name__  # of what ``import caffe`` gives
 
 
 def offer(package: str) -> None:
-    """Let the code of Python layers import a package, with what is in it, as ``caffe`` in place of this module."""
+    """Let the code of Python layers import a package as ``caffe`` instead of this module."""
     global _home
     _home = package
 
 
 @contextmanager
 def importable() -> Iterator[None]:
-    """Let code import the stand-in as ``caffe``, unless there is a real one, and modules of the current directory."""
+    """A block in which code can import modules of the current directory, and ``caffe`` even if it is missing."""
     directory = os.getcwd()
     sys.path.insert(0, directory)
     stand_in = "caffe" not in sys.modules and not _is_installed(directory)
@@ -72,7 +72,7 @@ def importable() -> Iterator[None]:
 
 
 def can_import(module: str) -> bool:
-    """Say whether code would find a module, without running it; a package that it lies in is imported."""
+    """Return whether a module can be found, without running it. Its parent package is imported."""
     with importable():
         try:
             return importlib.util.find_spec(module) is not None
@@ -82,6 +82,6 @@ def can_import(module: str) -> bool:
 
 @cache
 def _is_installed(directory: str) -> bool:
-    """Say whether Python, run in a directory, finds a caffe; a mere folder of that name (Caffe's sources) is none."""
+    """Return whether Python finds a caffe in a directory. A plain folder of that name (Caffe's sources) is none."""
     spec = importlib.util.find_spec("caffe")
     return spec is not None and spec.origin is not None

@@ -1,4 +1,4 @@
-"""The Python layer: runs code that people wrote for pycaffe.
+"""The Python layer: runs users' code for pycaffe.
 
 Caffe: include/caffe/layers/python_layer.hpp
 """
@@ -199,7 +199,7 @@ def _describe(fault: Exception) -> str:
 
 @cache
 def _not_of_user() -> tuple[str, ...]:
-    """Return how the files of Python, of what is installed, and of netspec begin."""
+    """Return the path prefixes of Python's own files, of installed packages, and of netspec."""
     folders = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
     ours = str(Path(__file__).parents[2])
     return ("<", *(os.path.join(folder, "") for folder in (*folders, ours)))

@@ -14,7 +14,7 @@ from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 class _OtherShape(Layer):
-    """A layer whose top has its bottom's numbers in another shape."""
+    """A layer that returns its bottom in another shape."""
 
     shares = frozenset({"data", "diff"})
     ignores_propagate_down = frozenset({0})
