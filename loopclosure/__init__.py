@@ -1,6 +1,6 @@
 """Loop closure: which images show the same place, and how well a method finds them. It uses no networks.
 
-``LoopDetector`` is loaded when it is first used, so that reading a trajectory loads nothing else.
+``LoopDetector`` is imported when it is first used, so that importing one module does not import all of them.
 """
 
 TYPE_CHECKING = False

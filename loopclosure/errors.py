@@ -1,3 +1,3 @@
-"""The error that this package raises for a fault of the user, printed as compilers print theirs."""
+"""The error for faults in a user's files or settings, printed in the style of compilers (file:line:column)."""
 
 from netspec.errors import InputError as InputError

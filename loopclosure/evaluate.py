@@ -1,7 +1,7 @@
-"""Any set of methods on one data set: scores, measures by both conventions and in both zones, times.
+"""Evaluates methods on a data set: scores, measures by both conventions and in both zones, and times.
 
-The rule zone is the data set's truth as it is. In the soft zone, known where frames have poses, a match of views that
-overlap is no mistake either (:mod:`loopclosure.places.overlap`). What is to be found is the same in both.
+In the rule zone, the truth of the data set decides. In the soft zone, available if the frames have poses, a match of
+overlapping views is not a mistake either (:mod:`loopclosure.places.overlap`). The loops to find are the same in both.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ SOFT_ZONE = "; soft zone"
 
 @dataclass(frozen=True)
 class Judgment:
-    """How good scores are in one zone.
+    """The measures of a matrix of scores in one zone.
 
     pairs      the curve over all pairs
     best       the curve of the best match of each query
     matches    the best match of each query
-    recall_at  k -> share of the queries with a loop that have one among their best k
+    recall_at  k -> share of the queries with a loop for which the best k references include one
     """
 
     pairs: PrecisionRecall
@@ -43,14 +43,14 @@ class Judgment:
 
     @classmethod
     def of(cls, scores: np.ndarray, truth: Truth) -> Judgment:
-        """Judge scores (Q, R) by a truth."""
+        """Compute the measures of scores (Q, R) against a truth."""
         judged = JudgedScores(scores, truth)
         return cls(
             judged.all_pairs_curve(), judged.best_match_curve(), judged.best_matches, judged.recall_at(RECALL_AT)
         )
 
     def answered(self) -> str:
-        """Say how much of all that has a score is right, and how much of what is to be found that is."""
+        """Return the precision and the recall of all best matches that have a score, as text."""
         if not len(self.best.recall):
             return "nothing accepted, recall 0"
         return f"precision {self.best.precision[-1]:.3f}, recall {self.best.recall[-1]:.3f}"
@@ -71,14 +71,14 @@ class Judgment:
 
 @dataclass(frozen=True)
 class Outcome:
-    """One method on one data set: what it answered, and how good that is.
+    """The result of one method on one data set.
 
-    scores   (Q, R), as the method gave them
-    rule     how good they are in the rule zone
-    soft     the same in the soft zone; None where it is not known
+    scores   (Q, R) of the method, higher = more similar
+    rule     the measures in the rule zone
+    soft     the measures in the soft zone; None if it is not known
     seconds  stage -> total seconds
-    training_stages  the stages done once, on training images
-    answer   of a method that decides by itself: what became of the queries, and how much of it is right
+    training_stages  the stages that run once, on training images
+    answer   for a method that makes its own decisions: a summary of them and of how many are right
     """
 
     name: str
@@ -107,7 +107,7 @@ class Outcome:
 
     @property
     def recall_at(self) -> dict[int, float]:
-        """Of the rule zone: k -> share of the queries with a loop that have one among their best k."""
+        """The recall at k in the rule zone, see :class:`Judgment`."""
         return self.rule.recall_at
 
     @property
@@ -117,7 +117,7 @@ class Outcome:
 
     @property
     def shown(self) -> dict[str, dict[str, float]]:
-        """The measures for a reader; NaN for those over all pairs, where a method scores one pair of a query."""
+        """The measures to print; NaN over all pairs for a method that scores only one pair per query."""
         measures = self.measures
         if self.answer:
             measures = {**measures, ALL_PAIRS: dict.fromkeys(measures[ALL_PAIRS], np.nan)}
@@ -125,13 +125,13 @@ class Outcome:
 
     @cached_property
     def measures(self) -> dict[str, dict[str, float]]:
-        """How good the method is: convention and zone -> name of the measure -> value in 0..1."""
+        """The measures in both zones: convention and zone -> name of the measure -> value in 0..1."""
         return {**self.rule.measures(), **({} if self.soft is None else self.soft.measures(SOFT_ZONE))}
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All methods on one data set; ``train`` says which images vocabularies and the like were learned from."""
+    """The results of all methods on one data set; ``train`` describes the training images, as text."""
 
     data: DataSet
     outcomes: list[Outcome]
@@ -146,7 +146,7 @@ class Evaluation:
 def named_method(text: str, context: MethodContext) -> tuple[str, Method]:
     """Build a method from ``LABEL=METHOD`` or ``METHOD``; return the name to show, and the method."""
     label, equals, spec = text.partition("=")
-    if not equals or ":" in label:  # the = of a setting, which follows the colon of its method
+    if not equals or ":" in label:  # this = belongs to a setting after the method's colon
         method = make_method(text, context)
         return method.name, method
     return printable(label.strip()), make_method(spec, context)

@@ -1,13 +1,13 @@
-"""Precision and recall of a matrix of scores, exactly: one point for each distinct score, no grid of thresholds.
+"""Exact precision and recall of a matrix of scores: one point for each distinct score, no grid of thresholds.
 
-Two conventions are in use, and their results must never be mixed; every result here has the name of its convention:
+There are two conventions, and their results must not be mixed. Every result here has the name of its convention:
 
 - **all pairs**: every judged pair is a sample (the similarity matrix against its truth, as in the paper);
-- **best match of each query**: each query names its best reference, right or wrong; recall is the share of the
-  queries with a loop whose loop is found (FAB-MAP, SeqSLAM and most of the loop-closure literature).
+- **best match of each query**: only the best reference of each query counts, right or wrong; recall is the share of
+  found loops among the queries with a loop (FAB-MAP, SeqSLAM and most of the loop-closure literature).
 
-Soft truth marks pairs that are near enough not to be a mistake, but need not be found. Over all pairs such a pair is
-ignored. A best match that hits only soft truth is right for a query that has a loop, and ignored for other queries.
+Soft truth marks pairs that are not a mistake but need not be found. Over all pairs, such a pair is ignored. A best
+match that is only soft truth is right if the query has a loop, and ignored otherwise.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ BEST_MATCH = "best match of each query"
 class PrecisionRecall:
     """A precision-recall curve, from the highest score down; equal scores are one point.
 
-    convention         ALL_PAIRS or BEST_MATCH, or what the samples are
+    convention         ALL_PAIRS or BEST_MATCH, or a name for the samples
     thresholds         (n,) the distinct scores, descending; a score >= threshold is called a loop
     precision, recall  (n,)
-    positives          how many there are to find: judged pairs, or queries with a loop
-    samples            how many scores were judged
-    truth_description  what makes a place the same, and what was left out
+    positives          number of judged true pairs, or of queries with a loop
+    samples            number of judged scores
+    truth_description  the rule for the same place, and what was excluded
     """
 
     convention: str
@@ -53,23 +53,23 @@ class PrecisionRecall:
 
     @property
     def recall_at_full_precision(self) -> float:
-        """The greatest recall before the first mistake; 0 if the highest score is wrong."""
+        """The largest recall before the first mistake; 0 if the highest score is wrong."""
         return self.recall_at_precision(1.0)
 
     def recall_at_precision(self, wanted: float) -> float:
-        """Return the greatest recall of any threshold with at least this precision; 0 if there is none."""
+        """Return the largest recall of any threshold with at least this precision; 0 if there is none."""
         if not self.positives:
             return float("nan")
         return float(np.max(self.recall[self.precision >= wanted], initial=0.0))
 
     @property
     def best_f1(self) -> float:
-        """The greatest F1 of any threshold."""
+        """The largest F1 of any threshold."""
         return float(np.max(self._f1, initial=0.0)) if self.positives else float("nan")
 
     @property
     def best_f1_threshold(self) -> float:
-        """The highest threshold with the greatest F1; +inf if nothing is ever right."""
+        """The highest threshold with the largest F1; +inf if no sample is right."""
         f1 = self._f1
         return float(self.thresholds[np.argmax(f1)]) if np.any(f1 > 0) else float("inf")
 
@@ -90,7 +90,7 @@ def curve(
 
     scores     (n,); a NaN or -inf is never called a loop
     right      (n,) bool
-    positives  how many there are to find; by default the number of True in ``right``
+    positives  number of samples to find; default: the number of True in ``right``
     """
     scores, right = np.asarray(scores).reshape(-1), np.asarray(right, dtype=bool).reshape(-1)
     if len(scores) != len(right):
@@ -120,10 +120,10 @@ def curve(
 class BestMatches:
     """The best judged reference of each query.
 
-    reference  (Q,) its number, -1 if the query has no candidate with a score; of equal scores the first
+    reference  (Q,) its number, -1 if the query has no candidate with a score; the first one of equal scores
     score      (Q,) its score, -inf if it has none
-    right      (Q,) bool: it hits hard truth, or soft truth if the query has a loop
-    ignored    (Q,) bool: it hits soft truth and the query has no loop: neither right nor wrong
+    right      (Q,) bool: the match is hard truth, or soft truth and the query has a loop
+    ignored    (Q,) bool: the match is soft truth and the query has no loop; neither right nor wrong
     """
 
     reference: np.ndarray
@@ -134,9 +134,9 @@ class BestMatches:
 
 @dataclass(frozen=True)
 class JudgedScores:
-    """The scores (Q, R) of a method, higher = more alike, and the truth that they are judged by.
+    """The scores (Q, R) of a method, higher = more similar, and their truth.
 
-    A NaN is never found, but may be missed. What several measures need is computed once.
+    A pair with score NaN is never found, but it counts as missed if it is true. Shared results are computed once.
     """
 
     scores: np.ndarray
@@ -150,7 +150,7 @@ class JudgedScores:
             )
 
     def all_pairs_curve(self) -> PrecisionRecall:
-        """Judge every pair by itself."""
+        """Return the curve over all pairs."""
         truth = self.truth
         counted = truth.judged & (truth.hard | ~truth.soft)
         return curve(
@@ -158,7 +158,7 @@ class JudgedScores:
         )
 
     def best_match_curve(self) -> PrecisionRecall:
-        """Judge the best match of each query. A wrong match of a query with a loop is one mistake."""
+        """Return the curve over the best match of each query. A wrong match counts as one mistake."""
         found = self.best_matches
         kept = ~found.ignored
         positives = int(np.count_nonzero(self.truth.queries_with_a_loop))
@@ -176,9 +176,10 @@ class JudgedScores:
         return BestMatches(np.where(none, -1, reference), score, soft & loops, soft & ~loops)
 
     def recall_at(self, ks: tuple[int, ...] = (1, 5, 10, 20)) -> dict[int, float]:
-        """Return, for each k, the share of the queries with a loop that have a hard or soft one among their best k.
+        """Return, for each k, the share of the queries with a loop that have a true reference among their best k.
 
-        Of equal scores the first references count. Queries without a loop are left out; NaN if no query has one.
+        Soft truth counts as true. Equal scores are ranked in the order of the references. Queries without a loop are
+        left out; NaN if no query has a loop.
         """
         queries = np.flatnonzero(self.truth.queries_with_a_loop)
         if not len(queries):
@@ -194,7 +195,7 @@ class JudgedScores:
 
     @cached_property
     def _candidates(self) -> np.ndarray:
-        """The scores (Q, R), -inf for what is not judged and for NaN."""
+        """The scores (Q, R), -inf for NaN and for pairs that are not judged."""
         return np.where(self.truth.judged & ~np.isnan(self.scores), self.scores, -np.inf)
 
 

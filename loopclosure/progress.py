@@ -1,4 +1,4 @@
-"""How far the work is, and how long its stages take; the caller decides how it is shown."""
+"""Progress and times of the stages of a computation; the caller decides how to show them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Item = TypeVar("Item")
 
 
 class Progress(Protocol):
-    """Wraps the items of one stage of the work, to show how far it is; ``stage`` is its name in the table of times."""
+    """Wraps the items of one stage to show progress; ``stage`` is its name in the table of times."""
 
     def __call__(self, items: Iterable[Item], stage: str, total: int | None = None) -> Iterable[Item]:
         """Return an iterable of the same items."""
@@ -19,7 +19,7 @@ class Progress(Protocol):
 
 
 def silent(items: Iterable[Item], stage: str, total: int | None = None) -> Iterable[Item]:
-    """Show nothing: for tests and for programs."""
+    """Return ``items`` and show nothing."""
     return items
 
 

@@ -1,1 +1,1 @@
-"""Closing the loops: odometry and loops become a pose graph, which is solved so that false loops do no harm."""
+"""Corrects a path by its loops: builds a pose graph of odometry and loops, and solves it despite false loops."""

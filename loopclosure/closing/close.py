@@ -1,4 +1,4 @@
-"""Odometry and loops -> a pose graph -> a mended path; its files. Simulated drift, and how far two paths are apart."""
+"""Corrects a path by its loops and writes the result; simulates drift; measures the error of a path."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from loopclosure.places.same_place import MAX_DISTANCE_M
 from loopclosure.places.trajectory import Trajectory, write_trajectory
 from netspec.files.whole_file import write_csv
 
-# The standard deviations of a step of odometry: a share of its length and of its turn, and this much at least.
+# The standard deviations of a step of odometry: a share of its length and of its rotation angle, plus a constant.
 STEP_SHARE, STEP_M, TURN_SHARE, TURN_RAD = 0.02, 0.002, 0.02, 0.002
 
 
@@ -28,10 +28,13 @@ class Closed:
     """A path before and after its loops were closed.
 
     frames     (N,) numbers of the frames that have odometry: node i of the graph is frame frames[i]
-    odometry   (N, 7) poses before;  poses  (N, 7) after
-    steps      the edges of the odometry;  edges  those of the L loops in it
-    loops      (L) loops between nodes;  accepted  (L,) bool: the loop agrees with the rest
-    not_measured  loops whose images do not tell a pose
+    odometry   (N, 7) poses before
+    poses      (N, 7) poses after
+    steps      edges of the odometry
+    edges      edges of the L loops
+    loops      the L loops between nodes
+    accepted   (L,) bool: the loop agrees with the rest of the graph
+    not_measured  number of loops left out because no relative pose could be computed from their images
     truth      (N, 7), NaN where not known, or None
     """
 
@@ -46,7 +49,7 @@ class Closed:
     truth: np.ndarray | None = None
 
     def count(self, kind: str) -> int:
-        """Return how many loops were measured in this way."""
+        """Return the number of loops of this ``Relative.kind``."""
         return sum(loop.relative is not None and loop.relative.kind == kind for loop in self.loops)
 
     def errors(self) -> dict[str, tuple[float, float]] | None:
@@ -72,7 +75,7 @@ class Closed:
 def close(odometry: np.ndarray, loops: Sequence[Loop], truth: np.ndarray | None = None) -> Closed:
     """Close measured loops of a sequence of frames with odometry (F, 7), NaN for frames without; truth likewise.
 
-    Loops whose frames have no odometry, or that were not measured, are left out.
+    Loops are left out if they were not measured, or if one of their frames has no odometry.
     """
     frames = np.flatnonzero(np.all(np.isfinite(odometry), axis=1))
     if len(frames) < 2:
@@ -102,8 +105,8 @@ def _information_of_step(step: np.ndarray) -> np.ndarray:
 def _constraint(relative: Relative) -> tuple[np.ndarray, np.ndarray]:
     """Return the pose (7,) and the information (6, 6) of a loop's edge.
 
-    Where the length of the translation is not known, the edge says nothing along its direction; where only the
-    rotation is known, nothing of the translation. So any program that reads g2o can use them.
+    If the length of the translation is not known, the information along its direction is 0. If only the rotation is
+    known, the information of the whole translation is 0. So any program that reads g2o can use these edges.
     """
     information = LOOP_SIGMAS.information()
     pose = relative.pose.copy()
@@ -117,9 +120,9 @@ def _constraint(relative: Relative) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_closed(out: Path, closed: Closed, stamps: np.ndarray | None, names: Sequence[str]) -> None:
-    """Write closed.g2o, closed.txt and odometry.txt (TUM), and loops.csv with what became of each loop.
+    """Write closed.g2o, closed.txt and odometry.txt (TUM), and loops.csv with each loop and whether it was used.
 
-    Frames without a stamp have their numbers for seconds.
+    Without stamps, the frame numbers are written as seconds.
     """
     out.mkdir(parents=True, exist_ok=True)
     times = closed.frames.astype(float) if stamps is None else stamps[closed.frames]
@@ -140,7 +143,7 @@ def write_closed(out: Path, closed: Closed, stamps: np.ndarray | None, names: Se
 
 
 def summary(closed: Closed) -> list[str]:
-    """Return what there is to say about a closed path, a sentence each."""
+    """Return sentences that summarize a closed path."""
     used = int(np.count_nonzero(closed.accepted))
     lines = [f"{used} of {len(closed.loops)} loops used, {len(closed.loops) - used} contradict the others"]
     if spot := one_spot(closed):
@@ -163,12 +166,12 @@ def summary(closed: Closed) -> list[str]:
 
 Array = NDArray[np.float64]
 
-# With a drift of 1 %: this much of rotation per meter, as of a turn of one degree.
+# Simulated rotation error per meter and per percent of drift, in degrees.
 DEGREES_PER_M = 0.1
 
 
 def steps_between(poses: Array) -> Array:
-    """Return the pose (N - 1, 7) of each of N poses (7,) in the frame of the one before."""
+    """Return the pose (N - 1, 7) of each of N poses (7,) in the frame of the previous one."""
     return relative_pose(poses[:-1], poses[1:])
 
 
@@ -184,9 +187,10 @@ def path_of(start: Array, steps: Array) -> Array:
 def drifted(truth: Array, percent: float, seed: int) -> Array:
     """Return the odometry (N, 7) that a robot with ``percent`` of drift has of a true path (N, 7).
 
-    Each step is off by that share of its length, in a direction fixed in the camera, and turned by that share of its
-    own turn plus 0.1 degrees per meter and percent about a fixed axis: calibration errors, which add up. Noise of the
-    same size in each step comes on top, which hardly does. Direction, axis and noise follow from the seed.
+    Each step gets a translation error of ``percent`` of its length, in a direction fixed in the camera, and a rotation
+    error of ``percent`` of its rotation plus 0.1 degrees per meter and percent, about a fixed axis. These errors model
+    a wrong calibration and accumulate. Each step also gets random noise of the same size, which mostly averages out.
+    The direction, the axis and the noise depend on ``seed``.
     """
     if not 0 < percent <= 100:
         raise InputError(f"a drift of {percent:g} %; expected a number above 0, at most 100")
@@ -204,7 +208,7 @@ def drifted(truth: Array, percent: float, seed: int) -> Array:
 
 
 def aligned(path: Array, truth: Array, known: NDArray[np.bool_]) -> Array:
-    """Return poses (N, 7) moved and turned as a whole, so that the ``known`` (N,) are nearest to those of ``truth``.
+    """Align poses (N, 7) with ``truth`` by one rigid motion: least squares over the positions of ``known`` (N,) poses.
 
     Umeyama, PAMI 1991, without scale.
     """
@@ -220,12 +224,12 @@ def ate_rmse_m(path: Array, truth: Array) -> float:
 
     Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012.
     """
-    apart = aligned(path, truth, np.ones(len(path), bool))[:, :3] - truth[:, :3]
-    return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+    differences = aligned(path, truth, np.ones(len(path), bool))[:, :3] - truth[:, :3]
+    return float(np.sqrt(np.mean(np.sum(differences**2, axis=1))))
 
 
 def turn_rmse_deg(path: Array, truth: Array) -> float:
-    """Return the root mean square of the angles between the rotations of two paths, after the best common turn."""
+    """Return the root mean square angle in degrees between the rotations of two paths, after aligning them."""
     a, b = (Rotation.from_quat(poses[:, 3:]) for poses in (path, truth))
     common = (b * a.inv()).mean()
     return float(np.degrees(np.sqrt(np.mean(((common * a).inv() * b).magnitude() ** 2))))

@@ -1,10 +1,11 @@
-"""Pose graphs in g2o files, of three and of two dimensions: read, solved, written.
+"""Reads, solves and writes pose graphs in g2o files, in 3D and in 2D.
 
 Lines: ``VERTEX_SE3:QUAT id x y z qx qy qz qw``, ``EDGE_SE3:QUAT i j`` with the pose of j in the frame of i and the 21
 upper entries of its information matrix; ``VERTEX_SE2 id x y theta``, ``EDGE_SE2 i j x y theta`` with 6 entries;
-``FIX id``. Ids may have gaps and any order; ``#`` begins a comment. A file of edges alone gets its vertices from them.
+``FIX id``. Ids may have gaps and be in any order; ``#`` starts a comment. If a file has only edges, the vertices are
+computed from them.
 
-A graph of two dimensions is one of three whose poses lie in a plane: errors and solution are the same.
+A 2D graph is solved as a 3D graph with all poses in a plane; errors and solution are the same.
 """
 
 from __future__ import annotations
@@ -25,17 +26,20 @@ from netspec.files.whole_file import write_csv
 
 Array = NDArray[np.float64]
 
-# How many numbers follow, and how many of them are ids.
+# tag: (how many numbers follow it, how many of them are ids)
 NUMBERS = {VERTEX: (8, 1), EDGE: (30, 2), VERTEX_2D: (4, 1), EDGE_2D: (11, 2), "FIX": (1, 1)}
 
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """A pose graph as its file gives it.
+    """A pose graph read from a file.
 
-    ids    (N,) of the vertices, ascending;  poses  (N, 7);  held  the vertices that stay, as rows of ids
-    steps  edges between vertices whose ids follow each other: odometry, which is trusted;  loops  all others
-    flat   whether the file has two dimensions
+    ids    (N,) ids of the vertices, ascending
+    poses  (N, 7) poses of the vertices
+    held   fixed vertices, as indices into ids
+    steps  edges between vertices with consecutive ids: odometry, which is trusted
+    loops  all other edges
+    flat   whether the file is a 2D graph
     """
 
     ids: NDArray[np.int_]
@@ -47,7 +51,7 @@ class PoseGraph:
 
 
 def read_pose_graph(path: Path) -> PoseGraph:
-    """Read a g2o file. Raises InputError (file:line) for what is not a pose graph."""
+    """Read a g2o file. Raises InputError (file:line) if it is not a pose graph."""
     vertices: dict[int, Array] = {}
     edges: list[tuple[int, int, int, Array, Array]] = []  # line, ids, pose, information
     fixed: list[tuple[int, int]] = []  # line, id
@@ -94,9 +98,9 @@ def read_pose_graph(path: Path) -> PoseGraph:
 
 
 def _chained(nodes: int, edges: list[Edge]) -> Array:
-    """Return the poses (N, 7) that edges give when they are chained from the first node of each part on.
+    """Return poses (N, 7) by chaining edges, starting at the first node of each connected part.
 
-    Odometry comes first: an edge is taken the sooner, the nearer its ends follow each other.
+    Edges with a smaller difference of ids are preferred, so odometry comes first.
     """
     joined: dict[tuple[int, int], Edge] = {}
     for edge in edges:
@@ -121,12 +125,12 @@ def _chained(nodes: int, edges: list[Edge]) -> Array:
 
 
 def solve_pose_graph(graph: PoseGraph, all_true: bool = False) -> Solution:
-    """Find the poses that agree best with all edges; loops that contradict the rest do no harm, if not ``all_true``."""
+    """Find the poses that agree best with all edges; reject loops that contradict the rest, unless ``all_true``."""
     return solve(graph.poses, graph.steps, graph.loops, graph.held, graph.flat, all_true)
 
 
 def write_solution(out: Path, graph: PoseGraph, solution: Solution) -> None:
-    """Write closed.g2o, without the loops that were rejected, and loops.csv, which says what became of each."""
+    """Write closed.g2o, without the rejected loops, and loops.csv, with each loop and whether it was used."""
     out.mkdir(parents=True, exist_ok=True)
     ids, accepted = graph.ids.tolist(), solution.accepted.tolist()
     kept = [edge for edge, used in zip(graph.loops, accepted, strict=True) if used]
@@ -141,13 +145,13 @@ def write_solution(out: Path, graph: PoseGraph, solution: Solution) -> None:
 
 
 def summary(graph: PoseGraph, solution: Solution) -> list[str]:
-    """Return what there is to say about a solved graph, a sentence each."""
+    """Return sentences that summarize a solved graph."""
     used = int(np.count_nonzero(solution.accepted))
     kept = [edge for edge, accepted in zip(graph.loops, solution.accepted, strict=True) if accepted]
     before = squares_of(graph.poses, [*graph.steps, *kept]).sum()
     after = solution.odometry_squares.sum() + solution.squares[solution.accepted].sum()
     return [
-        f"{len(graph.ids)} poses, {len(graph.steps)} edges of odometry: between vertices whose ids follow each other",
+        f"{len(graph.ids)} poses, {len(graph.steps)} edges of odometry: between vertices with consecutive ids",
         f"{used} of {len(graph.loops)} loops used, {len(graph.loops) - used} contradict the others",
         f"chi-squared {before:.6g} before, {after:.6g} after, of the edges that are used",
     ]
@@ -183,7 +187,7 @@ def _lifted(flat: Array) -> Array:
 
 
 def _information(values: Array, path: Path, line: int) -> Array:
-    """Return the information (6, 6) of an edge; in a plane, that of what it does not say is 1, and its error 0."""
+    """Return the information (6, 6) of an edge; a 2D edge gets 1 for the other dimensions, where its error is 0."""
     flat = len(values) == 9
     size, pose = (3, 3) if flat else (6, 7)
     matrix = np.zeros((size, size))

@@ -1,16 +1,16 @@
-"""A pose graph, and its solution by least squares with a loss that gives up on false loops.
+"""Solves a pose graph by least squares with a robust loss that ignores false loops.
 
-An edge i -> j measures the pose Z of j in the frame of i. Its error is that of g2o: the translation of Z^-1 T_i^-1 T_j,
-and its rotation as a vector in radians, weighted by an information matrix (6, 6).
+An edge i -> j measures the pose Z of j in the frame of i. Its error is defined as in g2o: the translation of
+Z^-1 T_i^-1 T_j, and its rotation as a vector in radians, weighted by an information matrix (6, 6).
 
-Steps are those of Gauss and Newton, halved until the loss is less. Damping them, as Levenberg and Marquardt do, costs
-more steps: it holds back the long, weak bends of a path most, which are what loops correct. SciPy factors the normal
-equations (SuperLU). Where GTSAM is installed, it does so (multifrontal Cholesky): in about two thirds of the time.
+The solver is Gauss-Newton with a line search: a step is halved until the loss decreases. Levenberg-Marquardt damping
+needs more steps, because it slows down the long, weak bends of a path most, and these are what loops correct. SciPy
+factors the normal equations (SuperLU). If GTSAM is installed, it does (multifrontal Cholesky), in about two thirds of
+the time.
 
-False loops: the loss of an edge with squared error s is that of Geman and McClure, s / (1 + s / c), which is nearly s
-for a small error and never more than c. To start far from the solution, c is large at first, at least as large as the
-greatest error, and then made smaller (graduated non-convexity: Yang, Antonante, Tzoumas, Carlone, RA-L 2020). Odometry
-edges keep the square.
+A loop edge with squared error s has the Geman-McClure loss s / (1 + s / c), which is nearly s for a small error and
+never more than c. To allow a start far from the solution, c is at least the largest error at first and is then reduced
+(graduated non-convexity: Yang, Antonante, Tzoumas, Carlone, RA-L 2020). Odometry edges have the squared loss.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from scipy.special import gammaincinv  # scipy.stats, which has chi2, takes a qu
 
 Array = NDArray[np.float64]
 
-TRUE_BELOW = 0.99  # the squared error of a true loop is below its limit in so many cases (chi-squared)
-WIDEST, NARROWER = 1000.0, 10.0  # the loss at first, in units of that square; and from one stage to the next
+TRUE_BELOW = 0.99  # probability that the squared error of a true loop is below its limit (chi-squared)
+WIDEST, NARROWER = 1000.0, 10.0  # c at first, as a multiple of that limit, and its divisor from stage to stage
 EARLY_STEPS, LAST_STEPS = 2, 50
-EARLY_GAIN, LAST_GAIN = 1e-2, 1e-7  # a stage ends when a step makes the loss smaller by less than this share
+EARLY_GAIN, LAST_GAIN = 1e-2, 1e-7  # a stage ends when a step reduces the loss by less than this share
 DAMPING = 1e-12  # of the diagonal: only a guard against directions that no edge constrains
-HALVES = 10  # of a step that makes the loss greater
+HALVES = 10  # the most lengths of a step that are tried, each half the one before
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Edge:
 class Solution:
     """Poses (N, 7) of all nodes, and the squared error of each edge there: (S,) odometry, (L,) loops.
 
-    limits  (L,) up to which the error of a loop agrees with the rest of the graph
+    limits  (L,) the largest squared error with which a loop is accepted
     """
 
     poses: Array
@@ -77,9 +77,9 @@ def solve(
 ) -> Solution:
     """Find the poses (N, 7) that agree best with all edges.
 
-    ``poses`` are those to start from. Some of the loops may be false, unless they are ``all_true``. The ``held`` nodes
-    stay where they are, and the first node of each part of the graph that has none of them. In a ``flat`` graph an edge
-    measures three numbers, not six.
+    The search starts from ``poses``. Some of the loops may be false, unless ``all_true`` is set. The ``held`` nodes do
+    not move; in a connected part of the graph without held nodes, the first node does not move. In a ``flat`` graph,
+    an edge measures three numbers, not six.
     """
     graph = _Graph(len(poses), [*odometry, *loops], held)
     state = State(poses[:, :3], Rotation.from_quat(poses[:, 3:]))
@@ -91,7 +91,7 @@ def solve(
     factor = max(WIDEST, worst()) if loops and not all_true else 1.0
     while factor > 1:
         state = _descend(graph, state, _Loss(len(odometry), factor * limits), EARLY_STEPS, EARLY_GAIN)
-        factor = min(factor / NARROWER, worst())  # at once to the last where no loop is false
+        factor = min(factor / NARROWER, worst())  # directly to the last stage if no loop is false
     state = _descend(graph, state, _Loss(len(odometry), limits), LAST_STEPS, LAST_GAIN)
     squares = graph.squares(state)
     solved = np.hstack([state.positions, state.turns.as_quat(canonical=True)])
@@ -99,7 +99,7 @@ def solve(
 
 
 def _limits(loops: Sequence[Edge], flat: bool) -> Array:
-    """Return the greatest error (L,) of a true loop: it grows with how many numbers the loop measures."""
+    """Return the largest squared error (L,) of a true loop; it depends on how many numbers the loop measures."""
     measured = np.linalg.matrix_rank(np.array([edge.information for edge in loops]).reshape(-1, 6, 6), hermitian=True)
     return 2 * gammaincinv(np.maximum(1, measured - (3 if flat else 0)) / 2, TRUE_BELOW)
 
@@ -118,7 +118,7 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class _Loss:
-    """The squares of the first edges, and Geman and McClure's loss, of at ``most`` (L,) that much, of the others."""
+    """The squared loss for the first ``odometry`` edges; the Geman-McClure loss with c = ``most`` (L,) for loops."""
 
     odometry: int
     most: Array
@@ -128,14 +128,14 @@ class _Loss:
         return float(squares[: self.odometry].sum() + (loops / (1 + loops / self.most)).sum())
 
     def weights(self, squares: Array) -> Array:
-        """Return the derivative (E,) of the loss by the square of each edge."""
+        """Return the derivative (E,) of the loss with respect to the squared error of each edge."""
         weights = np.ones(len(squares))
         weights[self.odometry :] = (1 + squares[self.odometry :] / self.most) ** -2
         return weights
 
 
 def _descend(graph: _Graph, state: State, loss: _Loss, most_steps: int, least_gain: float) -> State:
-    """Return a state of less loss near this one, by the steps of Gauss and Newton, halved until the loss is less."""
+    """Reduce the loss from this state by Gauss-Newton steps, each halved until the loss decreases."""
     squares = graph.squares(state)
     for _ in range(most_steps):
         before = loss(squares)
@@ -156,7 +156,7 @@ def _descend(graph: _Graph, state: State, loss: _Loss, most_steps: int, least_ga
 
 
 class _Graph:
-    """Errors of all edges and their derivatives; unknown: a step and a turn in the world of each node not held."""
+    """The errors of all edges and their derivatives. The unknowns are a translation and a rotation per free node."""
 
     def __init__(self, nodes: int, edges: Sequence[Edge], held: Collection[int] = ()) -> None:
         self._first = np.array([edge.first for edge in edges], int)
@@ -174,8 +174,8 @@ class _Graph:
         self._shape = 6 * len(edges), 6 * int(np.count_nonzero(self._place >= 0))
 
     def moved(self, state: State, x: Array) -> State:
-        """Return the state after a step and a turn in the world, x (6 U,), of the unknown nodes."""
-        change = np.vstack([x.reshape(-1, 6), np.zeros((1, 6))])[self._place]  # place -1, of those held, is the last
+        """Return the state after the free nodes are translated and rotated by x (6 U,), in the world frame."""
+        change = np.vstack([x.reshape(-1, 6), np.zeros((1, 6))])[self._place]  # place -1 of held nodes is the last row
         steps = np.linalg.solve(_inverse_left(change[:, 3:]), change[:, :3, None])[..., 0]
         return State(state.positions + steps, Rotation.from_rotvec(change[:, 3:]) * state.turns)
 
@@ -253,7 +253,7 @@ def _inverse_left(turns: Array) -> Array:
 def least_squares_step(derivatives: sparse.csr_matrix, errors: Array, gtsam: bool | None = None) -> Array:
     """Return the x (6 U,) with the least \\|derivatives x + errors\\|; rows (6 E) in blocks of six, one to an edge.
 
-    ``gtsam``: whether GTSAM factors; None: where it is installed. Steps along directions that no edge constrains are 0.
+    ``gtsam``: whether to use GTSAM; None: if it is installed. Directions that no edge constrains get steps of 0.
     """
     if find_spec("gtsam") is not None if gtsam is None else gtsam:
         try:
@@ -263,7 +263,7 @@ def least_squares_step(derivatives: sparse.csr_matrix, errors: Array, gtsam: boo
     normal = (derivatives.T @ derivatives).tocsc()
     guarded = normal + sparse.diags(DAMPING * normal.diagonal() + DAMPING)
     options = {"SymmetricMode": True}
-    # The unknowns are in a good order already; narrow panels suit blocks of six.
+    # The unknowns are in a good order already; narrow panels are fastest with blocks of six.
     factored = splu(guarded.tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0, relax=1, panel_size=8, options=options)
     return factored.solve(-(derivatives.T @ errors))
 
@@ -272,7 +272,7 @@ def _by_gtsam(derivatives: sparse.csr_matrix, errors: Array) -> Array:
     gtsam = import_module("gtsam")  # optional, and without types
 
     blocks, shape = derivatives.tobsr((6, 6)), derivatives.shape
-    assert shape is not None  # SciPy's types leave that open
+    assert shape is not None  # in SciPy's types it may be None
     starts, nodes, values = blocks.indptr.tolist(), blocks.indices.tolist(), np.asarray(blocks.data)
     unit = gtsam.noiseModel.Unit.Create(6)
     factors = gtsam.GaussianFactorGraph()
@@ -285,7 +285,7 @@ def _by_gtsam(derivatives: sparse.csr_matrix, errors: Array) -> Array:
 
 
 def order(nodes: int, first: NDArray[np.int_], second: NDArray[np.int_]) -> NDArray[np.int_]:
-    """Return the place (N,) of each node in an order that fills in little: minimum degree, one number to a node."""
+    """Return the place (N,) of each node in a minimum-degree order, which keeps the factor sparse."""
     if not nodes:
         return np.zeros(0, int)
     ends = sparse.coo_matrix((np.ones(len(first)), (first, second)), (nodes, nodes))

@@ -1,4 +1,4 @@
-"""From the table of accepted loops to measured ones: which frames they join, and the pose of one in the other."""
+"""Reads a table of loops and measures the relative pose of the two frames of each loop."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from netspec.errors import nearest_existing
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import safe_cell
 
-# A pose is measured in the whole image: the larger, the better.
+# Images are not reduced: a larger image gives a better pose.
 CHECK = GeometricCheck(max_features=1000, min_inliers=LEAST_INLIERS, most_side=1_000_000)
-KEPT_VIEWS = 500  # their features, in memory
+KEPT_VIEWS = 500  # images with cached features
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """The pose of one image relative to another that shows the same place: from depth, or from color alone.
 
-With depth the pose is in meters: points of one image with depth, seen by the other (PnP). From color alone the
-essential matrix gives the rotation, and the direction of the translation without its length. Where the camera only
-turned, all points fit a rotation, and the direction is noise: then only the rotation counts.
+With depth the pose is in meters: it is computed from points of one image with depth and their pixels in the other
+(PnP). From color alone the essential matrix gives the rotation and the direction of the translation, not its length.
+If the camera only rotated, all points fit a rotation and the direction is noise; then only the rotation is returned.
 
 Hartley and Zisserman, Multiple View Geometry, chapters 9 and 11.
 """
@@ -22,10 +22,10 @@ METRIC, UP_TO_SCALE, ROTATION_ONLY = "metric", "up to scale", "rotation only"
 LEAST_INLIERS = 20
 MAX_ERROR_PX = 2.0
 CONFIDENCE = 0.999
-# Points of SIFT are good to about a pixel. Where a rotation leaves less than this, the rest says nothing.
+# SIFT points are accurate to about a pixel. If a rotation leaves a smaller residual, there is no usable translation.
 LEAST_PARALLAX_PX = 2.0
 SEED = 1
-# Depths of neighboring pixels within this factor are of one surface.
+# Neighboring pixels are on one surface if their depths differ by less than this factor.
 ONE_SURFACE = 1.05
 
 
@@ -76,7 +76,7 @@ def relative_view(match: View, query: View, matches: np.ndarray) -> Relative | N
 
 
 def _depth_at(depth: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the depth (N,) at pixels (N, 2), 0 where it is not known; between two surfaces it is not known."""
+    """Return the depth (N,) at pixels (N, 2); 0 where it is not known or at the edge of a surface."""
     height, width = depth.shape
     at = np.rint(points).astype(np.intp)
     at = at[:, 1].clip(0, height - 1), at[:, 0].clip(0, width - 1)
@@ -122,7 +122,7 @@ def _from_color(in_match: np.ndarray, in_query: np.ndarray, focal: float) -> Rel
 
 
 def _turned(in_match: np.ndarray, in_query: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the rotation (3, 3) that brings the rays (N, 2) nearest, and the median of what is left, at depth 1."""
+    """Return the rotation (3, 3) that aligns the rays (N, 2) best, and the median residual at depth 1."""
     a, b = (np.column_stack([rays, np.ones(len(rays))]) for rays in (in_match, in_query))
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
     weights, left = np.ones(len(a)), np.zeros(len(a))

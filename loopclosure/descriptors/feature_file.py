@@ -12,9 +12,9 @@ from loopclosure.descriptors.whitening import Whitening
 from loopclosure.errors import InputError
 from netspec.files.arrays import read_npz
 
-# Arrays of the file that are about the images and are not descriptors.
-BESIDE_FEATURES = ("names", "keys", "stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms")
-# Descriptors of one image by one net on two machines differ by less than this share of their length.
+# Arrays of the file that are not descriptors.
+NOT_FEATURES = ("names", "keys", "stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms")
+# The descriptors of an image by the same net on two machines differ by less than this share of their length.
 SAME_DESCRIPTOR = 1e-3
 
 
@@ -25,8 +25,8 @@ class Features:
     features           (N, D) float32; with several views of each image (N, views D), view after view
     names              the N images' names, empty if the file has none
     stamps             (N,) seconds, None if the file has none
-    seconds_per_image  the net's time per image, NaN if the file does not say
-    views              how many views of each image were described: the file's ``zooms``
+    seconds_per_image  the net's time per image, NaN if the file does not have it
+    views              number of described views per image: the length of the file's ``zooms``
     """
 
     path: Path
@@ -39,8 +39,8 @@ class Features:
     def rows_of(self, images: Sequence[Path]) -> np.ndarray:
         """Return the descriptors (len(images), D) of these images, found by name.
 
-        As many trailing parts of path and name are compared as are needed to distinguish all images: ``rgb/1.png`` of
-        the file is ``/data/fr1/rgb/1.png``. A file without names must have exactly these images, in order.
+        Names match if their last parts are equal, with as many parts as needed to distinguish all images: ``rgb/1.png``
+        in the file matches ``/data/fr1/rgb/1.png``. A file without names must have exactly these images, in order.
         """
         if not self.names:
             if len(self.features) != len(images):
@@ -65,14 +65,14 @@ class Features:
         raise InputError(f"{missing}; its first name is {self.names[0]}", self.path)
 
     def whitened(self, whitening: Whitening) -> Features:
-        """Return the same images with whitened descriptors, each view by itself."""
+        """Return a copy with whitened descriptors; each view is whitened separately."""
         return replace(self, features=whitening.of_views(self.features, self.views))
 
     def described_too(self, images: Sequence[Path], rows: np.ndarray) -> list[Path]:
-        """Return those of ``images``, with descriptors ``rows`` (len(images), D), that this file describes too.
+        """Return the ``images``, with descriptors ``rows`` (len(images), D), that this file describes too.
 
-        An image is the same if the last part of its name and its descriptor are: many data sets have a 0001.jpg. If
-        the file has no names, the descriptor alone decides.
+        Two images are the same if the last parts of their names and their descriptors are equal. The name alone is not
+        enough, because many data sets have a 0001.jpg. If the file has no names, only the descriptors are compared.
         """
         numbers: dict[str, list[int]] = {}
         for number, name in enumerate(self.names):
@@ -86,10 +86,10 @@ class Features:
 
 
 def read_features(path: str | Path) -> Features:
-    """Read a features.npz; without an array ``features``, its only other array, named after a blob, is taken."""
+    """Read a features.npz. If it has no array ``features``, its only other array, named after a blob, is used."""
     path = Path(path)
     arrays = read_npz(path, "the .npz that netspec extract --images writes")
-    candidates = [name for name in arrays if name not in BESIDE_FEATURES]
+    candidates = [name for name in arrays if name not in NOT_FEATURES]
     chosen = "features" if "features" in arrays else candidates[0] if len(candidates) == 1 else ""
     if not chosen:
         found = ", ".join(sorted(arrays)) or "nothing"

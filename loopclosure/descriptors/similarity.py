@@ -1,9 +1,9 @@
-"""Similarity of descriptors: whole matrices for short sequences, the best few references of each frame for long ones.
+"""Similarity of descriptors: whole matrices for short sequences, the best references of each frame for long ones.
 
 Higher scores are more similar: the cosine similarity, or minus the Euclidean distance, which ContrastiveLoss trains.
-Products are computed in the precision of the descriptors. Euclidean distances come from |a|^2 + |b|^2 - 2 a.b about the
-references' mean, with a rounding error of about eps * (|a|^2 + |b|^2) in the square: 1e-3 of the norm in float32, which
-matters only for frames that are almost the same.
+Products are computed in the precision of the descriptors. Euclidean distances are computed as |a|^2 + |b|^2 - 2 a.b
+after subtracting the mean of the references. The squared distance has a rounding error of about
+eps * (|a|^2 + |b|^2), so the distance of almost equal frames has an error of up to 1e-3 of the norm in float32.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ BLOCK_COLUMNS = 16384
 class TopK:
     """The best references of each query, best first; equal scores in the order of the references.
 
-    indices  (Q, k) int64, -1 where a query has fewer than k candidates
-    scores   (Q, k), higher = more similar, -inf where there is no candidate
+    indices  (Q, k) int64, -1 if a query has fewer than k candidates
+    scores   (Q, k), higher = more similar, -inf if there is no candidate
     """
 
     indices: np.ndarray
@@ -42,8 +42,8 @@ class TopK:
 class Descriptors:
     """Descriptors prepared for one metric.
 
-    rows     (N, D): of unit length for cosine (a descriptor of zeros stays zero, similar to nothing); less ``mean``
-             for Euclidean
+    rows     (N, D): scaled to unit length for cosine (zeros stay zero, and are similar to nothing); minus ``mean`` for
+             Euclidean
     squares  (N,) their squared lengths
     """
 
@@ -53,7 +53,7 @@ class Descriptors:
     mean: np.ndarray
 
     def scores(self, queries: Descriptors, rows: slice, columns: slice) -> np.ndarray:
-        """Return the scores of some of ``queries`` (rows) against some of these (columns)."""
+        """Return the scores of a slice of ``queries`` (rows) against a slice of these descriptors (columns)."""
         if self.metric == "cosine":
             return queries.rows[rows] @ self.rows[columns].T
         distances = squared_distances(
@@ -68,11 +68,11 @@ class Descriptors:
 def squared_distances(a: np.ndarray, b: np.ndarray, squares_a: np.ndarray | float, squares_b: np.ndarray) -> np.ndarray:
     """Return |a|^2 + |b|^2 - 2 a.b for each row of ``a`` (N, D) and of ``b`` (M, D): (N, M).
 
-    squares_a  (N, 1) squared lengths of the rows of ``a``; 0 leaves them out, which keeps the order within each row
+    squares_a  (N, 1) squared lengths of the rows of ``a``; 0 omits them; the order within each row is the same
     squares_b  (M,) squared lengths of the rows of ``b``
 
-    Rounding may make a result slightly negative. scikit-learn's euclidean_distances and pairwise_distances_argmin
-    compute float32 in float64, which takes several times as long.
+    Rounding may make a result slightly negative. scikit-learn's euclidean_distances and pairwise_distances_argmin are
+    several times slower, because they compute float32 in float64.
     """
     products = a @ b.T
     products *= -2
@@ -82,7 +82,7 @@ def squared_distances(a: np.ndarray, b: np.ndarray, squares_a: np.ndarray | floa
 
 
 def prepare(features: np.ndarray, metric: str = "euclidean", mean: np.ndarray | None = None) -> Descriptors:
-    """Prepare descriptors (N, D); ``mean`` (D,) is that of the references, by default their own.
+    """Prepare descriptors (N, D); ``mean`` (D,) is the mean of the references, default: of ``features``.
 
     Raises InputError for another shape, an unknown metric, a NaN or an infinity.
     """
@@ -125,10 +125,10 @@ def similarity_matrix(
 ) -> np.ndarray:
     """Return all scores (Q, R) at once; ``references`` None compares ``queries`` (Q, D) with themselves.
 
-    A descriptor may consist of those of several ``views``, one after the other. The score of two images is then that of
-    their two most similar views.
+    A descriptor may contain several ``views``, one after the other. The score of two images is then the score of their
+    two most similar views.
 
-    100,000 frames would need 40 GB: use :func:`similarity_blocks` or :func:`top_k` for those.
+    The matrix of 100,000 frames needs 40 GB: use :func:`similarity_blocks` or :func:`top_k` for long sequences.
     """
     if views == 1:
         query, reference = _pair(queries, references, metric)
@@ -156,9 +156,9 @@ def top_k(
 ) -> TopK:
     """Find the ``k`` best references of each query; only one block of scores is in memory at a time.
 
-    ``references`` None searches one sequence for its own loops: frame i against the earlier frames j < i, without those
-    that ``exclusion`` excludes (by ``stamps`` (Q,) in seconds, if it has seconds). With references every pair is a
-    candidate.
+    Without ``references``, one sequence is searched for its own loops: frame i is compared with the earlier frames
+    j < i, except those that ``exclusion`` excludes (``stamps`` (Q,) in seconds are needed if it has seconds). With
+    references, every pair is a candidate.
     """
     if k < 1:
         raise InputError(f"the best {k} were asked for; expected 1 or more")
@@ -231,11 +231,11 @@ def _mask_not_earlier(
 
 
 def _merge(indices: np.ndarray, scores: np.ndarray, block: np.ndarray, left: int) -> None:
-    """Merge a block of scores, whose first column is reference ``left``, into the best so far, in place."""
+    """Merge a block of scores into the best so far, in place; its first column is reference ``left``."""
     k = indices.shape[1]
     if block.shape[1] > k:
         chosen = np.argpartition(block, block.shape[1] - k, axis=1)[:, -k:]
-        # Of equal scores at the border, argpartition takes any; the earliest are wanted, so that results repeat.
+        # argpartition keeps any of equal scores at the border; keeping the earliest makes results reproducible.
         border = np.take_along_axis(block, chosen, axis=1).min(axis=1)
         tied = (np.count_nonzero(block >= border[:, None], axis=1) > k) & ~np.isneginf(border)
         for row in np.flatnonzero(tied):

@@ -19,7 +19,7 @@ NORMALIZATIONS = ("image", "patch", "none")
 
 @dataclass(frozen=True)
 class Thumbnailer:
-    """How an image is reduced.
+    """Reduces an image to a gray thumbnail.
 
     width, height  of the thumbnail in pixels
     normalize      "image": zero mean, unit deviation; "patch": the same for each patch (SeqSLAM); "none": gray values
@@ -41,7 +41,7 @@ class Thumbnailer:
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the thumbnail (height, width) float32 of an (H, W) or (H, W, 3) uint8 image."""
-        # INTER_AREA averages all pixels; bilinear interpolation would use four of them and alias.
+        # INTER_AREA averages all pixels; bilinear interpolation uses only four and causes aliasing.
         small = cv2.resize(gray(image), (self.width, self.height), interpolation=cv2.INTER_AREA).astype(np.float32)
         if self.normalize == "none":
             return small
@@ -49,9 +49,10 @@ class Thumbnailer:
 
 
 def normalize_patches(image: np.ndarray, patch: int = 0) -> np.ndarray:
-    """Return (image - mean) / deviation for each patch, the deviation with n - 1; 0 if a patch is uniform.
+    """Return (image - mean) / standard deviation for each patch, with n - 1; 0 if a patch is uniform.
 
-    image (H, W); patch: its side in pixels, of which H and W are multiples; 0: the whole image is one patch.
+    image  (H, W)
+    patch  side of a patch in pixels; H and W must be multiples of it; 0: the whole image is one patch
     """
     height, width = image.shape
     rows, columns = (patch, patch) if patch else (height, width)
@@ -68,15 +69,15 @@ def differences(queries: np.ndarray, references: np.ndarray) -> np.ndarray:
     return cdist(a, b, "cityblock") / a.shape[1]
 
 
-# Levels of gray whose histogram gives the entropy of a region; its greatest value is their logarithm.
+# Gray levels of the histogram for the entropy of a region; the maximum of the entropy is their logarithm.
 ENTROPY_LEVELS = 32
 
 
 @dataclass(frozen=True)
 class Hog:
-    """Blocks of 2 x 2 cells of gradient histograms of a gray image.
+    """Histograms of oriented gradients of a gray image, in blocks of 2 x 2 cells.
 
-    side  the image is resized to this many pixels in both directions, a multiple of ``cell``
+    side  the image is resized to this many pixels in both directions; a multiple of ``cell``
     cell  side of a cell in pixels
     bins  directions over 180 degrees
     """
@@ -103,7 +104,7 @@ class Hog:
         share = direction - low
         cells = self.side // self.cell
         histogram = np.zeros((cells, cells, self.bins), np.float32)
-        for bin_, weight in ((low, 1 - share), (low + 1, share)):  # each gradient is shared by two bins
+        for bin_, weight in ((low, 1 - share), (low + 1, share)):  # each gradient is split between two bins
             for number in range(self.bins):
                 here = np.where(bin_ % self.bins == number, strength * weight, 0)
                 histogram[..., number] += here.reshape(cells, self.cell, cells, self.cell).sum(axis=(1, 3))
@@ -112,7 +113,7 @@ class Hog:
         return np.divide(block, length, out=np.zeros_like(block), where=length > 0)
 
     def entropies(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """Return the entropy of the gray values of each block, as a share of the greatest: (n - 1, n - 1)."""
+        """Return the entropy of the gray values of each block over its maximum: (n - 1, n - 1)."""
         levels = self._resized(image) // (256 // ENTROPY_LEVELS)
         cells = self.side // self.cell
         count = np.stack(

@@ -1,8 +1,8 @@
-"""PCA whitening: directions in which descriptors of all places vary together should not decide which are similar.
+"""PCA whitening of descriptors, so that directions with a large variance do not dominate the similarity.
 
-After Jegou and Chum, "Negative evidences and co-occurences in image retrieval: the benefit of PCA and whitening"
-(ECCV 2012): center the descriptors, rotate them to their principal directions, keep the strongest, give these equal
-variance, scale to length 1. It is learned from images of other places.
+From Jegou and Chum, "Negative evidences and co-occurences in image retrieval: the benefit of PCA and whitening" (ECCV
+2012): center the descriptors, project them on their strongest principal directions, scale these to equal variance, and
+normalize to length 1. It is learned from images of other places.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ COMPONENTS = 512
 
 @dataclass(frozen=True)
 class Whitening:
-    """A whitening, to be called with descriptors.
+    """A whitening transform; call it with descriptors.
 
-    mean        (D,) float32, of the descriptors it was learned from
+    mean        (D,) float32, mean of the training descriptors
     projection  (D, K) float32: the principal directions, strongest first, divided by their standard deviation ** power
-    images      how many descriptors it was learned from
+    images      number of training descriptors
     power       1 makes the variances of the K directions equal, 0 leaves them as they are
-    source      the file of these descriptors, for notes and errors
+    source      the file of the training descriptors, for notes and errors
     """
 
     mean: np.ndarray
@@ -38,7 +38,7 @@ class Whitening:
         return f"whitened by {self.source or 'other descriptors'}: {size}"
 
     def check(self, descriptors: np.ndarray) -> None:
-        """Raise InputError for descriptors (N, D) of another D than it was learned from."""
+        """Raise InputError if descriptors (N, D) have another D than the training descriptors."""
         if descriptors.shape[1] != len(self.mean):
             raise InputError(
                 f"has descriptors of {len(self.mean)} dimensions, those to be whitened have {descriptors.shape[1]}; "
@@ -47,18 +47,18 @@ class Whitening:
             )
 
     def project(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return descriptors (N, D) whitened, (N, K) float32, not scaled to length 1."""
+        """Whiten descriptors (N, D) without normalizing them: (N, K) float32."""
         self.check(descriptors)
         return (descriptors.astype(np.float32) - self.mean) @ self.projection
 
     def __call__(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return descriptors (N, D) whitened and of length 1, (N, K) float32; zero for the mean itself."""
+        """Whiten descriptors (N, D) and normalize them to length 1: (N, K) float32; zero for the mean itself."""
         rows = self.project(descriptors)
         lengths = np.linalg.norm(rows, axis=1, keepdims=True)
         return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0)
 
     def of_views(self, descriptors: np.ndarray, views: int) -> np.ndarray:
-        """Return descriptors of several views, one after the other (N, views D), each whitened: (N, views K)."""
+        """Whiten each view of descriptors (N, views D): (N, views K)."""
         return np.hstack([self(view) for view in np.split(descriptors, views, axis=1)])
 
 
@@ -67,7 +67,7 @@ def learn_whitening(
 ) -> Whitening:
     """Learn a whitening from descriptors (N, D) of other images, N >= 2.
 
-    At most ``components`` directions are kept, and no more than the descriptors vary in, which is at most
+    At most ``components`` directions are kept, and no more than the rank of the centered descriptors, which is at most
     min(N - 1, D). Raises InputError, naming ``source``, for unusable descriptors and for settings out of range.
     """
     if components < 1:
@@ -81,8 +81,8 @@ def learn_whitening(
     values = descriptors.astype(np.float64)
     mean = values.mean(axis=0)
     _, singular, directions = np.linalg.svd(values - mean, full_matrices=False)
-    # Below this a direction is rounding of float32 and not variance; dividing by it would amplify the rounding.
-    # The scale is that of the descriptors, not of their differences: their mean is rounded too.
+    # Below this floor, a direction is only float32 rounding, and dividing by it would amplify the rounding. The floor
+    # is relative to the descriptors, not to their differences, because their mean is rounded too.
     floor = np.finfo(np.float32).eps * np.linalg.norm(values)
     kept = min(components, len(values) - 1, int(np.count_nonzero(singular > floor)))
     if not kept:

@@ -1,4 +1,4 @@
-"""Closing loops as images arrive, and on recordings."""
+"""Finds loops while images arrive, or in recordings."""
 
 from loopclosure.detector.decision import DetectorSettings, LoopResult
 from loopclosure.detector.detector import LoopDetector

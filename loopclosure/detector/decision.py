@@ -1,4 +1,4 @@
-"""What a detector decides of a frame, and by which settings."""
+"""The result of adding a frame to a detector, and the settings of the decision."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from loopclosure.descriptors.similarity import check_metric
 from loopclosure.errors import InputError
 
-Runs = list[tuple[int, int]]  # of a frame: its candidates, and how many consecutive frames led to each
+Runs = list[tuple[int, int]]  # of one frame: (candidate, number of consecutive frames that led to it)
 
 
 @dataclass(frozen=True)
 class LoopResult:
-    """What adding one frame found. It is true if the frame closes a loop.
+    """The result of adding one frame. It is true if the frame closes a loop.
 
     query_id    the frame's number, from 0
     candidates  (id, score) of the best earlier frames, best first, higher = more similar
     accepted    the earlier frame that this one closes a loop with, or None
-    verdict     why: "accepted", "no candidate", "too early" (to choose a threshold), "below threshold",
+    verdict     the reason: "accepted", "no candidate", "too early" (to choose a threshold), "below threshold",
                 "not consistent", "not verified"
     score       of the accepted frame, or of the best candidate; -inf without one
     inliers     inliers of the accepted candidate, or the most of any candidate tried; None if none was tried
@@ -44,16 +44,16 @@ class DetectorSettings:
     """How loops are decided.
 
     metric              "euclidean" (score = minus the distance) or "cosine"
-    views               how many views of an image a descriptor consists of, one after the other; the score of two
-                        frames is that of their two most similar views
+    views               the number of views of an image in a descriptor, one after the other; the score of two
+                        frames is the score of their two most similar views
     exclude_recent      frames i - exclude_recent .. i - 1 are not candidates of frame i
     exclude_seconds     frames less than this many seconds old are not candidates either
     top_k               how many candidates are examined
-    threshold           a candidate needs score >= threshold. None: with a geometric check, that decides alone; without
-                        one a candidate must be as similar as consecutive frames so far are (their median)
-    consistency         how many previous frames must have had a candidate that leads to this one, so that places
-                        follow each other in time
-    consistency_window  a candidate leads to one of the next frame that is at most this many frames away
+    threshold           a candidate needs score >= threshold. None: the geometric check decides alone; without a check,
+                        the threshold is the median score of consecutive frames so far
+    consistency         the number of previous frames that must have had a candidate that leads to this one: the frames
+                        of a true loop follow each other
+    consistency_window  a candidate leads to a candidate of the next frame if they are at most this many frames apart
     """
 
     metric: str = "euclidean"
@@ -78,7 +78,7 @@ class DetectorSettings:
 
 
 def result_of(found: Any, count: int) -> LoopResult:
-    """Return a saved loop of a detector of ``count`` frames. Raises ValueError, LookupError or TypeError."""
+    """Return a loop read from a file of ``count`` frames. Raises ValueError, LookupError or TypeError."""
     candidates = [(int(number), float(score)) for number, score in found["candidates"]]
     loop = LoopResult(**{**found, "candidates": candidates})
     ends = (loop.query_id, loop.accepted)

@@ -6,8 +6,9 @@
         if result.accepted is not None:
             ...  # this frame shows the same place as frame result.accepted
 
-The search is that of an index (:mod:`loopclosure.index`), by default exact: a product of all earlier descriptors with
-the new one. Its cost grows with the number of frames; all other costs are constant: see :meth:`LoopDetector.add`.
+An index (:mod:`loopclosure.index`) searches the earlier descriptors. The default index is exact: it multiplies all
+earlier descriptors by the new one. The cost of the search grows with the number of frames; all other costs are
+constant. See :meth:`LoopDetector.add`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from netspec.files.arrays import check_array, from_json, read_npz
 from netspec.files.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]
-LEAST_STEPS = 20  # from one frame to the next, before they give a threshold
+LEAST_STEPS = 20  # scores of consecutive frames that are needed to choose a threshold
 FORMAT = 1  # of the file that save writes
 SAVED = "a file that LoopDetector.save wrote"
 
@@ -38,7 +39,7 @@ SAVED = "a file that LoopDetector.save wrote"
 class LoopDetector:
     """Finds loops frame by frame; ``loops`` holds the results that were accepted, in order.
 
-    Frames are numbered from 0; the newest, ``exclude_recent`` of them, are no candidates.
+    Frames are numbered from 0. The newest ``exclude_recent`` frames are not candidates.
 
         >>> detector = LoopDetector(exclude_recent=1, threshold=-0.5)
         >>> for place in (0, 1, 2, 0):
@@ -60,9 +61,10 @@ class LoopDetector:
 
         describe  image (H, W, 3) uint8 BGR -> descriptor (D,), the same D each time, or (views D,); None: use
                   ``add_descriptor``
-        settings  or its fields by name: ``LoopDetector(describe, exclude_recent=50, top_k=5)``
+        settings  the settings; single fields can also be given by name:
+                  ``LoopDetector(describe, exclude_recent=50, top_k=5)``
         check     verifies candidates by their geometry, best first; None: no verification
-        index     where descriptors are kept and searched, empty; or its name, for
+        index     an empty index that stores and searches the descriptors, or a name for
                   :func:`loopclosure.index.index.open_index`
         """
         given = asdict(settings or DetectorSettings())
@@ -70,7 +72,7 @@ class LoopDetector:
         if unknown:
             raise TypeError(f"LoopDetector has no setting {', '.join(sorted(unknown))}; known: {', '.join(given)}")
         self.describe = describe
-        self.fingerprint: str | None = fingerprint_of(describe)  # of what described the frames; None: an older file's
+        self.fingerprint: str | None = fingerprint_of(describe)  # None: unknown, from an older file
         self.settings = DetectorSettings(**{**given, **changes})
         self.check = check
         self.loops: list[LoopResult] = []
@@ -79,7 +81,7 @@ class LoopDetector:
         self._sessions = [0]  # the first frame of each
         self._steps: list[float] = []  # the score of each frame with the one before it
         self._runs: Runs = []  # of the last frame
-        self._last = np.zeros((0, 0), np.float32)  # its descriptor
+        self._last = np.zeros((0, 0), np.float32)  # the descriptor of the last frame
 
     def __len__(self) -> int:
         return self._frames.count
@@ -104,9 +106,9 @@ class LoopDetector:
     ) -> LoopResult:
         """Add the next frame, (H, W, 3) uint8 BGR, and return whether it closes a loop.
 
-        ``stamp`` in seconds; ``pose`` tx ty tz qx qy qz qw, camera-to-world: kept for the export, not used otherwise.
+        ``stamp`` is in seconds. ``pose`` is tx ty tz qx qy qz qw, camera-to-world; it is only stored for the export.
 
-        The cost is that of ``describe`` and of one pass over all earlier descriptors, 4 D bytes each (docs/growth.md).
+        The cost is one call of ``describe`` and one pass over all earlier descriptors of 4 D bytes (docs/growth.md).
         """
         if self.describe is None:
             raise InputError("this detector has no describe function; give one, or use add_descriptor")
@@ -119,7 +121,7 @@ class LoopDetector:
         pose: Sequence[float] | np.ndarray | None = None,
         image: np.ndarray | None = None,
     ) -> LoopResult:
-        """Add a frame whose descriptor (D,) is known already; ``image`` is needed only for a geometric check."""
+        """Add a frame by its descriptor (D,); ``image`` is needed only for a geometric check."""
         position = _checked_pose(pose)
         row = self._row(descriptor)
         self._check_stamp(stamp)
@@ -139,9 +141,9 @@ class LoopDetector:
         pose: Sequence[float] | np.ndarray | None = None,
         image: np.ndarray | None = None,
     ) -> None:
-        """Add the next frame and decide nothing: for a drive that is decided as a whole when it is over.
+        """Add the next frame without looking for loops, which are found later from all frames of the drive.
 
-        descriptor  (D,), or None: ``describe`` makes it of ``image``
+        descriptor  (D,), or None: ``describe`` computes it from ``image``
         image       (H, W, 3) uint8 BGR; also needed for a geometric check
         """
         if descriptor is None:
@@ -155,7 +157,7 @@ class LoopDetector:
         self._keep(row, stamp, position, self._local(image))
 
     def look_up(self, frame: int) -> LoopResult:
-        """Look for the place of a remembered frame of the last session in the sessions before it."""
+        """Look for the place of a frame of the last session in the sessions before it."""
         row = self.descriptors_of(frame, frame + 1).reshape(self.settings.views, -1)
         local = None if self.check is None else self.local_features(frame)
         stamp = float(self._frames.stamps[frame])
@@ -181,12 +183,12 @@ class LoopDetector:
         image: np.ndarray | None,
         before: Runs,
     ) -> tuple[LoopResult, Runs]:
-        """Look up frame ``query`` of another session, after one with the runs ``before``; nothing is kept of it."""
+        """Look up frame ``query`` of another session without adding it. ``before``: the runs of the frame before it."""
         candidates = self._candidates(self._row(descriptor), True)
         return self._decide(query, candidates, stamp, self._local(image), before)
 
     def begin_session(self) -> None:
-        """Go on with the frames of another drive: all earlier ones are its candidates, however recent."""
+        """Start another drive. All earlier frames are candidates for its frames, however recent they are."""
         self._frames.settle(len(self))
         if len(self) > self._sessions[-1]:
             self._sessions.append(len(self))
@@ -202,15 +204,15 @@ class LoopDetector:
         return self._frames.rows(start, stop)
 
     def local_features(self, frame: int) -> LocalFeatures:
-        """Return the points that the geometric check found in a frame, to measure a loop by."""
+        """Return the points that the geometric check found in a frame, for measuring the pose of a loop."""
         return self._frames.local[frame]
 
     def arrays_since(self, frame: int) -> dict[str, np.ndarray]:
-        """Return what a file has of the frames from this one on, but their descriptors."""
+        """Return the arrays that a file stores for the frames from ``frame`` on, without their descriptors."""
         return self._frames.arrays(self.check is not None, frame)
 
     def decided(self, loops: Sequence[LoopResult], threshold: float | None) -> None:
-        """Take loops that were found with all frames in view, and a threshold for frames to come."""
+        """Set the loops, found from all frames at once, and the threshold for later frames."""
         self.loops = list(loops)
         self.settings = replace(self.settings, threshold=None if threshold is None else float(threshold))
 
@@ -231,9 +233,9 @@ class LoopDetector:
 
     @classmethod
     def load(cls, path: str | Path, describe: Describe | None = None, index: Index | str = "exact") -> LoopDetector:
-        """Read what ``save`` wrote; ``describe`` must be the one that the detector was made with.
+        """Read a file that ``save`` wrote; ``describe`` must be the function that the detector was made with.
 
-        Raises InputError for any other file, and where both have a ``fingerprint``, as nets do, that differs.
+        Raises InputError for any other file, or if the file and ``describe`` have different fingerprints.
         """
         arrays = read_npz(path, SAVED)
         try:
@@ -241,11 +243,11 @@ class LoopDetector:
             if about["format"] != FORMAT:
                 raise InputError(f"has format {about['format']}; this version reads {FORMAT}", path)
             check = None
-            if about["check"] is not None:  # files from before a setting was added do not have it
+            if about["check"] is not None:  # older files lack newer settings
                 check = from_json(GeometricCheck, {**asdict(GeometricCheck()), **about["check"]})
             detector = cls(describe, from_json(DetectorSettings, about["settings"]), check=check, index=index)
             detector.fingerprint = about.get("fingerprint")
-            refuse_another(fingerprint_of(describe), detector.fingerprint, "or begin anew", path)
+            refuse_another(fingerprint_of(describe), detector.fingerprint, "or start a new file", path)
             detector._take(arrays)
             detector._sessions = _starts(about.get("sessions", [0]), len(detector))
             detector._steps = detector._all_steps()
@@ -268,11 +270,11 @@ class LoopDetector:
             frames.waiting.extend(arrays["rows"].reshape(count, self.settings.views, -1))
 
     def take_session(self, blocks: Iterable[np.ndarray], arrays: dict[str, np.ndarray], points: Points | None) -> None:
-        """Add the frames of a session that is over, without looking them up.
+        """Add the frames of a finished session without looking for loops.
 
-        blocks  their descriptors, (N, views D) each, if the index has none of them yet
+        blocks  their descriptors, (N, views D) each, except those that are in the index already
         arrays  their ``stamps`` (N,) and ``poses`` (N, 7), NaN where not known
-        points  for a geometric check
+        points  their local features for a geometric check, or None
         """
         self.begin_session()
         frames, views = self._frames, self.settings.views
@@ -283,13 +285,13 @@ class LoopDetector:
             self._last = frames.index.rows((len(self) - 1) * views, len(self) * views)
 
     def _row(self, descriptor: Sequence[float] | np.ndarray) -> np.ndarray:
-        """Return the row that is kept, (views, D): of unit length for cosine."""
+        """Check a descriptor and return the row to store, (views, D), of unit length for cosine."""
         row = np.asarray(descriptor, np.float32).reshape(-1)
         frames, views = self._frames, self.settings.views
         before = self._last.size if frames.count else len(row)
         if len(row) != before:
             found = f"frame {frames.count} has a descriptor of {len(row)} dimensions, those before {before}"
-            raise InputError(f"{found}; take the net that described those, or begin anew")
+            raise InputError(f"{found}; use the net that described those, or start a new detector")
         if len(row) % views:
             raise InputError(f"frame {frames.count} has a descriptor of {len(row)} dimensions, not of {views} views")
         row = row.reshape(views, -1)
@@ -316,7 +318,7 @@ class LoopDetector:
         return -np.linalg.norm(other[:, None] - row, axis=-1).min()
 
     def _threshold(self) -> float | None:
-        """Return the least score of a loop now; None if there are too few frames to tell."""
+        """Return the current threshold; None if there are too few frames to choose one."""
         if self.settings.threshold is not None:
             return self.settings.threshold
         if self.check is not None:
@@ -324,7 +326,7 @@ class LoopDetector:
         return float(np.median(self._steps)) if len(self._steps) >= LEAST_STEPS else None
 
     def _end(self, stamp: float | None) -> int:
-        """Return how many frames are candidates of the next one: all of earlier sessions, and this one's early ones."""
+        """Return how many frames are candidates: all of earlier sessions, and those of this one that are not recent."""
         frames, settings, begin = self._frames, self.settings, self._sessions[-1]
         end = max(begin, frames.count - settings.exclude_recent)
         if settings.exclude_seconds and stamp is not None:
@@ -333,9 +335,9 @@ class LoopDetector:
         return end
 
     def _candidates(self, row: np.ndarray, waiting: bool) -> list[tuple[int, float]]:
-        """Return the most similar frames, best first; ``waiting``: also of those that the index does not have yet."""
+        """Return the most similar frames, best first; ``waiting``: search the frames not yet in the index too."""
         frames, views, k = self._frames, self.settings.views, self.settings.top_k
-        best: dict[int, float] = {}  # several views of a frame may be found, and by several of this one
+        best: dict[int, float] = {}  # the search can return several views of one frame
         for view in row if frames.settled else ():
             for number, value in zip(*(found.tolist() for found in frames.index.search(view, k * views)), strict=True):
                 best[number // views] = max(value, best.get(number // views, value))
@@ -364,7 +366,7 @@ class LoopDetector:
         local: LocalFeatures | None,
         before: Runs,
     ) -> tuple[LoopResult, Runs]:
-        """Threshold, then consistency, then geometry; return the result, and what can lead to the next frame."""
+        """Apply threshold, consistency, then geometry; return the result and the runs for the next frame."""
         settings = self.settings
         runs: Runs = []
         score = candidates[0][1] if candidates else float("-inf")
@@ -402,15 +404,15 @@ class LoopDetector:
 
 
 def fingerprint_of(describe: Describe | None) -> str:
-    """Return the ``fingerprint`` of what describes, which a net has; "" where there is none."""
+    """Return the ``fingerprint`` of a ``describe`` function; "" if it has none. Nets have one."""
     return str(getattr(describe, "fingerprint", ""))
 
 
 def refuse_another(describes: str, described: str | None, instead: str, path: str | Path) -> None:
-    """Raise InputError for fingerprints that differ; ``instead`` says what else to do than take the other net."""
+    """Raise InputError for fingerprints that differ; ``instead`` is the alternative to using the other net."""
     if describes and described and describes != described:
-        told = f"its frames were described by another net ({described}, this is {describes})"
-        raise InputError(f"{told}; take the version of the package that has it, {instead}", path)
+        fault = f"its frames were described by another net ({described}, this is {describes})"
+        raise InputError(f"{fault}; use the version of the package that has it, {instead}", path)
 
 
 def _checked_pose(pose: Sequence[float] | np.ndarray | None) -> np.ndarray | None:
@@ -424,7 +426,7 @@ def _checked_pose(pose: Sequence[float] | np.ndarray | None) -> np.ndarray | Non
 
 
 def _starts(found: Any, count: int) -> list[int]:
-    """Return where the sessions of ``count`` frames begin. Raises ValueError or TypeError for anything else."""
+    """Check the first frame of each session of ``count`` frames. Raises ValueError or TypeError."""
     starts = [int(start) for start in found]
     if starts[:1] != [0] or sorted(starts) != starts or starts[-1] > count:
         raise ValueError(f"sessions that begin at {starts} of {count} frames")

@@ -1,7 +1,8 @@
-"""Loops as files: a table, and edges for a pose-graph optimizer (g2o).
+"""Writes loops to files: a CSV table, and a pose graph (g2o) for an optimizer.
 
-A g2o file has lines ``VERTEX_SE3:QUAT id x y z qx qy qz qw`` and ``EDGE_SE3:QUAT i j`` with the pose of j in the frame
-of i, T_i^-1 T_j, and the 21 upper entries of the information matrix, row by row: translation first, then rotation.
+A g2o file has one line per vertex and per edge. A vertex is ``VERTEX_SE3:QUAT id x y z qx qy qz qw``. An edge is
+``EDGE_SE3:QUAT i j``, followed by the pose of j in the frame of i, T_i^-1 T_j, and the 21 entries of the upper triangle
+of the information matrix, row by row: translation first, then rotation.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from loopclosure.errors import InputError
 from netspec.files.whole_file import write_csv, write_whole
 
 VERTEX, EDGE, VERTEX_2D, EDGE_2D = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_SE2", "EDGE_SE2"
-PLANE = np.array([0, 1, 5])  # x, y and the turn about z, of the six numbers of a pose's error
+PLANE = np.array([0, 1, 5])  # x, y and the rotation about z, in the 6-vector of a pose error
 LOOPS = ("query_id", "match_id", "score", "inliers", "query_stamp", "match_stamp", "query_name", "match_name")
 
 RelativePose = Callable[[int, int], np.ndarray | None]
@@ -42,7 +43,7 @@ LOOP_SIGMAS = Sigmas(0.1, 0.05)
 
 
 def relative_pose(pose_a: np.ndarray, pose_b: np.ndarray) -> np.ndarray:
-    """Return the pose (..., 7) of each b in the frame of its a, T_a^-1 T_b, w >= 0; poses are tx ty tz qx qy qz qw."""
+    """Return the pose (..., 7) of each b in the frame of a, T_a^-1 T_b, with w >= 0; a pose is tx ty tz qx qy qz qw."""
     back, there = Rotation.from_quat(pose_a[..., 3:]).inv(), Rotation.from_quat(pose_b[..., 3:])
     step = back.apply(pose_b[..., :3] - pose_a[..., :3])
     return np.concatenate([step, (back * there).as_quat(canonical=True)], axis=-1)
@@ -58,7 +59,7 @@ def write_loops_csv(
 ) -> None:
     """Write one row per loop: query_id, match_id, score, inliers, and stamps (N,) in seconds and names (N) if known.
 
-    ``match_stamps`` and ``match_names`` (M): those of another drive's frames, in which the queries were found.
+    ``match_stamps`` and ``match_names`` (M) are given if the matches are frames of another drive.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -78,11 +79,11 @@ def write_loops_csv(
 def write_g2o(path: str | Path, poses: np.ndarray, loops: Sequence[LoopResult], relative: RelativePose) -> int:
     """Write a pose graph; return how many loops were left out because their relative pose is not known.
 
-    poses     (N, 7) of the frames, tx ty tz qx qy qz qw, as the robot estimates them; NaN if not known. They are the
-              vertices, and consecutive poses give the odometry edges.
-    relative  (query_id, match_id) -> pose (7,) of the query in the frame of the match, measured in another way (depth,
-              motion capture), or None. Loops without it are left out: it cannot be computed from the robot's poses,
-              since the loop is there to correct their drift.
+    poses     (N, 7) poses of the frames, tx ty tz qx qy qz qw, as the robot estimates them; NaN if not known. They are
+              the vertices, and consecutive poses give the odometry edges.
+    relative  (query_id, match_id) -> pose (7,) of the query in the frame of the match, or None. It must come from an
+              independent measurement (depth, motion capture), because the loop is to correct the drift of the
+              robot's poses. Loops without it are left out.
     """
     poses = np.asarray(poses, np.float64)
     known: list[int] = np.flatnonzero(np.all(np.isfinite(poses), axis=1)).tolist()
@@ -113,16 +114,16 @@ def write_pose_graph(
 ) -> None:
     """Write vertices, number -> pose (7,), and edges: i, j, pose (7,) of j in the frame of i, information (6, 6).
 
-    ``fixed`` vertices are to stay where they are. ``flat``: in two dimensions, for poses in the plane z = 0.
+    An optimizer does not move ``fixed`` vertices. ``flat``: write a 2D graph; the poses lie in the plane z = 0.
     """
     vertex, edge = (VERTEX_2D, EDGE_2D) if flat else (VERTEX, EDGE)
     upper = np.triu_indices(3 if flat else 6)
-    said = _flat_pose if flat else np.asarray
-    lines = [f"{vertex} {i} {_numbers(said(pose))}" for i, pose in vertices.items()]
+    as_written = _flat_pose if flat else np.asarray
+    lines = [f"{vertex} {i} {_numbers(as_written(pose))}" for i, pose in vertices.items()]
     lines += [f"FIX {i}" for i in fixed]
     for i, j, pose, information in edges:
         entries = (information[np.ix_(PLANE, PLANE)] if flat else information)[upper]
-        lines.append(f"{edge} {i} {j} {_numbers(said(pose))} {_numbers(entries)}")
+        lines.append(f"{edge} {i} {j} {_numbers(as_written(pose))} {_numbers(entries)}")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, "\n".join(lines) + "\n")

@@ -1,4 +1,4 @@
-"""What a detector keeps of its frames, and the arrays that a file has of them."""
+"""The frames that a detector stores, and the arrays in which a file holds them."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ NO_ROWS = np.zeros((0, 0), np.float32)
 
 @dataclass(frozen=True)
 class Points:
-    """The local features of N frames one after the other, in arrays that may lie on disk.
+    """The local features of N frames, concatenated, in arrays that may be on disk.
 
     sizes        (N, 2) width and height of the images
-    ends         (N,) where the points of each frame end
-    points       (P, 2) float32;  descriptors  (P, 128) uint8
+    ends         (N,) the index after the last point of each frame
+    points       (P, 2) float32, x and y in pixels
+    descriptors  (P, 128) uint8, of SIFT
     """
 
     sizes: np.ndarray
@@ -32,14 +33,14 @@ class Points:
     descriptors: np.ndarray | Rows
 
     def of(self, frame: int) -> LocalFeatures:
-        """Return those of one frame."""
+        """Return the local features of one frame."""
         part = slice(int(self.ends[frame - 1]) if frame else 0, int(self.ends[frame]))
         width, height = self.sizes[frame].tolist()
         return LocalFeatures(self.points[part], self.descriptors[part], (width, height))
 
 
 class Local:
-    """The local features of all frames: of sessions in files, and of the frames since."""
+    """The local features of all frames: of sessions read from files, and of frames added since."""
 
     def __init__(self) -> None:
         self._parts: list[Points | list[LocalFeatures]] = []
@@ -55,7 +56,7 @@ class Local:
         return part.of(frame) if isinstance(part, Points) else part[frame]
 
     def append(self, features: LocalFeatures) -> None:
-        """Add those of the next frame."""
+        """Add the features of the next frame."""
         if not self._parts or isinstance(self._parts[-1], Points):
             self._begin([])
         part = self._parts[-1]
@@ -64,7 +65,7 @@ class Local:
         self._count += 1
 
     def extend(self, points: Points) -> None:
-        """Add those of many frames."""
+        """Add the features of many frames."""
         if len(points.ends):
             self._begin(points)
             self._count += len(points.ends)
@@ -78,8 +79,8 @@ class Local:
 class Frames:
     """All frames so far, ``count`` of them, in arrays that double when full.
 
-    An index has the descriptors (views, D) of those that are candidates of the next frame; ``waiting`` those of the
-    others, which are too recent.
+    The index has the descriptors (views, D) of the frames that are candidates for the next frame. ``waiting`` has the
+    descriptors of the other frames, which are too recent.
     """
 
     index: Index
@@ -102,11 +103,11 @@ class Frames:
 
     @property
     def settled(self) -> int:
-        """How many frames, the first ones, the index has."""
+        """The number of frames in the index; they are the first ones."""
         return self.count - len(self.waiting)
 
     def settle(self, end: int) -> None:
-        """Have the index take the frames before ``end``."""
+        """Move the frames before ``end`` into the index."""
         new = self.waiting[: max(0, end - self.settled)]
         if new:
             self.index.add(np.concatenate(new))
@@ -122,7 +123,7 @@ class Frames:
         return np.concatenate(parts).reshape(stop - start, -1)
 
     def arrays(self, checked: bool, start: int = 0) -> dict[str, np.ndarray]:
-        """Return what a file has of the frames from ``start`` on, but their descriptors; ``checked``: points too."""
+        """Return the arrays of the frames from ``start`` on, without descriptors; ``checked``: with local features."""
         found = {"stamps": self.stamps[start : self.count], "poses": self.poses[start : self.count]}
         if checked:
             local = [self.local[i] for i in range(start, self.count)]
@@ -133,9 +134,9 @@ class Frames:
         return found
 
     def take(self, arrays: Mapping[str, Any], points: Points | None) -> None:
-        """Add frames of a file; the index, or ``waiting``, has or gets their descriptors.
+        """Add the frames of a file, except their descriptors, which the caller adds to the index or to ``waiting``.
 
-        Raises ValueError or LookupError where the arrays do not fit together.
+        Raises ValueError or LookupError if the arrays do not fit together.
         """
         count = len(arrays["stamps"])
         check_array(arrays, "stamps", "f", (count,), finite=False)
@@ -148,9 +149,9 @@ class Frames:
 
 
 def points_of(arrays: Mapping[str, Any], count: int, finite: bool = True) -> Points:
-    """Return the points of ``count`` frames of a file; ``finite``: read them all, and check that each is a number.
+    """Return the points of ``count`` frames of a file. ``finite``: read all points and check that they are finite.
 
-    Raises ValueError where the arrays do not fit together.
+    Raises ValueError if the arrays do not fit together.
     """
     check_array(arrays, "points_of_frame", "i", (count,))
     if min(arrays["points_of_frame"], default=0) < 0:
@@ -159,6 +160,6 @@ def points_of(arrays: Mapping[str, Any], count: int, finite: bool = True) -> Poi
     points = int(ends[-1]) if count else 0
     check_array(arrays, "points", "f", (points, 2), finite)
     check_array(arrays, "descriptors", "u", (points, 128), finite)
-    sizes = arrays.get("sizes", np.tile(LocalFeatures.size, (count, 1)))  # files from before it do not have it
+    sizes = arrays.get("sizes", np.tile(LocalFeatures.size, (count, 1)))  # older files have no sizes
     check_array({"sizes": sizes}, "sizes", "i", (count, 2))
     return Points(sizes, ends, arrays["points"], arrays["descriptors"])

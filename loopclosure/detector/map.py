@@ -1,12 +1,12 @@
 """A map on disk: a folder of sessions, each with the descriptors and points of its frames.
 
-``map.json`` names all that belongs to the map: the net that describes the frames, how many sessions there are, and the
-projection. A session is a folder ``000000``, ``000001``, ... that never changes. ``projected-N`` has the projection
-that was learned from N frames, their principal directions, and the descriptors that it shortened: one file for each
-session.
+``map.json`` lists the contents of the map: the net that describes the frames, the number of sessions, and the
+projection. A session is a folder ``000000``, ``000001``, ... that never changes. The folder ``projected-N`` has the
+projection (the principal directions of N frames) and the projected descriptors: one file for each session.
 
-Whoever adds a session writes all new files first and then ``map.json``, in one step. So a map is always whole: what
-``map.json`` does not name is not read, and the next add removes it. Whoever reads meanwhile reads the sessions before.
+Adding a session writes all new files first and then replaces ``map.json`` in one step. So a map is always complete:
+files that ``map.json`` does not list are not read, and the next add removes them. A process that reads the map during
+an add sees the earlier sessions.
 """
 
 from __future__ import annotations
@@ -36,26 +36,26 @@ from netspec.files.own_folder import inside, remove_own
 from netspec.files.whole_file import only_one, whole_file, whole_folder, write_whole
 
 FORMAT = 2
-NAMED_BY_FOLDERS = 1  # the format in which the sessions are the folders that are there
+NAMED_BY_FOLDERS = 1  # an older format: every session folder on disk belongs to the map
 SESSION = "a session of a map that loopclosure map wrote"
 PROJECTION = "the projection of a map"
 METRIC = "euclidean"
 COMPONENTS = 256  # of a projected descriptor
-LEARNED_FROM = 2048  # frames, evenly spread; fewer are compared as they are
-BLOCK = 4096  # frames that are read at a time
-MOST_FRAMES = 10**15  # of a map; its projection says from how many it was learned
+LEARNED_FROM = 2048  # frames, evenly spread; with fewer there is no projection
+BLOCK = 4096  # frames read at a time
+MOST_FRAMES = 10**15  # a projection learned from more frames is rejected
 Decide = Callable[[LoopDetector], list[LoopResult]]
-# Of the nets of versions 0.2.0 and 0.3.0, whose maps do not say it.
+# Fingerprints of the nets of versions 0.2.0 and 0.3.0; their maps do not contain them.
 OLDER = {"default": "63cb899e0703cb96", "small": "2e195dd29a635c6c"}
 MAPPED = ("rows", "points", "descriptors")  # arrays in files of their own, read where they are used
 SESSION_FILES = ("frames.npz", *(f"{name}.npy" for name in MAPPED), "loops.csv")
 PROJECTION_FILE = "projection.npz"
-EXTRACTED, LOCK = "frames", ".lock"  # images from bags, and the lock of an add: no part of what map.json names
+EXTRACTED, LOCK = "frames", ".lock"  # images from bags, and the lock of an add; map.json does not list them
 
 
 @dataclass(frozen=True)
 class Session:
-    """N frames of a map: their names, and what its files have of them."""
+    """A session of N frames: their names, and the arrays in its files."""
 
     folder: Path
     names: list[str]
@@ -63,7 +63,7 @@ class Session:
     points: Points
 
     def blocks(self, start: int = 0, projection: Whitening | None = None, views: int = 1) -> Iterator[np.ndarray]:
-        """Yield the descriptors (n, views D) float32 from frame ``start`` on, each view projected by itself."""
+        """Yield the descriptors (n, views D) float32 from frame ``start`` on; the projection applies to each view."""
         kept = None if projection is None else self._projected(projection, views)
         for first in range(start, len(self.names), BLOCK):
             rows = slice(first, first + BLOCK)
@@ -71,7 +71,7 @@ class Session:
                 try:
                     yield kept[rows]
                     continue
-                except InputError:  # removed since, by an add that learned another projection
+                except InputError:  # removed meanwhile by an add that learned another projection
                     kept = None
             whole = self.arrays["rows"][rows].astype(np.float32)
             if not np.all(np.isfinite(whole)):
@@ -79,7 +79,7 @@ class Session:
             yield shortened(whole, projection, views)
 
     def _projected(self, projection: Whitening, views: int) -> Rows | None:
-        """Return the descriptors that this projection shortened before; None where they are not there."""
+        """Return the projected descriptors stored on disk; None if there are none."""
         try:
             kept = Rows(self.folder.with_name(projected(projection)) / f"{self.folder.name}.npy", SESSION)
         except (ValueError, OSError):
@@ -88,15 +88,15 @@ class Session:
 
 
 class Map:
-    """A map.
+    """A map on disk.
 
-    describer   the name of what describes its frames
+    describer   the name of the net that describes its frames
     sessions    its sessions, in the order in which they were added
-    projection  what shortens descriptors that are searched in memory; None while there are too few
+    projection  shortens the descriptors for the search in memory; None while there are too few frames
     """
 
     def __init__(self, folder: str | Path) -> None:
-        """Open a map to read it. Raises InputError for what is none."""
+        """Open a map to read it. Raises InputError if the folder is not a map."""
         self.folder = Path(folder)
         self.sessions: list[Session] = []
         self.projection: Whitening | None = None
@@ -139,7 +139,7 @@ class Map:
         return about
 
     def _count(self, about: dict[str, Any]) -> int:
-        """Return how many sessions there are."""
+        """Return the number of sessions."""
         count = about["sessions"]
         if count is None:
             count = 0
@@ -149,7 +149,7 @@ class Map:
 
     @classmethod
     def create(cls, folder: str | Path, describer: str) -> Map:
-        """Make an empty map. Raises InputError where there is one already."""
+        """Make an empty map. Raises InputError if the folder is in use already."""
         folder, describer = Path(folder), checked_name(describer)
         names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
         empty = names <= {"map.json", EXTRACTED, LOCK} and ("map.json" not in names or not cls(folder).sessions)
@@ -168,16 +168,16 @@ class Map:
         return [f"{session.folder.name}/{name}" for session in self.sessions for name in session.names]
 
     def detector(self, describe: Describe, index: str = "exact") -> LoopDetector:
-        """Return a detector that has all frames, checks candidates by their geometry, and describes frames as the map.
+        """Return a detector with all frames of the map and a geometric check.
 
-        index  for :func:`loopclosure.index.index.open_index`; a database keeps what it has of the map already
+        index  a name for :func:`loopclosure.index.index.open_index`; only frames that are not in the index are added
 
-        Raises InputError where descriptors of the net and of the map do not have the same size, or fingerprint.
+        Raises InputError if the net's descriptors have another size or fingerprint than those of the map.
         """
         return self._detector(self._described(describe, index), index)
 
     def _described(self, describe: Describe, index: str) -> _Described:
-        """Describe frames for an index; a database keeps their descriptors as they are."""
+        """Wrap ``describe`` for an index; only an index in memory gets projected descriptors."""
         return _Described(describe, self.projection if index in INDEXES else None)
 
     def _detector(self, described: _Described, index: str) -> LoopDetector:
@@ -204,11 +204,11 @@ class Map:
         progress: Progress = silent,
         decide: Decide | None = None,
     ) -> list[LoopResult]:
-        """Add a recording as a session; return what each of its frames found, in all sessions and in its own.
+        """Add a recording as a session, and return a result for each of its frames: loops to all sessions.
 
-        ``decide`` says which are loops, of a detector that has all frames; None: each is decided when it comes. The
-        loops are in ``loops.csv`` of the session's folder. Raises InputError, SpecError or OSError, and adds nothing,
-        where another process is adding, where there are no frames, and where a file cannot be written.
+        ``decide`` finds the loops from all frames at once; None: each frame is decided when it is added. The loops are
+        written to ``loops.csv`` in the session's folder. Raises InputError, SpecError or OSError, and adds nothing, if
+        another process is adding, if there are no frames, or if a file cannot be written.
         """
         with only_one(inside(self.folder, LOCK), "wait until it has ended"):
             self._read()  # what others have added
@@ -228,7 +228,7 @@ class Map:
     def _write(
         self, recording: ImageSequence, described: _Described, detector: LoopDetector, results: list[LoopResult]
     ) -> None:
-        """Write the files of a new session, then the head that names them; at a fault, remove what was written."""
+        """Write the files of a new session, then ``map.json``; after an error, remove what was written."""
         count, views, named = len(self.sessions), described.views, self.projection
         if self._about()["format"] == NAMED_BY_FOLDERS:
             self._write_projected(self.sessions, named, views)
@@ -244,8 +244,8 @@ class Map:
                 np.save(unfinished / "rows.npy", np.array(described.kept))
                 np.save(unfinished / "points.npy", arrays.pop("points"))
                 np.save(unfinished / "descriptors.npy", arrays.pop("descriptors"))
-                said = {"source": np.array(str(recording.source)), "fingerprint": np.array(described.fingerprint)}
-                np.savez(unfinished / "frames.npz", names=np.array(recording.names), **said, **arrays)
+                about = {"source": np.array(str(recording.source)), "fingerprint": np.array(described.fingerprint)}
+                np.savez(unfinished / "frames.npz", names=np.array(recording.names), **about, **arrays)
                 write_loops_csv(unfinished / "loops.csv", [r for r in results if r], detector.stamps, every)
             sessions = [*self.sessions, _read_session(folder)]
             projection = _learned(sessions, named, views)
@@ -259,7 +259,7 @@ class Map:
         self._remove_projections({projected(each) for each in (named, self.projection) if each is not None})
 
     def _write_projected(self, sessions: list[Session], projection: Whitening | None, views: int) -> None:
-        """Write a projection and what it shortens, where it is not there, so that opening need not compute it."""
+        """Write a projection and the projected descriptors that are missing on disk, to open the map faster."""
         if projection is None:
             return
         name = projected(projection)
@@ -276,12 +276,12 @@ class Map:
                 np.save(stream, np.concatenate(rows))
 
     def _remove_projections(self, kept: set[str]) -> None:
-        """Remove all projections but those ``kept``: that of the map, and that of whoever opened it just before."""
+        """Remove all projections except ``kept``: the current one, and the previous one, which may be in use."""
         files = (PROJECTION_FILE, *(f"{session.folder.name}.npy" for session in self.sessions))
         for folder in self.folder.glob("projected-*"):
             if folder.name not in kept and re.fullmatch(r"projected-\d+", folder.name):
                 remove_own(folder, files)
-        remove_own(self.folder, [PROJECTION_FILE])  # where format 1 had it
+        remove_own(self.folder, [PROJECTION_FILE])  # where format 1 stored it
 
 
 def _write_head(folder: Path, describer: str, sessions: int, projection: Whitening | None) -> None:
@@ -291,12 +291,12 @@ def _write_head(folder: Path, describer: str, sessions: int, projection: Whiteni
 
 
 def projected(projection: Whitening) -> str:
-    """Return the name of the folder of a projection, and of what it shortens."""
+    """Return the name of the folder for a projection and the descriptors that it shortened."""
     return f"projected-{projection.images}"
 
 
 def _read_projection(path: Path) -> Whitening | None:
-    """Read a projection; None where there is none."""
+    """Read a projection; None if there is no file."""
     if not path.exists():
         return None
     arrays = read_npz(regular(path, PROJECTION), PROJECTION)
@@ -304,7 +304,7 @@ def _read_projection(path: Path) -> Whitening | None:
         size = len(arrays["mean"])
         check_array(arrays, "mean", "f", (size,))
         check_array(arrays, "projection", "f", (size, COMPONENTS))
-        images = int(arrays.get("images", 0))  # files from before it do not have it
+        images = int(arrays.get("images", 0))  # older files do not have it
         if not 0 <= images < MOST_FRAMES:
             raise ValueError(f'"images" is {images:.6g}')
     except (ValueError, LookupError, TypeError, ArithmeticError) as error:
@@ -313,7 +313,7 @@ def _read_projection(path: Path) -> Whitening | None:
 
 
 def _learned(sessions: list[Session], before: Whitening | None, views: int) -> Whitening | None:
-    """Return a projection of these sessions: that of ``before``, or a new one once there are twice as many frames."""
+    """Return ``before``, or a new projection if there are twice as many frames as ``before`` was learned from."""
     starts = np.cumsum([0, *(len(session.names) for session in sessions)])
     count, size = int(starts[-1]), sessions[-1].arrays["rows"].shape[1] // views
     if count < max(LEARNED_FROM, 2 * before.images if before else 0) or size <= COMPONENTS:
@@ -329,7 +329,7 @@ def _learned(sessions: list[Session], before: Whitening | None, views: int) -> W
 
 
 class _Described:
-    """Describes images for a map: ``kept`` has what the net said, in half precision, as files keep it."""
+    """Describes images for a map; ``kept`` collects the net's descriptors in half precision, as in the files."""
 
     def __init__(self, describe: Describe, projection: Whitening | None) -> None:
         self.views, self.fingerprint = views_of(describe, None), fingerprint_of(describe)
@@ -346,7 +346,7 @@ class _Described:
 
 
 def shortened(rows: np.ndarray, projection: Whitening | None, views: int) -> np.ndarray:
-    """Return descriptors (n, views D) projected, each view by itself: (n, views 256)."""
+    """Project each view of descriptors (n, views D) to 256 components: (n, views 256)."""
     if projection is None:
         return rows
     if rows.shape[1] % views:
@@ -355,7 +355,7 @@ def shortened(rows: np.ndarray, projection: Whitening | None, views: int) -> np.
 
 
 def checked_name(describer: str) -> str:
-    """Check that a describer is a name: opening a map must not run a file that it mentions."""
+    """Check that a describer is a plain name: opening a map must not run a file that the map names."""
     if not re.fullmatch(NAME, describer):
         raise InputError(f'"{describer}" is no name of a net; a map needs default, small or another that is installed')
     return describer

@@ -53,7 +53,7 @@ def run_detector(
 def remember_all(
     detector: LoopDetector, sequence: ImageSequence, features: Features | None = None, progress: Progress = silent
 ) -> None:
-    """Do as :func:`run_detector`, but decide nothing: the drive is decided as a whole when it is over."""
+    """Add all frames as :func:`run_detector` does, without looking for loops; see :meth:`LoopDetector.remember`."""
     for row, image, stamp, pose in _described(sequence, features, detector.check is not None, progress):
         detector.remember(row, stamp, pose, image)
 
@@ -61,9 +61,9 @@ def remember_all(
 def _described(
     sequence: ImageSequence, features: Features | None, checked: bool, progress: Progress
 ) -> Iterator[tuple[np.ndarray | None, np.ndarray | None, float | None, np.ndarray | None]]:
-    """Yield the descriptor, the image, the stamp and the pose of each frame, as far as they are needed and known.
+    """Yield the descriptor, image, stamp and pose of each frame; None for what is not needed or not known.
 
-    ``checked``: a geometric check needs the images even where their descriptors are known.
+    ``checked``: read the images for a geometric check, even if their descriptors are known.
     """
     rows = None
     if features is not None:
@@ -79,7 +79,7 @@ def _described(
 
 
 def verdicts_said(results: Sequence[LoopResult]) -> str:
-    """Say in one sentence what became of all frames, and the best score."""
+    """Return a sentence that counts the verdicts and gives the best score."""
     verdicts = [result.verdict for result in results]
     words = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts))
     scores = [result.score for result in results if result.candidates]
@@ -87,7 +87,7 @@ def verdicts_said(results: Sequence[LoopResult]) -> str:
 
 
 def from_poses(detector: LoopDetector) -> RelativePose:
-    """Return a function for the relative poses of frames with poses in one frame of reference (motion capture)."""
+    """Return a function that computes relative poses from absolute poses (motion capture)."""
     poses = detector.poses
 
     def relative(query: int, match: int) -> np.ndarray | None:
@@ -98,7 +98,10 @@ def from_poses(detector: LoopDetector) -> RelativePose:
 
 
 def judged_by_poses(detector: LoopDetector) -> str:
-    """Say how many of the accepted loops with two known poses are the same place by the paper's rule."""
+    """Return a sentence that counts the accepted loops which are the same place by the paper's rule.
+
+    Only loops with two known poses count.
+    """
     poses = detector.poses
     ends = np.array([(loop.query_id, loop.accepted) for loop in detector.loops], int).reshape(-1, 2)
     known = ends[np.all(np.isfinite(poses[ends]), axis=(1, 2))]
@@ -110,10 +113,10 @@ def judged_by_poses(detector: LoopDetector) -> str:
 def load_describe(specification: str, options: dict[str, str] | None = None) -> Describe:
     """Return the ``describe`` function that ``module:name`` or ``FILE.py:name`` names, or a name without a colon.
 
-    Such a name is that of an entry point ``loopclosure.describers`` of an installed distribution, always called with
-    ``options``.
+    A name without a colon is an entry point in the group ``loopclosure.describers`` of an installed package. It is
+    always called with ``options``.
     A class, or a function if there are options, is called with ``options`` as keywords and must return the ``describe``
-    function. A module is one of an installed package: what lies in the working directory runs only if its path is
+    function. A module must belong to an installed package; a file in the working directory runs only if its path is
     given.
     """
     options = options or {}
@@ -189,12 +192,12 @@ def _file_module(path: Path) -> Any:
 
 
 def views_of(describe: Describe | None, features: Features | None) -> int:
-    """Return how many views of an image are described, by features or by a ``describe`` with ``views``."""
+    """Return the number of views per image: of the features, or the ``views`` attribute of ``describe`` (default 1)."""
     return getattr(describe, "views", 1) if features is None else features.views
 
 
 def whitened(describe: Describe, whitening: Whitening, views: int) -> Describe:
-    """Return a ``describe`` that whitens the descriptors (views D,) of another, view by view."""
+    """Wrap ``describe`` so that its descriptors (views D,) are whitened, view by view."""
     return lambda image: whitening.of_views(np.reshape(describe(image), (1, -1)), views)[0]
 
 

@@ -1,15 +1,15 @@
-"""Whether two images show the same scene, by geometry: SIFT, the ratio test, RANSAC on the fundamental matrix.
+"""Geometric verification of image pairs: SIFT, the ratio test, RANSAC on the fundamental matrix.
 
-Where the camera is known, the essential matrix, which has fewer degrees of freedom, replaces the fundamental matrix.
+If the camera is known, the essential matrix is used instead; it has fewer degrees of freedom.
 
-How many matches must agree depends on how many there are, on the size of the images and on how near to its epipolar
-line a match must be: enough that chance does not bring them about. The count is that of Moisan and Stival, "A
-probabilistic criterion to detect rigid point matches between two images and estimate the fundamental matrix" (IJCV
-2004). Small images are enlarged first: SIFT finds points down to about two pixels of what it is given.
+The number of inliers that a pair needs depends on the number of matches, the size of the images and the largest
+distance of an inlier from its epipolar line. It is large enough that chance does not explain the inliers; see Moisan
+and Stival, "A probabilistic criterion to detect rigid point matches between two images and estimate the fundamental
+matrix" (IJCV 2004). Small images are enlarged first, because SIFT finds no points smaller than about two pixels.
 
-A flat scene, or a camera that only rotates, does not determine the fundamental matrix. Its inliers still count points
-that agree, so such pairs are accepted. A pair needs texture: two views of a bare wall fail. It needs texture in several
-parts of the image, too: a sign or a printed code stands in many places.
+A flat scene, or a camera that only rotates, does not determine the fundamental matrix. The inliers still count points
+that agree, so such pairs are accepted. A pair needs texture: two views of a bare wall are rejected. The texture must be
+in several parts of the image, because a sign or a printed code can appear in many places.
 """
 
 from __future__ import annotations
@@ -27,20 +27,21 @@ from netspec.files.opencv import cv2
 
 # Fewer matches prove nothing: any seven have a fundamental matrix.
 LEAST_MATCHES = 8
-# The expected number of matrices that as many of the matches fit by chance is at most this, per pair of images. Chance
-# alone is not all: points of one object are not independent, and a detector compares thousands of pairs.
+# The largest expected number of matrices per image pair that as many matches fit by chance. It is small because points
+# of one object are not independent, and because a detector compares thousands of pairs.
 BY_CHANCE = 1e-6
-# The windows of a facade repeat and agree more than chance has it: so many times the inliers that rule out chance
-# decide against a score. No other place of the drives that this was chosen on had three times as many.
+# With this many times the inliers that rule out chance, a pair is accepted against its score. Once is not enough: the
+# windows of a facade repeat and agree more often than by chance. On the drives used to choose these values, no pair of
+# different places had three times as many.
 SURE, DOUBTLESS = 1.5, 3.0
-SAMPLE, SOLUTIONS = 7, 3  # matches that make a fundamental matrix, and how many they may make
+SAMPLE, SOLUTIONS = 7, 3  # matches in a sample, and the largest number of fundamental matrices they give
 PARTS = (8, 6)  # of an image, across and down
-SPREAD = 5  # parts: of one, no more than this share of the inliers needed count
-# Points that match where they are, within the error of an inlier, in this share of unlike pairs, and at least so many:
-# a clock, a watermark, the hood of the car.
+SPREAD = 5  # at most 1 / SPREAD of the needed inliers are counted in one part
+# A cell is fixed if points in it match at the same position in this share of the unlike pairs, and in at least this
+# many of them: a clock, a watermark, the hood of the car.
 FIXED, LEAST_FIXED = 0.1, 3
-CELLS = (48, 36)  # of an image, across and down, that are fixed or not
-# The most by which an image is enlarged; beyond it only the interpolation gets finer.
+CELLS = (48, 36)  # of an image, across and down; each is fixed or not
+# The largest factor by which an image is enlarged; a larger one adds no detail.
 MOST_ENLARGED = 4.0
 
 
@@ -57,9 +58,9 @@ class LocalFeatures:
 
 
 class Agreement(NamedTuple):
-    """How many points of two images match, how many matches agree with one matrix, and how many chance may not.
+    """The matches of two images, the inliers of one matrix among them, and the inliers needed to rule out chance.
 
-    Where inliers crowd in few parts of an image, those that count are fewer than are needed.
+    If the inliers crowd in few parts of an image, only some are counted, fewer than needed.
     """
 
     matches: int
@@ -73,12 +74,12 @@ class GeometricCheck:
 
     max_features   how many of the strongest SIFT points are kept per image; 500 need 66 kB of memory per frame
     ratio          a match must be nearer than ``ratio`` times the second nearest (Lowe's test)
-    max_error_px   distance of an inlier from its epipolar line, in pixels of the image as it is searched
+    max_error_px   largest distance of an inlier from its epipolar line, in pixels of the enlarged or reduced image
     confidence     of RANSAC
-    min_inliers    the least number of inliers of a loop; 0: as many as rule out chance
-    least_side     images whose shorter side has fewer pixels are enlarged to this, at most four times
-    most_side      images whose shorter side has more are reduced to this
-    focal_px       focal length in pixels of the images as they are; 0: not known, a fundamental matrix is used
+    min_inliers    minimum number of inliers of a loop; 0: as many as rule out chance
+    least_side     an image with a shorter side below this is enlarged to it, at most four times
+    most_side      an image with a shorter side above this is reduced to it
+    focal_px       focal length in pixels of the original images; 0: not known, a fundamental matrix is used
     center_x_px, center_y_px  principal point, with focal_px
     """
 
@@ -94,7 +95,7 @@ class GeometricCheck:
     center_y_px: float = 0.0
 
     def scaled(self, size: tuple[int, int]) -> float:
-        """Return the factor by which images of a width and height are enlarged or reduced."""
+        """Return the factor by which images of ``size`` (width, height) are enlarged or reduced."""
         side = max(1, min(size))
         return min(MOST_ENLARGED, max(1.0, self.least_side / side), self.most_side / side)
 
@@ -111,7 +112,7 @@ class GeometricCheck:
             return LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), size)
         # OpenCV's SIFT descriptors are integers up to 255, in float32: bytes hold them without loss.
         places = np.array([point.pt for point in points], np.float32)
-        if factor != 1:  # the middle of pixel 0 lies at 0 in both
+        if factor != 1:  # in both images the center of the first pixel is at 0
             places = (places + 0.5) / np.float32(factor) - 0.5
         kept = slice(self.max_features)
         return LocalFeatures(places[kept], descriptors[kept].astype(np.uint8), size)
@@ -120,7 +121,7 @@ class GeometricCheck:
         """Return the matches (M, 2), points of ``a`` and ``b``, that pass the ratio test; no point of ``b`` twice."""
         if len(a.points) < 2 or len(b.points) < 2:
             return np.zeros((0, 2), np.int64)
-        # As float32: with bytes the matcher takes several times as long.
+        # As float32: the matcher is several times slower with bytes.
         matcher = cv2.BFMatcher(cv2.NORM_L2)
         nearest_two = matcher.knnMatch(a.descriptors.astype(np.float32), b.descriptors.astype(np.float32), k=2)
         passed = [best for best, second in nearest_two if best.distance < self.ratio * second.distance]
@@ -148,7 +149,7 @@ class GeometricCheck:
             matrix, mask = cv2.findEssentialMat(*points, camera, cv2.RANSAC, self.confidence, error)
         else:
             matrix, mask = cv2.findFundamentalMat(*points, cv2.FM_RANSAC, error, self.confidence)
-        # Without a matrix OpenCV 5.0.0 does not fill in the mask. Of several solutions the mask says nothing.
+        # Without a matrix OpenCV 5.0.0 does not fill in the mask; with several solutions the mask belongs to none.
         if matrix is None or matrix.shape != (3, 3):
             return Agreement(len(matches), 0, needed)
         agree = mask.reshape(-1) > 0
@@ -157,15 +158,15 @@ class GeometricCheck:
         return Agreement(len(matches), count if spread >= needed else min(count, spread), needed)
 
     def enough(self, found: Agreement) -> int:
-        """Return the inliers of an agreement; 0 if there are fewer than this check asks for."""
+        """Return the inliers of an agreement; 0 if there are fewer than this check needs."""
         return found.inliers if found.inliers >= (self.min_inliers or found.needed) else 0
 
     def evidence(self, found: Agreement) -> float:
-        """Return the inliers of an agreement as a share of those that this check asks for; 1 is enough."""
+        """Return the inliers of an agreement divided by the number that this check needs; 1 is enough."""
         return found.inliers / (self.min_inliers or found.needed)
 
     def sure(self, found: Agreement) -> int:
-        """Return the inliers of an agreement that decides against a score; 0 if there are fewer."""
+        """Return the inliers of an agreement if they outweigh a low score; 0 otherwise."""
         return found.inliers if self.evidence(found) >= (1.0 if self.min_inliers else SURE) else 0
 
     def __post_init__(self) -> None:
@@ -189,13 +190,13 @@ class GeometricCheck:
 
 
 def _part(points: np.ndarray, size: tuple[int, int], parts: tuple[int, int]) -> np.ndarray:
-    """Return in which of so many parts, across and down, of an image of a size points (N, 2) lie: (N,) numbers."""
+    """Return the part (N,) that each point (N, 2) is in; an image has ``parts`` across and down."""
     column, row = (np.floor(points * parts / size).astype(int).clip(0, np.subtract(parts, 1))).T
     return row * parts[0] + column
 
 
 def _spread(points: np.ndarray, size: tuple[int, int], needed: int) -> int:
-    """Count points (N, 2) of an image, no more than a share of those ``needed`` in one part."""
+    """Count points (N, 2) of an image, at most ``needed`` / SPREAD in each part."""
     return int(np.minimum(np.bincount(_part(points, size, PARTS)), math.ceil(needed / SPREAD)).sum())
 
 
@@ -203,7 +204,7 @@ def _spread(points: np.ndarray, size: tuple[int, int], needed: int) -> int:
 def _needed(matches: int, width: int, height: int, error_px: float) -> int:
     """Return the least k with (n - 7) C(n, k) C(k, 7) 3 p^(k - 7) <= BY_CHANCE, n + 1 if there is none.
 
-    p is the greatest share of the image that lies within ``error_px`` of a line.
+    p is the largest share of the image that can lie within ``error_px`` of a line.
     """
     share = min(1.0, 2 * error_px * math.hypot(width, height) / (width * height))
     for count in range(SAMPLE + 1, matches + 1):
@@ -215,10 +216,10 @@ def _needed(matches: int, width: int, height: int, error_px: float) -> int:
 
 @dataclass
 class Pairs:
-    """Verified pairs of images, each image described and each pair matched once for all that ask.
+    """Verifies pairs of images. Results are cached: each image is described once, and each pair is matched once.
 
-    image   how an image is read: its key -> (H, W) or (H, W, 3) uint8, or its points
-    hidden  (CELLS) bool, the cells of all images, row by row, whose points do not count; None: all points do
+    image   reads an image: its key -> (H, W) or (H, W, 3) uint8, or its points
+    hidden  (CELLS) bool, row by row: points in these cells of an image are ignored; None: all points count
     """
 
     image: Callable[[Any], np.ndarray | LocalFeatures]
@@ -246,7 +247,7 @@ class Pairs:
         return self._found[of]
 
     def without_fixed(self, check: GeometricCheck, unlike: Sequence[tuple[Any, Any]]) -> Pairs:
-        """Return pairs without what stays where it is in many ``unlike`` pairs of images; itself if nothing does."""
+        """Return pairs that ignore fixed cells, found from ``unlike`` pairs of images; itself if none is fixed."""
         hits = np.zeros(CELLS[0] * CELLS[1], int)
         for one, other in unlike:
             a, b = self.features(check, one), self.features(check, other)
@@ -275,17 +276,17 @@ class Between:
         return self.pairs.agreement(self.check, self.queries[query], self.references[reference])
 
     def without_fixed(self, unlike: Sequence[tuple[int, int]]) -> Between:
-        """Return the same without what is fixed in the images; itself if nothing is."""
+        """Return a copy that ignores what is fixed in the images; itself if nothing is."""
         keys = [(self.queries[query], self.references[reference]) for query, reference in unlike]
         pairs = self.pairs.without_fixed(self.check, keys)
         return self if pairs is self.pairs else replace(self, pairs=pairs)
 
     @property
     def hidden(self) -> float:
-        """The share of the image that is not looked at."""
+        """The share of the image that is ignored."""
         return 0.0 if self.pairs.hidden is None else float(self.pairs.hidden.mean())
 
 
 def _by_points(check: GeometricCheck) -> GeometricCheck:
-    """Return a check that finds the same points, the same for all such."""
+    """Return a check with only the settings that the points depend on, as a key for the cache."""
     return GeometricCheck(max_features=check.max_features, least_side=check.least_side, most_side=check.most_side)

@@ -1,4 +1,4 @@
-"""Another session that asks where it is: its frames are looked up among those of a detector, which stays as it is."""
+"""Looking up the frames of another session in a detector, without adding them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from loopclosure.errors import InputError
 class Visitor:
     """Looks up the frames of one session, in order; all frames of the detector are candidates.
 
-    Its results have numbers of their own for ``query_id``, from 0. Several visitors may ask one detector, in threads of
-    their own too, as long as nothing is added to it.
+    The ``query_id`` of its results counts its own frames from 0. Several visitors, also in several threads, can use one
+    detector as long as nothing is added to it.
     """
 
     def __init__(self, detector: LoopDetector) -> None:
@@ -26,7 +26,7 @@ class Visitor:
 
     @property
     def check(self) -> GeometricCheck | None:
-        """The detector's."""
+        """The geometric check of the detector."""
         return self.detector.check
 
     def add(
@@ -44,7 +44,7 @@ class Visitor:
         pose: Sequence[float] | np.ndarray | None = None,
         image: np.ndarray | None = None,
     ) -> LoopResult:
-        """Look up a frame whose descriptor (D,) is known already; ``pose`` is not used."""
+        """Look up a frame by its descriptor (D,); ``pose`` is not used."""
         result, self._runs = self.detector.looked_up(self._count, descriptor, stamp, image, self._runs)
         self._count += 1
         return result

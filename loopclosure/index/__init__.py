@@ -1,1 +1,1 @@
-"""Where earlier descriptors are kept and searched: in memory, by FAISS, or in Milvus."""
+"""Indexes that store and search descriptors: in memory, with FAISS, or in Milvus."""

@@ -1,8 +1,9 @@
-"""FAISS: rows in half precision, and signs that say which of them are worth comparing. For long drives.
+"""An approximate index with FAISS, for long drives: binary codes preselect the rows to compare.
 
-The signs are those of the strongest principal directions, turned at random, learned from the first rows (Douze et al.,
-"The Faiss library", 2024, has the parts: PCA, LSH, refinement). All signs are compared, and of the rows only the most
-promising. Adding costs as much whatever the number of rows, and nothing is built when a map is opened.
+Rows are stored in half precision. A code has the signs of a row's strongest principal components after a random
+rotation, learned from the first rows (PCA, LSH and refinement: Douze et al., "The Faiss library", 2024). A search
+compares all codes, and then only the rows with the best codes. The cost of adding a row does not depend on the number
+of rows, and opening a map needs no index to be built.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-LEARNED_FROM = 4096  # rows; up to so many all are compared
+LEARNED_FROM = 4096  # rows; with fewer, all rows are compared
 BITS = 256
-EXAMINED = 1000  # rows, the most promising by their signs
+EXAMINED = 1000  # rows compared after the preselection
 
 
 class FaissIndex:
@@ -46,7 +47,7 @@ class FaissIndex:
         faiss, bits = self._faiss, min(BITS, size)
         lsh = faiss.IndexLSH(bits, bits, True, True)
         self._signs = faiss.IndexPreTransform(faiss.PCAMatrix(size, bits), lsh)
-        self._signs.metric_type = self._rows.metric_type  # that of what it helps; signs themselves differ in number
+        self._signs.metric_type = self._rows.metric_type  # IndexRefine expects the metric of the rows
         known = self.rows(0, len(self))
         self._signs.train(known[:: max(1, len(known) // LEARNED_FROM)])
         self._signs.add(known)

@@ -1,4 +1,4 @@
-"""Milvus: descriptors in a database, in a file (``MilvusClient("places.db")``) or of a cluster, for a fleet's maps."""
+"""An index in a Milvus database, a file (``MilvusClient("places.db")``) or a cluster, for maps of several robots."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from loopclosure.errors import InputError
 
 T = TypeVar("T")
 COLLECTION = "places"
-AT_ONCE = 1000  # rows of an insertion or of an answer
+AT_ONCE = 1000  # rows per insertion or query
 
 
 class MilvusIndex:
-    """See :class:`loopclosure.index.index.Index`; it may hold descriptors of earlier sessions already."""
+    """See :class:`loopclosure.index.index.Index`; it may have descriptors of earlier sessions already."""
 
     def __init__(self, uri: str, metric: str, first: int | None = None) -> None:
         self._uri, self._metric = uri, metric

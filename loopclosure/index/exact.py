@@ -1,4 +1,4 @@
-"""All descriptors in memory, all compared: 4 D bytes each, and as many read for every search."""
+"""An exact index in memory: 4 D bytes per descriptor, all of them read in every search."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class ExactIndex:
         rows = self.rows(0, self._count)
         if self._metric == "cosine":
             scores = rows @ row
-        else:  # as the distances are ordered, so are their squares
+        else:  # squared distances have the same order
             scores = -squared_distances(rows, row[None], self._squares[: self._count, None], np.zeros(1))[:, 0]
         k = min(k, self._count)
         best = np.argpartition(scores, self._count - k)[self._count - k :]
-        # The product is fast but rounds small distances badly: the few that are reported are computed directly.
+        # The product is fast but inaccurate for small distances, so the k returned scores are computed directly.
         values = scores[best] if self._metric == "cosine" else -np.linalg.norm(rows[best] - row, axis=1)
         order = np.lexsort((best, -values))
         return best[order], values[order]

@@ -1,4 +1,4 @@
-"""One protocol for all that keeps descriptors and finds the most similar ones; and their names."""
+"""The protocol of all indexes, and how to open one by name."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ INDEXES = ("exact", "faiss")
 
 
 class Index(Protocol):
-    """Descriptors (D,), numbered 0, 1, ... in the order in which they come."""
+    """Stores descriptors (D,) and finds the most similar ones. They are numbered from 0 in the order of adding."""
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of descriptors."""
         ...
 
     def add(self, rows: np.ndarray) -> None:
@@ -24,25 +24,27 @@ class Index(Protocol):
         ...
 
     def search(self, row: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers (k,) and scores (k,) of the most similar to ``row`` (D,), best first; fewer if there are.
+        """Return the numbers (k,) and scores (k,) of the descriptors most similar to ``row`` (D,), best first.
+
+        The arrays are shorter if there are fewer than ``k`` descriptors.
 
         Higher scores are more similar: the cosine similarity, or minus the Euclidean distance.
         """
         ...
 
     def rows(self, start: int, stop: int) -> np.ndarray:
-        """Return descriptors (stop - start, D) float32, as exactly as they are kept."""
+        """Return stored descriptors (stop - start, D) float32; an index may have rounded them."""
         ...
 
 
 def open_index(name: str, metric: str, first: int | None = None) -> Index:
     """Return an index: "exact" or "faiss", empty, or one in Milvus, ``FILE.db`` or ``http://HOST:PORT``.
 
-    ``first``: of what is in Milvus, so many descriptors are used at most, and new ones follow them; None: all.
+    ``first``: use at most this many of the descriptors in Milvus, and add new ones after them; None: use all.
 
-    Raises InputError for another name, and where what it needs is not installed.
+    Raises InputError for another name, or if a library that the index needs is not installed.
     """
-    # Each has what it needs imported only where it is wanted.
+    # Imported only when needed: the libraries are optional.
     if name == "exact":
         from loopclosure.index.exact import ExactIndex
 

@@ -49,7 +49,7 @@ class Bag:
         self.topic = self._chosen(topic, list(images), color or list(images), "images", "topic=", needed=True)
         poses = [c.topic for c in reader.connections if c.msgtype in POSES]
         self.pose_topic = self._chosen(pose_topic, poses, poses, "poses", "pose-topic=", needed=False)
-        self.frame = ""  # of the images: known when they have been read
+        self.frame = ""  # the frame_id of the images; known after reading them
         self.count = images[self.topic].msgcount
 
     def images(self) -> Iterator[tuple[float, np.ndarray]]:
@@ -60,9 +60,9 @@ class Bag:
                 yield _seconds(message.header.stamp), self._image(message)
 
     def poses(self) -> tuple[np.ndarray, np.ndarray, str]:
-        """Return stamps (N,), poses (N, 7) of the camera, and a sentence about how they came to be the camera's.
+        """Return stamps (N,), poses (N, 7) of the camera, and a sentence about how the poses were converted.
 
-        A static transform from the frame of the poses to that of the images is applied, where the bag has one.
+        If the bag has a static transform from the frame of the poses to that of the images, it is applied.
         """
         with _reading(self.path):
             return self._poses()
@@ -84,14 +84,14 @@ class Bag:
         return np.array(stamps), moved(poses, mount), f"poses of {self.pose_topic}, moved from {child} to {self.frame}"
 
     def camera(self) -> Intrinsics | None:
-        """Return the camera that a CameraInfo beside the images says, None without one."""
+        """Return the camera from the CameraInfo topic next to the images, None if there is none."""
         with _reading(self.path):
             return self._camera()
 
     def _camera(self) -> Intrinsics | None:
-        beside = self.topic.rsplit("/", 2 if self.topic.endswith("/compressed") else 1)[0]
+        namespace = self.topic.rsplit("/", 2 if self.topic.endswith("/compressed") else 1)[0]
         for connection in self._reader.connections:
-            if connection.msgtype == CAMERA_INFO and connection.topic == f"{beside}/camera_info":
+            if connection.msgtype == CAMERA_INFO and connection.topic == f"{namespace}/camera_info":
                 for message in self._messages(connection.topic):
                     k, d = (message.K, message.D) if hasattr(message, "K") else (message.k, message.d)  # ROS 1, 2
                     pinhole = message.distortion_model in ("plumb_bob", "") and len(d) in (0, 4, 5)
@@ -137,7 +137,7 @@ class Bag:
         return np.repeat(image, 3, axis=2) if channels == 1 else image
 
     def _mount(self, body: str) -> np.ndarray | None:
-        """Return the pose (4, 4) of the images' frame in the frame ``body`` by the static transforms, None without."""
+        """Return the pose (4, 4) of the camera in the frame ``body`` from static transforms; None if not known."""
         near: dict[str, list[tuple[str, np.ndarray]]] = {}
         for connection in self._reader.connections:
             if connection.msgtype != TREE or not connection.topic.endswith("tf_static"):
@@ -185,7 +185,7 @@ def open_bag(path: Path, topic: str = "", pose_topic: str = "") -> Iterator[Bag]
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Raise InputError for whatever is raised in the block: of a damaged bag the library raises many errors."""
+    """Convert any exception in the block to InputError: for a damaged bag the library raises many kinds."""
     try:
         yield
     except SpecError:

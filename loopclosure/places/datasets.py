@@ -1,4 +1,4 @@
-"""Sets of frames with their truth: sequences with poses, FAB-MAP, a folder with a mask, traverses, pairs of places."""
+"""Loads data sets with ground truth: sequences with poses, FAB-MAP, folders with masks, traverses, pairs of places."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import write_whole
 
-# Ten seconds are common for TUM's 30 Hz sequences; the other sets have no time.
+# Ten seconds are usual for TUM's 30 Hz sequences; the other sets have no stamps.
 TUM_EXCLUSION = Exclusion(seconds=10.0)
-# New College's own mask has no loop nearer than 142 images (71 pairs of left and right).
+# In the mask of New College, no loop is shorter than 142 images (71 pairs of left and right).
 FABMAP_EXCLUSION = Exclusion(frames=50)
 FOLDER_EXCLUSION = Exclusion(frames=10)
 COMMON_NAMES = ("images", "image", "rgb", "samples", "query", "ref", "reference", "frames")
@@ -42,10 +42,10 @@ class DataSet:
     queries         Q frames
     references      R frames, or None for one sequence that visits its own places again
     truth           (Q, R)
-    exclude_frames  least number of frames that covers all excluded pairs (SeqSLAM needs frames, not seconds)
-    overlap         (Q, R) bool: views that overlap as far as poses and depth tell; None without poses
-    overlap_rule    text: when they overlap
-    notes           what a reader of the results should know: what was left out, what looks odd
+    exclude_frames  smallest number of frames that covers all excluded pairs (SeqSLAM needs frames, not seconds)
+    overlap         (Q, R) bool: views that overlap by their poses and depth; None without poses
+    overlap_rule    the rule for overlapping views, as text
+    notes           remarks for readers of the results: what was left out, what looks wrong
     """
 
     name: str
@@ -59,18 +59,18 @@ class DataSet:
 
     @property
     def database(self) -> ImageSequence:
-        """The frames that are searched: the references, or the queries themselves in one sequence."""
+        """The frames that are searched: the references, or the queries themselves for one sequence."""
         return self.queries if self.references is None else self.references
 
     @property
     def positions(self) -> np.ndarray | None:
-        """The positions of the queries (Q, 3) in meters, for a map; None if any of them is not known."""
+        """The positions of the queries (Q, 3) in meters; None if any of them is not known."""
         poses = self.queries.poses
         return None if poses is None or np.isnan(poses[:, 0]).any() else poses[:, :3]
 
     @property
     def soft_truth(self) -> Truth | None:
-        """The truth by which a match of overlapping views is not a mistake; None where the overlap is not known."""
+        """The truth in which a match of overlapping views is not a mistake; None if the overlap is not known."""
         if self.overlap is None:
             return None
         description = f"{self.truth.description}; no mistake where views overlap: {self.overlap_rule}"
@@ -89,14 +89,14 @@ def load_sequence(
     references: ImageSequence | None = None,
     view_overlap: ViewOverlap | None = None,
 ) -> DataSet:
-    """Make a data set of a sequence with poses; truth by the paper's rule, with wider limits for soft truth, if given.
+    """Make a data set of a sequence with poses; truth by the paper's rule, soft truth by wider limits, if given.
 
-    ``selection`` counts all frames; then those without a pose are left out. Without an ``exclusion``, pairs less than
-    10 s apart are excluded; 10 frames where the frames have no time.
+    ``selection`` counts all frames; then frames without a pose are left out. The default ``exclusion`` is pairs of
+    frames within 10 s, or within 10 frames if there are no stamps.
 
     references    another sequence, with poses in the same frame of reference: each query against all its frames;
                   ``selection`` applies to the queries only, and no pair is excluded
-    view_overlap  which other views are not a mistake in the soft zone
+    view_overlap  the rule for overlapping views, for the soft zone
     """
     hard_m, hard_deg = _given(max_distance_m, MAX_DISTANCE_M), _given(max_angle_deg, MAX_ANGLE_DEG)
     rule = f"same place: nearer than {hard_m:g} m and turned less than {hard_deg:g} degrees"
@@ -146,7 +146,7 @@ def _given(value: float | None, otherwise: float) -> float:
 
 
 def _pose_notes(sequence: ImageSequence) -> list[str]:
-    """Say how many frames have no pose, and what looks wrong about the poses."""
+    """Return notes about frames without a pose, and about what looks wrong in the poses."""
     without = int(np.count_nonzero(~sequence.known))
     return [*([f"frames without a pose, left out: {without}"] if without else []), *sequence.doubts]
 
@@ -160,12 +160,12 @@ def load_fabmap(
     exclusion: Exclusion = FABMAP_EXCLUSION,
     joined_folder: str | Path | None = None,
 ) -> DataSet:
-    """Load a set in the form of FAB-MAP's New College and City Centre: numbered images of a left and a right camera.
+    """Load a set in the format of FAB-MAP's New College and City Centre: numbered images of two cameras.
 
     Image 0001 is the left one of the first place, 0002 the right one, and so on. The mask (``*GroundTruth.mat``) and
-    the coordinates (``*Coordinates.mat`` or ``.txt``) are searched for in the folder unless given.
+    the coordinates (``*Coordinates.mat`` or ``.txt``) are searched in the folder if they are not given.
 
-    camera     which images are taken: see loopclosure.places.masks; "joined" images are written to ``joined_folder``
+    camera     which images are used: see loopclosure.places.masks; "joined" images are written to ``joined_folder``
     selection  counts images of one camera, or joined images, or with "both" single images
     """
     folder = Path(folder)
@@ -232,10 +232,10 @@ def load_traverses(
 ) -> DataSet:
     """Load two traverses of one route.
 
-    Without a file of truth, frames of equal number show the same place, as in Nordland. ``tolerance``: frames i and j
-    are the same place if |i - j| <= tolerance (counted before ``selection``, which takes the same frames of both);
-    ``soft_tolerance`` is the wider one of soft truth. With a file (a mask, or the lists of VPR benchmarks: see
-    :func:`loopclosure.places.masks.read_matches`), ``selection`` takes queries.
+    Without ``truth_file``, frames with the same number show the same place, as in Nordland. Frames i and j are the same
+    place if |i - j| <= ``tolerance``; ``soft_tolerance`` is the same for soft truth. Both count all frames, and
+    ``selection`` then takes the same frames of both traverses. With ``truth_file`` (a mask or lists, see
+    :func:`loopclosure.places.masks.read_matches`), ``selection`` applies to the queries only.
     """
     query_images = ImageSequence.of_files(image_paths(queries))
     reference_images = ImageSequence.of_files(image_paths(references))
@@ -255,10 +255,10 @@ def load_traverses(
     if tolerance < 0 or (soft_tolerance is not None and soft_tolerance < tolerance):
         raise InputError(f"tolerance {tolerance}, soft tolerance {soft_tolerance}; expected 0 <= tolerance <= soft")
     taken = selection.numbers(len(query_images))
-    apart = np.abs(np.subtract.outer(taken, taken))
+    differences = np.abs(np.subtract.outer(taken, taken))
     rule = f"same place: at most {tolerance} frames apart" if tolerance else "same place: the frame of the same number"
-    soft = None if soft_tolerance is None else apart <= soft_tolerance
-    truth = traverse_truth(apart <= tolerance, rule, soft=soft)
+    soft = None if soft_tolerance is None else differences <= soft_tolerance
+    truth = traverse_truth(differences <= tolerance, rule, soft=soft)
     return DataSet(name, query_images.at(taken), reference_images.at(taken), truth)
 
 
@@ -292,7 +292,7 @@ def join_images(pairs: Sequence[tuple[Path, Path]], folder: Path) -> list[Path]:
 
 
 def _fold(path: Path, hard: np.ndarray, soft: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Move a square mask below the diagonal, where frame i is compared with earlier ones; note what was odd."""
+    """Move a square mask below the diagonal (frame i against earlier frames); return it with notes about it."""
     if hard.shape[0] != hard.shape[1]:
         raise InputError(f"is {hard.shape[0]} x {hard.shape[1]}; the mask of one sequence is square", path)
     above = int(np.count_nonzero(np.triu(hard, 1)))
@@ -305,7 +305,7 @@ def _fold(path: Path, hard: np.ndarray, soft: np.ndarray) -> tuple[np.ndarray, n
 def _fabmap_poses(
     folder: Path, coordinates_file: str | Path | None, images: int, places: np.ndarray
 ) -> np.ndarray | None:
-    """Return poses (N, 7) of which x and y are known, from a file of coordinates; None without one."""
+    """Return poses (N, 7) with x and y from a file of coordinates, the rest NaN; None if there is no file."""
     path = Path(coordinates_file) if coordinates_file else _only_file(folder, ("*Coordinates.mat", "*Coordinates.txt"))
     if path is None:
         return None
@@ -318,7 +318,7 @@ def _fabmap_poses(
 
 
 def _only_file(folder: Path, patterns: Sequence[str], needed: str = "") -> Path | None:
-    """Return the first file of the folder that fits a pattern; without one, None, or InputError if it is needed."""
+    """Return the first file of the folder that matches a pattern, or None; InputError if it is ``needed``."""
     for pattern in patterns:
         found = sorted(folder.glob(pattern))
         if found:
@@ -335,7 +335,7 @@ def _folder_name(source: str | Path) -> str:
 
 
 def _excluded_frames(exclusion: Exclusion, stamps: np.ndarray) -> int:
-    """Return the least number of frames that covers the exclusion, including its seconds."""
+    """Return the smallest number of frames that covers the exclusion, including its seconds."""
     earliest = np.searchsorted(stamps, stamps - exclusion.seconds, side="right")
     return max(exclusion.frames, int(np.max(np.arange(len(stamps)) - earliest)))
 
@@ -352,7 +352,7 @@ def _selection_text(selection: Selection) -> str:
 
 
 def _checked(data: DataSet, hard: np.ndarray) -> DataSet:
-    """Note how many loops the exclusion removes, and refuse a set with nothing left to find."""
+    """Note how many loops the exclusion removes. Raises InputError if no loop is left."""
     if data.references is None:
         whole = int(np.count_nonzero(np.tril(hard, -1)))
         lost = whole - data.truth.positives

@@ -1,4 +1,4 @@
-"""Where frames come from: folders and lists of images, TUM RGB-D sequences, videos, cameras; which frames are taken."""
+"""Reads images, videos and cameras, and selects frames."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ DEPTH_PER_M = 5000  # of depth images, as TUM RGB-D has them
 
 @dataclass(frozen=True)
 class Selection:
-    """Which of N frames are taken: from ``start`` up to ``stop``, every ``stride``-th, at most ``limit`` of them.
+    """Selects frames: from ``start`` to ``stop`` (exclusive), every ``stride``-th, at most ``limit`` of them.
 
-    ``start`` and ``stop`` count frames from 0, or are a share such as "60%".
+    ``start`` and ``stop`` are frame numbers from 0, or a share of the frames such as "60%".
     """
 
     start: int | str = 0
@@ -37,7 +37,7 @@ class Selection:
     limit: int | None = None
 
     def numbers(self, count: int) -> np.ndarray:
-        """Return the numbers of the frames taken of ``count``; InputError if none is left."""
+        """Return the numbers of the selected frames of ``count``. Raises InputError if none is left."""
         if self.stride < 1:
             raise InputError(f"a stride of {self.stride} takes no frame; expected 1 or more")
         if self.limit is not None and self.limit < 1:
@@ -65,18 +65,18 @@ def _frame_number(position: int | str, count: int) -> int:
 
 
 def image_paths(source: str | Path) -> list[Path]:
-    """Return the images of a folder or of a list, in order (the rule: docs/images.md); InputError if there are none."""
+    """Return the images of a folder or list in order (docs/images.md). Raises InputError if there are none."""
     return list(list_images(source).paths)
 
 
 def read_bgr(path: str | Path) -> np.ndarray:
-    """Read an image (H, W, 3) uint8, BGR; InputError if it cannot be read."""
+    """Read an image (H, W, 3) uint8, BGR. Raises InputError if it cannot be read."""
     return read_pixels(path, cv2.IMREAD_COLOR)
 
 
 def read_pixels(path: str | Path, mode: int) -> np.ndarray:
-    """Read an image as OpenCV lays it out in one of its modes; InputError if it cannot be read."""
-    # Read by Python, decoded by OpenCV: imread prints a warning of its own for a missing file.
+    """Read an image in one of OpenCV's modes (``IMREAD_...``). Raises InputError if it cannot be read."""
+    # Read by Python and decoded by OpenCV, because imread prints its own warning for a missing file.
     try:
         data = Path(path).read_bytes()
     except OSError as error:
@@ -91,7 +91,10 @@ def read_pixels(path: str | Path, mode: int) -> np.ndarray:
 
 
 def read_depth(path: str | Path) -> np.ndarray:
-    """Read a depth image of TUM RGB-D (16 bits, 5000 per meter) as meters (H, W), 0 where not known; or InputError."""
+    """Read a depth image of TUM RGB-D (16 bits, 5000 per meter) as meters (H, W), 0 where not known.
+
+    Raises InputError if it is not one.
+    """
     image = read_pixels(path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype != np.uint16:
         raise InputError("is not a depth image; expected one channel of 16 bits, 5000 per meter, as of TUM RGB-D", path)
@@ -99,8 +102,8 @@ def read_depth(path: str | Path) -> np.ndarray:
 
 
 def write_picture(path: Path, image: np.ndarray, *settings: int) -> None:
-    """Write an image in the form that its name's ending says, with OpenCV's settings. Raises InputError."""
-    # Encoded by OpenCV, written by Python: imwrite ends the process where a path is not UTF-8.
+    """Write an image in the format of its suffix, with OpenCV's ``settings``. Raises InputError if that fails."""
+    # Encoded by OpenCV and written by Python, because imwrite aborts the process if a path is not UTF-8.
     _, data = cv2.imencode(path.suffix, image, settings)
     try:
         path.write_bytes(data.tobytes())
@@ -111,9 +114,9 @@ def write_picture(path: Path, image: np.ndarray, *settings: int) -> None:
 def _capture(path: str | Path) -> cv2.VideoCapture:
     try:
         str(path).encode()
-    except UnicodeEncodeError:  # it would end the process
-        raise InputError("OpenCV opens no video whose path is not UTF-8; rename it", path) from None
-    with environment({"OPENCV_FFMPEG_LOGLEVEL": "-8"}):  # it is read at the first video: FFmpeg prints nothing itself
+    except UnicodeEncodeError:  # OpenCV would abort the process
+        raise InputError("OpenCV cannot open a video if its path is not UTF-8; rename it", path) from None
+    with environment({"OPENCV_FFMPEG_LOGLEVEL": "-8"}):  # read at the first video: keeps FFmpeg silent
         return cv2.VideoCapture(str(path))
 
 
@@ -136,7 +139,7 @@ def video_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
 
 
 def video_length(path: str | Path) -> int | None:
-    """Return the number of frames that a video file says it has, None if it does not say.
+    """Return the number of frames in the header of a video file, None if it is not there.
 
     Raises InputError for a file that cannot be decoded.
     """
@@ -150,7 +153,7 @@ def video_length(path: str | Path) -> int | None:
 
 
 def _opened(path: str | Path) -> cv2.VideoCapture:
-    """Open a video. Raises InputError for what is none, or cannot be decoded."""
+    """Open a video. Raises InputError if it is not a video or cannot be decoded."""
     capture = _capture(path)
     if not capture.isOpened():
         if Path(path).is_dir():
@@ -162,18 +165,18 @@ def _opened(path: str | Path) -> cv2.VideoCapture:
 
 
 def _advice(path: str | Path) -> str:
-    """Say what tried to decode a video, and what to do."""
+    """Return the end of an error message: what tried to decode a video, and what to do."""
     advice = f"try ffmpeg -i {Path(path).name} %06d.png, and give the folder of images"
     return f" by OpenCV {cv2.__version__}, which uses FFmpeg: it is cut, damaged, or of an unknown codec; {advice}"
 
 
 def gray(image: np.ndarray) -> np.ndarray:
-    """Return an (H, W, 3) BGR or (H, W) gray image, uint8, as (H, W) gray values."""
+    """Convert a uint8 image, (H, W, 3) BGR or (H, W) gray, to gray values (H, W)."""
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
 def read_gray(path: Path) -> np.ndarray:
-    """Read an image as (H, W) uint8 gray values; InputError if it cannot be read."""
+    """Read an image as gray values (H, W) uint8. Raises InputError if it cannot be read."""
     return gray(read_bgr(path))
 
 
@@ -182,8 +185,8 @@ def live_frames(source: str) -> Generator[tuple[float, np.ndarray], None, None]:
 
     source  the number of a camera; the address of a stream, as in ``rtsp://HOST/PATH``; or a video file
 
-    Of cameras and streams the newest image is taken: those that come while one is looked at are dropped, so that what
-    is found is not late. Raises InputError where nothing can be opened.
+    A camera or stream always gives its newest image. Images that arrive while the caller processes one are dropped, so
+    that results are not late. Raises InputError if the source cannot be opened.
     """
     if not source.isdigit() and "://" not in source:
         yield from video_frames(Path(source))
@@ -212,6 +215,6 @@ def live_frames(source: str) -> Generator[tuple[float, np.ndarray], None, None]:
             yield taken
     finally:
         stopped.set()
-        reader.join(2)  # a stream that hangs is left to the end of the process
+        reader.join(2)  # if a stream hangs, its thread ends with the process
         if not reader.is_alive():
             capture.release()

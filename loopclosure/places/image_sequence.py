@@ -1,4 +1,4 @@
-"""The one type of frames: what a data set, a detector, a method and a list of pairs are given."""
+"""The type for frames that data sets, detectors, methods and lists of pairs use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.trajectory import Poses
 from netspec.files.image_list import ImageList
 
-NAMED = 10  # of the images that cannot be read
+NAMED = 10  # unreadable images listed in a message
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class ImageSequence(ImageList):
     """N frames in order: image files, or frames of a video.
 
     paths       the N files; empty for a video
-    names       (N) of the frames: those of the files relative to ``source``, or "frame NUMBER" of a video
+    names       N names: the paths relative to ``source``, or "frame NUMBER" for a video
     stamps      (N,) seconds, None if not known
-    source      what was read: a folder, a list or a video
+    source      the folder, list or video that was read
     numbers     (N,) positions of the frames in the source, counted from 0; None: all of its frames
     poses       (N, 7) of the camera in the world, tx ty tz qx qy qz qw, NaN where not known; None if no pose is known
     camera      None if not known
@@ -44,7 +44,7 @@ class ImageSequence(ImageList):
 
     @classmethod
     def of_files(cls, paths: Sequence[Path]) -> ImageSequence:
-        """Return image files as frames of which nothing else is known."""
+        """Make a sequence of image files, without stamps, poses or a camera."""
         return cls(tuple(paths), tuple(path.name for path in paths))
 
     @classmethod
@@ -59,18 +59,18 @@ class ImageSequence(ImageList):
 
     @property
     def folder(self) -> Path:
-        """What the names are relative to."""
+        """The folder that the names are relative to."""
         return self.source if self.source.is_dir() else self.source.parent
 
     @property
     def known(self) -> np.ndarray:
-        """Which frames (N,) have a pose."""
+        """Whether each frame has a pose: (N,) bool."""
         if self.poses is None:
             return np.zeros(len(self), bool)
         return np.all(np.isfinite(self.poses), axis=1)
 
     def taken(self, selection: Selection) -> ImageSequence:
-        """Return some of the frames: a selection counts the rows of the sequence, with a pose or without."""
+        """Return the selected frames. The selection counts all frames, with or without a pose."""
         return self.at(selection.numbers(len(self)))
 
     def at(self, indices: Sequence[int] | np.ndarray) -> ImageSequence:
@@ -97,12 +97,12 @@ class ImageSequence(ImageList):
         return self.at(known)
 
     def known_poses(self) -> Poses:
-        """Return the N poses of a sequence in which each frame has one, as those of :meth:`with_poses`."""
+        """Return the poses of a sequence in which every frame has one; see :meth:`with_poses`."""
         assert self.poses is not None
         return Poses(self.poses[:, :3], self.poses[:, 3:])
 
     def with_files(self) -> ImageSequence:
-        """Return the same sequence. Raises InputError for the first image that is not there."""
+        """Return the sequence itself. Raises InputError for the first missing image."""
         for path in self.paths:
             if not os.path.isfile(path):
                 raise InputError("no such image, though the sequence lists it", path)
@@ -111,8 +111,8 @@ class ImageSequence(ImageList):
     def frames(self, wanted: Collection[int] | None = None) -> Iterator[tuple[int, np.ndarray, float | None]]:
         """Yield the index, the image (H, W, 3) uint8 BGR and the stamp of each frame, or of those ``wanted``.
 
-        An image that cannot be read is left out, and listed in ``unreadable``. Raises InputError where none can be
-        read, and where a video ends too soon.
+        An image that cannot be read is left out and added to ``unreadable``. Raises InputError if none can be read, or
+        if a video ends too soon.
         """
         chosen = range(len(self)) if wanted is None else sorted(wanted)
         if not self.paths:
@@ -129,7 +129,7 @@ class ImageSequence(ImageList):
             yield i, image, None if self.stamps is None else float(self.stamps[i])
 
     def _video_frames(self, chosen: Sequence[int]) -> Iterator[tuple[int, np.ndarray, float | None]]:
-        """Read a video once, from its beginning to the last frame of those chosen, which are in order."""
+        """Read a video once, up to the last of the ``chosen`` frames, which are in order."""
         wanted = [(i if self.numbers is None else int(self.numbers[i]), i) for i in chosen]
         if not wanted:
             return
@@ -144,11 +144,12 @@ class ImageSequence(ImageList):
         raise InputError(f"{message}; write {self.source},stop={count}", self.source)
 
     def left_out(self) -> str:
-        """Say in one sentence which images could not be read; empty where all could."""
+        """Return a sentence that lists the images that could not be read; empty if all could."""
         names = [self.names[i] for i in self.unreadable]
         more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-        said = f"{len(names)} of {len(self)} images cannot be read and are left out: {', '.join(names[:NAMED])}{more}"
-        return said if names else ""
+        listed = ", ".join(names[:NAMED])
+        text = f"{len(names)} of {len(self)} images cannot be read and are left out: {listed}{more}"
+        return text if names else ""
 
     def readable(self) -> ImageSequence:
         """Return the sequence without the images that could not be read."""

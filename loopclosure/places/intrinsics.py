@@ -1,4 +1,4 @@
-"""The camera's inner geometry: from ``calibration.txt``, EuRoC's ``sensor.yaml``, KITTI's ``calib.txt``, or numbers."""
+"""Camera intrinsics: from ``calibration.txt``, EuRoC's ``sensor.yaml``, KITTI's ``calib.txt``, or numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FORM = "FX,FY,CX,CY or FX,FY,CX,CY,K1,K2,P1,P2 or FX,FY,CX,CY,K1,K2,P1,P2,K3"
 class Intrinsics:
     """A pinhole camera: focal lengths and principal point in pixels, OpenCV's distortion (k1 k2 p1 p2 [k3]).
 
-    ``size`` is (width, height) in pixels of the images that the numbers are for, None if not known.
+    ``size`` is the (width, height) in pixels of the calibrated images, None if not known.
     """
 
     fx: float
@@ -30,7 +30,7 @@ class Intrinsics:
     size: tuple[int, int] | None = None
 
     def of_size(self, width: int, height: int) -> Intrinsics:
-        """Return the camera of images that were scaled to this size; the center of a pixel has whole coordinates."""
+        """Return the camera for images scaled to this size; integer coordinates are pixel centers."""
         if self.size is None or self.size == (width, height):
             return self
         x, y = width / self.size[0], height / self.size[1]
@@ -38,14 +38,14 @@ class Intrinsics:
         return replace(self, fx=self.fx * x, fy=self.fy * y, cx=cx, cy=cy, size=(width, height))
 
     def rays(self, points: np.ndarray) -> np.ndarray:
-        """Return pixels (N, 2) as points (N, 2) of the plane at depth 1, without distortion."""
+        """Convert pixels (N, 2) to undistorted points (N, 2) in the plane at depth 1."""
         matrix = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
         pixels = np.asarray(points, np.float64).reshape(-1, 1, 2)
         return cv2.undistortPoints(pixels, matrix, np.array(self.distortion or (0.0,) * 4)).reshape(-1, 2)
 
 
 def from_text(text: str) -> Intrinsics:
-    """Read the numbers that a command's ``--camera`` gives. Raises InputError for other texts."""
+    """Parse the numbers of a ``--camera`` option. Raises InputError for other text."""
     numbers = _floats(text.split(","))
     if len(numbers) not in (4, 8, 9):
         raise InputError(f'expected {FORM} in pixels, found "{text}"')
@@ -61,9 +61,9 @@ def write_calibration(path: Path, camera: Intrinsics) -> None:
 
 
 def read_intrinsics(path: Path, camera: str = "") -> Intrinsics:
-    """Read a file of the three forms: ``sensor.yaml``, ``calib.txt`` (of its ``camera``, P0 to P3), or one row.
+    """Read a calibration: ``sensor.yaml``, ``calib.txt`` (with ``camera``, P0 to P3), or ``calibration.txt``.
 
-    The row is that of ``calibration.txt``: fx fy cx cy width height, and k1 k2 p1 p2 [k3] where there is distortion.
+    ``calibration.txt`` has one row: fx fy cx cy width height, followed by k1 k2 p1 p2 [k3] if there is distortion.
     Raises InputError for other files.
     """
     try:
@@ -88,7 +88,7 @@ def read_intrinsics(path: Path, camera: str = "") -> Intrinsics:
 
 
 def yaml_numbers(text: str, key: str, count: int, path: Path) -> list[float]:
-    """Return the ``count`` numbers in brackets behind ``key:`` of a YAML text, over several lines or one."""
+    """Return the ``count`` numbers in brackets behind ``key:`` in a YAML text, on one line or several."""
     found = re.search(rf"^[ \t]*{key}[ \t]*:\s*\[([^\]]*)\]", text, re.MULTILINE)
     numbers = _floats(found[1].split(",")) if found else []
     if len(numbers) != count:
@@ -108,7 +108,7 @@ def kitti_projection(text: str, camera: str, path: Path) -> np.ndarray:
 
 
 def _floats(parts: Sequence[str]) -> list[float]:
-    """Return texts as numbers; none at all where one is no number."""
+    """Parse numbers; return an empty list if one of them is not a number."""
     try:
         return [float(part) for part in parts]
     except ValueError:

@@ -1,4 +1,4 @@
-"""Files that say which frames show the same place (masks as .mat, .npy, .txt or an image) and where they were taken."""
+"""Reads ground truth: masks of frames that show the same place (.mat, .npy, .txt, images), matches, coordinates."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from netspec.errors import SpecError
 from netspec.files.arrays import read_npy
 from netspec.files.opencv import cv2
 
-# The FAB-MAP sets call it truth; several papers' derived files GT.
+# Names of the matrix: "truth" in the FAB-MAP sets, "GT" in files derived from them.
 TRUTH_KEYS = ("truth", "gt", "groundtruth", "ground_truth")
 COORDINATE_KEYS = ("gps", "coordinates", "xy")
 LOSSLESS_SUFFIXES = (".bmp", ".png", ".pgm", ".tif", ".tiff")
@@ -27,9 +27,9 @@ LOSSLESS_SUFFIXES = (".bmp", ".png", ".pgm", ".tif", ".tiff")
 def read_truth_matrix(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Read a mask of loops: (hard, soft), both (Q, R) bool.
 
-    0 is another place, 1 (or 255) the same place. Values between are soft: near enough not to be a mistake, but they
-    need not be found (gray in RTAB-Map's masks). The suffix says what the file is: MATLAB (.mat, variable ``truth`` or
-    ``GT``, or its only matrix), numpy (.npy), numbers separated by blanks or commas (.txt, .csv), or a lossless image.
+    0 is another place, 1 (or 255) the same place. Values between are soft (gray in RTAB-Map's masks): such a match is
+    not a mistake, but it need not be found. The suffix gives the format: MATLAB (.mat, variable ``truth`` or ``GT``, or
+    its only matrix), NumPy (.npy), numbers separated by blanks or commas (.txt, .csv), or a lossless image.
     """
     path = Path(path)
     values = _read_matrix(path, TRUTH_KEYS, "a mask of loops")
@@ -48,9 +48,9 @@ def read_truth_matrix(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 def read_matches(path: str | Path, queries: int, references: int) -> tuple[np.ndarray, np.ndarray]:
     """Read which references (R) show each query (Q): (hard, soft), both (Q, R) bool.
 
-    A mask, as :func:`read_truth_matrix` reads it, or lists in a .json file: rows of a query's number and the numbers of
-    its references, as VPR-Bench has them in a pickle, or for each query such a list. Numbers count from 0. Raises
-    InputError for other files, and for numbers of images that are not there.
+    The file is a mask as for :func:`read_truth_matrix`, or a .json file with lists. The lists are rows of a query's
+    number and the numbers of its references (VPR-Bench has the same in a pickle), or only the references of each query
+    in order. Numbers count from 0. Raises InputError for other files, and for numbers out of range.
     """
     path = Path(path)
     lists = _read_lists(path) if path.suffix.lower() == ".json" else None
@@ -92,7 +92,7 @@ def _read_lists(path: Path) -> list[Any]:
 
 
 def read_coordinates(path: str | Path) -> np.ndarray:
-    """Read where images were taken: (N, 2) x, y, from a .mat (variable ``GPS``), .npy or text file.
+    """Read the coordinates x, y (N, 2) of images from a .mat (variable ``GPS``), .npy or text file.
 
     A row of a text file has x and y, or the image's name, x and y.
     """
@@ -196,16 +196,20 @@ def _read_text(path: Path, what: str, last_columns: int | None) -> np.ndarray:
     return np.array(rows)
 
 
-# Of folders in which the images of a left and a right camera alternate (Cummins and Newman, FAB-MAP, IJRR 2008), taken
-# are: all images, of one camera; the left ones; the right ones; both, of which a left one is never compared with a
-# right one, since they look to opposite sides; or both joined as one image, the same place if any of their views is.
+# Which images of a folder are used. Except with "all", images of a left and a right camera alternate (Cummins and
+# Newman, FAB-MAP, IJRR 2008).
+#   all     all images, of one camera
+#   left    only the left images
+#   right   only the right images
+#   both    all images; a left one is never compared with a right one, because the cameras look to opposite sides
+#   joined  left and right joined as one image; two show the same place if any of their views does
 CAMERAS = ("all", "left", "right", "both", "joined")
 
 
 def images_of_places(camera: str, images: int) -> NDArray[np.intp]:
-    """Return the image numbers of each place: (places, 1), or of "joined" (places, 2), left and right.
+    """Return the image numbers of each place: (places, 1), or for "joined" (places, 2), left and right.
 
-    Raises InputError for an unknown camera, or where ``images`` are not pairs of a left and a right one.
+    Raises InputError for an unknown camera, or if the number of ``images`` is odd.
     """
     if camera not in CAMERAS:
         raise InputError(f'unknown camera "{camera}"; known: {", ".join(CAMERAS)}')
@@ -218,10 +222,9 @@ def images_of_places(camera: str, images: int) -> NDArray[np.intp]:
 
 
 def mask_of_places(camera: str, mask: NDArray, images: int, file: Path) -> NDArray:
-    """Return a mask of images (images, images) as one of places (places, places).
+    """Convert a mask of images (images, images) to a mask of places (places, places).
 
-    A mask that already is one of places of two images passes as it is. Raises InputError, which names ``file``, for a
-    mask of another size.
+    A mask of places is returned unchanged. Raises InputError, which names ``file``, for a mask of another size.
     """
     places = images_of_places(camera, images)
     if mask.shape == (images, images):
@@ -236,6 +239,6 @@ def mask_of_places(camera: str, mask: NDArray, images: int, file: Path) -> NDArr
 
 
 def comparable(camera: str, places: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return which pairs of places, as :func:`images_of_places` gives them, are judged at all: (places, places)."""
+    """Return which pairs of places from :func:`images_of_places` can be judged: (places, places)."""
     side = places[:, 0] % 2 if camera == "both" else np.zeros(len(places))
     return side[:, None] == side

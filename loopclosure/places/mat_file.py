@@ -1,4 +1,4 @@
-"""MATLAB files, read by a process of its own: a damaged file can make SciPy's reader crash.
+"""Reads MATLAB files in a separate process, because a damaged file can crash SciPy's reader.
 
 Run as a program, this file writes the matrices of a .mat file to standard output, as .npz.
 """
@@ -11,8 +11,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-LIMIT = 1 << 30  # bytes of memory that the process may use beyond what it starts with, and
-TIMES = 100  # times the file's size
+# The process may use this much memory beyond what it starts with: LIMIT bytes plus TIMES the size of the file.
+LIMIT = 1 << 30
+TIMES = 100
 
 
 def read_mat(path: str | Path) -> dict[str, Any]:
@@ -56,11 +57,11 @@ def _main(path: str) -> None:
         np.savez(written, allow_pickle=False, **matrices)
     except NotImplementedError:
         sys.exit("it is a MATLAB 7.3 file; save it again in MATLAB with -v7")
-    except BaseException as error:  # a broken file can make loadmat raise anything
+    except BaseException as error:  # loadmat can raise anything for a damaged file
         sys.exit(" ".join(str(error).split()) or type(error).__name__)
     sys.stdout.buffer.write(written.getvalue())
 
 
 if __name__ == "__main__":
-    sys.path.pop(0)  # the folder of this file: modules must not be found there
+    sys.path.pop(0)  # no modules are imported from the folder of this file
     _main(sys.argv[1])

@@ -1,8 +1,8 @@
-"""How much of one view is seen in another, from the poses, and from depth where there is depth: the soft truth.
+"""Computes from poses, and depth if available, how much of one view is visible in another: the soft truth.
 
-The rule of :mod:`loopclosure.places.same_place` is strict: two views of one wall from 3 m apart, or turned by 20
-degrees, are different places to it, though a robot that closes a loop between them makes no mistake. Points of the one
-view, on a grid, are projected into the other. Their distance is the measured depth, or without depth each of three
+The rule of :mod:`loopclosure.places.same_place` is strict. By that rule, two views of one wall are different places if
+the cameras are 3 m from each other or rotated by 20 degrees, but a loop between them is not a mistake. Here, points on
+a grid in one view are projected into the other. The distance of a point is the measured depth, or else each of three
 assumed distances.
 """
 
@@ -26,18 +26,18 @@ from loopclosure.places.trajectory import Poses
 ASSUMED_M = (2.0, 4.0, 8.0)
 FOV_DEG = 60.0  # of a camera that is not known
 GRID = (6, 8)  # rows and columns of points in a view
-# A point that is farther than what the other view sees in its direction, by more than this factor, is hidden there.
+# A point is hidden in the other view if it is farther away than the surface seen there by more than this factor.
 HIDDEN = 1.25
 WIDEST_TURN_DEG = 90.0
 
 
 @dataclass(frozen=True)
 class ViewOverlap:
-    """When two views overlap; the defaults were chosen once, for indoor robots and hand-held cameras.
+    """The rule for overlapping views; the defaults were chosen for indoor robots and hand-held cameras.
 
-    fov_deg   horizontal field of view; None: the camera's where it is known, or 60. Pixels are square, the principal
-              point is the center
-    least     the least share of each of the two views that must be visible in the other
+    fov_deg   horizontal field of view; None: that of the camera if known, else 60. Pixels are assumed square, and the
+              principal point at the center
+    least     the minimum share of each of the two views that must be visible in the other
     """
 
     fov_deg: float | None = None
@@ -53,13 +53,13 @@ class ViewOverlap:
         return FOV_DEG if self.fov_deg is None else self.fov_deg
 
     def of_camera(self, camera: Intrinsics | None) -> ViewOverlap:
-        """Return the same with the field of view of a known camera, if none was given."""
+        """Return a copy with the field of view of ``camera``, if none was given and the camera is known."""
         if self.fov_deg is not None or camera is None or camera.size is None:
             return self
         return replace(self, fov_deg=math.degrees(2 * math.atan(camera.size[0] / 2 / camera.fx)))
 
     def describe(self, measured: bool) -> str:
-        """Say in words when views overlap."""
+        """Return the rule as text."""
         distances = f"assumed distances of {', '.join(f'{d:g}' for d in ASSUMED_M)} m"
         return (
             f"at least {100 * self.least:g} % of each view is visible in the other, by the poses and "
@@ -70,9 +70,9 @@ class ViewOverlap:
 
 @dataclass(frozen=True)
 class Views:
-    """N views: poses, and for each point of the grid the distances along the viewing axis (N, points, 3) in meters.
+    """N views: poses, and three distances for each grid point along the viewing axis, (N, points, 3), in meters.
 
-    measured  (N, points) bool: the three distances are the same, measured one
+    measured  (N, points) bool: all three distances are the measured depth
     """
 
     poses: Poses

@@ -1,10 +1,10 @@
-"""Files of poses in the forms of TUM, KITTI and EuRoC, and what makes a path look wrong.
+"""Reads files of poses in the formats of TUM, KITTI and EuRoC, and checks whether a path looks wrong.
 
 TUM    ``timestamp tx ty tz qx qy qz qw``: seconds, meters, w last
 KITTI  twelve numbers, the upper three rows of a 4 x 4 matrix; no time: one row per image
-EuRoC  ``timestamp,px,py,pz,qw,qx,qy,qz,...``: nanoseconds, meters, w first; more columns are not read
+EuRoC  ``timestamp,px,py,pz,qw,qx,qy,qz,...``: nanoseconds, meters, w first; further columns are ignored
 
-All of them say where the camera (EuRoC: the body) is in the world, unless a form says ``world-to-camera``.
+All of them give the pose of the camera (EuRoC: the body) in the world, unless the form has ``world-to-camera``.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ EXPECTED = (
 )
 # A rotation matrix in text has at least four decimals.
 MATRIX_TOLERANCE = 0.02
-# A step is a jump if it is this many times as fast as all but one step of a hundred, and longer than this.
+# A step is a jump if its speed is this many times the 99th percentile, and it is longer than this.
 JUMP_FACTOR, JUMP_M = 10.0, 0.5
-# A car or a robot moves one way in its own frame. Where another reading of the poses says so, and this one does not,
-# the other is likely. Of a camera in a hand nothing is said.
+# A car or a robot always moves in one direction of its own frame. If that is so only with another reading of the poses,
+# that reading is likely to be right. A hand-held camera moves in all directions, so nothing can be said about it.
 ONE_WAY, ALL_WAYS, SHORTER = 0.9, 0.7, 0.5
 
 
 @dataclass(frozen=True)
 class PoseForm:
-    """How a file of poses is to be read; an empty field is found out or is the form's own.
+    """How to read a file of poses; an empty field means the default.
 
-    form       "tum", "kitti" or "euroc": by the number of columns and the commas
-    order      "w-first" or "w-last" of the quaternion: EuRoC's is first, TUM's last
-    direction  "camera-to-world" or "world-to-camera"
+    form       "tum", "kitti" or "euroc"; default: found from the number of columns and the commas
+    order      "w-first" or "w-last" of the quaternion; default: w first for EuRoC, last for TUM
+    direction  "camera-to-world" (default) or "world-to-camera"
     """
 
     form: str = ""
@@ -62,7 +62,7 @@ class PoseForm:
 class PoseFile:
     """N poses, camera-to-world: ``poses`` (N, 7) tx ty tz qx qy qz qw, and ``stamps`` (N,) in s, None for KITTI.
 
-    ``doubts`` are sentences about what looks wrong; empty if nothing does.
+    ``doubts`` are sentences about what looks wrong.
     """
 
     poses: np.ndarray
@@ -79,8 +79,8 @@ class PoseFile:
     ) -> np.ndarray:
         """Return the poses (images, 7) of images with these stamps, NaN where none is within ``max_difference`` [s].
 
-        Without stamps on one side, pose i is that of image i. Raises InputError if their numbers differ then, or if no
-        image has a pose.
+        If the poses or the images have no stamps, pose i belongs to image i. Raises InputError if their numbers differ
+        then, or if no image has a pose.
         """
         if self.stamps is None or stamps is None:
             if len(self.poses) != images:
@@ -102,7 +102,7 @@ class PoseFile:
 
 
 def pose_form(text: str) -> PoseForm:
-    """Read words such as ``tum,w-first,world-to-camera``; InputError for others."""
+    """Parse words such as ``tum,w-first,world-to-camera``. Raises InputError for unknown words."""
     chosen = {}
     for word in filter(None, text.split(",")):
         for name, known in (("form", FORMS), ("order", ORDERS), ("direction", DIRECTIONS)):
@@ -111,14 +111,14 @@ def pose_form(text: str) -> PoseForm:
                 break
         else:
             known_words = ", ".join((*FORMS, *ORDERS, *DIRECTIONS))
-            raise InputError(f'"{word}" says nothing of how poses are written; known: {known_words}')
+            raise InputError(f'"{word}" is not a form of poses; known: {known_words}')
     return PoseForm(**chosen)
 
 
 def read_poses(path: str | os.PathLike[str], form: PoseForm = PoseForm()) -> PoseFile:
-    """Read a file of poses, in the order of time where it has one.
+    """Read a file of poses, sorted by time if it has stamps.
 
-    Raises InputError (file:line:column) for a line of another form, and for numbers that are not a rotation.
+    Raises InputError (file:line:column) for a line in another form, and for numbers that are not a rotation.
     """
     kind = form.form or _form_of(path)
     order = form.order or ("w-first" if kind == "euroc" else "w-last")
@@ -149,14 +149,14 @@ def inverse(poses: np.ndarray) -> np.ndarray:
 
 
 def moved(poses: np.ndarray, mount: np.ndarray) -> np.ndarray:
-    """Return the poses (N, 7) of a sensor, whose pose in a body is the matrix ``mount`` (4, 4), from the body's."""
+    """Return the poses (N, 7) of a sensor from the poses of its body; ``mount`` (4, 4): its pose in the body."""
     turns = Rotation.from_quat(poses[:, 3:])
     positions = poses[:, :3] + turns.apply(mount[:3, 3])
     return np.hstack([positions, (turns * Rotation.from_matrix(mount[:3, :3])).as_quat(canonical=True)])
 
 
 def doubts(poses: np.ndarray, stamps: np.ndarray | None, form: PoseForm = PoseForm()) -> list[str]:
-    """Return sentences about poses (N, 7) that look wrong: jumps, the world first, the order of the quaternion."""
+    """Return sentences about poses (N, 7) that look wrong: jumps, inverted poses, order of the quaternion."""
     found = []
     steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
     if len(steps) < 10:
@@ -190,12 +190,12 @@ def doubts(poses: np.ndarray, stamps: np.ndarray | None, form: PoseForm = PoseFo
 
 
 def _other_order(quaternions: np.ndarray, order: str) -> np.ndarray:
-    """Return quaternions xyzw that were read in one order as the other one reads them."""
+    """Convert quaternions xyzw that were read in ``order`` to the other order."""
     return np.roll(quaternions, 1, axis=1) if order == "w-first" else np.roll(quaternions, -1, axis=1)
 
 
 def _one_way(poses: np.ndarray) -> float:
-    """Return how much the camera moves in one direction of its own: 0 in all, 1 always in the same."""
+    """Return how constant the direction of motion is in the camera's frame: 0 all directions, 1 always the same."""
     every = max(1, len(poses) // 200)  # longer steps: the direction of a short one is noise
     poses = poses[::every]
     steps = np.diff(poses[:, :3], axis=0)
@@ -208,7 +208,7 @@ def _one_way(poses: np.ndarray) -> float:
 
 
 def _form_of(path: str | os.PathLike[str]) -> str:
-    """Return the form of a file of poses, by its first row."""
+    """Find the form of a file of poses from its first row."""
     for line_number, line in content_lines(path, EXPECTED):
         count = len(re.findall(r"[^\s,]+", line))
         if "," in line and count >= 8:
@@ -239,7 +239,7 @@ def _rows(path: str | os.PathLike[str], kind: str, count: int) -> np.ndarray:
 
 
 def _rotation_fault(row: Sequence[float], kind: str) -> str:
-    """Say why a row holds no valid rotation; empty if it does."""
+    """Return why a row has no valid rotation; empty if it has one."""
     if kind == "euroc":
         length = float(np.linalg.norm(row[4:8]))
         wrong = abs(length - 1) > NORM_TOLERANCE
@@ -248,9 +248,9 @@ def _rotation_fault(row: Sequence[float], kind: str) -> str:
 
 
 def matrix_fault(matrix: np.ndarray) -> str:
-    """Say why the first three columns (3, 3) of a pose are not a rotation; empty if they are."""
-    apart = float(np.abs(matrix.T @ matrix - np.eye(3)).max()) if np.abs(matrix).max() < 2 else np.inf
-    if not apart <= MATRIX_TOLERANCE:
-        return f"its first three columns are no rotation: M^T M differs from the identity by {apart:.3g}"
+    """Return why the first three columns (3, 3) of a pose are not a rotation; empty if they are."""
+    difference = float(np.abs(matrix.T @ matrix - np.eye(3)).max()) if np.abs(matrix).max() < 2 else np.inf
+    if not difference <= MATRIX_TOLERANCE:
+        return f"its first three columns are no rotation: M^T M differs from the identity by {difference:.3g}"
     reflected = np.linalg.det(matrix) < 0
     return "its first three columns are a reflection (determinant -1), not a rotation" if reflected else ""

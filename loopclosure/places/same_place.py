@@ -1,10 +1,10 @@
-"""The rule that says when two poses are the same place: it labels training pairs, and it judges loop closures.
+"""The rule for whether two poses are the same place. It labels training pairs and judges loop closures.
 
-The paper (section IV): the two cameras are less than 2 m apart, and the rotation between them is less than 15 degrees.
-Both poses must be in one frame of reference; the caller must know which sequences share one.
+The rule of the paper (section IV): the distance between the cameras is less than 2 m, and the rotation between them is
+less than 15 degrees. Both poses must be in one frame of reference; the caller must know which sequences share one.
 
-Every function takes single poses and arrays of them, with numpy's broadcasting, and does the same arithmetic for a
-single pair as for a whole matrix, so that a label never depends on how it was computed.
+Every function takes single poses or arrays, with NumPy's broadcasting. The arithmetic is the same for one pair as for a
+matrix, so a label never depends on how it was computed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Sequences of images in the layouts that people have: TUM RGB-D, EuRoC, KITTI odometry, folders and lists.
+"""Reads sequences of images in common layouts: TUM RGB-D, EuRoC, KITTI odometry, folders, lists and videos.
 
-All of them become one :class:`~loopclosure.places.image_sequence.ImageSequence`, from which evaluation, detection,
-closing and pairs are made.
+All of them become an :class:`~loopclosure.places.image_sequence.ImageSequence`, which all commands use.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ EUROC_POSES = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 
 @dataclass(frozen=True)
 class PoseChoice:
-    """A file of poses instead of the sequence's own: ``path``, and its ``form``."""
+    """A file of poses, and its form, that replaces the poses of a sequence."""
 
     path: Path
     form: PoseForm = field(default_factory=PoseForm)
@@ -41,10 +40,10 @@ class PoseChoice:
 def read_sequence(
     source: str | Path, layout: str = "", max_difference: float = MAX_DIFFERENCE_S, poses: PoseChoice | None = None
 ) -> ImageSequence:
-    """Read a sequence; without a ``layout`` ("tum", "euroc", "kitti", "images" or "video") it is seen from the files.
+    """Read a sequence with a layout "tum", "euroc", "kitti", "images" or "video"; "": found from the files.
 
-    Frames without a pose within ``max_difference`` seconds keep no pose. Raises InputError for files that are missing
-    or broken.
+    A frame gets the pose nearest in time, within ``max_difference`` seconds, or none. Raises InputError for files that
+    are missing or damaged.
     """
     source = Path(source)
     sequence = _READERS[layout or layout_of(source)](source, max_difference, poses is None)
@@ -56,7 +55,7 @@ def read_sequence(
 
 
 def layout_of(source: Path, otherwise: str = "images") -> str:
-    """Return the layout of a source by its name and the folders in it; ``otherwise`` where they do not show it."""
+    """Return the layout of a source by its name and its folders; ``otherwise`` if they do not determine it."""
     if source.suffix.lower() in VIDEO_SUFFIXES:
         return "video"
     if (source / "mav0").is_dir() or (source / "cam0" / "data.csv").is_file():
@@ -67,11 +66,10 @@ def layout_of(source: Path, otherwise: str = "images") -> str:
 
 
 def benchmark_parts(folder: Path) -> tuple[Path, Path, Path]:
-    """Return the queries, the references and the truth of a folder as VPR benchmarks ship it.
+    """Return the queries, the references and the truth in a folder of a VPR benchmark.
 
-    VPR-Bench (Zaffar et al., IJCV 2021): ``query/``, ``ref/``, and ground_truth*.json or .npy; of several the one
-    that ends in ``_new``. Lists in a .npy are refused with how to convert them.
-    Raises InputError if one of them is missing.
+    VPR-Bench (Zaffar et al., IJCV 2021): ``query/``, ``ref/``, and ground_truth*.json or .npy. If there are several
+    such files, the one that ends in ``_new`` is used. Raises InputError if one of the three is missing.
     """
     parts = []
     for names, what in ((QUERIES, "queries"), (REFERENCES, "references")):
@@ -103,7 +101,7 @@ def _tum(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
 def _with_tum_files(
     sequence: ImageSequence, stamps: np.ndarray, max_difference: float, own_poses: bool
 ) -> ImageSequence:
-    """Add what a TUM sequence has next to its images: poses, depth, calibration."""
+    """Add the poses, depth and calibration of a TUM sequence, if it has them."""
     folder, doubts = sequence.source, []
     if own_poses:
         path = folder / "groundtruth.txt"
@@ -121,7 +119,7 @@ def _with_tum_files(
 
 
 def _nearest_depths(listing: Path, stamps: np.ndarray, max_difference: float) -> tuple[Path | None, ...]:
-    """Return for each image the file of depth nearest in time; None where it is too far."""
+    """Return for each image the depth image nearest in time; None if none is within ``max_difference``."""
     depths = list_images(listing)
     if depths.stamps is None:
         raise InputError('has lines without a time stamp; expected "timestamp filename" in each line', listing)
@@ -141,7 +139,7 @@ def _images(source: Path, max_difference: float, own_poses: bool) -> ImageSequen
 
 
 def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
-    """EuRoC MAV and TUM-VI (Burri et al., IJRR 2016): the left camera, its poses those of the body and its mount."""
+    """Read EuRoC MAV and TUM-VI (Burri et al., IJRR 2016): the left camera; its poses are computed from the body's."""
     base = folder / "mav0" if (folder / "mav0").is_dir() else folder
     listing = base / "cam0" / "data.csv"
     if not listing.is_file():
@@ -181,9 +179,9 @@ def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
 
 
 def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
-    """KITTI odometry (Geiger et al., CVPR 2012): ``sequences/00`` with image_0 to image_3, and ``poses/00.txt``.
+    """Read KITTI odometry (Geiger et al., CVPR 2012): ``sequences/00`` with image_0 to image_3, and ``poses/00.txt``.
 
-    The poses are those of camera 0; another camera is beside it by what ``calib.txt`` says.
+    The file has the poses of camera 0. For another camera they are moved by the offset in ``calib.txt``.
     """
     cameras = [name for name in KITTI_CAMERAS if (folder / name).is_dir()]
     if not cameras:
@@ -195,19 +193,19 @@ def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
         times = np.array([_time(line, folder / "times.txt", line_number) for line_number, line in rows])
         if len(times) != len(images):
             raise InputError(f"has {len(times)} times, but there are {len(images)} images", folder / "times.txt")
-    camera, beside = None, np.eye(4)
+    camera, offset = None, np.eye(4)
     if (folder / "calib.txt").is_file():
         path, projection = folder / "calib.txt", f"P{cameras[0][-1]}"
         camera = read_intrinsics(path, projection)
         matrix = kitti_projection(path.read_text(encoding="utf-8-sig"), projection, path)
-        beside[:3, 3] = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
+        offset[:3, 3] = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
     sequence = ImageSequence(images, _names(images, folder), times, folder, camera=camera)
     if not own_poses:
         return sequence
     for path in (folder / "poses.txt", folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"):
         if path.is_file():
             read = read_poses(path, PoseForm("kitti"))
-            found = moved(read.of_images(len(sequence), times, path, max_difference), beside)
+            found = moved(read.of_images(len(sequence), times, path, max_difference), offset)
             return replace(sequence, poses=found, doubts=_named(read.doubts, path))
     return sequence
 

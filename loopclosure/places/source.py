@@ -1,4 +1,4 @@
-"""A source of images in one word, ``[KIND:]PATH[,KEY=VALUE]...``: its frames, its poses; bags and videos extracted."""
+"""Parses a source of images, ``[KIND:]PATH[,KEY=VALUE]...``, and extracts the frames of bags and videos."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from netspec.files.whole_file import whole_folder
 FRAMES = ("start", "stop", "stride", "limit")
 POSES = ("poses", "pose-form")
 TOPICS = ("topic", "pose-topic")
-Kinds = Mapping[str, Sequence[str]]  # the settings of each kind of source, "" for one whose kind is not named
+Kinds = Mapping[str, Sequence[str]]  # the settings of each kind of source; "" if no kind is named
 Listed = list[tuple[float, str]]  # the stamp in seconds and the file of each frame
 T = TypeVar("T")
 SEQUENCE = (*FRAMES, *POSES, "references")
-# The kinds of sources, and what may be set of each: for an evaluation (loopclosure evaluate) and for pairs of images
-# (lmdb-build pairs). None: that command does not take it.
+# The settings of each kind of source: for an evaluation (loopclosure evaluate) and for pairs of images
+# (lmdb-build pairs). None: the command does not accept this kind.
 _KINDS: dict[str, tuple[Sequence[str] | None, Sequence[str] | None]] = {
     "": ((*SEQUENCE, *TOPICS, "truth"), (*POSES, *TOPICS, "truth", "camera")),
     "tum": (SEQUENCE, (*POSES, *TOPICS)),
@@ -50,14 +50,14 @@ _KINDS: dict[str, tuple[Sequence[str] | None, Sequence[str] | None]] = {
 }
 EVALUATED = {kind: settings for kind, (settings, _) in _KINDS.items() if settings is not None}
 PAIRED = {kind: settings for kind, (_, settings) in _KINDS.items() if settings is not None}
-# What detect and map take, and what close takes: one sequence, whose kind is seen from its files.
+# The settings for detect and map, and for close. They take one sequence and find its kind from the files.
 DETECTED: Kinds = {"": (*FRAMES, *TOPICS)}
 CLOSED: Kinds = {"": (*FRAMES, *POSES, *TOPICS)}
 
 
 @dataclass(frozen=True)
 class Source:
-    """A folder or file. ``kind`` is "" where its own files tell it; ``settings`` are the texts of what was set."""
+    """A folder or file. ``kind`` is "" if it is to be found from the files; ``settings`` are not parsed yet."""
 
     kind: str
     path: Path
@@ -67,7 +67,7 @@ class Source:
         return ",".join((str(self.path), *(f"{key}={value}" for key, value in self.settings.items())))
 
     def get(self, name: str, read: Callable[[str], T]) -> T | None:
-        """Return a setting, None where it is absent. Raises InputError where ``read`` finds no such value."""
+        """Return a setting parsed by ``read``, or None if it is absent. Raises InputError if it cannot be parsed."""
         if name not in self.settings:
             return None
         try:
@@ -78,12 +78,12 @@ class Source:
             raise InputError(f'{self}: {name} is "{self.settings[name]}", expected a number') from None
 
     def selection(self) -> Selection:
-        """Return which of its frames are taken."""
+        """Return the selection of frames."""
         stride, limit = self.get("stride", int), self.get("limit", int)
         return Selection(self.get("start", str) or 0, self.get("stop", str), 1 if stride is None else stride, limit)
 
     def pose_choice(self) -> PoseChoice | None:
-        """Return the file of poses that replaces the sequence's own, if one is named."""
+        """Return the file of poses that replaces the sequence's own, or None."""
         poses = self.get("poses", Path)
         return PoseChoice(poses, self.get("pose-form", pose_form) or pose_form("")) if poses else None
 
@@ -91,8 +91,8 @@ class Source:
 def read_source(text: str, kinds: Kinds) -> Source:
     """Read a source. Raises InputError for a setting that its kind does not have.
 
-    A word before a colon that names no kind belongs to the path, as ``C:`` does. A comma ends the path only before
-    ``KEY=``.
+    If the text before a colon is not a kind, it belongs to the path, for example ``C:``. A comma ends the path only if
+    ``KEY=`` follows.
     """
     kind, colon, rest = text.partition(":")
     if not (colon and kind in kinds):
@@ -112,7 +112,7 @@ def read_source(text: str, kinds: Kinds) -> Source:
 
 
 MADE_FROM = "source.txt"
-# What the commands call the sequences with poses.
+# The sequences with poses, as the help texts describe them.
 LAYOUTS = {
     "tum": "a TUM RGB-D sequence",
     "euroc": "an EuRoC sequence (mav0/)",
@@ -123,23 +123,23 @@ LAYOUTS = {
 RECORDED = ("bag", "video")  # their frames are extracted first
 POSES_HELP = "the camera's poses, in the form of TUM, KITTI or EuRoC, instead of the sequence's own"
 POSE_FORM_HELP = (
-    f"how poses are written, if it is not seen: {', '.join((*FORMS, *ORDERS, *DIRECTIONS))}; commas between"
+    f"how poses are written, if not found from the file: {', '.join((*FORMS, *ORDERS, *DIRECTIONS))}; commas between"
 )
 
 
 def is_recording(source: Path) -> bool:
-    """Return whether a source is a bag or a video, whose frames are not files."""
+    """Return whether a source is a bag or a video."""
     return is_bag(source) or source.suffix.lower() in VIDEO_SUFFIXES
 
 
 def extract(
     source: Path, folder: Path, topic: str = "", pose_topic: str = "", progress: Progress = silent
 ) -> tuple[Path, str]:
-    """Write the frames of a bag or video into a new ``folder`` in TUM's layout; return it, and a sentence about it.
+    """Write the frames of a bag or video to a new ``folder`` in TUM's layout; return it, and a sentence about it.
 
-    rgb/ has the images as PNG, rgb.txt their times; groundtruth.txt and calibration.txt are written where a bag has
-    poses and a CameraInfo. A folder that was made from the same file, with the same topics, is kept as it is.
-    Raises InputError if there is another folder of that name, or the source cannot be read.
+    rgb/ has the images as PNG, and rgb.txt their times. groundtruth.txt and calibration.txt are written if a bag has
+    poses and a CameraInfo. An existing folder that was made from the same file and topics is not written again.
+    Raises InputError if there is another folder of that name, or if the source cannot be read.
     """
     if not source.exists():
         raise InputError("no such file", source)

@@ -1,4 +1,4 @@
-"""Where the camera was: the files of the TUM RGB-D benchmark.
+"""Reads and writes camera poses in the files of the TUM RGB-D benchmark.
 
 A sequence is a folder with ``rgb.txt`` (``timestamp filename``) and ``groundtruth.txt`` (``timestamp tx ty tz qx qy qz
 qw``). A pose is camera-to-world: the position of the optical center in meters and a unit quaternion with w last; the
@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from loopclosure.errors import InputError
 from netspec.files.whole_file import write_whole
 
-# TUM's own associate.py takes 0.02 s; with 30 Hz images and motion capture at 100 Hz a gap of 0.03 s does no harm.
+# TUM's associate.py allows 0.02 s; with 30 Hz images and 100 Hz motion capture, 0.03 s does no harm.
 MAX_DIFFERENCE_S = 0.03
-# Four printed decimals give a norm within 1e-3 of 1. Much further off, the four numbers are not a quaternion.
+# With four decimals the norm is within 1e-3 of 1. If it differs much more, the numbers are not a quaternion.
 NORM_TOLERANCE = 0.05
 
 
@@ -63,7 +63,7 @@ Posed = Poses | Trajectory
 def read_groundtruth(path: str | os.PathLike[str]) -> Trajectory:
     """Read ``groundtruth.txt``, in order of time; quaternions are normalized (the file has four decimals).
 
-    Raises InputError (file:line:column) for a line that is not eight numbers, or whose last four are not a quaternion.
+    Raises InputError (file:line:column) if a line is not eight numbers, or if its last four are not a quaternion.
     """
     names = "timestamp tx ty tz qx qy qz qw"
     rows = []
@@ -141,8 +141,9 @@ def content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple
 
 
 def number(field: re.Match[str], name: str, path: str | os.PathLike[str], line: int) -> float:
-    """Return a matched field as a number. Raises InputError (file:line:column), which calls it ``name``, if it is not
-    one, or if it is too large to compute distances with.
+    """Return a matched field as a number; ``name`` is for the message.
+
+    Raises InputError (file:line:column) if it is not a number, or if it is too large to compute distances with.
     """
     try:
         value = float(field.group())
@@ -154,5 +155,5 @@ def number(field: re.Match[str], name: str, path: str | os.PathLike[str], line: 
 
 
 def _column_of_count_fault(line: str, fields: list[re.Match[str]], expected: int) -> int:
-    """Return the column (from 1) of the first extra field, or of the place of the first missing one."""
+    """Return the column (from 1) of the first extra field, or where the first missing field should be."""
     return fields[expected].start() + 1 if len(fields) > expected else len(line.rstrip()) + 1

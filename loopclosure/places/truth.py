@@ -1,4 +1,4 @@
-"""Which pairs of frames show the same place, and which pairs count at all."""
+"""Ground truth: which pairs of frames show the same place, and which pairs are judged."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from loopclosure.errors import InputError
 
 @dataclass(frozen=True)
 class Exclusion:
-    """Pairs of one sequence that are too near in time to be a loop: |i - j| <= frames, or |t_i - t_j| < seconds.
+    """Excludes pairs of one sequence that are too close in time to be a loop.
 
-    Such pairs are not candidates, and neither right nor wrong. A frame with itself is always such a pair.
+    A pair is excluded if |i - j| <= frames, or |t_i - t_j| < seconds. It is not a candidate, and it counts neither as
+    right nor as wrong. A frame with itself is always excluded.
     """
 
     frames: int = 0
@@ -30,7 +31,7 @@ class Exclusion:
         query_stamps: np.ndarray | None = None,
         reference_stamps: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return for each query frame (Q,) and each reference frame (R,), by number, whether the pair is too near.
+        """Return for each query frame (Q,) and reference frame (R,), given by number, whether the pair is excluded.
 
         The stamps (Q,), (R,) in seconds are needed if seconds are excluded. Returns (Q, R) bool.
         """
@@ -52,12 +53,12 @@ class Exclusion:
 
 @dataclass(frozen=True)
 class Truth:
-    """The right answer for every query and every reference.
+    """The ground truth for every pair of a query and a reference.
 
     hard      (Q, R) bool: the same place; must be found
-    soft      (Q, R) bool, includes hard: near enough not to be a mistake; a pair that is only soft is ignored if found
-    judged    (Q, R) bool: the pairs that count; all others are not candidates, neither right nor wrong
-    description  what makes two frames the same place and what is excluded; printed with every result
+    soft      (Q, R) bool, includes hard: a match that is not a mistake; a pair that is only soft is ignored if found
+    judged    (Q, R) bool: the pairs that count; others are not candidates, and neither right nor wrong
+    description  the rule for the same place and the exclusion; printed with every result
     """
 
     hard: np.ndarray
@@ -77,7 +78,7 @@ class Truth:
 
     @property
     def queries_with_a_loop(self) -> np.ndarray:
-        """Return for each query (Q,) whether there is a loop to find."""
+        """Return for each query (Q,) whether it has a loop."""
         return np.any(self.hard & self.judged, axis=1)
 
 
@@ -95,7 +96,7 @@ def sequence_truth(
     hard, soft   (N, N) bool; only the lower triangle is read
     rule         text: what makes two frames the same place
     stamps       (N,) seconds
-    comparable   (N, N) bool: pairs that can be judged (not those of a left and a right camera); all by default
+    comparable   (N, N) bool: pairs that can be judged (not a left with a right image); default: all
     """
     numbers = np.arange(len(hard))
     judged = np.tri(len(hard), k=-1, dtype=bool) & ~exclusion.excludes(numbers, numbers, stamps, stamps)

@@ -1,4 +1,4 @@
-"""Reports of several evaluations side by side: one table and one figure of curves, from their report.json alone."""
+"""Compares the reports of several evaluations: a table and a figure of curves, made from their report.json files."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ PANELS = (ALL_PAIRS, BEST_MATCH, BEST_MATCH + SOFT_ZONE)
 
 @dataclass(frozen=True)
 class Report:
-    """What a report.json says: its label here, its data and truth, and of each method figures and curves.
+    """The contents of a report.json: a label, the data set, the truth, and the figures and curves of each method.
 
-    figures  method -> convention and zone -> measure -> value; None for one that is not defined
+    figures  method -> convention and zone -> measure -> value; None if it is undefined
     curves   method -> convention and zone -> ("recall", "precision") -> (n,)
     """
 
@@ -53,7 +53,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table: of one report, or the difference of two; cells as texts."""
+    """A row of the table, for one report or the difference of two; the cells are text."""
 
     method: str
     report: str
@@ -61,7 +61,7 @@ class Row:
 
 
 def read_reports(paths: Sequence[str | Path]) -> list[Report]:
-    """Read reports; their labels are the shortest ends of their folders' names that differ.
+    """Read reports. Their labels are the shortest endings of their folders' paths that are all different.
 
     Raises InputError for any other file.
     """
@@ -111,7 +111,7 @@ def _curves(found: dict[str, dict[str, list[float]]]) -> dict[str, dict[str, np.
 
 
 def warnings(reports: Sequence[Report]) -> list[str]:
-    """Say where reports judge different things, so that their figures do not compare; and which have no curves."""
+    """Return warnings: reports with different data or truth, which cannot be compared, and reports without curves."""
     found = []
     for kind, name in (("data_set", "data"), ("truth", "truth")):
         values = {getattr(report, kind) for report in reports}
@@ -125,7 +125,7 @@ def warnings(reports: Sequence[Report]) -> list[str]:
 
 
 def table(reports: Sequence[Report]) -> list[Row]:
-    """Return the rows: each method in each report that has it, and for two reports the difference, second - first."""
+    """Return one row per method and report. If there are two reports, add the difference, second - first."""
     rows = []
     for method in dict.fromkeys(name for report in reports for name in report.figures):
         having = [report for report in reports if method in report.figures]
@@ -150,7 +150,7 @@ def text(reports: Sequence[Report]) -> str:
 
 
 def curves(reports: Sequence[Report]) -> Figure:
-    """Draw the curves of all methods of all reports: a color for each method, a kind of line for each report."""
+    """Draw the curves of all methods of all reports: a color for each method, a line style for each report."""
     methods = list(dict.fromkeys(name for report in reports for name in report.curves))
     panels = [p for p in PANELS if any(p in found for report in reports for found in report.curves.values())]
     with matplotlib.rc_context(STYLE):
@@ -175,7 +175,7 @@ def curves(reports: Sequence[Report]) -> Figure:
 
 
 def write_comparison(reports: Sequence[Report], path: str | Path, command: str = "") -> None:
-    """Write table and curves as one self-contained HTML page."""
+    """Write the table and the curves as one self-contained HTML page."""
     page = rendered(
         "compare.html.jinja",
         title=f"Comparison of {len(reports)} reports",

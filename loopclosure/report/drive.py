@@ -1,4 +1,4 @@
-"""The page of ``loopclosure detect``: the verdict, where the loops are, and pairs of images to judge it by."""
+"""The HTML page of ``loopclosure detect``: a summary, a picture of the loops, and sample pairs of images."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from loopclosure.report.plots import AXES, FOUND, MISSED, STYLE
 from netspec.files.figures import COLORS, png
 from netspec.files.whole_file import write_whole
 
-BEST, WORST, REJECTED = 4, 3, 3  # pairs shown
+BEST, WORST, REJECTED = 4, 3, 3  # number of pairs shown
 IN_WORDS = {"below threshold": "not alike enough", "not verified": "their points do not agree"}
-APART = 30  # of so many equal parts of a drive one pair is shown at most
+PARTS = 30  # of a drive; the pairs shown differ by at least one part
 OF_PATH = "The path from its known poses; green lines join the two frames of each loop."
 OF_FRAMES = (
     "Each green dot is a loop: a frame (across) and the earlier frame of the same place (upward). "
@@ -30,7 +30,7 @@ OF_FRAMES = (
 def write_drive(
     path: Path, results: Sequence[LoopResult], reasons: Sequence[str], recording: ImageSequence | None, command: str
 ) -> None:
-    """Write the page; ``recording`` is None where the images are gone, those of a camera."""
+    """Write the page; ``recording`` is None for a camera, because its images were not kept."""
     loops = sum(1 for result in results if result)
     known = recording is not None and recording.poses is not None and np.isfinite(recording.poses[:, 0]).sum() > 1
     picture = _path(recording.poses, results) if known and recording and recording.poses is not None else _dots(results)
@@ -48,7 +48,7 @@ def write_drive(
 
 
 def verdict(loops: int, frames: int) -> str:
-    """Say in one sentence what was found."""
+    """Return a sentence that summarizes the result."""
     if not loops:
         return f"None of {frames} frames shows a place that was surely seen before"
     return f"{loops} of {frames} frames show a place that was seen before"
@@ -71,7 +71,7 @@ def _dots(results: Sequence[LoopResult]) -> Figure:
 
 
 def _path(poses: np.ndarray, results: Sequence[LoopResult]) -> Figure:
-    """Draw the path from the side from which it looks largest."""
+    """Draw the path in the plane of the two axes along which it is longest."""
     positions = poses[:, :3]
     across = np.sort(np.argsort(np.nanmax(positions, axis=0) - np.nanmin(positions, axis=0), kind="stable")[1:])
     places = positions[:, across]
@@ -89,14 +89,14 @@ def _path(poses: np.ndarray, results: Sequence[LoopResult]) -> Figure:
 
 
 def _ends(results: Sequence[LoopResult]) -> list[tuple[int, int]]:
-    """Return the loops as pairs of this drive's frames; those to frames of an earlier run are left out."""
+    """Return the loops as pairs of frames of this drive, without loops to frames of an earlier run."""
     first = results[0].query_id if results else 0
     ends = [(r.query_id - first, r.accepted - first) for r in results if r.accepted is not None]
     return [pair for pair in ends if pair[1] >= 0]
 
 
 def _kinds(results: Sequence[LoopResult], recording: ImageSequence) -> list[Kind]:
-    """Return the loops of the highest and of the lowest scores, and what is most alike of what was rejected."""
+    """Return the loops with the highest and the lowest scores, and the rejected pairs with the highest scores."""
     first = results[0].query_id if results else 0
     there = [r for r in results if r.candidates and r.candidates[0][0] >= first]
     loops = sorted((r for r in there if r), key=lambda r: -r.score)
@@ -127,4 +127,4 @@ def _pair(result: LoopResult, images: dict[int, np.ndarray], first: int) -> Pair
 
 
 def _spread(results: Sequence[LoopResult], count: int, frames: int) -> list[LoopResult]:
-    return [results[i] for i in spread([result.query_id for result in results], count, frames / APART)]
+    return [results[i] for i in spread([result.query_id for result in results], count, frames / PARTS)]

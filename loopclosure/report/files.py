@@ -1,4 +1,4 @@
-"""The results of an evaluation as CSV, JSON and text; every file gives its convention and what was excluded."""
+"""Writes the results of an evaluation as CSV, JSON and text. Every file states its convention and the exclusion."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, BestMatches, Pre
 from netspec.files.whole_file import write_csv, write_whole
 from netspec.terminal.output import in_columns
 
-# A curve in report.json has at most so many points; curve_*.csv has them all.
+# The largest number of points of a curve in report.json; curve_*.csv has all points.
 POINTS = 400
-# What tables say of the soft zone.
+# The measures of the soft zone in tables.
 SOFT_MEASURES = ("average precision", "recall at 100 % precision")
 
 EXPLANATION = {
@@ -82,7 +82,7 @@ def curves_of(outcome: Outcome) -> dict[str, PrecisionRecall]:
 
 
 def _points(curve: PrecisionRecall) -> dict[str, list[float]]:
-    """Return at most POINTS points of a curve, among those at which recall increases, for drawing it."""
+    """Return at most POINTS points of a curve for drawing, chosen from those at which recall increases."""
     rises = _rises(curve)
     kept = rises[np.unique(np.linspace(0, len(rises) - 1, min(len(rises), POINTS)).round().astype(int))]
     return {name: [round(float(v), 6) for v in getattr(curve, name)[kept]] for name in ("recall", "precision")}
@@ -160,7 +160,7 @@ def _write_matches_csv(evaluation: Evaluation, outcome: Outcome, path: Path) -> 
 
 
 def verdict(matches: BestMatches, query: int | np.intp) -> str:
-    """Say what the best match of a query is."""
+    """Return whether the best match of a query is "right", "wrong" or "ignored"."""
     return "right" if matches.right[query] else "ignored" if matches.ignored[query] else "wrong"
 
 

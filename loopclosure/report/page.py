@@ -1,7 +1,7 @@
-"""The report of an evaluation: one self-contained HTML page, and beside it the same as PNG, CSV and JSON.
+"""Writes the report of an evaluation: a self-contained HTML page, and the same data as PNG, CSV and JSON files.
 
-Every file gives the convention of its results and what was excluded. The page is made from ``report.html.jinja``,
-which escapes all values: names of methods, folders and notes may have any characters.
+Every file states the convention of its results and the exclusion. The template ``report.html.jinja`` escapes all
+values, so names of methods, folders and notes may have any characters.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PICTURE_HEIGHT = 120  # pixels of the pictures of pairs
 
 @dataclass(frozen=True)
 class Pair:
-    """A pair of images side by side (JPEG), and what stands below it."""
+    """A pair of images side by side (JPEG), and its caption."""
 
     picture: bytes
     caption: str
@@ -39,7 +39,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Kind:
-    """Some pairs of one kind; ``name`` is their CSS class."""
+    """A group of pairs with a title; ``name`` is their CSS class."""
 
     name: str
     title: str
@@ -47,12 +47,12 @@ class Kind:
 
 
 def write_report(evaluation: Evaluation, folder: str | Path, title: str = "", command: str = "") -> Path:
-    """Write report.html and its parts into ``folder`` (made if it does not exist); return the path of the page.
+    """Write report.html and its parts into ``folder``, which is created if needed; return the path of the page.
 
-    ``figures.csv``, ``times.csv``, ``report.json``; ``precision_recall.png``, ``matrices.png``, ``matches.png`` and,
-    for one sequence with positions, ``map.png``; for each method ``curve_*.csv`` (one row for each recall that is
-    reached, with its precision) and ``matches_*.csv``. ``command``, if given, is printed at the end of the page, so
-    that a reader can repeat it.
+    The parts are ``figures.csv``, ``times.csv``, ``report.json``, ``precision_recall.png``, ``matrices.png``,
+    ``matches.png`` and, for one sequence with positions, ``map.png``; for each method ``curve_*.csv`` (one row for each
+    value of recall, with its precision) and ``matches_*.csv``. ``command``, if given, is printed at the end of the page
+    to repeat the evaluation.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -88,7 +88,7 @@ def _page(evaluation: Evaluation, pictures: dict[str, bytes], title: str, comman
         "training": evaluation.train,
     }
     if data.soft_truth is not None:
-        facts["soft zone"] = f"beside the rule: a match is no mistake if {data.overlap_rule}"
+        facts["soft zone"] = f"in addition to the rule: a match is not a mistake if {data.overlap_rule}"
     return rendered(
         "report.html.jinja",
         title=title,
@@ -113,7 +113,7 @@ def _page(evaluation: Evaluation, pictures: dict[str, bytes], title: str, comman
 
 
 def verdict(evaluation: Evaluation) -> str:
-    """Say in one sentence how good the method is, or the best of several: that with the most right best matches."""
+    """Return a sentence about the method, or about the one of several with the most right best matches."""
     outcome = max(evaluation.outcomes, key=lambda outcome: np.count_nonzero(outcome.matches.right))
     right, matches = int(np.count_nonzero(outcome.matches.right)), outcome.matches
     loops = int(np.count_nonzero(evaluation.data.truth.queries_with_a_loop))
@@ -129,7 +129,7 @@ def verdict(evaluation: Evaluation) -> str:
 
 
 def _measures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, bool]]]]:
-    """Return for each method its name and its measures, each with whether it is the best of several methods."""
+    """Return the name and the measures of each method; each measure with whether it is the best of all methods."""
     rows = [[v for name in (ALL_PAIRS, BEST_MATCH) for v in o.shown[name].values()] for o in evaluation.outcomes]
     for row, outcome in zip(rows, evaluation.outcomes, strict=True):
         if outcome.soft is not None:
@@ -142,7 +142,7 @@ def _measures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, 
 
 
 def _stages(outcome: Outcome) -> list[tuple[str, float, bool]]:
-    """Return each stage, its seconds and whether it is done once; then the sum of those done for each frame."""
+    """Return each stage, its seconds and whether it runs only once; then the total of the stages for all frames."""
     stages = [(stage, seconds, stage in outcome.training_stages) for stage, seconds in outcome.seconds.items()]
     return [
         *stages,
@@ -151,7 +151,7 @@ def _stages(outcome: Outcome) -> list[tuple[str, float, bool]]:
 
 
 def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[Kind]:
-    """Return the best and worst pairs of one method as pictures."""
+    """Return sample pairs of a method as pictures: right, wrong and missed ones."""
     truth, matches = evaluation.data.truth, outcome.matches
     answered = matches.reference >= 0
     right = np.flatnonzero(matches.right)
@@ -165,10 +165,10 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[Kind]:
     lowest = np.argsort(true_scores, kind="stable")
 
     alone = evaluation.data.references is None
-    apart = max(1, len(evaluation.data.queries) // 30) if alone else 1
+    least_gap = max(1, len(evaluation.data.queries) // 30) if alone else 1
 
     def pairs(queries: np.ndarray, references: np.ndarray) -> list[Pair]:
-        shown = spread(queries.tolist(), PAIRS_SHOWN, apart)
+        shown = spread(queries.tolist(), PAIRS_SHOWN, least_gap)
         return [_pair(evaluation, outcome, queries[i], references[i]) for i in shown]
 
     both = "" if outcome.soft is None else " in both zones"
@@ -181,11 +181,11 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[Kind]:
     return kinds if outcome.soft is not None else [kind for kind in kinds if kind.name != "excused"]
 
 
-def spread(frames: Sequence[int], count: int, apart: float) -> list[int]:
-    """Return the indices of the first ``count`` frames, without neighbors of those taken, which look the same."""
+def spread(frames: Sequence[int], count: int, least_gap: float) -> list[int]:
+    """Return the indices of the first ``count`` frames that differ by at least ``least_gap`` from each other."""
     taken: list[int] = []
     for i, frame in enumerate(frames):
-        if len(taken) < count and all(abs(frame - frames[other]) >= apart for other in taken):
+        if len(taken) < count and all(abs(frame - frames[other]) >= least_gap for other in taken):
             taken.append(i)
     return taken
 
@@ -193,14 +193,14 @@ def spread(frames: Sequence[int], count: int, apart: float) -> list[int]:
 def _pair(evaluation: Evaluation, outcome: Outcome, query: int, reference: int) -> Pair:
     score = outcome.scores[query, reference]
     caption = f"{query} and {reference}, {f'score {score:.4g}' if np.isfinite(score) else 'no score'}"
-    caption += _apart(evaluation, int(query), int(reference))
+    caption += _distance_text(evaluation, int(query), int(reference))
     data = evaluation.data
     images = read_bgr(data.queries.paths[query]), read_bgr(data.database.paths[reference])
     return Pair(side_by_side(*images), caption)
 
 
 def side_by_side(*images: np.ndarray) -> bytes:
-    """Return images (H, W, 3) BGR of any size beside each other, small, as JPEG."""
+    """Return two images (H, W, 3) BGR of any size, reduced and side by side, as JPEG."""
     small = [
         cv2.resize(
             image,
@@ -214,8 +214,8 @@ def side_by_side(*images: np.ndarray) -> bytes:
     return jpeg.tobytes()
 
 
-def _apart(evaluation: Evaluation, query: int, reference: int) -> str:
-    """Say how far apart two views are, and whether they overlap, where the poses are known."""
+def _distance_text(evaluation: Evaluation, query: int, reference: int) -> str:
+    """Return the distance and angle between two views and whether they overlap; empty if the poses are not known."""
     data = evaluation.data
     if data.overlap is None or data.references is not None or not data.queries.known.all():
         return ""
@@ -226,7 +226,7 @@ def _apart(evaluation: Evaluation, query: int, reference: int) -> str:
 
 
 def rendered(template: str, **values: object) -> str:
-    """Return a page made from a template beside this file, all values escaped."""
+    """Render a template in the folder of this file; all values are escaped."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
     )

@@ -1,7 +1,7 @@
-"""The pictures of the reports: matrices, precision-recall curves, maps, matches, paths; matplotlib figures.
+"""Draws the pictures of the reports with Matplotlib: matrices, precision-recall curves, maps, matches, paths.
 
-They are made without pyplot, which would choose a backend for the whole program. Names of methods and data sets are
-drawn as they are (``parse_math=False``): a dollar sign in them does not begin a formula.
+pyplot is not used, because it would choose a backend for the whole program. Names of methods and data sets are drawn
+with ``parse_math=False``, so that a dollar sign in them does not start a formula.
 """
 
 from __future__ import annotations
@@ -31,14 +31,13 @@ from netspec.files.figures import COLORS
 from netspec.files.whole_file import whole_file
 
 FOUND, FALSE, MISSED, OVERLAPPING = "#1a9641", "#d7191c", "#9e9e9e", "#f4a582"
-LINES = ("-", "--", ":", "-.")  # a second round of the colors is dashed, and so on
-TITLE_WIDTH = 38  # characters that fit above a panel of a grid
-LABEL_WIDTH = 60  # characters of a legend's line that fit below a panel
+LINES = ("-", "--", ":", "-.")  # the second use of a color is dashed, and so on
+TITLE_WIDTH = 38  # characters that fit above a panel
+LABEL_WIDTH = 60  # characters that fit in a line of a legend
 LABELS_HEIGHT = 0.5  # inches for the tick labels and the label of the horizontal axis
 NOT_JUDGED = "#ececec"
-SHOWN_CELLS = (
-    700  # of a matrix with more rows or columns the greatest of each block is drawn, or thin loops would vanish
-)
+# A matrix with more rows or columns is reduced to the maximum of each block, so that thin loops stay visible.
+SHOWN_CELLS = 700
 COLUMNS = 4
 
 STYLE: dict[Any, Any] = {
@@ -79,7 +78,7 @@ def matrices(evaluation: Evaluation) -> Figure:
 def curves(evaluation: Evaluation) -> Figure:
     """Draw the precision-recall curves of all methods, one panel for each convention and zone.
 
-    Of the soft zone only the best match of each query is drawn: over all pairs it differs little from the rule zone.
+    For the soft zone, only the best match of each query is drawn: over all pairs, it differs little from the rule zone.
     """
     panels = {
         ALL_PAIRS: [outcome.pairs for outcome in evaluation.outcomes],
@@ -127,12 +126,12 @@ def matches(evaluation: Evaluation) -> Figure:
 
 
 def has_map(evaluation: Evaluation) -> bool:
-    """Return whether the loops can be drawn on a trajectory: one sequence, with positions."""
+    """Return whether the loops can be drawn on a trajectory: one sequence with positions."""
     return evaluation.data.positions is not None and evaluation.data.references is None
 
 
 def maps(evaluation: Evaluation) -> Figure:
-    """Draw for each method the found, false and missed loops as chords of the trajectory."""
+    """Draw for each method the found, false and missed loops as lines on the trajectory."""
     positions = evaluation.data.positions
     assert positions is not None
     with matplotlib.rc_context(STYLE):
@@ -148,7 +147,7 @@ def maps(evaluation: Evaluation) -> Figure:
 def decisions(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the numbers of the queries found, false and missed at the best F1 of their best matches.
 
-    A query with a loop whose match is wrong is both false and missed, and is drawn as both.
+    A query that has a loop but a wrong match is both false and missed, and is drawn as both.
     """
     accepted = (outcome.matches.reference >= 0) & (outcome.matches.score >= outcome.best.best_f1_threshold)
     found = accepted & outcome.matches.right
@@ -158,14 +157,14 @@ def decisions(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, n
 
 
 def overlapping(outcome: Outcome, queries: np.ndarray) -> np.ndarray:
-    """Return for each of these queries, whose match is wrong by the rule, whether the soft zone excuses it."""
+    """Return for each of these queries with wrong matches by the rule whether the match is right in the soft zone."""
     if outcome.soft is None:
         return np.zeros(len(queries), bool)
     return outcome.soft.matches.right[queries] | outcome.soft.matches.ignored[queries]
 
 
 def best_true_references(outcome: Outcome, truth: Truth, queries: np.ndarray) -> np.ndarray:
-    """Return for each of these queries, which have a loop, the true reference with the best score."""
+    """Return the true reference with the best score for each of these queries; all of them must have a loop."""
     scores = np.where(truth.hard[queries] & truth.judged[queries], outcome.scores[queries], np.nan)
     scores = np.where(np.isnan(scores), np.where(truth.hard[queries] & truth.judged[queries], -np.inf, np.nan), scores)
     return np.nanargmax(scores, axis=1)
@@ -200,10 +199,10 @@ def _greatest_of_blocks(values: np.ndarray, step: int) -> np.ndarray:
 def draw_curve(
     axis: Axes, recall: np.ndarray, precision: np.ndarray, name: str, number: int, average_precision: float
 ) -> None:
-    """Draw the steps whose area is the average precision, and a dot where precision falls below 1.
+    """Draw a curve as steps with the average precision as area, and a dot where precision falls below 1.
 
     recall, precision  (n,), recall ascending from 0
-    number             of the curve, from 0: its color and line
+    number             index of the curve, which selects its color and line style
     """
     color = COLORS[number % len(COLORS)]
     line = LINES[number // len(COLORS) % len(LINES)]
@@ -216,7 +215,7 @@ def draw_curve(
 
 
 def legends_below(figure: Figure, axes: Iterable[Axes]) -> None:
-    """Put the legend of each panel below it, and make the figure higher by the height of the highest legend."""
+    """Put the legend of each panel below it, and increase the figure's height by that of the highest legend."""
     heights = []
     for axis in axes:
         below = axis.transAxes + ScaledTranslation(0, -LABELS_HEIGHT, figure.dpi_scale_trans)
@@ -243,7 +242,7 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
     axis.plot(place[:, 0], place[:, 1], color="#303030", linewidth=0.6, zorder=1)
     for order, (queries, references, color) in enumerate(_drawn(outcome, truth), start=2):
         chords = np.stack([place[queries], place[references]], axis=1)
-        thin = min(1.0, 150 / max(len(chords), 1))  # or a thousand chords would merge
+        thin = min(1.0, 150 / max(len(chords), 1))  # so that a thousand lines do not merge
         width = 0.6 if color == MISSED else 0.9
         axis.add_collection(LineCollection(list(chords), colors=color, linewidths=width * thin, zorder=order))
         axis.plot(place[queries, 0], place[queries, 1], ".", color=color, markersize=2.5, zorder=order)
@@ -253,7 +252,7 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
 
 
 def _drawn(outcome: Outcome, truth: Truth) -> list[tuple[np.ndarray, np.ndarray, str]]:
-    """Return queries, their references, and a color: missed, found, false but excused in the soft zone, and false."""
+    """Return queries, references and a color for each group: missed, found, false only by the rule, false."""
     found, false, missed = decisions(outcome, truth)
     excused, reference = overlapping(outcome, false), outcome.matches.reference
     colored = [(found, FOUND), (false[excused], OVERLAPPING), (false[~excused], FALSE)]
@@ -282,7 +281,7 @@ def _loop_legend(figure: Figure, evaluation: Evaluation) -> None:
 
 
 def _state_truth(figure: Figure, evaluation: Evaluation, convention: str = "") -> None:
-    """Print the description of the truth below the figure, so that it can be used by itself."""
+    """Print the description of the truth below the figure, so that the figure can be used alone."""
     text = f"{evaluation.data.name}. {convention + '; ' if convention else ''}{evaluation.data.truth.description}"
     text = printable(text)
     width = int(figure.get_figwidth() * 22)  # characters of this size that fit into the width
@@ -319,10 +318,10 @@ AXES = ("x [m]", "y [m]", "z [m]")
 
 
 def draw_paths(path: Path, closed: Closed, names: tuple[str, str] = ("odometry", "loops closed")) -> None:
-    """Draw both paths from the side from which they look largest, and the true one where it is known, as PNG.
+    """Draw both paths, and the true path if it is known, as PNG, in the plane of the two longest axes.
 
-    Paths are moved and turned as a whole to be nearest to the true one. Lines across are loops: green if used, red if
-    they contradict the others.
+    The paths are aligned with the true path. Lines between the two frames of a loop are green if the loop was used, and
+    red if it contradicts the others.
     """
     paths = dict(zip(names, (closed.odometry, closed.poses), strict=True))
     if closed.truth is not None:

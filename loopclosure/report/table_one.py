@@ -38,7 +38,7 @@ COLUMNS = (
 class Run:
     """The results of one net: distances (N,) and labels (N,) of its validation pairs, metrics and costs.
 
-    ``losses`` are (iteration, validation loss); ``milliseconds`` are per image; ``iteration`` is the judged snapshot's.
+    ``losses`` are (iteration, validation loss); ``milliseconds`` are per image; ``iteration`` is that of the snapshot.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Run:
     iteration: int
 
     def cells(self) -> tuple[str, ...]:
-        """Return the row of the table, as ``COLUMNS`` names it."""
+        """Return the row of the table in the order of ``COLUMNS``."""
         m = self.metrics
         shares = (m.precision, m.recall, m.accuracy, m.f1, m.roc_auc)
         figures = (f"{m.threshold:.4g}", f"{self.milliseconds:.2f}", str(self.parameters), str(self.iteration))
@@ -59,7 +59,7 @@ class Run:
 
 
 def read_runs(path: Path) -> list[Run]:
-    """Read a run file and judge each of its nets: threshold from the training pairs, metrics of the validation pairs.
+    """Read a run file and judge its nets: thresholds from the training pairs, metrics from the validation pairs.
 
     Raises InputError if a file or an array is missing.
     """
@@ -140,7 +140,7 @@ def _draw_losses(runs: Sequence[Run], path: Path) -> None:
         xlabel="iteration", ylabel="contrastive loss of the validation pairs", title="Validation loss (circle: judged)"
     )
     losses = [loss for run in runs for _, loss in run.losses if math.isfinite(loss) and loss > 0]
-    if losses and max(losses) > 10 * min(losses):  # a diverging start would flatten all that follows
+    if losses and max(losses) > 10 * min(losses):  # large losses at the start would flatten the rest of the curve
         axes.set_yscale("log")
     axes.grid(alpha=0.3, which="both")
     axes.legend()
@@ -166,9 +166,9 @@ def _draw_distances(runs: Sequence[Run], path: Path) -> None:
 
 @dataclass(frozen=True)
 class PairMetrics:
-    """The metrics of one set of pairs at one threshold: a pair is called the same place if its distance < threshold.
+    """The metrics of a set of pairs at one threshold: a pair is called the same place if its distance < threshold.
 
-    Shares are in 0..1; a share whose denominator is zero (precision when no pair is called the same) is NaN.
+    Shares are in 0..1; a share with denominator 0 (precision if no pair is called the same) is NaN.
     """
 
     threshold: float
@@ -204,7 +204,7 @@ def pair_distances(features_a: np.ndarray, features_b: np.ndarray) -> np.ndarray
 def best_threshold(distances: np.ndarray, labels: np.ndarray) -> float:
     """Return the threshold with the best accuracy on these pairs.
 
-    It is halfway between two neighboring distances. Of equally good thresholds the smallest is taken, since a false
+    It is halfway between two neighboring distances. The smallest of equally good thresholds is returned: a false
     loop harms a map more than a missed one. It is the smallest distance if calling no pair the same place is best.
 
     distances   (N,); labels   (N,) 1 or True = same place

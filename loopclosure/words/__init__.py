@@ -1,1 +1,1 @@
-"""Visual words, and the methods built on them."""
+"""Visual words: vocabulary, bag of words, VLAD and FAB-MAP."""

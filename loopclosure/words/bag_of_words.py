@@ -1,4 +1,4 @@
-"""An image as the histogram of its words, by tf-idf (Sivic and Zisserman, ICCV 2003; DBoW2); and as VLAD."""
+"""Bag of words: tf-idf histograms of visual words (Sivic and Zisserman, ICCV 2003; DBoW2); and VLAD."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class BagOfWords:
     def learn(cls, words: np.ndarray, metric: str = "l1") -> BagOfWords:
         """Weight words by how rare they are among the training images' words (n, v).
 
-        A word that no training image has counts as a word that one image has.
+        A word that is in no training image is treated as if it were in one.
         """
         having = (np.asarray(words) > 0).sum(axis=0)
         return cls(np.log(max(len(words), 1) / np.maximum(having, 1)), metric)
@@ -40,7 +40,7 @@ class BagOfWords:
     def vectors(self, words: np.ndarray) -> np.ndarray:
         """Return the weighted histograms (n, v) of counts (n, v), of unit length (L1, or L2 for cosine).
 
-        An image without words of positive weight is all zeros: similar to nothing.
+        An image without words of positive weight gets zeros, and is similar to nothing.
         """
         weighted = np.asarray(words) * self.idf
         length = np.linalg.norm(weighted, ord=2 if self.metric == "cosine" else 1, axis=1, keepdims=True)
@@ -51,7 +51,7 @@ class BagOfWords:
         a, b = self.vectors(queries), self.vectors(references)
         if self.metric == "cosine":
             return a @ b.T
-        # |a - b| = |a| + |b| - 2 (their common part), and the lengths are 1, or 0 for images without words.
+        # |a - b| = |a| + |b| - 2 sum(min(a, b)), and the lengths are 1, or 0 for images without words.
         return (a.sum(axis=1)[:, None] + b.sum(axis=1)[None, :] - cdist(a, b, "cityblock")) / 2.0
 
 
@@ -64,8 +64,8 @@ def check_metric(metric: str) -> None:
 def vlad(descriptors: NDArray[np.float32], vocabulary: Vocabulary) -> NDArray[np.float32]:
     """Return the sums of differences between descriptors (n, d) and their nearest words, (words d,), of unit length.
 
-    The sum of each word has unit length too (Arandjelovic and Zisserman, CVPR 2013), so that repeated texture does not
-    dominate. Without descriptors all are 0.
+    The sum of each word is normalized too (Arandjelovic and Zisserman, CVPR 2013), so that repeated texture does not
+    dominate. Without descriptors, the result is 0.
     """
     centers = vocabulary.centers
     sums = np.zeros(centers.shape, np.float32)

@@ -1,7 +1,8 @@
 """The Chow-Liu tree: each word is predicted by one other word (Chow and Liu, 1968; FAB-MAP, IJRR 2008).
 
-The numbers are openFABMAP's: smoothed probabilities; the mutual information from the *unsmoothed* joint frequencies and
-the *smoothed* marginals, rounded to float32. That is slightly inaccurate, and kept so that trees can be compared.
+The numbers are those of openFABMAP: probabilities are smoothed, and the mutual information is computed from the
+*unsmoothed* joint frequencies and the *smoothed* marginals, in float32. This is slightly inaccurate, but the same
+trees as in openFABMAP result.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ LOWER_BOUND = 0.0005
 
 @dataclass(frozen=True)
 class WordTree:
-    """What is known about v words before any place is seen.
+    """The prior of v words: a tree of conditional probabilities.
 
-    parent         (v,) the word that predicts each word best; the root is its own parent
+    parent         (v,) the parent of each word; the root is its own parent
     marginal       (v,) p(z_q = 1)
-    given_present  (v,) p(z_q = 1 | parent present); the root's is its marginal
-    given_absent   (v,) p(z_q = 1 | parent absent); the root's is its marginal
+    given_present  (v,) p(z_q = 1 | parent present); for the root, its marginal
+    given_absent   (v,) p(z_q = 1 | parent absent); for the root, its marginal
     """
 
     parent: np.ndarray
@@ -70,7 +71,9 @@ def learn_tree(words: np.ndarray, lower_bound: float = LOWER_BOUND) -> WordTree:
 def mutual_information(joint: np.ndarray, frequency: np.ndarray, marginal: np.ndarray, word: int) -> np.ndarray:
     """Return the mutual information [nat] (v,) float32 of ``word`` and each word.
 
-    joint (v,) how often both are present, frequency (v,) how often each is, marginal (v,) the same, smoothed.
+    joint      (v,) frequency with which both words are present
+    frequency  (v,) frequency of each word
+    marginal   (v,) the smoothed frequency of each word
     """
     one, other = frequency[word], frequency
     p_one, p_other = marginal[word], marginal
@@ -79,10 +82,10 @@ def mutual_information(joint: np.ndarray, frequency: np.ndarray, marginal: np.nd
         both = np.maximum(both, 0.0)
         return xlogy(both, both / independent)
 
-    # Grouped so that exchanging the two words gives the same bits: ties are then decided by the order of the words.
+    # Grouped so that the result is bitwise symmetric in the two words; ties then depend only on the order of the words.
     same = term(joint, p_one * p_other) + term(1.0 - one - other + joint, (1.0 - p_one) * (1.0 - p_other))
-    apart = term(one - joint, p_one * (1.0 - p_other)) + term(other - joint, (1.0 - p_one) * p_other)
-    return (same + apart).astype(np.float32)
+    different = term(one - joint, p_one * (1.0 - p_other)) + term(other - joint, (1.0 - p_one) * p_other)
+    return (same + different).astype(np.float32)
 
 
 def _smoothed_share(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
@@ -92,10 +95,10 @@ def _smoothed_share(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
 def _strongest_tree(
     together: np.ndarray, images: int, marginal: np.ndarray, lower_bound: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (neighbor (v,), information (v,)): each word but word 0, and the edge that connects it to the tree.
+    """Return (neighbor (v,), information (v,)): the edge that connects each word except word 0 to the tree.
 
-    Prim's algorithm, which needs one row of information at a time. Of equally strong edges the first in the
-    order (lower word, higher word) wins: the tree of Kruskal's algorithm on stably sorted edges.
+    Prim's algorithm, which needs one row of the information matrix at a time. Equally strong edges are chosen in the
+    order (lower word, higher word), so the tree is that of Kruskal's algorithm with a stable sort.
     """
     size = len(together)
     frequency = np.diag(together).astype(np.float64) / images

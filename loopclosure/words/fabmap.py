@@ -1,9 +1,9 @@
 """FAB-MAP 1 and 2: the probability that an image was taken at a known place, from the words that it shows.
 
-Cummins and Newman, IJRR 2008 (FAB-MAP 1) and IJRR 2011 (FAB-MAP 2.0), with the choices of openFABMAP, the public
-baseline: a place is one image; the belief in the cause of a word at a place ignores the tree; the prior of that cause
-is the word's marginal. The numbers agree with openFABMAP's. Observations are words (v,) as counts or presence: only
-presence matters.
+Cummins and Newman, IJRR 2008 (FAB-MAP 1) and IJRR 2011 (FAB-MAP 2.0). As in openFABMAP, the public baseline, a place
+is one image; the belief that the cause of a word is at a place ignores the tree; the prior of that cause is the word's
+marginal. The results agree with openFABMAP's. Observations are words (v,) as counts or presence; only presence
+matters.
 
 Notation: z = 1 if the image shows a word, L = 1 if the place's image showed it, a = 1 if the image shows the word's
 parent.
@@ -19,7 +19,7 @@ from scipy.special import logsumexp
 from loopclosure.errors import InputError
 from loopclosure.words.chow_liu import WordTree
 
-# Query rows at a time offline: 256 x 5000 words are 10 MB per matrix.
+# Query rows processed at a time: 256 x 5000 words need 10 MB per matrix.
 BLOCK_ROWS = 256
 
 
@@ -27,19 +27,19 @@ BLOCK_ROWS = 256
 class FabMapSettings:
     """Settings of FAB-MAP; the defaults are openFABMAP's.
 
-    version      of 2 the new place is sampled over all training images, each once
+    version      1 or 2; version 2 samples the new place from all training images, each once
     hit          p(word seen | its cause is there), PzGe
     false_alarm  p(word seen | its cause is not there), PzGNe; the Oxford model has 0.005
     new_place    "sampled" from training images, or "mean_field": the average place (version 1 only)
-    samples      of version 1: training images drawn per query, with replacement; 0 takes each image once
-    naive        words are independent, without the tree
-    motion       the prior is the previous posterior, moved by one place forward or back
-    recent       how many of the last images are not on the map yet: in one sequence they all look like the query
-    smoothing    share of the posterior that is kept; the rest is spread evenly
-    p_new        of the motion model: prior of a new place
-    bias         of the motion model: share of the neighbors' weight that the next place gets; the previous one gets
-                 the rest
-    seed         of the random draws
+    samples      for version 1: training images drawn per query, with replacement; 0: each image once
+    naive        treat words as independent, without the tree
+    motion       use a motion model: the prior is the previous posterior, moved by one place forward or back
+    recent       number of the last images that are not on the map yet, because they look like the query
+    smoothing    share of the posterior that is kept; the rest is distributed evenly
+    p_new        for the motion model: prior of a new place
+    bias         for the motion model: share of the neighbors' weight for the next place; the rest is for the previous
+                 place
+    seed         seed of the random draws
     """
 
     version: int = 2
@@ -113,9 +113,9 @@ def _mix(tree: WordTree, settings: FabMapSettings, belief: np.ndarray) -> np.nda
 
 
 class FabMapModel:
-    """What FAB-MAP computes from words alone: likelihoods of images at known places and at a new place.
+    """The observation model of FAB-MAP: likelihoods of images at known places and at a new place.
 
-    tree      of the words
+    tree      the Chow-Liu tree of the words
     training  (n, v) words of the training images, needed for a sampled new place; they must not be test images
     """
 
@@ -195,7 +195,7 @@ class PlaceScores:
 
 
 def score_sets(model: FabMapModel, queries: np.ndarray, places: np.ndarray) -> PlaceScores:
-    """Score the queries' words (Q, v) on a finished map with the words (P, v), for two traverses."""
+    """Score queries with words (Q, v) on a map of places with words (P, v), for two traverses."""
     loglik, loglik_new = model.likelihoods(queries, places), model.new_place(queries)
     posterior, new = np.empty_like(loglik), np.empty(len(loglik))
     previous = None
@@ -206,10 +206,10 @@ def score_sets(model: FabMapModel, queries: np.ndarray, places: np.ndarray) -> P
 
 
 def score_sequence(model: FabMapModel, words: np.ndarray) -> PlaceScores:
-    """Score each image of a sequence, words (n, v), on the map of the images before it.
+    """Score each image of a sequence with words (n, v) on the map of the images before it.
 
-    The upper triangle with the diagonal is NaN. The posterior of images too recent to be on the map is NaN as well;
-    their log-odds are not.
+    The upper triangle with the diagonal is NaN. The posterior of images that are too recent to be on the map is NaN
+    too; their log-odds are not.
     """
     loglik, loglik_new = model.likelihoods(words, words), model.new_place(words)
     posterior, new = np.full_like(loglik, np.nan), np.empty(len(loglik))

@@ -1,8 +1,8 @@
-"""Visual words: local features of an image, the vocabulary that quantizes them, and how often each word occurs.
+"""Visual words: local features of an image, the vocabulary that quantizes them, and counts of words.
 
-A descriptor is a unit vector of SIFT (or, with ``root``, RootSIFT: the square roots of the histogram's shares,
-Arandjelovic and Zisserman, CVPR 2012), or the 256 bits of ORB as floats. An image without features has no words, and
-can be a place like any other.
+A descriptor is a SIFT vector of unit length (with ``root``, RootSIFT: the square root of the L1-normalized histogram,
+Arandjelovic and Zisserman, CVPR 2012), or the 256 bits of ORB as floats. An image without features has no words; it
+is still a place.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import gray
 from netspec.files.opencv import cv2
 
-# Rows at a time where a matrix of distances to all centers is needed: 4096 x 5000 words are 80 MB.
+# Rows processed at a time when all distances to the centers are needed: 4096 x 5000 words need 80 MB.
 BLOCK_ROWS = 4096
 KINDS = {"sift": 128, "orb": 256}
 
@@ -36,9 +36,9 @@ class Extractor:
     """Local features of a gray image.
 
     kind          "sift" or "orb"
-    max_features  how many of the strongest are kept per image
+    max_features  number of strongest features kept per image
     root          RootSIFT instead of SIFT
-    contrast      SIFT's contrast threshold (OpenCV's default); lower finds more in images of low contrast
+    contrast      SIFT's contrast threshold (OpenCV's default); a lower value finds more in images of low contrast
     """
 
     kind: str = "sift"
@@ -62,7 +62,7 @@ class Extractor:
         _, found = _detector(self.kind, self.max_features, self.contrast).detectAndCompute(gray(image), None)
         if found is None or len(found) == 0:
             return np.zeros((0, self.size), np.float32)
-        found = found[: self.max_features]  # SIFT returns more if the weakest have equal strength
+        found = found[: self.max_features]  # SIFT can return more if the weakest ones are equally strong
         if self.kind == "orb":
             return np.unpackbits(found, axis=1).astype(np.float32)
         tiny = np.float32(1e-12)
@@ -73,7 +73,7 @@ class Extractor:
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """The words: ``centers`` (v, d) float32, the extractor of the descriptors, and how the centers were ``made``."""
+    """The ``centers`` (v, d) float32 of the words, the extractor, and a text that says how they were ``made``."""
 
     centers: np.ndarray
     extractor: Extractor
@@ -87,11 +87,11 @@ class Vocabulary:
         return nearest_centers(descriptors, self.centers)
 
     def count(self, image: np.ndarray) -> np.ndarray:
-        """Return how often each word occurs in an (H, W) or (H, W, 3) uint8 image: (v,) int32."""
+        """Count each word in an (H, W) or (H, W, 3) uint8 image: (v,) int32."""
         return self.count_descriptors(self.extractor(image))
 
     def count_descriptors(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return how often each word occurs among descriptors (n, d): (v,) int32."""
+        """Count each word among descriptors (n, d): (v,) int32."""
         return np.bincount(self.nearest(descriptors), minlength=len(self)).astype(np.int32)
 
 
@@ -120,9 +120,9 @@ def kmeans(descriptors: np.ndarray, words: int, seed: int = 0) -> np.ndarray:
 
 
 def founders(descriptors: np.ndarray, radius: float) -> np.ndarray:
-    """Return the indices of the descriptors (n, d) that start a cluster: first pass of the sequential clustering.
+    """Return the indices of the descriptors (n, d) that start a cluster, in the first pass of sequential clustering.
 
-    In their order, each descriptor farther than ``radius`` from all founders before it becomes a founder.
+    A descriptor starts a cluster (is a founder) if it is farther than ``radius`` from all founders before it.
     """
     chosen: list[int] = []
     centers = np.empty((0, descriptors.shape[1]), descriptors.dtype)
@@ -130,7 +130,7 @@ def founders(descriptors: np.ndarray, radius: float) -> np.ndarray:
         block = descriptors[start : start + BLOCK_ROWS]
         far = np.flatnonzero(_squared_distance_to_nearest(block, centers) > radius**2)
         fresh: list[int] = []
-        while far.size:  # the first of those left starts a cluster and removes its neighbors
+        while far.size:  # the first one starts a cluster and removes its neighbors
             fresh.append(int(far[0]))
             gaps = block[far] - block[far[0]]
             far = far[np.einsum("nd,nd->n", gaps, gaps) > radius**2]
@@ -142,7 +142,7 @@ def founders(descriptors: np.ndarray, radius: float) -> np.ndarray:
 def sequential_clusters(descriptors: np.ndarray, radius: float, seed: int | None = 0) -> np.ndarray:
     """Return the centers (k, d) float32 of the modified sequential clustering (openFABMAP's BOWMSCTrainer).
 
-    Each descriptor is assigned to its nearest founder (see :func:`founders`), and the means are the words. The result
+    Each descriptor is assigned to its nearest founder (see :func:`founders`); the means are returned. The result
     depends on the order, which is shuffled with ``seed``; None keeps the given order. Useful radii: 0.55 to 0.6 for
     RootSIFT, 0.7 to 0.75 for SIFT, the root of the Hamming distance for ORB.
     """

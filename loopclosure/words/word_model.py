@@ -1,7 +1,8 @@
-"""What FAB-MAP and the bag of words learn from training images, in one file.
+"""The model that FAB-MAP and the bag of words learn from training images, and its file.
 
-A model file (.npz) has the vocabulary, the words of the training images (FAB-MAP 2 samples its new place from them; the
-bag of words takes its weights from them), the Chow-Liu tree, the extractor's settings and the training images' paths.
+A model file (.npz) has the vocabulary, the words of the training images, the Chow-Liu tree, the settings of the
+extractor and the paths of the training images. FAB-MAP 2 samples its new place from the words of the training images,
+and the bag of words computes its weights from them.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from netspec.files.arrays import check_array, from_json, read_npz
 from netspec.files.whole_file import whole_file
 
 FORMAT = 1
-# The stages of ``train``: done once, for any number of tested images.
+# The stages of ``train``, which run once for any number of tested images.
 TRAINING_STAGES = ("training features", "vocabulary", "training words", "tree")
 
 
 @dataclass(frozen=True)
 class WordModel:
-    """Vocabulary, ``training_words`` (n, v) counts of the training images, their paths, and the tree of the words."""
+    """The vocabulary, the counts ``training_words`` (n, v) of the training images, their paths, and the word tree."""
 
     vocabulary: Vocabulary
     training_words: np.ndarray
@@ -39,7 +40,7 @@ class WordModel:
     def count_words(
         self, images: list[Path], progress: Progress = silent, seconds: dict[str, float] | None = None
     ) -> np.ndarray:
-        """Return how often each word occurs in each image: (n, v) int32."""
+        """Count each word in each image: (n, v) int32."""
         seconds = {} if seconds is None else seconds
         counts = np.zeros((len(images), len(self.vocabulary)), np.int32)
         for i, path in enumerate(progress(images, "features", len(images))):
@@ -67,7 +68,7 @@ class WordModel:
 
     @classmethod
     def load(cls, path: Path) -> WordModel:
-        """Read a model that :meth:`save` wrote; InputError for any other file."""
+        """Read a model that :meth:`save` wrote. Raises InputError for any other file."""
         expected = "a word model; give another name, and a new one is written there"
         file = read_npz(path, expected)
         try:
@@ -95,13 +96,13 @@ class WordModel:
 
 @dataclass(frozen=True)
 class Training:
-    """How a word model is made.
+    """Settings for learning a word model.
 
-    words            how many, by k-means; 0: clusters by ``radius`` instead
-    radius           of the modified sequential clustering, see :func:`sequential_clusters`
-    max_descriptors  how many descriptors of all images are clustered, with the same limit for each image
+    words            number of words, by k-means; 0: sequential clustering with ``radius`` instead
+    radius           see :func:`sequential_clusters`
+    max_descriptors  number of descriptors that are clustered, with the same limit for each image
     lower_bound      see :func:`learn_tree`
-    seed             of all random numbers
+    seed             seed of all random numbers
     """
 
     extractor: Extractor = field(default_factory=Extractor)
@@ -120,7 +121,7 @@ def train(
 ) -> WordModel:
     """Learn the words and their tree from images that will not be tested.
 
-    ``seconds`` receives the time of each stage. Raises InputError without images or without features in them.
+    The time of each stage is added to ``seconds``. Raises InputError if there are no images or no features in them.
     """
     training = training or Training()
     seconds = {} if seconds is None else seconds

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from loopclosure.descriptors.feature_file import BESIDE_FEATURES, read_features
+from loopclosure.descriptors.feature_file import NOT_FEATURES, read_features
 from netspec.cli import main
 from paths import GOLDEN, ROOT
 
@@ -61,7 +61,7 @@ def test_what_is_written_is_what_is_documented() -> None:
 
 @pytest.mark.usefixtures("extract")
 def test_what_is_read_is_what_is_documented() -> None:
-    assert {*BESIDE_FEATURES, "features"} == set(TABLE)
+    assert {*NOT_FEATURES, "features"} == set(TABLE)
     images = read_features("images.npz")
     assert (len(images.features), images.views, images.names) == (IMAGES, VIEWS, [f"{k}.png" for k in range(IMAGES)])
     assert images.stamps is not None

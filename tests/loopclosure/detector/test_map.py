@@ -210,12 +210,12 @@ def test_a_map_that_another_net_described_is_refused(
     Map(tmp_path / "M").detector(Net()).save(tmp_path / "d.npz")
     LoopDetector.load(tmp_path / "d.npz", Net())
     monkeypatch.setattr(Net, "fingerprint", "another")
-    told = rf"described by another net \({described}, this is another\); take the version of the package that has it, "
-    with pytest.raises(InputError, match=f"M: its frames were {told}or build the map again from its drives"):
+    fault = rf"described by another net \({described}, this is another\); use the version of the package that has it, "
+    with pytest.raises(InputError, match=f"M: its frames were {fault}or build the map again from its drives"):
         Map(tmp_path / "M").detector(Net())
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=fault):
         Map(tmp_path / "M").add(read_sequence(drives / "b"), Net())
-    with pytest.raises(InputError, match=f"d.npz: its frames were {told}or begin anew"):
+    with pytest.raises(InputError, match=f"d.npz: its frames were {fault}or start a new file"):
         LoopDetector.load(tmp_path / "d.npz", Net())
     Map(tmp_path / "M").add(read_sequence(drives / "b"), Thumbnailer())  # of a function nothing is known
 
@@ -283,7 +283,7 @@ def test_faults_are_named(a_map: Map, drives: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "N").exists()
     with pytest.raises(InputError, match="ends at 65,504"):
         a_map.add(read_sequence(drives / "b"), lambda image: np.full(768, 1e5, np.float32))
-    with pytest.raises(InputError, match="5 dimensions, those before 768; take the net that described those"):
+    with pytest.raises(InputError, match="5 dimensions, those before 768; use the net that described those"):
         a_map.add(read_sequence(drives / "b"), lambda image: np.ones(5))
     assert len(Map(tmp_path / "M")) == PLACES
 

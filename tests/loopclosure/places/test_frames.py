@@ -110,7 +110,7 @@ def test_video(tmp_path):
 
 def test_a_video_whose_name_is_not_utf8_is_refused(tmp_path):
     for read in (video_length, lambda path: next(video_frames(path))):
-        with pytest.raises(InputError, match="no video whose path is not UTF-8; rename it"):
+        with pytest.raises(InputError, match="cannot open a video if its path is not UTF-8; rename it"):
             read(tmp_path / os.fsdecode(b"caf\xe9.mp4"))
 
 

@@ -82,7 +82,7 @@ def test_a_broken_row_is_one_line(text: str, message: str, tmp_path: Path) -> No
 
 
 def test_an_unknown_word_of_the_form_names_the_known_ones() -> None:
-    with pytest.raises(InputError, match='"xyzw" says nothing of how poses are written; known: tum, kitti, euroc, w-'):
+    with pytest.raises(InputError, match='"xyzw" is not a form of poses; known: tum, kitti, euroc, w-'):
         pose_form("tum,xyzw")
 
 
