@@ -1,4 +1,4 @@
-"""ImageSequences for the viewer of Rerun (rerun.io): images, scores, paths, and loops as lines between them."""
+"""Writes recordings for the Rerun viewer (rerun.io): images, scores, paths and loops."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from loopclosure.progress import Progress, silent
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import whole_file
 
-WIDTH = 320  # of the images, at most
-BEFORE, AFTER, TRUE = [230, 120, 30], [40, 110, 220], [150, 150, 150]  # colors of paths
-USED, FALSE = [40, 160, 60], [210, 40, 40]  # and of loops
+WIDTH = 320  # largest width of an image in pixels
+BEFORE, AFTER, TRUE = [230, 120, 30], [40, 110, 220], [150, 150, 150]  # RGB colors of paths
+USED, FALSE = [40, 160, 60], [210, 40, 40]  # RGB colors of loops
 
 
 def check_rerun() -> None:
-    """Raise InputError where Rerun's SDK is not installed."""
+    """Raise InputError if Rerun's SDK is not installed."""
     if find_spec("rerun") is None:
         raise InputError("rerun is not installed; pip install netspec-caffe[rerun]")
 
 
 class RerunFile:
-    """What is written of a drive, frame after frame."""
+    """Writes a drive to a Rerun file, frame by frame."""
 
     def __init__(self, path: Path) -> None:
         self._rr = import_module("rerun")  # optional
-        self._stream: Any = self._rr.ImageSequenceStream("loopclosure")
+        self._stream: Any = self._rr.RecordingStream("loopclosure")
         self._stream.save(str(path))
 
     def frame(self, number: int, stamp: float | None, jpeg: bytes, result: LoopResult | None = None) -> None:
-        """Write an image and the detector's result for it; what follows belongs to this frame."""
+        """Write an image and the detector's result for it. It becomes the current frame."""
         self._stream.set_time("frame", sequence=number)
         if stamp is not None and np.isfinite(stamp):
             self._stream.set_time("seconds", duration=stamp)
@@ -55,17 +55,17 @@ class RerunFile:
         self._stream.log(name, self._rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
 
     def point(self, name: str, position: np.ndarray, color: list[int]) -> None:
-        """Write where something is at the current frame; a position (3,) that is not known is left out."""
+        """Write a position (3,) at the current frame, unless it is not known (NaN)."""
         if np.all(np.isfinite(position)):
             self._stream.log(name, self._rr.Points3D([position], colors=[color], radii=[0.05]))
 
     def lines(self, name: str, lines: Sequence[np.ndarray], color: list[int]) -> None:
-        """Write lines, (n, 3) each, of the whole drive."""
+        """Write lines, (n, 3) each, that are visible at all frames."""
         if len(lines):
             self._stream.log(name, self._rr.LineStrips3D(list(lines), colors=[color] * len(lines)), static=True)
 
     def close(self) -> None:
-        """Bring all to disk."""
+        """Write everything to disk and close the file."""
         self._stream.flush()
         self._stream.disconnect()
 
@@ -91,7 +91,7 @@ def rerun_file(path: str | Path) -> Iterator[RerunFile]:
 def write_detected(
     path: Path, recording: ImageSequence, results: Sequence[LoopResult], progress: Progress = silent
 ) -> None:
-    """Write the frames of a recording, what became of each, and, where poses are known, the path and its loops."""
+    """Write the frames of a recording with their results and, if poses are known, the path and its loops."""
     matched: dict[int | None, bytes] = {}
     wanted = {result.accepted for result in results if result}
     poses = None if recording.poses is None else recording.poses[:, :3]
@@ -116,7 +116,7 @@ def write_detected(
 
 
 def write_closed_paths(path: Path, closed: Closed, frames: Iterator[tuple[int, float | None, np.ndarray]]) -> None:
-    """Write the path before and after its loops were closed, and the true one; ``frames``: number, stamp, image."""
+    """Write the paths before and after closing the loops, and the true path; ``frames``: number, stamp, image."""
     before, after = closed.odometry[:, :3], closed.poses[:, :3]
     row = {int(frame): i for i, frame in enumerate(closed.frames)}
     with rerun_file(path) as made:
