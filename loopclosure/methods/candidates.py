@@ -70,7 +70,7 @@ class Candidates:
     @cached_property
     def there(self) -> np.ndarray:
         """Which queries (Q,) have a candidate."""
-        return self.allowed.any(axis=1)
+        return np.any(self.allowed, axis=1)
 
     @cached_property
     def single(self) -> np.ndarray:

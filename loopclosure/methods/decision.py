@@ -9,6 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from loopclosure.detector.verification import DOUBTLESS, SURE
 from loopclosure.methods.geometry import Matches
 from loopclosure.methods.lines import LEAST_ACCEPTED, Lines
+from loopclosure.methods.seqslam import SequenceSettings
 
 WINDOW = 5  # references to each side of a line, and at least so many queries along it, where a loop has neighbors
 UNLIKELY = 0.05  # that so many matches in a row are not verified, at the share that is
@@ -18,7 +19,7 @@ def decide(matches: Matches, lines: Lines | None) -> np.ndarray:
     """Return the queries (Q,) whose matches are loops."""
     if lines is None:
         return matches.evidence >= SURE
-    pairs, verified = neighbors(matches.match, lines), matches.evidence >= 1
+    pairs, verified = neighbors(matches.match, lines.sequence), matches.evidence >= 1
     label = stretches(matches.line, pairs)
     many = np.bincount(label, matches.line)[label] >= LEAST_ACCEPTED
     seeds = matches.line & (many | (np.bincount(label, verified & matches.line)[label] > 0))
@@ -73,12 +74,12 @@ def stretches(loops: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     return connected_components(links, directed=False)[1]
 
 
-def neighbors(match: np.ndarray, lines: Lines) -> np.ndarray:
+def neighbors(match: np.ndarray, sequence: SequenceSettings) -> np.ndarray:
     """Return pairs (N, 2) of queries, the earlier first, whose matches lie on the line through one another.
 
-    The line has the length and the velocities of the search, and is ``WINDOW`` references wide to each side.
+    The line has the length and the velocities of the ``sequence``, and is ``WINDOW`` references wide to each side.
     """
-    sequence, pairs = lines.sequence, []
+    pairs = []
     for step in range(1, max(WINDOW, sequence.length // 2) + 1):
         moved = match[step:] - match[:-step]
         low, high = sequence.slowest * step - WINDOW, sequence.fastest * step + WINDOW

@@ -21,7 +21,7 @@ from loopclosure.methods.candidates import Compared, candidates, far_apart, move
 from loopclosure.methods.decision import contradicted, neighbors
 from loopclosure.methods.decoys import floor_age
 from loopclosure.methods.geometry import Geometry
-from loopclosure.methods.lines import Lines, threshold
+from loopclosure.methods.lines import threshold
 from loopclosure.methods.named import make_method
 from loopclosure.methods.seqslam import SequenceSettings
 from loopclosure.places.image_sequence import ImageSequence
@@ -145,8 +145,7 @@ def test_a_loop_ends_with_its_last_verified_match(elsewhere):
 def test_the_end_of_a_line_counts_only_if_its_points_may_have_been_missed(start):
     """Up to there each match, or each fifth, is verified; after it none, for less than the length of a line."""
     match, verified = np.arange(70), np.arange(70) % 5 == 0
-    found = Lines(SequenceSettings(30, contrast=0), *(np.zeros(70) for _ in range(5)), 1.0)
-    pairs, loops = neighbors(match, found), np.ones(70, bool)
+    pairs, loops = neighbors(match, SequenceSettings(30)), np.ones(70, bool)
     verified[start:] = False
     assert contradicted(loops, verified, pairs, 30).any() == (start == 50)
     assert np.array_equal(contradicted(loops, match < start, pairs, 30), match >= start)
@@ -154,8 +153,7 @@ def test_the_end_of_a_line_counts_only_if_its_points_may_have_been_missed(start)
 
 def test_a_short_line_without_a_verified_match_counts_only_where_few_are():
     match = np.concatenate([np.arange(40), np.full(20, -1), 100 + np.arange(8)])
-    found = Lines(SequenceSettings(10, contrast=0), *(np.zeros(68) for _ in range(5)), 1.0)
-    pairs, loops, numbers = neighbors(match, found), match >= 0, np.arange(68)
+    pairs, loops, numbers = neighbors(match, SequenceSettings(10)), match >= 0, np.arange(68)
     assert np.array_equal(contradicted(loops, (numbers < 40), pairs, 10), numbers >= 60)
     assert not contradicted(loops, (numbers < 40) & (numbers % 8 == 0), pairs, 10)[60:].any()
 
