@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -24,17 +24,8 @@ from netspec.layers.contract.targets import OnnxGraph, TorchCode
 class Activation(Layer):
     """Base of layers with a top of the same shape as the bottom."""
 
-    onnx_op: ClassVar[str]  # of a layer without settings, and its expression in torch
-    torch_call: ClassVar[str]
-
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return bottom_shapes
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node(self.onnx_op, *bottoms)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call(self.torch_call, x=bottoms[0])
 
 
 class Rounded(Activation):
@@ -151,6 +142,8 @@ class ELU(Rounded):
     Caffe: src/caffe/layers/elu_layer.cpp
     """
 
+    onnx_op, onnx_attributes = "Elu", ("alpha",)
+
     def setup(self) -> None:
         self.alpha: float = self.param.elu_param.alpha
         self.gradient_reads = frozenset({"top", "sign" if self.alpha >= 0 else "bottom"})  # as ReLU's
@@ -162,9 +155,6 @@ class ELU(Rounded):
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * (self.alpha + top))
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Elu", *bottoms, alpha=self.alpha)
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.alpha == 1:
@@ -246,6 +236,8 @@ class Threshold(Activation):
     Caffe: src/caffe/layers/threshold_layer.cpp
     """
 
+    torch_call = "torch.gt({x}, {threshold}).to({x}.dtype)"
+
     def setup(self) -> None:
         self.threshold: float = self.param.threshold_param.threshold
 
@@ -254,9 +246,6 @@ class Threshold(Activation):
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.cast(graph.node("Greater", *bottoms, graph.constant(self.threshold)), "float32")
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("torch.gt({x}, {threshold}).to({x}.dtype)", x=bottoms[0], threshold=self.threshold)
 
 
 @register("Clip", "clip_param")

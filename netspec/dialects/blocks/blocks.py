@@ -196,6 +196,8 @@ class ShuffleChannel(Layer):
     Fork: farmingyard/ShuffleNet, shuffle_channel_layer.cpp
     """
 
+    torch_call = "F.channel_shuffle({x}, {group})"
+
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shape, self.group = bottom_shapes[0], value(self.param, "shuffle_channel_param").group
         if len(shape) < 2 or self.group < 1 or shape[1] % self.group:
@@ -210,9 +212,6 @@ class ShuffleChannel(Layer):
         channels = self.bottom_shapes[0][1]
         dealt = graph.reshape(bottoms[0], [0, self.group, channels // self.group, -1])
         return graph.reshape_to_top(graph.node("Transpose", dealt, perm=[0, 2, 1, 3]))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("F.channel_shuffle({x}, {groups})", x=bottoms[0], groups=self.group)
 
 
 @register("Interp", "interp_param")

@@ -52,10 +52,10 @@ class Transpose(Reordered):
 
     def setup(self) -> None:
         """Read the order, in which each axis has its place."""
-        self.order = list(value(self.param, "transpose_param").dim)
+        self.perm = list(value(self.param, "transpose_param").dim)
         axes = len(self.bottom_shapes[0])
-        if sorted(self.order) != list(range(axes)):
-            message = f"found dim {self.order}, expected each of the {axes} axes 0 to {axes - 1} once"
+        if sorted(self.perm) != list(range(axes)):
+            message = f"found dim {self.perm}, expected each of the {axes} axes 0 to {axes - 1} once"
             raise self.error(message, "transpose_param", "dim")
 
 

@@ -8,25 +8,23 @@ import torch
 
 from netspec.data.blobs import Shape
 from netspec.layers import Layer
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.targets import TorchCode
 
 
 class Reordered(Layer):
-    """Base of layers that permute axes: axis i of the top is axis ``order[i]`` of the bottom."""
+    """Base of layers that permute axes: axis i of the top is axis ``perm[i]`` of the bottom."""
 
-    order: list[int]
+    perm: list[int]
+    onnx_op, onnx_attributes = "Transpose", ("perm",)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        if len(bottom_shapes[0]) != len(self.order):
-            message = f"found a bottom of shape {bottom_shapes[0]}, expected {len(self.order)} axes as before"
+        if len(bottom_shapes[0]) != len(self.perm):
+            message = f"found a bottom of shape {bottom_shapes[0]}, expected {len(self.perm)} axes as before"
             raise self.error(message, "bottom")
-        return [tuple(bottom_shapes[0][axis] for axis in self.order)]
+        return [tuple(bottom_shapes[0][axis] for axis in self.perm)]
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        return data.permute(self.order).contiguous()
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Transpose", *bottoms, perm=self.order)
+        return data.permute(self.perm).contiguous()
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call(f"{{x}}.permute({', '.join(map(str, self.order))})", x=bottoms[0])
+        return code.call(f"{{x}}.permute({', '.join(map(str, self.perm))})", x=bottoms[0])

@@ -265,4 +265,4 @@ class Permute(Reordered):
             if axis >= axes or axis in given[:i]:
                 message = f"found axis {axis}, expected each of 0 to {axes - 1} at most once"
                 raise self.error(message, "permute_param", "order", i)
-        self.order = given + [axis for axis in range(axes) if axis not in given]
+        self.perm = given + [axis for axis in range(axes) if axis not in given]

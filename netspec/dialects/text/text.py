@@ -23,7 +23,7 @@ from netspec.dialects.text.ctc import (
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.reading import State
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
+from netspec.layers.contract.targets import OnnxGraph
 from netspec.proto.schema import has, value
 
 DECLARATIONS = """
@@ -85,6 +85,7 @@ class ContinuationIndicator(Layer):
 
     bottoms = (0, 1)
     label_bottoms = frozenset({0})
+    torch_call = "torch.ones({size}).index_fill(0, torch.tensor([0]), 0)"
 
     def setup(self) -> None:
         param = value(self.param, "continuation_indicator_param")
@@ -104,9 +105,6 @@ class ContinuationIndicator(Layer):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.constant(self.forward().cpu())
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("torch.ones({size}).index_fill(0, torch.tensor([0]), 0)", size=self.size)
-
 
 @register("Reverse", "reverse_param")
 class Reverse(Layer):
@@ -116,6 +114,8 @@ class Reverse(Layer):
     top[0]     the same shape
     Fork: senlinuc/caffe_ocr, src/caffe/layers/reverse_layer.cpp
     """
+
+    torch_call = "{x}.flip({axis})"
 
     def setup(self) -> None:
         self.axis = self.canonical_axis(value(self.param, "reverse_param").axis, self.bottom_shapes[0], "reverse_param")
@@ -129,9 +129,6 @@ class Reverse(Layer):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         first, last, step = (graph.constant([n]) for n in (-1, -(2**31), -1))
         return graph.node("Slice", bottoms[0], first, last, graph.constant([self.axis]), step)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("{x}.flip({axis})", x=bottoms[0], axis=self.axis)
 
 
 @register("ReverseTime", "reverse_time_param")

@@ -18,9 +18,10 @@ from netspec.export.formats.preprocess import Preprocess
 from netspec.export.formats.shapes import Fixed, NetShapes, settled
 from netspec.files.whole_file import whole_file, write_whole
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.exporting import export
+from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.learned import values_of
-from netspec.layers.contract.targets import Sizes
+from netspec.layers.contract.offers import offered
+from netspec.layers.contract.targets import OnnxGraph, Sizes
 from netspec.net.net import Net
 
 OPSET, IR_VERSION = 21, 10  # ONNX 1.16, of 2024: which all runtimes of today read
@@ -77,6 +78,16 @@ def _written(net: Net, preprocess: Preprocess | None) -> tuple[_Writer, list[str
     return writer, list(shapes.fixed)
 
 
+def _write_layer(layer: Layer, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
+    """Write a layer into the graph; return the values of its tops. Raises SpecError where it cannot be written."""
+    write, op = offered(layer, "to_onnx"), offered(layer, "onnx_op")
+    if write is not None:
+        return write(graph, *bottoms)
+    if op is None:
+        raise refusal(layer, "ONNX")
+    return graph.node(op, *bottoms, **{name: getattr(layer, name) for name in getattr(layer, "onnx_attributes", ())})
+
+
 class _DataFile:
     """The file with the large weights of a model. The model refers to it by ``name``."""
 
@@ -104,7 +115,7 @@ class _Writer:
         self._constants: dict[bytes, str] = {}
         self._blobs: dict[tuple[int, tuple[int, ...]], str] = {}  # by address and shape
         for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
-            tops = export(layer, _LayerGraph(self, i), "ONNX", *(self.values[v] for v in node.bottoms))
+            tops = _write_layer(layer, _LayerGraph(self, i), *(self.values[v] for v in node.bottoms))
             named = (tops,) if isinstance(tops, str) else tops
             self.values.update(zip(node.tops, named, strict=False))
 

@@ -19,8 +19,9 @@ import torch
 from netspec.export.formats.shapes import Fixed, NetShapes
 from netspec.graph.plan import origins
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.exporting import export, passes_on
-from netspec.layers.contract.targets import Sizes
+from netspec.layers.contract.exporting import passes_on, refusal
+from netspec.layers.contract.offers import offered
+from netspec.layers.contract.targets import Sizes, TorchCode
 from netspec.net.net import Net
 
 WIDTH = 88  # ruff's and black's line length where nothing else is configured
@@ -207,11 +208,21 @@ def write_definition(net: Net, shapes: NetShapes) -> Definition:
     plan = net.plan
     for i, node in enumerate(plan.nodes):
         bottoms = [mark("v", collector.value[v]) for v in node.bottoms]
-        layer_code = _LayerCode(collector, i)
-        tops = export(net.layers[i], layer_code, "PyTorch", *bottoms)
+        tops = _write_layer(net.layers[i], _LayerCode(collector, i), *bottoms)
         collector.add(node.tops, tops)
     collector.made.outputs = {name: collector.value[v] for name, v in plan.outputs.items()}
     return collector.made
+
+
+def _write_layer(layer: Layer, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+    """Write a layer; return the expressions of its tops. Raises SpecError where it cannot be written."""
+    write, template = offered(layer, "to_torch"), offered(layer, "torch_call")
+    if write is not None:
+        return write(code, *bottoms)
+    if template is None:
+        raise refusal(layer, "PyTorch")
+    given = dict(zip("xyz", bottoms, strict=False))
+    return code.call(template, **{n: given[n] if n in given else getattr(layer, n) for n in _FIELD.findall(template)})
 
 
 class _Collector:

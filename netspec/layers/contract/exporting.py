@@ -1,9 +1,9 @@
-"""The methods that netspec/export calls to export a layer, with a writer of netspec/layers/contract/targets.py."""
+"""What netspec/export reads and calls to export a layer, with a writer of netspec/layers/contract/targets.py."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 from netspec.errors import SpecError
 from netspec.layers.contract.base import Layer
@@ -21,7 +21,15 @@ class PassesOn(Protocol):
 
 
 class Exported(Protocol):
-    """A layer that can be exported. Its exported form must compute the same as ``forward``, at every free size."""
+    """A layer that can be exported: as one operator and one call, or by methods where it takes more.
+
+    Where a class has both, the method counts. The exported form must compute the same as ``forward``, at every free
+    size.
+    """
+
+    onnx_op: ClassVar[str]  # an ONNX operator, whose inputs are the bottoms
+    onnx_attributes: ClassVar[Sequence[str]]  # the operator's attributes; the layer has them by the same names
+    torch_call: ClassVar[str]  # an expression; {x}, {y}, {z} are bottoms, other names in braces the layer's attributes
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
         """Write the layer into an ONNX graph, given the values of its bottoms; return those of its tops."""
@@ -30,14 +38,6 @@ class Exported(Protocol):
     def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
         """Write the layer as source for PyTorch, given the expressions of its bottoms; return those of its tops."""
         ...
-
-
-def export(layer: Layer, writer: OnnxGraph | TorchCode, target: str, *bottoms: str) -> str | Sequence[str]:
-    """Write a layer for ``ONNX`` or ``PyTorch``; return the values of its tops. Raises SpecError if it cannot."""
-    write = offered(layer, "to_onnx" if target == "ONNX" else "to_torch")
-    if write is None:
-        raise refusal(layer, target)
-    return write(writer, *bottoms)
 
 
 def passes_on(layer: Layer) -> bool:

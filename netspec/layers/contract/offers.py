@@ -1,6 +1,6 @@
 """What a layer may offer in addition to its forward pass, each by an attribute that its class defines.
 
-exporting.py  to_onnx, to_torch, passes_on: the layer in another form
+exporting.py  onnx_op, torch_call, or to_onnx, to_torch; passes_on: the layer in another form
 gradients.py  caffes_gradient: the gradient from the content of memory
 joining.py    joined_with, joins_as: consecutive layers that one layer computes
 reading.py    running_state, restart, and the like: records, and state that is kept between passes

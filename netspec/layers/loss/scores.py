@@ -235,21 +235,20 @@ class MultinomialLogisticLoss(ClassLoss):
     Caffe: src/caffe/layers/multinomial_logistic_loss_layer.cpp
     """
 
+    least = LOG_THRESHOLD
+    torch_call = "F.nll_loss(torch.log({x}.flatten(1).clamp(min={least})), {y}.flatten().long())"
+
     def forward(self, probabilities: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         p, label = self.scores_and_labels(probabilities, labels)
         self.valid(label, None)
-        chosen = Floor.apply(p.gather(1, label.unsqueeze(1)), LOG_THRESHOLD)
+        chosen = Floor.apply(p.gather(1, label.unsqueeze(1)), self.least)
         exact = self.is_exact(chosen)
         return -total(logarithm(chosen) if exact else chosen.log(), exact) / self.outer
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         p, labels = self.onnx_scores_and_labels(graph, *bottoms)
-        chosen = graph.node("Max", graph.node("GatherElements", p, labels, axis=1), graph.constant(LOG_THRESHOLD))
+        chosen = graph.node("Max", graph.node("GatherElements", p, labels, axis=1), graph.constant(self.least))
         return onnx_normalized_sum(graph, graph.node("Neg", graph.node("Log", chosen)), "", BATCH_SIZE)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        template = "F.nll_loss(torch.log({x}.flatten(1).clamp(min={least})), {y}.flatten().long())"
-        return code.call(template, x=bottoms[0], y=bottoms[1], least=LOG_THRESHOLD)
 
 
 @register("Accuracy", "accuracy_param")

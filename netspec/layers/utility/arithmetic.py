@@ -241,6 +241,8 @@ class Softmax(Layer):
 
     gradient_reads = frozenset({"top"})
     ignores_propagate_down = frozenset({0})
+    onnx_op, onnx_attributes = "Softmax", ("axis",)
+    torch_call = "F.softmax({x}, dim={axis})"
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         self.axis = self.canonical_axis(self.param.softmax_param.axis, bottom_shapes[0], "softmax_param", "axis")
@@ -259,12 +261,6 @@ class Softmax(Layer):
         if self.is_exact(top):
             return softmax_gradient(self._by_class(top), self._by_class(diff)).reshape(top.shape)
         return (diff - (diff * top).sum(self.axis, keepdim=True)) * top
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Softmax", *bottoms, axis=self.axis)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("F.softmax({x}, dim={axis})", x=bottoms[0], axis=self.axis)
 
 
 @register("Silence")

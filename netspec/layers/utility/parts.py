@@ -33,6 +33,7 @@ class Concat(Layer):
     """
 
     bottoms = (1, None)
+    onnx_op, onnx_attributes = "Concat", ("axis",)
 
     def setup(self) -> None:
         if len(self.bottom_shapes) == 1:  # it is not copied
@@ -51,9 +52,6 @@ class Concat(Layer):
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Concat", *bottoms, axis=self.axis)
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if len(bottoms) == 1:
@@ -193,6 +191,7 @@ class BatchReindex(Layer):
 
     bottoms = (2, 2)
     label_bottoms = frozenset({1})
+    torch_call = "{x}[{y}.long()]"
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         data, indices = bottom_shapes
@@ -209,9 +208,6 @@ class BatchReindex(Layer):
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Gather", bottoms[0], graph.cast(bottoms[1], "int64"), axis=0)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("{x}[{index}.long()]", x=bottoms[0], index=bottoms[1])
 
 
 @register("Filter")

@@ -133,12 +133,14 @@ class Tile(Layer):
     Caffe: src/caffe/layers/tile_layer.cpp
     """
 
+    torch_call = "{x}.repeat({repeats})"
+
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         p, shape = self.param.tile_param, bottom_shapes[0]
         self.axis = axis = self.canonical_axis(p.axis, shape, "tile_param", "axis")
         if p.tiles <= 0:
             raise self.error(f"found tiles {p.tiles}, expected a positive number", "tile_param", "tiles")
-        self.repeats = [p.tiles if i == axis else 1 for i in range(len(shape))]
+        self.repeats = tuple(p.tiles if i == axis else 1 for i in range(len(shape)))
         return [(*shape[:axis], shape[axis] * p.tiles, *shape[axis + 1 :])]
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -149,6 +151,3 @@ class Tile(Layer):
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Tile", *bottoms, graph.constant(self.repeats))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("{x}.repeat({repeats})", x=bottoms[0], repeats=tuple(self.repeats))

@@ -207,7 +207,7 @@ class Deconvolution(Convolution):
     Caffe: src/caffe/layers/base_conv_layer.cpp, deconv_layer.cpp
     """
 
-    onnx_op = "ConvTranspose"
+    onnx_filter = "ConvTranspose"
     torch_module = "ConvTranspose"
 
     @override

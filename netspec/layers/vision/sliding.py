@@ -114,18 +114,18 @@ class SlidingFilter(Layer):
             "pads": [*self.pad, *self.pad],
         }
 
-    onnx_op: ClassVar[str] = "Conv"
+    onnx_filter: ClassVar[str] = "Conv"
 
     def onnx_convolved(
         self, graph: OnnxGraph, maps: str, weights: Sequence[str], group: int, geometry: dict[str, Any]
     ) -> str:
         """Return the product with the filters. A filter of one pixel is padded before: OpenCV 5.0 does it wrong."""
         pads = geometry.get("pads", [])
-        if self.onnx_op == "Conv" and set(self.kernel) == {1} and any(pads):
+        if self.onnx_filter == "Conv" and set(self.kernel) == {1} and any(pads):
             before, after = pads[: len(self.pad)], pads[len(self.pad) :]
             maps = graph.node("Pad", maps, graph.constant([0, 0, *before, 0, 0, *after]))
             geometry = {**geometry, "pads": [0] * len(pads)}
-        return graph.node(self.onnx_op, maps, *weights, group=group, **geometry)
+        return graph.node(self.onnx_filter, maps, *weights, group=group, **geometry)
 
     def torch_geometry(self) -> dict[str, Any]:
         """Return kernel, stride, padding and dilation as torch takes them: one number where all axes have the same."""

@@ -18,6 +18,7 @@ from netspec.fast import prepared as programs
 from netspec.fast.entry import Entry
 from netspec.fast.table import entry_of
 from netspec.graph.options import PASSES
+from netspec.layers.activation import Sigmoid
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.offers import offered
 from netspec.layers.vision.convolution import Convolution
@@ -380,6 +381,11 @@ def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> No
     class Named(Convolution):
         """The same forward pass."""
 
+    class Doubled(Sigmoid):
+        @override
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            return 2 * super().forward(x)
+
     def made(cls: type[Layer]) -> Layer:
         param = LayerParameter(name="it", type="Convolution", bottom=["x"], top=["y"])
         param.convolution_param.num_output = 2
@@ -388,6 +394,7 @@ def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> No
 
     assert offered(made(Halved), "to_onnx") is None
     assert offered(made(Named), "to_onnx") is not None
+    assert [offered(made(Doubled), name) for name in ("onnx_op", "to_onnx", "torch_call", "to_torch")] == [None] * 4
     assert entry_of(made(Halved)) == entry_of(made(Named)) == Entry()  # entries are those of one class
 
 
