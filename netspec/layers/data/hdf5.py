@@ -39,10 +39,9 @@ class HDF5Data(ReadingLayer):
 
     def shapes_without_data(self) -> list[Shape]:
         """Return the shapes given by the caller; the prototxt says nothing of them."""
-        for top in self.param.top:
-            if top not in self.context.options.given_shapes:
-                raise self.shape_wanted(top, f"{self.batch_size},...")
-        return [self.context.options.given_shapes[top] for top in self.param.top]
+        given = self.context.options.given_shapes
+        self.refuse(self.shape_wanted(top, f"{self.batch_size},...") for top in self.param.top if top not in given)
+        return [given[top] for top in self.param.top]
 
 
 @register("HDF5Output", "hdf5_output_param")

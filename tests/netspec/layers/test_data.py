@@ -241,6 +241,16 @@ def test_a_shape_that_only_the_data_knows_is_asked_for(text: str, wanted: str) -
         data_layer(text, open_data=False)
 
 
+def test_every_shape_that_only_an_hdf5_file_knows_is_asked_for() -> None:
+    reported: list[SpecError] = []
+    with pytest.raises(SpecError, match="give --shape label=8,...") as raised:
+        data_layer(ROWS, open_data=False, report=reported.append)
+    assert [fault.message.partition(" is known")[0] for fault in [*reported, raised.value]] == [
+        'the shape of "data"',
+        'the shape of "label"',
+    ]
+
+
 def test_a_net_built_without_data_says_so_when_it_is_run() -> None:
     with pytest.raises(SpecError, match="built without opening its data"):
         data_layer(DATA + CUT, open_data=False).run()
