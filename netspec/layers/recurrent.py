@@ -204,6 +204,14 @@ class Recurrent(Layer):
             return tuple(s.to(x) for s in self.state)
         return (x.new_zeros(shape),) * len(self.state_names)
 
+    @property
+    def export_note(self) -> str:
+        """Say that the state is lost between two runs; with expose_hidden it is an input and an output instead."""
+        if self.exposed:
+            return ""
+        names = ", ".join(self.state_names)
+        return f"its state ({names}) starts at zero in every run; Caffe carries it on to the next run where cont is 1"
+
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         steps = graph.size(0, 0, "its time steps are unrolled")
         streams = graph.size(0, 1, "its state has a row for each stream")

@@ -17,6 +17,7 @@ from netspec.export.engines.runners import Unable, warn_unable
 from netspec.export.formats.convert import Source
 from netspec.export.formats.onnx import export_onnx
 from netspec.graph.options import BuildOptions
+from netspec.layers.contract.exporting import layer_notes
 from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias
 from netspec.layers.contract.reading import reads_data
 from netspec.net.net import Net
@@ -28,10 +29,13 @@ from netspec.run.walk import Result, losses_of, walk, weighted_sum
 def write_model(net: Net, path: Path, blobs: Iterable[str] = ()) -> None:
     """Write a net as an ONNX model. Those of ``blobs`` that are not inputs become outputs too.
 
-    Raises SpecError where a layer cannot be exported, and Unable for a blob that the model does not have.
+    Raises SpecError where a layer cannot be exported. Raises Unable where an exported layer would compute something
+    else, and for a blob that the model does not have.
     """
     import onnx
 
+    if notes := layer_notes(net.layers):
+        raise Unable(notes[0])
     export_onnx(net, path, largest=0)
     model = onnx.load(str(path), load_external_data=False)
     there = {output.name for output in model.graph.output} | {given.name for given in model.graph.input}

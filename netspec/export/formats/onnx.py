@@ -18,7 +18,7 @@ from netspec.export.formats.preprocess import Preprocess
 from netspec.export.formats.shapes import Fixed, NetShapes, settled
 from netspec.files.whole_file import whole_file, write_whole
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.exporting import refusal
+from netspec.layers.contract.exporting import layer_notes, refusal
 from netspec.layers.contract.learned import values_of
 from netspec.layers.contract.offers import offered
 from netspec.layers.contract.targets import OnnxGraph, Sizes
@@ -75,7 +75,7 @@ def onnx_model(
 def _written(net: Net, preprocess: Preprocess | None) -> tuple[_Writer, list[str]]:
     _onnx()
     writer, shapes = settled(net, lambda shapes: _Writer(net, shapes, preprocess))
-    return writer, list(shapes.fixed)
+    return writer, [*shapes.fixed, *layer_notes(net.layers)]
 
 
 def _write_layer(layer: Layer, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:

@@ -22,6 +22,7 @@ from netspec.errors import SpecError, Where
 from netspec.export.formats.shapes import NetShapes, input_shapes, settled
 from netspec.export.formats.torch_code import MARK, Definition, check_shapes, legal, unique, write_definition
 from netspec.files.whole_file import whole_file
+from netspec.layers.contract.exporting import layer_notes
 from netspec.net.net import Net
 
 OPERATORS: dict[type, Callable[..., Any]] = {
@@ -42,7 +43,7 @@ def export_pt2(net: Net, path: str | Path) -> list[str]:
     """
     module, shapes = _made(net)
     inputs = [v for node, layer in zip(net.plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops]
-    notes = list(shapes.fixed)
+    notes = [*shapes.fixed, *layer_notes(net.layers)]
     every = [free.name for free in shapes.free if not free.counted]
     for names in (*([every] if len(every) > 1 else []), *([["N"]] if "N" in every else []), []):
         dims = {free.name: torch.export.Dim.AUTO for free in shapes.free if free.name in names}

@@ -32,6 +32,7 @@ from netspec.export.formats.torch_code import (
     write_definition,
 )
 from netspec.files.whole_file import whole_file
+from netspec.layers.contract.exporting import layer_notes
 from netspec.net.net import Net
 
 
@@ -90,7 +91,7 @@ def torch_source(net: Net, origin: str = "a prototxt") -> tuple[str, dict[str, t
     state: dict[str, torch.Tensor] = {}
     for m, attribute in attributes.items():
         state.update(definition.modules[m].tensors(attribute))
-    return text, state, list(shapes.fixed)
+    return text, state, [*shapes.fixed, *layer_notes(net.layers)]
 
 
 def _parts(net: Net, definition: Definition, attributes: Mapping[int, str], shapes: NetShapes) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import ClassVar, Protocol
 
 from netspec.errors import SpecError
@@ -17,6 +17,15 @@ class PassesOn(Protocol):
     @property
     def passes_on(self) -> bool:
         """Whether every top is the bottom, unchanged."""
+        ...
+
+
+class Differs(Protocol):
+    """A layer that computes something else when it is exported."""
+
+    @property
+    def export_note(self) -> str:
+        """What is different, for the user; empty where nothing is."""
         ...
 
 
@@ -38,6 +47,11 @@ class Exported(Protocol):
     def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
         """Write the layer as source for PyTorch, given the expressions of its bottoms; return those of its tops."""
         ...
+
+
+def layer_notes(layers: Iterable[Layer]) -> list[str]:
+    """Return what the user of an exported net must know of its layers, in lines."""
+    return [str(layer.error(note)) for layer in layers if (note := offered(layer, "export_note"))]
 
 
 def passes_on(layer: Layer) -> bool:

@@ -26,7 +26,9 @@ from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.export.formats.onnx import export_onnx, onnx_model
 from netspec.export.formats.preprocess import Preprocess
+from netspec.export.formats.pt2 import export_pt2
 from netspec.export.formats.shapes import find_shapes
+from netspec.export.formats.torch import export_torch
 from netspec.net.net import Net
 from paths import GOLDEN, ROOT, shared
 
@@ -37,6 +39,12 @@ OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 IMAGE = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 dim: 12 dim: 10 } } }\n'
 CONV = """layer { name: "conv" type: "Convolution" bottom: "data" top: "conv"
   convolution_param { num_output: 4 kernel_size: 3 weight_filler { type: "xavier" } } }
+"""
+# The recurrent layer is in line 3.
+RECURRENT = """layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 3 dim: 2 dim: 4 } } }
+  layer { name: "cont" type: "Input" top: "cont" input_param { shape { dim: 3 dim: 2 } } }
+  layer { name: "r" type: "%s" bottom: "x" bottom: "cont" top: "r" %s
+    recurrent_param { num_output: 5 expose_hidden: %s weight_filler { type: "xavier" } } }
 """
 
 
@@ -82,6 +90,31 @@ def test_the_layer_that_fixes_a_size_is_named(net_of: Callable[..., Net]) -> Non
     assert len(notes) == 2
     assert notes[0].startswith("the height is fixed at 12: net.prototxt:4:")
     assert notes[0].endswith('layer "ip" (InnerProduct) takes no other'), "not the shape that was tried"
+
+
+@pytest.mark.parametrize(("layer_type", "state"), [("RNN", "h"), ("LSTM", "h, c")])
+@pytest.mark.parametrize("target", ["ONNX", "PyTorch source", "torch.export"])
+def test_a_note_says_that_the_state_of_a_recurrent_layer_starts_at_zero(
+    net_of: Callable[..., Net], tmp_path: Path, target: str, layer_type: str, state: str
+) -> None:
+    net = net_of(RECURRENT % (layer_type, "", "false"))
+    if target == "ONNX":
+        notes = export_onnx(net, tmp_path / "net.onnx")
+    elif target == "PyTorch source":
+        notes = export_torch(net, tmp_path / "net.py")
+    else:
+        notes = export_pt2(net, tmp_path / "net.pt2")
+    note = (
+        f'net.prototxt:3:3: layer "r" ({layer_type}): its state ({state}) starts at zero in every run; '
+        "Caffe carries it on to the next run where cont is 1"
+    )
+    assert note in notes
+
+
+def test_there_is_no_such_note_where_the_state_is_an_input_and_an_output(net_of: Callable[..., Net]) -> None:
+    text = RECURRENT % ("RNN", 'bottom: "h0" top: "h1"', "true")
+    state = 'layer { name: "h0" type: "Input" top: "h0" input_param { shape { dim: 1 dim: 2 dim: 5 } } }'
+    assert not any("starts at zero" in note for note in onnx_model(net_of(state + text))[1])
 
 
 def test_a_reshape_that_bakes_the_batch_does_what_caffes_does(net_of: Callable[..., Net]) -> None:

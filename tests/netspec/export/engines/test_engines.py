@@ -190,6 +190,24 @@ def test_what_it_cannot_do_is_torchs(
     assert line.endswith("; torch runs the net")
 
 
+@pytest.mark.usefixtures("files")
+def test_a_state_that_goes_on_from_run_to_run_is_torchs(engine: str, caplog: pytest.LogCaptureFixture) -> None:
+    Path("net.prototxt").write_text(
+        """layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 3 dim: 2 dim: 4 } } }
+        layer { name: "cont" type: "Input" top: "cont" input_param { shape { dim: 3 dim: 2 } } }
+        layer { name: "lstm" type: "LSTM" bottom: "x" bottom: "cont" top: "h"
+          recurrent_param { num_output: 5 weight_filler { type: "xavier" } } }"""
+    )
+    with caplog.at_level(logging.WARNING):
+        net, expected = (netspec.load_net("net.prototxt", seed=1, engine=each) for each in (engine, "torch"))
+        for _ in range(2):
+            found = [each(x=torch.ones(3, 2, 4), cont=torch.ones(3, 2))["h"] for each in (net, expected)]
+            assert torch.equal(*found)
+    (line,) = caplog.messages
+    assert line.startswith(f'engine {engine}: net.prototxt:3:9: layer "lstm" (LSTM): its state (h, c) starts at zero')
+    assert line.endswith("; torch runs the net")
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
 def test_a_library_that_fails_is_replaced(
