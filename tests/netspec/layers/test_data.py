@@ -243,7 +243,7 @@ def test_a_shape_that_only_the_data_knows_is_asked_for(text: str, wanted: str) -
 
 def test_every_shape_that_only_an_hdf5_file_knows_is_asked_for() -> None:
     reported: list[SpecError] = []
-    with pytest.raises(SpecError, match="give --shape label=8,...") as raised:
+    with pytest.raises(SpecError, match=r"give --shape label=8,\.\.\., or --data") as raised:
         data_layer(ROWS, open_data=False, report=reported.append)
     assert [fault.message.partition(" is known")[0] for fault in [*reported, raised.value]] == [
         'the shape of "data"',
