@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 
@@ -121,16 +120,6 @@ def several(given: Any) -> tuple[Any, ...]:
 
 
 _ENDINGS = ("_param", "parameter", "loss", "data")  # what many names have in common says nothing
-
-
-def nearest_existing(path: str | Path) -> str:
-    """Say how far a path exists that does not: "; there is no b in /home/a; the working directory is /home"."""
-    absolute = Path(os.path.abspath(path))
-    missing = next((part for part in reversed([absolute, *absolute.parents]) if not os.path.exists(part)), None)
-    if missing is None:
-        return ""
-    base = "" if Path(path).is_absolute() else f"; the working directory is {Path.cwd()}"
-    return f"; there is no {missing.name} in {missing.parent}{base}"
 
 
 def did_you_mean(word: str, known: Iterable[str], near: bool = False) -> str:

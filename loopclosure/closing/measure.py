@@ -18,7 +18,7 @@ from loopclosure.places.frames import read_bgr, read_depth
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.progress import Progress, silent
-from netspec.errors import nearest_existing
+from netspec.files.kinds import nearest_existing
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import safe_cell
 

@@ -26,7 +26,7 @@ import lmdb
 from netspec import log
 from netspec.data.lmdb_file import LmdbFile, Record
 from netspec.errors import SpecError, Where
-from netspec.files.kinds import head_of, pointer_fault
+from netspec.files.kinds import head_of, nearest_existing, pointer_fault
 from netspec.files.limits import amount
 from netspec.files.whole_file import whole_folder
 
@@ -103,7 +103,7 @@ def _kind(source: str) -> str:
     """Return the backend of the database in a folder."""
     folder = Path(source)
     if not os.path.exists(folder):
-        raise ValueError(f"does not exist (relative paths start from {os.getcwd()})")
+        raise ValueError(f"does not exist{nearest_existing(folder)}")
     if not folder.is_dir():
         raise ValueError("is a file; expected a folder that contains data.mdb (LMDB) or CURRENT (LevelDB)")
     if (folder / "data.mdb").is_file():

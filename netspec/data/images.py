@@ -12,6 +12,7 @@ import numpy as np
 
 from netspec.data.datum import decode_pixels, planar
 from netspec.errors import SpecError, Where
+from netspec.files.kinds import unreadable
 from netspec.files.limits import read_bytes
 from netspec.files.opencv import cv2
 
@@ -34,7 +35,7 @@ def read_image(path: str, color: bool = True, size: tuple[int, int] | None = Non
     try:
         pixels = decode_pixels(read_bytes(path), color)
     except OSError as fault:
-        raise ValueError(f'image "{path}" cannot be read: {fault.strerror}') from None
+        raise ValueError(f'image "{path}" {unreadable(path, fault)}') from None
     except ValueError as fault:
         raise ValueError(f'image "{path}" {fault}') from None
     if size:
@@ -54,7 +55,7 @@ def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Whe
     try:
         lines = read_bytes(path).decode("utf-8-sig").splitlines()
     except OSError as fault:
-        raise SpecError(f'list file "{path}" cannot be read: {fault.strerror}', where or Where(path)) from None
+        raise SpecError(f'list file "{path}" {unreadable(path, fault)}', where or Where(path)) from None
     except UnicodeDecodeError:
         raise SpecError(f'list file "{path}" is not UTF-8 text', where or Where(path)) from None
     if any("\0" in line for line in lines):

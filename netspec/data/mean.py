@@ -15,7 +15,7 @@ from netspec.data import blobs
 from netspec.data.database import Reader
 from netspec.data.datum import datum_to_array, parse_datum, times
 from netspec.errors import SpecError, Where
-from netspec.files.kinds import pointer_fault
+from netspec.files.kinds import pointer_fault, unreadable
 from netspec.files.limits import read_bytes
 from netspec.files.whole_file import write_whole
 from netspec.proto.schema import BlobProto
@@ -30,7 +30,7 @@ def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     try:
         data = read_bytes(path)
     except OSError as fault:
-        raise SpecError(f'mean file "{path}" cannot be read: {fault.strerror}', where) from None
+        raise SpecError(f'mean file "{path}" {unreadable(path, fault)}', where) from None
     if fault := pointer_fault(data):
         raise SpecError(f'mean file "{path}" {fault}', where)
     try:

@@ -66,13 +66,13 @@ def unreadable(path: object, fault: OSError | ValueError) -> str:
     if "://" in text or text.startswith(("http:/", "https:/")):
         return "is a web address; download the file, and give its path"
     reason = f"cannot be read: {getattr(fault, 'strerror', None) or fault}"
-    return f"{reason}{_what_is_there(text)}" if isinstance(fault, FileNotFoundError) else reason
+    return f"{reason}{nearest_existing(text)}" if isinstance(fault, FileNotFoundError) else reason
 
 
-def _what_is_there(path: str) -> str:
+def nearest_existing(path: str | os.PathLike[str]) -> str:
     """Return how far a path exists that does not, what has a similar name there, and where a relative one starts."""
     missing = Path(path)
-    while not missing.parent.exists():
+    while not os.path.exists(missing.parent):
         missing = missing.parent
     try:
         close = difflib.get_close_matches(missing.name, os.listdir(missing.parent), n=1)

@@ -9,6 +9,7 @@ import os
 from dataclasses import dataclass
 
 from netspec.errors import Report, SpecError, raise_fault
+from netspec.files.kinds import nearest_existing
 from netspec.graph.filter import in_state
 from netspec.proto.schema import TEST, TRAIN, NetParameter, NetState, SolverParameter
 from netspec.proto.source_map import Place, SourceMap
@@ -112,6 +113,6 @@ class _Reader:
 
     def _read(self, name: str, path: str, index: int) -> tuple[NetParameter, SourceMap]:
         if not os.path.isfile(path):
-            message = f'{name} "{path}" is not a file; paths are relative to the working directory'
+            message = f'{name} "{path}" is not a file{nearest_existing(path)}'
             raise SpecError(message, self._node.find(name, index))
         return parse_net(path, report=self._report)

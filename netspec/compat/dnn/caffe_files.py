@@ -13,6 +13,7 @@ import numpy as np
 from netspec import log
 from netspec.errors import ForkFault, SpecError, Where
 from netspec.exact import NONE
+from netspec.files.kinds import unreadable
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.base import Shape
@@ -97,7 +98,7 @@ def read_files(prototxt: FileOrBytes, weights: FileOrBytes | None) -> CaffeFiles
         try:
             data = Path(file).read_bytes()
         except OSError as fault:
-            raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(file)) from None
+            raise SpecError(unreadable(file, fault), Where(file)) from None
     else:
         file, data = PROTOTXT, bytes_of(prototxt)
     text = data.removeprefix(b"\xef\xbb\xbf").decode(errors="surrogateescape")

@@ -25,6 +25,7 @@ from typing import Any
 from netspec.compat.scripts import mended, old_names, python2
 from netspec.compat.scripts.mended import MENDED
 from netspec.errors import SpecError, Where
+from netspec.files.kinds import unreadable
 from netspec.files.whole_file import write_whole
 
 MAIN = "__netspec_main__"  # by this name a worker imports the program
@@ -48,7 +49,7 @@ def bytes_of(path: str) -> bytes:
     try:
         return Path(path).read_bytes()
     except OSError as fault:
-        raise SpecError(f"{path}: cannot be read: {fault.strerror}") from None
+        raise SpecError(f"{path}: {unreadable(path, fault)}") from None
 
 
 class Reader(importlib.abc.MetaPathFinder):

@@ -20,6 +20,7 @@ from netspec.export.engines.choice import TORCH, Choice
 from netspec.export.engines.model import Model, Origin
 from netspec.export.engines.runners import Unable, warn_unable
 from netspec.files.image_list import ImageList
+from netspec.files.kinds import unreadable
 from netspec.files.opencv import cv2
 from netspec.graph.filter import filter_net, is_input, prune, shapes_of_input, with_state
 from netspec.graph.options import BuildOptions
@@ -239,7 +240,7 @@ def read_pixels(path: Path, channels: int) -> np.ndarray:
     try:
         return decode_pixels(path.read_bytes(), channels == 3)
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror}", Where(str(path))) from None
+        raise SpecError(unreadable(path, fault), Where(str(path))) from None
     except ValueError as fault:
         raise SpecError(str(fault), Where(str(path))) from None
 

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from netspec.errors import SpecError, Where
+from netspec.files.kinds import unreadable
 from netspec.files.whole_file import write_whole
 
 
@@ -64,6 +65,6 @@ def read_scores(path: str | Path) -> Scores:
         tests = [Score(test["iteration"], test["net"], test["outputs"]) for test in entries["tests"]]
         return Scores(tests, [Snapshot(entry["iteration"], entry["path"]) for entry in entries["snapshots"]])
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror}", where) from None
+        raise SpecError(unreadable(path, fault), where) from None
     except (ValueError, KeyError, TypeError) as fault:
         raise SpecError(f"this is not a scores file (of netspec train --scores): {fault}", where) from None

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from netspec.errors import SpecError, Where
+from netspec.files.kinds import unreadable
 from netspec.log import number
 
 _POINTS_OF_WINDOW = 25  # a curve is smoothed over this part of its points
@@ -248,7 +249,7 @@ def read_log(path: str | Path, name: str = "") -> TrainingLog:
             for line in file:
                 reader.feed(line)
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror}", Where(str(path))) from None
+        raise SpecError(unreadable(path, fault), Where(str(path))) from None
     if not any(len(curve) for curve in reader.log.curves()):
         advice = "expected what `netspec train` or `caffe train` writes to stderr (2> train.log), with display above 0"
         raise SpecError(f"holds no iteration of a training; {advice}", Where(str(path)))

@@ -195,8 +195,6 @@ def test_loops_that_are_not_there_are_named_as_far_as_they_are(tmp_path: Path, m
     expected = "out/lops.csv: no such file; expected the loops.csv that loopclosure detect writes"
     with pytest.raises(InputError) as fault:
         read_loops(Path("out/lops.csv"), ["a.png"])
-    assert (
-        str(fault.value) == f"{expected}; there is no lops.csv in {tmp_path}/out; the working directory is {tmp_path}"
-    )
-    with pytest.raises(InputError, match=f"; there is no gone in {tmp_path}$"):
+    assert str(fault.value) == f"{expected}; relative paths start from {tmp_path}"
+    with pytest.raises(InputError, match=f'; "{tmp_path}" has no "gone"$'):
         read_loops(tmp_path / "gone" / "loops.csv", ["a.png"])

@@ -276,7 +276,7 @@ def test_a_database_that_is_missing_empty_or_of_another_shape(run: Run, edited: 
         return run("train", edited(SOLVER, NET, "net.prototxt"), "--weights", INIT).fault
 
     place = 'net.prototxt:9:16: layer "pair_data" (Data): database '
-    assert fault("nowhere") == f'{place}"nowhere" does not exist (relative paths start from {os.getcwd()})'
+    assert fault("nowhere") == f'{place}"nowhere" does not exist; relative paths start from {os.getcwd()}'
     assert fault("empty_lmdb") == f'{place}"empty_lmdb" is empty: it contains no records'
     assert fault("hollow_lmdb").startswith(f'{place}"hollow_lmdb" is a folder without data.mdb')
     assert fault(f"{GOLDEN}/images/lmdb_gray").startswith(
@@ -295,7 +295,7 @@ def test_a_solver_that_names_no_net(run: Run, edited: Edit) -> None:
         "edited.prototxt: the solver has no net to train, expected exactly one"
     )
     assert run("train", edited(SOLVER, NET, "nowhere.prototxt")).fault == (
-        'edited.prototxt:1:1: net "nowhere.prototxt" is not a file; paths are relative to the working directory'
+        'edited.prototxt:1:1: net "nowhere.prototxt" is not a file; relative paths start from ' + os.getcwd()
     )
 
 
