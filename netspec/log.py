@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 from typing_extensions import override
@@ -61,6 +61,28 @@ def silent() -> Iterator[None]:
         yield
     finally:
         logger.disabled = before
+
+
+@contextmanager
+def held_back() -> Iterator[list[logging.LogRecord]]:
+    """Log nothing within the block, and yield the list of what :func:`write` then logs."""
+    records: list[logging.LogRecord] = []
+
+    def hold(record: logging.LogRecord) -> bool:
+        records.append(record)
+        return False
+
+    logger.filters.insert(0, hold)  # before _OneLine, which a record passes once
+    try:
+        yield records
+    finally:
+        logger.removeFilter(hold)
+
+
+def write(records: Iterable[logging.LogRecord]) -> None:
+    """Log records that were held back."""
+    for record in records:
+        logger.handle(record)
 
 
 class GlogFormatter(logging.Formatter):

@@ -75,11 +75,12 @@ def nearest_existing(path: str | os.PathLike[str]) -> str:
     while not os.path.exists(missing.parent):
         missing = missing.parent
     try:
-        close = difflib.get_close_matches(missing.name, os.listdir(missing.parent), n=1)
+        stems = {Path(name).stem: name for name in os.listdir(missing.parent)}  # a common suffix is no likeness
     except OSError:  # it is no folder, or not to be listed
-        close = []
+        stems = {}
+    close = difflib.get_close_matches(missing.stem, stems, n=1)
     found = f'; "{missing.parent}" has no "{missing.name}"' if missing != Path(path) else ""
-    found += f'; did you mean "{missing.parent / close[0]}"?' if close else ""
+    found += f'; did you mean "{missing.parent / stems[close[0]]}"?' if close else ""
     return found if Path(path).is_absolute() else f"{found}; relative paths start from {os.getcwd()}"
 
 

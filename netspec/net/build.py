@@ -9,6 +9,7 @@ Caffe: Net::Init (src/caffe/net.cpp)
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from netspec.graph.options import BuildOptions
 from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits, without_splits
 from netspec.layers import class_of, layer_class
-from netspec.layers.contract.reading import channels_read, reads_data, takes_shapes
+from netspec.layers.contract.reading import channels_read, reads_data, source_of, takes_shapes
 from netspec.net.net import Net
 from netspec.net.weights import copy_weights, load_weights
 from netspec.process.garbage import no_collection
@@ -65,6 +66,21 @@ def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOpti
     if written.layer:  # weights in the prototxt itself
         copy_weights(built, written, source.file)
     return built
+
+
+def check_sources(net: NetParameter, source: SourceMap, options: BuildOptions) -> None:
+    """Raise SpecError for the first data layer of a net's ``state`` that reads from a path where nothing is.
+
+    Building the net would raise the same, but perhaps after a long log.
+    """
+    with log.silent():
+        net, source = filter_net(net, source)
+        for i, layer in enumerate(net.layer):
+            path = source_of(layer, class_of(layer))
+            if path and not os.path.exists(path):  # the layer itself knows what to say of it
+                build_filtered(
+                    NetParameter(layer=[layer], state=net.state), source.with_layers([source.layers[i]]), options
+                )
 
 
 def not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:

@@ -24,9 +24,8 @@ from netspec.proto.source_map import Place
 from netspec.solver import update
 from netspec.solver.extra import read_extra
 from netspec.solver.lr_policy import learning_rate, next_step
-from netspec.solver.options import TrainingOptions, choose_device
+from netspec.solver.options import TrainingOptions
 from netspec.solver.precision import FP16
-from netspec.solver.processes import own_device
 from netspec.solver.resuming import Snapshots
 from netspec.solver.testing import Display, Tests
 from netspec.solver.training import Blobs, Training
@@ -50,16 +49,9 @@ def make_solver(
     if weights is not None:
         param.ClearField("weights")
         param.weights.extend(map(str, several(weights)))
-    devices = options.devices or [choose_device(param, node)]
-    if not options.devices and options.processes.count > 1 and devices[0].type == "cuda":
-        devices = [own_device()]
-    if devices[0].type == "cpu":
-        log.info("caffe.cpp:197", "Use CPU.")
-    else:
-        log.info("caffe.cpp:204", "Using GPUs " + ", ".join(str(d.index or 0) for d in devices))
     extra = None if snapshot is None else read_extra(snapshot)
     build = options.build if extra is None else replace(options.build, seed=extra.seed)
-    solver = Solver(param, node, replace(options, build=build, devices=devices))
+    solver = Solver(param, node, replace(options, build=build))
     if snapshot is not None:
         log.info("caffe.cpp:235", f"Resuming from {snapshot}")
         solver.restore(snapshot)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
@@ -17,7 +17,7 @@ import torch
 from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.layers.contract.reading import Scores
-from netspec.net.build import build_net
+from netspec.net.build import build_net, check_sources
 from netspec.net.net import Net
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_large
 from netspec.proto.binary import check_readable, split_paths
@@ -38,6 +38,7 @@ from netspec.solver.debug import debug_info
 from netspec.solver.lr_policy import RATES_OF_FORKS
 from netspec.solver.options import TrainingOptions, choose_device
 from netspec.solver.precision import BF16, FP16, FP32, LossScale, computing, has_bfloat16
+from netspec.solver.processes import own_device
 from netspec.solver.replicas import Replicas
 
 Blobs = dict[str, torch.Tensor]  # the outputs of a run, by name
@@ -88,20 +89,25 @@ class Training:
     def __init__(self, param: Any, node: Place | None = None, options: TrainingOptions | None = None) -> None:
         """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError."""
         self.param, self.node, self.options = param, node or Place(Where("<solver>")), options or TrainingOptions()
-        log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
         check_settings(param, self.node)
-        options = self.options
         if param.snapshot:
             self.check_prefix()
         check_readable(self._weights())
-        self.device = options.devices[0] if options.devices else choose_device(param, self.node)
+        with log.held_back() as lines:  # what is missing is said before Caffe's log, which is long
+            described = nets.solver_nets(param, self.node)
+            for part in described if self.options.processes.is_root else described[:1]:
+                check_sources(part.net, part.source, self.options.build)
+        self.options = replace(self.options, devices=self._chosen_devices())
+        self.device = self.options.devices[0]
+        log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
+        log.write(lines)
         self.seed = self._chosen_seed()
         rule = update.find_rule(param.type)
         assert rule is not None, "check_settings refuses unknown types"
         self.rule = rule
         self.scores: list[Outputs] = []
         self.losses: deque[float] = deque(maxlen=param.average_loss)
-        self._build_nets()
+        self._build_nets(*described)
         self._check_size()
         self._warn_of_settings()
         self.blocks = Blocks(self.net.learnable, self.rule.sets)
@@ -132,13 +138,23 @@ class Training:
         """The training loss, a mean over the last ``average_loss`` iterations of this call of :meth:`step`."""
         return sum(self.losses) / len(self.losses) if self.losses else 0.0
 
+    def _chosen_devices(self) -> Sequence[torch.device]:
+        """Return the devices to train on, and log them as Caffe's tool does."""
+        devices = self.options.devices or [choose_device(self.param, self.node)]
+        if not self.options.devices and self.options.processes.count > 1 and devices[0].type == "cuda":
+            devices = [own_device()]
+        if devices[0].type == "cpu":
+            log.info("caffe.cpp:197", "Use CPU.")
+        else:
+            log.info("caffe.cpp:204", "Using GPUs " + ", ".join(str(d.index or 0) for d in devices))
+        return devices
+
     def _chosen_seed(self) -> int:
         given = self.options.processes.seed if self.options.build.seed is None else self.options.build.seed
         drawn = int.from_bytes(os.urandom(4), "little") if given is None else given
         return self.param.random_seed if self.param.random_seed >= 0 else drawn
 
-    def _build_nets(self) -> None:
-        train, *tests = nets.solver_nets(self.param, self.node)
+    def _build_nets(self, train: nets.SolverNet, *tests: nets.SolverNet) -> None:
         site, sentence = _CREATING[train.origin.split()[0]]
         log.info(site, sentence.format(train.origin))
         processes, others = self.options.processes, self.options.devices[1:]

@@ -10,6 +10,7 @@ import torch
 
 from netspec.errors import SpecError
 from netspec.layers.contract.base import Layer
+from netspec.proto.schema import value
 
 State = dict[str, int | str | tuple[torch.Tensor, ...]]
 
@@ -92,6 +93,12 @@ class Scores(Protocol):
 def reads_data(layer: Layer | type[Layer]) -> bool:
     """Return whether a layer's tops are records. They are inputs of an exported net."""
     return getattr(layer, "reads_data", False)
+
+
+def source_of(param: Any, layer: type[Layer] | None) -> str:
+    """Return the path that a LayerParameter names for its records, "" where it names none."""
+    group = getattr(layer, "group", "")
+    return getattr(value(param, group), "source", "") if layer and group and reads_data(layer) else ""
 
 
 def takes_shapes(layer: type[Layer]) -> bool:

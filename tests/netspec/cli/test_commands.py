@@ -286,6 +286,34 @@ def test_a_database_that_is_missing_empty_or_of_another_shape(run: Run, edited: 
     assert "cannot share param " in fault("colour_lmdb")
 
 
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        ('"Data" data_param { backend: LMDB', 'database "gone" does not exist'),
+        ('"ImageData" image_data_param {', 'list file "gone" cannot be read: No such file or directory'),
+        ('"HDF5Data" hdf5_data_param {', 'list file "gone" cannot be read: No such file or directory'),
+    ],
+    ids=["database", "images", "hdf5"],
+)
+def test_a_source_that_is_missing_is_said_before_the_log(run: Run, kind: str, says: str) -> None:
+    """Even if it is the last one, of the net that tests."""
+    Path("net.prototxt").write_text(
+        'layer { name: "a" type: "DummyData" top: "a" dummy_data_param { shape { dim: 1 dim: 2 } } }\n'
+        f'layer {{ name: "b" top: "b" top: "label" type: {kind} source: "gone" batch_size: 1 }} '
+        "include { phase: TEST } }\n"
+        'layer { name: "ip" type: "InnerProduct" bottom: "a" top: "ip" inner_product_param { num_output: 1 } }\n'
+        'layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "ip" include { phase: TRAIN } }\n'
+    )
+    Path("solver.prototxt").write_text(
+        'net: "net.prototxt" base_lr: 0.1 lr_policy: "fixed" max_iter: 1 test_iter: 1 test_interval: 1 '
+        'snapshot_prefix: "p" solver_mode: CPU'
+    )
+    line = run("train", "solver.prototxt").err.rstrip("\n")
+    assert line.startswith("net.prototxt:2:")
+    assert line.endswith(f"{says}; relative paths start from {Path.cwd()}")
+    assert "\n" not in line
+
+
 def test_a_solver_that_names_no_net(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, f'net: "{NET}"', "")
     assert run("train", solver).fault.startswith(

@@ -17,6 +17,7 @@ from netspec.proto.text import read_net, read_solver
         ("nest/solver_1.prototxt", '; "." has no "nest"; did you mean "nets"?'),
         ("nets/deep/er/solver.prototxt", '; "nets" has no "deep"'),
         ("other.caffemodel", ""),
+        ("nets/gone.prototxt", ""),
     ],
 )
 def test_how_far_the_path_exists(read, path: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
