@@ -135,10 +135,7 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
             sequence(source, a.out, layout),
             chosen,
             exclusion,
-            max_distance_m=a.max_distance,
-            max_angle_deg=a.max_angle,
-            soft_distance_m=a.soft_distance,
-            soft_angle_deg=a.soft_angle,
+            limits=datasets.PoseLimits(a.max_distance, a.max_angle, a.soft_distance, a.soft_angle),
             references=sequence(Source(kind, Path(references)), a.out, layout) if references else None,
             view_overlap=ViewOverlap(a.fov, ViewOverlap().least if a.overlap is None else a.overlap),
         )
@@ -147,8 +144,8 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
         if camera not in CAMERAS:
             raise InputError(f'{source}: camera is "{camera}", expected {", ".join(CAMERAS)}')
         exclusion = exclusion or datasets.FABMAP_EXCLUSION
-        joined, coordinates = Path(a.out) / "joined", source.get("coordinates", str)
-        return datasets.load_fabmap(source.path, truth, coordinates, camera, chosen, exclusion, joined)
+        files = datasets.FabmapFiles(truth, source.get("coordinates", str))
+        return datasets.load_fabmap(source.path, files, camera, chosen, exclusion, Path(a.out) / "joined")
     if kind == "images":
         if truth is None:
             raise WrongUsage(f"images:{source} needs ,truth=MASK, which says what shows the same place, or ,poses=FILE")

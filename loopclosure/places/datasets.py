@@ -77,41 +77,64 @@ class DataSet:
         return replace(self.truth, soft=self.truth.soft | self.overlap, description=description)
 
 
+@dataclass(frozen=True)
+class PoseLimits:
+    """How far from each other, in meters and degrees, two poses of one place may be.
+
+    A distance or angle that is None is the paper's. The ``soft`` ones are wider limits: a match within them is not a
+    mistake. If both are None there is no soft truth; if one is, it is as wide as the hard one.
+    """
+
+    distance_m: float | None = None
+    angle_deg: float | None = None
+    soft_distance_m: float | None = None
+    soft_angle_deg: float | None = None
+
+    @property
+    def hard(self) -> tuple[float, float]:
+        """The limits, in meters and degrees."""
+        return _given(self.distance_m, MAX_DISTANCE_M), _given(self.angle_deg, MAX_ANGLE_DEG)
+
+    @property
+    def soft(self) -> tuple[float, float] | None:
+        """The limits of soft truth, None if there is none. Raises InputError if they are narrower than hard ones."""
+        if self.soft_distance_m is None and self.soft_angle_deg is None:
+            return None
+        wide_m, wide_deg = _given(self.soft_distance_m, self.hard[0]), _given(self.soft_angle_deg, self.hard[1])
+        if wide_m < self.hard[0] or wide_deg < self.hard[1]:
+            raise InputError(f"soft truth ({wide_m:g} m, {wide_deg:g} degrees) is narrower than hard truth ({self})")
+        return wide_m, wide_deg
+
+    def __str__(self) -> str:
+        return "same place: nearer than {:g} m and turned less than {:g} degrees".format(*self.hard)
+
+
 def load_sequence(
     sequence: ImageSequence,
     selection: Selection = ALL_FRAMES,
     exclusion: Exclusion | None = None,
     *,
-    max_distance_m: float | None = None,
-    max_angle_deg: float | None = None,
-    soft_distance_m: float | None = None,
-    soft_angle_deg: float | None = None,
+    limits: PoseLimits = PoseLimits(),
     references: ImageSequence | None = None,
     view_overlap: ViewOverlap | None = None,
 ) -> DataSet:
-    """Make a data set of a sequence with poses; truth by the paper's rule, soft truth by wider limits, if given.
+    """Make a data set of a sequence with poses; truth by the paper's rule.
 
     ``selection`` counts all frames; then frames without a pose are left out. The default ``exclusion`` is pairs of
     frames within 10 s, or within 10 frames if there are no stamps.
 
+    limits        how near frames of one place are
     references    another sequence, with poses in the same frame of reference: each query against all its frames;
                   ``selection`` applies to the queries only, and no pair is excluded
     view_overlap  the rule for overlapping views, for the soft zone
     """
-    hard_m, hard_deg = _given(max_distance_m, MAX_DISTANCE_M), _given(max_angle_deg, MAX_ANGLE_DEG)
-    rule = f"same place: nearer than {hard_m:g} m and turned less than {hard_deg:g} degrees"
-    wide = None
-    if soft_distance_m is not None or soft_angle_deg is not None:
-        wide_m, wide_deg = _given(soft_distance_m, hard_m), _given(soft_angle_deg, hard_deg)
-        if wide_m < hard_m or wide_deg < hard_deg:
-            raise InputError(f"soft truth ({wide_m:g} m, {wide_deg:g} degrees) is narrower than hard truth ({rule})")
-        wide = (wide_m, wide_deg)
-        rule += f" (soft: {wide_m:g} m, {wide_deg:g} degrees)"
+    wide = limits.soft
+    rule = f"{limits}" if wide is None else f"{limits} (soft: {wide[0]:g} m, {wide[1]:g} degrees)"
     taken = sequence.taken(selection)
     queries = taken.with_poses().with_files()
     others = queries if references is None else references.with_poses().with_files()
     poses, stamps = queries.known_poses(), queries.stamps
-    hard = same_place_matrix(poses, others.known_poses(), hard_m, hard_deg)
+    hard = same_place_matrix(poses, others.known_poses(), *limits.hard)
     soft = None if wide is None else same_place_matrix(poses, others.known_poses(), *wide)
     overlap_rule = (view_overlap or ViewOverlap()).of_camera(sequence.camera)
     height, width = read_bgr(queries.paths[0]).shape[:2]
@@ -151,10 +174,17 @@ def _pose_notes(sequence: ImageSequence) -> list[str]:
     return [*([f"frames without a pose, left out: {without}"] if without else []), *sequence.doubts]
 
 
+@dataclass(frozen=True)
+class FabmapFiles:
+    """The mask of loops and the coordinates of a set in FAB-MAP's form; None is a file of its folder."""
+
+    truth: str | Path | None = None
+    coordinates: str | Path | None = None
+
+
 def load_fabmap(
     folder: str | Path,
-    truth_file: str | Path | None = None,
-    coordinates_file: str | Path | None = None,
+    files: FabmapFiles = FabmapFiles(),
     camera: str = "both",
     selection: Selection = ALL_FRAMES,
     exclusion: Exclusion = FABMAP_EXCLUSION,
@@ -163,14 +193,14 @@ def load_fabmap(
     """Load a set in the format of FAB-MAP's New College and City Centre: numbered images of two cameras.
 
     Image 0001 is the left one of the first place, 0002 the right one, and so on. The mask (``*GroundTruth.mat``) and
-    the coordinates (``*Coordinates.mat`` or ``.txt``) are searched in the folder if they are not given.
+    the coordinates (``*Coordinates.mat`` or ``.txt``) are searched for in the folder unless ``files`` names them.
 
     camera     which images are used: see loopclosure.places.masks; "joined" images are written to ``joined_folder``
     selection  counts images of one camera, or joined images, or with "both" single images
     """
     folder = Path(folder)
     images = image_paths(folder)
-    truth_path = Path(truth_file) if truth_file else _only_file(folder, ("*GroundTruth.mat",), "the mask of loops")
+    truth_path = Path(files.truth) if files.truth else _only_file(folder, ("*GroundTruth.mat",), "the mask of loops")
     assert truth_path is not None
     hard, soft, notes = _fold(truth_path, *read_truth_matrix(truth_path))
     places = images_of_places(camera, len(images))
@@ -186,7 +216,9 @@ def load_fabmap(
         paths = join_images([(images[a], images[b]) for a, b in places], Path(joined_folder))
     else:
         paths = [images[place[0]] for place in places]
-    queries = replace(ImageSequence.of_files(paths), poses=_fabmap_poses(folder, coordinates_file, len(images), places))
+    queries = replace(
+        ImageSequence.of_files(paths), poses=_fabmap_poses(folder, files.coordinates, len(images), places)
+    )
     rule = f"same place: as {truth_path.name} says"
     truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=judged)
     views = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")

@@ -127,7 +127,7 @@ def test_odometry_from_a_file(walk: Path, tmp_path: Path, capsys: pytest.Capture
 @pytest.mark.parametrize(
     ("line", "status", "words"),
     [
-        ("--drift 2 --loops NONE", 1, "cannot be read; expected the loops.csv"),
+        ("--drift 2 --loops NONE", 1, "no such file; expected the loops.csv"),
         ("--drift 2 --loops WALK/rgb.txt", 1, "is no table of loops"),
         ("--drift 2 --loops FAR", 1, 'far.csv:2:1: no frame has the number "900"; there are 90'),
         ("--drift 2 --loops NAMED", 1, 'named.csv:2:1: no image of the sequence has the name "x.jpg"'),

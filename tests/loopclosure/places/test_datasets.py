@@ -9,7 +9,15 @@ import scipy.io
 from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
-from loopclosure.places.datasets import load_fabmap, load_folder, load_place_pairs, load_sequence, load_traverses
+from loopclosure.places.datasets import (
+    FabmapFiles,
+    PoseLimits,
+    load_fabmap,
+    load_folder,
+    load_place_pairs,
+    load_sequence,
+    load_traverses,
+)
 from loopclosure.places.frames import Selection
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.truth import Exclusion
@@ -53,13 +61,13 @@ def test_tum_truth_is_the_papers_rule(tum_folder):
 
 
 def test_tum_soft_truth_and_selection(tum_folder):
-    data = load_sequence(read_sequence(tum_folder, "tum"), Selection(stride=2), soft_angle_deg=25)
+    data = load_sequence(read_sequence(tum_folder, "tum"), Selection(stride=2), limits=PoseLimits(soft_angle_deg=25))
     assert len(data.queries.paths) == 36
     only_soft = {(int(i), int(j)) for i, j in np.argwhere(data.truth.soft & ~data.truth.hard & data.truth.judged)}
     assert only_soft == {(i, j) for i in range(36) for j in range(36) if i - j in (17, 19, 35)}
     assert "every 2nd" in data.name
     with pytest.raises(InputError, match="narrower than hard truth"):
-        load_sequence(read_sequence(tum_folder, "tum"), soft_angle_deg=5)
+        load_sequence(read_sequence(tum_folder, "tum"), limits=PoseLimits(soft_angle_deg=5))
 
 
 def test_tum_without_a_revisit_is_refused(tum_folder):
@@ -97,8 +105,8 @@ def test_fabmap_cameras(fabmap_folder, tmp_path, camera, frames, loops):
     assert [path.stem for path in data.queries.paths] == frames
     assert {(int(i), int(j)) for i, j in np.argwhere(data.truth.hard & data.truth.judged)} == loops
     assert data.positions is not None
-    assert data.positions.shape == (len(frames), 2)
-    np.testing.assert_allclose(data.positions[-1], [5.0, 15.5])
+    assert data.positions.shape == (len(frames), 3)
+    np.testing.assert_allclose(data.positions[-1], [5.0, 15.5, np.nan])  # the set says no height
     if camera == "joined":
         joined = cv2.imread(str(data.queries.paths[0]))
         assert joined is not None
@@ -121,7 +129,9 @@ def test_fabmap_mask_of_places_for_images_of_both_cameras(fabmap_folder):
     truth = np.zeros((6, 6), np.uint8)
     truth[5, 2] = 1
     np.save(fabmap_folder / "six.npy", truth)
-    data = load_fabmap(fabmap_folder, fabmap_folder / "six.npy", camera="right", exclusion=Exclusion(frames=1))
+    data = load_fabmap(
+        fabmap_folder, FabmapFiles(fabmap_folder / "six.npy"), camera="right", exclusion=Exclusion(frames=1)
+    )
     assert data.truth.hard[5, 2]
     assert data.queries.paths[5].stem == "0012"
 
@@ -134,7 +144,7 @@ def test_fabmap_faults(fabmap_folder, tmp_path):
         load_fabmap(fabmap_folder, camera="joined")
     np.save(tmp_path / "big.npy", np.eye(24, k=-20, dtype=np.uint8))
     with pytest.raises(InputError, match="24 x 24, but there are 12 images; does the folder have only one camera's"):
-        load_fabmap(fabmap_folder, tmp_path / "big.npy")
+        load_fabmap(fabmap_folder, FabmapFiles(tmp_path / "big.npy"))
     (fabmap_folder / "ImageCollectionCoordinates.txt").write_text("1 2\n3 4\n")
     with pytest.raises(InputError, match="has 2 rows, but there are 12 images"):
         load_fabmap(fabmap_folder, camera="left", exclusion=Exclusion(frames=1))
