@@ -1,6 +1,6 @@
-"""What all tests share: a process that each leaves as it found it, and one thread, so that parallel runs stay quick.
+"""Settings of all tests: each must leave the process unchanged, and torch uses one thread, for fast parallel runs.
 
-torch is imported where tests run only: the process that hands them out to others needs none.
+torch is imported only in processes that run tests, not in the one that distributes them.
 """
 
 import logging
@@ -14,7 +14,15 @@ import pytest
 
 from fresh_dialects import fresh_dialects
 
-LIBRARIES = ("PYTEST", "TORCH", "_TORCH", "TRITON", "KMP", "OPENCV", "QT")  # set variables of theirs once they are used
+LIBRARIES = (
+    "PYTEST",
+    "TORCH",
+    "_TORCH",
+    "TRITON",
+    "KMP",
+    "OPENCV",
+    "QT",
+)  # libraries that set variables when they are used
 LOGGERS = [logging.getLogger(name) for name in ("", "netspec", "loopclosure", "lmdb_build")]
 SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)]  # Windows has no SIGHUP
 
@@ -22,13 +30,13 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGIN
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests of pages, site, wheel and examples take the longest and come first.
 
-    In a parallel run, what one process takes from another's end is then short, and none builds the site once more.
+    In a parallel run, the last tests are then short, and the site is built only once.
     """
     items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
 
 
 def pytest_collection_finish() -> None:
-    """Set up the process of the tests, where there are any: in a parallel run not that which hands them out."""
+    """Set up a process that runs tests; in a parallel run, not the one that distributes them."""
     import torch
 
     import fake_gpu  # noqa: F401  autograd counts the devices at its first backward pass
@@ -41,7 +49,7 @@ def pytest_collection_finish() -> None:
 
 
 def settings() -> dict[str, Any]:
-    """Return what is one for the whole process: what a test leaves behind there, another one stumbles over."""
+    """Return the settings of the process that tests must not change, because other tests depend on them."""
     import torch
 
     return {

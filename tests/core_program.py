@@ -1,7 +1,7 @@
-"""``python core_program.py COUNT``: what netspec computes, a hash for each net; tests/laws/test_wings.py compares them.
+"""``python core_program.py COUNT`` prints a hash of the results of each net; tests/laws/test_wings.py compares them.
 
-Goldens of layers, forward and backward; trainings of goldens; COUNT random nets, in phase TEST and trained, and by
-pycaffe where that is there. Nothing else that it imports needs a wing.
+The nets are golden cases of layers, forward and backward; golden trainings; and COUNT random nets, in phase TEST and in
+training, and with pycaffe if it is there. Nothing else that it imports needs a wing.
 """
 
 import hashlib

@@ -1,6 +1,6 @@
-"""Layers of dialects, inputs, and the numbers that they make: what plain loops over boxes, pixels and paths found.
+"""Layers of dialects with inputs, and the expected results, which were computed by plain loops over boxes and pixels.
 
-The loops stood in the tests until they had agreed. What the forks themselves computed is in test_forks_golden.py.
+Results of the forks themselves are in test_forks_golden.py.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,7 +34,7 @@ IN_CELLS = [  # of two images: class, x, y, width, height
 
 
 def priors(count: int, largest: float) -> np.ndarray:
-    """Boxes, some of which lie partly outside, and variances: (1, 2, 4 count)."""
+    """Boxes, some of them partly outside, and variances: (1, 2, 4 count)."""
     rng = np.random.default_rng(3)
     center, half = rng.uniform(0.1, 0.9, (count, 2)), rng.uniform(0.05, largest, (count, 2))
     boxes = np.concatenate([center - half, center + half], axis=1)

@@ -1,4 +1,4 @@
-"""One program for cv2.dnn of OpenCV 4 and for netspec.dnn: what it does with the nets in tests/golden/dnn.
+"""A program that runs the nets in tests/golden/dnn with cv2.dnn of OpenCV 4 or with netspec.dnn.
 
 tests/golden/dnn/make.py records what OpenCV 4.12 gives; tests/netspec/compat/dnn/test_golden.py compares.
 """
@@ -72,7 +72,7 @@ def _outputs(dnn: Any, name: str, shapes: list[list[int]], each_layer: bool) -> 
     inputs = [np.random.RandomState(len(shape) + k).rand(*shape).astype(np.float32) for k, shape in enumerate(shapes)]
 
     def fresh(fusion: bool = True) -> Any:
-        """Read the net anew for each pass: OpenCV's are wrong where an earlier one asked for other layers."""
+        """Read the net again for each pass. OpenCV's results are wrong after a pass for other layers."""
         net = _read(dnn, name)
         net.enableFusion(fusion)  # with fusion OpenCV gives the wrong blob for a BatchNorm inside the net
         blobs = [blob for blob in ("data", "a", "b") if net.getLayer(0).outputNameToIndex(blob) != -1]

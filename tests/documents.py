@@ -1,4 +1,4 @@
-"""The Markdown files: their blocks, the commands in them as a shell reads them, and how both run."""
+"""Reads the fenced blocks of Markdown files, and runs them and the commands in them."""
 
 import re
 import subprocess
@@ -36,7 +36,7 @@ record() { printf '%s\\0' $(($# + 1)) "$PWD" "$@" >&3; }
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block: where it begins, its language, its text; by the line before: its file, that it is not run."""
+    """A fenced block: its line, its language, its text. The line before may name its file or exclude it."""
 
     where: str
     language: str
@@ -47,7 +47,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Command:
-    """The words of a command, and the folder in which they are typed."""
+    """The words of a command, and the folder in which it runs."""
 
     words: tuple[str, ...]
     folder: Path
@@ -85,7 +85,7 @@ def commands(text: str, folder: Path) -> list[Command]:
 
 
 def run(command: Command, log: Path) -> int | None:
-    """Run a command of ours; return its exit status, None if it does not end. What it says goes to ``log``."""
+    """Run a command of ours; return its exit status, None if it does not end. Its output goes to ``log``."""
     main = PROGRAMS[command.words[0]]
     return forked.wait(forked.start(forked.main, main, command.words, folder=command.folder, out=log))
 

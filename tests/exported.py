@@ -1,4 +1,4 @@
-"""How the tests run a net, here and exported, and compare."""
+"""Runs nets, here and exported, and compares the results."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def in_opencv(model: Any, inputs: Arrays) -> dict[str, np.ndarray]:
 
 
 def run_module(module: torch.nn.Module, net: Net, inputs: Arrays) -> dict[str, np.ndarray]:
-    """Return the outputs of a module that came of a net."""
+    """Return the outputs of a module that was made from a net."""
     with torch.no_grad():
         found = module(*(torch.from_numpy(inputs[name]) for name in net.inputs))
     found = found if isinstance(found, dict) else {net.outputs[0]: found}

@@ -1,4 +1,4 @@
-"""Programs in processes of their own that begin when torch and our modules are imported: most of a start's seconds."""
+"""Runs programs in processes in which torch and our modules are imported already. That saves most of the start."""
 
 import multiprocessing
 import os
@@ -28,7 +28,7 @@ def start(
 ) -> BaseProcess:
     """Start ``function(*arguments)``, one of the functions below, in a folder.
 
-    What it prints goes to the file ``out``; what it says on standard error too, or to ``err``.
+    Standard output goes to the file ``out``, and standard error too, or to ``err``.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)

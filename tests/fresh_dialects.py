@@ -1,4 +1,4 @@
-"""Dialects for one test: registry and schema are afterwards as they were before."""
+"""Dialects for one test. Afterwards the registry and the schema are restored."""
 
 import sys
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from netspec.proto.text import parse_net_text
 
 
 def keep_registry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let what is registered from now on be forgotten afterwards."""
+    """Restore the registry of layers after the test."""
     monkeypatch.setattr(registry, "_LAYERS", copy(registry._LAYERS))
     for name in ("_owners", "_replacing", "_everywhere"):
         monkeypatch.setattr(layers, name, copy(getattr(layers, name)))

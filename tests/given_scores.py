@@ -1,4 +1,4 @@
-"""A method whose answer is given."""
+"""A method that returns given scores."""
 
 from loopclosure.methods.base import MethodResult
 

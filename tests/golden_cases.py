@@ -1,4 +1,4 @@
-"""Golden cases, which real Caffe computed: how they are loaded, how exactly they are repeated, how far off others are.
+"""Golden cases, computed by real Caffe: functions that load them, repeat them, and measure differences.
 
 A folder may hold ``exact.txt``: the least build option ``exact`` with which a net repeats the case to the last bit, on
 a CPU of the kind that Caffe ran on. Without that file it is "all".
@@ -97,8 +97,8 @@ def assert_same_layers(found: Arrays, expected: Arrays, tolerance: float) -> Non
 def layer_distances(found: Arrays, expected: Arrays) -> dict[str, float]:
     """Return how far the parameters named ``.../layer/index`` are off, each layer's as a share of its norm.
 
-    A blob that Caffe left at zero is not compared: what cancels to zero there leaves rounding on other CPUs, and the
-    solvers that divide a gradient by its size make a step of it.
+    A blob that is zero in Caffe is not compared. Values that cancel to zero there leave rounding errors on other CPUs,
+    and solvers that divide a gradient by its size turn these into a step.
     """
     distances = {}
     for layer in {key.rpartition("/")[0] for key in found}:
@@ -111,7 +111,7 @@ def layer_distances(found: Arrays, expected: Arrays) -> dict[str, float]:
 
 
 class LayerCase:
-    """A net of one layer or a few: inputs, parameters and top gradients, and what Caffe made of them.
+    """A net of one layer or a few: inputs, parameters and gradients of tops, and Caffe's results.
 
     Keys of ``golden``: in/BLOB, param_init/LAYER/INDEX, topdiff/BLOB, and the results out/BLOB, indiff/BLOB,
     paramdiff/LAYER/INDEX, param_after/LAYER/INDEX.

@@ -1,4 +1,4 @@
-"""Gradients against differences."""
+"""Compares gradients with finite differences."""
 
 from collections.abc import Callable, Sequence
 
@@ -10,6 +10,6 @@ def check_gradients(
 ) -> None:
     """Compare the Jacobians of a function in double precision along random directions.
 
-    The tolerances find one element of 400 that is off by a thousandth; the usual ones would not, along directions.
+    The tolerances detect an error of a thousandth in one element of 400. The default ones would not, along directions.
     """
     assert torch.autograd.gradcheck(function, inputs, fast_mode=True, rtol=rtol, atol=1e-9)

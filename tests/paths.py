@@ -1,6 +1,6 @@
-"""Where things are: the project, its golden data, and the data that is not part of it.
+"""Paths: the project, its golden data, and the data that is not part of it.
 
-That last is ``../shared`` beside the project, or what NETSPEC_SHARED names.
+The latter is in ``../shared`` next to the project, or in the folder that NETSPEC_SHARED names.
 """
 
 import os
@@ -20,14 +20,14 @@ _ALIKE_IN_OURS = ("siamese_128", "siamese_resnet27_512")
 
 
 def nets_as_found() -> list[Path]:
-    """Return the prototxts of the project's nets, and of public ones where they are there: one of each kind."""
+    """Return the prototxts of the project's nets, and of public nets if they are there, one of each kind."""
     found = sorted(path for path in (ROOT / "prototxt").rglob("*.prototxt") if path.parent.name not in _ALIKE_IN_OURS)
     found += sorted(path for path in (SHARED / "corpus").rglob("*.prototxt") if path.stem not in _ALIKE)
     return [path for path in found if "solver" not in path.name]
 
 
 def last_parts(path: Path) -> str:
-    """Return the id of a test whose case is a file: the file's name and two folders."""
+    """Return the id of a test for a file: the name of the file and two folders."""
     return "/".join(path.parts[-3:])
 
 

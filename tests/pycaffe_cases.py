@@ -1,4 +1,4 @@
-"""Golden cases through caffe.Net: its passes are not netspec's own."""
+"""Runs golden cases with caffe.Net, which has its own passes."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from netspec.proto.schema import PHASES
 
 
 def compute(case: LayerCase) -> dict[str, np.ndarray]:
-    """Return what a script would find in the blobs, under Caffe's keys."""
+    """Return the contents of the blobs after the passes, under Caffe's keys."""
     golden, meta = case.golden, case.meta
     net = caffe.Net(str(case.folder / "net.prototxt"), PHASES[meta["phase"]])
     for key, array in golden.items():

@@ -87,7 +87,7 @@ class Learned(caffe.Layer):
 
 
 class Half(caffe.Layer):
-    """A top whose shape shows in forward only; a lazy import; the phase."""
+    """A top with a shape that is known only in forward; a lazy import; the phase."""
 
     def forward(self, bottom, top):
         import caffe
@@ -169,7 +169,7 @@ class Phase(caffe.Layer):
 
 
 class Rows(caffe.Layer):
-    """A data layer as Fast R-CNN has it: the script hands it its records."""
+    """A data layer as in Fast R-CNN, which gets its records from the script."""
 
     def setup(self, bottom, top):
         self.kept = top

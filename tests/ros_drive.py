@@ -1,4 +1,4 @@
-"""Plays a sequence to examples/ros_node.py as a robot would, and keeps what it says: SEQUENCE ODOMETRY.npy OUT.npz.
+"""Plays a sequence to examples/ros_node.py, like a robot, and saves its answers: SEQUENCE ODOMETRY.npy OUT.npz.
 
 Started by tests/test_ros_node.py with ROS's packages behind the others.
 """

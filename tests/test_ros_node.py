@@ -1,4 +1,4 @@
-"""examples/ros_node.py beside a real master: images and odometry in, loops and a better path out."""
+"""examples/ros_node.py with a real master: images and odometry in, loops and a better path out."""
 
 import os
 import shutil

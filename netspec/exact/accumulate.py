@@ -25,7 +25,7 @@ class ParameterSums(torch.autograd.Function):
     def keep(
         ctx: Any, bottom: torch.Tensor, parameters: Sequence[torch.Tensor | None], in_place: bool, *others: torch.Tensor
     ) -> None:
-        """Save the bottom, the parameters and others for backward, and whether it is to add ``in_place``."""
+        """Save the bottom, the parameters and others for backward, and whether it must add ``in_place``."""
         ctx.save_for_backward(bottom, *parameters, *others)
         ctx.adds = [in_place and isinstance(p, torch.nn.Parameter) and p.is_contiguous() for p in parameters]
 

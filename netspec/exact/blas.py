@@ -20,7 +20,7 @@ import torch
 
 from netspec.process.environment import environment
 
-with environment({"KMP_DUPLICATE_LIB_OK": "True"}):  # it sets that and leaves it set
+with environment({"KMP_DUPLICATE_LIB_OK": "True"}):  # importing it sets this variable permanently
     from threadpoolctl import ThreadpoolController
 
 CAFFES = "SkylakeX"  # OpenBLAS' name of its kernels for AVX-512, with which the golden files were computed
@@ -31,9 +31,10 @@ CORE_TYPE = "OPENBLAS_CORETYPE"  # the environment variable by which OpenBLAS ch
 def _library(name: str) -> Any:
     """Return SciPy's BLAS, ``_fblas`` for arrays or ``cython_blas`` for addresses, with Caffe's kernels, for AVX-512.
 
-    OpenBLAS chooses others on some newer CPUs. What the environment says stays; if SciPy's BLAS was loaded before, so
-    do its kernels. Only this module of ``scipy.linalg`` is loaded: all of it takes ten times as long. It does not
-    stay in ``sys.modules``: code that imports ``scipy.linalg`` later would not find it as an attribute.
+    OpenBLAS chooses others on some newer CPUs. A choice in the environment is kept, and so are the kernels of a BLAS of
+    SciPy that was loaded before. Only this module of ``scipy.linalg`` is loaded, because all of it takes ten times as
+    long. It is removed from ``sys.modules``; otherwise a later import of ``scipy.linalg`` would lack it as an
+    attribute.
     """
     name = f"scipy.linalg.{name}"
     if name in sys.modules:
@@ -126,7 +127,7 @@ _ARGUMENTS = {"gemm": 13, "gemv": 11}
 
 @cache
 def _function(name: str, dtype: torch.dtype) -> Callable[..., None]:
-    """Return a Fortran routine of SciPy's BLAS, whose arguments are addresses."""
+    """Return a Fortran routine of SciPy's BLAS. Its arguments are addresses."""
     capsule = _library("cython_blas").__pyx_capi__[("s" if dtype == torch.float32 else "d") + name]
     api = ctypes.pythonapi
     api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
@@ -141,14 +142,14 @@ def _count(*matrices: torch.Tensor) -> int:
 
 
 def _without_gaps(matrices: torch.Tensor) -> torch.Tensor:
-    """Return matrices, or a copy where their rows do not lie one after the other: in part of a blob, after a Slice."""
+    """Return matrices, or a copy if there are gaps between their rows, as in a part of a blob after a Slice."""
     rows, columns = matrices.shape[-2:]
     side_by_side = (matrices.stride(-1) == 1 or columns == 1) and (matrices.stride(-2) == columns or rows == 1)
     return matrices if side_by_side else matrices.contiguous()
 
 
 def _step(matrices: torch.Tensor) -> int:
-    """Return how many bytes lie between a matrix and the next; 0 for a single one. Refuse one with gaps."""
+    """Return the bytes from one matrix to the next; 0 for a single one. The rows must have no gaps."""
     rows, columns = matrices.shape[-2:]
     assert matrices.stride(-1) == 1 or columns == 1, "the numbers of a row lie side by side"
     assert matrices.stride(-2) == columns or rows == 1, "the rows of a matrix lie side by side"
@@ -196,7 +197,7 @@ def sum_in_order(values: torch.Tensor, axis: int = 0) -> torch.Tensor:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Within the block BLAS uses one thread: more threads would busy-wait, like torch's, and slow each other down."""
+    """A block in which BLAS uses one thread. More threads would busy-wait, like torch's, and slow each other down."""
     before = [(pool, count) for pool in _pools() if (count := pool.get_num_threads()) != 1]
     for pool, _ in before:
         pool.set_num_threads(1)
@@ -213,7 +214,7 @@ def kernels() -> set[str]:
 
 
 def other_kernels() -> str:
-    """Return what to say where BLAS does not have the kernels for AVX-512; "" where it does."""
+    """Return a note if BLAS does not use its kernels for AVX-512; "" if it does."""
     found = kernels() or {"another BLAS"}
     if CAFFES in found:
         return ""
@@ -225,7 +226,7 @@ def other_kernels() -> str:
 
 @cache
 def _pools() -> list[Any]:
-    """Return the OpenBLAS that SciPy brings, or every one there is where SciPy's has no place of its own."""
-    _library("_fblas")  # so that its OpenBLAS is there
+    """Return the OpenBLAS of SciPy, or every loaded one if SciPy's is not in a folder of its own."""
+    _library("_fblas")  # loads its OpenBLAS
     pools = ThreadpoolController().select(internal_api="openblas").lib_controllers
     return [pool for pool in pools if "scipy.libs" in pool.filepath] or pools

@@ -87,7 +87,7 @@ def _channel_sums(values: torch.Tensor, factor: float = 1.0) -> torch.Tensor:
 
 
 class Slopes(ParameterSums):
-    """Multiply what is negative by a slope, one for each channel or a single one.
+    """Multiply negative values by a slope, one for each channel or a single one.
 
     values   (outer, channels, inner)
     slopes   (channels,), or one number
@@ -184,7 +184,7 @@ class RowNormalization(torch.autograd.Function):
 
 @one_thread()
 def row_normalization_gradient(rows: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, eps: float) -> torch.Tensor:
-    """Return the gradient of RowNormalization, (M, K), from ``tops`` that may hold other values since."""
+    """Return the gradient of RowNormalization, (M, K), from ``tops`` that may be overwritten."""
     return _normalization_gradient(tops, _deviations(rows - _row_means(rows), eps), diff.contiguous())
 
 

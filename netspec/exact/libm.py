@@ -1,8 +1,8 @@
-"""Functions of the C library, which Caffe calls number by number.
+"""Functions of the C library, which Caffe calls for each number.
 
-The vector functions of torch and numpy round differently, here and there by a last bit. Where one of them calls the C
-library's own function, that is taken; it is as fast as a loop in C. Values that are not on the CPU get torch's
-functions.
+The vector functions of torch and numpy sometimes differ in the last bit. Functions of torch or numpy that call the C
+library's own function are used instead; they are as fast as a loop in C. For values that are not on the CPU, torch's
+functions are used.
 
 glibc 2.36, with which the golden files were computed, and 2.41 have the same expf, logf, powf and double tanh. Their
 tanhf differ in the last bit of many values: since 2.41 it is rounded correctly. It is computed here as before.

@@ -1,4 +1,4 @@
-"""What losses compute for each item, with Caffe's gradients. Their sums are in netspec/exact/sums.py."""
+"""The losses of single items, with Caffe's gradients. The sums of losses are in netspec/exact/sums.py."""
 
 # pyright: reportPrivateImportUsage=false
 
@@ -73,7 +73,7 @@ class Infogain(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None, None]:
-        """Return the scores' gradient, for losses that go into one sum; it takes no notice of ``least``."""
+        """Return the gradient of the scores, for losses that are summed up. It ignores ``least``."""
         p, gain = ctx.saved_tensors
         of_scores = p.movedim(1, 2) * sum_in_order(gain, 2).unsqueeze(2) - gain
         return (of_scores * diff).movedim(2, 1), None, None

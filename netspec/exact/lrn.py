@@ -64,7 +64,7 @@ class AcrossChannels(torch.autograd.Function):
 def across_channels_gradient(
     maps: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, settings: tuple[int, float, float, float]
 ) -> torch.Tensor:
-    """Return the gradient of AcrossChannels, (N, C, H, W), from ``tops`` that may hold other values since.
+    """Return the gradient of AcrossChannels, (N, C, H, W), from ``tops`` that may have been overwritten.
 
     ``settings`` are its size, alpha, beta and k.
     """
@@ -80,7 +80,7 @@ def _framed(maps: torch.Tensor, size: int) -> torch.Tensor:
 
 
 def _forward_sums(squares: torch.Tensor, size: int, factor: float, start: float) -> torch.Tensor:
-    """Return start + factor * the sums of each window of channels: the first in full, then one added, one taken off."""
+    """Return start + factor * sum for each window of channels. After the first, one is added and one subtracted."""
     framed = _framed(squares, size)
     sums = torch.empty_like(squares)
     running = torch.full_like(squares[:, 0], start)
@@ -95,7 +95,7 @@ def _forward_sums(squares: torch.Tensor, size: int, factor: float, start: float)
 
 
 def _backward_sums(ratios: torch.Tensor, size: int) -> torch.Tensor:
-    """Return the sums of each window of channels: always one added, and taken off again once it has passed."""
+    """Return the sum of each window of channels: one is added in each step, and subtracted after its last window."""
     framed = _framed(ratios, size)
     sums = torch.empty_like(ratios)
     running = torch.zeros_like(ratios[:, 0])

@@ -1,8 +1,8 @@
-"""Sums over the classes of many small images, all at once, in the order in which BLAS adds up those of one.
+"""Sums over the classes of many small images at once, in the order in which BLAS sums up each image.
 
-Caffe calls BLAS image by image, which for a few classes takes longer than their sums. Which order its kernels take
-depends on the CPU and on the shape, so it is found by trying: an order is used where it gave the bits of the calls
-themselves for thousands of random images.
+Caffe calls BLAS for each image. For a few classes, the calls take longer than the sums. The order of the sums depends
+on the CPU and on the shape, so it is found by experiment: an order is used if it gave the same bits as the calls for
+thousands of random images.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from netspec.exact.blas import gemv_routine, one_thread
 
 _FEW = 4  # images: for fewer, calls are as fast
 _LARGEST = 64  # numbers of an image: for more, calls are as fast
-_FIRST, _ALL = 64, 2048  # random images with which an order is looked for, and proven
+_FIRST, _ALL = 64, 2048  # random images to search for an order, and to verify it
 
 
 class _Order(NamedTuple):
-    """Classes are added up in blocks of so many, then the blocks; the rest is a ``block`` too, or one by one."""
+    """Classes are summed in blocks of ``block``, then the blocks. The rest is one more block, or added one by one."""
 
     size: int
     block: bool
@@ -69,7 +69,7 @@ def _one_by_one(values: np.ndarray, axis: int) -> np.ndarray:
 @cache
 @one_thread()
 def _order(classes: int, inner: int, kind: str) -> _Order | None:
-    """Return the order in which BLAS adds up so many classes; None if it is none of those that are known here."""
+    """Return the order in which BLAS sums this number of classes; None if it is not one of the known orders."""
     random = np.random.default_rng(0)
     shape = (_ALL, classes, inner)
     size = np.exp2(random.integers(-12, 12, shape))  # sums of numbers of one size often agree in any order

@@ -1,4 +1,4 @@
-"""Functions of one tensor with Caffe's gradient, most of them number by number, and the unit of an LSTM."""
+"""Functions of one tensor with Caffe's gradient, most of them elementwise, and the unit of an LSTM."""
 
 # pyright: reportPrivateImportUsage=false
 

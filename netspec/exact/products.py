@@ -19,7 +19,7 @@ from netspec.exact.accumulate import ParameterSums
 from netspec.exact.blas import add_sums, gemm, one_thread
 
 Axes = tuple[int, ...]
-COLUMNS = 2**20  # numbers, 4 MB: the columns of some images, which stay in a CPU's cache
+COLUMNS = 2**20  # numbers (4 MB): the columns of several images, which fit into a CPU's cache
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Filter:
         return framed[(*every, *(slice(p, p + n) for n, p in zip(size, self.pad, strict=True)))]
 
     def images_at_once(self, channels: int, size: Axes) -> int:
-        """Return for how many maps (channels, size) to have columns at a time: no more than ``COLUMNS`` numbers."""
+        """Return the number of maps (channels, size) with columns of at most ``COLUMNS`` numbers together."""
         return max(1, COLUMNS // (channels * math.prod(self.kernel) * math.prod(self.fits(size))))
 
 
@@ -136,7 +136,7 @@ class ColumnProducts(ParameterSums):
 
 
 class SpreadProducts(ParameterSums):
-    """Spread each pixel by filters: what is a convolution's backward pass, run forward.
+    """Spread each pixel by filters, like the backward pass of a convolution.
 
     maps     (N, C, ...)
     weight   (C, num_output / group, kernel)
@@ -197,7 +197,7 @@ _rounded: dict[int, tuple[torch.Tensor, torch.Tensor]] | None = None  # by id, a
 
 @contextmanager
 def weights_rounded_once() -> Iterator[None]:
-    """Within the block, in which weights do not change, :func:`rounded_weight` makes one copy of each."""
+    """A block in which :func:`rounded_weight` makes one copy of each weight. Weights must not change in it."""
     global _rounded
     before, _rounded = _rounded, {}
     try:
@@ -207,9 +207,9 @@ def weights_rounded_once() -> Iterator[None]:
 
 
 def rounded_weight(weight: torch.Tensor) -> torch.Tensor | None:
-    """Return a weight in the precision that autocast asks for; None where it asks for none, or has that of the weight.
+    """Return a weight in the precision of autocast; None without autocast, or if the weight has that precision.
 
-    Towers that share it, and their backward passes, take the same copy.
+    Towers that share the weight, and their backward passes, use the same copy.
     """
     kind = weight.device.type
     if kind not in ("cpu", "cuda") or not torch.is_autocast_enabled(kind) or weight.dtype != torch.float32:
@@ -222,11 +222,11 @@ def rounded_weight(weight: torch.Tensor) -> torch.Tensor | None:
 
 
 class SummedConvolutions(ParameterSums):
-    """What :class:`ColumnProducts` and :class:`SpreadProducts` compute, by torch's kernels, on any device.
+    """Like :class:`ColumnProducts` and :class:`SpreadProducts`, but with torch's kernels, on any device.
 
-    Unlike torch's own functions it adds each gradient of the filters to the sum at once: autograd holds those of one
-    tower until it has those of all towers that share the filters. And it keeps the maps as they come, which others may
-    keep too, instead of the copy that ``lay_out`` makes for the kernel.
+    In contrast to torch's own functions, it adds each gradient of the filters to the sum at once. Autograd would hold
+    the gradients of one tower until it has those of all towers that share the filters. Also, it saves the given maps,
+    which others may have saved too, instead of the copy that ``lay_out`` makes for the kernel.
     """
 
     @staticmethod
@@ -272,7 +272,7 @@ class SummedConvolutions(ParameterSums):
 
 
 def laid_out_like(maps: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-    """Return the gradient of maps in their order in memory: where the two differ, torch's kernels are slow."""
+    """Return the gradient in the memory layout of the maps, because torch's kernels are slow if layouts differ."""
     if maps.dim() == 4 and not maps.is_contiguous() and maps.is_contiguous(memory_format=torch.channels_last):
         return diff.contiguous(memory_format=torch.channels_last)
     return diff.contiguous()
@@ -286,7 +286,7 @@ def convolution(
     group: int,
     transposed: bool = False,
 ) -> torch.Tensor:
-    """Return what torch's kernel for so many axes computes: the filters slide, or each pixel is spread by them."""
+    """Return the convolution, or transposed convolution, of torch's kernel for the number of axes."""
     axes = len(sliding.kernel) - 1
     if transposed:
         function = (F.conv_transpose1d, F.conv_transpose2d, F.conv_transpose3d)[axes]

@@ -1,4 +1,4 @@
-"""Whether a value is computed in Caffe's order."""
+"""Decides whether a value is computed in Caffe's order."""
 
 # pyright: reportPrivateImportUsage=false
 
@@ -11,9 +11,9 @@ from netspec.exact.blas import suits_blas
 
 
 def applies(exact: str, values: torch.Tensor, small: bool = False) -> bool:
-    """Return whether ``exact`` asks for Caffe's order: it is "all", or "small" and what is computed is ``small`` too.
+    """Return whether to use Caffe's order: if ``exact`` is "all", or if it is "small" and the work is ``small``.
 
-    What computes so calls into numpy, which tools that record a net's operations cannot follow: there it never applies.
+    Never while operations are recorded, because Caffe's order is computed with numpy, which cannot be recorded.
     """
     if exact != ALL and not (small and exact == SMALL):
         return False
@@ -21,5 +21,5 @@ def applies(exact: str, values: torch.Tensor, small: bool = False) -> bool:
 
 
 def is_recorded() -> bool:
-    """Return whether operations are recorded, not only run."""
+    """Return whether operations are recorded (traced or compiled), not only run."""
     return torch.compiler.is_compiling() or torch.jit.is_tracing()

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from netspec.exact.accumulate import ParameterSums
 from netspec.exact.blas import add_sums, gemm, one_thread
 
-FEW = 64  # vectors; a product of fewer takes less time than to round the weights to another precision
+FEW = 64  # vectors: for fewer, the product takes less time than rounding the weights to another precision
 
 
 class VectorProducts(ParameterSums):
@@ -65,10 +65,10 @@ class VectorProducts(ParameterSums):
 
 
 class SummedProducts(ParameterSums):
-    """What :class:`VectorProducts` computes, by torch's kernels, on any device.
+    """Like :class:`VectorProducts`, but with torch's kernels, on any device.
 
-    Unlike torch's own function it adds the weights' gradient to the sum at once: in fully connected layers it is the
-    largest of all tensors, and fresh memory for it takes longer to get than the product itself.
+    In contrast to torch's own function, it adds the gradient of the weights to the sum at once. In fully connected
+    layers it is the largest of all tensors, and allocating memory for it takes longer than the product itself.
     """
 
     @staticmethod
@@ -80,7 +80,7 @@ class SummedProducts(ParameterSums):
         transposed: bool,
         in_place: bool,
     ) -> torch.Tensor:
-        """Return the product; of few vectors in the weights' precision, whatever autocast asks for."""
+        """Return the product. For few vectors it has the precision of the weights, even with autocast."""
         few, ctx.kind = len(vectors) < FEW, vectors.dtype
         vectors = vectors.to(weight.dtype) if few else vectors
         ParameterSums.keep(ctx, vectors, (weight, bias), in_place)

@@ -1,6 +1,6 @@
-"""Where exported models are kept: a folder for each key, whole or not at all; a key is all that decides a model.
+"""The cache of exported models: one folder for each key, which is complete or does not exist.
 
-Nothing in it is ever removed.
+A key is a hash of everything that determines a model. Nothing is ever removed from the cache.
 """
 
 from __future__ import annotations
@@ -22,7 +22,15 @@ from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
 from netspec.proto.forks import forks
 
-_EXPORTING = ("dialects", "exact", "export", "graph", "layers", "net", "proto")  # the rooms that decide
+_EXPORTING = (
+    "dialects",
+    "exact",
+    "export",
+    "graph",
+    "layers",
+    "net",
+    "proto",
+)  # the packages that determine an exported model
 DIGESTS = "digests.json"  # of the files of an entry, by name
 
 
@@ -83,7 +91,7 @@ def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, b
             return place, False
         aside = Path(tempfile.mkdtemp(prefix=".damaged-", dir=folder))
         log.logger.warning(f"{place}: is damaged, and is made again; what was there is {aside.name} now")
-        with suppress(FileNotFoundError):  # another process was first
+        with suppress(FileNotFoundError):  # another process moved it
             place.rename(aside)
     folder.mkdir(parents=True, exist_ok=True)
     unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
@@ -97,7 +105,7 @@ def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, b
         try:
             unfinished.rename(place)
         except OSError:
-            if not place.is_dir():  # another process may have made it meanwhile, and that one is as good
+            if not place.is_dir():  # another process may have made the same entry
                 raise
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)  # what this call made

@@ -1,4 +1,4 @@
-"""Which engine is to run a net, in what precision, and where its model is kept."""
+"""The choice of the engine for a net, its precision, and the folder of its model."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Choice:
     def of(engine: str, precision: str = FP32, cache: str | Path | bool | None = None) -> Choice:
         """Return a checked choice. ``cache``: None for the user's cache folder, False for none, or a folder.
 
-        Raises SpecError for an engine or a precision that there is not, and for an engine that is not installed.
+        Raises SpecError for an unknown engine or precision, and for an engine that is not installed.
         """
         for what, found, known in (("engine", engine, ENGINES), ("precision", precision, PRECISIONS)):
             check_choice(what, found, known)
@@ -39,11 +39,11 @@ class Choice:
 
 
 def fastest() -> str:
-    """Return the engine that runs small nets fastest on a CPU, of those that are installed."""
+    """Return the fastest installed engine for small nets on a CPU."""
     return ONNXRUNTIME if all(find_spec(module) for module in _NEEDS[ONNXRUNTIME]) else TORCH
 
 
 def user_folder() -> Path:
-    """Return where the models are kept by default: ``netspec`` in XDG_CACHE_HOME, or in ``~/.cache``."""
+    """Return the default folder of the models: ``netspec`` in XDG_CACHE_HOME, or in ``~/.cache``."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "netspec"

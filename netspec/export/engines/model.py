@@ -26,7 +26,7 @@ Export = Callable[[Path], None]  # writes the ONNX model to a path, with its wei
 
 @dataclass(frozen=True)
 class Origin:
-    """What a net is made of: its prototxt and weights, and the options that decide what is exported of it."""
+    """The origin of a net: its prototxt and weights, and the options that determine what is exported."""
 
     files: Sequence[str | Path]
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -41,7 +41,7 @@ class Model:
 
     def __init__(self, choice: Choice, origin: Origin | None, export: Export) -> None:
         self.choice = choice
-        self._kept: tempfile.TemporaryDirectory[str] | None = None  # where the cache does not
+        self._kept: tempfile.TemporaryDirectory[str] | None = None  # if it is not in the cache
         self.folder = self._made(origin, export)
         self._runner, precision = self._opened(choice.precision)
         self._difference_shown = precision == FP32

@@ -49,7 +49,7 @@ def write_model(net: Net, path: Path, blobs: Iterable[str] = ()) -> None:
     path.write_bytes(model.SerializeToString())
 
 
-Write = Callable[[Path, Sequence[str]], None]  # exports the net to a path, with these blobs besides its outputs
+Write = Callable[[Path, Sequence[str]], None]  # exports the net to a path; these blobs become outputs too
 
 
 def with_engine(net: Net, choice: Choice, path: str | Path, weights: Iterable[str | Path]) -> Net:
@@ -93,7 +93,9 @@ class Engine:
         self._readers = [step for step in net.eager.one_by_one() if reads_data(self._layers[step.node])]
         layers = zip(net.plan.nodes, net.layers, strict=True)
         ends = [node for node, layer in layers if layer.is_input or reads_data(layer)]
-        self._ends = {v: net.plan.blobs[v] for node in ends for v in node.tops}  # what no layer computes
+        self._ends = {
+            v: net.plan.blobs[v] for node in ends for v in node.tops
+        }  # inputs, and tops of layers that read data
         self._built = {blob: net.shapes[blob] for blob in self._ends.values()}
         self._model: Model | None = None
         self._opened_for: tuple[str, ...] = ()  # the blobs that the model has
@@ -153,7 +155,7 @@ class Engine:
             computed, as_loaded = [blob for blob in blobs if blob not in self._built], self._loaded.are(self._blobs())
             origin = self._origin(blobs) if as_loaded else None
             self._model = Model(self._choice, origin, lambda path: self._write(path, computed))
-            self._opened_for, self._exported = blobs, self._seen()  # the export, too, counts as handing them out
+            self._opened_for, self._exported = blobs, self._seen()  # after the export, which hands out aliases
             if as_loaded:
                 self._loaded = self._exported
         return self._model

@@ -1,4 +1,4 @@
-"""The libraries that run an exported model: how each prepares it once, opens it, and runs it.
+"""Runs exported models with onnxruntime and OpenVINO.
 
 The weights are in a file next to the model. Both libraries map it into memory instead of reading it.
 """
@@ -26,11 +26,11 @@ _ENOUGH = 64  # bytes: a stack_t has 24
 
 @contextmanager
 def signal_stack_kept() -> Iterator[None]:
-    """Give the thread its alternate signal stack back after the block, on Linux; elsewhere do nothing.
+    """Restore the alternate signal stack of the thread after the block, on Linux; elsewhere do nothing.
 
-    Each ``openvino.Core`` sets one when it loads its CPU plugin, and frees it when it is deleted. If the thread still
-    has that stack then, it gets the one from before, which may be that of a Core deleted earlier: freed memory, and the
-    next signal that Python handles ends the process.
+    Each ``openvino.Core`` sets such a stack when it loads its CPU plugin, and frees it when it is deleted. If it is
+    still in use then, the thread gets the previous one, which may belong to a Core that was deleted earlier. That is
+    freed memory, and the next signal that Python handles would end the process.
     """
     if not sys.platform.startswith("linux"):
         yield
@@ -45,7 +45,7 @@ def signal_stack_kept() -> Iterator[None]:
 
 
 MODEL, OPTIMIZED = "net.onnx", "optimized.onnx"
-MOST_SHAPES = 4  # for which a model stays compiled
+MOST_SHAPES = 4  # the number of input shapes for which a model stays compiled
 Arrays = Mapping[str, np.ndarray]
 
 
@@ -63,9 +63,9 @@ def warn_unable(choice: Choice, reason: str) -> None:
 
 @contextmanager
 def _no_telemetry() -> Iterator[None]:
-    """Import a library in it: it then neither looks up a host of its maker's nor writes to the home folder.
+    """A block in which a library can be imported without telemetry: no network access, no file in the home folder.
 
-    OpenVINO takes an empty stub where its package for telemetry is missing; onnxruntime asks a variable at its start.
+    OpenVINO uses an empty stub if its telemetry package is missing. onnxruntime reads a variable when it is imported.
     """
     module, variable = "openvino_telemetry", "ORT_DISABLE_TELEMETRY"
     before, chosen = sys.modules.get(module), os.environ.get(variable)
@@ -100,7 +100,7 @@ def threads() -> int:
 
 
 class OnnxRuntime:
-    """onnxruntime on the CPU. Its own optimizations of a model are done once, for its version and for the processor."""
+    """onnxruntime on the CPU. Its optimizations of a model are done once for each version and processor."""
 
     def __init__(self, folder: Path) -> None:
         with _no_telemetry():
@@ -108,7 +108,9 @@ class OnnxRuntime:
 
         options = self._options(onnxruntime)
         options.intra_op_num_threads = threads()
-        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL  # they are done
+        options.graph_optimization_level = (
+            onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        )  # they were done by prepare
         self._session = onnxruntime.InferenceSession(
             str(folder / OPTIMIZED), options, providers=["CPUExecutionProvider"]
         )
@@ -125,7 +127,7 @@ class OnnxRuntime:
 
     @classmethod
     def prepare(cls, folder: Path) -> None:
-        """Optimize the model in a folder; the one that was exported goes."""
+        """Replace the model in a folder by an optimized one."""
         with _no_telemetry():
             import onnxruntime
 
@@ -174,7 +176,7 @@ class OpenVino:
 
     @staticmethod
     def prepare(folder: Path) -> None:
-        """Leave the model in a folder as it was exported."""
+        """Do nothing: OpenVINO reads the exported model."""
 
     def run(self, inputs: Arrays) -> dict[str, np.ndarray]:
         """See :class:`Runner`."""
@@ -222,6 +224,6 @@ def open_runner(engine: str, folder: Path, precision: str) -> Runner:
 
 
 def reason(fault: Exception) -> str:
-    """Return a library's words in one line, not too long."""
+    """Return the message of a library's exception in one short line."""
     text = " ".join(str(fault).split()) or type(fault).__name__
     return text if len(text) <= 200 else f"{text[:197]}..."

@@ -1,1 +1,1 @@
-"""A net in another form: ONNX, PyTorch source, torch.export, safetensors. Each layer defines how it is written."""
+"""A net in another form: ONNX, PyTorch source, torch.export, safetensors. Each layer defines its own export."""

@@ -29,11 +29,11 @@ from netspec.terminal.commands import version
 
 @dataclass(frozen=True)
 class Source:
-    """What is exported: a net's prototxt, for a phase, and its weights, some files in a row.
+    """The net to export: a prototxt, for a phase, and files of weights, which are loaded in order.
 
-    Of ``options`` the level and stages count, the shapes of the tops of data layers and of inputs, and whether Python
-    layers may run. ``blobs``: only what computes these is exported. Without ``labels`` nothing that needs labels is:
-    losses, accuracies.
+    ``options`` gives the level and stages, the shapes of inputs and of the tops of data layers, and whether Python
+    layers may run. ``blobs``: only the layers that compute these are exported. Without ``labels``, layers that need
+    labels (losses, accuracies) are left out.
     """
 
     file: Path
@@ -56,7 +56,7 @@ class Source:
         return net
 
     def metadata(self) -> dict[str, str]:
-        """Return where an exported net comes from."""
+        """Return the origin of an exported net."""
         found = {"prototxt": self.file.name, "prototxt.sha256": _sha256(self.file), "phase": self.phase}
         if self.weights:
             found["weights"] = ",".join(path.name for path in self.weights)
@@ -69,7 +69,7 @@ class Source:
 
     @property
     def origin(self) -> str:
-        """Say in a few words where an exported net comes from."""
+        """The origin of an exported net in a few words."""
         return " and ".join([self.file.name, *(path.name for path in self.weights)])
 
 
@@ -96,7 +96,7 @@ def export_net(source: Source, target: str, out: Path, preprocess: Preprocess | 
 
 
 def blob_tensors(net: Net) -> dict[str, torch.Tensor]:
-    """Return the learned blobs of a net in Caffe's order, as ``layer.index``; what layers share as its owner's."""
+    """Return the learned blobs of a net in Caffe's order, as ``layer.index``. Shared blobs have their owner's name."""
     found: dict[str, torch.Tensor] = {}
     seen: set[int] = set()
     for layer in net.layers:
@@ -108,7 +108,7 @@ def blob_tensors(net: Net) -> dict[str, torch.Tensor]:
 
 
 def fold_files(source: Source, prefix: Path) -> tuple[int, int]:
-    """Write the folded net as PREFIX.prototxt and PREFIX.caffemodel; return how many layers there were and are."""
+    """Write the folded net as PREFIX.prototxt and PREFIX.caffemodel; return the layer counts before and after."""
     if not prefix.parent.is_dir():
         raise SpecError(f"there is no folder {prefix.parent}; make it first", Where(str(prefix)))
     net = source.net()

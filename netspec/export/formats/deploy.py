@@ -1,4 +1,4 @@
-"""A net as it is shipped: inputs for data layers, no labels and losses, BatchNorm and Scale in the weights.
+"""Makes the deploy form of a net: inputs for data layers, no labels and losses, BatchNorm and Scale in the weights.
 
 The result is a NetParameter with its weights, for Caffe or any reader of its files.
 """
@@ -32,9 +32,9 @@ from netspec.proto.upgrade.rewrite import copy_without
 def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool = True) -> tuple[Any, SourceMap]:
     """Return a net in which layers that read data are Input layers; ``options`` has the shapes of their tops.
 
-    Without ``labels`` every top of such a layer but the first is left out, and so is what needs one of them: losses
-    and accuracies; the scores that they compared become outputs. The net's own ``state`` says which layers it has.
-    Raises SpecError for faults of the net, and where a shape is given for a blob that no such layer makes.
+    Without ``labels``, only the first top of such a layer is kept. Layers that need another one, losses and accuracies,
+    are left out, and the scores that they read become outputs. The ``state`` of the net determines its layers. Raises
+    SpecError for faults of the net, and for a given shape of a blob that no such layer makes.
     """
     filtered, source = filter_net(net, source)
     for fault in not_to_be_given(options.given_shapes, [filtered], source.file):
@@ -60,10 +60,10 @@ def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool
 
 
 def fold(net: Net) -> NetParameter:
-    """Return a net with its weights, folded, without Splits, Dropouts and others that only pass their bottom on.
+    """Return the folded net with its weights, without Split, Dropout and other layers that return their bottom.
 
-    netspec/fast/fold.py says what is folded. Blobs keep their names where they still exist, outputs always do;
-    layers that share parameters share them still where folding left them equal.
+    netspec/fast/fold.py says what is folded. Blobs that remain keep their names, and outputs always do. Layers that
+    share parameters still share them if they are equal after folding.
     """
     folds = _found_folds(net)
     plan = net.plan
@@ -103,10 +103,10 @@ def _found_folds(net: Net) -> list[Any]:
 
 
 def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
-    """Return the names of the values that are left.
+    """Return the names of the remaining values.
 
-    A value that only the net's caller reads, under another name, takes that; where other layers read it too, it is no
-    output by its own name, and the layer that passes it on stays.
+    An output that a removed layer has renamed gets the new name. If other layers read the value too, it keeps its name,
+    and the layer that renames it stays.
     """
     plan = net.plan
     names = {v: blob for v, blob in enumerate(plan.blobs) if origin[v] == v}

@@ -24,9 +24,12 @@ from netspec.layers.contract.offers import offered
 from netspec.layers.contract.targets import OnnxGraph, Sizes
 from netspec.net.net import Net
 
-OPSET, IR_VERSION = 21, 10  # ONNX 1.16, of 2024: which all runtimes of today read
+OPSET, IR_VERSION = 21, 10  # ONNX 1.16 (2024), which all current runtimes read
 LARGEST = 2**31 - 2**24  # bytes of weights: protobuf's limit, with room for the graph
-LARGE, PAGE = 1024, 4096  # bytes: smaller weights stay in the model; where others begin, so that they can be mapped
+LARGE, PAGE = (
+    1024,
+    4096,
+)  # bytes: smaller weights stay in the model; the others start at pages, so that they can be mapped
 DTYPES = {np.dtype(np.float32): 1, np.dtype(np.uint8): 2, np.dtype(np.int64): 7, np.dtype(bool): 9}  # TensorProto's
 CAST_TO = {"float32": 1, "int64": 7, "bool": 9}
 
@@ -95,7 +98,7 @@ class _DataFile:
         self.file, self.name = file, name
 
     def write(self, array: np.ndarray) -> dict[str, str]:
-        """Append an array; return where it is, as ONNX has it."""
+        """Append an array. Return its place in the form of ONNX."""
         self.file.seek(-(-self.file.tell() // PAGE) * PAGE)
         place = {"location": self.name, "offset": str(self.file.tell()), "length": str(array.nbytes)}
         self.file.write(array.data)
@@ -103,7 +106,7 @@ class _DataFile:
 
 
 class _Writer:
-    """The graph of a net while it is written."""
+    """Writes the graph of a net."""
 
     def __init__(self, net: Net, shapes: NetShapes, preprocess: Preprocess | None) -> None:
         self.net, self.shapes, self.preprocess = net, shapes, preprocess
@@ -119,10 +122,10 @@ class _Writer:
             named = (tops,) if isinstance(tops, str) else tops
             self.values.update(zip(node.tops, named, strict=False))
 
-    # What layers ask for
+    # Called by layers
 
     def unique(self, name: str) -> str:
-        """Return a name that no other value has, made of this one."""
+        """Return a new name that starts with this one."""
         found, k = name, 1
         while found in self.names:
             found, k = f"{name}_{k}", k + 1
@@ -154,7 +157,7 @@ class _Writer:
         return self._blobs[key]
 
     def add_input(self, value: int, blob: str) -> str:
-        """Add an input of the net, with the steps before it that are asked for; return what the net reads."""
+        """Add an input of the net, with the preparation of images. Return the value that the net reads."""
         sizes = self.symbols(value)
         if self.preprocess is None or self.preprocess.blob != blob:
             self.inputs.append(_value_info(blob, np.float32, sizes))
@@ -165,7 +168,7 @@ class _Writer:
         return read
 
     def symbols(self, value: int) -> list[int | str]:
-        """Return the shape of a value as ONNX has it: numbers, and names for what is free."""
+        """Return the shape of a value for ONNX: numbers, and names for free sizes."""
         sizes: list[int | str] = []
         for axis, size in enumerate(self.shapes.sizes(value)):
             name = self.shapes.name(value, axis) if size is None else ""
@@ -187,7 +190,7 @@ class _Writer:
         model.producer_name = "netspec"
         described = {**metadata, **({"blobs": json.dumps(renamed)} if renamed else {})}
         if self.shapes.fixed:
-            file = net.plan.source.file  # without its folder, which is private
+            file = net.plan.source.file  # the folder is private
             described["fixed"] = "\n".join(self.shapes.fixed).replace(file, Path(file).name)
         if self.preprocess:
             described["input"] = self.preprocess.description
@@ -321,7 +324,7 @@ class _LayerGraph(_Steps):
         return self.node("Reshape", value, self.node("Concat", *parts, axis=0))
 
     def _like(self, value: int, axis: int) -> str | None:
-        """Return the size of the axis of a bottom that is always this one, if there is any."""
+        """Return the size of an axis of a bottom that always equals this size, if there is one."""
         for bottom in self.plan_node.bottoms:
             for k in range(len(self.shapes.built[bottom])):
                 if self.shapes.same((bottom, k), (value, axis)):

@@ -1,4 +1,4 @@
-"""What is done to an image before the net sees it, put into the exported model.
+"""The preparation of images as part of the exported model.
 
 Caffe: Transformer.preprocess (python/caffe/io.py), DataTransformer::Transform (src/caffe/data_transformer.cpp)
 """
@@ -34,12 +34,12 @@ class Preprocess:
 
     @property
     def changes_images(self) -> bool:
-        """Whether there is any step at all."""
+        """Whether there is any step."""
         return self.mean is not None or (self.scale, self.raw_scale) != (1, 1) or self.swap or self.crop or self.uint8
 
     @property
     def description(self) -> str:
-        """Say in a line what the exported model takes."""
+        """The input of the exported model, in one line."""
         steps = [
             *(["the middle part of the net's size is taken"] if self.crop else []),
             *(["the channels are reversed"] if self.swap else []),

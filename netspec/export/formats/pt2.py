@@ -38,8 +38,8 @@ OPERATORS: dict[type, Callable[..., Any]] = {
 def export_pt2(net: Net, path: str | Path) -> list[str]:
     """Write a net as a torch.export archive; return notes for its user.
 
-    The sizes are free as in the source where torch.export can follow them, or else the batch alone, or none.
-    Raises SpecError where torch.export cannot take the net, and where it cannot be written.
+    The sizes are free as in the exported source if torch.export supports it, or else only the batch, or none.
+    Raises SpecError if torch.export cannot export the net, or if the file cannot be written.
     """
     module, shapes = _made(net)
     inputs = [v for node, layer in zip(net.plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops]
@@ -134,7 +134,7 @@ def _parsed(expression: str) -> ast.expr:
 
 
 def _value(node: ast.AST | None, names: Mapping[str, Any]) -> Any:
-    """Return the value of an expression. It knows what layers write; nothing else can be said in it."""
+    """Return the value of an expression. Only the kinds of expressions that layers write are supported."""
     match node:
         case None | ast.Constant():
             return None if node is None else node.value

@@ -1,7 +1,7 @@
-"""Which sizes of an exported net its caller may choose: the batch, height and width, where the net allows it.
+"""Finds the free sizes of an exported net, which its caller may choose: batch, height and width, if the net allows it.
 
-Each is tried: the shapes of all blobs are computed as if Caffe's net had been reshaped to inputs of other sizes. What
-changes is free; what makes a layer refuse is fixed.
+Each size is tried: the shapes of all blobs are computed for inputs of other sizes, as when Caffe reshapes a net. A size
+is fixed if a layer refuses the others.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ def _other_sizes(size: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 @dataclass(frozen=True)
 class FreeSize:
-    """A size that is known when the exported net runs.
+    """A size that is known only when the exported net runs.
 
-    ``axes`` have it, each of an input, or of the top of a layer that counts what it finds (``counted``). ``tried`` are
-    the shapes of all values at some other sizes than ``size``, which the net was built with.
+    ``axes`` are the axes with this size: of inputs, or of the top of a layer that counts its results (``counted``).
+    ``size`` is the size in the built net. ``tried`` are the shapes of all values for some other sizes.
     """
 
     name: str
@@ -43,9 +43,9 @@ class FreeSize:
 
 @dataclass(frozen=True)
 class NetShapes:
-    """The shapes of all values, as the net was built, and which of their sizes are free.
+    """The shapes of all values in the built net, and their free sizes.
 
-    ``fixed`` has a line for the user for each batch, height and width of an input that is not free.
+    ``fixed`` has a note for the user for each batch, height and width of an input that is not free.
     """
 
     built: Shapes
@@ -62,12 +62,12 @@ class NetShapes:
         return [free for free in self.free if any(shapes[value][axis] != size for shapes in free.tried)]
 
     def same(self, first: Axis, second: Axis) -> bool:
-        """Return whether two axes have one size, whatever is chosen."""
+        """Return whether two axes always have the same size."""
         every = [self.built, *(shapes for free in self.free for shapes in free.tried)]
         return all(shapes[first[0]][first[1]] == shapes[second[0]][second[1]] for shapes in every)
 
     def name(self, value: int, axis: int) -> str:
-        """Return the name of the free size that an axis has, or ``?`` where its size only depends on one."""
+        """Return the name of the free size of an axis, or ``?`` if its size only depends on one."""
         return next((free.name for free in self.free if self.same(free.axes[0], (value, axis))), "?")
 
     def without(self, fixed: FreeSize, why: str) -> NetShapes:
@@ -90,7 +90,7 @@ class Fixed(Exception):
 
 
 def settled(net: Net, write: Callable[[NetShapes], T]) -> tuple[T, NetShapes]:
-    """Return what ``write`` makes of a net's shapes, and those: fewer are free each time that it raises Fixed."""
+    """Call ``write`` with the shapes, and return its result and them. After each Fixed, retry with fewer free sizes."""
     shapes = find_shapes(net)
     while True:
         try:
@@ -127,9 +127,9 @@ def find_shapes(net: Net) -> NetShapes:
 
 
 def input_shapes(net: Net, shapes: NetShapes) -> dict[str, tuple[int | str, ...]]:
-    """Return what inputs the net takes, by blob: for each size its number, or a name where it is free.
+    """Return the shapes of the inputs, by blob. A free size is a name.
 
-    Inputs that have one name for a size must agree about it, as Caffe's layers want it.
+    Sizes with the same name must be equal, as Caffe's layers require it.
     """
     found: dict[str, tuple[int | str, ...]] = {}
     for node, layer in zip(net.plan.nodes, net.layers, strict=True):
@@ -146,7 +146,7 @@ def input_shapes(net: Net, shapes: NetShapes) -> dict[str, tuple[int | str, ...]
 
 
 def _input_sizes(net: Net) -> dict[str, tuple[Axis, ...]]:
-    """Return the sizes of the inputs that might be free, by name: equal ones of one kind are one."""
+    """Return the sizes of the inputs that may be free, by name. Equal sizes of the same kind count as one."""
     found: dict[tuple[str, int], list[Axis]] = {}
     names: dict[tuple[str, int], str] = {}
     for node, layer in zip(net.plan.nodes, net.layers, strict=True):
@@ -161,7 +161,7 @@ def _input_sizes(net: Net) -> dict[str, tuple[Axis, ...]]:
 
 
 def _try(net: Net, axes: tuple[Axis, ...], size: int) -> tuple[tuple[Shapes, ...], SpecError | None]:
-    """Return the shapes for other sizes of these axes, and the fault where none is possible."""
+    """Return the shapes for other sizes of these axes, and the fault if none is possible."""
     tried, faults = [], []
     for sizes in _other_sizes(size):
         for other in sizes:

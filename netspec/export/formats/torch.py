@@ -1,7 +1,7 @@
 """``--to torch``: a net as the source of a PyTorch module, with its weights in a file next to it.
 
-The source reads as if a person had written it: submodules named after the layers, no trace of this
-project but the line that says where it came from. It computes what the net computes.
+The source reads as if a person had written it. Submodules have the names of the layers. Only the line that gives the
+origin mentions this project. The module computes the same as the net.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def export_torch(net: Net, path: str | Path, origin: str = "a prototxt") -> list
 def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: Mapping[str, str]) -> None:
     """Write tensors as a .safetensors file, with the same bytes each time.
 
-    The library writes metadata in the order of a hash table, another in each process.
+    The library writes metadata in the order of a hash table, which differs from process to process.
     """
     from safetensors.torch import save
 
@@ -95,7 +95,7 @@ def torch_source(net: Net, origin: str = "a prototxt") -> tuple[str, dict[str, t
 
 
 def _parts(net: Net, definition: Definition, attributes: Mapping[int, str], shapes: NetShapes) -> str:
-    """Return what stands in the file below its imports: functions, the class, and how it is loaded and tried."""
+    """Return the file below its imports: functions, the class, and code that loads and runs it."""
     name, expected = class_name(net.name or "net"), input_shapes(net, shapes)
     if expected:
         definition.functions[check_shapes.__name__] = check_shapes
@@ -162,7 +162,8 @@ def _constructed(module: Module, attribute: str) -> str:
 def _forward(definition: Definition, inputs: Mapping[int, str], attributes: Mapping[int, str]) -> list[str]:
     """Return the statements of the forward method, in lines.
 
-    A value that only the next statement reads is ``x``, so that its memory is free then; others have their blob's name.
+    A value that only the next statement reads is called ``x``, so that its memory is freed. Others have the name
+    of their blob.
     """
     names, statements = dict(inputs), definition.statements
     readers: dict[int, list[int]] = {}

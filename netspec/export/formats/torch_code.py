@@ -1,6 +1,6 @@
-"""A net as a PyTorch module while it is written, layer by layer: statements, the modules they call, their text.
+"""Builds the source of a PyTorch module layer by layer: its statements, and the submodules that they call.
 
-An expression is text in which marks stand for values and modules: names are given when all is known.
+In the text of an expression, marks stand for values and modules. They are replaced by names at the end.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def mark(kind: str, number: int) -> str:
 
 @dataclass(eq=False)
 class Module:
-    """A submodule, or a parameter or buffer of the module itself: its constructor's call, and its tensors by name.
+    """A submodule, or a parameter or buffer of the module: the call of its constructor, and its tensors by name.
 
-    ``numbers`` are the values of the fields of the template; those that are the ``usual`` ones are left out.
+    ``numbers`` are the values for the fields of the template. Arguments with their ``usual`` value are left out.
     """
 
     layer: str
@@ -70,7 +70,7 @@ class Statement:
     expression: str
 
     def values(self) -> list[int]:
-        """Return the values that it reads, in order, each as often as it does."""
+        """Return the values that it reads, in order, with repetitions."""
         return [int(number) for kind, number in MARK.findall(self.expression) if kind == "v"]
 
     def modules(self) -> list[int]:
@@ -80,10 +80,10 @@ class Statement:
 
 @dataclass
 class Definition:
-    """A whole module: what it takes and gives, and how it computes it.
+    """A whole module: its inputs, outputs and statements.
 
-    ``names`` are the blobs' names of values; ``inputs`` and ``outputs`` are values; ``modules`` are what
-    marks stand for; ``functions`` are copied as they are.
+    ``names`` are the names of the blobs, by value. ``inputs`` and ``outputs`` are values. ``modules`` are what marks of
+    modules stand for. ``functions`` are copied into the file.
     """
 
     statements: list[Statement] = field(default_factory=list)
@@ -100,17 +100,17 @@ class Definition:
         return {m: unique(legal(self.modules[m].layer), taken) for m in used}
 
 
-# Names: no text of a file enters source but as an identifier or quoted
+# Names: text of a file becomes an identifier or a quoted string in the source, nothing else
 
 
 def legal(name: str, prefix: str = "layer_") -> str:
-    """Return a Python name made of a layer's or a blob's."""
+    """Return a legal Python name for a layer or a blob."""
     text = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or prefix.rstrip("_")
     return _free(prefix + text if text[0].isdigit() else text, "_")
 
 
 def _free(identifier: str, ending: str) -> str:
-    """Return an identifier, with the ending where Python or the file itself uses it."""
+    """Return an identifier, with the ending if Python or the file already uses the name."""
     used = keyword.iskeyword(identifier) or identifier in _TAKEN or hasattr(builtins, identifier)
     return identifier + ending if used else identifier
 
@@ -130,14 +130,14 @@ def unique(name: str, taken: set[str]) -> str:
 
 
 def class_name(text: str) -> str:
-    """Return the name of a class made of words."""
+    """Return a class name made from the words of a text."""
     words = [word for word in re.split(r"[^0-9A-Za-z]+", text) if word]
     name = "".join(word[0].upper() + word[1:] for word in words) or "Net"
     return _free(f"Net{name}" if name[0].isdigit() else name, "Net")
 
 
 def number(value: Any) -> str:
-    """Return a number, a bool or a tuple of them as a person writes it; floats as short as float32 allows.
+    """Return a number, a bool or a tuple of them as source; floats with as few digits as float32 allows.
 
     A text, which is the name of a free size, is quoted.
     """
@@ -156,7 +156,7 @@ def number(value: Any) -> str:
 
 
 def lay_out(statement: str, indent: int) -> list[str]:
-    """Return a statement in lines: where it is longer than ``WIDTH``, its widest bracket has a line for each part."""
+    """Return a statement in lines. In one longer than ``WIDTH``, each part of the widest bracket gets its own line."""
     space = " " * indent
     whole = [space + statement]
     if indent + len(statement) <= WIDTH:
@@ -174,7 +174,7 @@ def lay_out(statement: str, indent: int) -> list[str]:
 
 
 def _parts(node: ast.AST) -> list[tuple[int, int]]:
-    """Return where each part in the brackets of a call, a list or a tuple begins and ends; nothing for all else."""
+    """Return the begin and end of each part in the brackets of a call, a list or a tuple; nothing for other nodes."""
     if isinstance(node, ast.Call):
         inside = [*node.args, *node.keywords]
         if any(isinstance(part, ast.GeneratorExp) for part in inside):
@@ -226,7 +226,7 @@ def _write_layer(layer: Layer, code: TorchCode, *bottoms: str) -> str | Sequence
 
 
 class _Collector:
-    """What the layers have written so far."""
+    """Collects what the layers write."""
 
     def __init__(self, net: Net, shapes: NetShapes) -> None:
         self.net, self.shapes = net, shapes
