@@ -34,7 +34,7 @@ def in_state(net: NetParameter, *states: NetState) -> NetParameter:
 def with_state(
     net: NetParameter, phase: PhaseValue, level: int | None = None, stages: Iterable[str] = ()
 ) -> NetParameter:
-    """Return a copy of the net whose state has this phase, this level (unless None) and these stages added."""
+    """Return a copy of the net with this phase, this level (unless None) and these additional stages in its state."""
     return in_state(net, net.state, NetState(phase=phase, level=level, stage=several(stages)))
 
 
@@ -67,7 +67,7 @@ def filter_net(net: NetParameter, source: SourceMap) -> tuple[NetParameter, Sour
 
 
 def _remedy(state: NetState, layer: LayerParameter) -> str:
-    """Return what to do where a layer is missed that the net's state leaves out."""
+    """Return advice for a layer that is missing because the state of the net excludes it."""
     here, there = PHASE_NAMES[state.phase], PHASE_NAMES[1 - state.phase]
     if any(rule.HasField("phase") and rule.phase != state.phase for rule in layer.include):
         return f"in phase {there}; say --phase {there}, or give phase {here} a layer that does"
@@ -115,14 +115,14 @@ def is_input(layer: LayerParameter) -> bool:
 
 
 def add_input(net: NetParameter, name: str, shapes: Mapping[str, Sequence[int]]) -> None:
-    """Append an Input layer whose tops have these shapes."""
+    """Append an Input layer with tops of these shapes."""
     entry = net.layer.add(name=name, type=INPUT, top=list(shapes))
     for shape in shapes.values():
         entry.input_param.shape.add().dim.extend(shape)
 
 
 def shapes_of_input(layer: LayerParameter) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the tops of an Input layer, as far as it has them; one may stand for all."""
+    """Return the shapes of the tops of an Input layer, as far as given. A single shape applies to all."""
     shapes = [tuple(shape.dim) for shape in layer.input_param.shape]
     return dict(zip(layer.top, shapes * len(layer.top) if len(shapes) == 1 else shapes, strict=False))
 

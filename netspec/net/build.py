@@ -1,7 +1,7 @@
 """From a prototxt to a runnable net: read, filter, insert splits, plan, build, load weights.
 
-A .caffemodel holds its layers with their weights: :func:`recover_net` is for weights without a prototxt. What is in
-the file is the net as it ran, mostly a training: with Split layers, in one phase, reading a database.
+A .caffemodel holds its layers with their weights: :func:`recover_net` is for weights without a prototxt. The file
+contains the net as it ran, usually in a training: with Split layers, in one phase, reading a database.
 
 Caffe: Net::Init (src/caffe/net.cpp)
 """
@@ -54,7 +54,7 @@ def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None
 
 @no_collection()
 def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOptions) -> Net:
-    """Insert splits, plan, and build a net whose layers all belong to its ``state``."""
+    """Insert splits, plan, and build a net that is already filtered by its ``state``."""
     if log.logger.isEnabledFor(logging.INFO):
         log.dump("net.cpp:53", "Initializing net from parameters: ", write_text(filtered).rstrip("\n"))
     split, source = insert_splits(filtered, source)
@@ -84,7 +84,7 @@ def check_sources(net: NetParameter, source: SourceMap, options: BuildOptions) -
 
 
 def not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
-    """Return an error for each given shape whose blob is not a top of a data layer (or Python layer)."""
+    """Return an error for each given shape of a blob that is not a top of a data layer (or Python layer)."""
     layers = [layer for net in nets for layer in net.layer]
     makers = [layer for layer in layers if not layer.bottom or ((cls := class_of(layer)) and takes_shapes(cls))]
     blobs = list(dict.fromkeys(top for layer in makers for top in layer.top))
@@ -105,10 +105,10 @@ def not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], p
 def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParameter, SourceMap]:
     """Return the deploy net of a .caffemodel, without its weights, and a map that knows the file only.
 
-    Layers that read data, and blobs that nothing makes, become Input layers of the ``shapes`` (blob -> shape) given. Of
-    a layer that reads cropped images the shape is known: one image, with the channels that the first layer's filters
-    have. What needs a label, or another blob that is not given, is left out; so are Split layers, phases and rules.
-    Raises SpecError where a shape is neither given nor known, and for a file that holds weights only.
+    Layers that read data, and blobs that no layer makes, become Input layers with the given ``shapes`` (blob -> shape).
+    For a layer that reads cropped images the shape is known: one image, with the channels of the first layer's filters.
+    Layers that need a label, or another blob that is not given, are left out, and so are Split layers, phases and
+    rules. Raises SpecError if a shape is neither given nor known, and for a file that has only weights.
     """
     trained, source = parse_net_binary(path)
     where = Where(str(path))
@@ -155,7 +155,7 @@ def _reads_data(layer: LayerParameter) -> bool:
 
 
 def _inputs(layers: list[LayerParameter]) -> dict[str, Shape]:
-    """Return the blobs that come from outside, and their shapes as far as the file tells: 0 is an unknown size."""
+    """Return the blobs that no layer makes, and their shapes as far as the file has them; 0 is an unknown size."""
     inputs: dict[str, Shape] = {}
     made: set[str] = set()
     for layer in layers:

@@ -96,13 +96,13 @@ class Net(torch.nn.Module):
         self._given = [
             v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops
         ]
-        if made.backward is not None:  # otherwise errors were collected: it will not run
+        if made.backward is not None:  # otherwise errors were collected, and the net will not run
             self.backward_plan = made.backward
             self.plan = unblocked(plan, made.backward)
             self._set_runners()
 
     def _set_runners(self) -> None:
-        """Make what runs the net: of ``runners`` the first that can. The last, ``eager``, always can."""
+        """Make the runners. The first one that can run a pass does; the last, ``eager``, always can."""
         options = self.options
         self.eager = Eager(self.plan, list(self.layers), self.loss_weights, options.exact)
         prepares = options.speed and options.passes and self.phase == TEST
@@ -112,12 +112,12 @@ class Net(torch.nn.Module):
         self.runners: list[Runner] = [runner for runner in (self.prepared, self.eager) if runner]
 
     def replace_layer(self, i: int, layer: Layer) -> None:
-        """Let another layer, of the same blobs and shapes, be layer ``i``."""
+        """Replace layer ``i`` by a layer with the same blobs and shapes."""
         self.layers[i] = layer
         self._set_runners()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without what runs the net."""
+        """Return the state without the runners."""
         gone = {"runners", "eager", "prepared", "_training", "_passing"}
         return {name: value for name, value in self.__dict__.items() if name not in gone}
 
@@ -171,14 +171,14 @@ class Net(torch.nn.Module):
 
     @property
     def blobs(self) -> dict[str, torch.Tensor]:
-        """The blobs kept by the last pass of this thread, or of any where it made none; see ``keep``."""
+        """The blobs kept by the last pass of this thread, or of any thread if it made none; see ``keep``."""
         return ByName("blob", getattr(self._passing.own, "blobs", self._passing.last), self.shapes)
 
     def forward_backward(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]] | None:
         """Run forward and backward by kernels prepared once; return the loss and the outputs, as forward_loss does.
 
-        Gradients are added to ``grad``. None where autograd must do it: see :meth:`new_trainer`, or where hooks or
-        ``keep`` look at the pass. The loss is valid until the next call.
+        Gradients are added to ``grad``. Returns None if autograd is needed: see :meth:`new_trainer`, or because of
+        hooks or ``keep``. The loss is valid until the next call.
         """
         training = self.trainer()
         if training is None or self.keep or training.is_watched():
@@ -189,17 +189,17 @@ class Net(torch.nn.Module):
         return loss, outputs
 
     def trainer(self) -> Trainer | None:
-        """Return what :meth:`forward_backward` runs, made once; None without it."""
+        """Return the trainer that :meth:`forward_backward` runs, or None. It is made once."""
         if self._training is None:
             self._training = self.new_trainer()
         return None if isinstance(self._training, str) else self._training
 
     def forget_trainer(self) -> None:
-        """Let the next pass of :meth:`forward_backward` be one of a new trainer, in other memory."""
+        """Forget the trainer. The next :meth:`forward_backward` makes a new one, in other memory."""
         self._training = None
 
     def new_trainer(self) -> Trainer | str:
-        """Return what trains the net faster than autograd, or the reason why nothing does."""
+        """Return a trainer that is faster than autograd, or the reason why there is none."""
         if self.options.speed is None:
             return "nothing makes it faster (netspec/fast)"
         return self.options.speed.trainer(self.eager, self.largest_trained)
@@ -303,7 +303,7 @@ class Net(torch.nn.Module):
 
 
 class _Passing:
-    """Which thread runs a net, and what the last pass of each kept. A copy of a net has its own."""
+    """The thread that runs a net, and the blobs kept by the last pass of each thread. A copy of a net has its own."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()

@@ -1,7 +1,7 @@
-"""What a snapshot says of its own files: their sizes and hashes, in ``X.solverstate.extra``.
+"""Protects snapshots: ``X.solverstate.extra`` has the sizes and hashes of their files.
 
-That file is JSON, with a hash of its own: one changed digit would otherwise give a training other numbers. Who reads
-``X.caffemodel`` compares it with what was written; protobuf reads most damaged files without a word.
+That file is JSON, and has a hash of itself, because one changed digit would change the results of a training. Readers
+of ``X.caffemodel`` compare it with the hash, because protobuf reads most damaged files without an error.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FORMAT = 2
 _BLOCK = 1 << 20  # bytes
 _SHOWN = 40  # characters of a wrong value
 MOST = 2**63 - 1
-#: What a damaged file of JSON makes Python raise.
+#: The exceptions that Python raises for a damaged JSON file.
 FAULTS = (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError)
 
 
@@ -52,7 +52,7 @@ class Digest:
         return cls(whole_number(size, "size"), hashed)
 
     def check(self, path: Path, extra: Path) -> None:
-        """Raise SpecError where a file is not the one that was written together with ``extra``."""
+        """Raise SpecError if a file is not the one that was written together with ``extra``."""
         if Digest.of(path) != self:
             message = f"is not the file that was written with {extra.name}: it was cut or replaced"
             raise SpecError(f"{message}; if you replaced it yourself, remove {extra.name}", Where(str(path)))
@@ -103,7 +103,7 @@ def damaged(path: Path, reason: Exception) -> SpecError:
 def check_weights(path: Path) -> None:
     """Compare ``X.caffemodel`` with ``X.solverstate.extra``, if that is there. Raises SpecError if they do not fit.
 
-    A warning says where the .extra is damaged, so that nothing was compared.
+    If the .extra is damaged, nothing is compared, and a warning says so.
     """
     found = re.fullmatch(r"(.+)\.caffemodel(\.h5)?", path.name)
     extra = path.with_name(f"{found[1]}.solverstate{found[2] or ''}.extra") if found else None

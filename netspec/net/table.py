@@ -1,4 +1,4 @@
-"""A built net as a table for people, and as JSON for programs."""
+"""A built net as a table of text."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ def table(plan: Plan, layers: Sequence[Layer], width: int | None = None) -> str:
     """Return one line per layer: its name and type, its blobs, the shapes of its tops, its costs; and totals.
 
     Costs: number of learnable values ("shared" if an earlier layer owns them), memory of its tops, multiply-adds of
-    one forward pass. Splits are left out: who reads a copy of a blob reads the blob. In a table of at most ``width``
-    characters lists take several lines, and if that is not enough, columns are left out, as its last line says.
+    one forward pass. Splits are left out: a reader of a copy counts as a reader of the blob. In a table of at
+    most ``width`` characters lists take several lines, and if that is not enough, columns are left out, as its last
+    line says.
     """
     rows: list[_Row] = []
     totals = [0, 0, 0]

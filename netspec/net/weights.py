@@ -40,10 +40,11 @@ def load_weights(
 ) -> None:
     """Copy the weights of a .caffemodel, .caffemodel.h5 or .safetensors into the layers of the same names, all or none.
 
-    Of several files each is loaded in turn, the last one winning. Layers that only a file has are ignored, and named
-    in the log. One warning names the layers that no file has, which stay as they were filled; with ``strict`` that is a
-    SpecError, and with ``some`` it is one where nothing fits. Others are those of a file that cannot be read, or is not
-    what its snapshot wrote, and of blobs of other number or shape than the net's; all go to ``net.plan.source.report``.
+    Several files are loaded in order; a later one overrides an earlier one. Layers that only a file has are ignored,
+    and the log names them. One warning names the layers that no file has; they keep their initial values. With ``strict``
+    this is a SpecError. With ``some`` it is a SpecError if no layer fits. There are also SpecErrors for a file that
+    cannot be read, or that its snapshot did not write, and for another number or shape of blobs than in the net. All go
+    to ``net.plan.source.report``.
     """
     paths: list[str] = [os.fspath(each) for each in several(path)]  # not a Path: of a web address that loses a slash
     loaded: set[int] = set()
@@ -82,7 +83,7 @@ def copy_weights(net: Net, message: NetParameter, path: str | Path) -> None:
 
 
 def _copy(find: Callable[[Report], Copies], report: Report) -> set[int]:
-    """Copy what is found where nothing is wrong with any of it; on meta there is nothing to copy to.
+    """Copy the values if none has a fault. On the device meta there is nothing to copy.
 
     Return the ids of the net's blobs that were found.
     """
@@ -164,13 +165,13 @@ def write_binary(net: Net, path: str | Path, diff: bool = False) -> None:
 
 
 def binary_bytes(net: Net, diff: bool = False) -> int:
-    """Return about how many bytes the weights take in Caffe's binary form: those of their numbers."""
+    """Return the approximate size in bytes of the weights in Caffe's binary form: the size of their numbers."""
     numbers = sum(math.prod(shape) for layer in net.layers for shape in layer.blob_shapes)
     return (2 if diff else 1) * np.dtype(np.float32).itemsize * numbers
 
 
 def too_large(size: int) -> str:
-    """Return what is wrong with a binary file of so many bytes, and the remedy."""
+    """Return the message for a binary file that would be too large, with advice."""
     return f"{size / 2**30:.2f} GiB are more than the 2 GiB of a binary file; set snapshot_format: HDF5"
 
 

@@ -1,4 +1,4 @@
-"""Programs that were written for pycaffe: how they find it, old names and old Python in them, and how they are run.
+"""Runs programs written for pycaffe: lets them import it, restores old names, and translates Python 2.
 
 Nothing here needs torch or numpy before the program itself asks for them.
 """

@@ -1,4 +1,4 @@
-"""What programs translated from Python 2 call, where Python 3 computes otherwise. `--write-py3` copies it from here."""
+"""Functions for programs translated from Python 2, where Python 3 differs. `--write-py3` copies them from here."""
 
 import builtins
 import io
@@ -24,13 +24,13 @@ def py2_idiv(left, right):
 
 
 def py2_is_whole(value):
-    """Say whether a value is a whole number, or an array of them."""
+    """Return whether a value is a whole number, or an array of whole numbers."""
     kind = getattr(getattr(value, "dtype", None), "kind", "")
     return kind in "iub" if kind else isinstance(value, numbers.Integral)
 
 
 def round(number, ndigits=0):
-    """Return a number rounded to so many digits, halves away from zero, as a float."""
+    """Return a number rounded to ``ndigits`` digits, halves away from zero, as a float."""
     scale = 10.0**ndigits
     return math.copysign(math.floor(abs(number) * scale + 0.5) / scale, number)
 
@@ -113,7 +113,7 @@ class file:
         return getattr(self.buffer, name)
 
     def _given(self, data):
-        """Return what was read as what the whole file is: text or bytes."""
+        """Return data as text if the whole file is text, or else as bytes."""
         if self._form is None:
             head = data
             if self.buffer.seekable():
@@ -125,7 +125,7 @@ class file:
         return data.decode("utf-8", "surrogateescape") if self._form is str else Py2Bytes(data)
 
     def read(self, size=-1):
-        """Return what is left, or so many bytes of it."""
+        """Return the rest of the file, or at most ``size`` bytes of it."""
         return self._given(self.buffer.read(-1 if size is None else size))
 
     def readline(self, size=-1):
@@ -133,7 +133,7 @@ class file:
         return self._given(self.buffer.readline(size))
 
     def readlines(self, hint=-1):
-        """Return the lines that are left."""
+        """Return the remaining lines."""
         return [self._given(line) for line in self.buffer.readlines(hint)]
 
     def write(self, data):
@@ -143,7 +143,7 @@ class file:
             self.buffer.flush()
 
     def writelines(self, lines):
-        """Write texts or bytes, with no line ends between them."""
+        """Write a sequence of texts or bytes, without adding line ends."""
         for line in lines:
             self.write(line)
 

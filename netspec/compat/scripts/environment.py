@@ -1,8 +1,8 @@
-"""Puts a ``caffe`` package and Caffe's commands into the current Python environment, and takes them away again.
+"""Installs a ``caffe`` package and Caffe's commands into the current Python environment, and removes them again.
 
-The package is a few lines that hand over to netspec.pycaffe, the commands are those of netspec and lmdb_build under
-Caffe's names. Shell scripts call the commands in a folder that Caffe is built in (``build/tools/caffe``): such a folder
-can be made too. Every file that is written begins with a mark; nothing else is ever removed.
+The package is a few lines that import netspec.pycaffe. The commands are those of netspec and lmdb_build under Caffe's
+names. Shell scripts call commands in Caffe's build folder (``build/tools/caffe``), so such a folder can be made too.
+Every written file begins with a mark, and no other file is ever removed.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ _EXAMPLES: dict[str, tuple[str, list[str]]] = {  # in the build folder only
     "examples/siamese/convert_mnist_siamese_data": (_BUILD, ["mnist", "--pairs", "--backend=leveldb"]),
     "examples/cifar10/convert_cifar_data": (_BUILD, ["cifar"]),
 }
-_ASIDE = ".before-netspec"  # what a file in the way is called meanwhile
+_ASIDE = ".before-netspec"  # suffix of files that are in the way, while ours are installed
 
 
 def install_caffe(replace: bool = False) -> list[Path]:
-    """Write the package and the commands; return what was written. What is in their way is moved aside.
+    """Write the package and the commands; return the paths. Files that are in the way are renamed.
 
-    Raises SpecError where a real Caffe or a command of one of these names is there, unless ``replace``, and OSError
-    where the environment cannot be written to.
+    Raises SpecError if a real Caffe or a command of one of these names exists, unless ``replace``, and OSError if the
+    environment cannot be written to.
     """
     paths = {_package(): _PACKAGE} | {_scripts() / name: _command(*command) for name, command in _COMMANDS.items()}
     in_the_way = [str(path) for path in paths if path.exists() and not _is_ours(path)]
@@ -72,7 +72,7 @@ def install_caffe(replace: bool = False) -> list[Path]:
 
 
 def remove_caffe() -> list[Path]:
-    """Take away what :func:`install_caffe` wrote, and put back what it moved aside; return what was taken away."""
+    """Remove what :func:`install_caffe` wrote, and restore the files that it renamed; return the removed paths."""
     removed = []
     for path in (_package(), *(_scripts() / name for name in _COMMANDS)):
         owner = path.parent if path.name == "__init__.py" else path
@@ -90,10 +90,9 @@ def remove_caffe() -> list[Path]:
 
 
 def make_build_folder(folder: Path) -> list[Path]:
-    """Write the commands where Caffe's build has them: ``tools/caffe``, ``tools/caffe.bin``, ...; return the paths.
+    """Write the commands at the paths of Caffe's build: ``tools/caffe``, ``tools/caffe.bin``, ...; return the paths.
 
-    Raises SpecError where there is another file of one of these names, and OSError where the folder cannot be written
-    to.
+    Raises SpecError if there is another file at one of these paths, and OSError if the folder cannot be written to.
     """
     paths = _build_paths(folder)
     there = [str(path) for path in paths if path.exists() and not _is_ours(path)]
@@ -107,7 +106,7 @@ def make_build_folder(folder: Path) -> list[Path]:
 
 
 def remove_build_folder(folder: Path) -> list[Path]:
-    """Take away what :func:`make_build_folder` wrote, and the folders that are empty then; return what was taken."""
+    """Remove what :func:`make_build_folder` wrote, and folders that are then empty; return the removed paths."""
     removed = [path for path in _build_paths(folder) if _is_ours(path)]
     for path in removed:
         path.unlink()

@@ -1,7 +1,7 @@
-"""Lets ``import caffe`` and its submodules find :mod:`netspec.pycaffe`, and never in the place of a real Caffe.
+"""Lets ``import caffe`` and its submodules find :mod:`netspec.pycaffe`, unless there is a real Caffe.
 
-A real Caffe is any package or module ``caffe`` on ``sys.path``, but for Caffe's sources without the compiled part:
-scripts put these on the path (``sys.path.insert(0, caffe_root + "python")``), and they cannot be imported.
+A real Caffe is any package or module ``caffe`` on ``sys.path``, except Caffe's sources without the compiled part.
+Scripts put these on the path (``sys.path.insert(0, caffe_root + "python")``), but they cannot be imported.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ MARK = "# netspec as caffe"  # the first line of what `netspec install-caffe` wr
 
 
 def install(shadow: bool = False) -> None:
-    """Let ``import caffe`` find netspec.pycaffe from now on; with ``shadow`` also where there is a real Caffe."""
+    """Let ``import caffe`` find netspec.pycaffe from now on; with ``shadow`` even if there is a real Caffe."""
     uninstall()
     sys.meta_path.insert(0, CaffeFinder(shadow))
 
 
 def uninstall() -> None:
-    """Undo :func:`install`; what was imported stays."""
+    """Undo :func:`install`. Modules that were imported stay."""
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, CaffeFinder)]
 
 
 def real_caffe() -> str | None:
-    """Return where a real Caffe is that Python finds now, or None."""
+    """Return the path of the real Caffe that Python finds now, or None."""
     spec = PathFinder.find_spec(NAME, sys.path)
     if spec is None or spec.origin is None:  # a mere folder of that name is none
         return None
@@ -46,13 +46,13 @@ def real_caffe() -> str | None:
 
 
 class CaffeFinder(importlib.abc.MetaPathFinder):
-    """Finds ``caffe`` and what is in it."""
+    """Finds ``caffe`` and its submodules."""
 
     def __init__(self, shadow: bool) -> None:
         self.shadow = shadow
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
-        """Return the spec of netspec's module, of another one beside Caffe's sources, or None for Python to look on."""
+        """Return the spec of netspec's module, or of another one in Caffe's sources, or None: Python searches on."""
         if fullname == NAME:
             return self._whole()
         parent, _, leaf = fullname.rpartition(".")
@@ -75,7 +75,7 @@ class CaffeFinder(importlib.abc.MetaPathFinder):
         return spec
 
     def _search(self, fullname: str) -> ModuleSpec | None:
-        """Return the spec of a module of Caffe's sources on the path, as the other finders have it, or None."""
+        """Return the spec of a module in Caffe's sources on the path, from the other finders, or None."""
         inside = Path(*fullname.split(".")[:-1])
         trees = [Path(entry) for entry in sys.path if (Path(entry) / NAME / "pycaffe.py").is_file()]
         folders = [str(tree / inside) for tree in trees]

@@ -1,4 +1,4 @@
-"""What is called in the place of operations that Python 2, or NumPy before 2.4, understood otherwise.
+"""Functions that replace operations with another meaning in Python 2, or in NumPy before 2.4.
 
 netspec/compat/scripts/sources.py writes these calls into a program. Each function changes what it is given and then
 calls once: text where bytes are due becomes the bytes of the file that it came from, an array of one element a number,
@@ -25,13 +25,13 @@ _CONVERSION = re.compile(r"%(?:\((?P<name>.*?)\))?[-#0 +]*(?P<width>\*|\d*)(?:\.
 
 
 def _number(value: Any) -> Any:
-    """Return the element of an array that has one; everything else as it is."""
+    """Return the element of an array of one element. Return everything else unchanged."""
     is_array = hasattr(value, "dtype") and getattr(value, "ndim", 0) > 0 and value.size == 1
     return value.item() if is_array else value
 
 
 def _integer(value: Any) -> Any:
-    """Return a number with a point as an integer, as NumPy took it for an index or a size until 1.12."""
+    """Return a float as an integer. NumPy accepted floats as indices and sizes until 1.12."""
     if isinstance(value, (tuple, list)):
         return type(value)(map(_integer, value)) if type(value) in (tuple, list) else value
     value = _number(value)
@@ -39,7 +39,7 @@ def _integer(value: Any) -> Any:
 
 
 def _percent(text: str, values: Any) -> str:
-    """Return text % values; an array of one element is a number where the text has %d, %f or the like."""
+    """Return text % values. An array of one element counts as a number for %d, %f and the like."""
     given = values if isinstance(values, tuple) else (values,)
     if isinstance(values, dict) or not any(hasattr(value, "dtype") for value in given):
         return text % values
@@ -53,7 +53,7 @@ def _percent(text: str, values: Any) -> str:
 
 
 class _Formatter(string.Formatter):
-    """Formats as str.format does, and what has no format of its own, such as None or a list, as its text."""
+    """Formats like str.format. Objects without a format of their own, such as None or a list, become their text."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         return format(str(value) if type(value).__format__ is object.__format__ else value, format_spec)
@@ -98,7 +98,7 @@ def _encode(value: Any, *codec: Any) -> Any:
 
 
 def _comparing(compare: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Return a comparison that has an order of unlike types too: None, numbers, and others by their types' names."""
+    """Return a comparison that also orders different types: None, numbers, and others by the names of their types."""
 
     def compared(left: Any, right: Any) -> Any:
         ranks = _rank(left), _rank(right)
@@ -116,7 +116,7 @@ def _rank(value: Any) -> tuple[int, str] | None:
 
 
 def _equality(compare: Callable[[Any, Any], Any], otherwise: bool) -> Callable[[Any, Any], Any]:
-    """Return == or !=; one answer for an array beside None or another length of list, as before NumPy 1.13."""
+    """Return == or !=, with a single result for an array and None, or a list of another length (NumPy before 1.13)."""
 
     def compared(left: Any, right: Any) -> Any:
         if right is None:

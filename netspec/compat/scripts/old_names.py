@@ -1,7 +1,6 @@
-"""What NumPy, SciPy, scikit-image, lmdb, PyYAML and Python itself have dropped since then, given back to old scripts.
+"""Restores names that NumPy, SciPy, scikit-image, lmdb, PyYAML and Python have removed, for old scripts.
 
-Only a program that `netspec run` runs gets them: each module gets its names when it is imported, and only those that it
-has not.
+Only programs that `netspec run` runs get them. Each module gets its missing names when it is imported.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ from netspec.terminal.commands import VARIABLE
 
 
 def install(also: Mapping[str, Callable[[Any], None]], quiet: bool = False) -> None:
-    """Give the names to modules that are imported already, and to others when they are imported.
+    """Add the names to modules that are imported already, and to others when they are imported.
 
-    ``also`` are functions for further modules, which are called with the module. Unless ``quiet``, a NumPy that is too
-    new for old programs gets one warning, in this process and none that it forks.
+    ``also`` has functions for further modules; each is called with its module. Unless ``quiet``, one warning says if
+    NumPy is too new for old programs, in this process but not in its forks.
     """
     _PATCHES.update(also)
     if not quiet and os.environ.get(VARIABLE, "0") in ("", "0", "1"):
@@ -55,7 +54,7 @@ def install(also: Mapping[str, Callable[[Any], None]], quiet: bool = False) -> N
 
 
 class _Finder(importlib.abc.MetaPathFinder):
-    """Finds the modules to patch where Python does; scipy.misc also where SciPy has it no longer."""
+    """Finds the modules to patch with Python's finders; and scipy.misc, even if SciPy no longer has it."""
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
         if fullname not in _PATCHES:
@@ -137,7 +136,7 @@ def _warn_if_too_new(np: Any) -> None:
 
 
 def remedy(fault: BaseException) -> str:
-    """Return what to do about a fault that an old program meets and a new one would not; or an empty string."""
+    """Return advice for an error that is typical of old programs, or an empty string."""
     text = str(fault)
     place = next((f for f in reversed(traceback.extract_tb(fault.__traceback__)) if f.filename in TRANSLATED), None)
     if place and isinstance(fault, (TypeError, UnicodeError)):
@@ -154,9 +153,9 @@ def remedy(fault: BaseException) -> str:
         return forks.advice(unknown[1], tuple(sorted(forks.with_field("", unknown[1]))))
     caffe = sys.modules.get("netspec.compat.pycaffe")
     if isinstance(fault, FileNotFoundError) and caffe and isinstance(fault.filename, str):
-        beside = os.path.relpath(fault.filename, os.path.dirname(str(caffe.__file__)))
-        if not beside.startswith(os.pardir):
-            return f"this is python/caffe/{beside} of Caffe's sources: put a copy at {fault.filename}"
+        relative = os.path.relpath(fault.filename, os.path.dirname(str(caffe.__file__)))
+        if not relative.startswith(os.pardir):
+            return f"this is python/caffe/{relative} of Caffe's sources: put a copy at {fault.filename}"
     return ""
 
 
@@ -295,7 +294,7 @@ def _skimage_io(io: Any) -> None:
 
 
 def _skimage_transform(transform: Any) -> None:
-    """Let the last axis of an image (H, W, C) be its channels where nothing is said, as until scikit-image 0.19."""
+    """Take the last axis of an image (H, W, C) for its channels by default, as until scikit-image 0.19."""
     new = transform.rescale
 
     def rescale(image: Any, scale: Any, *arguments: Any, multichannel: Any = None, **named: Any) -> Any:
@@ -314,7 +313,7 @@ def _skimage_color(color: Any) -> None:
 
 
 def _lmdb(lmdb: Any) -> None:
-    """Let keys be text, and an environment be opened twice in a process, as both were in Python 2."""
+    """Allow keys to be text, and an environment to be opened twice in a process, as in Python 2."""
     whole, transaction = lmdb.open, lmdb.Transaction
     opened: dict[str, Any] = {}
 
@@ -336,7 +335,7 @@ def _lmdb(lmdb: Any) -> None:
 
 
 class _Proxy:
-    """Hands everything on to an object of lmdb, whose classes cannot be derived from."""
+    """Passes everything on to an object of lmdb, because the classes of lmdb cannot be subclassed."""
 
     def __init__(self, real: Any) -> None:
         self.real = real
@@ -396,7 +395,7 @@ def _bytes(text: Any) -> Any:
 
 
 def _string(string: Any) -> None:
-    """Give the functions that became methods, and letters by their old names."""
+    """Add the functions that became methods, and the old names of letters."""
     methods = "capitalize center count expandtabs find index ljust lower lstrip replace rfind rindex rjust rsplit"
     for name in (*methods.split(), *("rstrip", "split", "strip", "swapcase", "title", "translate", "upper", "zfill")):
         _give(string, name, getattr(str, name))
@@ -411,7 +410,7 @@ def _string(string: Any) -> None:
 
 
 def _pickle(pickle: Any) -> None:
-    """Let texts of Python 2, with any bytes in them, be read, and files of text be read and written."""
+    """Allow pickles of Python 2 with any bytes in strings, and files opened as text."""
     load, loads, dump = pickle.load, pickle.loads, pickle.dump
     pickle.load = lambda file, **named: load(getattr(file, "buffer", file), **{"encoding": "latin1", **named})
     pickle.loads = lambda data, **named: loads(py2_bytes(data), **{"encoding": "latin1", **named})
@@ -419,7 +418,7 @@ def _pickle(pickle: Any) -> None:
 
 
 def _yaml(yaml: Any) -> None:
-    """Let a loader be left out: it is FullLoader, as in PyYAML 5."""
+    """Make the loader optional: the default is FullLoader, as in PyYAML 5."""
     load, load_all = yaml.load, yaml.load_all
     yaml.load = lambda stream, Loader=yaml.FullLoader: load(stream, Loader)
     yaml.load_all = lambda stream, Loader=yaml.FullLoader: load_all(stream, Loader)

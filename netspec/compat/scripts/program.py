@@ -1,4 +1,4 @@
-"""Runs a script, or a module, as Python itself does, with netspec's ``caffe`` at hand."""
+"""Runs a script or a module like Python itself, with netspec's ``caffe`` available."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from netspec.errors import SpecError
 
 @dataclass(frozen=True)
 class Options:
-    """How to run: in the place of a real Caffe, as Python 2 in any case."""
+    """How to run a program: whether to replace a real Caffe, and whether it is always Python 2."""
 
     shadow: bool = False
     python2: bool = False
 
 
 def run_script(path: str, arguments: Sequence[str], options: Options) -> NoReturn:
-    """Run a script. Ends as the script does, with its exit status and its traceback.
+    """Run a script. The process ends like the script, with its exit status and traceback.
 
-    Raises SpecError where the file cannot be read.
+    Raises SpecError if the file cannot be read.
     """
     data = sources.bytes_of(path)
     reader = _prepare(os.path.dirname(os.path.realpath(path)), options)
@@ -64,7 +64,7 @@ def run_module(name: str, arguments: Sequence[str], options: Options) -> NoRetur
 
 
 def _prepare(folder: str, options: Options) -> sources.Reader:
-    # The folder of the console script makes room; ``python -m netspec`` has already taken its own away.
+    # Replace the folder of the console script; ``python -m netspec`` has already removed its own.
     of_program = [os.path.dirname(os.path.abspath(sys.argv[0]))]
     sys.path[: int(sys.path[:1] == of_program)] = [folder]
     reader = sources.Reader(folder, options.python2)
@@ -96,7 +96,7 @@ def _execute(data: bytes, main: ModuleType, path: str, reader: sources.Reader) -
 
 
 def _from(trace: TracebackType | None, path: str) -> TracebackType | None:
-    """Return the part of a traceback that begins in the script; None where it does not get there."""
+    """Return the part of a traceback that begins in the script; None if it does not reach the script."""
     while trace is not None and trace.tb_frame.f_code.co_filename != path:
         trace = trace.tb_next
     return trace
@@ -114,11 +114,11 @@ def _show(fault: BaseException, trace: TracebackType | None) -> None:
         print(f"netspec run: {remedy}", file=sys.stderr)
 
 
-# Processes that a program starts by spawn or forkserver: Python starts them anew, and they import the program
+# Processes that a program starts by spawn or forkserver: each is a new Python process that imports the program
 
 
 def _make_ready(reader: sources.Reader, shadow: bool, quiet: bool = False) -> None:
-    """Make this process, and those that it starts, one in which old programs run."""
+    """Prepare this process, and those that it starts, for old programs."""
     old_names.install({"multiprocessing.spawn": lambda spawn: _hand_on(spawn, reader, shadow)}, quiet)
     reader.install()
     finder.install(shadow)  # the last is asked first
@@ -138,7 +138,7 @@ def _hand_on(spawn: Any, reader: sources.Reader, shadow: bool) -> None:
 
 
 class _Prepared:
-    """Prepares the process that unpickles it, which happens before that imports the program."""
+    """Prepares the process that unpickles it, before that process imports the program."""
 
     def __init__(self, reader: sources.Reader, shadow: bool) -> None:
         self._arguments = reader, shadow

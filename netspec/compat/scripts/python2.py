@@ -1,9 +1,9 @@
-"""Python 2: how to recognize it, and how to make it Python 3 that computes the same.
+"""Recognizes Python 2, and translates it to Python 3 that computes the same.
 
 The translation is 2to3's (lib2to3 where Python still has it, else fissix, its fork), and adds what that leaves out:
 the quotient of whole numbers is rounded down, ``round`` gives a float and rounds halves away from zero, files and
 ``StringIO`` take and give text and bytes (netspec/compat/scripts/as_python2.py). Imports of a package's own modules by
-bare name are left to the run, since only that knows what is imported as a package.
+bare name are resolved at run time, because only then it is known what is imported as a package.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _STATEMENTS = re.compile(
 
 
 def is_python2(data: bytes, path: str) -> bool:
-    """Say whether a file is Python 2: it is no Python 3 but reads as Python 2, or uses what only Python 2 has."""
+    """Return whether a file is Python 2: it parses only as Python 2, or uses something that only Python 2 has."""
     if re.match(rb"#!.*python2", data):
         return True
     try:
@@ -63,7 +63,7 @@ def is_python2(data: bytes, path: str) -> bool:
 
 
 def is_python3(data: bytes, path: str) -> bool:
-    """Say whether a file that Python 3 can read has what Python 2 could not read."""
+    """Return whether a file that parses as Python 3 would not parse as Python 2."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return _has_python3(ast.parse(data, path))
@@ -105,7 +105,7 @@ def _has_python3(tree: ast.AST) -> bool:
 
 
 def _has_python2(tree: ast.AST) -> bool:
-    """Say whether a file uses names or modules that only Python 2 has, without a way out for Python 3."""
+    """Return whether a file uses names or modules that only Python 2 has, without an alternative for Python 3."""
     bound = _bound_names(tree)
     guarded = {inner for node in ast.walk(tree) if isinstance(node, ast.Try) for inner in ast.walk(node)}
     for node in ast.walk(tree):
@@ -129,7 +129,7 @@ def _has_python2(tree: ast.AST) -> bool:
 
 
 def _is_method_of_2(node: ast.AST) -> bool:
-    """Say whether a node is d.has_key(k), d.iteritems() or the like; six.iteritems(d) is another."""
+    """Return whether a node is d.has_key(k), d.iteritems() or the like, but not six.iteritems(d)."""
     if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
         return False
     return node.func.attr in _METHODS and len(node.args) == (node.func.attr == "has_key")
@@ -171,8 +171,8 @@ _BYTES_IN_TEXT = re.compile(r"(?<!\\)((?:\\\\)*)\\x([89a-fA-F][0-9a-fA-F])")
 def translated(data: bytes, path: str, alone: bool = False) -> str:
     """Return Python 2 source as Python 3; ``alone`` puts what it needs into the text.
 
-    Otherwise :func:`import_helpers` imports it, where no line is added: the lines keep their numbers.
-    Raises SyntaxError where it is not Python 2 either, SpecError where neither lib2to3 nor fissix is there.
+    Otherwise :func:`import_helpers` imports it without a new line, so that lines keep their numbers.
+    Raises SyntaxError if it is not Python 2 either, and SpecError if neither lib2to3 nor fissix is installed.
     """
     package = _translator()
     if not package:
@@ -182,7 +182,7 @@ def translated(data: bytes, path: str, alone: bool = False) -> str:
     text = _spaces(text.rstrip() + "\n", package)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # lib2to3 says that it will go
+            warnings.simplefilter("ignore")  # lib2to3 warns that it is deprecated
             tree = _tool(package, _ALONE if alone else _HOME).refactor_string(text, path)
     except Exception as fault:  # each part of 2to3 has errors of its own
         raise SyntaxError(f"this is neither Python 3 nor Python 2: {fault}") from None
@@ -195,7 +195,7 @@ def translated(data: bytes, path: str, alone: bool = False) -> str:
 
 @functools.cache
 def _translator() -> str:
-    """Return the package that translates: fissix, which is looked after, else lib2to3; "" where there is none."""
+    """Return the package that translates: fissix, which is maintained, or else lib2to3, or ""."""
     return next((name for name in ("fissix", "lib2to3") if importlib.util.find_spec(name)), "")
 
 
@@ -221,7 +221,7 @@ def _encoding(data: bytes) -> str:
 
 
 def _spaces(text: str, package: str) -> str:
-    """Return a text whose lines are indented by spaces, a tab reaching to the next multiple of 8 as in Python 2."""
+    """Return a text indented by spaces. A tab reaches to the next multiple of 8, as in Python 2."""
     if "\t" not in text:
         return text
     tokens = importlib.import_module(f"{package}.pgen2.tokenize")
@@ -242,7 +242,7 @@ def _spaces(text: str, package: str) -> str:
 
 
 def _floor_quotients(tree: Any, package: str) -> list[str]:
-    """Write each ``/`` and ``/=`` whose operands may be whole numbers as a call; return the names that are called."""
+    """Replace each ``/`` and ``/=`` of operands that may be whole numbers by a call; return the names that are called."""
     pytree = importlib.import_module(f"{package}.pytree")
     util = importlib.import_module(f"{package}.fixer_util")
     syms = importlib.import_module(f"{package}.pygram").python_symbols
@@ -288,7 +288,7 @@ def _mark_bytes(tree: Any, package: str) -> None:
 
 
 def _is_float(node: Any) -> bool:
-    """Say whether an operand is a float for certain: 2.0, or float(x)."""
+    """Return whether an operand is certainly a float: 2.0, or float(x)."""
     text = str(node).strip()
     return bool(re.fullmatch(r"(\d+\.\d*|\.\d+|\d+)([eE][-+]?\d+)?", text) and re.search(r"[.eE]", text)) or (
         text.startswith("float(") and text.endswith(")") and len(node.children) == 2
@@ -296,14 +296,14 @@ def _is_float(node: Any) -> bool:
 
 
 def _used_builtins(tree: Any) -> list[str]:
-    """Return which of the builtins that are others in Python 2 are used; x.open and file=f are no use of them."""
+    """Return the used builtins that differ in Python 2. x.open and file=f do not count."""
     named = (leaf for leaf in tree.leaves() if leaf.value in (*_BUILTINS_OF_2, _ALONE))
     used = {leaf.value for leaf in named if str(leaf.prev_sibling) != "." and str(leaf.next_sibling) != "="}
     return sorted(used)
 
 
 def import_helpers(tree: ast.Module) -> None:
-    """Let a translation that was parsed import what it needs."""
+    """Add the imports of the helpers to a parsed translation."""
     used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
     if names := [ast.alias(name) for name in _HELPERS if name in used]:
         first = _head(tree)
@@ -314,7 +314,7 @@ def import_helpers(tree: ast.Module) -> None:
 
 
 def _head(tree: ast.Module) -> int:
-    """Return how many statements the docstring and the imports from __future__ are."""
+    """Return the number of statements of the docstring and the imports from __future__."""
     for number, node in enumerate(tree.body):
         docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and number == 0
         if not docstring and not (isinstance(node, ast.ImportFrom) and node.module == "__future__"):

@@ -1,6 +1,6 @@
-"""From a program's text to code: Python 2 is translated, and what NumPy's arrays have lost is given back.
+"""Compiles programs: translates Python 2, and restores behavior that NumPy's arrays have lost.
 
-The same is done to modules that a program imports from outside of Python's own folders.
+The same is done for modules that a program imports from outside of Python's own folders.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ RENAMED_METHODS = {"tostring": "tobytes"}  # of arrays, called without arguments
 
 
 def write_translation(path: str, out: Path, always: bool) -> None:
-    """Write a program of Python 2 as Python 3 that needs nothing of netspec; ``always`` also where it is Python 3 too.
+    """Translate a program from Python 2 to Python 3 that does not need netspec; ``always`` even if it is Python 3 too.
 
-    Raises SyntaxError where it is neither, SpecError where it is Python 3 already, cannot be read, or Python 2 cannot
-    be translated here.
+    Raises SyntaxError if it is neither, and SpecError if it is Python 3 already, if it cannot be read, or if no
+    translator is installed.
     """
     data = bytes_of(path)
     if not (always or python2.is_python2(data, path)):
@@ -53,10 +53,11 @@ def bytes_of(path: str) -> bytes:
 
 
 class Reader(importlib.abc.MetaPathFinder):
-    """Reads a program and its modules, but for those of Python and of site-packages.
+    """Reads a program and its modules, except those of Python and of site-packages.
 
-    A module without syntax of either language is Python 2 where the program is, and it lies beside or below the
-    program or in a folder that the program has put on ``sys.path``; with ``always`` wherever it lies.
+    A module that could be Python 2 or 3 counts as Python 2 if the program is Python 2, and if the module is in the
+    folder of the program, below it, or in a folder that the program added to ``sys.path``. With ``always``, every such
+    module does.
     """
 
     def __init__(self, folder: str, always: bool) -> None:
@@ -79,7 +80,7 @@ class Reader(importlib.abc.MetaPathFinder):
     def main_code(self, data: bytes, path: str) -> CodeType:
         """Return the code of the program.
 
-        Raises SyntaxError where it is neither Python 3 nor Python 2, SpecError where Python 2 cannot be translated.
+        Raises SyntaxError if it is neither Python 3 nor Python 2, and SpecError if Python 2 cannot be translated.
         """
         self.main = path
         ours = path.startswith(str(Path(__file__).parents[3] / "netspec") + os.sep)  # netspec run -m netspec train
@@ -92,7 +93,7 @@ class Reader(importlib.abc.MetaPathFinder):
     def module_code(self, data: bytes, path: str, package: str) -> CodeType:
         """Return the code of a module of the program, in a package unless that is "". Raises as :meth:`main_code`."""
         is_python2 = python2.is_python2(data, path) or (
-            ((self.python2 and self._is_neighbor(path)) or _imports_beside(data, path, package))
+            ((self.python2 and self._is_neighbor(path)) or _imports_neighbor(data, path, package))
             and not python2.is_python3(data, path)
         )
         return self._code(data, path, is_python2, "is Python 2 too")
@@ -113,7 +114,7 @@ class Reader(importlib.abc.MetaPathFinder):
         return self.always or any(place.is_relative_to(folder) for folder in folders)
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
-        """Return the spec of a module of the program, which is found where Python finds it, or None."""
+        """Return the spec of a module of the program, from Python's own finders, or None."""
         if fullname == MAIN and self.main:
             return spec_from_file_location(MAIN, self.main, loader=_Loader(MAIN, self.main, self.main_code))
         spec = PathFinder.find_spec(fullname, path)
@@ -142,11 +143,11 @@ def _installed(folder: Path) -> frozenset[str]:
     return frozenset(re.split("[/,]", line, maxsplit=1)[0] for text in records for line in text.splitlines())
 
 
-def _imports_beside(data: bytes, path: str, package: str) -> bool:
-    """Say whether a module of a package imports another by a bare name that nothing else has, as in Python 2."""
+def _imports_neighbor(data: bytes, path: str, package: str) -> bool:
+    """Return whether a module imports another of its package by a bare name that nothing else has, as in Python 2."""
     folder = Path(path).parent
-    beside = {name for name in python2.imported_names(data, path) if package and _is_in(name, folder)}
-    return any(name not in sys.modules and PathFinder.find_spec(name) is None for name in beside)
+    neighbors = {name for name in python2.imported_names(data, path) if package and _is_in(name, folder)}
+    return any(name not in sys.modules and PathFinder.find_spec(name) is None for name in neighbors)
 
 
 def _is_in(name: str, folder: Path) -> bool:
@@ -154,7 +155,7 @@ def _is_in(name: str, folder: Path) -> bool:
 
 
 def builtins_for(path: str) -> Any:
-    """Return the builtins of a module: in Python 2 an import looks beside the module first, if that is in a package."""
+    """Return the builtins of a module. In Python 2 an import searches the package of the module first."""
     return {**vars(builtins), "__import__": _import} if path in mended.TRANSLATED else builtins
 
 
@@ -168,7 +169,7 @@ def _import(name: str, names: Any = None, own: Any = None, wanted: Sequence[str]
 
 
 class _Loader(SourceFileLoader):
-    """Compiles as a :class:`Reader` does, and keeps no compiled file: plain Python would take it."""
+    """Compiles like :class:`Reader`, without a cached file, because plain Python would use that file."""
 
     def __init__(self, fullname: str, path: str, code: Callable[[bytes, str], CodeType]) -> None:
         super().__init__(fullname, path)
@@ -184,11 +185,11 @@ class _Loader(SourceFileLoader):
 
 
 def _compiled(source: str | bytes, path: str, is_python2: bool = False) -> CodeType:
-    """Return the code of Python 3; the lines of a text that is not in the file are known to tracebacks."""
+    """Return the code of Python 3 source. Tracebacks show the lines of a translation."""
     if isinstance(source, str):
         linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of escapes in strings and the like: the script is old
+        warnings.simplefilter("ignore")  # about escapes in strings and the like in old scripts
         tree = ast.parse(source, path)
         if is_python2:
             python2.import_helpers(tree)
@@ -223,10 +224,10 @@ _WITH_SIZES = ("empty", "ones", "reshape", "resize", "zeros")  # their first arg
 
 
 class _Mending(ast.NodeTransformer):
-    """Writes calls of netspec/compat/scripts/mended.py for what Python 3 or NumPy refuses, or understands otherwise.
+    """Replaces what Python 3 or NumPy refuses, or does differently, by calls of netspec/compat/scripts/mended.py.
 
-    These are ``a.tostring()``, ``"%f" % a`` and ``float(a)`` of one element; in Python 2 also text where bytes are due,
-    comparisons of unlike types, ``sort(cmp)``, and numbers with a point as sizes and in slices.
+    These are ``a.tostring()``, ``"%f" % a`` and ``float(a)`` for one element; in Python 2 also text instead of bytes,
+    comparisons of different types, ``sort(cmp)``, and floats as sizes and in slices.
     """
 
     def __init__(self, is_python2: bool) -> None:
