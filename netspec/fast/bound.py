@@ -1,7 +1,7 @@
-"""Products with learned weights at fixed shapes: what products.py and vectors.py compute, call by call.
+"""Products with learned weights at fixed shapes. They compute the same as products.py and vectors.py in netspec/exact.
 
-The arguments of BLAS' calls are made once: they are views of memory that stays where it is. So what a function here
-returns is good until its next call. Everything here expects that BLAS uses one thread.
+The arguments of the calls of BLAS are made once: they are views of memory that is reused. So the result of a function
+is valid until its next call. BLAS must use one thread.
 
 Caffe: src/caffe/layers/inner_product_layer.cpp, base_conv_layer.cpp
 """
@@ -54,7 +54,7 @@ class Matrix:
 
 
 class Weights(NamedTuple):
-    """What a layer has learned, and where its gradients are added up, None where there are none."""
+    """The weights of a layer, and the tensors to which their gradients are added (None: not learned)."""
 
     weight: torch.Tensor
     bias: torch.Tensor | None
@@ -63,15 +63,15 @@ class Weights(NamedTuple):
 
 
 def at_rest(weight: torch.Tensor, bias: torch.Tensor | None = None) -> Weights:
-    """Return the weights and biases of a layer that does not learn."""
+    """Return the Weights of a layer that does not learn."""
     return Weights(weight, bias, None, None)
 
 
 class BoundVectors:
     """:class:`netspec.exact.vectors.VectorProducts` of vectors of one shape, and of one matrix.
 
-    ``shape`` is the bottom's, any that has rows of K numbers; the top is ``top_shape``. ``wanted`` says whether the
-    bottom's gradient is computed. ``nbytes`` of memory are kept between forward passes.
+    ``shape`` is the shape of the bottom, which consists of rows of K numbers; ``top_shape`` is that of the top.
+    ``wanted`` says whether the gradient of the bottom is computed. ``nbytes`` of memory are kept between passes.
     """
 
     def __init__(
@@ -122,8 +122,8 @@ class BoundVectors:
 class BoundColumns:
     """:class:`netspec.exact.products.ColumnProducts` of maps (N, C, H, W) of one shape.
 
-    The columns of a batch that fits into :data:`netspec.exact.products.COLUMNS` are kept for the backward pass, if maps
-    are ``steady``: if they do not change before it. About ``nbytes`` of memory are kept between forward passes.
+    If the columns of a batch fit into :data:`netspec.exact.products.COLUMNS`, they are kept for the backward pass,
+    unless maps may change before it (not ``steady``). About ``nbytes`` of memory are kept between passes.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ def _by_group(matrix: np.ndarray, group: int) -> list[np.ndarray]:
 def _columns(
     shape: Axes, dtype: torch.dtype, sliding: Filter, fits: Sequence[int], group: int
 ) -> Callable[[torch.Tensor], list[list[np.ndarray]]]:
-    """Return what :meth:`Filter.columns` gives for all maps (N, C, H, W) of one shape, by image and by group."""
+    """Return a function like :meth:`Filter.columns` for maps (N, C, H, W) of one shape, by image and by group."""
     (count, channels, *size), (kernel, stride, dilation) = shape, (sliding.kernel, sliding.stride, sliding.dilation)
     flat = (count, channels * math.prod(kernel), math.prod(fits))
     each_pixel_once = math.prod(kernel) * flat[2] == math.prod(size)

@@ -1,9 +1,9 @@
-"""Layers that do the work of others: weights that scale and shift as well.
+"""Folds layers that scale and shift channels into the weights of other layers.
 
 A convolution y = W x + b followed by z = s y + t, both s and t one number for each channel, is a convolution with the
-weights s W and the bias s b + t. A BatchNorm that normalizes by its past is such a map, s = 1 / sqrt(var + eps) and t =
--mean s, and so is a Scale; maps in a row are one map. The arithmetic is in double precision. What each layer
-is to its neighbors stands in its entry (folding.py); here they are only put together.
+weights s W and the bias s b + t. A BatchNorm with stored statistics is such a map, s = 1 / sqrt(var + eps) and t =
+-mean s, and so is a Scale. Consecutive maps are one map. The arithmetic is in double precision. The entry of a layer
+says how it can be joined with its neighbors (folding.py); this module only combines them.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from netspec.layers.contract.exporting import passes_on
 
 @dataclass(frozen=True)
 class Fold:
-    """A chain of a net's layers, and the parameters and learned blobs (double) with which its keeper does it all."""
+    """A chain of layers, and the parameters and learned blobs (double) with which its keeper computes all of it."""
 
     chain: Chain
     absorbed: Absorbed
 
 
 def roles_of(plan: Plan, layers: Sequence[Layer]) -> Roles:
-    """Return what each layer of a plan is for folding."""
+    """Return what each layer of a plan can do in folding."""
     folds = [folds_of(layer) for layer in layers]
     one_top = [len(node.tops) == 1 for node in plan.nodes]
     one_to_one = [one and len(node.bottoms) == 1 for one, node in zip(one_top, plan.nodes, strict=True)]
@@ -44,14 +44,14 @@ def roles_of(plan: Plan, layers: Sequence[Layer]) -> Roles:
 
 
 def find_folds(plan: Plan, layers: Sequence[Layer]) -> list[Fold]:
-    """Return all that can be folded, with the weights as they are; the layers are not changed."""
+    """Return everything that can be folded, with the present weights. The layers are not changed."""
     return [Fold(chain, absorbed_by(chain, layers)) for chain in find_chains(plan, roles_of(plan, layers))]
 
 
 def absorbed_by(chain: Chain, layers: Sequence[Layer], like: torch.Tensor | None = None) -> Absorbed:
-    """Return what a chain's keeper has to be to do the work of all, in double or in the precision of ``like``.
+    """Return the layer that computes a whole chain, in double or in the precision of ``like``.
 
-    What scales and shifts is composed in double in any case.
+    Scales and shifts are always combined in double.
     """
     affine, keeper = [folds_of(layers[i]).affine for i in chain.folded], folds_of(layers[chain.keeper])
     scale, shift = composed([each() for each in affine if each])
@@ -63,7 +63,7 @@ def absorbed_by(chain: Chain, layers: Sequence[Layer], like: torch.Tensor | None
 
 
 def composed(maps: Sequence[Affine]) -> Affine:
-    """Return the one map that does what these do one after the other."""
+    """Return the map that is the composition of these, in order."""
     scale, shift = torch.ones((), dtype=torch.double), torch.zeros((), dtype=torch.double)
     for each in maps:
         scale, shift = each[0] * scale, each[0] * shift + each[1]

@@ -1,8 +1,8 @@
-"""How the work of a layer and that of its neighbors become one: what each is to them; chains.py and fold.py join them.
+"""The types that describe how a layer can be joined with its neighbors; chains.py and fold.py join them.
 
 A convolution y = W x + b followed by z = s y + t, both s and t one number for each channel, is a convolution with the
-weights s W and the bias s b + t. A map from number to number can be done in place to the top of the layer before it.
-Both leave layers out where weights stay as they are.
+weights s W and the bias s b + t. An elementwise function can be applied in place to the top of the layer before it.
+Both save a layer as long as the weights do not change.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Affine = tuple[torch.Tensor, torch.Tensor]  # scale and shift of each channel, (
 
 @dataclass(frozen=True)
 class Absorbed:
-    """A layer that also does what another did: its LayerParameter and its learned blobs."""
+    """A layer that has absorbed another: its LayerParameter and its learned blobs."""
 
     param: Any
     blobs: tuple[torch.Tensor, ...]
@@ -34,11 +34,12 @@ Absorb = Callable[[torch.Tensor, torch.Tensor], Absorbed]  # of a scale and a sh
 
 @dataclass(frozen=True)
 class Folds:
-    """What a layer is to its neighbors, at its present settings.
+    """How a layer can be joined with its neighbors, at its present settings.
 
-    ``finish``: the layer is this map from number to number. ``affine`` returns how it scales and shifts the channels,
-    axis 1, of its bottom, where that is all it does. ``absorb`` returns the layer that scales and shifts the channels
-    of its top as well, ``absorb_before`` that which does so to its bottom before its own work.
+    - ``finish``: the layer is this elementwise function.
+    - ``affine``: returns the scale and shift of the channels (axis 1), if the layer does nothing else.
+    - ``absorb``: returns a layer that also scales and shifts the channels of its top.
+    - ``absorb_before``: returns a layer that first scales and shifts the channels of its bottom.
     """
 
     finish: Finish | None = None

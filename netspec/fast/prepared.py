@@ -1,8 +1,9 @@
 """Runs of a net without gradients: each layer is prepared once for the shapes at hand.
 
-A program is the line of kernels for one set of input shapes and of blobs to keep. Programs keep weights in other forms,
-folded or laid out for a kernel. Before each run, a program checks whether a learned blob was written to, or could be
-through an alias that is still alive. Layers with such blobs read them directly until they have not changed for a run.
+A program is the sequence of kernels for one set of input shapes and of blobs to keep. Programs keep copies of weights,
+folded or in the layout of a kernel. Before each run, a program checks whether a learned blob was written to, or could
+be through an alias that is still alive. Layers with such blobs read them directly until they have not changed for a
+run.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ from netspec.process.heap import give_back_freed_memory
 from netspec.run.shapes import fitted
 from netspec.run.walk import Result, Step, Values, losses_of, walk
 
-PROGRAMS = 64  # kept for a net: pyramids of images need one for each size
-RUNS = 4  # times what one run needs: so much may programs keep together, in bytes
+PROGRAMS = 64  # the most that a net keeps; pyramids of images need one for each size
+RUNS = 4  # all programs together may keep this many times the memory of one run
 Given = tuple[int, Shape, torch.dtype]
 
 
@@ -49,15 +50,15 @@ class PreparedLine:
     schedule: Schedule
     kinds: list[str]
     one_thread: bool
-    frozen: list[int]  # of the net's learned blobs: those whose values it holds
-    seen: Seen  # these, as they were
-    waiting: list[tuple[torch.Tensor, Seen]]  # those that were changing
+    frozen: list[int]  # indices of the learned blobs that it holds values of
+    seen: Seen  # the state of these blobs
+    waiting: list[tuple[torch.Tensor, Seen]]  # blobs that were changing, with their state
     memos: set[Any]  # the keys of other tensors that it keeps in memory
     kept: int  # bytes that kernels keep for these shapes
-    need: int  # bytes of the values that are alive at one time, at most, and of what kernels keep
+    need: int  # bytes: the peak of the values, and what kernels keep
 
     def is_current(self, blobs: list[torch.Tensor]) -> bool:
-        """Return whether no blob was written to or replaced since, and every blob that was changing still is."""
+        """Return whether no blob was written to or replaced since, and all blobs that were changing still are."""
         if not self.seen.are([blobs[i] for i in self.frozen] if self.waiting else blobs):
             return False
         if not self.waiting:
@@ -68,7 +69,7 @@ class PreparedLine:
 
 
 class Prepared:
-    """Runs a net by programs, made when they are first needed, by shapes and kept values."""
+    """Runs a net by programs. One is made for each set of shapes and kept values, when it is first needed."""
 
     def __init__(
         self,
@@ -88,14 +89,14 @@ class Prepared:
             if not node.bottoms and not layer.is_input
         ]
         self.made: OrderedDict[Any, PreparedLine] = OrderedDict()
-        self.memos: dict[Any, tuple[Seen, Any]] = {}  # what layers keep, by what they need it for
+        self.memos: dict[Any, tuple[Seen, Any]] = {}  # tensors that layers keep, by key
         self._blobs = blobs_of(self._layers)
         self._seen: dict[int, Seen] = {}
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
-        """Run the net on the values ``given`` by the caller; None where torch records gradients or a graph.
+        """Run the net on the values ``given``. Return None if torch records gradients or a graph.
 
-        Layers without bottoms run first: data layers, whose records have the shapes that they have.
+        Layers without bottoms run first, because the shapes of records are known only after data layers have run.
         """
         if torch.is_grad_enabled() or is_recorded():
             return None
@@ -109,7 +110,7 @@ class Prepared:
         return loss, {v: values[origin[v]].contiguous() for v in kept}
 
     def line_for(self, given: tuple[Given, ...], kept: frozenset[int]) -> PreparedLine:
-        """Return the program for values of these shapes and types, made now or before."""
+        """Return the program for values of these shapes and types. Make it if there is none."""
         key = (given, kept)
         program = self.made.get(key)
         if program is None or not program.is_current(self._blobs()):
@@ -122,7 +123,7 @@ class Prepared:
         return program
 
     def _trim(self) -> None:
-        """Give up the programs that were not used for longest, until the rest keeps no more than it may."""
+        """Remove the least recently used programs until the rest are within the limits."""
         learned = sum(blob.nbytes for layer in self._layers for blob in layer.blobs)
         most = RUNS * (learned + max(program.need for program in self.made.values()))
         while True:
@@ -192,7 +193,7 @@ class Prepared:
         memos: set[Any],
         keeps: Callable[[int], None],
     ) -> tuple[Kernel, str]:
-        """Return what runs a step, and in which way: "by value", "as is", "packed" or "prepared".
+        """Return the kernel of a step, and its kind: "by value", "as is", "packed" or "prepared".
 
         The keys of the memos that it uses are added to ``memos``; ``keeps`` is called with the bytes of the rest.
         """
@@ -231,7 +232,7 @@ class Prepared:
         return kernel, "as is" if as_is else "packed" if len(uses) > bool(step.chain) else "prepared"
 
     def _changing(self) -> set[int]:
-        """Return which learned blobs may change between runs: those that did, and those with a live alias."""
+        """Return the learned blobs that may change between runs: those that did, and those with a live alias."""
         found = set()
         for blob in self._blobs():
             before = self._seen.get(id(blob))
@@ -242,7 +243,7 @@ class Prepared:
 
 
 def _checked(kernel: Kernel, layer: Layer) -> Kernel:
-    """Return a kernel whose first pass checks the shapes that the layer promised."""
+    """Return a kernel that checks, in its first pass, the shapes that the layer promised."""
 
     def checked(*bottoms: torch.Tensor) -> Any:
         nonlocal unchecked
@@ -257,7 +258,7 @@ def _checked(kernel: Kernel, layer: Layer) -> Kernel:
 
 
 def _most_alive(steps: Sequence[planned.PlannedStep], shapes: Mapping[int, Shape]) -> int:
-    """Return the bytes of the values that are alive at one time, as far as their shapes are known."""
+    """Return the peak memory of the values in bytes, as far as their shapes are known."""
     alive, most = dict[int, int](), 0
     for step in steps:
         alive.update((v, 4 * math.prod(shapes[v])) for v in (*step.bottoms, *step.tops) if v in shapes)

@@ -1,4 +1,4 @@
-"""The entries of all classes. A class without one, such as a subclass with another ``forward``, runs by ``forward``."""
+"""The table of entries. A class without an entry, such as a subclass with its own ``forward``, runs by ``forward``."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ _NONE = Entry()
 
 
 def entry_of(layer: Layer) -> Entry:
-    """Return the entry of a layer's class, an empty one where it has none."""
+    """Return the entry of a layer's class, or an empty one."""
     cls = type(layer)
     return ENTRIES.get(cls) or dialects.ENTRIES.get(f"{cls.__module__}.{cls.__qualname__}") or _NONE
 
 
 def folds_of(layer: Layer) -> Folds:
-    """Return what a layer is to its neighbors."""
+    """Return how a layer can be joined with its neighbors."""
     return entry_of(layer).folds(layer)
 
 
 def is_fresh(layer: Layer) -> bool:
-    """Return whether a layer's one top is memory of its own, not a bottom's."""
+    """Return whether a layer's single top has memory of its own, and not a bottom's."""
     fresh = entry_of(layer).fresh
     return fresh(layer) if callable(fresh) else fresh
 
 
 def inference_kernel(layer: Layer, how: Inference) -> Kernel | None:
-    """Return the kernel of runs without gradients that a layer has for its present shapes."""
+    """Return a layer's kernel for runs without gradients, at its present shapes; None if it has none."""
     return entry_of(layer).inference(layer, how)
 
 
 def learning_kernels(layer: Layer, how: Learning) -> Kernels | None:
-    """Return the kernels that a layer that learns has for its present shapes."""
+    """Return a layer's kernels for training, at its present shapes; None if it has none."""
     return entry_of(layer).learning(layer, how)
 
 
 def learns_alone(layer: Layer, steady: bool = True) -> bool:
-    """Return whether a layer that learns has kernels of its own at its present shapes."""
+    """Return whether a layer has its own kernels for training at its present shapes."""
     how = Learning((True,) * len(layer.bottom_shapes), (None,) * len(layer.blobs), steady)
     return learning_kernels(layer, how) is not None

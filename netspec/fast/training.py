@@ -1,9 +1,8 @@
-"""Training passes of small nets: each layer prepared once, then run forward and backward without autograd between them.
+"""Training passes of small nets: each layer is prepared once, and then run forward and backward without autograd.
 
-A pass through autograd costs about a millisecond for ten layers, whatever their size; that is what a net of small
-layers or batches spends most of its time on. Here a layer is a pair of kernels
-(kernels.py, layers/), made for the shapes at hand, and a pass calls one after
-the other. The numbers are the same.
+Autograd costs about a millisecond for ten layers, whatever their size. A net of small layers or batches spends most of
+its time there. Here a layer is a pair of kernels (kernels.py, layers/) for the present shapes, and a pass calls one
+after the other. The numbers are the same.
 """
 
 # pyright: reportPrivateImportUsage=false
@@ -34,7 +33,7 @@ Values = list[Any]  # by value number, a tensor or None
 
 
 def obstacle(plan: Plan, parts: Sequence[Part], largest: float = LARGEST) -> str:
-    """Return why a net of these parts is not trained by prepared kernels, in words; "" if it is."""
+    """Return the reason why prepared kernels cannot train a net of these parts; "" if they can."""
     layers = [layer for part in parts for layer in part.members]
     count = sum(math.prod(shape) for part in parts for shape in part.layer.top_shapes)
     if count > largest:
@@ -61,12 +60,12 @@ def obstacle(plan: Plan, parts: Sequence[Part], largest: float = LARGEST) -> str
 
 @dataclass
 class _Prepared:
-    """The kernels of all layers for one set of shapes, and what they hold."""
+    """The kernels of all layers for one set of shapes."""
 
     forward: list[tuple[Kernel, tuple[int, ...], tuple[int, ...], tuple[tuple[int, float], ...]]]
     backward: list[tuple[Backward, tuple[int, ...], tuple[int, ...]]]
-    start: Values  # the gradients that are there before the backward pass: those of the losses
-    seen: Seen  # the learnable blobs, into whose gradients they write
+    start: Values  # the gradients at the start of the backward pass: those of the losses
+    seen: Seen  # the state of the learnable blobs; kernels write to their gradients
 
 
 class TrainingStep:
@@ -99,13 +98,13 @@ class TrainingStep:
             )
         ]
         self._blobs = blobs_of(layers)
-        self._made: dict[Any, _Prepared] = {}  # by shapes, and by which blobs learn
+        self._made: dict[Any, _Prepared] = {}  # by shapes, and by the blobs that learn
         self._values: Values = []
-        self.keeps = False  # whether ``passed`` has the values of a pass, and their gradients, until the next
+        self.keeps = False  # whether ``passed`` keeps the values and gradients of a pass until the next one
         self.passed: tuple[Values, Values] | None = None
 
     def is_watched(self) -> bool:
-        """Return whether hooks wait for autograd's passes, on layers or learnable blobs, or there is no autograd."""
+        """Return whether layers or learnable blobs have hooks that need autograd, or autograd is switched off."""
         if any(self._hooks) or not torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
             return True
         return any(blob._backward_hooks or blob._post_accumulate_grad_hooks for blob in self._blobs())
@@ -169,10 +168,10 @@ class TrainingStep:
         return torch.zeros(()) if loss is None else loss, outputs
 
     def _prepare(self, values: Values) -> _Prepared:
-        """Make the kernels for data of these shapes; let every learned blob have a gradient."""
+        """Make the kernels for values of these shapes, and allocate the gradient of every learned blob."""
         plan = self._plan
         shapes = {v: tuple(x.shape) for v, x in enumerate(values) if x is not None}
-        needs: set[int] = set()  # values whose gradient is used
+        needs: set[int] = set()  # values with a gradient that is used
         blobs = self._blobs()
         for blob in blobs:
             if blob.requires_grad and blob.grad is None:
@@ -197,13 +196,13 @@ class TrainingStep:
         return made
 
     def _losses(self, i: int, layer: Layer, made: _Prepared) -> tuple[tuple[int, float], ...]:
-        """Note the gradients of a layer's losses; return which of its tops they are, and their weights."""
+        """Record the gradients of a layer's losses. Return pairs of a top's index and its loss weight."""
         for j, weight in self._loss_of[i]:
             made.start[self._tops(i)[j]] = torch.full(layer.top_shapes[j], weight)
         return self._loss_of[i]
 
     def _tops(self, i: int) -> tuple[int, ...]:
-        """Return the values that layer i makes; a loss may have a top without a name."""
+        """Return the values that layer ``i`` makes. A loss may have a top without a name."""
         return self._plan.nodes[i].tops or (len(self._plan.blobs) + i,)
 
     def _kernels(self, part: Part, wanted: tuple[bool, ...]) -> Kernels:
@@ -218,7 +217,7 @@ class TrainingStep:
         return (whole and learning_kernels(part.layer, how)) or recorded(part.layer.run, wanted, part.blobs)
 
     def _overwritten_kernels(self, i: int) -> Kernels:
-        """Return the kernels of a layer whose gradient reads what later layers have left in its memory."""
+        """Return the kernels of a layer with a gradient that reads what later layers wrote into its memory."""
         node, layer = self._plan.nodes[i], self._layers[i]
         final = self._plan.final[node.tops[0]]
         held = node.in_place[0] and bool(gradient_reads(layer) & {"bottom", "sign"})

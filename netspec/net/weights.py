@@ -41,10 +41,10 @@ def load_weights(
     """Copy the weights of a .caffemodel, .caffemodel.h5 or .safetensors into the layers of the same names, all or none.
 
     Several files are loaded in order; a later one overrides an earlier one. Layers that only a file has are ignored,
-    and the log names them. One warning names the layers that no file has; they keep their initial values. With ``strict``
-    this is a SpecError. With ``some`` it is a SpecError if no layer fits. There are also SpecErrors for a file that
-    cannot be read, or that its snapshot did not write, and for another number or shape of blobs than in the net. All go
-    to ``net.plan.source.report``.
+    and the log names them. One warning names the layers that no file has; they keep their initial values. With
+    ``strict`` this is a SpecError. With ``some`` it is a SpecError if no layer fits. There are also SpecErrors for a
+    file that cannot be read, or that its snapshot did not write, and for another number or shape of blobs than in the
+    net. All go to ``net.plan.source.report``.
     """
     paths: list[str] = [os.fspath(each) for each in several(path)]  # not a Path: of a web address that loses a slash
     loaded: set[int] = set()

@@ -2,9 +2,9 @@
 
 Caffe's backward reads bottom and top from memory. If a later layer has overwritten them in place, it reads that layer's
 result. For example, if an in-place Sigmoid follows an in-place ReLU, every value is positive, and the ReLU passes every
-gradient. Nets were trained with these gradients, so they are computed here too. This matters only for layers whose
-backward reads overwritten data; other layers keep a copy or a mask. ``gradient_reads`` of a layer lists what its
-backward reads: the "bottom", only the "sign" of the bottom (which its own top has too), or the "top".
+gradient. Nets were trained with these gradients, so they are computed here too. It matters only for layers with a
+backward pass that reads overwritten data; other layers keep a copy or a mask. ``gradient_reads`` of a layer lists what
+its backward reads: the "bottom", only the "sign" of the bottom (which its own top has too), or the "top".
 """
 
 from __future__ import annotations

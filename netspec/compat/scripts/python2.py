@@ -242,7 +242,7 @@ def _spaces(text: str, package: str) -> str:
 
 
 def _floor_quotients(tree: Any, package: str) -> list[str]:
-    """Replace each ``/`` and ``/=`` of operands that may be whole numbers by a call; return the names that are called."""
+    """Replace each ``/`` and ``/=`` of operands that may be whole numbers by a call; return the called names."""
     pytree = importlib.import_module(f"{package}.pytree")
     util = importlib.import_module(f"{package}.fixer_util")
     syms = importlib.import_module(f"{package}.pygram").python_symbols
