@@ -1,19 +1,21 @@
-"""The object that a net is given to run faster."""
+"""The object that a net is given to run faster.
+
+Its methods import what they need: a command whose net an engine runs makes this object, and starts without torch.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
-from netspec.fast.kernels import Learning
-from netspec.fast.prepared import Prepared
-from netspec.fast.table import is_fresh, learning_kernels, learns_alone
-from netspec.fast.training import LARGEST, TrainingStep, obstacle
-from netspec.layers.contract.base import Layer
-from netspec.run.eager import Eager
-from netspec.run.recorded import Diff, Kernels
-from netspec.run.walk import weighted_sum
+if TYPE_CHECKING:
+    from netspec.fast.prepared import Prepared
+    from netspec.fast.training import TrainingStep
+    from netspec.layers.contract.base import Layer
+    from netspec.run.eager import Eager
+    from netspec.run.recorded import Diff, Kernels
 
 
 @dataclass(frozen=True)
@@ -22,10 +24,15 @@ class Fast:
 
     def prepared(self, eager: Eager, passes: Collection[str]) -> Prepared:
         """Return the runner for passes without gradients."""
+        from netspec.fast.prepared import Prepared
+
         return Prepared(eager.plan, eager.layers, eager.loss_weights, eager.exact, passes)
 
     def trainer(self, eager: Eager, largest: float | None) -> TrainingStep | str:
         """Return the prepared training step of a net, or the reason why it has none."""
+        from netspec.fast.training import LARGEST, TrainingStep, obstacle
+        from netspec.run.walk import weighted_sum
+
         parts = eager.parts()
         if why := obstacle(eager.plan, parts, LARGEST if largest is None else largest):
             return why
@@ -34,12 +41,19 @@ class Fast:
 
     def is_fresh(self, layer: Layer) -> bool:
         """Return whether the top of a prepared layer has memory of its own."""
+        from netspec.fast.table import is_fresh
+
         return is_fresh(layer)
 
     def learns(self, layer: Layer) -> bool:
         """Return whether a layer has its own kernels for training."""
+        from netspec.fast.table import learns_alone
+
         return learns_alone(layer, steady=False)
 
     def kernels(self, layer: Layer, wanted: Sequence[bool], sums: Sequence[Diff]) -> Kernels | None:
         """Return the training kernels of a layer. Its bottoms may change before the backward pass."""
+        from netspec.fast.kernels import Learning
+        from netspec.fast.table import learning_kernels
+
         return learning_kernels(layer, Learning(tuple(wanted), tuple(sums), steady=False))
