@@ -1,1 +1,1 @@
-"""From image sequences to labeled pairs, and from pairs to databases for Data layers."""
+"""Makes labeled pairs from image sequences, and databases for Data layers from pairs."""

@@ -4,7 +4,8 @@ import os
 import sys
 from functools import partial
 
-# python -m puts the working directory first, where a file may be called torch.py; the package itself may lie there.
+# python -m puts the working directory first in sys.path, so that a file torch.py there would be imported. It stays only
+# if the package itself is there.
 HERE = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 if __name__ == "__main__" and sys.path[:1] == [os.getcwd()] != [HERE] and not getattr(sys.flags, "safe_path", False):
     del sys.path[0]

@@ -1,12 +1,12 @@
-"""Nets trained on the same pairs, compared as in the paper's Table I: a chain of netspec's commands through files.
+"""Compares nets trained on the same pairs, as in the paper's Table I, by running netspec's commands.
 
-For each net, in the output folder:
+Files in the output folder, for each net:
 
     NAME.log, NAME.scores.json            its training (netspec train --scores)
     NAME.ITERATION.scores.json            a snapshot that the training did not test (netspec test --scores)
     NAME.train.npz, NAME.validation.npz   the descriptors of both databases' pairs (netspec extract)
 
-and then runs.json, from which the table and the pictures are made.
+The table and the pictures are made from runs.json.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ TESTING = re.compile(r"\] Iteration \d+, Testing net")
 PROGRESS = ("    Test net output", "Snapshotting to", "Optimization Done")  # lines of the log to show
 LOSS = re.compile(r"\] Iteration (\d+)(?: \(.*\))?, loss = (\S+)")
 Say = Callable[[str], None]
-Step = Callable[[int, int, str], None]  # iterations that are done, all of them, and the loss
+Step = Callable[[int, int, str], None]  # iterations done, iterations in total, loss
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What the table needs to know about one solver's net.
+    """The facts about a solver and its net that the comparison needs.
 
-    bottoms  of its ContrastiveLoss: two descriptors and the label
-    loss     that layer's top
-    length   iterations of the training
-    tests    batches of a test
+    bottoms  bottoms of its ContrastiveLoss: two descriptors and the label
+    loss     top of its ContrastiveLoss
+    length   number of training iterations
+    tests    number of batches per test
     sources  train, validation -> data layer -> database
     """
 
@@ -116,8 +116,9 @@ def compare(
 ) -> tuple[str, list[Path]]:
     """Train the nets of the solvers and evaluate the best snapshot of each; return the table and the report's files.
 
-    Without ``train`` the snapshots of earlier trainings are evaluated. ``gpu`` is netspec's ``--gpu``. ``say`` gets
-    messages, ``step`` how far each training is. Raises SpecError or InputError for an error in the files.
+    Without ``train`` the snapshots of earlier trainings are evaluated. ``gpu`` is netspec's ``--gpu``. ``say`` is
+    called with messages, ``step`` with the progress of each training. Raises SpecError or InputError for faults in the
+    files.
     """
     entries = [read_entry(path) for path in solvers]
     for i, entry in enumerate(entries):
@@ -138,7 +139,7 @@ def compare(
 
 
 def _judged(entry: Entry, out: Path, gpu: str, say: Say) -> dict[str, Any]:
-    """Return the net's entry of the run file, its descriptors extracted."""
+    """Extract the descriptors of a net and return its entry of the run file."""
     saved, losses = _snapshots(entry, out)
     for iteration, path in saved.items():
         if iteration not in losses:
@@ -174,8 +175,8 @@ def best_snapshot(saved: Sequence[int], losses: dict[int, float]) -> int:
 def _snapshots(entry: Entry, out: Path) -> tuple[dict[int, Path], dict[int, float]]:
     """Return the snapshots by iteration, and the validation losses that are known.
 
-    Only snapshots of the training whose scores are in the output folder are returned, none of other trainings with the
-    same prefix; without such scores, all existing snapshots.
+    If the output folder has the scores of a training, only its snapshots are returned, not those of other trainings
+    with the same prefix. Otherwise all existing snapshots are returned.
     """
     file = out / f"{entry.stem}.scores.json"
     if file.is_file():
@@ -209,8 +210,8 @@ def _netspec(words: list[str], log: Path, say: Say, step: Step = lambda *_: None
 
     Raises SpecError with the command's last line if it fails.
     """
-    beside = str(Path(__file__).parents[1])  # netspec is in the same folder as this package
-    path = os.pathsep.join(filter(None, (beside, os.environ.get("PYTHONPATH"))))
+    packages = str(Path(__file__).parents[1])  # netspec is in the same folder as this package
+    path = os.pathsep.join(filter(None, (packages, os.environ.get("PYTHONPATH"))))
     command = [sys.executable, "-m", "netspec", *words]
     environment = {**os.environ, "PYTHONPATH": path}
     with (
@@ -220,7 +221,7 @@ def _netspec(words: list[str], log: Path, say: Say, step: Step = lambda *_: None
         assert process.stderr is not None
         try:
             last = _relay(process.stderr, file, say, step, length)
-        except KeyboardInterrupt:  # the command was interrupted too: a training ends with a snapshot
+        except KeyboardInterrupt:  # the command got SIGINT too: a training writes a snapshot and ends
             _relay(process.stderr, file, say, step, length)
             raise
     if process.returncode:

@@ -1,4 +1,4 @@
-"""Lists of images, single or in pairs, to databases of Datums.
+"""Writes lists of single images or pairs to databases of Datums.
 
 A pair becomes one Datum, both images stacked along the channels: six for color (blue, green, red of the first, then
 of the second), two for gray. An encoded Datum can hold only one image, so encoded pairs become two databases in the
@@ -42,7 +42,7 @@ _AHEAD = 8  # pending entries per worker
 
 @dataclass(frozen=True)
 class Entry:
-    """A record to write: its image or its two images, its label, its line in the list."""
+    """A record to write: one or two images, the label, and the line in the list."""
 
     images: tuple[str, ...]
     label: int
@@ -53,10 +53,14 @@ class Entry:
 class Options:
     """How images become Datums of a database.
 
-    ``size`` is (height, width), None for the files' own. ``encoding`` None stores pixels; "" stores the format that the
-    file's name ends with, any other text that format ("png", "jpg"). ``check_size`` refuses an image of another size
-    than the first. With ``skip`` an entry that cannot be read is logged and left out, as Caffe's convert_imageset does,
-    unless that is every entry; the keys of the others stay. ``workers`` processes read images, None: one per core.
+    color       color or grayscale
+    size        (height, width) to resize to; None: each file's own size
+    encoding    None: store pixels; "": store the file's format; else a format such as "png" or "jpg"
+    backend     "lmdb" or "leveldb"
+    check_size  raise an error if an image has another size than the first
+    skip        log and leave out entries that cannot be read, as Caffe's convert_imageset does; the other keys do not
+                change; an error if no entry can be read
+    workers     number of processes that read images; None: one per core
     """
 
     color: bool = True
@@ -102,11 +106,11 @@ def write_databases(
     key: Callable[[int, Entry], str],
     progress: Progress = silent,
 ) -> None:
-    """Write entries, in order, into new databases, which appear when they are complete.
+    """Write entries, in order, to new databases, which appear when they are complete.
 
-    ``paths`` names one database, or, with encoded images, one for each image of an entry. ``root`` is put in front of
-    image names, with a slash between. Raises SpecError,
-    with the line in the list, for an image that is missing, unreadable, or differs in size from its partner.
+    ``paths`` has one database, or, with encoded images, one for each image of an entry. Image names are relative to
+    ``root``. Raises SpecError, with the line in the list, for an image that is missing, unreadable, or differs in size
+    from its partner.
     """
     assert len(paths) == (1 if options.encoding is None else len(entries[0].images))
     work = partial(_try, root=root if root.endswith("/") or not root else root + "/", options=options)
@@ -170,9 +174,9 @@ def _records(entry: Entry, root: str, options: Options) -> tuple[list[bytes], tu
 
 
 def _encode(path: str, label: int, options: Options) -> tuple[bytes, tuple[int, ...]]:
-    """Return one encoded Datum: the file as it is if it already has the requested format, as in Caffe.
+    """Return one encoded Datum. A file that already has the requested format is stored unchanged, as in Caffe.
 
-    (Caffe stores a color file as it is even with -gray, and so keeps its colors.)
+    Unlike here, Caffe stores a color file unchanged even with -gray.
     """
     suffix = Path(path).suffix[1:].lower().replace("jpeg", "jpg")
     encoding = (options.encoding or suffix).lower().replace("jpeg", "jpg")
@@ -199,7 +203,7 @@ class _Workers:
 
     def __enter__(self) -> _Workers:
         if self._count > 1:
-            # Forked if possible: a new process could not import a script that is read from standard input.
+            # Fork if possible: a spawned process could not import a script that was read from standard input.
             method = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
             context = multiprocessing.get_context(method)
             self._pool = ProcessPoolExecutor(self._count, context, initializer=_start_worker)
@@ -211,7 +215,7 @@ class _Workers:
             self._pool.shutdown(cancel_futures=True)
 
     def ordered(self, work: Callable[[S], T], items: Iterable[S]) -> Iterator[T]:
-        """Yield the results in the order of the items; only a few are pending at a time, so that memory is bounded."""
+        """Yield the results in the order of the items. The number of pending items is limited, to bound memory."""
         if self._pool is None:
             yield from map(work, items)
             return
@@ -235,7 +239,7 @@ def _start_worker() -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent does, however that ends."""
+    """End this process when its parent ends, even if the parent is killed."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

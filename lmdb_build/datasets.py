@@ -1,4 +1,4 @@
-"""The files of MNIST and of CIFAR-10 to databases of Datums, as Caffe's examples have them.
+"""Writes the files of MNIST and CIFAR-10 to databases of Datums, as Caffe's examples do.
 
 Caffe: examples/mnist/convert_mnist_data.cpp, examples/siamese/convert_mnist_siamese_data.cpp,
 examples/cifar10/convert_cifar_data.cpp
@@ -19,7 +19,7 @@ from netspec.errors import SpecError, Where
 from netspec.files.kinds import pointer_fault
 from netspec.proto.schema import Datum
 
-IMAGES, LABELS = 2051, 2049  # the first number of a file of MNIST
+IMAGES, LABELS = 2051, 2049  # magic numbers at the start of MNIST files
 CIFAR_SHAPE = (3, 32, 32)
 
 
@@ -28,8 +28,8 @@ def convert_mnist(
 ) -> None:
     """Write the images and labels of two files of MNIST into a new database. Raises SpecError.
 
-    ``in_pairs`` writes as many pairs of images chosen at random, the same ones each time: a pair is a Datum of two
-    channels, with label 1 where both show the same digit, else 0.
+    ``in_pairs`` writes as many random pairs instead, the same ones each time. A pair is a Datum with two channels and
+    label 1 if both images show the same digit, else 0.
     """
     pixels, classes = read_idx(images, IMAGES), read_idx(labels, LABELS)
     if len(pixels) != len(classes):
@@ -50,7 +50,7 @@ def convert_mnist(
 
 
 def read_idx(path: str, magic: int) -> np.ndarray:
-    """Return what is in a file of MNIST: images uint8 (n, rows, columns), or labels uint8 (n,). Raises SpecError."""
+    """Read an MNIST file: images uint8 (n, rows, columns), or labels uint8 (n,). Raises SpecError."""
     data = _read(path)
     axes = 3 if magic == IMAGES else 1
     what = "images" if magic == IMAGES else "labels"

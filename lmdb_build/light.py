@@ -1,4 +1,4 @@
-"""The same view in other light, another season, other weather, with something in front of it."""
+"""Changes how a view looks: light, season, weather, and objects in front of it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from netspec.files.opencv import cv2
 
 Picture = NDArray[Any]  # (H, W, 3) float32, BGR, 0 to 1 for black to white
 
-# How often each change is drawn for a view, and how strong it is.
+# For each change: its probability for a view, and its strength.
 OCCLUDED, PARTS, PART_HEIGHT, PART_WIDTH = 0.3, (1, 2), (0.12, 0.45), (0.1, 0.4)  # shares of the view's size
 FADED, SATURATION, TINT = 0.6, (0.0, 1.3), 0.15
-MIXED, MIX = 0.4, 0.15  # of the faded ones: colors mixed by a random matrix
+MIXED, MIX = 0.4, 0.15  # for faded views: colors mixed by a random matrix
 GAMMA_DRAWN, GAMMA = 0.7, 0.45
-TONED, TONE_STEPS, TONE = 0.3, 5, 0.25  # a curve of tones that need not rise: snow, wet ground, lit windows
+TONED, TONE_STEPS, TONE = 0.3, 5, 0.25  # a tone curve that may fall: snow, wet ground, lit windows
 UNEVEN, UNEVEN_LIGHT = 0.5, 0.45  # light that differs over the view, in 3 cells of height
 SHADED, SHADE = 0.3, (0.3, 0.7)
 FOGGED, FOG, FOG_LIGHT = 0.2, (0.2, 0.8), (0.4, 1.0)
@@ -31,10 +31,10 @@ GRAY = np.array([0.114, 0.587, 0.299], np.float32)  # of blue, green, red: Rec. 
 def change_light(
     view: NDArray[np.uint8], other: Callable[[], NDArray], rng: np.random.Generator, calm: float = 0.0
 ) -> NDArray[np.uint8]:
-    """Return the view (H, W, 3), BGR, as it could look at another time.
+    """Return the view (H, W, 3), BGR, as it might look at another time.
 
-    Parts of the picture that ``other`` returns may be in front of it. With the probability ``calm`` it keeps its colors
-    and tones, nothing comes in front of it, and there is no fog.
+    Parts of the picture that ``other`` returns may cover it. With probability ``calm``, its colors and tones do not
+    change, nothing covers it, and there is no fog.
     """
     x = view.astype(np.float32) / 255
     changes = not (calm and rng.random() < calm)
@@ -62,7 +62,7 @@ def change_light(
 
 
 def _occlude(x: Picture, other: NDArray[np.uint8], rng: np.random.Generator) -> None:
-    """Put one or two rectangles of another picture into ``x``: people, cars, furniture that were not there."""
+    """Copy one or two rectangles of another picture into ``x``, to simulate people, cars or furniture."""
     for _ in range(rng.integers(PARTS[0], PARTS[1] + 1)):
         size = [
             int(side * rng.uniform(*share)) for side, share in zip(x.shape, (PART_HEIGHT, PART_WIDTH), strict=False)

@@ -1,4 +1,4 @@
-"""Pictures in perspective, pictures as files, and warped copies of them."""
+"""Perspective transforms, image files, and warped copies of images."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)  # of a picture
 def seen_through(
     image: NDArray, quad: NDArray, corners: NDArray, size: tuple[int, int], border: int = cv2.BORDER_REFLECT
 ) -> NDArray:
-    """Return a part of an image (H, W, 3) in perspective: a picture of ``size`` (width, height).
+    """Return a perspective view of a part of an image (H, W, 3), of ``size`` (width, height).
 
-    ``quad`` (4, 2) are the pixels x, y of the image that come to ``corners`` (4, 2) of the picture; ``border`` is
-    OpenCV's mode for what lies outside of the image.
+    The pixels ``quad`` (4, 2), x and y, of the image are mapped to ``corners`` (4, 2) of the result. ``border`` is
+    OpenCV's mode for pixels outside the image.
     """
     homography = cv2.getPerspectiveTransform(quad.astype(np.float32), corners.astype(np.float32))
     return cv2.warpPerspective(image, homography, size, borderMode=border)
 
 
 def write_jpeg(path: Path, picture: NDArray) -> None:
-    """Write a picture (H, W, 3) uint8, BGR, as JPEG. Raises InputError where it cannot be written."""
+    """Write a picture (H, W, 3) uint8, BGR, as JPEG. Raises InputError if it cannot be written."""
     write_picture(path, picture, cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
 
 
 def write_depth(path: Path, depth: NDArray) -> None:
-    """Write depth (H, W) in meters as TUM RGB-D does: PNG, 16 bits, 5000 per meter, 0 for not known or 13.1 m and more.
+    """Write depth (H, W) in meters in TUM RGB-D's format: PNG, 16 bits, 5000 per meter.
 
-    Raises InputError where it cannot be written.
+    Depth that is not known or above 13.1 m is written as 0. Raises InputError if the file cannot be written.
     """
     steps = np.rint(depth * DEPTH_PER_M)
     write_picture(path, np.where(steps < 1 << 16, steps, 0).astype(np.uint16))
 
 
-# Each corner of the crop is moved inward by up to this share of the picture's width and height. That crops, scales (to
+# Each corner of the crop is moved inward by up to this share of the picture's width and height. This crops, scales (to
 # at least 0.6), shifts, rotates and changes the perspective, without a black border.
 LARGEST_INSET = 0.2
 GAIN = (0.6, 1.4)
@@ -49,7 +49,7 @@ TINT = 0.08  # the gain of each color channel also varies by this much
 
 
 def warp(image: NDArray, rng: np.random.Generator) -> NDArray:
-    """Return the image (H, W, 3) uint8, at the same size, as a nearby camera might see it in other light."""
+    """Return the image (H, W, 3) uint8, at the same size, as a nearby camera might see it in different light."""
     height, width = image.shape[:2]
     inset = rng.uniform(0, LARGEST_INSET, (4, 2))
     whole = CORNERS * [width - 1, height - 1]

@@ -1,9 +1,8 @@
-"""Two views of each place, in batches of different places: for nets that learn to tell a batch's places apart.
+"""Makes two views of each place, in batches of different places, to train nets with an N-pair loss.
 
-Contrastive pairs show a net one negative for each positive. If the loss compares every first image of a batch with
-every second one (Sohn, Improved Deep Metric Learning with Multi-class N-pair Loss, NIPS 2016), a batch of N pairs has
-N (N - 1) negatives, and the choice of its places matters: places of one run look alike, so a batch takes several
-places of few runs.
+Contrastive pairs have one negative for each positive. The N-pair loss compares every first image of a batch with every
+second one (Sohn, Improved Deep Metric Learning with Multi-class N-pair Loss, NIPS 2016), so a batch of N pairs has
+N (N - 1) negatives. Places of one run look similar and are hard negatives, so a batch has several places of few runs.
 """
 
 from __future__ import annotations
@@ -24,26 +23,28 @@ from loopclosure.places.frames import read_bgr
 from loopclosure.progress import Progress, silent
 from netspec.files.opencv import cv2
 
-# Of a batch: at most so many places of one run, more than so many seconds apart.
-PER_RUN, APART_S = 8, 4.0
-# In this share of the pairs the second image is another one, at most so many seconds from the first.
+# A batch has at most this many places of one run, and the times of these differ by more than this many seconds.
+PER_RUN, LEAST_GAP_S = 8, 4.0
+# In this share of the pairs, the second view is from another image within this many seconds of the first.
 OTHER, OTHER_S = 0.4, 1.0
-# What changes between two views, drawn for each view.
-ZOOM = 2.0  # the part that is seen has 1 to 1/2 of the image's height
-SHIFT = 0.2  # a pair's views have a common center; each is shifted by up to this share of its margin
-STRETCH = 0.15  # the proportions of the part change by a factor of up to e^0.15
+# Random changes of each view.
+ZOOM = 2.0  # the visible part has 1 to 1/2 of the image's height
+SHIFT = 0.2  # each view is shifted from the center of its pair by up to this share of its margin
+STRETCH = 0.15  # the aspect ratio changes by a factor of up to e^0.15
 TURN_DEG = 4.0  # standard deviation
-CORNER = 0.08  # each corner is moved by up to this share of the part's size: perspective
-MOST_VIEWPOINT = 3  # a part of an eighth of the height; beyond, two views may have little in common
-SMOOTHING = 0.4  # standard deviation of the filter before a part is made smaller, in pixels of the view
+CORNER = 0.08  # perspective: each corner is moved by up to this share of the part's size
+MOST_VIEWPOINT = 3  # the visible part is then down to 1/8 of the height; with more, views may not overlap
+SMOOTHING = 0.4  # standard deviation of the smoothing before reducing a part, in pixels of the view
 
 
 @dataclass(frozen=True)
 class Batches:
-    """How many batches, the pairs in each, and the part of a run that a batch's places come from.
+    """The number of batches and how their places are chosen.
 
-    The part has the length ``window`` (in units of the stamps) and is at a random position. ``seed`` is that of the
-    choice of places, and of the views.
+    count   number of batches
+    size    pairs per batch
+    window  length of the part of a run that a batch's places come from, in units of the stamps; at a random position
+    seed    seed of the choice of places and of the views
     """
 
     count: int
@@ -52,7 +53,7 @@ class Batches:
     seed: int = 1
 
     def check(self) -> None:
-        """Raise InputError for numbers that cannot make a batch."""
+        """Raise InputError for values out of range."""
         for name in ("count", "size"):
             if getattr(self, name) < 1:
                 raise InputError(f"--{name} must be at least 1, not {getattr(self, name)}")
@@ -64,11 +65,11 @@ class Batches:
 
 @dataclass(frozen=True)
 class Changes:
-    """How the two views of a place are made of its images.
+    """How the two views of a place differ.
 
-    viewpoint  how strongly the point of view does: zoom, turn and perspective are this many times as strong
-    calm       this share of the views keeps its colors, and what it shows (:func:`lmdb_build.light.change_light`)
-    size       of a view: width, height
+    viewpoint  factor for the strength of zoom, rotation and perspective
+    calm       share of the views that keep their colors and are not covered (:func:`lmdb_build.light.change_light`)
+    size       (width, height) of a view
     """
 
     viewpoint: float = 1.0
@@ -76,7 +77,7 @@ class Changes:
     size: tuple[int, int] = (128, 96)
 
     def check(self) -> None:
-        """Raise InputError for numbers that mean nothing."""
+        """Raise InputError for values out of range."""
         if not 0 <= self.viewpoint <= MOST_VIEWPOINT:
             raise InputError(f"--viewpoint must be 0 to {MOST_VIEWPOINT}, not {self.viewpoint:g}")
         if not 0 <= self.calm <= 1:
@@ -86,8 +87,8 @@ class Changes:
 def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tuple[Indices, Indices]:
     """Return first and second images of all pairs (count * size,), batch after batch.
 
-    A batch draws its images from runs in random order; a run is as likely to come first as it is long.
-    Raises InputError where all runs together have not enough places for a batch.
+    A batch draws its images from runs in random order; the probability of a run to come first is proportional to its
+    length. Raises InputError if the runs do not have enough places for a batch.
     """
     batches.check()
     of_track = [np.flatnonzero(runs.tracks == track) for track in np.unique(runs.tracks)]
@@ -103,14 +104,14 @@ def choose_views(runs: Runs, batches: Batches, rng: np.random.Generator) -> tupl
         else:
             raise InputError(
                 f"a batch of {batches.size} different places cannot be made: the {len(of_track)} runs gave "
-                f"{len(batch)}, at most {PER_RUN} of each, more than {APART_S:g} s apart; lower --size"
+                f"{len(batch)}, at most {PER_RUN} of each, more than {LEAST_GAP_S:g} s apart; lower --size"
             )
         first += batch[: batches.size]
     return np.array(first), np.array([_partner(runs, image, rng) for image in first])
 
 
 def _part(stamps: NDArray[np.float64], images: Indices, window: float, rng: np.random.Generator) -> Indices:
-    """Return the images of a run that are in a window at a random position."""
+    """Return the images of a run in a window at a random position."""
     if not np.isfinite(window):
         return images
     of_run = stamps[images]
@@ -119,10 +120,10 @@ def _part(stamps: NDArray[np.float64], images: Indices, window: float, rng: np.r
 
 
 def _different_places(stamps: NDArray[np.float64], images: Indices) -> list[int]:
-    """Return the first images that are far enough from the earlier ones."""
+    """Return the first images that are more than LEAST_GAP_S from the ones chosen before."""
     taken: list[int] = []
     for image in images.tolist():
-        if len(taken) < PER_RUN and np.all(np.abs(stamps[taken] - stamps[image]) > APART_S):
+        if len(taken) < PER_RUN and np.all(np.abs(stamps[taken] - stamps[image]) > LEAST_GAP_S):
             taken.append(image)
     return taken
 
@@ -142,7 +143,7 @@ def cut_view(
     """Return a view of the image (H, W, 3) uint8 as a nearby camera might see it: (height, width, 3).
 
     ``about`` (2,) is the position of the visible part: 0 at the left (the top), 1 at the right (the bottom). Views
-    about one point overlap at any zoom. ``viewpoint`` is that of :class:`Changes`.
+    with the same position overlap at any zoom. See :class:`Changes` for ``viewpoint``.
     """
     width, height = size
     part_h = image.shape[0] * np.exp(rng.uniform(-np.log(ZOOM) * viewpoint, 0))
@@ -165,9 +166,9 @@ def write_views(
     folder: Path,
     progress: Progress = silent,
 ) -> Path:
-    """Write two views for each pair below ``folder``, and the list ``folder``.txt.
+    """Write two views for each pair to ``folder``, and the list ``folder``.txt.
 
-    Both views of a pair are mirrored, or neither is. Raises InputError if batches cannot be made, or an image cannot
+    Either both views of a pair are mirrored or none. Raises InputError if batches cannot be made, or an image cannot
     be read or written.
     """
     changes.check()
@@ -190,7 +191,7 @@ def write_views(
     settings = {
         "source": f"{len(runs.names)} images of {len(np.unique(runs.tracks))} runs",
         "batches": f"{batches.count} of {batches.size} places, up to {PER_RUN} of one run, "
-        f"more than {APART_S:g} apart, in a part of {batches.window:g}",
+        f"more than {LEAST_GAP_S:g} apart, in a part of {batches.window:g}",
         "point of view": f"{changes.viewpoint:g} times as different",
         "calm": f"{changes.calm:g} of the views",
         "seed": str(batches.seed),

@@ -1,4 +1,4 @@
-"""The command ``lmdb-build``: one module for each group of commands; it computes nothing."""
+"""The command ``lmdb-build``. Each module has a group of commands, which parse arguments and call the library."""
 
 from __future__ import annotations
 

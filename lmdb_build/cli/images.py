@@ -1,4 +1,4 @@
-"""``lmdb-build walk`` and ``views``: images to begin with."""
+"""``lmdb-build walk`` and ``views``, which make images."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _add_views(commands: Commands) -> None:
         nargs="+",
         type=_source,
         metavar="SOURCE",
-        help="a folder of images, a run; or index:CSV,track=COLUMN,time=COLUMN, a table of frames of several runs",
+        help="a folder with the images of a run; or index:CSV,track=COLUMN,time=COLUMN, a table of several runs",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FOLDER", help="folder for the views; the list is FOLDER.txt"
@@ -60,7 +60,9 @@ def _add_views(commands: Commands) -> None:
         metavar="S",
         help="seconds between two images of a folder (default: %(default)g)",
     )
-    parser.add_argument("--batches", type=int, default=400, metavar="N", help="how many batches (default: %(default)s)")
+    parser.add_argument(
+        "--batches", type=int, default=400, metavar="N", help="number of batches (default: %(default)s)"
+    )
     parser.add_argument(
         "--size",
         type=int,
@@ -73,7 +75,7 @@ def _add_views(commands: Commands) -> None:
         type=float,
         default=float("inf"),
         metavar="S",
-        help="take the places of one run from so many seconds of it (default: all of it)",
+        help="take the places of a run from a part of it with this length in seconds (default: the whole run)",
     )
     parser.add_argument(
         "--viewpoint",

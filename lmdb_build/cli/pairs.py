@@ -49,10 +49,10 @@ NEEDED = {
 }
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]...
 
-Sequences with poses, several of them (KIND is seen from the files, or named):
+Several sequences with poses (KIND can be left out; then it is found from the files):
 {chr(10).join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())}
   with poses=FILE, {POSES_HELP},
-  and pose-form: {POSE_FORM_HELP}; topic, pose-topic: of a bag that has several
+  and pose-form: {POSE_FORM_HELP}; topic, pose-topic: the topics of a bag that has several
 Or one of these:
   images:     images in natural order, truth=MASK of loops (.mat .npy .txt or image), camera={"|".join(CAMERAS)}
   traverses:  queries, references=FOLDER, truth=MASK or ground_truth*.json
@@ -61,8 +61,8 @@ Or one of these:
   table:      a CSV of positives, two columns of image names; group=COLUMN names the place; index=CSV of groups
   index:      a CSV of frames; group=COLUMN names the place, track=COLUMN the clip, time=COLUMN the position in it:
               neighbors, at most max-gap (1) apart, are positives
-  singles:    a folder, each image a different place; positives are warped copies"""
-# Options that mean something only for sequences with poses.
+  singles:    a folder, each image is a different place; positives are warped copies"""
+# Options for sequences with poses only.
 POSED = (
     *("max_distance", "max_angle", "negatives", "clear_distance", "clear_view_angle", "same_scene", "same_frame"),
     *("different_scenes", "max_difference"),
@@ -96,26 +96,26 @@ def _add_pairs(commands: Commands) -> None:
         metavar="FOLDER",
         help="folder that the lists' names are relative to (the sources' common parent)",
     )
-    group = parser.add_argument_group("what is the same place")
+    group = parser.add_argument_group("rules for the same place")
     group.add_argument(
         "--max-distance",
         type=above_zero,
         default=MAX_DISTANCE_M,
         metavar="M",
-        help=f"less is a positive (default: {MAX_DISTANCE_M:g})",
+        help=f"maximum distance of a positive pair (default: {MAX_DISTANCE_M:g})",
     )
     group.add_argument(
         "--max-angle",
         type=above_zero,
         default=MAX_ANGLE_DEG,
         metavar="DEG",
-        help=f"less is a positive (default: {MAX_ANGLE_DEG:g})",
+        help=f"maximum angle of a positive pair (default: {MAX_ANGLE_DEG:g})",
     )
     group.add_argument(
         "--min-gap",
         type=float,
         metavar="S",
-        help="leave out pairs nearer to each other in time, in seconds (images: frames) (default: 0)",
+        help="leave out pairs with a smaller time difference, in seconds (images: in frames) (default: 0)",
     )
     group.add_argument(
         "--negatives", default="both", choices=NEGATIVES, help="where negatives come from (default: %(default)s)"
@@ -124,10 +124,10 @@ def _add_pairs(commands: Commands) -> None:
         "--clear-distance",
         type=float,
         metavar="M",
-        help="least distance of two images of a negative pair, by their poses",
+        help="minimum distance of a negative pair, by its poses",
     )
     group.add_argument(
-        "--clear-view-angle", type=float, metavar="DEG", help="or the least angle between their viewing axes"
+        "--clear-view-angle", type=float, metavar="DEG", help="or minimum angle between its viewing axes"
     )
     group.add_argument(
         "--same-scene",
@@ -143,7 +143,7 @@ def _add_pairs(commands: Commands) -> None:
         type=_names,
         default=[],
         metavar="A,B",
-        help="sequences whose poses share a frame: labeled by pose across them",
+        help="sequences with a common frame of reference: pairs across them are labeled by pose",
     )
     group.add_argument("--different-scenes", action="store_true", help="all other sequences show different rooms")
     group.add_argument(
@@ -153,7 +153,7 @@ def _add_pairs(commands: Commands) -> None:
         metavar="S",
         help=f"longest time from image to pose (default: {MAX_DIFFERENCE_S:g})",
     )
-    group = parser.add_argument_group("the choice")
+    group = parser.add_argument_group("choice of the pairs")
     for split, count in zip(SPLITS, (30000, 6000, 6000), strict=True):
         group.add_argument(
             f"--{split}", type=int, default=count, metavar="N", help="pairs, half positive (default: %(default)s)"
@@ -179,7 +179,7 @@ def _add_pairs(commands: Commands) -> None:
     for split in SPLITS:
         group.add_argument(f"--{split}-sequences", type=_names, metavar="A,B", help=f"sequences (groups) of {split}")
     group.add_argument(
-        "--hard-negatives", type=Path, metavar="NPZ", help="choose negatives that are near by these features"
+        "--hard-negatives", type=Path, metavar="NPZ", help="choose negatives that are similar by these features"
     )
     group.add_argument(
         "--hard-share", type=float, default=0.5, metavar="SHARE", help="share of such negatives (default: %(default)g)"
@@ -239,7 +239,7 @@ def _source_text(text: str) -> Source:
 
 
 def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
-    """Open the sources; return them as one, and the root folder."""
+    """Open the sources; return one combined source, and the root folder."""
     first, *others = arguments.source
     path, kind = first.path, first.kind
     if (kind not in SEQUENCES and others) or any(each.kind not in SEQUENCES for each in others):

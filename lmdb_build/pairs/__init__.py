@@ -1,1 +1,1 @@
-"""Labeled pairs of images: which ones, and the lists that name them."""
+"""Chooses labeled pairs of images, and reads and writes lists of them."""

@@ -1,4 +1,4 @@
-"""From a source of pairs to list files: split, choose, warp, write, and report what was chosen."""
+"""Makes list files from a source of pairs: splits, chooses, warps, writes, and reports the chosen pairs."""
 
 from __future__ import annotations
 
@@ -35,14 +35,15 @@ from loopclosure.progress import Progress, silent
 class Plan:
     """The lists to make from a source.
 
-    counts       how many pairs each split gets; a split of 0 pairs gets no images
-    by           "time" or "group": how images are split
+    counts       number of pairs per split; a split with 0 pairs gets no images
+    by           split the images by "time" or by "group"
     shares       share of the images (or groups) for each split
-    split_gap    least gap in time between two splits
-    named        the names of a split's groups
-    at_most      if there are too few pairs, take as many as there are
-    features, hard_share  this share of the negatives is nearest by these features
-    warp_share   this share of all pairs has a warped image
+    split_gap    minimum gap in time between two splits
+    named        names of the groups of each split
+    at_most      if there are too few pairs, use all of them instead of raising an error
+    features     descriptors for choosing hard negatives
+    hard_share   share of the negatives that are the nearest by ``features``
+    warp_share   share of all pairs with a warped image
     """
 
     counts: Mapping[str, int]
@@ -57,7 +58,7 @@ class Plan:
     warp_share: float = 0.0
 
     def check(self) -> None:
-        """Raise InputError for numbers that are out of range."""
+        """Raise InputError for values out of range."""
         for split, count in self.counts.items():
             if count < 0 or count % 2:
                 raise InputError(
@@ -86,7 +87,7 @@ class Split:
 
 @dataclass(frozen=True)
 class Written:
-    """A list that was written: its file, what was chosen (:func:`report`), and doubts about its labels."""
+    """A written list: its file, a report (:func:`report`), and doubts about its labels."""
 
     path: Path
     report: str
@@ -96,7 +97,7 @@ class Written:
 def build_lists(
     source: PairSource, plan: Plan, root: Path, out: Path, progress: Progress = silent
 ) -> dict[str, Written]:
-    """Write ``out``/train.txt, val.txt and test.txt as planned, and warped images below ``out``; return the lists.
+    """Write ``out``/train.txt, val.txt and test.txt by ``plan``, and warped images below ``out``; return the lists.
 
     Raises InputError, before anything is written, if a split does not have enough pairs.
     """
@@ -155,7 +156,7 @@ def _below(path: Path, root: Path) -> str:
 
 
 def _head(source: PairSource, plan: Plan, split: Split, root: Path, out: Path) -> dict[str, str]:
-    """Return the settings from which the list can be made again."""
+    """Return the settings for the list's header, with which the list can be made again."""
     cut = f"time, {plan.split_gap:g} between splits" if plan.by == "time" else source.group_word
     shares = ", ".join(f"{name} {plan.shares[name]:g}" for name in SPLITS if plan.counts.get(name))
     head = dict(source.settings)

@@ -1,4 +1,4 @@
-"""Pairs from lists: a mask of loops, equal names in two folders, tables, single images."""
+"""Sources of pairs from files: masks of loops, folders with equal names, tables, single images."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class MaskSource(PairSource):
     def __init__(self, mask: Path, images: Path, root: Path, min_gap: int | None = None, camera: str = "all") -> None:
         """Read the mask (Q, Q) and the Q images of a folder, in natural order.
 
-        A mask does not mark neighbors in time, though they show one place: pairs nearer than ``min_gap`` images are
-        left out; by default pairs nearer than the nearest marked pair. Soft entries of the mask are left out too.
-        ``camera`` says which images are taken: see loopclosure.places.masks.images_of_places.
+        A mask does not mark neighbors in time, although they show the same place. So pairs with a gap of less than
+        ``min_gap`` images are left out; the default is the smallest gap of a marked pair. Soft entries of the mask are
+        left out too. ``camera`` selects images: see loopclosure.places.masks.images_of_places.
         """
         hard, soft = read_truth_matrix(mask)
         paths = image_paths(images)
@@ -50,7 +50,7 @@ class MaskSource(PairSource):
         }
 
     def judge(self, first: Indices, second: Indices) -> NDArray[np.int8]:
-        """Label pairs (N,) as the mask does."""
+        """Label pairs (N,) by the mask."""
         labels = np.where(self._hard[first, second], POSITIVE, NEGATIVE).astype(np.int8)
         labels[self._soft[first, second] & ~self._hard[first, second]] = LEFT_OUT
         labels[np.abs(self.stamps[first] - self.stamps[second]) < self._min_gap] = LEFT_OUT
@@ -67,10 +67,10 @@ class MaskSource(PairSource):
 
 
 class TraverseSource(MaskSource):
-    """Two traverses of one route, and which images of one show the places of the other.
+    """Two traverses of one route, with a file of the matching images.
 
-    A pair is a query and a reference: negatives of one traverse would teach a net to tell traverses apart. The images
-    of both are one run, in the order of the references that they show.
+    A pair is a query and a reference. Negatives within one traverse are not used: a net would learn to recognize the
+    traverse. The images of both traverses form one run, in the order of the references that they show.
     """
 
     def __init__(self, truth: Path, queries: Path, references: Path, root: Path) -> None:
@@ -98,7 +98,7 @@ class TraverseSource(MaskSource):
 
 
 def _both_ways(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a mask (Q, R) of queries and references as one of all images (Q + R, Q + R)."""
+    """Extend a mask (Q, R) of queries and references to all images: (Q + R, Q + R)."""
     queries, references = mask.shape
     nothing = [np.zeros((size, size), bool) for size in (queries, references)]
     return np.block([[nothing[0], mask], [mask.T, nothing[1]]])
@@ -154,10 +154,10 @@ class PlaceSource(PairSource):
 
 
 def folders_source(folder_a: Path, folder_b: Path, root: Path, min_gap: int = 0) -> PlaceSource:
-    """Pair two folders: images of equal names are the same place (without the suffix: a.png and a.jpg are equal).
+    """Pair two folders: images with equal names are the same place (without the suffix: a.png and a.jpg are equal).
 
     Places are in natural order of their names; places nearer than ``min_gap`` to each other are not paired (frames of a
-    traverse). Only images with a partner are taken.
+    traverse). Only images with a partner are used.
     """
     first, second = ({path.stem: path for path in image_paths(folder)} for folder in (folder_a, folder_b))
     places = [stem for stem in first if stem in second]
@@ -184,9 +184,9 @@ def table_source(table: Path, root: Path, group: str | None = None, index: Path 
     """Read a CSV table of positives: two columns with names of images, relative to the table's folder.
 
     Negatives are images of different groups. A group is the value in column ``group`` of ``index`` (a table with one
-    column of images, which may have more images than the positives), or of the table itself; without ``group``, images
-    that are linked by positives are one place. If no image is in both columns (for example queries and references),
-    negatives also consist of one image of each column.
+    column of images, which may have more images than the positives), or of the table itself. Without ``group``, images
+    that are linked by positives are one place. If no image is in both columns (as for queries and references), each
+    negative has one image of each column too.
     """
     lines, (column_a, column_b) = read_table(table, 2)
     pairs = [(row[column_a], row[column_b]) for _, row in lines]
@@ -222,8 +222,8 @@ def table_source(table: Path, root: Path, group: str | None = None, index: Path 
 def index_source(index: Path, root: Path, group: str, track: str, time: str, max_gap: float) -> PlaceSource:
     """Read a CSV table of frames: neighbors in time are positives, frames of different groups are negatives.
 
-    Positives are two frames with the same value in column ``track`` whose numbers in column ``time`` differ by at most
-    ``max_gap``.
+    Two frames are positive if they have the same value in column ``track`` and their numbers in column ``time`` differ
+    by at most ``max_gap``.
     """
     rows, (column,) = read_table(index, 1)
     tracks: dict[str, list[tuple[float, int]]] = {}

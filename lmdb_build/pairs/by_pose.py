@@ -1,4 +1,4 @@
-"""Pairs of frames with poses: the paper's rule, and which sequences show the same scene."""
+"""A source of pairs from sequences with poses: the paper's rule, and which sequences show the same scene."""
 
 from __future__ import annotations
 
@@ -21,24 +21,25 @@ from loopclosure.places.same_place import (
 )
 from loopclosure.places.trajectory import Poses
 
-# How the images of two sequences relate.
+# The relations of two sequences.
 SAME_SEQUENCE, ONE_FRAME, ONE_SCENE, OTHER_SCENE = range(4)
 NEGATIVES = ("same_sequence", "cross_sequence", "both")
 
-NEIGHBOR_S = 3.0  # images less than this apart are neighbors in time, not two visits to a place
-NEAR_FACTOR = 2.0  # a negative pair within this factor of the rule's limits shows nearly the same
-TOO_MANY = 0.2
+NEIGHBOR_S = 3.0  # images within this time are neighbors, not two visits to a place
+NEAR_FACTOR = 2.0  # negative pairs within this factor of the rule's limits look almost like positives
+TOO_MANY = 0.2  # share of such pairs that causes a warning
 
 
 @dataclass(frozen=True)
 class PoseRule:
-    """How pairs with poses are labeled; the defaults are the paper's.
+    """The rule for labeling pairs with poses; the defaults are the paper's.
 
-    max_distance_m, max_angle_deg  less distance and less rotation than these: the same place
-    min_gap_s          two images of one sequence nearer in time than this are not paired
-    negatives          from ``same_sequence``, from ``cross_sequence`` pairs, or ``both``
-    clear_distance_m, clear_view_angle_deg  if given, a pair in one frame of reference is negative only if it is at
-                       least this far apart, or its viewing axes are; other pairs that are not positive are left out
+    max_distance_m, max_angle_deg  a pair is positive if both distance and rotation are below these limits
+    min_gap_s          pairs of one sequence with a smaller time difference are left out
+    negatives          pairs used as negatives: ``same_sequence``, ``cross_sequence`` or ``both``
+    clear_distance_m, clear_view_angle_deg  if given, a pair in one frame of reference is negative only if its distance
+                       or the angle between its viewing axes is at least this; pairs that are neither positive nor
+                       negative are left out
     """
 
     max_distance_m: float = MAX_DISTANCE_M
@@ -54,8 +55,8 @@ class Scenes:
     """Which sequences show the same scene, by their names.
 
     same_scene   sets of sequences of one scene without a common frame of reference: pairs across them are left out
-    same_frame   sets of sequences of one scene whose poses share a frame: pairs across them are labeled by pose
-    all_others_differ  sequences that are in no common set show different scenes: no warning
+    same_frame   sets of sequences of one scene with a common frame of reference: pairs across them are labeled by pose
+    all_others_differ  all other sequences show different scenes; without it, there is a warning
     """
 
     same_scene: tuple[tuple[str, ...], ...] = ()
@@ -63,7 +64,7 @@ class Scenes:
     all_others_differ: bool = False
 
     def relations(self, names: Sequence[str]) -> NDArray[np.int8]:
-        """Return (S, S): the relation of each two sequences. Raises InputError for a name that is not among them."""
+        """Return the relation of each two sequences, (S, S). Raises InputError for an unknown name."""
         table = np.full((len(names), len(names)), OTHER_SCENE, np.int8)
         for sets, relation in ((self.same_scene, ONE_SCENE), (self.same_frame, ONE_FRAME)):
             for members in sets:
@@ -77,7 +78,7 @@ class Scenes:
 
 
 class PoseSource(PairSource):
-    """Sequences with poses: the paper's rule."""
+    """Pairs of images from sequences with poses, labeled by a :class:`PoseRule`."""
 
     group_word = "sequence"
 
@@ -90,7 +91,7 @@ class PoseSource(PairSource):
     ) -> None:
         """Take the frames of all sequences.
 
-        sequences  frames that have a pose; those without a time have their numbers for stamps
+        sequences  frames that all have a pose; frames without stamps get their numbers as stamps
         folders    the sequences' folders, relative to the list's root
         """
         self.group_names = [sequence.name for sequence in sequences]
@@ -132,20 +133,20 @@ class PoseSource(PairSource):
         a, b = self.poses[first], self.poses[second]
         comparable = relation <= ONE_FRAME
         same = same_place(a, b, rule.max_distance_m, rule.max_angle_deg)
-        apart = ~same
+        different = ~same
         if rule.clear_distance_m is not None or rule.clear_view_angle_deg is not None:
             clear = np.zeros(len(first), bool)
             if rule.clear_distance_m is not None:
                 clear |= distances_m(a, b) >= rule.clear_distance_m
             if rule.clear_view_angle_deg is not None:
                 clear |= view_angles_deg(a, b) >= rule.clear_view_angle_deg
-            apart &= clear
+            different &= clear
         wanted_origin = (relation == SAME_SEQUENCE) if rule.negatives == "same_sequence" else relation > SAME_SEQUENCE
         if rule.negatives == "both":
             wanted_origin = np.ones(len(first), bool)
         labels = np.full(len(first), LEFT_OUT, np.int8)
         labels[comparable & same] = POSITIVE
-        labels[((comparable & apart) | (relation == OTHER_SCENE)) & wanted_origin] = NEGATIVE
+        labels[((comparable & different) | (relation == OTHER_SCENE)) & wanted_origin] = NEGATIVE
         neighbors = np.abs(self.stamps[first] - self.stamps[second]) < rule.min_gap_s
         labels[(relation == SAME_SEQUENCE) & neighbors] = LEFT_OUT
         return labels
@@ -164,7 +165,7 @@ class PoseSource(PairSource):
         }
 
     def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
-        """Return what may make labels wrong: undeclared scenes, neighbors as positives, negatives near the limits."""
+        """Return warnings about labels: undeclared scenes, neighbors as positives, negatives near the limits."""
         found = []
         relation = self._relations[self.groups[first], self.groups[second]]
         across = (labels == NEGATIVE) & (relation == OTHER_SCENE)

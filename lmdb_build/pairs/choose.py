@@ -1,4 +1,4 @@
-"""The seeded, balanced choice of image pairs: which images go to which split, and which pairs of them are taken.
+"""Chooses balanced pairs of images at random: assigns images to splits, and draws pairs within each split.
 
 The source decides what makes a pair positive or negative (:mod:`lmdb_build.pairs.by_list`). All random draws follow
 from the seed, and each split has its own random numbers, so that more pairs in one split do not change the others.
@@ -21,20 +21,20 @@ LABEL_WORDS = {POSITIVE: "positive", NEGATIVE: "negative"}
 
 Indices = NDArray[np.intp]
 
-# Up to this many possible pairs, all are labeled. Above, pairs are drawn at random until there are enough.
+# Up to this many possible pairs, all pairs are labeled. With more, pairs are drawn at random until there are enough.
 ALL_PAIRS = 4_000_000
 DRAWN_AT_ONCE = 1 << 18
 
 
 class PairSource:
-    """M images and what is known about pairs of them; index i is the image ``names[i]`` below the root folder.
+    """M images and the labels of their pairs; image i is the file ``names[i]`` below the root folder.
 
-    tracks       (M,) which run of the camera an image is from; along a run, ``stamps`` ascend
-    stamps       (M,) when it was taken, or its position in the run
-    groups       (M,) what a split by group keeps together: a sequence, a place, a floor
-    group_names  the groups' names
-    group_word   what a group is called in messages
-    settings     what the list's header says about the source
+    tracks       (M,) the run of the camera that an image is from; along a run, ``stamps`` ascend
+    stamps       (M,) the time of an image, or its position in the run
+    groups       (M,) the group of an image (a sequence, a place, a floor), which a split by group does not divide
+    group_names  names of the groups
+    group_word   the word for a group in messages
+    settings     settings of the source for the list's header
     """
 
     names: list[str]
@@ -58,7 +58,7 @@ class PairSource:
         return {}
 
     def warnings(self, first: Indices, second: Indices, labels: NDArray) -> list[str]:
-        """What may make labels of these chosen pairs wrong, one sentence each."""
+        """Return warnings about the labels of these chosen pairs."""
         return []
 
 
@@ -81,8 +81,8 @@ class Pairs:
 def split_by_time(source: PairSource, shares: Mapping[str, float], gap: float = 0.0) -> dict[str, Indices]:
     """Cut each run into one part per split, with its share of the images; return the images of each split.
 
-    ``gap`` is the least difference of stamps between two splits: images after a cut are left out until it is reached,
-    since neighbors in time show the same scene.
+    ``gap`` is the minimum difference of stamps between two splits. Images right after a cut are left out, because
+    neighbors in time show the same scene.
     """
     total = sum(shares.values())
     taken: dict[str, list[Indices]] = {split: [] for split in shares}
@@ -105,8 +105,8 @@ def split_by_group(
 ) -> dict[str, Indices]:
     """Assign whole groups to splits; return the images of each split.
 
-    ``named`` says which groups go to which split; the one split that it does not mention gets the rest, and groups of a
-    split that is not in ``shares`` are not used. Without ``named``, groups are drawn at random until each split has its
+    ``named`` lists the groups of each split. One split may be missing; it gets the remaining groups. Groups of a split
+    that is not in ``shares`` are not used. Without ``named``, groups are drawn at random until each split has its
     share of the groups, and at least one.
     Raises InputError for an unknown group, one named twice, or fewer groups than splits.
     """
@@ -147,10 +147,10 @@ def split_by_group(
 class Wanted:
     """The pairs to choose for a split: ``count``, half of them positive.
 
-    at_most         if there are not enough pairs, take as many as there are, half positive
-    warp_share      this share of the positives is an image and a warped copy of it; in the same share of the negatives
-                    the second image is warped, or a net would learn to detect the warp instead of the place
-    hard_negatives  (K, 2) pairs that are taken as negatives before any is drawn
+    at_most         if there are not enough pairs, use as many as there are, half of them positive
+    warp_share      share of the positives that are an image and a warped copy of it; in the same share of the negatives
+                    the second image is warped too, so that a net does not learn to detect the warp
+    hard_negatives  (K, 2) pairs that are used as negatives before others are drawn
     """
 
     count: int
@@ -162,7 +162,7 @@ class Wanted:
 def choose_pairs(source: PairSource, images: Indices, wanted: Wanted, rng: np.random.Generator, split: str) -> Pairs:
     """Choose different pairs among ``images``, in shuffled order.
 
-    Each half is drawn uniformly from all pairs of its label, but for warped images and hard negatives.
+    Each half is drawn uniformly from all pairs of its label, except for warped images and hard negatives.
     Raises InputError, which names the ``split``, if there are not enough pairs.
     """
     half, warp_share, hard_negatives = wanted.count // 2, wanted.warp_share, wanted.hard_negatives
@@ -279,13 +279,13 @@ def _draw_and_judge(
     return {label: images[np.column_stack(np.divmod(code, count))] for label, code in codes.items()}
 
 
-# How many nearest images of each image are examined: in a video the first hundreds may be neighbors in time.
+# Number of nearest images examined per image; in a video, the first hundreds may be neighbors in time.
 DEEPEST = 512
 ROWS_AT_ONCE = 512
 
 
 def hard_negatives(source: PairSource, images: Indices, features: NDArray[np.floating], wanted: int) -> Indices:
-    """Choose up to ``wanted`` negative pairs (n, 2) of ``images`` (m,) whose ``features`` (m, D) are nearest.
+    """Choose up to ``wanted`` negative pairs (n, 2) of ``images`` (m,) with the nearest ``features`` (m, D).
 
     Every image's nearest negative comes first, then every image's second nearest, and so on, each time with the nearer
     pairs first. So the pairs are of all places, and not only of the place that the net knows least.

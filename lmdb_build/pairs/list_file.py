@@ -181,7 +181,7 @@ def write_contact_sheet(list_file: Path, root: Path, out: Path, rows: int = 6, s
         done = False
     if not done:
         raise InputError("cannot be written as a picture; a suffix such as .png says its format", out)
-    with suppress(OSError):  # said when the file is written
+    with suppress(OSError):  # write_whole reports it
         out.parent.mkdir(parents=True, exist_ok=True)
     write_whole(out, picture.tobytes())
 

@@ -1,4 +1,4 @@
-"""Images of a camera, run by run, from a table of frames or from folders; CSV tables that name images."""
+"""Reads runs of a camera from tables of frames or from folders, and CSV tables with names of images."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def index_runs(index: Path, root: Path, track: str, time: str) -> Runs:
 
 
 def folder_runs(folders: Sequence[Path], root: Path, step: float = 1.0) -> Runs:
-    """Take each folder (or list) of images as a run, with images ``step`` apart."""
+    """Make a run of each folder (or list) of images; ``step`` is the difference of stamps of two images."""
     runs = [[relative(path, root) for path in image_paths(folder)] for folder in folders]
     return Runs(
         names=[name for run in runs for name in run],
@@ -86,7 +86,7 @@ def read_table(path: Path, images: int) -> tuple[list[tuple[int, dict[str, str]]
 
 
 def cell(path: Path, line: int, row: dict[str, str], column: str) -> str:
-    """Return what a row has in a column. Raises InputError if it is empty."""
+    """Return the text of a row in a column. Raises InputError if it is empty."""
     if column not in row:
         raise InputError(f'has no column "{column}"; there are: {", ".join(map(str, row))}', path, 1, 1)
     if not row[column]:
@@ -95,7 +95,7 @@ def cell(path: Path, line: int, row: dict[str, str], column: str) -> str:
 
 
 def as_number(path: Path, line: int, row: dict[str, str], column: str) -> float:
-    """Return the number that a row has in a column. Raises InputError if there is no number."""
+    """Return the number of a row in a column. Raises InputError if it is not a number."""
     text = cell(path, line, row, column)
     try:
         return float(text)

@@ -87,7 +87,7 @@ class Room:
         ]
 
     def is_taken(self, wall: int, low: float, high: float, bottom: float) -> bool:
-        """Say whether something hangs or stands at this part of a wall, above ``bottom``."""
+        """Return whether something hangs or stands at this part of a wall, above ``bottom``."""
         return any(k == wall and low < end and start < high and bottom < top for k, start, end, top in self.taken)
 
 
@@ -130,7 +130,7 @@ def build_house(seed: int, rooms: int = 4) -> House:
 def _place_door(rng: np.random.Generator, room: Room, following: Room) -> Door:
     """Choose where the door between two neighbors is."""
     margin = DOOR_WIDTH_M / 2 + 0.5
-    for axis in (0, 1):  # one above the other, then one beside the other
+    for axis in (0, 1):  # rooms one above the other, then side by side
         low = max(room.bounds[axis], following.bounds[axis]) + margin
         high = min(room.bounds[axis + 2], following.bounds[axis + 2]) - margin
         if high > low:
@@ -284,8 +284,8 @@ def _placed(rng: np.random.Generator, room: Room, piece: list[Box], way: Vector)
         low = rng.uniform(0.02, wall.length - width - 0.02)
         ends = np.array([wall.at(low, 0, 0)[:2], wall.at(low + width, depth, 0)[:2]])
         (x0, y0), (x1, y1) = ends.min(axis=0), ends.max(axis=0)
-        apart = np.maximum(np.maximum([x0, y0] - way, way - [x1, y1]), 0)
-        blocks = np.linalg.norm(apart, axis=1).min() < CLEARANCE_M or room.is_taken(number, low, low + width, 0)
+        gaps = np.maximum(np.maximum([x0, y0] - way, way - [x1, y1]), 0)
+        blocks = np.linalg.norm(gaps, axis=1).min() < CLEARANCE_M or room.is_taken(number, low, low + width, 0)
         if blocks or any(x0 < q1 and p0 < x1 and y0 < r1 and o0 < y1 for p0, o0, q1, r1 in room.footprints):
             continue
         room.footprints.append((x0, y0, x1, y1))

@@ -42,7 +42,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Light:
-    """The light of a lap: BGR factors of what is everywhere, and of each room's source; where that source is."""
+    """The light of a lap: BGR factors of the ambient light and of one source per room, and the sources' positions."""
 
     ambient: Array  # (3,)
     sources: Array  # (rooms, 3)
@@ -67,13 +67,13 @@ class Renderer:
         self.relight(light)
 
     def relight(self, light: Light) -> None:
-        """Change the light: all textures are lit again."""
+        """Change the light, and compute all textures again."""
         self._pyramids = [_pyramid(_lit(quad, light)) for quad in self.house.quads]
 
     def draw(self, position: Array, rotation: Array) -> Image:
         """Return the picture (H, W, 3), BGR, seen from ``position`` (3,) with camera-to-world ``rotation`` (3, 3).
 
-        ``depth`` then holds the depth (H, W) of its pixels along the camera's axis, in meters, 0 where nothing is.
+        ``depth`` then has the depth (H, W) of its pixels along the camera's axis, in meters, 0 where there is nothing.
         """
         shape = self.camera.height, self.camera.width
         picture, nearness = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32)  # 1 / z: linear, unlike z
@@ -98,9 +98,9 @@ class Renderer:
     def _draw_quad(
         self, picture: Image, nearness: NDArray[np.float32], pyramid: list[Image], corners: Array, to_unit: Array
     ) -> None:
-        """Paint one rectangle of ``corners`` (4, 3) where it is nearer than what is there."""
+        """Paint a rectangle with ``corners`` (4, 3) where it is nearer than the picture so far."""
         x0, y0, x1, y1 = 0, 0, self.camera.width, self.camera.height
-        if (corners[:, 2] > NEAR_M).all():  # else it may come to anywhere in the picture
+        if (corners[:, 2] > NEAR_M).all():  # otherwise it may be anywhere in the picture
             outline = self.camera.project(corners)
             (left, top), (right, bottom) = outline.min(axis=0), outline.max(axis=0)
             x0, y0, x1, y1 = max(x0, int(left)), max(y0, int(top)), min(x1, int(right) + 2), min(y1, int(bottom) + 2)
@@ -143,7 +143,7 @@ def _pyramid(texture: Image) -> list[Image]:
 
 
 def _lit(quad: Quad, light: Light) -> Image:
-    """Return the rectangle's texture as the room's source of light shows it."""
+    """Return the rectangle's texture, lit by the light of its room."""
     wide, tall = np.linalg.norm(quad.right), np.linalg.norm(quad.down)
     across = np.linspace(0, 1, max(2, round(wide / LIGHT_GRID_M)))
     along = np.linspace(0, 1, max(2, round(tall / LIGHT_GRID_M)))

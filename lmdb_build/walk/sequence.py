@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 SPEED_M_S = 1.2
 POSES_PER_IMAGE = 10
-POSE_STEP_S = 0.09  # at most; an image whose nearest pose is more than 0.03 s away counts as one without a pose
+POSE_STEP_S = 0.09  # at most; an image has no pose if the nearest one is more than 0.03 s away
 EYE_HEIGHT_M = 1.5
 # On laps after the first: the greatest distance and rotation from the path.
 SIDE_STEP_M, TURN_DEG = 0.25, 5.0
@@ -191,7 +191,7 @@ def _look(yaw: Array, pitch: Array, roll: Array) -> Array:
 
 
 def _sway(walked: Array, periods_m: tuple[float, float], phases: Array) -> Array:
-    """A variation between -1 and 1 whose periods do not divide a lap, so that laps differ."""
+    """Return a variation between -1 and 1; a lap is no multiple of its periods, so that laps differ."""
     return 0.6 * np.sin(2 * np.pi * walked / periods_m[0] + phases[0]) + 0.4 * np.sin(
         2 * np.pi * walked / periods_m[1] + phases[1]
     )

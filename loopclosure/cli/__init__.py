@@ -1,4 +1,4 @@
-"""The command line: one module for each group of commands; it parses arguments, shows progress and computes nothing."""
+"""The command ``loopclosure``. Each module has a group of commands, which parse arguments and call the library."""
 
 from __future__ import annotations
 

@@ -23,9 +23,9 @@ from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands, seed
 
-# What belongs to frames, and means nothing to --graph.
+# Options that cannot be used with --graph.
 OF_FRAMES = ("loops", "odometry", "drift", "odometry_form", "seed", "camera", "rerun")
-ALL = "all"  # --loops of a graph in which none is false
+ALL = "all"  # value of --loops with --graph
 
 
 def add_commands(commands: Commands) -> None:
@@ -40,14 +40,12 @@ def _add_close(commands: Commands) -> None:
         "source",
         nargs="?",
         metavar="SOURCE",
-        help="the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag; with "
-        f"{', '.join((*POSES, *TOPICS))} behind it, as in drive.mp4,poses=slam.txt",
+        help="the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag; "
+        f"{', '.join((*POSES, *TOPICS))} may follow, as in drive.mp4,poses=slam.txt",
     )
+    parser.add_argument("--graph", type=Path, metavar="IN.g2o", help="solve this pose graph, instead of frames")
     parser.add_argument(
-        "--graph", type=Path, metavar="IN.g2o", help="a pose graph to solve as it is, instead of frames"
-    )
-    parser.add_argument(
-        "--loops", metavar="CSV", help="the loops.csv that detect wrote; with --graph: all, if no loop of it is false"
+        "--loops", metavar="CSV", help="the loops.csv that detect wrote; with --graph: all, to trust all loops"
     )
     exclusive = parser.add_mutually_exclusive_group()
     exclusive.add_argument(
@@ -56,9 +54,9 @@ def _add_close(commands: Commands) -> None:
     exclusive.add_argument(
         "--drift", type=float, metavar="PERCENT", help="simulate odometry that drifts, from the true poses"
     )
-    parser.add_argument("--odometry-form", metavar="WORDS", help="how --odometry is written, as pose-form")
-    parser.add_argument("--seed", type=seed, metavar="N", help="of --drift (default: 1)")
-    parser.add_argument("--camera", metavar="NUMBERS", help=f"{intrinsics.FORM}, if the source does not say")
+    parser.add_argument("--odometry-form", metavar="WORDS", help="form of the --odometry file, as in pose-form")
+    parser.add_argument("--seed", type=seed, metavar="N", help="seed of --drift (default: 1)")
+    parser.add_argument("--camera", metavar="NUMBERS", help=f"{intrinsics.FORM}, if the source has no calibration")
     parser.add_argument(
         "--rerun", metavar="F.rrd", help="write images, both paths and loops for the viewer of rerun.io"
     )
@@ -120,7 +118,7 @@ def _close_graph(a: argparse.Namespace, out: Path) -> None:
 
 
 def _odometry(a: argparse.Namespace, frames: ImageSequence) -> np.ndarray:
-    """Return the path (F, 7) to correct, NaN for frames without a pose."""
+    """Return the path (F, 7) to correct, NaN for frames without a pose. Raises InputError if there is none."""
     if a.odometry:
         read = read_poses(a.odometry, pose_form(a.odometry_form or ""))
         for doubt in read.doubts:

@@ -1,4 +1,4 @@
-"""The data set that a command is about, and the rule that says which of its frames show the same place."""
+"""Arguments for data sets and sequences, and loading them."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ from netspec.terminal.parser import above_zero
 
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]..., for example tum:desk,stop=50%,stride=2.
 
-Truth from poses (KIND is seen from the files, or named):
+Truth from poses (KIND can be left out; then it is found from the files):
 {chr(10).join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())}
   images:     a folder or list of images, with poses=FILE, or truth=MASK: which frames show the same place
-Truth from elsewhere:
+Other truth:
   fabmap:     FAB-MAP's New College or City Centre; truth=, coordinates=, camera={"|".join(CAMERAS)} (default: both)
-  traverses:  two drives, PATH and references=PATH; equal numbers are equal places, or truth= says it
-  nordland:   query/, ref/, ground_truth*.json, as VPR benchmarks ship it
+  traverses:  two drives, PATH and references=PATH; equal frame numbers are the same place, unless truth= is given
+  nordland:   query/, ref/, ground_truth*.json, as in VPR benchmarks
   pairs:      places photographed twice (pairs.csv)
 
-KEYs: start, stop (frame N or share P%), stride, limit: which frames; references=PATH: another sequence to look in;
+KEYs: start, stop (frame N or share P%), stride, limit: which frames; references=PATH: another sequence to search;
 truth=FILE (.mat .npy .txt or image); poses=FILE ({POSES_HELP}),
 pose-form ({POSE_FORM_HELP});
-topic, pose-topic: of a bag that has several."""
+topic, pose-topic: the topics to read from a bag that has several."""
 RULE = ("max_distance", "max_angle", "soft_distance", "soft_angle", "fov", "overlap", "exclude_seconds")
 TRAVERSES = ("tolerance", "soft_tolerance")
 
@@ -56,16 +56,33 @@ OVERLAP = "the soft zone: a match is not counted as wrong if this share of each 
 
 
 def add_data_set(parser: argparse.ArgumentParser) -> None:
-    """Add the source of a data set, and the options that say which frames show the same place; HELP explains it."""
+    """Add the arguments for a data set: its source (see HELP) and the rule for the same place."""
     parser.add_argument("source", metavar="SOURCE", help="the data set, see below")
-    parser.add_argument("--tolerance", type=int, metavar="FRAMES", help="of traverses (default: 0)")
-    parser.add_argument("--soft-tolerance", type=int, metavar="FRAMES", help="a match up to here is ignored, not wrong")
-    parser.add_argument("--max-distance", type=above_zero, metavar="M", help=f"of poses (default: {MAX_DISTANCE_M:g})")
-    parser.add_argument("--max-angle", type=above_zero, metavar="DEG", help=f"of poses (default: {MAX_ANGLE_DEG:g})")
     parser.add_argument(
-        "--soft-distance", type=above_zero, metavar="M", help="a match up to here is ignored, not wrong"
+        "--tolerance",
+        type=int,
+        metavar="FRAMES",
+        help="traverses: largest difference of the frame numbers of one place (default: 0)",
     )
-    parser.add_argument("--soft-angle", type=above_zero, metavar="DEG", help="the same, for the angle")
+    parser.add_argument(
+        "--soft-tolerance",
+        type=int,
+        metavar="FRAMES",
+        help="ignore wrong matches up to this difference of frame numbers",
+    )
+    parser.add_argument(
+        "--max-distance",
+        type=above_zero,
+        metavar="M",
+        help=f"maximum distance of two poses at one place (default: {MAX_DISTANCE_M:g})",
+    )
+    parser.add_argument(
+        "--max-angle", type=above_zero, metavar="DEG", help=f"maximum angle between them (default: {MAX_ANGLE_DEG:g})"
+    )
+    parser.add_argument(
+        "--soft-distance", type=above_zero, metavar="M", help="ignore wrong matches up to this distance"
+    )
+    parser.add_argument("--soft-angle", type=above_zero, metavar="DEG", help="and up to this angle")
     parser.add_argument(
         "--fov", type=float, metavar="DEG", help=f"horizontal field of view (default: the camera's, or {FOV_DEG:g})"
     )
@@ -74,19 +91,19 @@ def add_data_set(parser: argparse.ArgumentParser) -> None:
         "--exclude-frames",
         type=int,
         metavar="N",
-        help=f"frames i and j with |i - j| <= N are no pair (default: {EXCLUDED})",
+        help=f"exclude pairs of frames i and j with |i - j| <= N (default: {EXCLUDED})",
     )
     parser.add_argument(
         "--exclude-seconds",
         type=float,
         metavar="S",
-        help="frames less than S seconds from each other are no pair "
-        f"(default: with times {datasets.TUM_EXCLUSION.seconds:g})",
+        help="exclude pairs of frames within S seconds "
+        f"(default if there are times: {datasets.TUM_EXCLUSION.seconds:g})",
     )
 
 
 def typed(text: str, kinds: Kinds) -> Source:
-    """Read a source of the command line."""
+    """Parse a source on the command line. Raises WrongUsage."""
     try:
         return read_source(text, kinds)
     except InputError as fault:
@@ -94,7 +111,7 @@ def typed(text: str, kinds: Kinds) -> Source:
 
 
 def sequence(source: Source, out: str | Path, layout: str = "") -> ImageSequence:
-    """Read a sequence; frames of bags and videos go to ``out``/frames. ``layout`` "" is found out."""
+    """Read a sequence; the frames of a bag or video are extracted to ``out``/frames. ``layout`` "": find it."""
     poses, path = source.pose_choice(), source.path
     if layout in RECORDED or (not layout and is_recording(path)):
         topics = source.get("topic", str) or "", source.get("pose-topic", str) or ""
@@ -162,7 +179,7 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
 
 
 def _check_truth(source: Source, kind: str) -> None:
-    """Refuse a plain folder of images: nothing says which of them show the same place."""
+    """Raise InputError for a plain folder of images, which has no truth."""
     path = source.path
     plain = not kind and not is_recording(path) and "poses" not in source.settings and _layout(source, path) == "tum"
     if plain and path.is_dir() and not (path / "rgb.txt").exists():
@@ -175,14 +192,14 @@ def _layout(source: Source, path: Path) -> str:
 
 
 def warn_of_unreadable(recording: ImageSequence) -> ImageSequence:
-    """Name the images that could not be read; return the recording without them."""
+    """Warn about images that could not be read; return the recording without them."""
     if unreadable := recording.left_out():
         warn(unreadable)
     return recording.readable()
 
 
 def recording_of(text: str, frames: Path) -> ImageSequence:
-    """Open the frames of a source for the detector; those of a bag go to a folder ``frames``."""
+    """Open a source for the detector; the frames of a bag are extracted to the folder ``frames``."""
     source = typed(text, DETECTED)
     path, (topic, pose_topic) = source.path, (source.get(name, str) or "" for name in TOPICS)
     if is_bag(path):

@@ -1,4 +1,4 @@
-"""``loopclosure detect``, and ``loopclosure map``: loops within a drive, and with those of earlier drives."""
+"""``loopclosure detect`` and ``loopclosure map``: loops within a drive, and between several drives."""
 
 from __future__ import annotations
 
@@ -35,10 +35,9 @@ from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands
 
-# The detector's settings that --resume takes from the saved one.
+# Settings that --resume reads from the saved detector.
 SETTINGS = ("metric", "exclude_recent", "exclude_seconds", "top_k", "threshold", "consistency", "consistency_window")
-RECENT_SECONDS = 10.0  # of --video: the present place does not count as seen again
-# Settings of the search frame by frame.
+RECENT_SECONDS = 10.0  # for --video: frames of the current visit to a place are not loops
 OF = DetectorSettings()
 ONLINE = ("top_k", "consistency", "consistency_window")
 
@@ -63,11 +62,13 @@ def _add_detect(commands: Commands) -> None:
         "source",
         nargs="?",
         metavar="SOURCE",
-        help="a folder or list of images, a sequence (TUM, EuRoC, KITTI), a video or a ROS bag; with "
-        f"{', '.join((*FRAMES, *TOPICS))} behind it, as in drive.bag,stride=2,topic=/cam0",
+        help="a folder or list of images, a sequence (TUM, EuRoC, KITTI), a video or a ROS bag; "
+        f"{', '.join((*FRAMES, *TOPICS))} may follow, as in drive.bag,stride=2,topic=/cam0",
     )
     parser.add_argument(
-        "--video", metavar="CAMERA|URL|FILE", help="decide as images come, of camera 0, rtsp://HOST/PATH or a file"
+        "--video",
+        metavar="CAMERA|URL|FILE",
+        help="find loops while images arrive, from camera 0, rtsp://HOST/PATH or a file",
     )
     parser.add_argument("--out", required=True, metavar="FOLDER", help="where loops.csv, and loops.g2o with poses, go")
     exclusive = parser.add_mutually_exclusive_group()
@@ -75,14 +76,14 @@ def _add_detect(commands: Commands) -> None:
         "--describe",
         default="default",
         metavar="NAME|MODULE:FUNCTION|FILE.py:FUNCTION",
-        help="image (H, W, 3) BGR -> descriptor: default and small are nets that come with it (default: %(default)s)",
+        help="function image (H, W, 3) BGR -> descriptor; default and small are included nets (default: %(default)s)",
     )
     exclusive.add_argument(
         "--features", metavar="F.npz", help="descriptors computed beforehand (netspec extract --images)"
     )
     parser.add_argument("--with", action="append", default=[], metavar="KEY=VALUE", help="a keyword for --describe")
     parser.add_argument(
-        "--whiten", metavar="OTHER.npz", help="whiten the descriptors by these, of images of other places"
+        "--whiten", metavar="OTHER.npz", help="whiten with the descriptors in this file, of images of other places"
     )
     exclusive = parser.add_mutually_exclusive_group()
     exclusive.add_argument(
@@ -95,31 +96,35 @@ def _add_detect(commands: Commands) -> None:
         "--threshold",
         type=float,
         metavar="S",
-        help="decide frame by frame, by this least score (euclidean: minus the distance)",
+        help="decide frame by frame: a loop has at least this score (euclidean: minus the distance)",
     )
     exclusive.add_argument("--resume", metavar="F.npz", help="decide frame by frame, with a detector that --save wrote")
-    parser.add_argument("--metric", choices=METRICS, help=f"of the descriptors (default: {OF.metric})")
+    parser.add_argument("--metric", choices=METRICS, help=f"metric of the descriptors (default: {OF.metric})")
     parser.add_argument(
         "--exclude-recent",
         type=int,
         metavar="FRAMES",
-        help=f"no candidates (default: those of one visit to a place; frame by frame {OF.exclude_recent})",
+        help="number of recent frames that are not candidates "
+        f"(default: those of one visit to a place; frame by frame {OF.exclude_recent})",
     )
     parser.add_argument(
-        "--exclude-seconds", type=float, metavar="S", help="frames less than S seconds old are no candidates either"
+        "--exclude-seconds", type=float, metavar="S", help="frames of the last S seconds are not candidates either"
     )
     parser.add_argument("--top-k", type=int, metavar="K", help=f"candidates examined (default: {OF.top_k})")
     parser.add_argument(
-        "--consistency", type=int, metavar="K", help="previous frames that must have led to the candidate"
+        "--consistency", type=int, metavar="K", help="number of previous frames with candidates that lead to this one"
     )
     parser.add_argument(
-        "--consistency-window", type=int, metavar="FRAMES", help=f"how near (default: {OF.consistency_window})"
+        "--consistency-window",
+        type=int,
+        metavar="FRAMES",
+        help=f"largest step to the next candidate (default: {OF.consistency_window})",
     )
     parser.add_argument("--verify", action="store_true", help="verify candidates by SIFT matches and RANSAC")
     parser.add_argument(
         "--odometry",
         metavar="FILE",
-        help="poses (TUM, KITTI, EuRoC): two frames that it puts far from each other are no loop",
+        help="poses (TUM, KITTI, EuRoC): frames that are far from each other by these are not a loop",
     )
     parser.add_argument("--save", metavar="F.npz", help="write the detector, to continue with --resume")
     parser.add_argument("--rerun", metavar="F.rrd", help="write images, scores and loops for the viewer of rerun.io")
@@ -136,7 +141,7 @@ def _detect(a: argparse.Namespace) -> None:
         describe = None if describe is None else run.whitened(describe, whitening, views)
         features = None if features is None else features.whitened(whitening)
     detector = _detector(a, describe, views)
-    # Frames of the run that is resumed have numbers but no names here.
+    # The names of the frames before --resume are not known.
     names, ended = [""] * len(detector), None
     out = Path(a.out)
     out.mkdir(parents=True, exist_ok=True)
@@ -188,7 +193,7 @@ def _detect(a: argparse.Namespace) -> None:
 
 
 def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResult], KeyboardInterrupt | None]:
-    """Look at the images of a camera, a stream or a file until it ends, or Ctrl-C ends it."""
+    """Process the images of a camera, a stream or a file until it ends, or until Ctrl-C."""
     results: list[LoopResult] = []
     with rerun_file(a.rerun) if a.rerun else nullcontext() as made:
         try:
@@ -205,7 +210,7 @@ def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResu
 
 
 def _odometry(path: str, source: str, recording: ImageSequence) -> np.ndarray:
-    """Return the odometry (frames, 7) of the frames that are taken."""
+    """Return the odometry (frames, 7) of the selected frames."""
     read = read_poses(path)
     for doubt in read.doubts:
         warn(f"{path}: {doubt}")
@@ -218,7 +223,7 @@ def _odometry(path: str, source: str, recording: ImageSequence) -> np.ndarray:
 
 
 def _checked_options(a: argparse.Namespace) -> dict[str, str]:
-    """Return the keywords of --with; refuse options that do not go together."""
+    """Return the keywords of --with. Raises WrongUsage for options that do not go together."""
     if bool(a.source) == bool(a.video):
         raise WrongUsage("expected the frames, or --video")
     if a.video and (a.features or a.least_precision is not None):
@@ -247,7 +252,7 @@ def _checked_options(a: argparse.Namespace) -> dict[str, str]:
 
 
 def _changes(a: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings of the detector that are given."""
+    """Return the settings of the detector that are given on the command line."""
     return {name: getattr(a, name) for name in SETTINGS if getattr(a, name) is not None}
 
 
@@ -292,7 +297,7 @@ def _add_build(commands: Commands) -> None:
 
 def _build(a: argparse.Namespace) -> None:
     describe = run.load_describe(checked_name(a.describe))
-    recordings = _recordings(a, 0)  # before there is a map: a name may be mistyped
+    recordings = _recordings(a, 0)  # before the map is made, in case a name is mistyped
     _add_all(Map.create(a.map, a.describe), describe, recordings, a.index)
 
 
@@ -348,7 +353,7 @@ def _query(a: argparse.Namespace) -> None:
     known, out = Map(a.map), Path(a.out)
     recording = recording_of(a.source, out / "frames")
     detector, before = known.detector(run.load_describe(known.describer), a.index), len(known)
-    if a.index in INDEXES:  # in memory: frames that are added are not in the map
+    if a.index in INDEXES:  # in memory: the frames are added to the detector, not to the map
         run.remember_all(detector, recording, progress=bar)
         results = _decided(detector, own=False)
         results = [replace(result, query_id=result.query_id - before) for result in results]

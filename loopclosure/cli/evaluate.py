@@ -64,7 +64,7 @@ def _add_evaluate(commands: Commands) -> None:
     parser.add_argument("--out", required=True, metavar="FOLDER", help="where the report and its parts go")
     parser.add_argument("--title", default="", metavar="TEXT", help="heading of the report")
     parser.add_argument(
-        "--seed", type=seed, default=0, metavar="N", help="of the methods' random numbers (default: %(default)s)"
+        "--seed", type=seed, default=0, metavar="N", help="seed of the methods' random numbers (default: %(default)s)"
     )
 
 
@@ -113,11 +113,15 @@ def _add_similarity(commands: Commands) -> None:
     parser.add_argument("features", metavar="FEATURES", help="the .npz file of the queries")
     parser.add_argument("--references", metavar="F.npz", help="the references (default: the queries, as one sequence)")
     parser.add_argument(
-        "--metric", default=METRICS[0], choices=METRICS, help="of the descriptors (default: %(default)s)"
+        "--metric", default=METRICS[0], choices=METRICS, help="metric of the descriptors (default: %(default)s)"
     )
     parser.add_argument("--top-k", type=int, metavar="K", help="write the best K of each query as CSV, not all as .npy")
     parser.add_argument(
-        "--exclude-frames", type=int, default=0, metavar="N", help="of --top-k in one sequence (default: %(default)s)"
+        "--exclude-frames",
+        type=int,
+        default=0,
+        metavar="N",
+        help="with --top-k, in one sequence: exclude pairs up to N frames (default: %(default)s)",
     )
     parser.add_argument(
         "--exclude-seconds", type=float, default=0.0, metavar="S", help="the same, by stamps (default: %(default)g)"
