@@ -1,1 +1,1 @@
-"""How fast netspec is, beside hand-written PyTorch, OpenCV 4, onnxruntime, OpenVINO and, where it is at hand, Caffe."""
+"""Compares the speed of netspec with PyTorch, OpenCV 4, onnxruntime, OpenVINO and, if it is available, Caffe."""

@@ -1,4 +1,4 @@
-"""The files that all that is compared reads: one net, its weights, its ONNX model, its inputs, its records."""
+"""The files of a benchmark case, which all programs read: net, weights, ONNX model, inputs and records."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ ROOT = Path(__file__).resolve().parents[1]
 PAPER = [f"siamese_{n}" for n in ("8", "128", "resnet27_256", "resnet27_512")]
 SMALL = [f"small/{name}" for name in PAPER]
 CATALOG = [*PAPER, *SMALL, *ZOO]
-RATE, MOMENTUM, DECAY = 1e-4, 0.9, 5e-4  # of trainings: small, so that numbers stay usual ones however long it takes
+RATE, MOMENTUM, DECAY = 1e-4, 0.9, 5e-4  # of trainings; small, so that they do not diverge
 
 
 @dataclass(frozen=True)
 class Case:
-    """One net at one batch size; ``folder`` has its files. ``twin`` is the name of its twin, if it has one."""
+    """One net at one batch size. ``folder`` has its files; ``twin`` is the name of its PyTorch twin, if it has one."""
 
     name: str
     batch: int
@@ -32,27 +32,27 @@ class Case:
 
     @property
     def prototxt(self) -> Path:
-        """The net."""
+        """The file of the net."""
         return self.folder / "net.prototxt"
 
     @property
     def caffemodel(self) -> Path:
-        """Its weights."""
+        """The file of the weights."""
         return self.folder / "net.caffemodel"
 
     @property
     def onnx(self) -> Path:
-        """The same net and weights as ``netspec export --to onnx`` writes them."""
+        """The ONNX model that ``netspec export --to onnx`` wrote."""
         return self.folder / "net.onnx"
 
     @property
     def inputs(self) -> Path:
-        """An .npz: its inputs by blob, or a batch of records and labels for training."""
+        """An .npz file with the inputs by blob, or with a batch of records and labels for training."""
         return self.folder / "inputs.npz"
 
     @property
     def solver(self) -> Path:
-        """For training: a solver without tests and snapshots."""
+        """The solver for training, without tests and snapshots."""
         return self.folder / "solver.prototxt"
 
 
@@ -60,9 +60,9 @@ class Case:
 def forward_case(
     name: str, batch: int, weights: str | None = None, twin: str | None = None, onnx: bool = True
 ) -> Iterator[Case]:
-    """Write what forward passes of a net need; ``name`` is one of the catalog, or the path of a prototxt.
+    """Write the files for forward passes of a net; ``name`` is in the catalog, or the path of a prototxt.
 
-    Without ``weights`` they are random. Raises SpecError for faults of the files.
+    Without ``weights``, random weights are written. Raises SpecError for faults in the files.
     """
     import netspec
     from netspec.export.formats.onnx import export_onnx
@@ -87,7 +87,7 @@ def forward_case(
 
 @contextmanager
 def training_case(name: str, batch: int) -> Iterator[Case]:
-    """Write what the training of a net of the catalog needs: a database that has one batch."""
+    """Write the files for training a net of the catalog, with a database of one batch."""
     import netspec
     from netspec.data.database import Writer
     from netspec.data.datum import array_to_datum
@@ -146,7 +146,7 @@ def training_net(name: str, source: str, batch: int) -> Any:
 
 
 def record(name: str) -> tuple[tuple[int, int, int], int]:
-    """Return the shape of a net's records, and how many labels there are."""
+    """Return the shape of a net's records, and the number of labels."""
     if name in ZOO:
         return ZOO[name][1], 2 if name == "pnet" else 10
     size = 64 if name in SMALL else 224
@@ -162,7 +162,7 @@ def _with_batch(message: Any, batch: int) -> Any:
 
 
 def randomize(net: Any) -> None:
-    """Set BatchNorm statistics as after some training, and normally distributed weights where there is no filler."""
+    """Set BatchNorm statistics as if after some training, and normally distributed weights if there is no filler."""
     import torch
 
     torch.manual_seed(0)
@@ -180,7 +180,7 @@ def randomize(net: Any) -> None:
 
 
 def calm(net: Any, inputs: dict[str, np.ndarray]) -> None:
-    """Scale the last layer that learns, so that its values are of the size of 1: a softmax then tells differences."""
+    """Scale the last layer with weights so that its outputs are about 1 and a softmax is not saturated."""
     import torch
 
     last = [layer for layer in net.layers if len(layer.blobs)][-1:]

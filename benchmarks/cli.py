@@ -49,12 +49,10 @@ def parser() -> Parser:
 
 def _add_common(parser: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
     _add_ways(parser, known, default)
-    parser.add_argument("--caffe", metavar="BINARY", help="also Caffe's own program")
+    parser.add_argument("--caffe", metavar="BINARY", help="also time this caffe binary")
+    parser.add_argument("--batch", type=int, nargs="+", default=[1], help="one or several batch sizes (default: 1)")
     parser.add_argument(
-        "--batch", type=int, nargs="+", default=[1], help="items of a batch, one or several (default: 1)"
-    )
-    parser.add_argument(
-        "--threads", type=int, nargs="+", default=[1], help="threads of a pass, one or several (default: 1)"
+        "--threads", type=int, nargs="+", default=[1], help="one or several numbers of threads (default: 1)"
     )
     parser.add_argument(
         "--seconds",
@@ -70,7 +68,7 @@ def _add_ways(parser: argparse.ArgumentParser, known: Sequence[str], default: Se
         "--with", dest="ways", nargs="+", choices=known, default=list(default), help=f"default: {' '.join(default)}"
     )
     parser.add_argument(
-        "--rounds", type=int, default=9, help="rounds, in each of which every way has its turn (default: 9)"
+        "--rounds", type=int, default=9, help="number of rounds; each way runs once per round (default: 9)"
     )
     _add_json(parser)
 
@@ -89,10 +87,10 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_settings(commands: Commands) -> None:
-    parser = commands.add_parser("settings", help="judge loopclosure's auto on drives whose loops are known")
+    parser = commands.add_parser("settings", help="evaluate loopclosure's auto on drives with known loops")
     parser.set_defaults(function=_settings)
     _add_data(parser)
-    parser.add_argument("families", nargs="*", metavar="FAMILY", help="only the drives made of these (default: all)")
+    parser.add_argument("families", nargs="*", metavar="FAMILY", help="only drives of these families (default: all)")
     parser.add_argument("--halves", action="store_true", help="also the figures of each half of the roads and rooms")
 
 
@@ -109,8 +107,10 @@ def _add_tables(commands: Commands) -> None:
     parser = commands.add_parser("tables", help="measure loopclosure's methods for the tables of its pages")
     parser.set_defaults(function=_tables)
     _add_data(parser)
-    parser.add_argument("sets", nargs="*", metavar="SET", help="only on these (default: all)")
-    parser.add_argument("--methods", nargs="+", default=[], metavar="NAME", help="only these, as the tables name them")
+    parser.add_argument("sets", nargs="*", metavar="SET", help="only these data sets (default: all)")
+    parser.add_argument(
+        "--methods", nargs="+", default=[], metavar="NAME", help="only these methods, by their names in the tables"
+    )
 
 
 def _tables(arguments: argparse.Namespace) -> None:
@@ -121,7 +121,7 @@ def _tables(arguments: argparse.Namespace) -> None:
 
 
 def _add_pages(commands: Commands) -> None:
-    parser = commands.add_parser("pages", help="write the figures of the pages from benchmarks/results")
+    parser = commands.add_parser("pages", help="write the figures in benchmarks/results into the pages")
     parser.set_defaults(function=_pages)
 
 
@@ -143,11 +143,11 @@ def _list(arguments: argparse.Namespace) -> None:
 
 
 def _add_forward(commands: Commands) -> None:
-    parser = commands.add_parser("forward", help="time forward passes beside those of other programs")
+    parser = commands.add_parser("forward", help="compare the time of forward passes with other programs")
     parser.set_defaults(function=_forward)
     parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list), or a prototxt")
     parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
-    parser.add_argument("--twin", help="the net of the catalog whose PyTorch twin the prototxt has")
+    parser.add_argument("--twin", help="the net of the catalog with the PyTorch twin of the prototxt")
     _add_common(parser, FORWARD, (*ENGINES, "pytorch", "opencv4"))
     parser.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
 
@@ -168,7 +168,7 @@ def _add_train(commands: Commands) -> None:
     parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
     _add_common(parser, TRAINING, ("netspec", "pytorch"))
     parser.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
-    parser.add_argument("--device", default="cpu", help="torch's name of it, for netspec and pytorch (default: cpu)")
+    parser.add_argument("--device", default="cpu", help="torch device for netspec and pytorch (default: cpu)")
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -205,7 +205,7 @@ def _add_waiting(commands: Commands) -> None:
     parser.add_argument(
         "--waits", nargs="+", default=["", "OMP_WAIT_POLICY=PASSIVE", "GOMP_SPINCOUNT=2000"], metavar="VARIABLE=VALUE"
     )
-    parser.add_argument("--batch", type=int, default=32, help="items of a batch (default: 32)")
+    parser.add_argument("--batch", type=int, default=32, help="batch size (default: 32)")
     parser.add_argument("--threads", type=int, default=2, help="threads of each training (default: 2)")
     parser.add_argument("--rounds", type=int, default=7, help="default: 7")
 
@@ -218,10 +218,12 @@ def _waiting(arguments: argparse.Namespace) -> None:
 
 
 def _add_feeding(commands: Commands) -> None:
-    parser = commands.add_parser("feeding", help="how long trainings wait for data from databases and image files")
+    parser = commands.add_parser(
+        "feeding", help="measure how long trainings wait for data from databases and image files"
+    )
     parser.set_defaults(function=_feeding)
     parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
-    parser.add_argument("--batch", type=int, default=4, help="items of a batch (default: 4)")
+    parser.add_argument("--batch", type=int, default=4, help="batch size (default: 4)")
     parser.add_argument("--threads", type=int, default=2, help="threads of the training (default: 2)")
     _add_json(parser)
 
@@ -233,11 +235,11 @@ def _feeding(arguments: argparse.Namespace) -> None:
 
 
 def _add_growth(commands: Commands) -> None:
-    parser = commands.add_parser("growth", help="time and memory of more and more layers, pairs, frames, ...")
+    parser = commands.add_parser("growth", help="measure time and memory for more and more layers, pairs, frames, ...")
     parser.set_defaults(function=_growth)
     parser.add_argument("kind", choices=KINDS, help="what grows")
     parser.add_argument(
-        "sizes", type=int, nargs="*", metavar="SIZE", help="how many of it, several times (default: usual)"
+        "sizes", type=int, nargs="*", metavar="SIZE", help="the sizes to measure (default: the usual ones)"
     )
     parser.add_argument("--plot", metavar="FILE", help="draw what was measured, as .png or .svg")
     _add_json(parser)
@@ -305,9 +307,9 @@ def _compare(
 def _report(
     arguments: argparse.Namespace, rows_of: Callable[[str | None], Iterator[list[Row]]], before: Sequence[Row] = ()
 ) -> list[Row]:
-    """Print a table for each list of rows, and what could not run; write all that there is so far, and return it.
+    """Print a table for each list of rows, and the ways that could not run; write all rows so far, and return them.
 
-    ``before`` was measured before, for the same files.
+    ``before``: rows measured earlier, for the same files.
     """
     from benchmarks import environment, report, results
     from benchmarks.compare import YARDSTICKS

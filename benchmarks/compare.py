@@ -1,4 +1,4 @@
-"""All ways to run one case, in rounds."""
+"""Runs a case in all ways, in rounds."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from benchmarks.case import DECAY, MOMENTUM, RATE, Case
 from benchmarks.report import REFERENCES, Row
 from benchmarks.rounds import CaffeProgram, Contestant, Pass, Starter, Worker, difference, measure, ratio
 
-YARDSTICKS = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")  # these run in an environment of their own
+YARDSTICKS = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")  # these run in a separate environment
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The ways to run a case, and for how long.
+    """The ways to run a case, and the limits of the measurement.
 
-    training    whether a pass is a training iteration, else it is a forward pass
-    yardsticks  the Python of those among the ways that run in an environment of their own
-    caffe       Caffe's own program, if it is to be timed too
-    limit       the rounds take at most so many seconds, or as long as three of them do
-    device      where trainings of netspec and of the twin run: a name of torch's
+    training    a pass is a training iteration; otherwise a forward pass
+    yardsticks  the Python for the ways that need a separate environment
+    caffe       the caffe binary, if it is timed too
+    limit       the rounds take at most this many seconds, but there are at least three
+    device      the torch device for trainings of netspec and of the twin
     """
 
     ways: Sequence[str]
@@ -79,7 +79,7 @@ def _rows(
 
 
 def task_of(case: Case, threads: int) -> dict[str, Any]:
-    """Return what benchmarks/worker.py needs to know of a case."""
+    """Return the task for benchmarks/worker.py."""
     from netspec.proto.text import read_net
 
     message = read_net(case.prototxt)
@@ -101,14 +101,14 @@ def _worker(case: Case, way: str, task: dict[str, Any], suffix: str, yardsticks:
 
 
 def parts(way: str) -> tuple[str, dict[str, str]]:
-    """Return who runs ``netspec-openvino-bf16``, by which engine, and in which precision."""
+    """Split a name such as ``netspec-openvino-bf16`` into program, engine and precision."""
     name, *rest = way.split("-")
     precision = rest.pop() if rest[-1:] == ["bf16"] else "fp32"
     return name, {"engine": rest[0] if rest else "torch", "precision": precision}
 
 
 def python_of(way: str, yardsticks: str | None) -> str:
-    """Return the Python that has a way's library."""
+    """Return the Python with the library of a way."""
     return yardsticks if yardsticks and way in YARDSTICKS else sys.executable
 
 
@@ -129,7 +129,7 @@ def starts_of(case: Case, ways: Sequence[str], yardsticks: str | None, rounds: i
 
 
 class _Absent:
-    """A way that there is not for this net."""
+    """A way that is not available for this net."""
 
     peak: float | None = None
 
@@ -141,7 +141,7 @@ class _Absent:
         raise AssertionError(self.fault)
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing."""
 
 
 def _tell(case: Case, threads: int, done: int, rounds: int) -> None:

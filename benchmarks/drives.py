@@ -1,9 +1,9 @@
-"""Drives whose loops are known, to choose settings on and to judge them: ``tools/bench settings``.
+"""Makes drives with known loops, for choosing and evaluating settings: ``tools/bench settings``.
 
-Sequences that pass no place twice are driven again: each frame in another season, which is one change of colors, tones
-and light for the whole drive, from a point of view that differs a little. Then frame i of both shows one place. From
-these and from synthetic walks: whole traverses, keyframes, parts of a route, other speeds, small images, one drive that
-comes back, and drives that share nothing.
+A sequence without loops gets a second pass: each frame in another season (one change of colors, tones and light for the
+whole drive), from a slightly different viewpoint. Frame i of both passes shows the same place. The drives are made from
+such passes and from synthetic walks: whole traverses, keyframes, parts of a route, other speeds, small images, one
+drive that comes back, and drives that share nothing.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from netspec.files.opencv import cv2
 
 NEAR, OVERLAP = 1, 4  # frames of one route: the same place, and views that overlap
 KEYFRAMES = 4
-VIEWPOINT = 0.3  # of lmdb_build.views: how differently a place is seen in another season
+VIEWPOINT = 0.3  # strength of the change of viewpoint in another season, see lmdb_build.views
 SMALL = (64, 32)
-NOISE = 4.0  # gray levels, of a camera that stands
+NOISE = 4.0  # gray levels, camera noise between frames at one position
 SEASONS, SAME = (2, 3), 0
 WALKS = (41, 42)  # seeds
-GAP = 30  # frames of one drive that are no loop
+GAP = 30  # frames nearer than this in one drive are not a loop
 # The families of the first half, by place; all others are the second. What is chosen on one is judged on the other.
 FIRST_HALF = (
     "bridge_highway",
@@ -52,7 +52,7 @@ SOFT_DEG = 45.0  # views of one room turned by less are no mistake: the soft rul
 
 @dataclass(frozen=True)
 class Drive:
-    """A data set, and the sequence or house it was made of: what is chosen is never judged on the same one."""
+    """A data set, and the sequence or house it was made of: settings are never chosen and evaluated on the same one."""
 
     family: str
     kind: str
@@ -65,7 +65,7 @@ class Drive:
 
 
 def drives(data: Path, work: Path, only: Sequence[str] = ()) -> Iterator[Drive]:
-    """Yield all drives that can be made of the folder ``data``, or of some families; images go to ``work``."""
+    """Yield the drives of all or some families in the folder ``data``; images are written to ``work``."""
     routes = {}
     with (data / "sequences" / "index.csv").open(encoding="utf-8") as table:
         for row in csv.DictReader(table):
@@ -148,8 +148,8 @@ def _of_route(name: str, route: list[Path], other: list[Path], work: Path) -> It
     where = np.concatenate([every, np.full(len(between), np.nan), every[half]])
     yield Drive(name, "comes back", _one_drive(once, where))
     yield Drive(name, "once", _one_drive(route, every))
-    beside = in_season(route, work / name, SAME)
-    passes = [*route, *beside]
+    second_pass = in_season(route, work / name, SAME)
+    passes = [*route, *second_pass]
     yield Drive(name, "twice", _one_drive(passes, np.tile(every, 2)))
     yield Drive(name, "twice, small", _one_drive(_resized(passes, work / f"{name}_passes_small"), np.tile(every, 2)))
     yield Drive(name, "twice, season 2", _one_drive([*route, *second], np.tile(every, 2)))
@@ -162,7 +162,7 @@ def _of_route(name: str, route: list[Path], other: list[Path], work: Path) -> It
 
 
 def _standing(frames: int) -> np.ndarray:
-    """Return the places of a drive that stands at three places of the route, and drives on."""
+    """Return the places of a drive that stops at three places of the route."""
     rng = np.random.default_rng(frames)
     times = np.ones(frames, int)
     times[rng.integers(0, frames, 3)] = rng.integers(10, 40, 3)
@@ -170,7 +170,7 @@ def _standing(frames: int) -> np.ndarray:
 
 
 def _stood(images: list[Path], folder: Path) -> list[Path]:
-    """Return the same images, of which repeated ones differ by a camera's noise; files in ``folder``."""
+    """Write copies of the images with camera noise to ``folder``, so that repeated images differ."""
     folder.mkdir(parents=True, exist_ok=True)
     made = [folder / f"{number:06d}.jpg" for number in range(len(images))]
     for number, (image, path) in enumerate(zip(images, made, strict=True)):
@@ -200,23 +200,25 @@ def walked(work: Path, seed: int, size: tuple[int, int], frames: int = 300, laps
 
 
 def _traverses(queries: list[Path], there: np.ndarray, references: list[Path], here: np.ndarray) -> DataSet:
-    """Make two traverses of their places on the route, (Q,) and (R,): numbers of frames, NaN elsewhere."""
-    apart = np.abs(np.subtract.outer(there, here))
+    """Make a data set of two traverses; ``there`` (Q,) and ``here`` (R,) are frame numbers on the route, or NaN."""
+    differences = np.abs(np.subtract.outer(there, here))
     step = np.median(np.diff(here))
-    truth = traverse_truth(apart <= max(NEAR, step / 2), "same place: frames of the same number")
+    truth = traverse_truth(differences <= max(NEAR, step / 2), "same place: frames of the same number")
     both = ImageSequence.of_files(queries), ImageSequence.of_files(references)
-    return DataSet("", *both, truth, overlap=apart <= OVERLAP, overlap_rule=f"{OVERLAP} frames apart")
+    return DataSet("", *both, truth, overlap=differences <= OVERLAP, overlap_rule=f"{OVERLAP} frames apart")
 
 
 def _one_drive(images: list[Path], where: np.ndarray) -> DataSet:
-    apart = np.abs(np.subtract.outer(where, where))
-    truth = sequence_truth(apart <= NEAR, Exclusion(GAP), "same place: frames of the same number")
+    differences = np.abs(np.subtract.outer(where, where))
+    truth = sequence_truth(differences <= NEAR, Exclusion(GAP), "same place: frames of the same number")
     rule = f"{OVERLAP} frames apart"
-    return DataSet("", ImageSequence.of_files(images), None, truth, GAP, overlap=apart <= OVERLAP, overlap_rule=rule)
+    return DataSet(
+        "", ImageSequence.of_files(images), None, truth, GAP, overlap=differences <= OVERLAP, overlap_rule=rule
+    )
 
 
 def in_season(images: list[Path], folder: Path, season: int) -> list[Path]:
-    """Return the same drive from beside, in another season unless that is ``SAME``; its files are in ``folder``."""
+    """Write the drive from a shifted viewpoint to ``folder``, in another season unless it is ``SAME``."""
     folder = folder.with_name(f"{folder.name}_{season}")
     folder.mkdir(parents=True, exist_ok=True)
     made = [folder / f"{image.stem}.jpg" for image in images]

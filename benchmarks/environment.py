@@ -1,4 +1,4 @@
-"""The environment of the yardsticks: their libraries contradict netspec's, or netspec does not need them."""
+"""A separate environment for libraries that conflict with netspec's, or that netspec does not need."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PACKAGES = (
 
 
 def python() -> str:
-    """Return the Python of the yardsticks; at the first call, install them. Raises SpecError where that fails."""
+    """Return the Python of that environment; the first call installs it. Raises SpecError if that fails."""
     program, done = FOLDER / "bin" / "python", FOLDER / "installed"
     wanted = "\n".join(PACKAGES)
     if not done.is_file() or done.read_text() != wanted:

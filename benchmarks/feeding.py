@@ -1,6 +1,6 @@
-"""How long a training waits for its data, from each kind of source: ``tools/bench feeding``.
+"""Measures how long a training waits for data, for each kind of source: ``tools/bench feeding``.
 
-The records are pictures of noise, smoothed as photographs are: JPEG files take as long to decode.
+The records are smoothed noise, so that JPEG files take as long to decode as photographs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ BACKENDS = ("leveldb", "lmdb")  # caffe.proto: enum DataParameter.DB
 
 
 def measure(names: list[str], batch: int, threads: int, say: Say) -> list[dict[str, Any]]:
-    """Say and return how long each net waits for its data, source by source, and how long a record takes by itself."""
+    """Print and return how long each net waits for data from each source, and how long a record takes alone."""
     import torch
 
     import netspec
@@ -60,7 +60,7 @@ def measure(names: list[str], batch: int, threads: int, say: Say) -> list[dict[s
 
 
 def _making(solver: Any, batch: int) -> float:
-    """Return the seconds that reading and transforming take, by record: the median of batches, one after the other."""
+    """Return the seconds for reading and transforming a record: the median over batches, read one after the other."""
     make = next(layer.source.batch for layer in solver.net.layers if hasattr(layer, "source"))
     times: list[float] = []
     start = time.perf_counter()
@@ -72,7 +72,7 @@ def _making(solver: Any, batch: int) -> float:
 
 
 def _run(solver: Any) -> tuple[float, float]:
-    """Return the seconds of an iteration, and how many of them it waits for data."""
+    """Return the seconds of an iteration, and the seconds that it waits for data."""
     solver.step(2)
     start, waited, iterations = time.perf_counter(), _waited(solver), 0
     while iterations < 3 or time.perf_counter() - start < SECONDS:

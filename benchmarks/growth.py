@@ -1,8 +1,7 @@
-"""How cost grows: with layers, the batch, pairs in a database, frames of a sequence, workers.
+"""Measures how cost grows with layers, the batch, pairs in a database, frames of a sequence, or workers.
 
-Each size is measured in a process of its own, ``python -m benchmarks.growth KIND SIZE``, so that its peak of memory is
-its own. Times are those that the process computed, in one thread, which other load hardly changes; only those of
-workers are times of the clock.
+Each size is measured in a separate process, ``python -m benchmarks.growth KIND SIZE``, to get its peak memory. Times
+are CPU times of one thread, which other load hardly changes; only those of workers are wall-clock times.
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ DATA = 'layer { name: "data" type: "Input" top: "x0" input_param { shape { dim: 
 LOSS = """
 layer {{ name: "loss" type: "Reduction" bottom: "x{i}" top: "loss" loss_weight: 1 }}"""
 TRAINED = "small/siamese_resnet27_256"
-WALK = 300  # frames, whose descriptors are perturbed to the number wanted
+WALK = 300  # frames; more descriptors are made by perturbing theirs
 QUERIES, AT_ONCE = 50, 4096  # frames searched for, and added at a time
-AGAIN = 0.3  # of the difference of any two descriptors: how far a frame seen again is from itself
-PAIRS = 2000  # that each number of workers converts
+AGAIN = 0.3  # distance of two descriptors of one place, as a share of that of two places
+PAIRS = 2000  # converted with each number of workers
 
 
 def residual_net(layers: int) -> str:
@@ -69,7 +68,7 @@ def layers(size: int) -> Found:
     def run(net: Any) -> None:
         net.forward_loss(x0=torch.ones(1, 4, 8, 8))[0].backward()
 
-    run(build(7))  # what only the first net of a process pays for
+    run(build(7))  # warm-up: costs of the first net of a process
     start = time.process_time()
     net = build(size)
     built = time.process_time() - start
@@ -158,7 +157,7 @@ def frames(size: int) -> Found:
 
 
 def described_walk(frames: int) -> np.ndarray:
-    """Return the descriptors of a synthetic walk by the small net, less their mean and at most 256 numbers long."""
+    """Return the small net's descriptors of a synthetic walk, minus their mean, with at most 256 components."""
     from lmdb_build.walk.sequence import Walk, write_walk
     from loopclosure.descriptors.whitening import learn_whitening
     from loopclosure.detector.map import COMPONENTS
@@ -209,7 +208,7 @@ def workers(size: int) -> Found:
 
 @dataclass(frozen=True)
 class Kind:
-    """Something that grows: what it is counted in, the usual sizes, and what measures one of them."""
+    """A quantity that grows: its unit, the usual sizes, and the function that measures one size."""
 
     unit: str
     sizes: tuple[int, ...]
@@ -231,14 +230,14 @@ def measure(name: str, sizes: Sequence[int]) -> list[Found]:
 
 
 def table(rows: Sequence[Found]) -> str:
-    """Return what was measured as a table in Markdown."""
+    """Return the measurements as a Markdown table."""
     columns = list(rows[0])
     lines = [columns, ["---"] * len(columns), *([_number(row[column]) for column in columns] for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def draw(path: str, rows: Sequence[Found]) -> None:
-    """Draw each column against the size; ``path`` ends with the kind of picture, .png or .svg."""
+    """Draw each column against the size; the suffix of ``path`` is .png or .svg."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullLocator
 
@@ -264,7 +263,7 @@ def draw(path: str, rows: Sequence[Found]) -> None:
 
 def _in_a_process(name: str, size: int) -> Found:
     words = [sys.executable, "-m", "benchmarks.growth", name, str(size)]
-    one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}  # FAISS would take all
+    one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}  # FAISS would use all cores
     finished = subprocess.run(words, cwd=ROOT, env=one_thread, capture_output=True, text=True, check=False)
     if finished.returncode:
         last = (finished.stderr.strip().splitlines() or ["no message"])[-1]
@@ -273,7 +272,7 @@ def _in_a_process(name: str, size: int) -> Found:
 
 
 def _least(run: Callable[[], object], rounds: int) -> float:
-    """Return the least seconds that the process computed for a run."""
+    """Return the smallest CPU time of a run, in seconds."""
     spent = []
     for _ in range(rounds):
         start = time.process_time()
@@ -283,7 +282,7 @@ def _least(run: Callable[[], object], rounds: int) -> float:
 
 
 def _peak() -> float:
-    """Return the most memory that this process had at a time [MB]; NaN where the system does not tell."""
+    """Return the peak memory of this process in MB; NaN if the system does not report it."""
     try:
         status = Path("/proc/self/status").read_text()
     except OSError:
@@ -293,7 +292,7 @@ def _peak() -> float:
 
 
 def _forget_peak() -> None:
-    """Give freed memory back to the system, and count its peak from now on, where the system can."""
+    """Return freed memory to the system and reset the peak memory, if the system supports it."""
     if sys.platform == "linux":
         ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")
@@ -304,7 +303,7 @@ def _number(value: float) -> str:
 
 
 def main() -> None:
-    """Measure one size and print what was found, as JSON."""
+    """Measure one size and print the result as JSON."""
     name, size = sys.argv[1], int(sys.argv[2])
     print(json.dumps({**KINDS[name].measure(size), "memory, MB": _peak()}))
 

@@ -1,9 +1,9 @@
-"""The figures of the pages, written from the files in ``benchmarks/results``: ``tools/bench pages``.
+"""Writes the figures in ``benchmarks/results`` into the pages: ``tools/bench pages``.
 
-``<!-- table: NAME -->`` on a line of its own, up to ``<!-- end -->``, holds the rows of ``results/NAME.json``;
-``<!-- figure: ... -->`` within a line holds one cell. After the name may stand ``; COLUMN, COLUMN as TITLE``
-(default: all of them) and ``; COLUMN=VALUE, ...``, which the rows must have. ``COLUMN: OTHER`` as the last column
-spreads rows that are equal otherwise: each value of COLUMN becomes a column with the values of OTHER.
+A line ``<!-- table: NAME -->`` starts a table with the rows of ``results/NAME.json``, up to ``<!-- end -->``.
+``<!-- figure: ... -->`` within a line marks one cell. The name can be followed by ``; COLUMN, COLUMN as TITLE``, which
+selects columns (default: all), and by ``; COLUMN=VALUE, ...``, which selects rows. ``COLUMN: OTHER`` as the last column
+makes a pivot table: each value of COLUMN becomes a column with the values of OTHER.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MARKED = re.compile(r"(<!-- (table|figure): (.+?) -->)(.*?)<!-- end -->", re.DOT
 
 
 def made(text: str, folder: Path = RESULTS) -> str:
-    """Return the text of a page with the figures that the files have. Raises SpecError for a marker that fits none."""
+    """Return the text of a page with current figures. Raises SpecError for a marker that matches no figure."""
 
     def written(found: re.Match[str]) -> str:
         rows, columns = _chosen(found[3], folder)
@@ -38,7 +38,7 @@ def made(text: str, folder: Path = RESULTS) -> str:
 
 
 def write(pages: Sequence[Path] = PAGES) -> list[Path]:
-    """Write all pages anew. Returns those that changed."""
+    """Write all pages again; return those that changed."""
     changed = []
     for page in pages:
         old = page.read_text(encoding="utf-8")
@@ -82,7 +82,7 @@ def _decimals(value: Any) -> int:
 
 
 def _cell(value: Any, column: str, most: int) -> str:
-    """Three digits that count, as many behind the point as the column has; of a ratio two behind the point."""
+    """Format a number: three significant digits, with the column's number of decimals; two decimals for a ratio."""
     if value is None:
         return ""
     if not isinstance(value, float):

@@ -1,4 +1,4 @@
-"""What is printed and drawn of a benchmark whose ways take turns."""
+"""Prints and draws the results of a benchmark."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ REFERENCES = ("pytorch", "opencv4", "caffe")
 class Row:
     """How one way ran one net.
 
-    ``seconds`` and ``computing`` have each round: the time of a pass, and that of all its threads together; ``ratios``
-    and ``spent`` are those of the one and of the other to the references'. ``peak`` is the most memory that the
-    process had, in MB. ``what`` was timed: "forward", "training" or "start".
+    ``seconds`` (wall clock) and ``computing`` (CPU time of all threads) are times of a pass, one per round. ``ratios``
+    and ``spent`` are their ratios to the references. ``peak`` is the peak memory of the process in MB. ``what`` was
+    timed: "forward", "training" or "start".
     """
 
     net: str
@@ -36,7 +36,7 @@ class Row:
 
 
 def columns(row: Row) -> dict[str, Any]:
-    """Return a row as it is kept: milliseconds, ratios to each reference, MB; what was not measured is None."""
+    """Return a row for the results file: milliseconds, ratios to each reference, MB; None if not measured."""
     found: dict[str, Any] = {"what": row.what, "net": row.net, "batch": row.batch, "threads": row.threads}
     found["run by"] = row.name
     times = (statistics.median, row.seconds), (min, row.seconds), (statistics.median, row.computing)
@@ -72,7 +72,7 @@ def _cell(name: str, value: Any) -> str:
 def draw(path: str | Path, rows: Sequence[Row], way: str = "netspec") -> None:
     """Draw the CPU time of one way of running, divided by that of each reference: a row for each net and batch.
 
-    The picture is a PNG or an SVG, as its name ends. Rows of which no ratio is known are left out.
+    The suffix of the name is .png or .svg. Rows without a ratio are left out.
     """
     from matplotlib.figure import Figure
 

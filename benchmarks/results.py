@@ -1,8 +1,7 @@
-"""Files of figures: the tables of the pages are made from those in ``benchmarks/results``.
+"""Writes the files in ``benchmarks/results``, from which the tables of the pages are made.
 
-Each is one JSON object for one table: ``machine``, ``date``, ``command`` (which measured it and wrote it), ``rows``.
-A row is a flat object of column and value, the same columns in each row; numbers are not rounded for reading, and None
-stands for what was not measured.
+Each file is a JSON object for one table: ``machine``, ``date``, ``command`` (which measured it) and ``rows``. A row
+maps columns to values; all rows have the same columns. Numbers are not rounded, and null means not measured.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ def write(
     words: Sequence[str],
     described: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a file of figures; ``words`` are those of ``tools/bench``, ``described`` is the machine, if not this."""
+    """Write a file of figures; ``words``: arguments of ``tools/bench``; ``described``: another machine than this."""
     made = {
         "machine": described or machine(),
         "date": date.today().isoformat(),
@@ -45,7 +44,7 @@ def _short(value: Any) -> Any:
 
 
 def machine(python: str | None = None) -> dict[str, Any]:
-    """Describe the machine; ``python`` is that of the yardsticks, whose versions are added."""
+    """Describe the machine; ``python``: add the versions of the libraries in that environment."""
     cpu = _cpu()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     described: dict[str, Any] = {

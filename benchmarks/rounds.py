@@ -1,4 +1,4 @@
-"""Rounds in which all that is compared takes its turn, so that other load on the machine meets all alike."""
+"""Runs all contestants in turn, round after round, so that other load on the machine affects all of them equally."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ import numpy as np
 from netspec.errors import SpecError
 
 ROOT = Path(__file__).resolve().parents[1]
-TURN, MOST = 0.4, 50  # seconds of a turn, and at most so many passes
-FEWEST = 3  # rounds, however long they take
-REST = 0.03  # seconds before a turn: threads of the one before may still spin
-Pass = tuple[float, float]  # seconds of the clock, and those that all threads together spent computing
+TURN, MOST = 0.4, 50  # seconds of a turn, and its largest number of passes
+FEWEST = 3  # minimum number of rounds
+REST = 0.03  # seconds before a turn, in which threads of the previous contestant stop spinning
+Pass = tuple[float, float]  # wall-clock seconds, and CPU seconds of all threads
 
 
 class Contestant(Protocol):
-    """What takes turns. ``fault`` says why it cannot, else it is empty; ``outputs`` are those of its first pass.
+    """A way of running a case.
 
-    ``peak`` is the most memory that it had until it was closed, in MB; None where that is unknown.
+    fault    why it cannot run; empty if it can
+    outputs  outputs of its first pass
+    peak     peak memory in MB, set by ``close``; None if unknown
     """
 
     name: str
@@ -38,16 +40,16 @@ class Contestant(Protocol):
     outputs: dict[str, np.ndarray]
 
     def turn(self, passes: int) -> list[Pass]:
-        """Return the times of so many passes."""
+        """Run ``passes`` passes and return their times."""
         ...
 
     def close(self) -> None:
-        """End it."""
+        """End the process, if there is one."""
         ...
 
 
 class Worker:
-    """A process of benchmarks/worker.py, with the Python that has its library."""
+    """A process of benchmarks/worker.py, with the Python that has the library it needs."""
 
     def __init__(
         self, name: str, python: str, task: Mapping[str, Any], variables: Mapping[str, str | None] | None = None
@@ -61,7 +63,7 @@ class Worker:
         self.process = subprocess.Popen(
             command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.errors, text=True
         )
-        self.fault = self._said().get("fault", "")
+        self.fault = self._read_line().get("fault", "")
         self.peak: float | None = None
         self.outputs: dict[str, np.ndarray] = {}
         if not self.fault:
@@ -69,16 +71,16 @@ class Worker:
                 self.outputs = {key: arrays[key] for key in arrays.files}
 
     def tell(self, passes: int) -> None:
-        """Let it begin so many passes."""
+        """Start ``passes`` passes."""
         assert self.process.stdin is not None
         print(passes, file=self.process.stdin, flush=True)
 
     def answer(self) -> list[Pass]:
-        """Return their times."""
-        said = self._said()
-        if isinstance(said, dict):
-            raise SpecError(f"{self.name}: {said['fault']}")
-        return [(clock, computing) for clock, computing in said]
+        """Wait for the passes and return their times."""
+        answer = self._read_line()
+        if isinstance(answer, dict):
+            raise SpecError(f"{self.name}: {answer['fault']}")
+        return [(clock, computing) for clock, computing in answer]
 
     def turn(self, passes: int) -> list[Pass]:
         """See :class:`Contestant`."""
@@ -91,7 +93,7 @@ class Worker:
         self.process.communicate()
         self.errors.close()
 
-    def _said(self) -> Any:
+    def _read_line(self) -> Any:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if line:
@@ -103,10 +105,10 @@ class Worker:
 
 
 def _peak(process: int) -> float | None:
-    """Return the most memory that a process had so far, in MB; None where the system does not tell."""
+    """Return the peak memory of a process in MB; None if the system does not report it."""
     path = Path(f"/proc/{process}/status")
-    told = re.search(r"VmHWM:\s+(\d+) kB", path.read_text()) if path.is_file() else None
-    return int(told[1]) / 1e3 * 1.024 if told else None
+    found = re.search(r"VmHWM:\s+(\d+) kB", path.read_text()) if path.is_file() else None
+    return int(found[1]) / 1e3 * 1.024 if found else None
 
 
 class Starter:
@@ -138,15 +140,15 @@ class Starter:
         seconds = time.perf_counter() - began
         if done.returncode:
             raise SpecError((done.stderr.strip().splitlines() or ["it failed"])[-1])
-        told = json.loads(done.stdout)
-        return seconds - told["torch"], told["computing"]
+        printed = json.loads(done.stdout)
+        return seconds - printed["torch"], printed["computing"]
 
     def close(self) -> None:
         """See :class:`Contestant`."""
 
 
 class CaffeProgram:
-    """The program ``caffe`` itself, begun anew at each turn; times are those in its log."""
+    """The program ``caffe``, started again for each turn; the times are read from its log."""
 
     name = "caffe"
     peak: float | None = None
@@ -169,15 +171,15 @@ class CaffeProgram:
 
     def _passes(self, count: int) -> list[float]:
         log = self._log(["time", f"-model={self.task['prototxt']}", "-phase=TEST", f"-iterations={count}"])
-        return [float(told) / 1e3 for told in re.findall(r"Average Forward pass: ([\d.e+-]+) ms", log)]
+        return [float(text) / 1e3 for text in re.findall(r"Average Forward pass: ([\d.e+-]+) ms", log)]
 
     def _iterations(self, count: int) -> list[float]:
         solver = Path(self.task["folder"]) / "caffe_solver.prototxt"
         limit = f"max_iter: {count + 2}\ndisplay: 1\nsnapshot_after_train: false"
         solver.write_text(re.sub(r"max_iter: \d+", limit, Path(self.task["solver"]).read_text()))
         log = self._log(["train", f"-solver={solver}", f"-weights={self.task['caffemodel']}"])
-        told = re.findall(r"^I(?:\d{4})?\d{4} (\d\d:\d\d:\d\d\.\d+).*Iteration \d+, lr", log, re.M)
-        moments = [datetime.strptime(text, "%H:%M:%S.%f") for text in told[1:]]  # the first does not count
+        stamps = re.findall(r"^I(?:\d{4})?\d{4} (\d\d:\d\d:\d\d\.\d+).*Iteration \d+, lr", log, re.M)
+        moments = [datetime.strptime(text, "%H:%M:%S.%f") for text in stamps[1:]]  # the first does not count
         return [(b - a).total_seconds() % 86400 for a, b in itertools.pairwise(moments)]
 
     def _log(self, words: Sequence[str]) -> str:
@@ -201,10 +203,10 @@ class CaffeProgram:
 def measure(
     contestants: Sequence[Contestant], rounds: int, tell: Callable[[int], object], limit: float = math.inf
 ) -> dict[str, list[Pass]]:
-    """Return, by name, the times of a pass in each round: the medians of its turn.
+    """Return the times of a pass by name, one per round: the median of its turn.
 
-    ``tell`` gets the number of each round before it begins. After three rounds none begins that would end later than
-    ``limit`` seconds after the first began.
+    ``tell`` is called with the number of each round before it starts. After three rounds, no round starts that would
+    end more than ``limit`` seconds after the start of the first.
     """
     times: dict[str, list[Pass]] = {one.name: [] for one in contestants}
     passes = {one.name: max(1, min(MOST, int(TURN / one.turn(1)[0][0]))) for one in contestants}
@@ -227,7 +229,7 @@ def ratio(seconds: Sequence[float], others: Sequence[float]) -> float:
 
 
 def difference(outputs: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray]) -> float | None:
-    """Return the largest difference of any output, relative to its largest element; None where shapes differ."""
+    """Return the largest difference of any output, relative to its largest element; None if shapes differ."""
     worst = 0.0
     for name, value in expected.items():
         found = outputs.get(name)

@@ -1,8 +1,8 @@
-"""How good ``auto`` is beside the best setting that the truth would choose, on drives whose loops are known.
+"""Compares ``auto`` with the best setting that could be chosen with the truth, on drives with known loops.
 
-For each drive: the precision and recall of what ``auto`` accepts, views that overlap being no mistake, and the greatest
-recall at that precision of any threshold on single images and on each of the sequences that ``auto`` may choose, whole
-or only what geometry verifies.
+For each drive: the precision and recall of the matches that ``auto`` accepts (overlapping views are not a mistake), and
+the largest recall at that precision of all other settings. These are all thresholds on single images and on each of the
+sequence lengths that ``auto`` may choose, with and without geometric verification.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ ENOUGH = 0.7  # of the best setting's recall
 
 @dataclass(frozen=True)
 class Result:
-    """What ``auto`` reached on one drive.
+    """The result of ``auto`` on one drive.
 
     loops      queries with a loop
     accepted   matches that auto accepts
-    precision  of these; NaN without any
-    recall     of these
+    precision  of the accepted matches; NaN if there are none
+    recall     of the accepted matches
     best       the recall of the best setting, named ``setting``
-    reasons    what auto says
+    reasons    the reasons that auto gives
     """
 
     family: str
@@ -58,18 +58,18 @@ class Result:
 
     @property
     def silent(self) -> bool:
-        """Whether auto accepts nothing where there is something to find."""
+        """Whether auto accepts nothing although there are loops."""
         return self.best > 0 and not self.accepted
 
     @property
     def good(self) -> bool:
-        """Whether precision and recall are what they should be."""
+        """Whether precision and recall are high enough."""
         return (not self.accepted or self.precision >= PRECISION) and self.recall >= ENOUGH * self.best
 
 
 @dataclass
 class Kept:
-    """What is computed once for all drives of a family, and kept in a file between runs."""
+    """Results computed once for all drives of a family, and cached in a file."""
 
     path: Path
     rows: dict[tuple[str, Path], np.ndarray] = field(default_factory=dict)  # by the net and the image
@@ -102,7 +102,7 @@ class Kept:
 
 @dataclass
 class Scored:
-    """A method whose scores are known already."""
+    """A method that returns given scores."""
 
     scores: np.ndarray
     name: str = "known"
@@ -141,7 +141,7 @@ def measure(drive: Drive, kept: Kept) -> Result:
 
 
 def _best(scores: np.ndarray, drive: Drive, pairs: Pairs) -> tuple[float, str]:
-    """Return the greatest recall at the precision wanted, and the setting that has it."""
+    """Return the largest recall at the wanted precision, and its setting."""
     data, two = drive.data, drive.data.references is not None
     truth = data.soft_truth or data.truth
     if not truth.positives:
@@ -176,7 +176,7 @@ def _recall(scores: np.ndarray, truth: Any) -> float:
 
 
 def run(data: Path, work: Path, only: Sequence[str], say: Callable[[str], None]) -> list[Result]:
-    """Measure all drives, or those of some families; what was measured is added to ``work``/settings.json."""
+    """Measure all drives, or those of some families; results are added to ``work``/settings.json."""
     file = work / "settings.json"
     kept: Kept | None = None
     for drive in drives(data, work, only):
@@ -193,13 +193,13 @@ def run(data: Path, work: Path, only: Sequence[str], say: Callable[[str], None])
 
 
 def _stored(file: Path) -> dict[str, Result]:
-    """Return what was measured before, by drive."""
+    """Return earlier results by drive."""
     found = json.loads(file.read_text(encoding="utf-8")) if file.exists() else []
     return {f"{each['family']}/{each['kind']}": Result(**each) for each in found}
 
 
 def line(result: Result) -> str:
-    """Say in one line what was reached."""
+    """Return one line that summarizes a result."""
     share = f"{result.recall / result.best:.2f}" if result.best else "-"
     mark = "" if result.good else " silent" if result.silent else " MISSED"
     return (
@@ -209,7 +209,7 @@ def line(result: Result) -> str:
 
 
 def summary(results: Sequence[Result]) -> str:
-    """Say how many drives were as they should be."""
+    """Return how many drives have a good result."""
     right = sum(not r.accepted or r.precision >= PRECISION for r in results)
     there = [r for r in results if r.best > 0]
     enough = sum(r.recall >= ENOUGH * r.best for r in there)

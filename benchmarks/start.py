@@ -1,6 +1,6 @@
 """A process that loads a net, describes one image and ends: ``python -m benchmarks.start TASK``.
 
-Prints, as JSON, the seconds that importing torch took, 0 where it is not needed, and those that all else computed.
+Prints as JSON the seconds of importing torch (0 if it is not needed) and the CPU seconds of everything else.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Any
 
 Task = dict[str, Any]
 MEAN, SCALE = 128.0, 1 / 128  # of pixels
-Seconds = tuple[float, float]  # of the clock, and of computing
+Seconds = tuple[float, float]  # wall clock, CPU
 
 
 def netspec(task: Task) -> tuple[Seconds, Any]:
-    """Describe with netspec's Describer, by the engine of the task."""
+    """Describe with netspec's Describer and the engine of the task."""
     seconds = _import_torch() if task["engine"] == "torch" else (0.0, 0.0)
     import cv2
 
@@ -60,7 +60,7 @@ def _import_torch() -> Seconds:
 
 
 def main() -> None:
-    """Do it."""
+    """Run the task and print the times."""
     import numpy as np
 
     task = json.loads(sys.argv[1])

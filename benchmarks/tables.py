@@ -1,7 +1,7 @@
-"""The figures of loopclosure's methods on five sets, measured anew: ``tools/bench tables``.
+"""Measures loopclosure's methods on five data sets: ``tools/bench tables``.
 
-They are kept in ``results``, and ``tools/bench pages`` writes them into the pages. What a run does not measure keeps
-its figures.
+The figures are written to ``results``, and ``tools/bench pages`` writes them into the pages. Figures that a run does
+not measure stay as they are.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ TITLES = {
     "ESSEX3IN1": "ESSEX3IN1",
     "SPED": "SPED",
 }
-# As the tables name them; F is the file of descriptors by the net that comes with the package, W a file of words.
+# By the names in the tables; F is the file of descriptors of the included net, W a file of words.
 METHODS = {
     "gray thumbnails, 32x24": "thumbnails",
     "bag of SIFT words, tf-idf": "bow:model=W",
@@ -60,7 +60,7 @@ AUTO = "auto, on the net"
 
 
 def data_set(name: str, data: Path, work: Path) -> DataSet:
-    """Load one of the sets."""
+    """Load one of the data sets."""
     if name == "fr1_rpy":
         sequence = read_sequence(data / "tum_fr1" / "rgbd_dataset_freiburg1_rpy", "tum")
         return load_sequence(sequence, Selection(start="60%"), Exclusion(seconds=3.0))
@@ -80,7 +80,7 @@ def measure(
     say: Callable[[str], None],
     words: Sequence[str],
 ) -> None:
-    """Measure methods on sets, and write the figures over those that are kept; ``words`` are those of the command."""
+    """Measure methods on data sets and update the figures; ``words`` are the arguments of the command."""
     work.mkdir(parents=True, exist_ok=True)
     figures = {kind: _kept(kind) for kind in TABLES}
     words_needed = any(METHODS[name][-1] in "WV" for name in methods or METHODS)
@@ -106,7 +106,7 @@ def measure(
 
 
 def _kept(kind: str) -> dict[str, dict[str, Any]]:
-    """Return the rows of a table by method, in the order of ``TABLES``; what was never measured is None."""
+    """Return the rows of a table by method, in the order of ``TABLES``; None if never measured."""
     path = RESULTS / f"{kind}.json"
     rows = json.loads(path.read_text(encoding="utf-8"))["rows"] if path.is_file() else []
     found = {row["method"]: row for row in rows}
@@ -121,7 +121,7 @@ def _figures(label: str, outcome: Outcome, name: str) -> Iterator[tuple[str, flo
     if name not in PAIRS and label in TABLES["recall"]:
         zones = [judged.best for judged in (outcome.rule, outcome.soft) if judged is not None]
         if label == AUTO:
-            said = [f"{z.recall[-1]:.3f} at {z.precision[-1]:.3f}" if len(z.recall) else "none" for z in zones]
+            texts = [f"{z.recall[-1]:.3f} at {z.precision[-1]:.3f}" if len(z.recall) else "none" for z in zones]
         else:
-            said = [f"{z.recall_at_full_precision:.3f}" for z in zones]
-        yield "recall", said[0] + "".join(f" ({text})" for text in said[1:])
+            texts = [f"{z.recall_at_full_precision:.3f}" for z in zones]
+        yield "recall", texts[0] + "".join(f" ({text})" for text in texts[1:])

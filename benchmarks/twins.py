@@ -1,7 +1,7 @@
-"""The nets of the benchmark as one writes them in PyTorch by hand, and their weights from a caffemodel.
+"""The nets of the benchmark, written by hand in PyTorch, with weights from a caffemodel.
 
-Modules are made in the order of the prototxt's layers, so that weights are loaded in order.
-Results equal netspec's: tests/benchmarks/test_twins.py.
+Modules are created in the order of the prototxt's layers, so that weights are loaded in order. The results equal
+netspec's; see tests/benchmarks/test_twins.py.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def conv_bn(inputs: int, outputs: int, size: int = 1, bias: bool = False, **othe
 
 
 class ResidualPair(nn.Module):
-    """Two 3x3 convolutions beside their input; the sum comes before the last ReLU."""
+    """A residual block: two 3x3 convolutions plus the input; the last ReLU follows the sum."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -116,13 +116,13 @@ def pnet() -> nn.Module:
 
 
 def rnet() -> nn.Module:
-    """Its second, for windows of 24 pixels."""
+    """MTCNN's second net, for windows of 24 pixels."""
     maps = (*_conv_prelu(3, 28, 3), _pool_ceil(3), *_conv_prelu(28, 48, 3), _pool_ceil(3), *_conv_prelu(48, 64, 2))
     return _Windows(*maps, nn.Flatten(), nn.Linear(576, 128), nn.PReLU(128), nn.Linear(128, 2))
 
 
 def onet() -> nn.Module:
-    """Its third, for windows of 48 pixels."""
+    """MTCNN's third net, for windows of 48 pixels."""
     maps = (*_conv_prelu(3, 32, 3), _pool_ceil(3), *_conv_prelu(32, 64, 3), _pool_ceil(3))
     maps = (*maps, *_conv_prelu(64, 64, 3), _pool_ceil(2), *_conv_prelu(64, 128, 2))
     return _Windows(*maps, nn.Flatten(), nn.Linear(1152, 256), nn.PReLU(256), nn.Linear(256, 2))
@@ -205,7 +205,7 @@ class AlexNet(nn.Module):
 
 
 class Inception(nn.Module):
-    """Four ways side by side."""
+    """GoogLeNet's Inception block: four parallel branches."""
 
     def __init__(self, inputs: int, widths: Sequence[int]) -> None:
         super().__init__()
@@ -250,19 +250,19 @@ class GoogLeNet(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """A block of ResNet-50; one that changes the shape has a projection beside it."""
+    """A block of ResNet-50; a block that changes the shape has a projection in its shortcut."""
 
     def __init__(self, inputs: int, width: int, stride: int) -> None:
         super().__init__()
         outputs = 4 * width
-        self.beside = conv_bn(inputs, outputs, stride=stride) if inputs != outputs or stride > 1 else nn.Identity()
+        self.shortcut = conv_bn(inputs, outputs, stride=stride) if inputs != outputs or stride > 1 else nn.Identity()
         self.a = conv_bn(inputs, width, stride=stride)
         self.b = conv_bn(width, width, 3, padding=1)
         self.c = conv_bn(width, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return (N, 4 width, H', W')."""
-        return F.relu(self.beside(x) + self.c(F.relu(self.b(F.relu(self.a(x))))))
+        return F.relu(self.shortcut(x) + self.c(F.relu(self.b(F.relu(self.a(x))))))
 
 
 class ResNet50(nn.Module):
@@ -285,7 +285,7 @@ class ResNet50(nn.Module):
 
 
 class Inverted(nn.Module):
-    """A block of MobileNet v2: wide inside, added to its input where the shapes are equal."""
+    """An inverted residual block of MobileNet v2; the input is added if the shapes are equal."""
 
     def __init__(self, inputs: int, expansion: int, outputs: int, stride: int) -> None:
         super().__init__()
@@ -321,7 +321,7 @@ class MobileNet(nn.Module):
 
 
 class Fire(nn.Module):
-    """SqueezeNet's block."""
+    """SqueezeNet's fire module."""
 
     def __init__(self, inputs: int, squeezed: int, expanded: int) -> None:
         super().__init__()
@@ -405,9 +405,9 @@ def net(name: str) -> nn.Module:
 
 
 def load(twin: nn.Module, caffemodel: str | Path) -> None:
-    """Load the weights of a net whose layers are in the order of the twin's modules.
+    """Load the weights of a net with layers in the order of the twin's modules.
 
-    A second tower, whose layers are named ``..._p``, shares those of the first.
+    A second tower, with layers named ``..._p``, shares the weights of the first.
     """
     from netspec.proto.binary import read_net_binary
 
@@ -429,7 +429,7 @@ def load(twin: nn.Module, caffemodel: str | Path) -> None:
 
 
 def parameter_groups(twin: nn.Module, rate: float, decay: float) -> list[dict]:
-    """Return what torch.optim takes: biases learn at twice the rate, only weights decay."""
+    """Return the parameter groups for torch.optim: biases have twice the learning rate and no weight decay."""
     groups = []
     for module in _learning(twin):
         weighs = not isinstance(module, nn.BatchNorm2d)

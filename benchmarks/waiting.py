@@ -1,4 +1,4 @@
-"""A training alone, and two side by side, as their OpenMP threads wait in different ways."""
+"""Times one training alone and two side by side, with different settings for waiting OpenMP threads."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from benchmarks.case import training_case
 from benchmarks.compare import task_of
 from benchmarks.rounds import TURN, Pass, Worker, ratio
 
-VARIABLES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")  # by which OpenMP runtimes are told how to wait
+VARIABLES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")  # set how threads of OpenMP runtimes wait
 
 
 def compare(name: str, waits: Sequence[str], batch: int, threads: int, rounds: int) -> None:
-    """Print, for each way to wait (VARIABLE=VALUE; empty: the runtime's own), the time alone and of each of two."""
+    """Print for each setting (VARIABLE=VALUE; empty: the default) the time alone and of each of two trainings."""
     with training_case(name, batch) as case:
         task = {**task_of(case, threads), "runs": "netspec_training", "torch_first": True}
         pairs = {}

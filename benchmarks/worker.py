@@ -1,9 +1,9 @@
-"""A process that runs one net in one way whenever it is told to: ``python -m benchmarks.worker TASK``.
+"""A process that runs one net in one way on request: ``python -m benchmarks.worker TASK``.
 
-TASK is JSON: ``runs`` names the way, the rest says on what. Answers are lines of JSON on stdout: first {} or
-{"fault": ...}, then, for each line with a number n on stdin, the seconds of n passes after one that is not counted: for
-each pass those of the clock, and those that all threads together spent computing.
-Every way imports its library itself, since each may live in an environment that lacks the others.
+TASK is JSON: ``runs`` names the way, the other keys are its settings. The process answers with lines of JSON on stdout:
+first {} or {"fault": ...}; then, for each line with a number n on stdin, the times of n passes, after one pass that is
+not counted. The times of a pass are the wall-clock seconds and the CPU seconds of all threads.
+Every way imports its own library, because the environment may not have the others.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ Run = Callable[[], dict[str, Any]]  # a pass; returns its outputs by blob
 
 
 def netspec(task: Task) -> Run:
-    """Run an engine, the default one unless the task names another, as a program does that imports netspec."""
-    netspec = import_module("netspec")  # before torch: it says how OpenMP's threads wait
+    """Run netspec with the engine of the task, or the default one, as a program that imports netspec does."""
+    netspec = import_module("netspec")  # before torch: it sets how OpenMP's threads wait
     import torch
 
     torch.set_num_threads(task["threads"])
@@ -53,7 +53,7 @@ def pycaffe(task: Task) -> Run:
 
 
 def pytorch(task: Task) -> Run:
-    """Run the hand-written twin in eval mode. netspec, which tells OpenMP how to wait, is imported after torch."""
+    """Run the hand-written twin in eval mode. netspec, which sets how OpenMP waits, is imported after torch."""
     import torch
 
     from benchmarks import twins
@@ -89,7 +89,7 @@ def opencv4(task: Task) -> Run:
 
 
 def onnxruntime(task: Task) -> Run:
-    """Run the exported model in onnxruntime itself."""
+    """Run the exported model in onnxruntime directly."""
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # it would look up a host
     import onnxruntime as ort
 
@@ -102,7 +102,7 @@ def onnxruntime(task: Task) -> Run:
 
 
 def openvino(task: Task) -> Run:
-    """Run the exported model in OpenVINO itself, in the precision of the task."""
+    """Run the exported model in OpenVINO directly, in the precision of the task."""
     sys.modules["openvino_telemetry"] = None  # type: ignore[assignment]  # it would look up a host
     import openvino
 
@@ -125,7 +125,7 @@ def openvino(task: Task) -> Run:
 
 
 def memory(task: Task) -> Run:
-    """Read as many bytes as the weights have: no pass that reads each weight once takes less."""
+    """Read as many bytes as the weights have: a lower bound for a pass that reads each weight once."""
     import torch
 
     torch.set_num_threads(task["threads"])
@@ -136,7 +136,7 @@ def memory(task: Task) -> Run:
 def netspec_training(task: Task) -> Run:
     """Train as ``netspec train`` does: its data layer, its solver."""
     if not task.get("torch_first"):
-        import_module("netspec.process.programs").set_up()  # before torch: how OpenMP's threads wait
+        import_module("netspec.process.programs").set_up()  # before torch: it sets how OpenMP's threads wait
     import torch
 
     import netspec
@@ -174,13 +174,13 @@ def pycaffe_training(task: Task) -> Run:
 
 
 def pytorch_training(task: Task) -> Run:
-    """Train the twin with torch's SGD, on a batch that is in memory."""
+    """Train the twin with torch's SGD on a batch in memory."""
     import torch
 
     from benchmarks import twins
 
     torch.set_num_threads(task["threads"])
-    torch.backends.cudnn.allow_tf32 = False  # as netspec computes
+    torch.backends.cudnn.allow_tf32 = False  # as in netspec
     twin = twins.net(task["twin"]).train()
     twins.load(twin, task["caffemodel"])
     twin.to(task["device"])
@@ -210,7 +210,7 @@ WAYS: dict[str, Callable[[Task], Run]] = {
 
 
 def _finish(task: Task) -> None:
-    """Wait for what a GPU still computes."""
+    """Wait until a GPU has finished."""
     import torch
 
     if torch.device(task["device"]).type == "cuda":
@@ -223,10 +223,10 @@ def _inputs(task: Task) -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    """Serve until stdin ends."""
+    """Answer requests until stdin ends."""
     task = json.loads(sys.argv[1])
     answers = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # libraries that print do it on stderr
+    os.dup2(2, 1)  # output of libraries goes to stderr
     try:
         run = WAYS[task["runs"]](task)
         np.savez(task["result"], allow_pickle=False, **{name: np.array(value) for name, value in run().items()})

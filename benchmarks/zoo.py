@@ -1,7 +1,7 @@
-"""Prototxts of well-known architectures, so that a benchmark needs no files of other people.
+"""Prototxts of well-known architectures, so that benchmarks need no downloaded files.
 
-Each function adds the layers of one to a NetParameter ``n`` that makes the blob ``data``, and returns the blob of the
-scores. Layers are in the order in which the public files have them; benchmarks/twins.py has the same nets in PyTorch.
+Each function adds the layers of a net to a NetParameter ``n`` with the blob ``data``, and returns the blob of the
+scores. The layers are in the order of the public files. benchmarks/twins.py has the same nets in PyTorch.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def lenet(n: Any) -> str:
 
 
 def tiny(n: Any) -> str:
-    """Three layers of at most 20 numbers, as those of reinforcement learning and of tutorials."""
+    """Three layers of at most 20 numbers, as in reinforcement learning and tutorials."""
     top = _relu(n, "relu1", _full(n, "ip1", "data", 20))
     top = _add(n, "TanH", "tanh2", _full(n, "ip2", top, 20))
     return _full(n, "ip3", top, 10)
@@ -124,11 +124,11 @@ def resnet50(n: Any) -> str:
     for stage, (blocks, width) in enumerate(RESNET50, 2):
         for k in range(blocks):
             name, stride = f"res{stage}{'abcdef'[k]}", 2 if stage > 2 and not k else 1
-            beside = top if k else _normalized(n, f"{name}_branch1", top, 4 * width, 1, stride=stride)
+            shortcut = top if k else _normalized(n, f"{name}_branch1", top, 4 * width, 1, stride=stride)
             top = _relu(n, f"{name}_2a_relu", _normalized(n, f"{name}_branch2a", top, width, 1, stride=stride))
             top = _relu(n, f"{name}_2b_relu", _normalized(n, f"{name}_branch2b", top, width, 3, pad=1))
             top = _normalized(n, f"{name}_branch2c", top, 4 * width, 1)
-            top = _relu(n, f"{name}_relu", _sum(n, name, beside, top))
+            top = _relu(n, f"{name}_relu", _sum(n, name, shortcut, top))
     top = _add(n, "Pooling", "pool5", top, pooling_param={"pool": "AVE", "kernel_size": 7, "stride": 1})
     return _full(n, "fc1000", top, 1000)
 
@@ -196,7 +196,7 @@ ZOO: dict[str, tuple[Callable[[Any], str], tuple[int, int, int]]] = {  # the lay
 
 
 def deploy(name: str) -> Any:
-    """Return the NetParameter that one ships: ``data`` in, ``prob`` out."""
+    """Return the NetParameter for deployment: input ``data``, output ``prob``."""
     n, (layers, image) = NetParameter(name=name), ZOO[name]
     _add(n, "Input", "data", input_param={"shape": [{"dim": [1, *image]}]})
     _add(n, "Softmax", "prob", layers(n))
@@ -204,7 +204,7 @@ def deploy(name: str) -> Any:
 
 
 def training(name: str, source: str, batch: int) -> Any:
-    """Return the NetParameter that one trains, on the LMDB ``source``."""
+    """Return the NetParameter for training on the LMDB ``source``."""
     n, (layers, _) = NetParameter(name=name), ZOO[name]
     reads = {"source": source, "batch_size": batch, "backend": "LMDB"}
     scaled = {"mean_value": [128], "scale": 1 / 128}
@@ -215,7 +215,7 @@ def training(name: str, source: str, batch: int) -> Any:
 
 
 def _add(n: Any, kind: str, name: str, *bottoms: str, in_place: bool = False, **fields: Any) -> str:
-    """Add a layer of one top, which has its name, or with ``in_place`` that of the bottom; return the top."""
+    """Add a layer with one top, named as the layer, or as the bottom with ``in_place``; return the top."""
     top = bottoms[0] if in_place else name
     n.layer.add(name=name, type=kind, bottom=bottoms, top=[top], **fields)
     return top

@@ -1,9 +1,10 @@
-"""The words of siamese_words_256 within the net places learn further: from the other words there, and many negatives.
+"""Train the words of siamese_words_256 in the net places further: by distillation, and with many negatives.
 
 python distilled_words.py FOLDER ITERATIONS WEIGHTS LIST...: FOLDER has the files of trained_head.py, WEIGHTS are
 siamese_words_256.caffemodel, a LIST has batches of 64 pairs of views of 192x144 (docs/trained.md). It writes
-places.caffemodel anew. Loss: that of trained_head.py, and how far the cosines of a batch's views are from those of both
-teachers, the other words and the net as it was (Hinton, Vinyals, Dean: Distilling the Knowledge in a Neural Network).
+places.caffemodel again. The loss is that of trained_head.py, plus the difference between the cosines of a batch's views
+and those of two teachers, the other words and the original net (Hinton, Vinyals, Dean: Distilling the Knowledge in a
+Neural Network).
 """
 
 import sys

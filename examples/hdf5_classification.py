@@ -1,4 +1,4 @@
-"""Logistic regression from HDF5 files, and a hidden layer on top, beside scikit-learn's."""
+"""Logistic regression from HDF5 files, with and without a hidden layer, compared with scikit-learn."""
 
 import os
 import sys

@@ -112,14 +112,14 @@ class Node:
         for stamp, pose in zip(self.stamps, closed.poses, strict=True):
             path.poses.append(PoseStamped(header=rospy.Header(stamp=stamp, frame_id="map")))
             set_pose(path.poses[-1].pose, after(pose, inverse(self.mount)))
-        said = PoseWithCovarianceStamped(header=header)
+        message = PoseWithCovarianceStamped(header=header)
         camera = after(closed.poses[loop.match], loop.relative.pose)
-        if loop.relative.kind != METRIC:  # the length of the step is not known: the corrected path has it
+        if loop.relative.kind != METRIC:  # the length of the step is not known; use the corrected path
             camera[:3] = closed.poses[loop.query, :3]
-        set_pose(said.pose.pose, after(camera, inverse(self.mount)))
+        set_pose(message.pose.pose, after(camera, inverse(self.mount)))
         place = UNKNOWN if loop.relative.kind == ROTATION_ONLY else LOOP_SIGMAS.translation_m**2
-        said.pose.covariance = np.diag([place] * 3 + [LOOP_SIGMAS.rotation_rad**2] * 3).ravel().tolist()
-        self.loops.publish(said)
+        message.pose.covariance = np.diag([place] * 3 + [LOOP_SIGMAS.rotation_rad**2] * 3).ravel().tolist()
+        self.loops.publish(message)
         self.path.publish(path)
 
 

@@ -1,4 +1,4 @@
-"""The net places: words on a trunk that stays as it is, trained on many negatives, and siamese_words_256 beside them.
+"""Train the net places: words on a fixed trunk, with many negatives, combined with the words of siamese_words_256.
 
 python trained_head.py FOLDER ITERATIONS LIST...: FOLDER has the files of efficientnet_lite0.py, a LIST batches of 64
 pairs of views of 192x144 (docs/trained.md). It writes places.prototxt and places.caffemodel. Loss: Sohn, NIPS 2016.

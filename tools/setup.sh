@@ -1,7 +1,7 @@
 # Sourced by the scripts of tools/: makes a Python environment, .venv in this project, and installs into it, once.
-# NEEDS: the extras of pyproject.toml that a script needs; without it only what the programs themselves need is installed.
-# VENV: another environment, which may be there already; a torch in it stays. PYTHON: the Python to make it with.
-# What pip reads from its own variables holds, such as PIP_EXTRA_INDEX_URL.
+# NEEDS: the extras of pyproject.toml that a script needs; without it, only the dependencies of the programs are installed.
+# VENV: another environment, which may exist already; a torch in it is kept. PYTHON: the Python to make it with.
+# pip's own variables, such as PIP_EXTRA_INDEX_URL, apply.
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="${VENV:-$ROOT/.venv}"
 PYTHON="${PYTHON:-python3}"

@@ -29,7 +29,7 @@ SCRIPTS = Path(sys.executable).parent
 
 
 def modules(package: str) -> list[str]:
-    """Return a package's modules, but for its __main__, which would run, and dialects, of which two share names."""
+    """Return the modules of a package, except __main__, which would run, and dialects, which have duplicate names."""
     found = importlib.import_module(package)
     walked = pkgutil.walk_packages(found.__path__[:1], f"{package}.")
     return [module.name for module in walked if not re.search(r"__main__$|\.dialects\.", module.name)]
