@@ -58,7 +58,7 @@ def _add_common(parser: argparse.ArgumentParser, known: Sequence[str], default: 
         "--seconds",
         type=float,
         default=60,
-        help="fewer rounds, but at least 3, where those of one net, batch and number of threads take longer "
+        help="run fewer rounds, but at least 3, if those of one net, batch and number of threads take longer "
         "(default: 60)",
     )
 
@@ -241,7 +241,7 @@ def _add_growth(commands: Commands) -> None:
     parser.add_argument(
         "sizes", type=int, nargs="*", metavar="SIZE", help="the sizes to measure (default: the usual ones)"
     )
-    parser.add_argument("--plot", metavar="FILE", help="draw what was measured, as .png or .svg")
+    parser.add_argument("--plot", metavar="FILE", help="draw the measurements, as .png or .svg")
     _add_json(parser)
 
 

@@ -47,7 +47,7 @@ FIRST_HALF = (
     "kitchen",
     "nordland_1",
 )
-SOFT_DEG = 45.0  # views of one room turned by less are no mistake: the soft rule, with the 2 m of the paper
+SOFT_DEG = 45.0  # the soft rule: views of one place (2 m) with a smaller angle are not a mistake
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ PAIRS = 2000  # converted with each number of workers
 
 
 def residual_net(layers: int) -> str:
-    """Return the prototxt of a residual net of small maps that has about so many layers, splits not counted."""
+    """Return the prototxt of a residual net with small feature maps and about this many layers, without splits."""
     blocks = max(1, (layers - 2) // 5)
     return DATA + "".join(BLOCK.format(i=i, k=i + 1) for i in range(blocks)) + LOSS.format(i=blocks)
 

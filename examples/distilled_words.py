@@ -23,7 +23,7 @@ from netspec.inspect.features.describer import Describer
 from netspec.proto.text import read_net, write_text
 
 RATE, WARM, SCALE, VIEWS = 8e-4, 30, 15, 128  # rate of learning, and iterations until it is reached; views of a batch
-OWN = 0.3  # the share of the net as it was in what it learns
+OWN = 0.3  # weight of the original net as a teacher
 folder, iterations, start, lists = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], [Path(n) for n in sys.argv[4:]]
 places = [folder / f"places.{kind}" for kind in ("prototxt", "caffemodel")]
 both = Path(__file__).parents[1] / "prototxt" / "many_negatives" / "siamese_words_256" / "train_val.prototxt"

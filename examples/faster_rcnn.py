@@ -18,7 +18,7 @@ MEANS, DEVIATIONS = (102.9801, 115.9465, 122.7717), (0.1, 0.1, 0.2, 0.2)  # of p
 
 
 def detect(net, image, side=600):
-    """Return the boxes (n, 6) that a net finds, one of those that overlap; the side is that of the training."""
+    """Return the boxes (n, 6) that a net finds, after non-maximum suppression; ``side`` is that of the training."""
     net.blobs["data"].reshape(1, 3, side, side)
     net.blobs["data"].data[0] = (cv2.resize(image, (side, side)) - np.array(MEANS)).transpose(2, 0, 1)
     net.blobs["im_info"].data[...] = side, side, 1

@@ -1,4 +1,4 @@
-"""What a net has learned and what it sees: its filters and its activations as pictures."""
+"""Draw the filters and the activations of a net."""
 
 import os
 import sys

@@ -28,7 +28,7 @@ from loopclosure.detector.run import load_describe
 from loopclosure.places.intrinsics import from_text
 
 FORWARD = "0,0,0,-0.5,0.5,-0.5,0.5"  # a camera that looks forward: its z is the robot's x
-UNKNOWN = 1e6  # variance of what a loop does not tell
+UNKNOWN = 1e6  # variance of what a loop does not measure
 
 
 def after(pose, step):  # a pose (7,), tx ty tz qx qy qz qw, and one in its frame -> that in the world

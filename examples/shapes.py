@@ -44,7 +44,7 @@ def write(path, images):
 
 
 def judge(images, found, path, least=0.5):
-    """Print precision and recall of the boxes (n, 6) of the least confidence or more; draw those of ten images."""
+    """Print precision and recall of the boxes (n, 6) with at least confidence ``least``; draw ten images."""
     right, tiles, found = 0, [], [boxes[boxes[:, 1] >= least] for boxes in found]
     for (image, true), boxes in zip(images, found, strict=True):
         tiles.append(cv2.resize(image, (256, 256)))

@@ -10,10 +10,10 @@ VENV = ROOT / ".venv"  # made by tools/setup.sh
 
 
 def run(module: str, *words: str) -> int:
-    """Call a module's ``main`` with ``words`` and those of the command line; return its exit status.
+    """Call a module's ``main`` with ``words`` and the command-line arguments; return its exit status.
 
-    If this Python lacks a required package, the script restarts with the Python of ``.venv``; without one, a line on
-    stderr says what to run.
+    If this Python lacks a required package, the script restarts with the Python of ``.venv``. If there is none, it
+    prints the command that installs the packages.
     """
     sys.path[0] = str(ROOT)  # in place of this folder
     typed = sys.argv

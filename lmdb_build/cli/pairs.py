@@ -60,7 +60,7 @@ Or one of these:
   folders:    a folder, references=FOLDER: equal names are the same place
   table:      a CSV of positives, two columns of image names; group=COLUMN names the place; index=CSV of groups
   index:      a CSV of frames; group=COLUMN names the place, track=COLUMN the clip, time=COLUMN the position in it:
-              neighbors, at most max-gap (1) apart, are positives
+              neighbors with a gap of at most max-gap (1) are positives
   singles:    a folder, each image is a different place; positives are warped copies"""
 # Options for sequences with poses only.
 POSED = (
@@ -135,7 +135,7 @@ def _add_pairs(commands: Commands) -> None:
         type=_names,
         default=[],
         metavar="A,B",
-        help="sequences of one room: no pair is made across them",
+        help="sequences of one room: no pairs are made across them",
     )
     group.add_argument(
         "--same-frame",
@@ -182,7 +182,11 @@ def _add_pairs(commands: Commands) -> None:
         "--hard-negatives", type=Path, metavar="NPZ", help="choose negatives that are similar by these features"
     )
     group.add_argument(
-        "--hard-share", type=float, default=0.5, metavar="SHARE", help="share of such negatives (default: %(default)g)"
+        "--hard-share",
+        type=float,
+        default=0.5,
+        metavar="SHARE",
+        help="share of the negatives chosen this way (default: %(default)g)",
     )
     group.add_argument(
         "--warp-share",

@@ -141,8 +141,8 @@ class PlaceSource(PairSource):
         """Label pairs (N,): listed ones positive, those of different groups negative."""
         codes = np.minimum(first, second) * len(self.names) + np.maximum(first, second)
         labels = np.full(len(first), LEFT_OUT, np.int8)
-        apart = np.abs(self.stamps[first] - self.stamps[second]) >= self._min_gap
-        labels[(self.groups[first] != self.groups[second]) & apart] = NEGATIVE
+        far = np.abs(self.stamps[first] - self.stamps[second]) >= self._min_gap
+        labels[(self.groups[first] != self.groups[second]) & far] = NEGATIVE
         if self._sides is not None:
             labels[self._sides[first] == self._sides[second]] = LEFT_OUT
         labels[np.isin(codes, self._codes)] = POSITIVE

@@ -98,7 +98,7 @@ def _quoted(name: str) -> str:
 
 
 def root_of(path: Path) -> Path:
-    """Return the folder that a list's images are relative to: what its header says, or else the list's own folder."""
+    """Return the folder that a list's images are relative to: the one in its header, or else the list's own folder."""
     return path.parent / read_settings(path).get(ROOT_FOLDER, ".")
 
 

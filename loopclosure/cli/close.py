@@ -82,7 +82,7 @@ def _close(a: argparse.Namespace) -> None:
     frames = sequence(source, a.out)
     camera = intrinsics.from_text(a.camera) if a.camera else frames.camera
     if camera is None:
-        raise InputError(f"does not say what its camera is; give --camera {intrinsics.FORM}", frames.source)
+        raise InputError(f"has no calibration of its camera; give --camera {intrinsics.FORM}", frames.source)
     odometry = _odometry(a, frames)[source.selection().numbers(len(frames))]
     frames = frames.taken(source.selection())
     loops = measure(frames, read_loops(Path(a.loops), frames.names), camera, bar)

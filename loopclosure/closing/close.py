@@ -247,5 +247,5 @@ def one_spot(closed: Closed) -> str:
     away = np.linalg.norm(closed.poses[ends.min() : ends.max() + 1, :3] - middle, axis=1).max()
     if radius > MAX_DISTANCE_M or away <= 2 * MAX_DISTANCE_M:
         return ""
-    said = f"all loops lie in one spot, within {max(radius, 0.01):.2g} m"
-    return f"{said}; the path between them goes up to {away:.3g} m away, where no loop corrects it"
+    spot = f"all loops lie in one spot, within {max(radius, 0.01):.2g} m"
+    return f"{spot}; the path between them goes up to {away:.3g} m away, where no loop corrects it"

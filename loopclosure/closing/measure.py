@@ -39,7 +39,7 @@ class Loop:
 def read_loops(path: Path, names: Sequence[str]) -> list[Loop]:
     """Read the loops.csv of ``loopclosure detect``: loops between the frames with these names (N).
 
-    Frames are found by their names, or by their numbers where the table has no names. Raises InputError (file:line)
+    Frames are found by their names, or by their numbers if the table has no names. Raises InputError (file:line)
     for a frame that is not there.
     """
     numbers = {str(safe_cell(name)): number for number, name in enumerate(names)}
@@ -53,7 +53,7 @@ def read_loops(path: Path, names: Sequence[str]) -> list[Loop]:
             reader = csv.DictReader(stream, restval="")
             missing = {"query_id", "match_id"} - set(reader.fieldnames or ())
             if missing:
-                raise InputError("is no table of loops; expected the loops.csv that loopclosure detect writes", path)
+                raise InputError("is not a table of loops; expected the loops.csv that loopclosure detect writes", path)
             for row in reader:
                 query, match = (_frame(row, end, numbers, path, reader.line_num) for end in ("query", "match"))
                 if query == match:
@@ -67,7 +67,7 @@ def read_loops(path: Path, names: Sequence[str]) -> list[Loop]:
 def measure(
     sequence: ImageSequence, loops: Sequence[Loop], camera: Intrinsics, progress: Progress = silent
 ) -> list[Loop]:
-    """Measure the pose of each loop's query in the frame of its match, from depth where there is some."""
+    """Measure the pose of each loop's query in the frame of its match, from depth if it is available."""
 
     @lru_cache(KEPT_VIEWS)
     def view(frame: int) -> View:

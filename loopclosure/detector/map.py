@@ -135,7 +135,7 @@ class Map:
         except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
             if isinstance(error, InputError):
                 raise
-            raise InputError("is no map; loopclosure map build makes one", self.folder) from None
+            raise InputError("is not a map; loopclosure map build makes one", self.folder) from None
         return about
 
     def _count(self, about: dict[str, Any]) -> int:
@@ -357,7 +357,7 @@ def shortened(rows: np.ndarray, projection: Whitening | None, views: int) -> np.
 def checked_name(describer: str) -> str:
     """Check that a describer is a plain name: opening a map must not run a file that the map names."""
     if not re.fullmatch(NAME, describer):
-        raise InputError(f'"{describer}" is no name of a net; a map needs default, small or another that is installed')
+        raise InputError(f'"{describer}" is not the name of a net; a map needs default, small or another installed net')
     return describer
 
 

@@ -26,7 +26,7 @@ from loopclosure.places.trajectory import Poses
 from loopclosure.progress import Progress, silent
 
 DESCRIBERS = "loopclosure.describers"  # the group of entry points: name -> function that makes a describer
-NAME = r"[\w-]+"  # of such an entry point
+NAME = r"[\w-]+"  # the form of a name in that group
 OWN = ("netspec", "loopclosure", "lmdb_build")  # one distribution; a checkout of it may be the working directory
 
 
@@ -177,7 +177,7 @@ def _installed_module(name: str) -> Any:
 
 
 def _file_module(path: Path) -> Any:
-    """Run a file as a module; what it imports from its own folder comes after the installed packages."""
+    """Run a file as a module. Its folder is searched for imports after the installed packages."""
     spec = importlib.util.spec_from_file_location(f"_describe_{path.stem}", path)
     assert spec is not None, "the path ends in .py"
     assert spec.loader is not None

@@ -1,1 +1,1 @@
-"""Where images were taken, which show the same place, and the data sets that say so."""
+"""Images, poses and cameras, the ground truth of places, and data sets."""

@@ -40,7 +40,7 @@ MATRIX_TOLERANCE = 0.02
 # A step is a jump if its speed is this many times the 99th percentile, and it is longer than this.
 JUMP_FACTOR, JUMP_M = 10.0, 0.5
 # A car or a robot always moves in one direction of its own frame. If that is so only with another reading of the poses,
-# that reading is likely to be right. A hand-held camera moves in all directions, so nothing can be said about it.
+# that reading is likely to be right. A hand-held camera moves in all directions, so it gives no hint.
 ONE_WAY, ALL_WAYS, SHORTER = 0.9, 0.7, 0.5
 
 
@@ -251,6 +251,6 @@ def matrix_fault(matrix: np.ndarray) -> str:
     """Return why the first three columns (3, 3) of a pose are not a rotation; empty if they are."""
     difference = float(np.abs(matrix.T @ matrix - np.eye(3)).max()) if np.abs(matrix).max() < 2 else np.inf
     if not difference <= MATRIX_TOLERANCE:
-        return f"its first three columns are no rotation: M^T M differs from the identity by {difference:.3g}"
+        return f"its first three columns are not a rotation: M^T M differs from the identity by {difference:.3g}"
     reflected = np.linalg.det(matrix) < 0
     return "its first three columns are a reflection (determinant -1), not a rotation" if reflected else ""

@@ -22,7 +22,7 @@ SOFT_MEASURES = ("average precision", "recall at 100 % precision")
 
 EXPLANATION = {
     ALL_PAIRS: "every judged pair of frames is a sample",
-    BEST_MATCH: "each query names its best reference; recall is the share of queries with a loop whose match is right",
+    BEST_MATCH: "only the best reference of each query counts; recall: share of queries with a loop and a right match",
 }
 
 

@@ -84,7 +84,7 @@ class WordModel:
                 check_array(file, name, "f", (count,))
             parents = file["parent"]
             if len(parents) and (parents.min() < 0 or parents.max() >= count):
-                raise ValueError("a word's parent is no word")
+                raise ValueError("the parent of a word is not a word")
             tree = WordTree(*(file[name] for name in ("parent", "marginal", "given_present", "given_absent")))
             vocabulary = Vocabulary(file["centres"], from_json(Extractor, settings["extractor"]), settings["made"])
             return cls(vocabulary, file["training_words"], images, tree)

@@ -128,7 +128,7 @@ def test_odometry_from_a_file(walk: Path, tmp_path: Path, capsys: pytest.Capture
     ("line", "status", "words"),
     [
         ("--drift 2 --loops NONE", 1, "no such file; expected the loops.csv"),
-        ("--drift 2 --loops WALK/rgb.txt", 1, "is no table of loops"),
+        ("--drift 2 --loops WALK/rgb.txt", 1, "is not a table of loops"),
         ("--drift 2 --loops FAR", 1, 'far.csv:2:1: no frame has the number "900"; there are 90'),
         ("--drift 2 --loops NAMED", 1, 'named.csv:2:1: no image of the sequence has the name "x.jpg"'),
         ("--drift 200 --loops LOOPS", 1, "a drift of 200 %; expected"),
@@ -159,7 +159,7 @@ def test_without_a_camera_the_numbers_are_asked_for(two_laps: Path, tmp_path: Pa
     (tmp_path / "loops.csv").write_text("query_id,match_id\n25,5\n")
     line = f"close {two_laps} --loops {tmp_path / 'loops.csv'} --drift 1 --out {tmp_path / 'out'}"
     assert main(line.split()) == 1
-    assert "does not say what its camera is; give --camera FX,FY,CX,CY" in capsys.readouterr().err
+    assert "has no calibration of its camera; give --camera FX,FY,CX,CY" in capsys.readouterr().err
 
 
 def test_fr1_rpy_where_the_camera_turns_gets_rotations_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

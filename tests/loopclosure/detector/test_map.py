@@ -223,9 +223,9 @@ def test_a_map_that_another_net_described_is_refused(
 @pytest.mark.parametrize(
     ("damage", "sentence"),
     [
-        (lambda m: (m / "map.json").write_text("{"), "M: is no map; loopclosure map build makes one"),
+        (lambda m: (m / "map.json").write_text("{"), "M: is not a map; loopclosure map build makes one"),
         (lambda m: (m / "map.json").write_text(json.dumps({"format": 9, "describer": "x"})), "has format 9"),
-        (lambda m: (m / "map.json").write_text('{"format": 1, "describer": "./x.py:f"}'), "no name of a net"),
+        (lambda m: (m / "map.json").write_text('{"format": 1, "describer": "./x.py:f"}'), "not the name of a net"),
         (lambda m: (m / "000000" / "rows.npy").write_bytes(b"x"), "rows.npy: cannot be read"),
         (lambda m: os.truncate(m / "000000" / "rows.npy", 900), "rows.npy: cannot be read"),
         (lambda m: (m / "000000" / "points.npy").unlink(), "points.npy: no such file"),
@@ -276,9 +276,9 @@ def test_a_file_that_is_cut_while_it_is_open_is_a_fault(name: str, a_map: Map, d
 def test_faults_are_named(a_map: Map, drives: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is there already; loopclosure map add adds to a map"):
         Map.create(tmp_path / "M", "default")
-    with pytest.raises(InputError, match="is no map"):
+    with pytest.raises(InputError, match="is not a map"):
         Map(drives)
-    with pytest.raises(InputError, match="no name of a net"):
+    with pytest.raises(InputError, match="not the name of a net"):
         Map.create(tmp_path / "N", "here.py:describe")
     assert not (tmp_path / "N").exists()
     with pytest.raises(InputError, match="ends at 65,504"):

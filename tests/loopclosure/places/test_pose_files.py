@@ -66,7 +66,7 @@ def test_a_jump_is_noticed(tmp_path: Path) -> None:
     [
         ("1 0 0 0 1 0 0 0 1 0 0\n", "a.txt:1:1: has 11 numbers in a row; expected a file of poses: TUM"),
         ("# empty\n", "a.txt: holds no pose"),
-        ("1 0 0 0 0 2 0 0 0 0 1 0\n", "a.txt:1:1: its first three columns are no rotation: M^T M differs"),
+        ("1 0 0 0 0 2 0 0 0 0 1 0\n", "a.txt:1:1: its first three columns are not a rotation: M^T M differs"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "a.txt:1:1: its first three columns are a reflection"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0\n", "a.txt:2:1: has 8 numbers, a row of KITTI's form has 12"),
         ("#t\n5,0,0,0,1,1,0,0\n", "a.txt:2:9: qw qx qy qz have length 1.414, a rotation has length 1"),
