@@ -19,7 +19,7 @@ from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import TEST
 
-MAX_OFFSET = 8  # means, in standard deviations, up to which torch's CPU kernel is exact to 1e-6
+MAX_OFFSET = 8  # the largest mean, in standard deviations, for which torch's CPU kernel is exact to 1e-6
 
 
 @register("BatchNorm", "batch_norm_param")
@@ -39,11 +39,11 @@ class BatchNorm(Layer):
     """
 
     ignores_propagate_down = frozenset({0})
-    joined: tuple[Layer, ...] = ()  # a Scale of its channels, a ReLU: it does their work too, where the batch counts
+    joined: tuple[Layer, ...] = ()  # a Scale and a ReLU after it that it computes too, in training
     rectifies = False  # whether there is a ReLU among them
 
     def setup(self) -> None:
-        """Add the sums, all zero; refuse a ``param`` that would have them learned."""
+        """Add the sums, all zero. Raise SpecError for a ``param`` that would train them."""
         param = self.param.batch_norm_param
         for i, spec in enumerate(self.param.param[:3]):
             if spec.lr_mult != 0:
@@ -73,16 +73,16 @@ class BatchNorm(Layer):
 
     @property
     def eps(self) -> float:
-        """What is added to the variance."""
+        """The constant that is added to the variance."""
         return self.param.batch_norm_param.eps
 
     def past(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the mean and the variance of each channel, (C,), that the sums stand for."""
+        """Return the stored mean and variance of each channel, (C,)."""
         with torch.no_grad():
             return means(*(self.blob(i) for i in range(3)))
 
     def by_past(self, exact: bool) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return what normalizes a bottom of the present shape by the past, as it is now."""
+        """Return a function that normalizes a bottom of the present shape by the present stored statistics."""
         mean, variance = self.past()
         eps, axes = self.param.batch_norm_param.eps, (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
         by_channel = mean.view(axes)
@@ -94,7 +94,7 @@ class BatchNorm(Layer):
         return lambda data: torch.batch_norm(data - by_channel if far else data, None, None, *arguments)
 
     def joined_with(self, after: Layer) -> Layer | None:
-        """Return this layer with a Scale of its channels after it, or a ReLU: torch's kernel does all in one."""
+        """Return this layer joined with a Scale of its channels, or a ReLU, after it: one kernel of torch does it."""
         kind = offered(after, "joins_as")
         fits = (kind == "scale" and not self.joined) or (kind == "relu" and not self.rectifies)
         if not fits or self.use_global_stats or self.is_exact(self.blob(0), self.small):
@@ -134,7 +134,7 @@ class BatchNorm(Layer):
     def _by_torch(
         self, data: torch.Tensor, normalize: Callable[..., Any], options: Sequence[Any]
     ) -> tuple[Any, torch.Tensor, torch.Tensor]:
-        """Return what ``normalize`` makes of a batch, its mean and its unbiased variance: running ones of one batch."""
+        """Return the normalized batch, its mean and its unbiased variance."""
         exact_enough = torch.promote_types(data.dtype, torch.float32)
         mean, variance = data.new_zeros(2, self.channels, dtype=exact_enough).unbind()
         made = normalize(data, *self.factors(), mean, variance, True, 1.0, self.eps, *options)
@@ -169,7 +169,7 @@ class BatchNorm(Layer):
 
 
 def as_before(layer: Layer, shapes: Sequence[Shape], channels: int) -> Sequence[Shape]:
-    """Return the shapes of a bottom (N, C) or (N, C, ...); refuse other than so many channels."""
+    """Return the shape of a bottom (N, C) or (N, C, ...). Raise SpecError for another number of channels."""
     shape = shapes[0]
     if len(shape) < 2 or shape[1] != channels:
         raise layer.error(f"found a bottom of shape {shape}, expected {channels} channels as before", "bottom")
@@ -177,7 +177,7 @@ def as_before(layer: Layer, shapes: Sequence[Shape], channels: int) -> Sequence[
 
 
 def means(means: torch.Tensor, variances: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the sums divided by their weight; 0 where nothing was added yet."""
+    """Return the sums divided by their weight; 0 if nothing was added yet."""
     factor = torch.where(weight == 0, 0, 1 / weight)
     return means * factor, variances * factor
 
@@ -185,7 +185,7 @@ def means(means: torch.Tensor, variances: torch.Tensor, weight: torch.Tensor) ->
 def torch_batch_norm(
     code: TorchCode, axes: int, mean: torch.Tensor, variance: torch.Tensor, eps: float, **affine: torch.Tensor
 ) -> str:
-    """Add torch's batch normalization by the past for so many axes; ``affine`` has its weight and bias, or nothing."""
+    """Add torch's batch normalization by stored statistics; ``affine`` has its weight and bias, or is empty."""
     count = torch.zeros((), dtype=torch.long)
     state = {**affine, "running_mean": mean, "running_var": variance, "num_batches_tracked": count}
     options = ("" if eps == 1e-5 else ", eps={eps}") + ("" if affine else ", affine=False")
@@ -195,7 +195,7 @@ def torch_batch_norm(
 
 
 def onnx_normalized(graph: OnnxGraph, data: str, axes: int, eps: float) -> str:
-    """Write a batch of so many axes less the mean of each channel, divided by its deviation."""
+    """Write the normalization of a batch: minus the mean of each channel, divided by its standard deviation."""
     centered = graph.node("Sub", data, _onnx_channel_means(graph, data, axes))
     variance = _onnx_channel_means(graph, graph.node("Mul", centered, centered), axes)
     return graph.node("Div", centered, graph.node("Sqrt", graph.node("Add", variance, graph.constant(eps))))
@@ -209,9 +209,9 @@ def _onnx_channel_means(graph: OnnxGraph, data: str, axes: int) -> str:
 
 
 def _far_from_zero(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> bool:
-    """Whether torch's kernel would lose digits: on a CPU it computes x / std - mean / std, not (x - mean) / std.
+    """Return whether torch's kernel would lose digits: on a CPU it computes x / std - mean / std.
 
-    What torch.compile makes of it subtracts the mean first.
+    Compiled by torch.compile, it subtracts the mean first.
     """
     return (
         mean.device.type == "cpu"

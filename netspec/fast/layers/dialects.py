@@ -1,4 +1,4 @@
-"""Kernels of layers of dialects, by the path of the class: a dialect is imported where a net uses it, not for this."""
+"""Kernels of layers of dialects, by the path of the class, so that a dialect is imported only if a net uses it."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from netspec.run.recorded import Kernels
 
 
 def _learn_softmax(layer: SoftmaxWithLoss, how: Learning) -> Kernels | None:
-    """Return the kernels where every label counts."""
+    """Return the kernels, or None if a label may be ignored."""
     if layer.ignore_label is not None or math.prod(layer.bottom_shapes[0]) == 0:
         return None
     shape, tops = layer.bottom_shapes[0], layer.num_tops
@@ -31,7 +31,7 @@ def _learn_softmax(layer: SoftmaxWithLoss, how: Learning) -> Kernels | None:
     label, diff = torch.empty(flat, dtype=torch.long), torch.empty(split)
     normalize = _bound_softmax(split) if exact else partial(F.softmax, dim=1)
     sum_up = _bound_cross_entropy(split, FLT_MIN, divisor) if exact else lambda p, _: _mean(p, label, divisor)
-    # Of p and its gradient, as arrays: the calls of torch take longer than what they compute.
+    # p and its gradient are arrays, because the overhead of torch's calls exceeds the work.
     p, classes, found = torch.empty(0), label.numpy().reshape(-1), diff.numpy()
     unsigned, starts = classes.view(np.uint64), np.arange(layer.outer * layer.inner)
     starts += (layer.classes - 1) * layer.inner * (starts // layer.inner)  # where the first class is
@@ -60,9 +60,9 @@ def _mean(p: torch.Tensor, label: torch.Tensor, divisor: float) -> torch.Tensor:
 
 
 def _bound_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return what computes netspec.exact.losses.softmax of float32 scores of one shape, in memory of its own.
+    """Return a function like netspec.exact.losses.softmax, for float32 scores of one shape, with its own memory.
 
-    It expects one thread.
+    It must run in one thread.
     """
     p, largest = torch.empty(shape), np.empty((shape[0], 1, shape[2]), np.float32)
     values, exponents, powers = p.numpy(), np.zeros(shape, np.complex64), np.empty(shape, np.complex64)
@@ -81,9 +81,9 @@ def _bound_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torc
 def _bound_cross_entropy(
     shape: tuple[int, int, int], least: float, divisor: float
 ) -> Callable[[torch.Tensor, np.ndarray], torch.Tensor]:
-    """Return what computes the sum of -log p, one after the other, by ``divisor``, ().
+    """Return a function that computes the sum of -log(max(p, least)) / ``divisor``, (), adding one by one.
 
-    Of p, float32 of this shape, it takes the numbers at the given places, and of these none less than ``least``.
+    It takes p, float32 of this shape, and the places of the numbers to use.
     """
     one, loss = torch.ones(()), torch.empty(())
     chosen, logs = torch.empty(2, shape[0] * shape[2])

@@ -15,7 +15,7 @@ from netspec.run.recorded import Kernels
 
 
 def affine(layer: BatchNorm) -> Affine:
-    """Return what a BatchNorm that normalizes by its past does to each channel."""
+    """Return the scale and shift of each channel by a BatchNorm with stored statistics."""
     mean, variance = means(*(blob_in_double(layer, i) for i in range(3)))
     scale = (variance + layer.eps).rsqrt()
     return scale, -mean * scale

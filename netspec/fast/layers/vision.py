@@ -23,7 +23,7 @@ from netspec.layers.vision.pooling import AVE, STOCHASTIC, Pooling
 from netspec.layers.vision.windows import CEIL, LOWEST, Windows, max_pool
 from netspec.run.recorded import Kernels, recorded
 
-SLICED, SLICED_BY_TWO = 2**12, 2**17  # numbers in a bottom: of more, slices pay (largest)
+SLICED, SLICED_BY_TWO = 2**12, 2**17  # numbers in a bottom: for more, slices are faster (see largest)
 
 
 def is_usual(layer: Convolution) -> bool:
@@ -71,7 +71,7 @@ def _convolutions(
     wanted: bool,
     lay_out: Callable[[torch.Tensor], torch.Tensor],
 ) -> Kernels:
-    """Return what SummedConvolutions (exact/products.py) computes, of maps that ``lay_out`` puts into its order."""
+    """Return the result of SummedConvolutions (exact/products.py) for maps in the layout that ``lay_out`` makes."""
     weight, bias, *sums = weights
     geometry = (sliding.stride, sliding.pad, sliding.dilation)
     asked = (wanted, *(total is not None for total in sums))
@@ -157,14 +157,14 @@ def _pooling(layer: Pooling, how: Inference) -> Kernel | None:
             values = largest(maps, windows)
         else:
             values = torch.max_pool2d(maps, *geometry, 1, ceil)
-        # As in max_pool: torch lets NaN win.
+        # As in max_pool: in torch NaN wins.
         return values if values.amin().item() > LOWEST else max_pool(maps, windows)[0]
 
     return finished(kernel, how.finish)
 
 
 def _learn_pooling(layer: Pooling, how: Learning) -> Kernels | None:
-    """Return the kernels; where a window has no pixel to win, autograd records the run."""
+    """Return the kernels. If a window has no maximum, autograd records the run."""
     if not _has_kernels(layer):
         return None
     windows = layer.windows
@@ -186,7 +186,7 @@ def _learn_pooling(layer: Pooling, how: Learning) -> Kernels | None:
         nonlocal given, bottom, indices, is_usual
         given, bottom = maps, channels_side_by_side(maps)
         values, indices = F.max_pool2d(bottom, *geometry, 1, ceil, return_indices=True)
-        is_usual = values.amin().item() > LOWEST  # as in max_pool: torch lets NaN win
+        is_usual = values.amin().item() > LOWEST  # as in max_pool: in torch NaN wins
         return values if is_usual else record(maps)
 
     def backward(diff: torch.Tensor) -> Any:
@@ -201,8 +201,8 @@ def _learn_pooling(layer: Pooling, how: Learning) -> Kernels | None:
 def largest(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
     """Return the maximum of each window, unpadded and known to torch, of maps (N, C, H, W) in this order.
 
-    NaN wins, and of zeros either sign. Rows first, then columns: torch's kernel takes such maps pixel by pixel, which
-    is up to ten times as slow.
+    NaN wins; a zero may have either sign. It reduces rows first, then columns, because torch's kernel reads such maps
+    pixel by pixel, which is up to ten times as slow.
     """
     for axis, (_, kernel, stride, _), count in zip((2, 3), windows.axes(), windows.count, strict=True):
         first, *more = (

@@ -1,1 +1,1 @@
-"""Losses, and the accuracy that is measured like one."""
+"""Losses, and the accuracy."""

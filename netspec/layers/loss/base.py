@@ -1,4 +1,4 @@
-"""What the losses share: scores against labels, what does not count, and what the sum is divided by.
+"""The base classes of losses: comparison of scores and labels, ignored labels, and normalization.
 
 Caffe: include/caffe/layers/loss_layer.hpp
 """
@@ -19,7 +19,7 @@ FULL, VALID, BATCH_SIZE, NONE = 0, 1, 2, 3  # caffe.proto: enum LossParameter.No
 
 
 class Loss(Layer):
-    """Base of the losses: one scalar top, and as many items in every bottom."""
+    """Base of losses: one scalar top, and the same number of items in every bottom."""
 
     bottoms = (2, 2)
     is_loss = True
@@ -50,7 +50,7 @@ class Classified(Layer):
     label_bottoms = frozenset({1})
 
     def reshape_scores(self, bottom_shapes: Sequence[Shape], axis: int, *path: str) -> None:
-        """Keep outer x classes x inner of the scores; refuse labels of another count than outer x inner."""
+        """Set outer x classes x inner from the scores. Raise SpecError for a label count other than outer x inner."""
         scores, labels = bottom_shapes[:2]
         axis = self.canonical_axis(axis, scores, *path)
         self.outer, self.inner = math.prod(scores[:axis]), math.prod(scores[axis + 1 :])
@@ -78,7 +78,7 @@ class Classified(Layer):
         return scores, graph.cast(graph.node("Reshape", labels, shape), "int64")
 
     def onnx_valid(self, graph: OnnxGraph, labels: str, ignore_label: int | None) -> tuple[str, str]:
-        """Write which labels count, as 0 or 1 (empty: all of them), and the labels with 0 for those that do not."""
+        """Write which labels count, as 0 or 1 (empty: all of them), and the labels with 0 for ignored ones."""
         if ignore_label is None:
             return "", labels
         valid = graph.cast(graph.node("Not", graph.node("Equal", labels, graph.constant(ignore_label))), "int64")
@@ -112,7 +112,7 @@ class ClassLoss(Loss, Classified):
 
 
 def ignore_label(param: Any) -> int | None:
-    """Return the label that does not count, of a LossParameter or an AccuracyParameter."""
+    """Return the ignored label of a LossParameter or an AccuracyParameter."""
     return param.ignore_label if param.HasField("ignore_label") else None
 
 
@@ -126,12 +126,12 @@ def normalization_mode(loss_param: Any, default: int) -> int:
 
 
 def total(losses: torch.Tensor, exact: bool) -> torch.Tensor:
-    """Return the sum of all losses; in Caffe's order where ``exact``."""
+    """Return the sum of all losses, in Caffe's order if ``exact``."""
     return SumInOrder.apply(losses.flatten(), 0) if exact else losses.sum()
 
 
 def normalizer(mode: int, outer: int, inner: int, valid: torch.Tensor | None) -> torch.Tensor | float:
-    """Return what a summed loss is divided by: at least 1."""
+    """Return the divisor of a summed loss, at least 1."""
     if mode == VALID and valid is not None:
         return valid.sum().clamp(min=1)
     return float(max(1, {FULL: outer * inner, VALID: outer * inner, BATCH_SIZE: outer, NONE: 1}[mode]))

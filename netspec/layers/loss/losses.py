@@ -172,7 +172,7 @@ class EuclideanLoss(Loss):
 
 
 class _Contrastive(torch.autograd.Function):
-    """Caffe's gradient divides by the distance + 1e-4: not quite the derivative, and finite at distance 0."""
+    """The loss with Caffe's gradient, which divides by the distance + 1e-4, so that it is finite at distance 0."""
 
     @staticmethod
     def forward(

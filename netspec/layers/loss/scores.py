@@ -35,12 +35,12 @@ from netspec.layers.loss.base import (
 )
 from netspec.proto.schema import BlobProto
 
-FLT_MIN = 1.17549435e-38  # SoftmaxWithLoss takes no logarithm of less
-LOG_THRESHOLD = 1e-20  # nor MultinomialLogisticLoss and InfogainLoss of less than this
+FLT_MIN = 1.17549435e-38  # the least argument of the logarithm in SoftmaxWithLoss
+LOG_THRESHOLD = 1e-20  # the same in MultinomialLogisticLoss and InfogainLoss
 
 
 class SoftmaxLoss(Loss, Classified):
-    """Base of the two losses that begin with a softmax, their optional second top, which brings no gradient."""
+    """Base of the two losses that begin with a softmax. It is their optional second top, without a gradient."""
 
     tops = (1, 2)
     normalization: int
@@ -59,7 +59,7 @@ class SoftmaxLoss(Loss, Classified):
 
 
 class _NegativeLogOfSoftmax(torch.autograd.Function):
-    """-log p of the labels' classes, p being the softmax; the logarithm is of no less than FLT_MIN."""
+    """-log(max(p, FLT_MIN)) of the labels' classes. p is the softmax."""
 
     @staticmethod
     def forward(ctx: Any, scores: torch.Tensor, label: torch.Tensor, exact: bool) -> tuple[torch.Tensor, torch.Tensor]:
@@ -82,9 +82,9 @@ class _NegativeLogOfSoftmax(torch.autograd.Function):
 class SoftmaxWithLoss(SoftmaxLoss):
     """-log(softmax(scores)[label]), summed and normalized.
 
-    The logarithm is taken of no less than FLT_MIN, so one prediction costs 87.34 at most; its label's gradient is p - 1
-    all the same. Real Caffe refuses a second top unless loss_weight is written twice; here it needs nothing. As in
-    Caffe no gradient comes from it.
+    The probability is at least FLT_MIN in the logarithm, so the loss of one prediction is 87.34 at most. The gradient
+    of its label is still p - 1. Caffe refuses a second top unless loss_weight is given twice; this layer does not. As
+    in Caffe, the second top has no gradient.
 
     bottom[0]  scores (N, C, ...), C at softmax_param.axis
     bottom[1]  labels, one per prediction, (N,), (N, 1, ...) or (N, ...)
@@ -136,7 +136,7 @@ class SoftmaxWithLoss(SoftmaxLoss):
 class InfogainLoss(SoftmaxLoss):
     """-sum over classes of H[label, class] log(softmax(scores)[class]), summed and normalized.
 
-    The logarithm is taken of no less than 1e-20; the gradient takes no notice of that.
+    The probability is at least 1e-20 in the logarithm; the gradient ignores this limit.
 
     bottom[0]  scores (N, C, ...), C at infogain_loss_param.axis
     bottom[1]  labels, one per prediction
@@ -255,7 +255,7 @@ class MultinomialLogisticLoss(ClassLoss):
 class Accuracy(Classified):
     """The share of predictions with their label among the top_k scores. A tie with the label's score counts against it.
 
-    It is 0 where every label is ignored. No gradient.
+    It is 0 if every label is ignored. It has no gradient.
 
     bottom[0]  scores (N, C, ...), C at accuracy_param.axis
     bottom[1]  labels, one per prediction

@@ -79,7 +79,7 @@ class Convolution(SlidingFilter):
         return self.slide(shape)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return one shape for all tops; the bottoms must suit the filters."""
+        """Return one shape for all tops. Raise SpecError for bottoms that do not fit the filters."""
         self.check_axes(bottom_shapes, self.channels)
         shape = bottom_shapes[0]
         top = (*shape[: self.channel_axis], self.num_output, *self.output_shape(shape))
@@ -88,7 +88,7 @@ class Convolution(SlidingFilter):
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         weight = self.blob(0)
         bias = self.blob(1) if len(self.blobs) > 1 else None
-        if not self.kernel:  # a map without spatial axes is one of a single pixel
+        if not self.kernel:  # a map without spatial axes counts as a single pixel
             weight = weight.unsqueeze(2)
         geometry = [v or (n,) for v, n in ((self.stride, 1), (self.pad, 0), (self.dilation, 1))]
         sliding = Filter(tuple(weight.shape[2:]), *geometry)
@@ -127,7 +127,7 @@ class Convolution(SlidingFilter):
         lay_out: Callable[[torch.Tensor], torch.Tensor],
         transposed: bool = False,
     ) -> torch.Tensor:
-        """Return what torch's kernel computes of maps that ``lay_out`` puts into its order, with gradients."""
+        """Return the result of torch's kernel, with gradients, for maps in the layout that ``lay_out`` makes."""
         if self.context.options.accumulate_in_place and not is_recorded():
             return SummedConvolutions.apply(maps, weight, bias, (sliding, self.group, transposed), lay_out)
         return convolution(lay_out(maps), weight, bias, sliding, self.group, transposed)
@@ -143,7 +143,7 @@ class Convolution(SlidingFilter):
 
     @property
     def work(self) -> int:
-        """The multiply-adds for one image, bias aside."""
+        """The multiply-adds for one image, without the bias."""
         return math.prod(self.top_shapes[0][self.channel_axis + 1 :]) * math.prod(self.blob_shapes[0])
 
     def multiply_adds(self) -> int:
@@ -198,7 +198,7 @@ class Convolution(SlidingFilter):
 
 @register("Deconvolution", "convolution_param")
 class Deconvolution(Convolution):
-    """Spread each pixel by learned filters: a convolution's backward pass, run forward.
+    """Spread each pixel by learned filters, like the backward pass of a convolution.
 
     bottom[i]  (N, C, H, W); with ``axis`` and other kernels (..., C, spatial axes: up to three)
     top[i]     (N, num_output, H', W'),  H' = stride (H - 1) + dilation (kernel - 1) + 1 - 2 pad

@@ -1,11 +1,10 @@
-"""In which order maps lie in memory.
+"""The memory layout of maps.
 
-Caffe's blobs lie image by image, map by map. Torch's kernels for CPUs are faster where the channels of a pixel lie side
-by side (``torch.channels_last``), as vectors then hold channels. Max pooling takes a tenth of the time, batch
-normalization half, convolution six to ten tenths. What a layer computes does not depend on the order, but for
-the rounding of sums. Layers further on keep the order they meet; those that look at maps as vectors restore Caffe's.
-Gradients come in the order of the maps they belong to: where the two differ, torch's kernels take 10 to 20 times as
-long.
+Caffe's blobs are stored image by image, map by map. Torch's kernels for CPUs are faster with the channels of a pixel
+next to each other (``torch.channels_last``), because vectors then hold channels. Max pooling takes a tenth of the time,
+batch normalization half, convolution six to ten tenths. The results do not depend on the layout, except for the
+rounding of sums. Later layers keep the layout of their bottom; layers that take maps as vectors restore Caffe's.
+Gradients have the layout of their maps. If the two differ, torch's kernels take 10 to 20 times as long.
 """
 
 from __future__ import annotations
@@ -16,11 +15,11 @@ import torch
 
 from netspec.exact.switch import is_recorded
 
-FEWEST = 3  # channels from which on the other order pays
+FEWEST = 3  # channels: with fewer, channels_last is not faster
 
 
 def channels_side_by_side(maps: torch.Tensor) -> torch.Tensor:
-    """Return maps (N, C, H, W) in the order that suits torch's kernels: on a CPU with their channels side by side."""
+    """Return maps (N, C, H, W) in the layout that is best for torch's kernels: channels_last on a CPU."""
     if maps.dim() != 4 or maps.device.type != "cpu":
         return maps
     if maps.shape[1] < FEWEST:
@@ -33,10 +32,10 @@ def channels_side_by_side(maps: torch.Tensor) -> torch.Tensor:
 
 
 def of_one_channel(maps: torch.Tensor) -> torch.Tensor:
-    """Return maps (N, 1, H, W) with the strides of Caffe's order, others as they are.
+    """Return maps (N, 1, H, W) with the strides of Caffe's layout. Return other maps unchanged.
 
-    A single channel lies alike in both orders. By its strides torch may take it for the other one, and some of oneDNN's
-    convolutions then compute wrong numbers.
+    With a single channel, both layouts are the same in memory. Its strides may be those of channels_last, and some of
+    oneDNN's convolutions then compute wrong numbers.
     """
     if maps.dim() != 4 or maps.shape[1] != 1 or maps.stride(1) == maps.shape[2] * maps.shape[3]:
         return maps
@@ -44,12 +43,12 @@ def of_one_channel(maps: torch.Tensor) -> torch.Tensor:
 
 
 def map_by_map(maps: torch.Tensor) -> torch.Tensor:
-    """Return maps (N, C, H, W) in Caffe's order."""
+    """Return maps (N, C, H, W) in Caffe's layout."""
     return of_one_channel(maps.contiguous())
 
 
 class _SideBySide(torch.autograd.Function):
-    """Return maps with their channels side by side; their gradient comes map by map, as they did."""
+    """Return maps in channels_last. Their gradient has Caffe's layout, like the given maps."""
 
     @staticmethod
     def forward(maps: torch.Tensor) -> torch.Tensor:
@@ -57,7 +56,7 @@ class _SideBySide(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[torch.Tensor], output: torch.Tensor) -> None:
-        """Keep nothing."""
+        """Save nothing for backward."""
 
     @staticmethod
     def backward(ctx: Any, *diffs: torch.Tensor) -> torch.Tensor:

@@ -30,7 +30,7 @@ HIGHEST_PYRAMID = 16  # levels: 4^16 / 3 windows
 
 
 class _PoolingBase(Layer):
-    """What Pooling and SPP have in common."""
+    """Base of Pooling and SPP."""
 
     def check_pad(self, windows: Windows, method: int, field: str) -> None:
         """Refuse padding as Caffe does: as long as the kernel, or for another method than MAX and AVE."""
@@ -52,7 +52,7 @@ class _PoolingBase(Layer):
     def onnx_pool(
         self, graph: OnnxGraph, data: str, windows: Windows, method: int, mask: bool = False
     ) -> Sequence[str]:
-        """Return the pooled maps and, where it is asked for, the mask."""
+        """Return the pooled maps, and the mask if wanted."""
         if any(r >= k for r, k in zip(windows.reach, windows.kernel, strict=True)):
             raise refusal(
                 self, "ONNX", "unpadded windows at a stride above the kernel can miss the map; use round_mode: FLOOR"
@@ -84,7 +84,7 @@ class _PoolingBase(Layer):
         areas = windows.areas(torch.zeros(())) / math.prod(windows.kernel)
         if not any(beyond) or (fixed and bool((areas == 1).all())):
             return means
-        # The last windows reach past the padded map; what lies there does not count.
+        # The last windows reach past the padded map. Pixels there do not count.
         if fixed:
             return graph.node("Div", means, graph.constant(areas[None, None]))
         ones = graph.node("Expand", graph.constant(1.0), graph.shape_of(data))
@@ -94,7 +94,7 @@ class _PoolingBase(Layer):
         return graph.node("Div", means, graph.node("AveragePool", framed, count_include_pad=1, **counts))
 
     def torch_pool(self, code: TorchCode, x: str, windows: Windows, method: int, mask: bool = False) -> str:
-        """Return the expression of the pooled maps; with ``mask`` of them and of the mask."""
+        """Return the expression of the pooled maps; with ``mask``, of the maps and the mask."""
         if self.phase == TRAIN and method == STOCHASTIC:
             raise refusal(self, "PyTorch", "STOCHASTIC pooling draws random numbers in the training phase")
         geometry = list(zip(windows.kernel, windows.stride, windows.pad, windows.reach, strict=True))
@@ -200,7 +200,7 @@ class Pooling(_PoolingBase):
 
 @register("SPP", "spp_param")
 class SPP(_PoolingBase):
-    """Pool a map into 1, then 2 x 2, then 4 x 4, ... windows: as many features whatever the map's size.
+    """Pool a map into 1, then 2 x 2, then 4 x 4, ... windows: the same number of features for every size of the map.
 
     bottom[0]  (N, C, H, W)
     top[0]     (N, C (1 + 4 + 16 + ...)) with ``pyramid_height`` terms, level by level; (N, C, 1, 1) for height 1
@@ -215,7 +215,7 @@ class SPP(_PoolingBase):
             raise self.error(message, "spp_param", "pyramid_height")
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the number of features; place each level's windows."""
+        """Return the number of features, and compute the windows of each level."""
         shape, param = bottom_shapes[0], self.param.spp_param
         if len(shape) != 4:
             raise self.error(f"SPP needs a bottom of 4 axes (N, C, H, W), found shape {shape}", "bottom")
@@ -253,7 +253,7 @@ class SPP(_PoolingBase):
 
 
 def _pyramid_level(bins: int, size: Pair) -> Windows:
-    """Return windows, side by side, that cover a map of ``size`` with ``bins`` down and across."""
+    """Return ``bins`` x ``bins`` adjacent windows that cover a map of ``size``."""
     kernel = (-(-size[0] // bins), -(-size[1] // bins))
     pad = ((kernel[0] * bins - size[0] + 1) // 2, (kernel[1] * bins - size[1] + 1) // 2)
     return Windows(size, kernel, kernel, pad)

@@ -1,4 +1,4 @@
-"""Layers that slide a filter over a map: the filter's geometry, and Im2col."""
+"""The base of layers that slide a filter over a map, and Im2col."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class SlidingFilter(Layer):
             )
 
     def check_axes(self, bottom_shapes: Sequence[Shape], channels: int) -> None:
-        """Refuse bottoms that the filters, made for those seen first, do not suit; all must have one shape."""
+        """Raise SpecError for bottoms that do not fit the filters, or that have different shapes."""
         shape = bottom_shapes[0]
         if len(shape) != self.channel_axis + 1 + self.spatial_axes or shape[self.channel_axis] != channels:
             raise self.error(
@@ -119,7 +119,7 @@ class SlidingFilter(Layer):
     def onnx_convolved(
         self, graph: OnnxGraph, maps: str, weights: Sequence[str], group: int, geometry: dict[str, Any]
     ) -> str:
-        """Return the product with the filters. A filter of one pixel is padded before: OpenCV 5.0 does it wrong."""
+        """Return the convolution. A filter of one pixel is padded by a separate node, for OpenCV 5.0."""
         pads = geometry.get("pads", [])
         if self.onnx_filter == "Conv" and set(self.kernel) == {1} and any(pads):
             before, after = pads[: len(self.pad)], pads[len(self.pad) :]
@@ -128,7 +128,7 @@ class SlidingFilter(Layer):
         return graph.node(self.onnx_filter, maps, *weights, group=group, **geometry)
 
     def torch_geometry(self) -> dict[str, Any]:
-        """Return kernel, stride, padding and dilation as torch takes them: one number where all axes have the same."""
+        """Return kernel, stride, padding and dilation for torch: one number if all axes have the same."""
         given = {"kernel_size": self.kernel, "stride": self.stride, "padding": self.pad, "dilation": self.dilation}
         return {name: values[0] if len(set(values)) == 1 else values for name, values in given.items()}
 
@@ -138,7 +138,7 @@ TORCH_USUAL = {"stride": 1, "padding": 0, "dilation": 1, "groups": 1}
 
 @register("Im2col", "convolution_param")
 class Im2col(SlidingFilter):
-    """Lay the pixels under each position of a filter side by side, as channels.
+    """Return the pixels under each position of a filter as channels.
 
     bottom[0]  (N, C, H, W); with ``axis`` and other kernels (..., C, spatial axes: any number, at least one)
     top[0]     (N, C kernel_h kernel_w, H', W'),  H' as Convolution's; zero where the filter leaves the map

@@ -1,4 +1,4 @@
-"""Windows over a map, and what is taken from each: the largest, the mean, a sample."""
+"""Windows over a map, and pooling over them: the maximum, the mean, or a sample."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SMALLEST = torch.finfo(torch.float32).tiny  # Caffe's FLT_MIN
 
 @dataclass(frozen=True)
 class Windows:
-    """Where the windows of a map lie; every pair is (vertical, horizontal), in pixels."""
+    """The positions of the windows of a map. Every pair is (vertical, horizontal), in pixels."""
 
     size: Pair  # of the map
     kernel: Pair
@@ -32,10 +32,10 @@ class Windows:
 
     @property
     def count(self) -> Pair:
-        """Return how many windows there are, down and across.
+        """Return the number of windows, down and across.
 
-        Rounded up, so the last window may reach past the map; it is dropped if it would begin past the map's end, but
-        only where either axis is padded. Unpadded, a stride longer than the kernel can leave it without a pixel.
+        It is rounded up, so the last window may reach past the map. If either axis is padded, a last window that would
+        begin past the map is dropped. Without padding, it may have no pixel if the stride is longer than the kernel.
         """
         counts = []
         for size, kernel, stride, pad in self.axes():
@@ -48,19 +48,19 @@ class Windows:
 
     @property
     def known_to_torch(self) -> bool:
-        """Whether torch's pooling has these windows: none empty, none padded by more than half a kernel."""
+        """Whether torch's pooling supports these windows: none is empty, and no padding exceeds half a kernel."""
         axes = zip(self.axes(), self.count, strict=True)
         return all(2 * p <= k and (n - 1) * s < size + p for (size, k, s, p), n in axes)
 
     def padded(self, maps: torch.Tensor, value: float) -> torch.Tensor:
-        """Return the maps framed by ``value`` such that every window is full."""
+        """Return the maps padded with ``value``, so that every window is full."""
         frame: list[int] = []
         for (size, kernel, stride, pad), count in zip(self.axes(), self.count, strict=True):
             frame = [pad, (count - 1) * stride + kernel - pad - size, *frame]
         return F.pad(maps, frame, value=value)
 
     def areas(self, like: torch.Tensor) -> torch.Tensor:
-        """Return what an average divides by, (count down, count across): padding counts, up to ``pad`` past the map."""
+        """Return the divisors of an average (count down, count across). Up to ``pad`` pixels of padding count."""
         lengths = []
         for (size, kernel, stride, pad), count in zip(self.axes(), self.count, strict=True):
             starts = torch.arange(count, dtype=like.dtype, device=like.device) * stride - pad
@@ -73,10 +73,10 @@ class Windows:
 
     @property
     def reach(self) -> Pair:
-        """Return the padding after the map, vertical and horizontal, that brings Caffe's windows when rounding down.
+        """Return the padding after the map, vertical and horizontal, that gives Caffe's windows when rounding down.
 
-        With it, (size + pad + reach - kernel) // stride + 1 is ``count`` at every size: rounding up adds windows as
-        long as there is a pixel left, and where either axis is padded those that begin past the padded map are dropped.
+        With it, (size + pad + reach - kernel) // stride + 1 equals ``count`` at every size. Rounding up adds windows as
+        long as a pixel is left; if either axis is padded, windows that begin past the padded map are dropped.
         """
         reaches = []
         for _, kernel, stride, pad in self.axes():
@@ -95,8 +95,8 @@ def max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor, torch.
         values, indices = _native_max_pool(torch.where(maps > LOWEST, maps, LOWEST), windows)
         return values, torch.where(values > LOWEST, indices, -1)
     values, indices = _native_max_pool(maps, windows)
-    # torch lets NaN win, so the maxima betray whether any window needs Caffe's rule; maps without one pay only for
-    # this look at the smaller output.
+    # In torch NaN wins, so the maxima show whether any window needs Caffe's rule. If none does, this check of the
+    # smaller output is the only extra cost.
     if values.numel() and not bool(values.detach().amin() > LOWEST):
         values, indices = _native_max_pool(torch.where(maps > LOWEST, maps, LOWEST), windows)
         indices = torch.where(values > LOWEST, indices, -1)
@@ -118,7 +118,7 @@ def _native_max_pool(maps: torch.Tensor, windows: Windows) -> tuple[torch.Tensor
 def average_pool(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
     """Return the mean of each window; padding counts as zeros.
 
-    A window without a pixel divides zero by what is left of its area, at times zero: NaN, as in Caffe.
+    A window without a pixel is 0 divided by the rest of its area. If that is 0, the result is NaN, as in Caffe.
     """
     if windows.known_to_torch and not is_recorded():  # torch 2.13 compiles its gradient wrong at the rim, in ceil mode
         ceil = windows.round_mode == CEIL
