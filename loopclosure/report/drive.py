@@ -18,7 +18,7 @@ from netspec.files.figures import COLORS, png
 from netspec.files.whole_file import write_whole
 
 BEST, WORST, REJECTED = 4, 3, 3  # number of pairs shown
-IN_WORDS = {"below threshold": "not alike enough", "not verified": "their points do not agree"}
+IN_WORDS = {"below threshold": "not similar enough", "not verified": "their points do not agree"}
 PARTS = 30  # of a drive; the pairs shown differ by at least one part
 OF_PATH = "The path from its known poses; green lines join the two frames of each loop."
 OF_FRAMES = (
@@ -50,7 +50,7 @@ def write_drive(
 def verdict(loops: int, frames: int) -> str:
     """Return a sentence that summarizes the result."""
     if not loops:
-        return f"None of {frames} frames shows a place that was surely seen before"
+        return f"None of {frames} frames shows a place that was certainly seen before"
     return f"{loops} of {frames} frames show a place that was seen before"
 
 
@@ -105,9 +105,9 @@ def _kinds(results: Sequence[LoopResult], recording: ImageSequence) -> list[Kind
     worst = _spread([r for r in reversed(loops) if r.query_id not in taken], WORST, len(results))
     rejected = _spread(sorted((r for r in there if not r), key=lambda r: -r.score), REJECTED, len(results))
     groups = {
-        ("found", "loops, the surest"): best,
-        ("found", "loops, the least sure"): worst,
-        ("rejected", "not accepted, the most alike"): rejected,
+        ("found", "loops with the highest scores"): best,
+        ("found", "loops with the lowest scores"): worst,
+        ("rejected", "not accepted, with the highest scores"): rejected,
     }
     wanted = {end - first for some in groups.values() for r in some for end in (r.query_id, _match(r))}
     images = {number: image for number, image, _ in recording.frames(wanted)}
