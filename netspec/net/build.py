@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from netspec import log
@@ -106,9 +107,10 @@ def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParam
     """Return the deploy net of a .caffemodel, without its weights, and a map that knows the file only.
 
     Layers that read data, and blobs that no layer makes, become Input layers with the given ``shapes`` (blob -> shape).
-    For a layer that reads cropped images the shape is known: one image, with the channels of the first layer's filters.
-    Layers that need a label, or another blob that is not given, are left out, and so are Split layers, phases and
-    rules. Raises SpecError if a shape is neither given nor known, and for a file that has only weights.
+    For a layer that reads data the shape is known if its source can be read, or if it crops images: one image, with the
+    channels of the first layer's filters. Layers that need a label, or another blob that is not given, are left out,
+    and so are Split layers, phases and rules. Raises SpecError if a shape is neither given nor known, and for a file
+    that has only weights.
     """
     trained, source = parse_net_binary(path)
     where = Where(str(path))
@@ -142,7 +144,9 @@ def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParam
             kept.ClearField(name)
     if len(net.layer) == len(given):
         advice = " or ".join(_advice(inputs))
-        raise SpecError(f"the file does not tell the shape of its input; say {advice}", where)
+        sources = [path for layer in layers if (path := source_of(layer, class_of(layer)))]
+        gone = f', and "{sources[0]}", which it was trained on, cannot be read here' if sources else ""
+        raise SpecError(f"the file does not tell the shape of its input{gone}; say {advice}", where)
     if without:
         blobs = ", ".join(name for name in inputs if name not in given)
         log.logger.warning(f"{path}: left out, since no --shape says what {blobs} is: {', '.join(without)}")
@@ -171,12 +175,24 @@ def _inputs(layers: list[LayerParameter]) -> dict[str, Shape]:
 
 
 def _shape_of_images(reader: LayerParameter, top: str, layers: list[LayerParameter]) -> Shape:
+    read = _shape_of_records(reader) if top == reader.top[0] else ()
     side = reader.transform_param.crop_size
     channels = _channels(top, layers)
     if channels and (reader.transform_param.mean_value or reader.transform_param.scale != 1):
         settings = " ".join(write_text(reader.transform_param).split())
         log.logger.warning(f'the net was trained with transform_param {{ {settings} }} for blob "{top}"')
-    return (1, channels, side, side)
+    return read or (1, channels, side, side)
+
+
+def _shape_of_records(reader: LayerParameter) -> Shape:
+    """Return the shape of the first record of a data layer, as one image; () if its source cannot be read here."""
+    if not os.path.exists(source_of(reader, class_of(reader))):
+        return ()
+    with log.silent(), suppress(SpecError):
+        alone = NetParameter(layer=[reader])
+        net = build_filtered(alone, SourceMap.unknown("", 1), BuildOptions(device="meta"))
+        return (1, *net.layers[0].top_shapes[0][1:])
+    return ()
 
 
 def _channels(blob: str, layers: list[LayerParameter]) -> int:

@@ -1,9 +1,11 @@
 """The net inside a .caffemodel, for weights whose prototxt is lost."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import lmdb
 import numpy as np
 import pytest
 import torch
@@ -13,8 +15,9 @@ from netspec.errors import SpecError
 from netspec.net.build import recover_net
 from netspec.net.weights import net_to_proto
 from netspec.proto.binary import is_net_binary
-from netspec.proto.schema import BlobProto, LayerParameter, NetParameter, V1LayerParameter
+from netspec.proto.schema import BlobProto, Datum, LayerParameter, NetParameter, V1LayerParameter
 from netspec.proto.text import write_text
+from paths import GOLDEN
 
 TRAINED = """
 name: "classifier"
@@ -71,6 +74,19 @@ def test_a_shape_that_the_file_does_not_tell_is_asked_for(trained: Callable[...,
         recover_net("w.caffemodel", {"date": (1, 3, 9, 9)})
     deploy, _ = recover_net("w.caffemodel", {"data": (2, 3, 7, 7), "label": (2,)})
     assert deploy.layer[-1].type == "SoftmaxWithLoss"
+
+
+def test_the_shape_of_records_is_read_where_they_are(trained: Callable[..., Any]):
+    trained("mirror: true")
+    shutil.copytree(GOLDEN / "images" / "lmdb_plain", "gone")
+    deploy, _ = recover_net("w.caffemodel", {})
+    with lmdb.open("gone", readonly=True, lock=False) as records, records.begin() as reading:
+        datum = Datum.FromString(next(iter(reading.cursor()))[1])
+    assert list(deploy.layer[0].input_param.shape[0].dim) == [1, datum.channels, datum.height, datum.width]
+    assert deploy.layer[-1].name == "ip"
+    Path("gone/data.mdb").write_bytes(b"")
+    with pytest.raises(SpecError, match='its input, and "gone", which it was trained on, cannot be read here; say'):
+        recover_net("w.caffemodel", {})
 
 
 @pytest.mark.slow
