@@ -271,7 +271,7 @@ def _plyvel() -> ModuleType:
 class Writer:
     """Writes a new database that appears at its path only when it is complete.
 
-    A context manager: records are put into a hidden folder beside the path, which is renamed at the end, or removed
+    A context manager: records are put into a hidden folder next to the path, which is renamed at the end, or removed
     after an error. Missing parent folders are made. Memory use is constant, and real Caffe reads the result. Raises
     SpecError if the path already exists (as Caffe does) or cannot be written to.
     """

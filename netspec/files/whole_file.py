@@ -1,6 +1,6 @@
 """Files and folders that appear whole or not at all, and locks that end with their process.
 
-What is being written has a hidden name beside its path, ``.NAME.XXXXXXXX.unfinished``, and is locked. A killed run
+What is being written has a hidden name next to its path, ``.NAME.XXXXXXXX.unfinished``, and is locked. A killed run
 leaves it behind, unlocked; the next run that writes into the same folder removes it. Also a check, before a long run,
 whether a file can be written.
 """
@@ -41,7 +41,7 @@ _swept: set[Path] = set()
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary name beside ``path`` to write to; it is renamed once the block is done and all is on disk.
+    """Yield a temporary name next to ``path`` to write to; it is renamed once the block is done and all is on disk.
 
     A symbolic link stays one; a pipe or a device is written to. The new file gets the mode and owner of the old one.
     If the block fails, the temporary file is removed, and what was at ``path`` is still there. Raises SpecError if it
@@ -110,7 +110,7 @@ def safe_cell(value: object) -> object:
 
 @contextmanager
 def whole_folder(path: str | Path) -> Iterator[Path]:
-    """Yield a new folder beside ``path`` to fill; it is renamed once the block is done and all is on disk.
+    """Yield a new folder next to ``path`` to fill; it is renamed once the block is done and all is on disk.
 
     If the block fails, it is removed. Raises OSError if it cannot be made or renamed.
     """

@@ -86,7 +86,7 @@ class Snapshots:
     def restore(self, path: str | Path) -> None:
         """Resume from a .solverstate or .solverstate.h5, of Caffe or of netspec, and from its weights.
 
-        With the file ``X.solverstate.extra`` beside it the training goes on as if it had never stopped; without it, as
+        With the file ``X.solverstate.extra`` next to it the training goes on as if it had never stopped; without it, as
         in Caffe, the data layers start again at their first record. Raises SpecError, and changes nothing, if the state
         does not fit this solver's type and net.
         """

@@ -124,7 +124,7 @@ def test_trainings_are_compared_with_the_program_caffe_too(tmp_path: Path, capsy
     assert "/ pytorch | / caffe" in capsys.readouterr().out
 
 
-def test_what_cannot_run_is_told_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_run_is_reported_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     net = tmp_path / "net.prototxt"
     net.write_text('layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 2 } } }')
     assert main(["forward", str(net), "--with", "pytorch", "--rounds", "1"]) == 0
@@ -180,7 +180,7 @@ def test_what_keeps_growth_from_being_measured_is_said(capsys: pytest.CaptureFix
 
 
 @pytest.mark.slow
-def test_waiting_for_data_is_told_for_each_source(
+def test_waiting_for_data_is_reported_for_each_source(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     pytest.importorskip("plyvel")

@@ -1,4 +1,4 @@
-"""What layers offer beside their forward pass is described once, by protocols; Layer itself has none of it."""
+"""What layers offer in addition to their forward pass is described once, by protocols; Layer itself has none of it."""
 
 import ast
 import inspect

@@ -89,16 +89,16 @@ def _faults(seed: int) -> Iterator[str]:
         except Exception as fault:
             yield f"seed {seed}: {way}: {type(fault).__name__}: {fault}\n{text}"
             continue
-        told = _differs(first, second)
+        reported = _differs(first, second)
         drawn_otherwise = "Dropout" in text and way != "prepared"  # numbers are drawn in the order of memory
-        if told and not drawn_otherwise:
-            yield f"seed {seed}: {way} differs from autograd: {told}\n{text}"
+        if reported and not drawn_otherwise:
+            yield f"seed {seed}: {way} differs from autograd: {reported}\n{text}"
 
 
 @pytest.mark.slow
 def test_random_nets_learn_alike_in_every_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    found = [told for seed in range(SEED, SEED + COUNT) for told in _faults(seed)]
-    faults = [told for told in found if not told.startswith("refused")]
+    found = [reported for seed in range(SEED, SEED + COUNT) for reported in _faults(seed)]
+    faults = [reported for reported in found if not reported.startswith("refused")]
     assert not faults, "\n".join([f"{len(faults)} faults", *faults[:3]])
     assert len(found) < COUNT / 3, found[:3]

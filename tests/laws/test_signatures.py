@@ -144,7 +144,7 @@ def test_every_public_function_is_called_here() -> None:
 @pytest.mark.parametrize(("function", "name"), parameters("Iterable[str", "Collection[str", "Sequence[str"))
 def test_one_text_is_one_of_several(function: Callable[..., Any], name: str) -> None:
     one = ONE_OF_SEVERAL[name]
-    assert told(CALLS[function](**{name: one})) == told(CALLS[function](**{name: [one]}))
+    assert reported(CALLS[function](**{name: one})) == reported(CALLS[function](**{name: [one]}))
 
 
 @pytest.mark.parametrize(("function", "name"), parameters("str"))
@@ -162,10 +162,10 @@ def test_a_phase_is_a_number_that_there_is() -> None:
         netspec.load_net("net.prototxt", phase=7)
 
 
-def told(result: Any) -> Any:
+def reported(result: Any) -> Any:
     """Return what one can compare of a result."""
     if isinstance(result, Solver):
-        return told(result.net), list(result.param.weights), result.options.devices
+        return reported(result.net), list(result.param.weights), result.options.devices
     if isinstance(result, Net):
         return [node.name for node in result.plan.nodes], result.options.stages, result.options.passes
     if isinstance(result, caffe.Net):

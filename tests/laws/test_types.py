@@ -1,4 +1,4 @@
-"""Types: pyright finds nothing. It is a test so that it runs beside the others."""
+"""Types: pyright finds nothing. It is a test so that it runs compared with the others."""
 
 import subprocess
 import sys

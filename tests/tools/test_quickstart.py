@@ -74,7 +74,7 @@ def test_started_again_it_deletes_nothing(project: Path, tmp_path: Path) -> None
     assert "clone/out/quickstart-3" in start(project, tmp_path)[-1]
 
 
-def test_a_step_that_fails_is_told(project: Path) -> None:
+def test_a_step_that_fails_is_reported(project: Path) -> None:
     (project / ".venv" / "bin" / "loopclosure").write_text("#!/bin/sh\necho no such net >&2; exit 1\n")
     done = quickstart(project, project)
     assert done.returncode == 1

@@ -198,7 +198,7 @@ def _surplus(net: NetParameter, place: Place) -> list[str]:
         found.append(f"{place.find('input_shape', inputs)}: input_shape beyond the {inputs} inputs")
     used = 0 if len(net.input_shape) else 4 * inputs
     if len(net.input_dim) > used:
-        beyond = f"beyond four each of {inputs} inputs" if used else "beside input_shape"
+        beyond = f"beyond four each of {inputs} inputs" if used else "together with input_shape"
         found.append(f"{place.find('input_dim', used)}: input_dim {beyond}")
     return found
 

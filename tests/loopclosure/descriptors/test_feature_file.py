@@ -38,7 +38,7 @@ def test_rows_by_bare_file_names_and_by_absolute_ones(tmp_path):
     np.testing.assert_array_equal(absolute.rows_of(images), ROWS[[1, 0]])
 
 
-def test_equal_file_names_in_two_folders_are_told_apart_by_the_folder(tmp_path):
+def test_equal_file_names_in_two_folders_are_distinguished_by_the_folder(tmp_path):
     names = ["query/1.jpg", "query/2.jpg", "ref/1.jpg", "ref/2.jpg"]
     features = read_features(save(tmp_path / "f.npz", names))
     np.testing.assert_array_equal(features.rows_of([Path("x/ref/1.jpg"), Path("x/query/1.jpg")]), ROWS[[2, 0]])

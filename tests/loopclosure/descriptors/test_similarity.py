@@ -147,7 +147,7 @@ def test_the_whole_image_as_one_patch() -> None:
     np.testing.assert_allclose(normalize_patches(image), (image - image.mean()) / image.std(ddof=1), atol=1e-6)
 
 
-def test_thumbnails_ignore_brightness_and_contrast_unless_told() -> None:
+def test_thumbnails_ignore_brightness_and_contrast_by_default() -> None:
     image = np.random.default_rng(2).integers(0, 100, (48, 64)).astype(np.uint8)
     brighter = 2 * image + 40
     normalized, plain = Thumbnailer(), Thumbnailer(normalize="none")

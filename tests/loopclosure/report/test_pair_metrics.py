@@ -41,7 +41,7 @@ def test_all_or_none_can_be_best():
     assert metrics_at(best_threshold(distances, np.array([0, 0])), distances, np.array([0, 0])).true_negatives == 2
 
 
-def test_neighboring_floats_are_still_told_apart():
+def test_neighboring_floats_are_still_distinguished():
     low = 1.0
     high = np.nextafter(low, 2.0)
     distances, labels = np.array([low, high]), np.array([1, 0])

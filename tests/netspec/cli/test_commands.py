@@ -88,7 +88,7 @@ def test_train_takes_its_arguments_in_each_spelling(run: Run, edited: Edit, word
 
 
 @pytest.mark.parametrize("words", [["train", SOLVER], ["test", "--model", NET]], ids=["train", "test"])
-def test_missing_weights_are_told_before_a_net_is_built(run: Run, words: list[str]) -> None:
+def test_missing_weights_are_reported_before_a_net_is_built(run: Run, words: list[str]) -> None:
     result = run(*words, "--weights", "nope.caffemodel")
     assert result.fault.startswith("nope.caffemodel: cannot be read: No such file or directory; ")
     assert "layer_factory" not in result.err
@@ -98,8 +98,8 @@ def test_missing_weights_are_told_before_a_net_is_built(run: Run, words: list[st
 def test_a_solver_without_max_iter_is_not_trained(run: Run, edited: Edit) -> None:
     """Caffe trains nothing and ends well; load_solver and step(n) need none."""
     solver = edited(SOLVER, "max_iter: 60", "")
-    told = "has no max_iter, so there is nothing to train; add max_iter: N, the number of iterations"
-    assert run("train", solver).fault == f"{solver}: {told}"
+    reported = "has no max_iter, so there is nothing to train; add max_iter: N, the number of iterations"
+    assert run("train", solver).fault == f"{solver}: {reported}"
 
 
 def test_quiet_is_no_log_and_every_warning(run: Run, edited: Edit) -> None:

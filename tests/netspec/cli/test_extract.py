@@ -229,21 +229,21 @@ def test_extract_says_in_three_lines_what_it_did(run: Run, images: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("param", "told"),
+    ("param", "reported"),
     [
         ("mean_value: 128 scale: 0.0078125", ", minus 128, times 0.0078125"),
         ("mean_value: 123 mean_value: 104 mean_value: 123", ", minus 123, 104, 123"),
         ("mirror: true", ""),
     ],
 )
-def test_extract_says_what_it_does_to_the_pixels(run: Run, images: Path, param: str, told: str) -> None:
+def test_extract_says_what_it_does_to_the_pixels(run: Run, images: Path, param: str, reported: str) -> None:
     Path("net.prototxt").write_text(
         'layer { name: "in" type: "DummyData" top: "data" dummy_data_param { shape { dim: 1 dim: 3 dim: 9 dim: 9 } } '
         f"transform_param {{ {param} }} }}"
     )
     words = ["--model", "net.prototxt", "--blob", "data", "--images", images / "rgb", "--out", "f.npz"]
     pixels = run("extract", *words).out.splitlines()[1]
-    assert pixels == f'data (3 x 9 x 9): BGR, 0 to 255{told} (transform_param of layer "in")'
+    assert pixels == f'data (3 x 9 x 9): BGR, 0 to 255{reported} (transform_param of layer "in")'
 
 
 def test_extract_says_how_many_records_it_read(run: Run) -> None:
@@ -326,8 +326,8 @@ def test_extract_features_writes_what_caffes_did(run: Run) -> None:
     result = run("extract_features", INIT, NET, "feat,sim", "feat_lmdb,sim_lmdb", 4, "lmdb", "CPU")
     assert result.status == 0
     golden = (GOLDEN / "log" / "extract_features.log").read_text().splitlines()
-    told = [line for line in result.messages if "blob sim" not in line]
-    assert told == [line.partition("] ")[2] for line in golden]
+    reported = [line for line in result.messages if "blob sim" not in line]
+    assert reported == [line.partition("] ")[2] for line in golden]
     ours, caffes = open_reader("feat_lmdb"), open_reader(str(GOLDEN / "features" / "feat_lmdb"))
     assert len(ours) == len(caffes) == 200
     for i in range(200):

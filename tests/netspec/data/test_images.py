@@ -38,7 +38,7 @@ def test_a_gray_image_has_one_channel_also_when_resized() -> None:
     assert read_image(str(PNG / "0.png"), color=False, size=(5, 6)).shape == (1, 5, 6)
 
 
-def test_a_missing_and_a_broken_image_are_told_apart(tmp_path: Path) -> None:
+def test_a_missing_and_a_broken_image_are_distinguished(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r'image ".*nix.png" cannot be read: No such file'):
         read_image(str(tmp_path / "nix.png"))
     (tmp_path / "text.png").write_text("hello")

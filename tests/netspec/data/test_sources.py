@@ -200,9 +200,9 @@ def test_of_records_longer_than_their_shape_the_first_numbers_are_read(
         np.frombuffer(each.data, np.uint8) if each.data else each.float_data for each in map(parse_datum, records)
     ]
     assert (data == np.stack([np.array(each[:24], np.float32).reshape(2, 3, 4) for each in stored])).all()
-    told = [each.getMessage() for each in caplog.records if "only the first values" in each.getMessage()]
-    assert len(told) == (max(map(len, stored)) > 24)
-    assert all(message.startswith("net.prototxt:9:5: a record contains ") for message in told)
+    reported = [each.getMessage() for each in caplog.records if "only the first values" in each.getMessage()]
+    assert len(reported) == (max(map(len, stored)) > 24)
+    assert all(message.startswith("net.prototxt:9:5: a record contains ") for message in reported)
 
 
 @pytest.mark.parametrize("ranks", [1, 3])

@@ -1,4 +1,4 @@
-"""SSD's AnnotatedData beside plain loops, and pictures whose boxes must stay on what they show."""
+"""SSD's AnnotatedData compared with plain loops, and pictures whose boxes must stay on what they show."""
 
 import itertools
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The building blocks of many forks, each beside plain loops."""
+"""The building blocks of many forks, each compared with plain loops."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""SSD's DetectionEvaluate beside plain loops, its average precision, and a small SSD trained and tested end to end."""
+"""SSD's DetectionEvaluate compared with plain loops, its average precision, and a small SSD from training to test."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Faster R-CNN's layers that were Python code: beside plain loops, and a training whose losses fall."""
+"""Faster R-CNN's layers that were Python code: compared with plain loops, and a training whose losses fall."""
 
 from collections.abc import Callable
 from pathlib import Path

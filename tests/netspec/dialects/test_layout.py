@@ -1,4 +1,4 @@
-"""Layers that only move numbers, beside plain loops over their indices."""
+"""Layers that only move numbers, compared with plain loops over their indices."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""MultiBoxLoss beside the loss summed up prior by prior, and its oddities one by one."""
+"""MultiBoxLoss compared with the loss summed up prior by prior, and its oddities one by one."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""The layers of R-CNN and R-FCN beside plain loops over pixels."""
+"""The layers of R-CNN and R-FCN compared with plain loops over pixels."""
 
 import math
 from collections.abc import Callable

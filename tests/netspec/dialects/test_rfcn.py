@@ -1,4 +1,4 @@
-"""R-FCN's losses of the hardest examples, beside plain loops over regions."""
+"""R-FCN's losses of the hardest examples, compared with plain loops over regions."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Ristretto's layers beside Caffe's on numbers that were rounded by hand."""
+"""Ristretto's layers compared with Caffe's on numbers that were rounded by hand."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""SSD's layers beside plain loops over single boxes."""
+"""SSD's layers compared with plain loops over single boxes."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""SSD's VideoData beside the frames that OpenCV reads, and told apart from the VideoData of temporal segments."""
+"""SSD's VideoData compared with the frames that OpenCV reads, and with the VideoData of temporal segments."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The layers that read text, beside the sum over all paths that the paper defines."""
+"""The layers that read text, compared with the sum over all paths that the paper defines."""
 
 import sys
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""YOLO's detections beside plain loops over the cells of its maps."""
+"""YOLO's detections compared with plain loops over the cells of its maps."""
 
 from collections.abc import Callable
 

@@ -61,7 +61,7 @@ def test_who_imports_scipys_linalg_afterwards_finds_all_of_it() -> None:
         ("Haswell", "small", []),
     ],
 )
-def test_other_kernels_are_told(
+def test_other_kernels_are_reported(
     kernels: str,
     exact: str,
     said: list[str],

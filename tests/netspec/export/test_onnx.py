@@ -231,8 +231,8 @@ def test_what_is_done_to_images_is_part_of_the_model(name: str, net_of: Callable
     mean = mean[:, 1:13, 1:11] if mean.ndim == 3 else mean.reshape(-1, 1, 1)
     expected = here(net, {"data": np.ascontiguousarray((done - mean) * np.float32(steps.scale))})
     assert_same(in_onnxruntime(model, {"data": images}), expected)
-    (told,) = [each.value for each in model.metadata_props if each.key == "netspec.input"]
-    assert told.startswith(f"data: {'uint8' if steps.uint8 else 'float32'} (N, C, H, W), ")
+    (reported,) = [each.value for each in model.metadata_props if each.key == "netspec.input"]
+    assert reported.startswith(f"data: {'uint8' if steps.uint8 else 'float32'} (N, C, H, W), ")
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Convolution, Deconvolution, Im2col and Crop beside plain loops, at random settings; their corners; their refusals."""
+"""Convolution, Deconvolution, Im2col and Crop compared with plain loops at random settings; corner cases; errors."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Pooling and SPP beside Caffe's loops written plainly, at random settings; the oddities by name; the refusals."""
+"""Pooling and SPP compared with Caffe's loops written plainly, at random settings; corner cases; errors."""
 
 import math
 

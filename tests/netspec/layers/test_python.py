@@ -99,7 +99,7 @@ def test_first_example_as_a_net(python, tmp_path: Path) -> None:
     assert net(data=np.ones((4, 4, 4, 4), np.float32))["three"].shape == (4, 4, 4, 4)
 
 
-def test_second_example_of_caffe_is_told_which_bottoms_want_a_gradient(python) -> None:
+def test_second_example_of_caffe_gets_which_bottoms_want_a_gradient(python) -> None:
     layer = python("Euclidean", (4, 3), (4, 3))
     a, b = torch.randn(4, 3, requires_grad=True), torch.randn(4, 3, requires_grad=True)
     loss = layer.run(a, b)[0]

@@ -82,9 +82,9 @@ def test_hdf5_weights_that_caffe_would_not_load_are_warned_of(
         f'layer {{ name: "{name}" type: "InnerProduct" bottom: "x" top: "y" inner_product_param {{ num_output: 1 }} }}'
     )
     save_weights(net, tmp_path / f"w.caffemodel{ending}")
-    told = [record.getMessage() for record in caplog.records if "Caffe loads no weights" in record.getMessage()]
-    assert len(told) == warned
-    assert all("a/b" in text and "BINARYPROTO" in text for text in told)
+    reported = [record.getMessage() for record in caplog.records if "Caffe loads no weights" in record.getMessage()]
+    assert len(reported) == warned
+    assert all("a/b" in text and "BINARYPROTO" in text for text in reported)
 
 
 def test_the_hdf5_form_has_caffes_structure(golden_net, tmp_path: Path):

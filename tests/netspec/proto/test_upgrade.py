@@ -238,7 +238,7 @@ def test_input_without_a_shape_among_others_is_refused(text: str, message: str) 
         ('\ninput: "a"', "f:2:1: input without input_shape or input_dim is not used"),
         ('input: "a"\ninput_dim: [1, 2, 3, 4,\n5]', "f:3:1: input_dim beyond four each of 1 inputs is not used"),
         ('input: "a" input_shape {}\ninput_shape {}', "f:2:1: input_shape beyond the 1 inputs is not used"),
-        ('input: "a" input_shape {}\ninput_dim: 1', "f:2:1: input_dim beside input_shape is not used"),
+        ('input: "a" input_shape {}\ninput_dim: 1', "f:2:1: input_dim together with input_shape is not used"),
     ],
 )
 def test_input_fields_that_are_not_used_are_named(text: str, message: str, caplog: pytest.LogCaptureFixture) -> None:

@@ -284,9 +284,9 @@ def test_runs_of_many_sizes_take_little_more_memory_than_one(tmp_path: Path) -> 
                 net(c0=torch.ones(size, 32, 40, 40))
             grown.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
         print(max(grown) - grown[0])"""
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=True)
+    reported = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=True)
     one_run = 3 * 4 * 70 * 32 * 40 * 40  # bytes: the input, a bottom and a top
-    assert int(told.stdout) < 3 * one_run
+    assert int(reported.stdout) < 3 * one_run
 
 
 def test_nets_that_train_are_not_prepared(net_of: Callable[..., Net]) -> None:

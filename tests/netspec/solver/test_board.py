@@ -57,4 +57,4 @@ def test_faults(run: Run, solver: Callable[[int], str], monkeypatch: pytest.Monk
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     result = run("train", solver(1), "--tensorboard", "board")
     assert result.fault == "--tensorboard needs an extra package: pip install 'netspec-caffe[tensorboard]'"
-    assert result.err.count("\n") == 1, "it is told before the net's log"
+    assert result.err.count("\n") == 1, "it is reported before the net's log"

@@ -106,7 +106,7 @@ def test_a_file_is_read_once_however_many_nets_it_holds(monkeypatch: pytest.Monk
     assert read == ["s.prototxt", "a.prototxt", "b.prototxt"]
 
 
-def test_every_fault_is_told_to_who_asks_for_all():
+def test_every_fault_is_reported_if_all_are_collected():
     Path("broken.prototxt").write_text("layer {")
     text = """net: "gone.prototxt" train_net: "broken.prototxt"
 test_net: "broken.prototxt" test_net: "missing.prototxt"

@@ -66,7 +66,7 @@ def test_an_unknown_precision_is_refused(work_in: Callable[..., Path]) -> None:
 
 
 @pytest.mark.parametrize(("precision", "has_it", "said"), [(BF16, False, 1), (BF16, True, 0), (FP32, False, 0)])
-def test_a_cpu_without_bf16_is_told_of(
+def test_a_cpu_without_bf16_is_reported(
     precision: str,
     has_it: bool,
     said: int,

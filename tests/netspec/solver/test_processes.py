@@ -107,8 +107,8 @@ def wait_for_training(started: "subprocess.Popen[str]") -> None:
 
 def test_two_processes_follow_one_with_twice_the_batch() -> None:
     write(batch=8, iterations=50)
-    told = train()
-    assert told.count("Iteration 20, Testing net (#0)") == 1, "one log"
+    reported = train()
+    assert reported.count("Iteration 20, Testing net (#0)") == 1, "one log"
     assert sorted(p.name for p in Path().glob("x_*")) == [
         "x_iter_50.caffemodel",
         "x_iter_50.solverstate",
@@ -168,13 +168,13 @@ def test_a_killed_process_ends_the_training_and_the_last_snapshot_is_whole() -> 
             assert time.monotonic() < end, "no snapshot was taken"
             time.sleep(0.05)
         os.kill(other, signal.SIGKILL)
-        _, told = started.communicate(timeout=LIMIT)
+        _, reported = started.communicate(timeout=LIMIT)
     finally:
         end_all(started)
     assert started.returncode != 0
-    lines = [line for line in told.splitlines() if "rank 0 of 2" in line]
+    lines = [line for line in reported.splitlines() if "rank 0 of 2" in line]
     (state,) = Path().glob("x_iter_*.solverstate")
-    assert len(lines) == 1, told
+    assert len(lines) == 1, reported
     assert re.fullmatch(r"rank 0 of 2: another process ended.*; the last snapshot is (.*); start .*--resume", lines[0])
     assert str(state) in lines[0]
     assert newest_pair("x") == state
@@ -191,18 +191,18 @@ def test_who_is_asked_to_end_does_not_wait_for_a_process_that_stands_still() -> 
         os.kill(other, signal.SIGSTOP)
         os.kill(process_of_rank(0, started.pid), signal.SIGTERM)
         assert started.stderr is not None
-        told = next(line for line in started.stderr if line.startswith("rank 0 of 2"))
-        assert "another process ended, or has not answered for 15 seconds" in told
+        reported = next(line for line in started.stderr if line.startswith("rank 0 of 2"))
+        assert "another process ended, or has not answered for 15 seconds" in reported
         assert any(f"Sending process {other} closing signal" in line for line in started.stderr), "it ended by itself"
     finally:
         end_all(started)
 
 
-def test_a_fault_of_the_files_is_told_once() -> None:
+def test_a_fault_of_the_files_is_reported_once() -> None:
     write(batch=8, iterations=10)
     Path("net.prototxt").write_text(Path("net.prototxt").read_text().replace("Convolution", "Convolutoin", 1))
-    told = train(status=1)
-    assert len([line for line in told.splitlines() if line.startswith("net.prototxt:")]) == 1, told
+    reported = train(status=1)
+    assert len([line for line in reported.splitlines() if line.startswith("net.prototxt:")]) == 1, reported
 
 
 def test_a_gpu_is_not_chosen_where_torchrun_chooses() -> None:

@@ -212,9 +212,9 @@ OTHERWISE = [
 ]
 
 
-@pytest.mark.parametrize(("changed", "options", "told"), OTHERWISE, ids=[told for *_, told in OTHERWISE])
+@pytest.mark.parametrize(("changed", "options", "reported"), OTHERWISE, ids=[reported for *_, reported in OTHERWISE])
 def test_what_changes_the_numbers_is_said(
-    changed: dict[str, str], options: Any, told: str, warnings: Callable[[], list[str]]
+    changed: dict[str, str], options: Any, reported: str, warnings: Callable[[], list[str]]
 ) -> None:
     write(NETS["crop and mirror"], "iter_size: 2 random_seed: 3")
     shutil.copytree("db", "copy")
@@ -225,7 +225,7 @@ def test_what_changes_the_numbers_is_said(
     load_solver("solver.prototxt", snapshot=state, **options)
     (said,) = [line for line in warnings() if line.startswith(state)]
     assert said.startswith(f"{state}.extra: the training goes on with other numbers: ")
-    assert told in said
+    assert reported in said
 
 
 def test_a_state_of_when_trainings_could_be_compiled() -> None:

@@ -409,14 +409,14 @@ def test_a_net_can_have_attributes(net_of: Callable[..., Any]) -> None:
     assert net.mean == 5
 
 
-def test_hooks_are_told_each_layer(net_of: Callable[..., caffe.Net]) -> None:
+def test_hooks_get_each_layer(net_of: Callable[..., caffe.Net]) -> None:
     net = net_of(PYRAMID)
-    told: list[tuple[str, int]] = []
+    reported: list[tuple[str, int]] = []
     for which in ("before_forward", "after_forward", "before_backward", "after_backward"):
-        getattr(net, which)(lambda layer, which=which: told.append((which, layer)))
+        getattr(net, which)(lambda layer, which=which: reported.append((which, layer)))
     net.forward(start="pool1", end="pool1_pool1_0_split")
     net.backward(start="pool1", end="pool1")
-    assert told == [
+    assert reported == [
         ("before_forward", 3), ("after_forward", 3), ("before_forward", 4), ("after_forward", 4),
         ("before_backward", 3), ("after_backward", 3),
     ]  # fmt: skip

@@ -153,14 +153,15 @@ def test_settings_can_be_changed(solver: caffe.SGDSolver) -> None:
 
 
 def test_callbacks(solver: caffe.SGDSolver) -> None:
-    told = []
+    reported = []
     weights = solver.net.params["scores"][0].data
     before = weights.copy()
     solver.add_callback(
-        lambda: told.append("start"), lambda: told.append(("ready", solver.iter, bool((weights == before).all())))
+        lambda: reported.append("start"),
+        lambda: reported.append(("ready", solver.iter, bool((weights == before).all()))),
     )
     solver.step(1)
-    assert told == ["start", ("ready", 0, True)]
+    assert reported == ["start", ("ready", 0, True)]
     assert not (weights == before).all()
 
 

@@ -227,7 +227,7 @@ def test_a_library_that_fails_is_replaced(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
-def test_a_cache_that_cannot_be_written_is_told(
+def test_a_cache_that_cannot_be_written_is_reported(
     engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture
 ) -> None:
     Path("file").write_text("")
@@ -284,12 +284,12 @@ def test_a_net_that_reads_records_scores_and_extracts_the_same(
 ) -> None:
     work_in("snapshot", "sgd_step")
     words = ["--model", "sgd_step/train_val.prototxt", "--weights", "sgd_step/init.caffemodel"]
-    told = []
+    reported = []
     for options in ([], ["--engine", engine, "--cache", str(tmp_path / "kept")]):
         assert main(["test", *words, "--iterations", "3", *options]) == 0
-        told.append([line.split("] ")[1] for line in capsys.readouterr().err.splitlines() if "loss = " in line])
-    assert len(told[0]) > 3
-    numbers = [[float(line.split("loss = ")[1].split()[0]) for line in lines] for lines in told]
+        reported.append([line.split("] ")[1] for line in capsys.readouterr().err.splitlines() if "loss = " in line])
+    assert len(reported[0]) > 3
+    numbers = [[float(line.split("loss = ")[1].split()[0]) for line in lines] for lines in reported]
     np.testing.assert_allclose(numbers[1], numbers[0], rtol=1e-4)
     plain = extract_records(netspec.load_net(words[1], weights=words[3]), ["feat"])
     assert main(["extract", *words, "--blob", "feat", "--out", "f.npz", "--engine", engine, "--cache", "none"]) == 0
@@ -303,14 +303,14 @@ def test_a_net_that_reads_records_scores_and_extracts_the_same(
 def test_time_is_of_the_whole_forward_pass(engine: str, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["time", "--model", "net.prototxt", "--phase", "TEST", "--iterations", "2", "--engine", engine]
     assert main(words) == 0
-    told = capsys.readouterr().err
-    assert "Average Forward pass: " in told
-    assert "backward" not in told.partition("Benchmark begins")[2]
+    reported = capsys.readouterr().err
+    assert "Average Forward pass: " in reported
+    assert "backward" not in reported.partition("Benchmark begins")[2]
     words[4] = "TRAIN"
     assert main(words) == 0
-    told = capsys.readouterr().err
-    assert f"engine {engine}: it runs nets in phase TEST, this one is in TRAIN; torch runs the net" in told
-    assert "Average Backward pass: " in told
+    reported = capsys.readouterr().err
+    assert f"engine {engine}: it runs nets in phase TEST, this one is in TRAIN; torch runs the net" in reported
+    assert "Average Backward pass: " in reported
 
 
 def test_a_describer_takes_an_engine(engine: str, files: Path) -> None:

@@ -42,7 +42,7 @@ def test_the_variable_that_torch_sets_does_not_stay(before: str | None, monkeypa
     assert os.environ.get("PIP_DISABLE_PIP_VERSION_CHECK") == before
 
 
-def test_the_home_folder_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_home_folder_is_not_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NETSPEC_SHARED", f"{Path.home()}/x")
     assert "NETSPEC_SHARED: ~/x\n" in bug_report([])
 

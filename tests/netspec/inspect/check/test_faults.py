@@ -179,7 +179,7 @@ SHAPES = {
 
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize("name", FOUND_IN_DATA)
-def test_check_opens_data_only_where_it_is_told_to(run: Run, name: str) -> None:
+def test_check_opens_data_only_if_asked(run: Run, name: str) -> None:
     write_case(FOUND_IN_DATA[name])
     shutil.rmtree("db")
     words = next((words for kind, words in SHAPES.items() if f'type: "{kind}"' in Path("net.prototxt").read_text()), [])

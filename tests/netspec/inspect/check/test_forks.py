@@ -96,12 +96,12 @@ def test_an_unknown_field_hides_nothing_elsewhere():
     for line, word in (pair.split(":") for pair in expected):
         assert any(fault.startswith(f"net.prototxt:{line}:") and word in fault for fault in found), word
     Path("solver.prototxt").write_text('net: "net.prototxt" base_lr: 1 lr_policy: "fixed" fast: true')
-    told = lines("solver.prototxt")
-    assert any('SolverParameter has no field "fast"' in fault for fault in told)
-    assert set(found) <= set(told)
+    messages = lines("solver.prototxt")
+    assert any('SolverParameter has no field "fast"' in fault for fault in messages)
+    assert set(found) <= set(messages)
 
 
-def test_what_is_meant_is_told_by_what_differs():
+def test_what_is_meant_follows_from_what_differs():
     for field, meant in (("spatial_wta_param", ""), ("pooling_parm", "pooling_param"), ("pool_param", "pooling_param")):
         Path("net.prototxt").write_text(f'{INPUT}layer {{ name: "s" type: "ReLU" {field} {{ }} }}')
         assert ("did you mean" in lines("net.prototxt")[0], meant in lines("net.prototxt")[0]) == (bool(meant), True)

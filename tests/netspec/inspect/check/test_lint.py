@@ -135,10 +135,12 @@ def test_nothing_is_said_of_a_sound_solver(advice: Callable[..., list[str]]) -> 
 def test_a_test_on_what_the_net_is_trained_on(advice: Callable[..., list[str]]) -> None:
     source = str(GOLDEN / "pairs" / "train_lmdb")
     tested = SOLVER + "test_interval: 10\ntest_iter: 30\n"
-    told = 'layer "d" (Data): the test reads "%s", which the net is trained on; name another database'
-    assert [line.partition(": ")[2] for line in advice(in_phases(siamese(source=source)), tested)] == [told % source]
+    reported = 'layer "d" (Data): the test reads "%s", which the net is trained on; name another database'
+    assert [line.partition(": ")[2] for line in advice(in_phases(siamese(source=source)), tested)] == [
+        reported % source
+    ]
     same = siamese(source=source)
-    assert f"net.prototxt:2:16: {told % source}" in advice(same, tested, open_data=True)
+    assert f"net.prototxt:2:16: {reported % source}" in advice(same, tested, open_data=True)
     assert advice(same, SOLVER) == [
         f'net.prototxt:2:16: layer "d" (Data): a test would read "{source}" too, which the net is trained on; '
         "give phase TEST a data layer"

@@ -80,7 +80,7 @@ def test_the_command_writes_png_svg_and_html(run: Run_) -> None:
     assert 0 < curves["left"] < curves["right"] < 1
 
 
-def test_equal_names_are_told_apart_by_their_folders(run: Run_) -> None:
+def test_equal_names_are_distinguished_by_their_folders(run: Run_) -> None:
     for folder in "ab":
         Path(folder).mkdir()
         Path(folder, "train.log").write_bytes(CAFFES.read_bytes())
