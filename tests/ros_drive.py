@@ -43,7 +43,7 @@ def main(folder, odometry, out):
     images = rospy.Publisher("image", Image, queue_size=100)
     while not (odom.get_num_connections() and images.get_num_connections()):
         time.sleep(0.1)
-    for i, path in enumerate(sequence.images):
+    for i, path in enumerate(sequence.paths):
         stamp = rospy.Time.from_sec(1000 + i / 2)
         message = Odometry()
         message.header.stamp = stamp
