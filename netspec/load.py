@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from netspec.errors import SpecError, several
 from netspec.exact import SMALL
-from netspec.graph.options import PASSES, BuildOptions
+from netspec.graph.options import FP32, PASSES, TORCH, BuildOptions
 from netspec.proto.schema import phase_of
 
 if TYPE_CHECKING:
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from netspec.net.net import Net
     from netspec.run.speed import Speed
     from netspec.solver.solver import Solver
-
-TORCH, FP32 = "torch", "fp32"
 
 
 def speed() -> Speed | None:

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import argparse
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from netspec import log
 from netspec.errors import SpecError
 from netspec.exact import CHOICES, SMALL
-from netspec.export.engines.choice import BF16, ENGINES, FP32, OPENVINO, PRECISIONS, TORCH, Choice
 from netspec.files.limits import read_amount
-from netspec.graph.options import PASSES, BuildOptions
+from netspec.graph.options import BF16, ENGINES, FP32, OPENVINO, PASSES, PRECISIONS, TORCH, BuildOptions
 from netspec.load import speed
 from netspec.proto.binary import split_paths
 from netspec.proto.forks import use_dialect
 from netspec.proto.schema import PHASES
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.parser import CAFFES_LOG
+
+if TYPE_CHECKING:
+    from netspec.export.engines.choice import Choice
 
 # How values are read
 
@@ -237,6 +239,8 @@ def model(arguments: argparse.Namespace) -> str:
 
 def choice(arguments: argparse.Namespace) -> Choice:
     """Return the engine that is asked for."""
+    from netspec.export.engines.choice import Choice
+
     engine, _, precision = arguments.engine.partition(",")
     if engine == TORCH:
         refuse(arguments, ("cache",), f"is for engines that run exported nets; {TORCH} does not")
@@ -310,9 +314,8 @@ def load_weights(net: Any, paths: str | None, strict: bool) -> None:
 
 def run_by(net: Any, arguments: argparse.Namespace, weights: str | None) -> Any:
     """Return the net of ``--model`` as the chosen engine runs it; ``weights`` are those that were loaded."""
-    chosen = choice(arguments)
-    if (chosen.engine, chosen.precision) == (TORCH, FP32):
+    if arguments.engine == TORCH and arguments.precision in (None, FP32) and not arguments.cache:
         return net
     from netspec.export.engines.net import with_engine
 
-    return with_engine(net, chosen, model(arguments), split_paths(weights) if weights else [])
+    return with_engine(net, choice(arguments), model(arguments), split_paths(weights) if weights else [])

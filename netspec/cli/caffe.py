@@ -34,7 +34,7 @@ from netspec.cli.arguments import (
     stages,
 )
 from netspec.errors import SpecError
-from netspec.inspect.logs.scores import Score, Scores, Snapshot, read_scores
+from netspec.files.scores import Score, Scores, Snapshot, read_scores
 from netspec.proto.binary import check_readable, split_paths
 from netspec.terminal.commands import DONE, FAULT, WrongUsage
 from netspec.terminal.parser import Commands

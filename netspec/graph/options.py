@@ -9,6 +9,8 @@ from typing import Any
 from netspec.errors import check_choice, several
 from netspec.exact import CHOICES, SMALL
 
+TORCH, ONNXRUNTIME, OPENVINO = ENGINES = ("torch", "onnxruntime", "openvino")  # what may run a net
+FP32, BF16 = PRECISIONS = ("fp32", "bf16")  # in what numbers
 FOLD, FUSE, SKIP, PACK = PASSES = ("fold", "fuse", "skip", "pack")  # netspec/fast/steps.py says what they do
 
 

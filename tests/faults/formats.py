@@ -39,9 +39,9 @@ from netspec.data.mean import read_mean, read_mean_option, write_mean
 from netspec.data.windows import read_window_file
 from netspec.errors import SpecError, raise_fault
 from netspec.files.image_list import list_images
+from netspec.files.scores import Score, Scores, Snapshot, read_scores
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
-from netspec.inspect.logs.scores import Score, Scores, Snapshot, read_scores
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.sealed import Digest, sealed

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from paths import ROOT
+from paths import GOLDEN, ROOT
 
 pytestmark = pytest.mark.slow
 
@@ -92,6 +92,27 @@ def test_what_needs_a_wing_says_so_when_it_is_asked_for(missing: str, asked: str
     program = folder / "program.py"
     program.write_text(f"import netspec\ntry:\n    {asked}\nexcept netspec.SpecError as fault:\n    print(fault)\n")
     assert message in run(program, folder)
+
+
+def test_the_commands_of_the_core_alone(tmp_path: Path) -> None:
+    """It trains as the whole does; a command of a wing says in one line what it lacks."""
+    folder = copy_without(WINGS, tmp_path)
+    for part in ("train/sgd_step", "pairs"):
+        shutil.copytree(GOLDEN / part, folder / Path(part).name)
+    program = folder / "program.py"
+    program.write_text("import sys\nfrom netspec.cli import main\nprint(main(sys.argv[1:]))\n")
+    assert run(program, folder, "train", "--solver", "sgd_step/solver.prototxt", "-q") == "0\n"
+    trained = (folder / "sgd_step" / "ref_iter_60.caffemodel").read_bytes()
+    subprocess.run(
+        [sys.executable, "-m", "netspec", "train", "--solver", "sgd_step/solver.prototxt", "-q"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1"},
+        check=True,
+    )
+    assert (folder / "sgd_step" / "ref_iter_60.caffemodel").read_bytes() == trained
+    program.write_text("import sys\nsys.stderr = sys.stdout\nfrom netspec.cli import main\nmain(sys.argv[1:])\n")
+    line = "this command needs netspec/export, which was removed from this installation\n"
+    assert run(program, folder, "export", "sgd_step/train_val.prototxt", "--to", "onnx", "--out", "x.onnx") == line
 
 
 def test_the_core_stays_small() -> None:

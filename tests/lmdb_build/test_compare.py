@@ -19,7 +19,7 @@ import forked
 from lmdb_build.cli import main, parser
 from lmdb_build.compare import best_snapshot, read_entry
 from netspec.errors import SpecError
-from netspec.inspect.logs.scores import read_scores
+from netspec.files.scores import read_scores
 from paths import GOLDEN, ROOT
 
 pytestmark = pytest.mark.slow

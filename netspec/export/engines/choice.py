@@ -8,9 +8,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from netspec.errors import SpecError, check_choice
+from netspec.graph.options import ENGINES, FP32, ONNXRUNTIME, OPENVINO, PRECISIONS, TORCH
 
-TORCH, ONNXRUNTIME, OPENVINO = ENGINES = ("torch", "onnxruntime", "openvino")
-FP32, BF16 = PRECISIONS = ("fp32", "bf16")
 _NEEDS = {ONNXRUNTIME: ("onnx", "onnxruntime"), OPENVINO: ("onnx", "openvino")}  # modules
 
 

@@ -15,10 +15,11 @@ import numpy as np
 from netspec import log
 from netspec.errors import SpecError
 from netspec.export.engines.cache import entry, key_of
-from netspec.export.engines.choice import FP32, Choice
+from netspec.export.engines.choice import Choice
 from netspec.export.engines.runners import MODEL, RUNNERS, Arrays, Runner, Unable, open_runner, reason
 from netspec.files.own_folder import inside
 from netspec.files.whole_file import write_whole
+from netspec.graph.options import FP32
 
 WARNINGS, DIFFERENCE = "warnings.txt", "bf16.txt"  # lines that are logged each time the model is opened
 Export = Callable[[Path], None]  # writes the ONNX model to a path, with its weights in the same folder

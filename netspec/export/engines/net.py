@@ -11,12 +11,12 @@ import numpy as np
 import torch
 
 from netspec.data.blobs import Shape
-from netspec.export.engines.choice import TORCH, Choice
+from netspec.export.engines.choice import Choice
 from netspec.export.engines.model import Model, Origin
 from netspec.export.engines.runners import Unable, warn_unable
 from netspec.export.formats.convert import Source
 from netspec.export.formats.onnx import export_onnx
-from netspec.graph.options import BuildOptions
+from netspec.graph.options import TORCH, BuildOptions
 from netspec.layers.contract.exporting import layer_notes
 from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias
 from netspec.layers.contract.reading import reads_data

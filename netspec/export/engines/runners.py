@@ -19,7 +19,8 @@ import numpy as np
 
 from netspec import log
 from netspec.export.engines.cache import processor
-from netspec.export.engines.choice import BF16, FP32, ONNXRUNTIME, OPENVINO, Choice
+from netspec.export.engines.choice import Choice
+from netspec.graph.options import BF16, FP32, ONNXRUNTIME, OPENVINO
 
 _ENOUGH = 64  # bytes: a stack_t has 24
 

@@ -16,14 +16,14 @@ from netspec import log
 from netspec.data.blobs import Shape
 from netspec.data.datum import decode_pixels, planar
 from netspec.errors import SpecError, Where
-from netspec.export.engines.choice import TORCH, Choice
+from netspec.export.engines.choice import Choice
 from netspec.export.engines.model import Model, Origin
 from netspec.export.engines.runners import Unable, warn_unable
 from netspec.files.image_list import ImageList
 from netspec.files.kinds import unreadable
 from netspec.files.opencv import cv2
 from netspec.graph.filter import filter_net, is_input, prune, shapes_of_input, with_state
-from netspec.graph.options import BuildOptions
+from netspec.graph.options import TORCH, BuildOptions
 from netspec.inspect.features.scaling import Steps, middle, scaling_of
 from netspec.load import speed
 from netspec.proto.binary import read_net_binary
