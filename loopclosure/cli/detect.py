@@ -22,7 +22,7 @@ from loopclosure.detector.verification import GeometricCheck
 from loopclosure.detector.visitor import Visitor
 from loopclosure.index.index import INDEXES
 from loopclosure.methods.auto import PRECISION
-from loopclosure.methods.drive import last_session, later_threshold, whole_drive
+from loopclosure.methods.drive import Request, last_session, later_threshold, whole_drive
 from loopclosure.methods.features import WhitenBy
 from loopclosure.places.frames import live_frames
 from loopclosure.places.image_sequence import ImageSequence
@@ -151,13 +151,16 @@ def _detect(a: argparse.Namespace) -> None:
         reasons = [run.verdicts_said(results)]
         if a.threshold is None and not a.resume:
             seconds = a.exclude_seconds or 0.0
-            found = last_session(detector, results, progress=bar, visit=a.exclude_recent, seconds=seconds)
+            found = last_session(
+                detector, results, request=Request(visit=a.exclude_recent, seconds=seconds), progress=bar
+            )
             results, reasons = found.results, [*found.reasons, run.verdicts_said(found.results)]
             detector.decided([result for result in results if result], None)
     elif a.threshold is None and not a.resume:
         precision = PRECISION if a.least_precision is None else a.least_precision
         odometry = _odometry(a.odometry, a.source, recording) if a.odometry else None
-        found = whole_drive(detector, recording, features, precision, bar, odometry, a.exclude_recent)
+        request = Request(precision, a.exclude_recent, odometry=odometry)
+        found = whole_drive(detector, recording, features, request, bar)
         results = found.results
         reasons = [*found.reasons, run.verdicts_said(results)]
         if a.save:
@@ -334,7 +337,7 @@ def _add_all(into: Map, describe: Describe, recordings: list[ImageSequence], ind
 
 
 def _decided(detector: LoopDetector, own: bool = True) -> list[LoopResult]:
-    found = last_session(detector, progress=bar, own=own)
+    found = last_session(detector, own=own, progress=bar)
     for limit in found.limits:
         warn(limit)
     return found.results

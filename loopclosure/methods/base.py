@@ -136,12 +136,10 @@ def compared(
     images: Images,
     metric: str,
     seconds: dict[str, float],
-    notes: Sequence[str] = (),
-    once: tuple[str, ...] = (),
     views: int = 1,
 ) -> MethodResult:
-    """Compare the descriptors (D,) of the tested images, of so many views each; ``once`` are the training stages."""
+    """Compare the descriptors (D,) of the tested images, of so many views each; its time is added to ``seconds``."""
     with timed(seconds, "similarity"):
         queries, references = np.split(np.array(rows), [len(images.queries)])
         scores = similarity_matrix(queries, None if images.references is None else references, metric, views)
-    return MethodResult(scores, seconds, [*notes, f"{len(rows[0])} dimensions, {metric}"], once)
+    return MethodResult(scores, seconds, [f"{len(rows[0])} dimensions, {metric}"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,7 +38,8 @@ class DescribedMethod:
                 rows.append(np.asarray(describe(read_bgr(path)), np.float32).reshape(-1))
             if len(rows[-1]) != len(rows[0]):
                 raise InputError(f"{self.function} gave {len(rows[-1])} numbers, and {len(rows[0])} before", path)
-        return compared(rows, images, self.metric, seconds, once=("loading",), views=views_of(describe, None))
+        result = compared(rows, images, self.metric, seconds, views_of(describe, None))
+        return replace(result, training_stages=("loading",))
 
 
 def described(argument: str, context: MethodContext, inner: Method | None) -> DescribedMethod:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -28,21 +28,39 @@ NOTHING = np.zeros((8, 8), np.uint8)
 MOST_PAIRS = 64_000_000  # of frames that are compared at once, in 0.8 GB
 
 
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a decision on a whole drive.
+
+    precision  the share of the accepted loops that shall be right
+    visit      how many frames a visit to a place lasts, None: found from the scores
+               (:func:`loopclosure.methods.auto.answer`)
+    seconds    how long it lasts at least
+    odometry   poses (frames, 7), NaN where not known; frames that they put far apart are no loop
+    """
+
+    precision: float = PRECISION
+    visit: int | None = None
+    seconds: float = 0.0
+    odometry: np.ndarray | None = None
+
+
+USUAL = Request()
+
+
 def whole_drive(
     detector: LoopDetector,
     recording: ImageSequence,
     features: Features | None = None,
-    precision: float = PRECISION,
+    request: Request = USUAL,
     progress: Progress = silent,
-    odometry: np.ndarray | None = None,
-    visit: int | None = None,
 ) -> Answer:
     """Add every frame of a recording to a new detector, then decide with all of them in view which close loops.
 
-    ``odometry`` are poses (frames, 7), NaN where not known; ``visit`` is that of
-    :func:`loopclosure.methods.auto.answer`. The detector gets these loops.
+    ``request.seconds`` is that of the detector's settings. The detector gets these loops.
     """
     remember_all(detector, recording, features, progress)
+    odometry = request.odometry
     if recording.unreadable and odometry is not None:
         odometry = np.delete(odometry, recording.unreadable, axis=0)
     recording = recording.readable()
@@ -50,8 +68,8 @@ def whole_drive(
     if not recording.paths:  # frames that cannot be read later
         frames = progress(recording.frames(), "local features", len(recording))
         pairs = Pairs({number: check.describe(gray(image)) for number, image, _ in frames}.__getitem__)
-    seconds, between = detector.settings.exclude_seconds, Between(check, pairs, (), ())
-    found = _among(detector, 0, len(detector), between, precision, progress, odometry, visit, seconds)
+    request = replace(request, seconds=detector.settings.exclude_seconds, odometry=odometry)
+    found = _among(detector, (0, len(detector)), Between(check, pairs, (), ()), request, progress)
     detector.decided([result for result in found.results if result], None)
     return replace(found, reasons=[*found.limits, *found.reasons])
 
@@ -80,16 +98,13 @@ def later_threshold(detector: LoopDetector, accepted: np.ndarray) -> float | Non
 def last_session(
     detector: LoopDetector,
     results: list[LoopResult] | None = None,
-    precision: float = PRECISION,
-    progress: Progress = silent,
-    visit: int | None = None,
-    seconds: float = 0.0,
     own: bool = True,
+    request: Request = USUAL,
+    progress: Progress = silent,
 ) -> Answer:
     """Decide on the last session of a detector that verifies, with all of its frames in view.
 
-    It is compared with each session before as two traverses and, if ``own``, with itself as one drive in which a visit
-    lasts ``visit`` frames (see :func:`loopclosure.methods.auto.answer`) and at least ``seconds``. Of more earlier
+    It is compared with each session before as two traverses and, if ``own``, with itself as one drive. Of more earlier
     sessions than are compared at once, those are in which most frames have their best candidate; in the others each
     frame is looked up by itself. ``results`` are what the frames found when they came; None: they were remembered.
     """
@@ -110,7 +125,7 @@ def last_session(
     between = Between(detector.check, Pairs(detector.local_features), (), ())
     found, limits, reasons = list[list[LoopResult]](), list[str](), list[str]()
     for first, end in [*compared, (begin, count)][: None if own else -1]:
-        answered = _among(detector, first, end, between, precision, progress, None, visit, seconds)
+        answered = _among(detector, (first, end), between, request, progress)
         found, limits, reasons = [*found, answered.results], [*limits, *answered.limits], answered.reasons
     if results is not None and left:
         elsewhere = [any(first <= (result.accepted or 0) < end for first, end in left) for result in results]
@@ -122,31 +137,24 @@ def last_session(
 
 
 def _among(
-    detector: LoopDetector,
-    first: int,
-    end: int,
-    between: Between,
-    precision: float,
-    progress: Progress,
-    odometry: np.ndarray | None,
-    visit: int | None,
-    seconds: float,
+    detector: LoopDetector, span: tuple[int, int], between: Between, request: Request, progress: Progress
 ) -> Answer:
-    """Decide on the last session among the frames ``first`` to ``end``, another session or this one.
+    """Decide on the last session among the frames of a ``span``, another session or this one.
 
     Where these are more than ``MOST_PAIRS``, every second or third frame is compared, and decides for those after it.
     """
+    first, end = span
     begin, two = detector.sessions[-1], first != detector.sessions[-1]
     count = len(detector) - begin
     step = math.isqrt(max(0, count * (end - first) - 1) // MOST_PAIRS) + 1
     queries, references = range(begin, len(detector), step), range(first, end, step)
     stamps = detector.stamps[begin:]
     agree = replace(between, queries=queries, references=references)
-    far = None if odometry is None else far_apart(odometry[::step])
-    visit = None if visit is None else visit // step
-    allowed = np.ones((len(queries), len(references)), bool) if two else _earlier(stamps[::step], seconds)
+    far = None if request.odometry is None else far_apart(request.odometry[::step])
+    visit = None if request.visit is None else request.visit // step
+    allowed = np.ones((len(queries), len(references)), bool) if two else _earlier(stamps[::step], request.seconds)
     compared = Compared(_compared(detector, queries, references), allowed, two, far, visit, stamps[::step])
-    answered = answer(compared, between.check, agree, precision, progress)
+    answered = answer(compared, between.check, agree, request.precision, progress)
     results = []
     for number in range(count):
         result = answered.results[number // step]

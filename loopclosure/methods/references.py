@@ -33,7 +33,8 @@ class HogMethod:
         rows = describe_each(
             images, "HOG", lambda path: self.hog.blocks(read_gray(path)).reshape(-1), progress, seconds
         )
-        return compared(rows, images, "cosine", seconds, [f"{self.hog}"])
+        result = compared(rows, images, "cosine", seconds)
+        return replace(result, notes=[f"{self.hog}", *result.notes])
 
 
 @dataclass
@@ -90,7 +91,8 @@ class VladMethod:
         rows = describe_each(
             images, "features", lambda path: vlad(words.extractor(read_gray(path)), words), progress, seconds
         )
-        return compared(rows, images, "cosine", seconds, notes, TRAINING_STAGES)
+        result = compared(rows, images, "cosine", seconds)
+        return replace(result, notes=[*notes, *result.notes], training_stages=TRAINING_STAGES)
 
 
 def hog(argument: str, context: MethodContext, inner: Method | None) -> HogMethod:
