@@ -77,7 +77,7 @@ def test_a_mount_that_is_no_rotation_is_refused(value: str, tmp_path: Path) -> N
     folder = write_euroc(tmp_path)
     sensor = folder / "mav0/cam0/sensor.yaml"
     sensor.write_text(sensor.read_text().replace("data: [0,", f"data: [{value},"))
-    with pytest.raises(InputError, match=r"sensor\.yaml: the camera's pose in the body, T_BS: .* no rotation"):
+    with pytest.raises(InputError, match=r"sensor\.yaml: the camera's pose in the body, T_BS: .* not a rotation"):
         read_sequence(folder)
 
 

@@ -75,7 +75,11 @@ def test_a_layer_of_several_forks_is_taken_as_the_file_shows(
     net_of: Callable[..., Net], caplog: pytest.LogCaptureFixture, text: str, others: str
 ) -> None:
     net_of(PLAIN + text)
-    said = [record.getMessage() for record in caplog.records if "forks have other layers" in record.getMessage()]
+    said = [
+        record.getMessage()
+        for record in caplog.records
+        if "several forks define this layer type" in record.getMessage()
+    ]
     assert len(said) == bool(others)
     assert all(others in line and "# dialect: " in line and "--plugin" in line for line in said)
 

@@ -3,7 +3,7 @@
 import atexit
 import multiprocessing
 
-import caffe
+import caffe  # pyright: ignore[reportMissingImports]
 import numpy as np
 
 FORK = multiprocessing.get_context("fork")

@@ -225,7 +225,7 @@ def test_single_steps_leave_in_the_blobs_what_passes_from_layer_to_layer_do(
     case: str, work_in: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Bit by bit where all is computed in Caffe's order; otherwise kernels may round otherwise than autograd."""
-    monkeypatch.setattr("netspec.net.net.LARGEST", 2**10)  # pycaffe has no limit
+    monkeypatch.setattr("netspec.fast.training.LARGEST", 2**10)  # pycaffe has no limit
     monkeypatch.setattr(mode, "exact", lambda: "all")
     with ExitStack() as stack:
         if case in ZOO:

@@ -56,7 +56,8 @@ def test_a_scripts_own_excepthook_is_called(run: Run) -> None:
 
 def test_wrong_usage_and_what_is_not_there_are_one_line(run: Run) -> None:
     assert "SCRIPT, or -m MODULE" in run(rc=2).stderr
-    assert run("none.py", rc=1).stderr == "none.py: cannot be read: No such file or directory\n"
+    missing = "none.py: cannot be read: No such file or directory; relative paths start from "
+    assert run("none.py", rc=1).stderr.startswith(missing)
     assert run("-m", "nothing.here", rc=1).stderr.startswith("-m nothing.here: ")
 
 
