@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -87,18 +88,25 @@ def test_detect_saves_and_resumes(two_laps, two_laps_features, tmp_path, capsys)
         assert [int(row["query_id"]) for row in csv.DictReader(stream)] == list(range(20, 40))
 
 
+THUMBNAILS = "loopclosure.descriptors.thumbnails:Thumbnailer"
+
+
+def drive_that_comes_back(folder: Path) -> Path:
+    """Write 120 pictures that change slowly, and 80 of them again, darker; frame 120 shows what frame 20 shows."""
+    steps = np.random.default_rng(0).integers(0, 256, (126, 24, 32)).astype(np.float64)
+    road = [steps[i : i + 6].mean(axis=0) for i in range(120)]
+    drive = folder / "drive"
+    drive.mkdir()
+    for i, image in enumerate([*road, *(0.8 * image for image in road[20:100])]):
+        cv2.imwrite(str(drive / f"{i:03d}.png"), cv2.resize(image, (64, 48)))
+    return drive
+
+
 @pytest.mark.slow
 def test_detect_chooses_by_itself(tmp_path, capsys):
-    """A drive that comes back: pictures that change slowly, the second time darker."""
-    rng = np.random.default_rng(0)
-    steps = rng.integers(0, 256, (126, 24, 32)).astype(np.float64)
-    road = [steps[i : i + 6].mean(axis=0) for i in range(120)]
-    frames = [*road, *(0.8 * image for image in road[20:100])]
-    (tmp_path / "drive").mkdir()
-    for i, image in enumerate(frames):
-        cv2.imwrite(str(tmp_path / "drive" / f"{i:03d}.png"), cv2.resize(image, (64, 48)))
-    thumbnails = ["--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]
-    line = ["detect", str(tmp_path / "drive"), *thumbnails, "--out", str(tmp_path / "found")]
+    drive = drive_that_comes_back(tmp_path)
+    thumbnails = ["--describe", THUMBNAILS]
+    line = ["detect", str(drive), *thumbnails, "--out", str(tmp_path / "found")]
     assert main([*line, "--save", str(tmp_path / "d.npz")]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert len(printed) == 7
@@ -111,12 +119,18 @@ def test_detect_chooses_by_itself(tmp_path, capsys):
     with (tmp_path / "found" / "loops.csv").open() as stream:
         loops = [(int(row["query_id"]), int(row["match_id"])) for row in csv.DictReader(stream)]
     assert len(loops) > 60
-    resumed = ["detect", str(tmp_path / "drive"), "--resume", str(tmp_path / "d.npz"), "--out", str(tmp_path / "again")]
+    resumed = ["detect", str(drive), "--resume", str(tmp_path / "d.npz"), "--out", str(tmp_path / "again")]
     assert main([*resumed, *thumbnails]) == 0
-    wrong = [(query, match) for query, match in loops if abs(query - 100 - match) > 5]
-    assert len(wrong) <= 5
-    if wrong:  # the line through a loop is followed too far before its first frame, where no image can be verified
-        pytest.xfail(f"{len(wrong)} of {len(loops)} loops are wrong: {wrong}")
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(reason="the line through a loop is followed too far before its first frame", strict=True)
+def test_loops_of_a_drive_that_cannot_be_verified_are_right(tmp_path):
+    line = ["detect", str(drive_that_comes_back(tmp_path)), "--describe", THUMBNAILS, "--out", str(tmp_path / "found")]
+    assert main(line) == 0
+    with (tmp_path / "found" / "loops.csv").open() as stream:
+        loops = [(int(row["query_id"]), int(row["match_id"])) for row in csv.DictReader(stream)]
+    assert all(abs(query - 100 - match) <= 5 for query, match in loops)
 
 
 def test_images_that_cannot_be_read_are_left_out(two_laps, tmp_path, capsys):
