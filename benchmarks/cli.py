@@ -1,4 +1,4 @@
-"""Time netspec and loopclosure, and other programs that do the same, for the tables of the pages."""
+"""Time netspec, loopclosure and comparable programs, for the tables in the documentation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TRAINING = ("netspec", "netspec-bf16", "pytorch", "pycaffe")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; the exit statuses are those of netspec."""
+    """Run one command; return its exit status, as netspec's commands do."""
     words = list(sys.argv[1:] if argv is None else argv)
     made = parser()
     made.set_defaults(words=words)
@@ -58,40 +58,52 @@ def _add_common(parser: argparse.ArgumentParser, known: Sequence[str], default: 
         "--seconds",
         type=float,
         default=60,
-        help="run fewer rounds, but at least 3, if those of one net, batch and number of threads take longer "
-        "(default: 60)",
+        help="time limit for one net, batch size and number of threads; at least 3 rounds are run (default: 60)",
     )
 
 
 def _add_ways(parser: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
     parser.add_argument(
-        "--with", dest="ways", nargs="+", choices=known, default=list(default), help=f"default: {' '.join(default)}"
+        "--with",
+        dest="ways",
+        nargs="+",
+        choices=known,
+        default=list(default),
+        help=f"programs to time (default: {' '.join(default)})",
     )
     parser.add_argument(
-        "--rounds", type=int, default=9, help="number of rounds; each way runs once per round (default: 9)"
+        "--rounds", type=int, default=9, help="number of rounds; every program runs once per round (default: 9)"
     )
     _add_json(parser)
 
 
 def _add_json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", metavar="FILE", help="write all numbers and the machine's description to this file")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write all results and a description of the machine to this file"
+    )
 
 
 def _add_data(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--data", type=Path, required=True, metavar="FOLDER", help="with sequences, tum_fr1, place_pairs, ..."
+        "--data",
+        type=Path,
+        required=True,
+        metavar="FOLDER",
+        help="folder that contains sequences, tum_fr1, place_pairs, ...",
     )
     parser.add_argument(
-        "--work", type=Path, required=True, metavar="FOLDER", help="for images, descriptors and results"
+        "--work", type=Path, required=True, metavar="FOLDER", help="folder for images, descriptors and results"
     )
 
 
 def _add_settings(commands: Commands) -> None:
-    parser = commands.add_parser("settings", help="evaluate loopclosure's auto on drives with known loops")
+    parser = commands.add_parser("settings", help="evaluate loopclosure's method auto on drives with known loops")
     parser.set_defaults(function=_settings)
     _add_data(parser)
-    parser.add_argument("families", nargs="*", metavar="FAMILY", help="only drives of these families (default: all)")
-    parser.add_argument("--halves", action="store_true", help="also the figures of each half of the roads and rooms")
+    parser.add_argument("families", nargs="*", metavar="FAMILY", help="families of drives to evaluate (default: all)")
+    parser.add_argument(
+        "--halves", action="store_true", help="also print the results for each half of the roads and rooms"
+    )
 
 
 def _settings(arguments: argparse.Namespace) -> None:
@@ -104,12 +116,16 @@ def _settings(arguments: argparse.Namespace) -> None:
 
 
 def _add_tables(commands: Commands) -> None:
-    parser = commands.add_parser("tables", help="measure loopclosure's methods for the tables of its pages")
+    parser = commands.add_parser("tables", help="measure loopclosure's methods for the tables in the documentation")
     parser.set_defaults(function=_tables)
     _add_data(parser)
-    parser.add_argument("sets", nargs="*", metavar="SET", help="only these data sets (default: all)")
+    parser.add_argument("sets", nargs="*", metavar="SET", help="data sets to measure (default: all)")
     parser.add_argument(
-        "--methods", nargs="+", default=[], metavar="NAME", help="only these methods, by their names in the tables"
+        "--methods",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="methods to measure, by their names in the tables (default: all)",
     )
 
 
@@ -121,14 +137,14 @@ def _tables(arguments: argparse.Namespace) -> None:
 
 
 def _add_pages(commands: Commands) -> None:
-    parser = commands.add_parser("pages", help="write the figures in benchmarks/results into the pages")
+    parser = commands.add_parser("pages", help="write the results in benchmarks/results into the documentation")
     parser.set_defaults(function=_pages)
 
 
 def _pages(arguments: argparse.Namespace) -> None:
     from benchmarks import pages
 
-    print("\n".join(f"written: {page.relative_to(pages.ROOT)}" for page in pages.write()) or "no figure changed")
+    print("\n".join(f"written: {page.relative_to(pages.ROOT)}" for page in pages.write()) or "no number changed")
 
 
 def _add_list(commands: Commands) -> None:
@@ -145,11 +161,13 @@ def _list(arguments: argparse.Namespace) -> None:
 def _add_forward(commands: Commands) -> None:
     parser = commands.add_parser("forward", help="compare the time of forward passes with other programs")
     parser.set_defaults(function=_forward)
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list), or a prototxt")
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list), or a prototxt")
     parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
-    parser.add_argument("--twin", help="the net of the catalog with the PyTorch twin of the prototxt")
+    parser.add_argument("--twin", help="net of the catalog whose PyTorch version the prototxt equals")
     _add_common(parser, FORWARD, (*ENGINES, "pytorch", "opencv4"))
-    parser.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
+    parser.add_argument(
+        "--plot", metavar="FILE", help="draw the ratios of netspec's times to the others', as .png or .svg"
+    )
 
 
 def _forward(arguments: argparse.Namespace) -> None:
@@ -165,9 +183,11 @@ def _forward(arguments: argparse.Namespace) -> None:
 def _add_train(commands: Commands) -> None:
     parser = commands.add_parser("train", help="time training iterations: forward, backward, update")
     parser.set_defaults(function=_train)
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list)")
     _add_common(parser, TRAINING, ("netspec", "pytorch"))
-    parser.add_argument("--plot", metavar="FILE", help="draw netspec's ratios to the others, as .png or .svg")
+    parser.add_argument(
+        "--plot", metavar="FILE", help="draw the ratios of netspec's times to the others', as .png or .svg"
+    )
     parser.add_argument("--device", default="cpu", help="torch device for netspec and pytorch (default: cpu)")
 
 
@@ -175,14 +195,18 @@ def _train(arguments: argparse.Namespace) -> None:
     from benchmarks.case import training_case
 
     if arguments.device != "cpu" and ("pycaffe" in arguments.ways or arguments.caffe):
-        raise WrongUsage("only netspec and pytorch are timed on other devices than the CPU")
+        raise WrongUsage("only netspec and pytorch can be timed on a device other than the CPU")
     _compare(arguments, training_case, training=True, device=arguments.device)
 
 
 def _add_small(commands: Commands) -> None:
-    parser = commands.add_parser("small", help="time small nets and batches: training iterations, then forward passes")
+    parser = commands.add_parser(
+        "small", help="time small nets at several batch sizes: training iterations, then forward passes"
+    )
     parser.set_defaults(function=_small)
-    parser.add_argument("nets", nargs="*", metavar="NET", default=SMALL, help=f"default: {' '.join(SMALL)}")
+    parser.add_argument(
+        "nets", nargs="*", metavar="NET", default=SMALL, help=f"nets of the catalog (default: {' '.join(SMALL)})"
+    )
     _add_common(parser, WAYS_OF_SMALL, WAYS_OF_SMALL)
     parser.set_defaults(batch=[1, 4, 16, 64])
 
@@ -197,17 +221,19 @@ def _small(arguments: argparse.Namespace) -> None:
 
 
 def _add_waiting(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "waiting", help="time two trainings side by side, as their OpenMP threads wait in several ways"
-    )
+    parser = commands.add_parser("waiting", help="time two simultaneous trainings under several OpenMP wait settings")
     parser.set_defaults(function=_waiting)
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list)")
     parser.add_argument(
-        "--waits", nargs="+", default=["", "OMP_WAIT_POLICY=PASSIVE", "GOMP_SPINCOUNT=2000"], metavar="VARIABLE=VALUE"
+        "--waits",
+        nargs="+",
+        default=["", "OMP_WAIT_POLICY=PASSIVE", "GOMP_SPINCOUNT=2000"],
+        metavar="VARIABLE=VALUE",
+        help="settings to compare",
     )
     parser.add_argument("--batch", type=int, default=32, help="batch size (default: 32)")
     parser.add_argument("--threads", type=int, default=2, help="threads of each training (default: 2)")
-    parser.add_argument("--rounds", type=int, default=7, help="default: 7")
+    parser.add_argument("--rounds", type=int, default=7, help="number of rounds (default: 7)")
 
 
 def _waiting(arguments: argparse.Namespace) -> None:
@@ -222,7 +248,7 @@ def _add_feeding(commands: Commands) -> None:
         "feeding", help="measure how long trainings wait for data from databases and image files"
     )
     parser.set_defaults(function=_feeding)
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list)")
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list)")
     parser.add_argument("--batch", type=int, default=4, help="batch size (default: 4)")
     parser.add_argument("--threads", type=int, default=2, help="threads of the training (default: 2)")
     _add_json(parser)
@@ -235,13 +261,13 @@ def _feeding(arguments: argparse.Namespace) -> None:
 
 
 def _add_growth(commands: Commands) -> None:
-    parser = commands.add_parser("growth", help="measure time and memory for more and more layers, pairs, frames, ...")
+    parser = commands.add_parser("growth", help="measure how time and memory grow with layers, pairs or frames")
     parser.set_defaults(function=_growth)
-    parser.add_argument("kind", choices=KINDS, help="what grows")
+    parser.add_argument("kind", choices=KINDS, help="what to increase")
     parser.add_argument(
-        "sizes", type=int, nargs="*", metavar="SIZE", help="the sizes to measure (default: the usual ones)"
+        "sizes", type=int, nargs="*", metavar="SIZE", help="sizes to measure (default: depends on the kind)"
     )
-    parser.add_argument("--plot", metavar="FILE", help="draw the measurements, as .png or .svg")
+    parser.add_argument("--plot", metavar="FILE", help="draw the results, as .png or .svg")
     _add_json(parser)
 
 
@@ -265,7 +291,7 @@ def _keep(arguments: argparse.Namespace, rows: Sequence[Any], described: Any = N
 def _add_start(commands: Commands) -> None:
     parser = commands.add_parser("start", help="time processes that load a net and describe one image")
     parser.set_defaults(function=_start)
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a name of the catalog (see list), or a prototxt")
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list), or a prototxt")
     parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
     _add_ways(parser, (*ENGINES, "opencv4"), (*ENGINES[:3], "opencv4"))
 
@@ -307,9 +333,9 @@ def _compare(
 def _report(
     arguments: argparse.Namespace, rows_of: Callable[[str | None], Iterator[list[Row]]], before: Sequence[Row] = ()
 ) -> list[Row]:
-    """Print a table for each list of rows, and the ways that could not run; write all rows so far, and return them.
+    """Print a table for each list of rows, and the programs that could not run; write and return all rows.
 
-    ``before``: rows measured earlier, for the same files.
+    ``before``: rows that were measured earlier, for the same output files.
     """
     from benchmarks import environment, report, results
     from benchmarks.compare import YARDSTICKS

@@ -13,14 +13,14 @@ from netspec.terminal.parser import Commands, Parser, program
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return 0: done, 1: an error in the user's files, 2: wrong usage, 128 + N: signal N."""
-    cv2.setNumThreads(1)  # the pictures are small
+    cv2.setNumThreads(1)  # the images are small
     return run(parser(), list(sys.argv[1:] if argv is None else argv))
 
 
 def parser() -> Parser:
     """Return the parser of all commands."""
     made = program(
-        "lmdb-build", "From image sequences to labeled pairs, to databases that Caffe reads, to a table of nets."
+        "lmdb-build", "Choose labeled pairs of images, write databases that Caffe reads, and compare Siamese nets."
     )
     commands = Commands(made)
     for module in (images, pairs, databases):

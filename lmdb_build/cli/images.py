@@ -1,4 +1,4 @@
-"""``lmdb-build walk`` and ``views``, which make images."""
+"""``lmdb-build walk`` and ``views``, which generate images."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ def _source(text: str) -> Source:
 
 
 def _add_views(commands: Commands) -> None:
-    parser = commands.add_parser("views", help="make two views of each place, in batches of different places")
+    parser = commands.add_parser("views", help="generate two views of each place, in batches of different places")
     parser.set_defaults(function=_views)
     parser.add_argument(
         "source",
         nargs="+",
         type=_source,
         metavar="SOURCE",
-        help="a folder with the images of a run; or index:CSV,track=COLUMN,time=COLUMN, a table of several runs",
+        help="a folder with the images of a drive; or index:CSV,track=COLUMN,time=COLUMN, a table of several drives",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FOLDER", help="folder for the views; the list is FOLDER.txt"
@@ -58,7 +58,7 @@ def _add_views(commands: Commands) -> None:
         type=above_zero,
         default=1.0,
         metavar="S",
-        help="seconds between two images of a folder (default: %(default)g)",
+        help="seconds between successive images of a folder (default: %(default)g)",
     )
     parser.add_argument(
         "--batches", type=int, default=400, metavar="N", help="number of batches (default: %(default)s)"
@@ -68,28 +68,28 @@ def _add_views(commands: Commands) -> None:
         type=int,
         default=48,
         metavar="N",
-        help="pairs per batch, each of a different place (default: %(default)s)",
+        help="pairs in a batch, each of a different place (default: %(default)s)",
     )
     parser.add_argument(
         "--window",
         type=float,
         default=float("inf"),
         metavar="S",
-        help="take the places of a run from a part of it with this length in seconds (default: the whole run)",
+        help="take the places of a batch from this many seconds of a drive (default: the whole drive)",
     )
     parser.add_argument(
         "--viewpoint",
         type=float,
         default=1.0,
         metavar="X",
-        help="factor for the strength of zoom, turn and perspective (default: %(default)g)",
+        help="strength of zoom, rotation and perspective (default: %(default)g)",
     )
     parser.add_argument(
         "--calm",
         type=float,
         default=0.0,
         metavar="SHARE",
-        help="share of the views that keep their colors and get no occlusion (default: %(default)g)",
+        help="share of the views without color changes and occlusions (default: %(default)g)",
     )
     parser.add_argument(
         "--view-size", type=_size, default=(128, 96), metavar="WxH", help="size of a view (default: 128x96)"
@@ -101,7 +101,7 @@ def _views(arguments: argparse.Namespace) -> None:
     sources: list[Source] = arguments.source
     root = Path(os.path.commonpath([(each.path.parent if each.kind else each.path).resolve() for each in sources]))
     if all(each.kind for each in sources):
-        refuse(arguments, ("step",), "is for folders; a table has the times of its images")
+        refuse(arguments, ("step",), "is for folders; a table has its own times")
     parts = []
     for each in sources:
         if each.kind:
@@ -113,11 +113,11 @@ def _views(arguments: argparse.Namespace) -> None:
     changes = Changes(arguments.viewpoint, arguments.calm, arguments.view_size)
     path = write_views(runs, batches, changes, root, arguments.out, bar)
     made = f"{arguments.batches} batches of {arguments.size} pairs"
-    print(f"{path}: {made}; the names of images in it are relative to {path.parent}/")
+    print(f"{path}: {made}; its image names are relative to {path.parent}/")
 
 
 def _add_walk(commands: Commands) -> None:
-    parser = commands.add_parser("walk", help="render a synthetic walk through textured rooms, as TUM RGB-D sequences")
+    parser = commands.add_parser("walk", help="render walks through textured rooms, as TUM RGB-D sequences")
     parser.set_defaults(function=_walk)
     parser.add_argument("out", type=Path, metavar="OUT", help="folder for the sequences walk_1, walk_2, ...")
     parser.add_argument(
@@ -136,7 +136,7 @@ def _add_walk(commands: Commands) -> None:
     parser.add_argument(
         "--laps", type=int, default=3, metavar="N", help="laps through the house (default: %(default)s)"
     )
-    parser.add_argument("--depth", action="store_true", help="write depth images too, in TUM's form")
+    parser.add_argument("--depth", action="store_true", help="also write depth images, in TUM's format")
     parser.add_argument(
         "--rooms", type=int, default=4, metavar="N", help="rooms per house, an even number (default: %(default)s)"
     )

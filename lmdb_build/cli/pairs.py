@@ -49,19 +49,19 @@ NEEDED = {
 }
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]...
 
-Several sequences with poses (KIND can be left out; then it is found from the files):
+One or more sequences with poses (KIND may be omitted; it is then detected from the files):
 {chr(10).join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())}
   with poses=FILE, {POSES_HELP},
-  and pose-form: {POSE_FORM_HELP}; topic, pose-topic: the topics of a bag that has several
-Or one of these:
+  and pose-form: {POSE_FORM_HELP}; topic, pose-topic: the topics to read from a bag with several
+Or one source of another kind:
   images:     images in natural order, truth=MASK of loops (.mat .npy .txt or image), camera={"|".join(CAMERAS)}
   traverses:  queries, references=FOLDER, truth=MASK or ground_truth*.json
-  nordland:   query/, ref/, ground_truth*.json: VPR benchmarks
-  folders:    a folder, references=FOLDER: equal names are the same place
-  table:      a CSV of positives, two columns of image names; group=COLUMN names the place; index=CSV of groups
-  index:      a CSV of frames; group=COLUMN names the place, track=COLUMN the clip, time=COLUMN the position in it:
-              neighbors with a gap of at most max-gap (1) are positives
-  singles:    a folder, each image is a different place; positives are warped copies"""
+  nordland:   query/, ref/, ground_truth*.json, as in VPR benchmarks
+  folders:    a folder, references=FOLDER; files with equal names show the same place
+  table:      a CSV of positive pairs, in two columns of image names; group=COLUMN names the place; index=CSV of groups
+  index:      a CSV of frames; group=COLUMN names the place, track=COLUMN the clip, time=COLUMN the position in it;
+              frames at most max-gap=N (default: 1) apart are positive pairs
+  singles:    a folder in which each image shows a different place; positive pairs are an image and a warped copy"""
 # Options for sequences with poses only.
 POSED = (
     *("max_distance", "max_angle", "negatives", "clear_distance", "clear_view_angle", "same_scene", "same_frame"),
@@ -85,7 +85,11 @@ def _add_pairs(commands: Commands) -> None:
     )
     parser.set_defaults(function=_pairs)
     parser.add_argument(
-        "source", nargs="+", type=_source_text, metavar="SOURCE", help="sequences with poses, or one other, see below"
+        "source",
+        nargs="+",
+        type=_source_text,
+        metavar="SOURCE",
+        help="sequences with poses, or one source of another kind (see below)",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FOLDER", help="folder for train.txt, val.txt and test.txt"
@@ -94,7 +98,7 @@ def _add_pairs(commands: Commands) -> None:
         "--root",
         type=Path,
         metavar="FOLDER",
-        help="folder that the lists' names are relative to (the sources' common parent)",
+        help="folder that the image names are relative to (default: the common parent of the sources)",
     )
     group = parser.add_argument_group("rules for the same place")
     group.add_argument(
@@ -102,20 +106,20 @@ def _add_pairs(commands: Commands) -> None:
         type=above_zero,
         default=MAX_DISTANCE_M,
         metavar="M",
-        help=f"maximum distance of a positive pair (default: {MAX_DISTANCE_M:g})",
+        help=f"maximum distance between the images of a positive pair (default: {MAX_DISTANCE_M:g})",
     )
     group.add_argument(
         "--max-angle",
         type=above_zero,
         default=MAX_ANGLE_DEG,
         metavar="DEG",
-        help=f"maximum angle of a positive pair (default: {MAX_ANGLE_DEG:g})",
+        help=f"maximum angle between the images of a positive pair (default: {MAX_ANGLE_DEG:g})",
     )
     group.add_argument(
         "--min-gap",
         type=float,
         metavar="S",
-        help="leave out pairs with a smaller time difference, in seconds (images: in frames) (default: 0)",
+        help="minimum time between the images of a pair, in seconds (images: in frames; default: 0)",
     )
     group.add_argument(
         "--negatives", default="both", choices=NEGATIVES, help="where negatives come from (default: %(default)s)"
@@ -124,10 +128,10 @@ def _add_pairs(commands: Commands) -> None:
         "--clear-distance",
         type=float,
         metavar="M",
-        help="minimum distance of a negative pair, by its poses",
+        help="minimum distance between the poses of a negative pair",
     )
     group.add_argument(
-        "--clear-view-angle", type=float, metavar="DEG", help="or minimum angle between its viewing axes"
+        "--clear-view-angle", type=float, metavar="DEG", help="or minimum angle between its viewing directions"
     )
     group.add_argument(
         "--same-scene",
@@ -135,7 +139,7 @@ def _add_pairs(commands: Commands) -> None:
         type=_names,
         default=[],
         metavar="A,B",
-        help="sequences of one room: no pairs are made across them",
+        help="sequences of the same scene: form no pairs across them",
     )
     group.add_argument(
         "--same-frame",
@@ -143,61 +147,63 @@ def _add_pairs(commands: Commands) -> None:
         type=_names,
         default=[],
         metavar="A,B",
-        help="sequences with a common frame of reference: pairs across them are labeled by pose",
+        help="sequences with the same coordinate frame: label pairs across them by pose",
     )
-    group.add_argument("--different-scenes", action="store_true", help="all other sequences show different rooms")
+    group.add_argument("--different-scenes", action="store_true", help="all other sequences show different scenes")
     group.add_argument(
         "--max-difference",
         type=float,
         default=MAX_DIFFERENCE_S,
         metavar="S",
-        help=f"longest time from image to pose (default: {MAX_DIFFERENCE_S:g})",
+        help=f"maximum time between an image and its pose (default: {MAX_DIFFERENCE_S:g})",
     )
     group = parser.add_argument_group("choice of the pairs")
     for split, count in zip(SPLITS, (30000, 6000, 6000), strict=True):
         group.add_argument(
-            f"--{split}", type=int, default=count, metavar="N", help="pairs, half positive (default: %(default)s)"
+            f"--{split}",
+            type=int,
+            default=count,
+            metavar="N",
+            help="number of pairs, half of them positive (default: %(default)s)",
         )
-    group.add_argument("--at-most", action="store_true", help="take fewer pairs if there are not enough")
+    group.add_argument("--at-most", action="store_true", help="accept fewer pairs if there are not enough")
     group.add_argument(
-        "--split", choices=("time", "sequence"), help="by stretches of time, or by whole sequences (places, groups)"
+        "--split", choices=("time", "sequence"), help="split by time, or by whole sequences (or places, or groups)"
     )
     group.add_argument(
         "--shares",
         type=_shares,
         default=(0.6, 0.2, 0.2),
         metavar="A,B,C",
-        help="shares of the images per split (default: 0.6,0.2,0.2)",
+        help="shares of the images in train, val and test (default: 0.6,0.2,0.2)",
     )
     group.add_argument(
         "--split-gap",
         type=float,
         default=0.0,
         metavar="S",
-        help="time left out between two splits (default: %(default)g)",
+        help="time to leave out between two splits (default: %(default)g)",
     )
     for split in SPLITS:
-        group.add_argument(f"--{split}-sequences", type=_names, metavar="A,B", help=f"sequences (groups) of {split}")
+        group.add_argument(f"--{split}-sequences", type=_names, metavar="A,B", help=f"sequences (or groups) of {split}")
     group.add_argument(
-        "--hard-negatives", type=Path, metavar="NPZ", help="choose negatives that are similar by these features"
+        "--hard-negatives", type=Path, metavar="NPZ", help="features (.npz) for choosing negatives that look alike"
     )
     group.add_argument(
         "--hard-share",
         type=float,
         default=0.5,
         metavar="SHARE",
-        help="share of the negatives chosen this way (default: %(default)g)",
+        help="share of the negatives that --hard-negatives chooses (default: %(default)g)",
     )
     group.add_argument(
         "--warp-share",
         type=float,
         default=0.0,
         metavar="SHARE",
-        help="share of pairs in which one image is a warped copy (default: %(default)g)",
+        help="share of the pairs whose second image is a warped copy (default: %(default)g)",
     )
-    group.add_argument(
-        "--seed", type=seed, default=1, metavar="N", help="seed of the random choice (default: %(default)s)"
-    )
+    group.add_argument("--seed", type=seed, default=1, metavar="N", help="random seed (default: %(default)s)")
 
 
 def _pairs(arguments: argparse.Namespace) -> None:
@@ -225,7 +231,7 @@ def _pairs(arguments: argparse.Namespace) -> None:
         for doubt in written.doubts:
             warn(doubt)
     paths = ", ".join(str(written.path) for written in lists.values())
-    print(f"wrote {paths}; the names of images in them are relative to {root}/")
+    print(f"wrote {paths}; their image names are relative to {root}/")
 
 
 def _source_text(text: str) -> Source:
@@ -247,7 +253,9 @@ def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
     first, *others = arguments.source
     path, kind = first.path, first.kind
     if (kind not in SEQUENCES and others) or any(each.kind not in SEQUENCES for each in others):
-        raise WrongUsage(f"{kind or 'sequences'}: only sequences may be several; name one source of another kind")
+        raise WrongUsage(
+            f"{kind or 'sequences'}: several sources must all be sequences; give one source of another kind"
+        )
     if kind not in SEQUENCES:
         refuse(arguments, POSED, f"is for sequences with poses, not for {kind}")
     sequences = _sequences(arguments) if kind in SEQUENCES else []
@@ -341,17 +349,17 @@ def _shares(text: str) -> tuple[float, ...]:
 
 
 def _add_sheet(commands: Commands) -> None:
-    parser = commands.add_parser("sheet", help="draw sample pairs of a list as a picture")
+    parser = commands.add_parser("sheet", help="draw sample pairs of a list")
     parser.set_defaults(function=_sheet)
     parser.add_argument("list", type=Path, metavar="LIST", help="a list of pairs")
-    parser.add_argument("picture", type=Path, metavar="PICTURE", help="the picture to write, such as sheet.png")
+    parser.add_argument("picture", type=Path, metavar="PICTURE", help="the image to write, such as sheet.png")
     parser.add_argument(
-        "--root", type=Path, metavar="FOLDER", help="folder of the images (default: as in the list's header)"
+        "--root", type=Path, metavar="FOLDER", help="folder of the images (default: the folder in the list's header)"
     )
-    parser.add_argument("--rows", type=int, default=6, metavar="N", help="pairs of each label (default: %(default)s)")
     parser.add_argument(
-        "--seed", type=seed, default=1, metavar="N", help="seed of the random choice (default: %(default)s)"
+        "--rows", type=int, default=6, metavar="N", help="number of pairs of each label (default: %(default)s)"
     )
+    parser.add_argument("--seed", type=seed, default=1, metavar="N", help="random seed (default: %(default)s)")
 
 
 def _sheet(arguments: argparse.Namespace) -> None:
@@ -361,15 +369,18 @@ def _sheet(arguments: argparse.Namespace) -> None:
 
 
 def _add_join(commands: Commands) -> None:
-    parser = commands.add_parser("join", help="shuffle several lists into one")
+    parser = commands.add_parser("join", help="join several lists and shuffle the result")
     parser.set_defaults(function=_join)
     parser.add_argument("out", type=Path, metavar="OUT", help="the list to write")
     parser.add_argument("list", nargs="+", type=Path, metavar="LIST", help="lists of pairs")
     parser.add_argument(
-        "--root", type=Path, metavar="FOLDER", help="folder that the names are relative to (the lists' roots' parent)"
+        "--root",
+        type=Path,
+        metavar="FOLDER",
+        help="folder that the image names are relative to (default: the common parent of the lists' roots)",
     )
     parser.add_argument(
-        "--seed", type=seed, default=1, metavar="N", help="seed of the random order (default: %(default)s)"
+        "--seed", type=seed, default=1, metavar="N", help="random seed of the order (default: %(default)s)"
     )
 
 

@@ -34,7 +34,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def _add_close(commands: Commands) -> None:
-    parser = commands.add_parser("close", help="correct a path by the loops that detect found")
+    parser = commands.add_parser("close", help="correct a path using the loops that detect found")
     parser.set_defaults(function=_close)
     parser.add_argument(
         "source",
@@ -43,24 +43,28 @@ def _add_close(commands: Commands) -> None:
         help="the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag; "
         f"{', '.join((*POSES, *TOPICS))} may follow, as in drive.mp4,poses=slam.txt",
     )
-    parser.add_argument("--graph", type=Path, metavar="IN.g2o", help="solve this pose graph, instead of frames")
+    parser.add_argument("--graph", type=Path, metavar="IN.g2o", help="solve this pose graph instead of reading frames")
     parser.add_argument(
-        "--loops", metavar="CSV", help="the loops.csv that detect wrote; with --graph: all, to trust all loops"
+        "--loops",
+        metavar="CSV",
+        help="the loops.csv that detect wrote; with --graph only the word all, to accept every loop",
     )
     exclusive = parser.add_mutually_exclusive_group()
     exclusive.add_argument(
-        "--odometry", type=Path, metavar="FILE", help="the path to correct: poses of TUM, KITTI or EuRoC"
+        "--odometry", type=Path, metavar="FILE", help="the path to correct: poses in the format of TUM, KITTI or EuRoC"
     )
     exclusive.add_argument(
-        "--drift", type=float, metavar="PERCENT", help="simulate odometry that drifts, from the true poses"
+        "--drift", type=float, metavar="PERCENT", help="simulate drifting odometry from the true poses"
     )
-    parser.add_argument("--odometry-form", metavar="WORDS", help="form of the --odometry file, as in pose-form")
+    parser.add_argument("--odometry-form", metavar="WORDS", help="how the --odometry file is written, as for pose-form")
     parser.add_argument("--seed", type=seed, metavar="N", help="seed of --drift (default: 1)")
     parser.add_argument("--camera", metavar="NUMBERS", help=f"{intrinsics.FORM}, if the source has no calibration")
     parser.add_argument(
-        "--rerun", metavar="F.rrd", help="write images, both paths and loops for the viewer of rerun.io"
+        "--rerun", metavar="F.rrd", help="write images, both paths and the loops for the Rerun viewer (rerun.io)"
     )
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="where closed.g2o, closed.txt and paths.png go")
+    parser.add_argument(
+        "--out", required=True, metavar="FOLDER", help="folder for closed.g2o, closed.txt and paths.png"
+    )
 
 
 def _close(a: argparse.Namespace) -> None:
@@ -73,22 +77,22 @@ def _close(a: argparse.Namespace) -> None:
     if a.odometry is None and a.drift is None:
         raise WrongUsage("one of the arguments --odometry --drift is required")
     if a.odometry_form and not a.odometry:
-        raise WrongUsage("--odometry-form means nothing without --odometry")
+        raise WrongUsage("--odometry-form needs --odometry")
     if a.rerun:
         check_rerun()
     if a.seed is not None and a.drift is None:
-        raise WrongUsage("--seed means nothing without --drift")
+        raise WrongUsage("--seed needs --drift")
     source = typed(a.source, CLOSED)
     frames = sequence(source, a.out)
     camera = intrinsics.from_text(a.camera) if a.camera else frames.camera
     if camera is None:
-        raise InputError(f"has no calibration of its camera; give --camera {intrinsics.FORM}", frames.source)
+        raise InputError(f"has no camera calibration; give --camera {intrinsics.FORM}", frames.source)
     odometry = _odometry(a, frames)[source.selection().numbers(len(frames))]
     frames = frames.taken(source.selection())
     loops = measure(frames, read_loops(Path(a.loops), frames.names), camera, bar)
     closed = close(odometry, loops, frames.poses)
     write_closed(out, closed, frames.stamps, frames.names)
-    # Drawing takes seconds to import, which the other commands need not wait for.
+    # Imported here, since it takes seconds and only this command needs it.
     from loopclosure.report.plots import draw_paths
 
     draw_paths(out / "paths.png", closed)
@@ -104,8 +108,8 @@ def _close_graph(a: argparse.Namespace, out: Path) -> None:
     for option in ("source", *OF_FRAMES):
         if getattr(a, option) not in (None, ALL if option == "loops" else None):
             name = "the frames" if option == "source" else f"--{option.replace('_', '-')}"
-            hint = f"; --loops {ALL} says that all are true" if option == "loops" else ""
-            raise WrongUsage(f"{name} and --graph do not go together: a graph has its poses and loops{hint}")
+            hint = f"; --loops {ALL} accepts every loop" if option == "loops" else ""
+            raise WrongUsage(f"{name} cannot be used with --graph, which has its own poses and loops{hint}")
     graph = read_pose_graph(a.graph)
     solution = solve_pose_graph(graph, a.loops == ALL)
     write_solution(out, graph, solution)
@@ -126,7 +130,7 @@ def _odometry(a: argparse.Namespace, frames: ImageSequence) -> np.ndarray:
         return read.of_images(len(frames), frames.stamps, a.odometry)
     if frames.poses is None:
         raise InputError(
-            "has no true poses to simulate drift on; give --odometry, or the source ,poses=FILE", frames.source
+            "has no true poses to simulate drift from; give --odometry, or add ,poses=FILE to the source", frames.source
         )
     known = np.all(np.isfinite(frames.poses), axis=1)
     path = frames.poses.copy()

@@ -34,47 +34,47 @@ from netspec.terminal.parser import above_zero
 
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]..., for example tum:desk,stop=50%,stride=2.
 
-Truth from poses (KIND can be left out; then it is found from the files):
+Ground truth from poses (KIND may be omitted; it is then detected from the files):
 {chr(10).join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())}
-  images:     a folder or list of images, with poses=FILE, or truth=MASK: which frames show the same place
-Other truth:
+  images:     a folder or list of images, with poses=FILE, or with truth=MASK, which marks frames of the same place
+Other ground truth:
   fabmap:     FAB-MAP's New College or City Centre; truth=, coordinates=, camera={"|".join(CAMERAS)} (default: both)
-  traverses:  two drives, PATH and references=PATH; equal frame numbers are the same place, unless truth= is given
+  traverses:  two drives, PATH and references=PATH; equal frame numbers show the same place, unless truth=FILE is given
   nordland:   query/, ref/, ground_truth*.json, as in VPR benchmarks
-  pairs:      places photographed twice (pairs.csv)
+  pairs:      places that were photographed twice (pairs.csv)
 
-KEYs: start, stop (frame N or share P%), stride, limit: which frames; references=PATH: another sequence to search;
+KEYs: start, stop (a frame number N or a percentage P%), stride, limit: which frames to use;
 truth=FILE (.mat .npy .txt or image); poses=FILE ({POSES_HELP}),
 pose-form ({POSE_FORM_HELP});
-topic, pose-topic: the topics to read from a bag that has several."""
+references=PATH: another sequence to search; topic, pose-topic: the topics to read from a bag with several."""
 RULE = ("max_distance", "max_angle", "soft_distance", "soft_angle", "fov", "overlap", "exclude_seconds")
 TRAVERSES = ("tolerance", "soft_tolerance")
 
 
 EXCLUDED = f"fabmap {datasets.FABMAP_EXCLUSION.frames}, images {datasets.FOLDER_EXCLUSION.frames}"
-OVERLAP = "the soft zone: a match is not counted as wrong if this share of each view is visible in the other"
+OVERLAP = "ignore a wrong match if at least this share of each view is visible in the other"
 
 
 def add_data_set(parser: argparse.ArgumentParser) -> None:
     """Add the arguments for a data set: its source (see HELP) and the rule for the same place."""
-    parser.add_argument("source", metavar="SOURCE", help="the data set, see below")
+    parser.add_argument("source", metavar="SOURCE", help="the data set (see below)")
     parser.add_argument(
         "--tolerance",
         type=int,
         metavar="FRAMES",
-        help="traverses: largest difference of the frame numbers of one place (default: 0)",
+        help="traverses: largest difference between frame numbers of the same place (default: 0)",
     )
     parser.add_argument(
         "--soft-tolerance",
         type=int,
         metavar="FRAMES",
-        help="ignore wrong matches up to this difference of frame numbers",
+        help="traverses: ignore wrong matches up to this difference",
     )
     parser.add_argument(
         "--max-distance",
         type=above_zero,
         metavar="M",
-        help=f"maximum distance of two poses at one place (default: {MAX_DISTANCE_M:g})",
+        help=f"maximum distance between two poses of the same place (default: {MAX_DISTANCE_M:g})",
     )
     parser.add_argument(
         "--max-angle", type=above_zero, metavar="DEG", help=f"maximum angle between them (default: {MAX_ANGLE_DEG:g})"
@@ -82,7 +82,7 @@ def add_data_set(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--soft-distance", type=above_zero, metavar="M", help="ignore wrong matches up to this distance"
     )
-    parser.add_argument("--soft-angle", type=above_zero, metavar="DEG", help="and up to this angle")
+    parser.add_argument("--soft-angle", type=above_zero, metavar="DEG", help="ignore wrong matches up to this angle")
     parser.add_argument(
         "--fov", type=float, metavar="DEG", help=f"horizontal field of view (default: the camera's, or {FOV_DEG:g})"
     )
@@ -91,14 +91,14 @@ def add_data_set(parser: argparse.ArgumentParser) -> None:
         "--exclude-frames",
         type=int,
         metavar="N",
-        help=f"exclude pairs of frames i and j with |i - j| <= N (default: {EXCLUDED})",
+        help=f"exclude pairs of frames i, j with |i - j| <= N (default: {EXCLUDED})",
     )
     parser.add_argument(
         "--exclude-seconds",
         type=float,
         metavar="S",
         help="exclude pairs of frames within S seconds "
-        f"(default if there are times: {datasets.TUM_EXCLUSION.seconds:g})",
+        f"(default if frames have times: {datasets.TUM_EXCLUSION.seconds:g})",
     )
 
 
@@ -140,13 +140,13 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
     excluded = a.exclude_frames is not None or a.exclude_seconds is not None
     exclusion = Exclusion(a.exclude_frames or 0, a.exclude_seconds or 0.0) if excluded else None
     if references is not None and excluded:
-        raise WrongUsage("--exclude-frames means nothing with references: nothing is near in time")
+        raise WrongUsage("--exclude-frames cannot be used with references, which were recorded at another time")
     if posed:
         _check_truth(source, kind)
         if truth:
-            raise WrongUsage("truth and poses both say which frames show the same place; give one")
+            raise WrongUsage("give either truth or poses, not both")
         if references and "poses" in source.settings:
-            raise WrongUsage("poses are those of one sequence; with references each must have its own")
+            raise WrongUsage("poses=FILE is for one sequence; with references, each sequence must have its own poses")
         layout = kind or ("" if is_recording(source.path) else _layout(source, source.path))
         return datasets.load_sequence(
             sequence(source, a.out, layout),
@@ -165,12 +165,12 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
         return datasets.load_fabmap(source.path, files, camera, chosen, exclusion, Path(a.out) / "joined")
     if kind == "images":
         if truth is None:
-            raise WrongUsage(f"images:{source} needs ,truth=MASK, which says what shows the same place, or ,poses=FILE")
+            raise WrongUsage(f"images:{source} needs ,truth=MASK (which frames show the same place) or ,poses=FILE")
         exclusion = exclusion or datasets.FOLDER_EXCLUSION
         return datasets.load_folder(source.path, truth, references, chosen, exclusion)
     if kind == "traverses":
         if references is None:
-            raise WrongUsage(f"traverses:{source} needs ,references=FOLDER, the other drive")
+            raise WrongUsage(f"traverses:{source} needs ,references=FOLDER (the other drive)")
         return datasets.load_traverses(source.path, references, a.tolerance or 0, a.soft_tolerance, chosen, truth)
     if kind == "nordland":
         queries, found, truth_file = benchmark_parts(source.path)
@@ -179,12 +179,12 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
 
 
 def _check_truth(source: Source, kind: str) -> None:
-    """Raise InputError for a plain folder of images, which has no truth."""
+    """Raise InputError for a plain folder of images, which has no ground truth."""
     path = source.path
     plain = not kind and not is_recording(path) and "poses" not in source.settings and _layout(source, path) == "tum"
     if plain and path.is_dir() and not (path / "rgb.txt").exists():
-        expected = "add ,poses=FILE, or write images:FOLDER,truth=MASK; detect finds loops without truth"
-        raise InputError(f"has no truth, which says what frames show the same place; {expected}", path)
+        expected = "add ,poses=FILE, or write images:FOLDER,truth=MASK; the command detect needs no ground truth"
+        raise InputError(f"has no ground truth of which frames show the same place; {expected}", path)
 
 
 def _layout(source: Source, path: Path) -> str:
@@ -206,7 +206,7 @@ def recording_of(text: str, frames: Path) -> ImageSequence:
         path, summary = extract(path, frames, topic, pose_topic, bar)
         print(summary)
     elif topic or pose_topic:
-        raise WrongUsage(f"{source}: topics belong to bags")
+        raise WrongUsage(f"{source}: topics are for bags")
     recording = read_sequence(path).taken(source.selection())
     for doubt in recording.doubts:
         warn(doubt)

@@ -70,64 +70,70 @@ def _add_detect(commands: Commands) -> None:
         metavar="CAMERA|URL|FILE",
         help="find loops while images arrive, from camera 0, rtsp://HOST/PATH or a file",
     )
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="where loops.csv, and loops.g2o with poses, go")
+    parser.add_argument(
+        "--out", required=True, metavar="FOLDER", help="folder for loops.csv, and for loops.g2o if there are poses"
+    )
     exclusive = parser.add_mutually_exclusive_group()
     exclusive.add_argument(
         "--describe",
         default="default",
         metavar="NAME|MODULE:FUNCTION|FILE.py:FUNCTION",
-        help="function image (H, W, 3) BGR -> descriptor; default and small are included nets (default: %(default)s)",
+        help="an included net (default or small), or a function from a BGR image (H, W, 3) to its descriptor",
     )
-    exclusive.add_argument(
-        "--features", metavar="F.npz", help="descriptors computed beforehand (netspec extract --images)"
-    )
-    parser.add_argument("--with", action="append", default=[], metavar="KEY=VALUE", help="a keyword for --describe")
+    exclusive.add_argument("--features", metavar="F.npz", help="descriptors that netspec extract --images wrote")
     parser.add_argument(
-        "--whiten", metavar="OTHER.npz", help="whiten with the descriptors in this file, of images of other places"
+        "--with", action="append", default=[], metavar="KEY=VALUE", help="keyword argument of the --describe function"
+    )
+    parser.add_argument(
+        "--whiten", metavar="OTHER.npz", help="whiten using the descriptors in this file, from images of other places"
     )
     exclusive = parser.add_mutually_exclusive_group()
     exclusive.add_argument(
         "--least-precision",
         type=float,
         metavar="P",
-        help=f"share of the loops that should be right (default: {PRECISION:g})",
+        help=f"required share of correct loops (default: {PRECISION:g})",
     )
     exclusive.add_argument(
         "--threshold",
         type=float,
         metavar="S",
-        help="decide frame by frame: a loop has at least this score (euclidean: minus the distance)",
+        help="decide frame by frame: lowest score of a loop (euclidean: the negative distance)",
     )
-    exclusive.add_argument("--resume", metavar="F.npz", help="decide frame by frame, with a detector that --save wrote")
+    exclusive.add_argument(
+        "--resume", metavar="F.npz", help="continue, frame by frame, with a detector that --save wrote"
+    )
     parser.add_argument("--metric", choices=METRICS, help=f"metric of the descriptors (default: {OF.metric})")
     parser.add_argument(
         "--exclude-recent",
         type=int,
         metavar="FRAMES",
-        help="number of recent frames that are not candidates "
-        f"(default: those of one visit to a place; frame by frame {OF.exclude_recent})",
+        help="number of recent frames that are never candidates "
+        f"(default: the length of a visit to a place; {OF.exclude_recent} if decided frame by frame)",
     )
     parser.add_argument(
-        "--exclude-seconds", type=float, metavar="S", help="frames of the last S seconds are not candidates either"
+        "--exclude-seconds", type=float, metavar="S", help="frames of the last S seconds are never candidates"
     )
-    parser.add_argument("--top-k", type=int, metavar="K", help=f"candidates examined (default: {OF.top_k})")
+    parser.add_argument("--top-k", type=int, metavar="K", help=f"number of candidates to examine (default: {OF.top_k})")
     parser.add_argument(
-        "--consistency", type=int, metavar="K", help="number of previous frames with candidates that lead to this one"
+        "--consistency", type=int, metavar="K", help="number of previous frames whose candidates must lead to this one"
     )
     parser.add_argument(
         "--consistency-window",
         type=int,
         metavar="FRAMES",
-        help=f"largest step to the next candidate (default: {OF.consistency_window})",
+        help=f"largest step between candidates of successive frames (default: {OF.consistency_window})",
     )
-    parser.add_argument("--verify", action="store_true", help="verify candidates by SIFT matches and RANSAC")
+    parser.add_argument("--verify", action="store_true", help="verify candidates with SIFT matches and RANSAC")
     parser.add_argument(
         "--odometry",
         metavar="FILE",
-        help="poses (TUM, KITTI, EuRoC): frames that are far from each other by these are not a loop",
+        help="poses (TUM, KITTI, EuRoC); frames far apart by these poses are never a loop",
     )
-    parser.add_argument("--save", metavar="F.npz", help="write the detector, to continue with --resume")
-    parser.add_argument("--rerun", metavar="F.rrd", help="write images, scores and loops for the viewer of rerun.io")
+    parser.add_argument("--save", metavar="F.npz", help="write the detector to this file, for --resume")
+    parser.add_argument(
+        "--rerun", metavar="F.rrd", help="write images, scores and loops for the Rerun viewer (rerun.io)"
+    )
 
 
 def _detect(a: argparse.Namespace) -> None:
@@ -180,14 +186,14 @@ def _detect(a: argparse.Namespace) -> None:
 
     write_drive(out / "report.html", results, reasons, recording, a.command_line)
     loops = sum(result.accepted is not None for result in results)
-    print(f"{loops} loops in {len(results)} frames: {out / 'loops.csv'}; to be looked at: {out / 'report.html'}")
+    print(f"{loops} loops in {len(results)} frames: {out / 'loops.csv'}; report: {out / 'report.html'}")
     print("\n".join(reasons))
     if engine := getattr(net, "engine", ""):
         print(f"descriptors: {a.describe}, computed by {engine}")
     if np.isfinite(detector.poses).any():
         left_out = write_g2o(out / "loops.g2o", detector.poses, detector.loops, run.from_poses(detector))
         note = f", {left_out} loops without a pose left out" if left_out else ""
-        print(f"pose graph, its relative poses from the known poses{note}: {out / 'loops.g2o'}")
+        print(f"pose graph, with relative poses from the known poses{note}: {out / 'loops.g2o'}")
         print(run.judged_by_poses(detector))
     if a.save:
         detector.save(a.save)
@@ -230,21 +236,19 @@ def _checked_options(a: argparse.Namespace) -> dict[str, str]:
     if bool(a.source) == bool(a.video):
         raise WrongUsage("expected the frames, or --video")
     if a.video and (a.features or a.least_precision is not None):
-        raise WrongUsage(
-            f"--{'features' if a.features else 'least-precision'} is for a drive that is over, not for --video"
-        )
+        raise WrongUsage(f"--{'features' if a.features else 'least-precision'} needs a complete recording, not --video")
     if a.rerun:
         check_rerun()
     if a.resume and (_changes(a) or a.verify):
-        raise WrongUsage("--resume continues with the settings of the saved detector; leave out others")
+        raise WrongUsage("--resume uses the settings of the saved detector; leave out all others")
     given = [f"--{name.replace('_', '-')}" for name in ONLINE if getattr(a, name) is not None]
     given += ["--verify"] if a.verify else []
     if given and a.threshold is None and not a.video:
-        raise WrongUsage(f"{given[0]} means nothing without --threshold")
+        raise WrongUsage(f"{given[0]} needs --threshold")
     if a.odometry and (a.threshold is not None or a.resume or a.video):
-        raise WrongUsage("--odometry means nothing to a search frame by frame, as with --threshold or --video")
+        raise WrongUsage("--odometry cannot be used with --threshold, --resume or --video, which decide frame by frame")
     if a.features and getattr(a, "with"):
-        raise WrongUsage("--with belongs to --describe; --features has descriptors already")
+        raise WrongUsage("--with is for --describe, not for --features")
     options = {}
     for text in getattr(a, "with"):
         key, equals, value = text.partition("=")
@@ -263,7 +267,7 @@ def _detector(a: argparse.Namespace, describe: Describe | None, views: int) -> L
     if a.resume:
         detector = LoopDetector.load(a.resume, describe)
         if detector.fingerprint is None:
-            warn(f"{a.resume} does not say what net described its frames; it has to be the same one")
+            warn(f"{a.resume} does not name the net that described its frames; use the same net")
         return detector
     check = None
     changes = _changes(a)
@@ -288,13 +292,13 @@ def _add_index(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_build(commands: Commands) -> None:
-    parser = commands.add_parser("build", help="make a map of one or several drives")
+    parser = commands.add_parser("build", help="build a map of one or several drives")
     parser.set_defaults(function=_build)
     _add_map(parser)
-    parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as those of detect")
+    parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as for detect")
     _add_index(parser)
     parser.add_argument(
-        "--describe", default="default", metavar="NAME", help="the net: default or small (default: %(default)s)"
+        "--describe", default="default", metavar="NAME", help="the net, default or small (default: %(default)s)"
     )
 
 
@@ -305,10 +309,10 @@ def _build(a: argparse.Namespace) -> None:
 
 
 def _add_add(commands: Commands) -> None:
-    parser = commands.add_parser("add", help="add drives to a map, and find the loops between all of its drives")
+    parser = commands.add_parser("add", help="add drives to a map and find the loops between all its drives")
     parser.set_defaults(function=_add)
     _add_map(parser)
-    parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as those of detect")
+    parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as for detect")
     _add_index(parser)
 
 
@@ -344,12 +348,12 @@ def _decided(detector: LoopDetector, own: bool = True) -> list[LoopResult]:
 
 
 def _add_query(commands: Commands) -> None:
-    parser = commands.add_parser("query", help="find the frames of a drive in a map, and add nothing to it")
+    parser = commands.add_parser("query", help="find the frames of a drive in a map, without adding them")
     parser.set_defaults(function=_query)
     _add_map(parser)
-    parser.add_argument("source", metavar="SOURCE", help="frames, as those of detect")
+    parser.add_argument("source", metavar="SOURCE", help="frames, as for detect")
     _add_index(parser)
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="where loops.csv goes")
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for loops.csv")
 
 
 def _query(a: argparse.Namespace) -> None:

@@ -49,8 +49,8 @@ def _add_evaluate(commands: Commands) -> None:
         required=True,
         default=[],
         metavar="[LABEL=]METHOD",
-        help=f"may be repeated; METHOD is one of {', '.join(METHODS)}, with :settings, or NAME+METHOD: "
-        "features:PATH.npz[:cosine][:whiten=OTHER.npz], seqslam+features:PATH.npz, fabmap:model=words.npz",
+        help=f"a method to evaluate (may be repeated): {', '.join(METHODS)}, with :SETTINGS, or NAME+METHOD, such as "
+        "features:PATH.npz[:cosine][:whiten=OTHER.npz], seqslam+features:PATH.npz or fabmap:model=words.npz",
     )
     parser.add_argument(
         "--train",
@@ -58,18 +58,18 @@ def _add_evaluate(commands: Commands) -> None:
         type=_training,
         default=[],
         metavar="PATH[,KEY=VALUE]",
-        help="may be repeated: images for vocabularies, other than those tested: a folder, list or TUM sequence, "
-        "with start, stop, stride, limit",
+        help="images to train vocabularies on, not those evaluated: a folder, list or TUM sequence, "
+        "with start, stop, stride, limit; may be repeated",
     )
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the report and its parts go")
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the report")
     parser.add_argument("--title", default="", metavar="TEXT", help="heading of the report")
     parser.add_argument(
-        "--seed", type=seed, default=0, metavar="N", help="seed of the methods' random numbers (default: %(default)s)"
+        "--seed", type=seed, default=0, metavar="N", help="random seed of the methods (default: %(default)s)"
     )
 
 
 def _evaluate(a: argparse.Namespace) -> None:
-    # Drawing takes seconds to import, which the other commands need not wait for.
+    # Imported here, since it takes seconds and only this command needs it.
     from loopclosure.report.files import measures_text
     from loopclosure.report.page import verdict, write_report
 
@@ -91,12 +91,14 @@ def _evaluate(a: argparse.Namespace) -> None:
 def _add_compare(commands: Commands) -> None:
     parser = commands.add_parser("compare", help="compare the reports of several evaluations in a table and curves")
     parser.set_defaults(function=_compare)
-    parser.add_argument("report", nargs="+", metavar="REPORT.json", help="two or more, as evaluate writes them")
-    parser.add_argument("--out", default="comparison.html", metavar="FILE.html", help="the page (default: %(default)s)")
+    parser.add_argument("report", nargs="+", metavar="REPORT.json", help="two or more reports that evaluate wrote")
+    parser.add_argument(
+        "--out", default="comparison.html", metavar="FILE.html", help="the page to write (default: %(default)s)"
+    )
 
 
 def _compare(a: argparse.Namespace) -> None:
-    # Drawing takes seconds to import, which the other commands need not wait for.
+    # Imported here, since it takes seconds and only this command needs it.
     from loopclosure.report.compare import read_reports, text, write_comparison
 
     if len(a.report) < 2:
@@ -108,23 +110,34 @@ def _compare(a: argparse.Namespace) -> None:
 
 
 def _add_similarity(commands: Commands) -> None:
-    parser = commands.add_parser("similarity", help="compare all descriptors of a file, by blocks")
+    parser = commands.add_parser("similarity", help="compute the similarity of all pairs of descriptors in a file")
     parser.set_defaults(function=_similarity)
-    parser.add_argument("features", metavar="FEATURES", help="the .npz file of the queries")
-    parser.add_argument("--references", metavar="F.npz", help="the references (default: the queries, as one sequence)")
+    parser.add_argument("features", metavar="FEATURES", help="the .npz file with the queries")
+    parser.add_argument(
+        "--references", metavar="F.npz", help="the .npz file with the references (default: the queries)"
+    )
     parser.add_argument(
         "--metric", default=METRICS[0], choices=METRICS, help="metric of the descriptors (default: %(default)s)"
     )
-    parser.add_argument("--top-k", type=int, metavar="K", help="write the best K of each query as CSV, not all as .npy")
+    parser.add_argument(
+        "--top-k",
+        type=int,
+        metavar="K",
+        help="write the best K references of each query as CSV (default: write all as .npy)",
+    )
     parser.add_argument(
         "--exclude-frames",
         type=int,
         default=0,
         metavar="N",
-        help="with --top-k, in one sequence: exclude pairs up to N frames (default: %(default)s)",
+        help="with --top-k and without --references: exclude pairs within N frames (default: %(default)s)",
     )
     parser.add_argument(
-        "--exclude-seconds", type=float, default=0.0, metavar="S", help="the same, by stamps (default: %(default)g)"
+        "--exclude-seconds",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="the same, within S seconds (default: %(default)g)",
     )
     parser.add_argument("--out", required=True, metavar="FILE", help="the file to write")
 
@@ -132,13 +145,13 @@ def _add_similarity(commands: Commands) -> None:
 def _similarity(a: argparse.Namespace) -> None:
     excluded = a.exclude_frames or a.exclude_seconds
     if excluded and a.top_k is None:
-        raise WrongUsage("an exclusion belongs to --top-k; the matrix holds all pairs")
+        raise WrongUsage("--exclude-frames and --exclude-seconds need --top-k")
     if excluded and a.references is not None:
-        raise WrongUsage("an exclusion belongs to one sequence; with --references nothing is near in time")
+        raise WrongUsage("--exclude-frames and --exclude-seconds cannot be used with --references")
     queries = read_features(a.features)
     references = None if a.references is None else read_features(a.references).features
     if queries.views > 1:
-        raise InputError("describes several views of an image; this command compares one", a.features)
+        raise InputError("describes several views of each image; this command needs one", a.features)
     if a.top_k is None:
         shape = write_similarity(a.out, queries.features, references, a.metric, bar)
         print(f"{shape[0]} x {shape[1]} scores, float32: {a.out}")

@@ -107,7 +107,7 @@ def read_source(text: str, kinds: Kinds) -> Source:
             hint = did_you_mean(name, list(kinds[kind])) or f"; it has: {', '.join(kinds[kind]) or 'none'}"
             raise InputError(f'{text}: {kind or "a sequence"} has no setting "{name}"{hint}')
     if "pose-form" in settings and "poses" not in settings:
-        raise InputError(f"{text}: pose-form means nothing without poses")
+        raise InputError(f"{text}: pose-form needs poses")
     return Source(kind, Path(path), settings)
 
 
@@ -121,9 +121,9 @@ LAYOUTS = {
     "video": "a video (with poses)",
 }
 RECORDED = ("bag", "video")  # their frames are extracted first
-POSES_HELP = "the camera's poses, in the form of TUM, KITTI or EuRoC, instead of the sequence's own"
+POSES_HELP = "camera poses in the format of TUM, KITTI or EuRoC, instead of the sequence's own"
 POSE_FORM_HELP = (
-    f"how poses are written, if not found from the file: {', '.join((*FORMS, *ORDERS, *DIRECTIONS))}; commas between"
+    f"format of the poses, if not detected from the file: {', '.join((*FORMS, *ORDERS, *DIRECTIONS))}, with commas"
 )
 
 

@@ -12,11 +12,11 @@ from netspec.terminal.parser import Commands, Parser, program
 # The headings in ``netspec --help``, and the modules with the commands below each.
 _GROUPS = {
     "Caffe's programs": [caffe, caffe_tools],
-    "look at nets": [nets, look],
-    "look at data and trainings": [data],
-    "use a net elsewhere": [export],
-    "old programs": [run_script],
-    "shell, help": [shell],
+    "inspect nets": [nets, look],
+    "inspect data and trainings": [data],
+    "features and other formats": [export],
+    "programs written for pycaffe": [run_script],
+    "other commands": [shell],
 }
 
 

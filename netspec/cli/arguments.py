@@ -1,4 +1,4 @@
-"""What the commands of netspec share: the options that several of them have, and what these options say."""
+"""The options that several commands of netspec have, and functions that read them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from netspec.terminal.parser import CAFFES_LOG
 if TYPE_CHECKING:
     from netspec.export.engines.choice import Choice
 
-# How values are read
+# Types of values
 
 
 def positive(text: str) -> int:
@@ -66,13 +66,13 @@ def _amount(text: str) -> int:
 
 
 def add_plugin(parser: argparse.ArgumentParser) -> None:
-    """Add ``--plugin``, of the commands that read the files of nets."""
+    """Add ``--plugin``, for commands that read nets."""
     parser.add_argument(
         "--plugin",
         action="append",
         default=[],
         metavar="NAME|FILE.py",
-        help="a dialect (the layers of a fork of Caffe): its name, or your own Python file; may be repeated",
+        help="a dialect (the layers of a fork of Caffe), by name or as a Python file; may be repeated",
     )
     parser.set_defaults(prepare=_use_dialects)
 
@@ -83,7 +83,7 @@ def _use_dialects(arguments: argparse.Namespace) -> None:
 
 
 def add_limit(parser: argparse.ArgumentParser) -> None:
-    """Add ``--limit``, of the commands that build nets, which takes memory."""
+    """Add ``--limit``, for commands that build nets."""
     parser.add_argument(
         "--limit",
         type=_amount,
@@ -93,12 +93,12 @@ def add_limit(parser: argparse.ArgumentParser) -> None:
 
 
 def add_verbose(parser: argparse.ArgumentParser) -> None:
-    """Add ``-v``, of the commands that build nets and show only warnings otherwise."""
+    """Add ``-v``, for commands that build nets and otherwise show only warnings."""
     parser.add_argument("-v", "--verbose", nargs=0, action=_Verbose, help="show Caffe's log")
 
 
 class _Verbose(argparse.Action):
-    """Show the whole log, like the commands that Caffe has."""
+    """Show the whole log, as Caffe's own commands do."""
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
         for name, value in CAFFES_LOG.items():
@@ -108,23 +108,22 @@ class _Verbose(argparse.Action):
 def add_net(parser: argparse.ArgumentParser) -> None:
     """Add the net's prototxt, as an argument and as ``--model``; :func:`model` reads them."""
     parser.add_argument("net", nargs="?", metavar="NET", help="the net's prototxt")
-    parser.add_argument("--model", metavar="MODEL", help="the same, as Caffe's programs name it")
+    parser.add_argument("--model", metavar="MODEL", help="the net's prototxt, as an option like Caffe's")
 
 
-def add_gpu(parser: argparse.ArgumentParser) -> None:
+def add_gpu(parser: argparse.ArgumentParser, text: str = "number of the GPU to use (default: the CPU)") -> None:
     """Add ``--gpu``."""
-    parser.add_argument(
-        "--gpu",
-        default="",
-        metavar="GPU",
-        help="number of the GPU; train also takes several, as 0,1, or all (default: as the solver says)",
-    )
+    parser.add_argument("--gpu", default="", metavar="GPU", help=text)
 
 
 def add_phase(parser: argparse.ArgumentParser, default: str = "TEST") -> None:
     """Add ``--phase``."""
     parser.add_argument(
-        "--phase", type=str.upper, default=default, choices=["TEST", "TRAIN"], help="default: %(default)s"
+        "--phase",
+        type=str.upper,
+        default=default,
+        choices=["TEST", "TRAIN"],
+        help="phase of the net (default: %(default)s)",
     )
 
 
@@ -137,7 +136,7 @@ def add_state(parser: argparse.ArgumentParser) -> None:
 
 
 def add_part(parser: argparse.ArgumentParser) -> None:
-    """Add what a written net is made of: ``--blob``, ``--shape``, the state, Python layers."""
+    """Add the options that choose the part of a net to write: ``--blob``, ``--shape``, the state, Python layers."""
     parser.add_argument(
         "--blob",
         action="extend",
@@ -175,7 +174,7 @@ def add_exact(parser: argparse.ArgumentParser) -> None:
         "--exact",
         default=SMALL,
         choices=CHOICES,
-        help="which sums equal Caffe's to the last bit, on the CPU; all is slower (default: %(default)s)",
+        help="which sums are bit-identical to Caffe's on the CPU; all is slower (default: %(default)s)",
     )
 
 
@@ -196,37 +195,37 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
         "--engine",
         default=TORCH,
         choices=[*ENGINES, f"{OPENVINO},{BF16}"],
-        help=f"what runs the net (default: %(default)s); ,{BF16} computes in bfloat16",
+        help=f"engine that runs the net (default: %(default)s); {OPENVINO},{BF16} computes in bfloat16",
     )
     parser.add_argument("--precision", choices=PRECISIONS, help=argparse.SUPPRESS)
     parser.add_argument(
         "--cache",
         metavar="DIR|none",
-        help="folder that keeps exported nets, or none to keep no files (default: the user's cache folder)",
+        help="folder to keep exported nets in, or none (default: the user's cache folder)",
     )
 
 
 def add_steps(parser: argparse.ArgumentParser) -> None:
-    """Add what is done to the pixels of image files before a net gets them."""
-    parser.add_argument("--swap", action="store_true", help="with image files: reverse the channels, to RGB")
+    """Add the options for preprocessing image files."""
+    parser.add_argument("--swap", action="store_true", help="for image files: reverse the channels, from BGR to RGB")
     parser.add_argument(
-        "--raw-scale", type=float, default=1.0, metavar="S", help="then multiply pixels, 0 to 255, by this"
+        "--raw-scale", type=float, default=1.0, metavar="S", help="then multiply the pixels (0 to 255) by this"
     )
     parser.add_argument(
         "--mean",
         metavar="A,B,C|FILE",
-        help="then subtract this: numbers in the net's order, or a .binaryproto or .npy",
+        help="then subtract this: one number per channel, in the net's order, or a .binaryproto or .npy file",
     )
     parser.add_argument(
         "--scale",
         type=float,
         default=1.0,
         metavar="S",
-        help="then multiply by this; these four options replace the data layer's transform_param",
+        help="then multiply by this; with any of these four options, the data layer's transform_param is not used",
     )
 
 
-# What the options say
+# Values of the options
 
 
 def model(arguments: argparse.Namespace) -> str:
@@ -238,12 +237,12 @@ def model(arguments: argparse.Namespace) -> str:
 
 
 def choice(arguments: argparse.Namespace) -> Choice:
-    """Return the engine that is asked for."""
+    """Return the chosen engine."""
     from netspec.export.engines.choice import Choice
 
     engine, _, precision = arguments.engine.partition(",")
     if engine == TORCH:
-        refuse(arguments, ("cache",), f"is for engines that run exported nets; {TORCH} does not")
+        refuse(arguments, ("cache",), f"is for engines that run exported nets; {TORCH} is not one")
     cache = False if arguments.cache == "none" else arguments.cache
     return Choice.of(engine, precision or arguments.precision or FP32, cache)
 
@@ -253,20 +252,20 @@ _CHOSEN |= {"allow_python_layers": "allow_python", "data": "open_data"}
 
 
 def options(arguments: argparse.Namespace, **chosen: Any) -> BuildOptions:
-    """Return how a command's nets are built: as its options say, and as ``chosen``."""
-    said = {field: getattr(arguments, name) for name, field in _CHOSEN.items() if name in arguments}
+    """Return the options for building a command's nets, from its arguments and ``chosen``, which has priority."""
+    values = {field: getattr(arguments, name) for name, field in _CHOSEN.items() if name in arguments}
     if "stage" in arguments:
-        said["stages"] = stages(arguments)
-    return BuildOptions(**{"speed": speed(), **said, **chosen})
+        values["stages"] = stages(arguments)
+    return BuildOptions(**{"speed": speed(), **values, **chosen})
 
 
 def stages(arguments: argparse.Namespace, as_caffe: bool = False) -> tuple[str, ...]:
-    """Return the stages of ``--stage``; ``as_caffe``, whose programs split an empty text too, at least an empty one."""
+    """Return the stages of ``--stage``. With ``as_caffe``, empty names count, as in Caffe: "" is one empty stage."""
     return tuple(stage for stage in arguments.stage.split(",") if stage or as_caffe)
 
 
 def devices(gpu: str) -> list[Any]:
-    """Return the torch devices of ``--gpu``: the CPU where it is empty, every GPU for ``all``, else the listed ones."""
+    """Return the torch devices of ``--gpu``: the CPU if it is empty, every GPU for ``all``, else the listed ones."""
     import torch
 
     if not gpu:
@@ -275,7 +274,7 @@ def devices(gpu: str) -> list[Any]:
     numbers = [str(k) for k in range(count)] or ["0"] if gpu == "all" else gpu.split(",")
     for number in numbers:
         if not number.isdigit():
-            raise SpecError(f"--gpu {gpu}: expected the number of a GPU, several numbers separated by commas, or all")
+            raise SpecError(f"--gpu {gpu}: expected a GPU's number, several numbers separated by commas, or all")
         if int(number) >= count:
             raise SpecError(
                 f"--gpu {gpu}: torch finds {count or 'no'} GPU(s) on this machine; omit --gpu to use the CPU"
@@ -292,7 +291,7 @@ def device(gpu: str) -> Any:
 
 
 def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str, write_files: bool = True) -> Any:
-    """Return the net of ``--model``, on the device of ``--gpu``; the sites are where Caffe logs the device."""
+    """Return the net of ``--model`` on the device of ``--gpu``; the sites are where Caffe logs the device."""
     from netspec.net.build import load_net
 
     path, chosen = model(arguments), device(arguments.gpu)
@@ -305,7 +304,7 @@ def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str
 
 
 def load_weights(net: Any, paths: str | None, strict: bool) -> None:
-    """Load weights from one file after the other; their paths are separated by commas. Something must fit."""
+    """Load weights from files, whose paths are separated by commas. At least one layer must match."""
     from netspec.net import weights
 
     if paths:
@@ -313,7 +312,7 @@ def load_weights(net: Any, paths: str | None, strict: bool) -> None:
 
 
 def run_by(net: Any, arguments: argparse.Namespace, weights: str | None) -> Any:
-    """Return the net of ``--model`` as the chosen engine runs it; ``weights`` are those that were loaded."""
+    """Return the net, or a version of it that the chosen engine runs; ``weights`` are the files that were loaded."""
     if arguments.engine == TORCH and arguments.precision in (None, FP32) and not arguments.cache:
         return net
     from netspec.export.engines.net import with_engine

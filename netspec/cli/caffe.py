@@ -67,7 +67,7 @@ def _add_train(commands: Commands) -> None:
     )
     parser.add_argument("--weights", metavar="WEIGHTS", help="weights to start from, several separated by commas")
     parser.add_argument(
-        "--scores", metavar="F.json", help="write the scores of each test, and the names of the snapshots, to this file"
+        "--scores", metavar="F.json", help="write the scores of each test and the names of the snapshots to this file"
     )
     parser.add_argument(
         "--tensorboard",
@@ -80,7 +80,7 @@ def _add_train(commands: Commands) -> None:
         choices=["stop", "warn"],
         help="what to do when the loss is NaN or infinite (default: %(default)s)",
     )
-    add_gpu(parser)
+    add_gpu(parser, "number of the GPU, several separated by commas, or all (default: the device in the solver)")
     add_state(parser)
     parser.add_argument(
         "--sigint_effect",
@@ -100,8 +100,8 @@ def _add_train(commands: Commands) -> None:
         "--precision",
         default="fp32",
         choices=["fp32", "tf32", "bf16", "fp16"],
-        help="of the training net's passes; bf16 is faster on CPUs and GPUs that have it, fp16 on GPUs; both round "
-        "more (default: %(default)s)",
+        help="precision of forward and backward passes; bf16 is faster on CPUs and GPUs that support it, fp16 on "
+        "GPUs; both are less accurate (default: %(default)s)",
     )
     add_strict(parser)
 
@@ -117,7 +117,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from netspec.solver.processes import FaultOfAll, Lost, Processes, join, started_by_torchrun
 
     if arguments.gpu and started_by_torchrun():
-        raise WrongUsage("under torchrun each process takes the GPU of its number; leave out --gpu")
+        raise WrongUsage("under torchrun each process uses the GPU of its local rank; leave out --gpu")
     processes = join() if started_by_torchrun() else Processes()
     status = DONE
     with nullcontext() if processes.is_root else log.silent():

@@ -1,4 +1,4 @@
-"""Caffe's smaller tools under their own names: features, GPUs, upgrades of older files."""
+"""``netspec extract_features``, ``device_query`` and the ``upgrade_*`` commands, as Caffe's tools."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _add_extract_features(commands: Commands) -> None:
         "databases", metavar="DATABASES", help="databases to write, one for each blob, separated by commas"
     )
     parser.add_argument("batches", type=positive, metavar="N", help="mini-batches to run")
-    parser.add_argument("db_type", choices=["lmdb", "leveldb"], help="the form of the databases")
+    parser.add_argument("db_type", choices=["lmdb", "leveldb"], help="format of the databases")
     parser.add_argument(
         "mode", nargs="?", default="CPU", choices=["CPU", "GPU"], help="where the net runs (default: %(default)s)"
     )
@@ -97,7 +97,7 @@ def _add_upgrade_net_proto_text(commands: Commands) -> None:
     parser.set_defaults(function=_upgrade_net_proto_text)
     add_plugin(parser)
     _add_files(parser)
-    add_shapes(parser, "shape of an input, for a .caffemodel: its net is written as a deploy prototxt")
+    add_shapes(parser, "for a .caffemodel: shape of an input of the deploy prototxt that is written")
 
 
 def _upgrade_net_proto_text(arguments: argparse.Namespace) -> None:
@@ -109,7 +109,7 @@ def _upgrade_net_proto_text(arguments: argparse.Namespace) -> None:
 
         net, _ = recover_net(arguments.input, dict(arguments.shape))
     elif arguments.shape:
-        raise WrongUsage("--shape is for the net inside a .caffemodel; a prototxt has its own shapes")
+        raise WrongUsage("--shape is for a .caffemodel; a prototxt has its own shapes")
     else:
         net = read_net(arguments.input)
     write_whole(arguments.output, write_text(net))

@@ -36,13 +36,16 @@ def _add_data(commands: Commands) -> None:
         "what", choices=[SHOW, STAT], help="show: draw records, labels, statistics; stat: print statistics"
     )
     parser.add_argument("source", metavar="DB", help="an LMDB, a LevelDB, an HDF5 file, or a list of HDF5 files")
-    parser.add_argument("--records", type=positive, metavar="N", help="look at N records, evenly spread (default: all)")
-    parser.add_argument("--out", metavar="F.png|svg", help="show: the picture to write")
+    parser.add_argument("--records", type=positive, metavar="N", help="read N evenly spaced records (default: all)")
+    parser.add_argument("--out", metavar="F.png|svg", help="show: the image to write")
     parser.add_argument(
-        "--count", type=positive, default=40, metavar="N", help="show: how many records to draw (default: %(default)s)"
+        "--count", type=positive, default=40, metavar="N", help="show: number of records to draw (default: %(default)s)"
     )
     parser.add_argument(
-        "--start", type=int, metavar="K", help="show: draw the records from number K on (default: evenly spread ones)"
+        "--start",
+        type=int,
+        metavar="K",
+        help="show: index of the first record to draw (default: draw evenly spaced records)",
     )
     parser.add_argument(
         "--images",
@@ -105,8 +108,8 @@ def _show(arguments: argparse.Namespace, records: Records, found: Survey) -> Non
 def _add_plot(commands: Commands) -> None:
     parser = commands.add_parser("plot", help="draw the curves of trainings from their logs, netspec's or Caffe's")
     parser.set_defaults(function=_plot, **QUIET)
-    parser.add_argument("logs", nargs="+", metavar="LOG", help="log of a training: what it wrote to stderr")
-    parser.add_argument("--out", required=True, metavar="F.png|svg|html", help="picture or HTML page to write")
+    parser.add_argument("logs", nargs="+", metavar="LOG", help="log of a training (its stderr)")
+    parser.add_argument("--out", required=True, metavar="F.png|svg|html", help="image or HTML page to write")
     parser.add_argument(
         "--names",
         metavar="NAMES,...",
@@ -139,7 +142,7 @@ def _plot(arguments: argparse.Namespace) -> None:
 
 
 def _names(paths: list[str]) -> list[str]:
-    """Return the files' names, with as many folders as needed to tell them apart."""
+    """Return the files' names, with as many folders as needed to make them different."""
     parts = [Path(path).parts for path in paths]
     for length in range(1, max(map(len, parts)) + 1):
         names = ["/".join(each[-length:]) for each in parts]

@@ -89,7 +89,7 @@ def _add_extract(commands: Commands) -> None:
         type=_layer_source,
         default=[],
         metavar="LAYER=DB",
-        help="read this database instead, for a data layer",
+        help="let data layer LAYER read this database instead of its own",
     )
     parser.add_argument("--iterations", type=positive, metavar="N", help="batches to run (default: every record once)")
     parser.add_argument("--images", metavar="FOLDER|LIST", help="use image files instead of records")
@@ -100,7 +100,7 @@ def _add_extract(commands: Commands) -> None:
         "--zooms",
         type=_zooms,
         metavar="1,0.7",
-        help="describe several views of each image: the whole (1) and its middle (0.7)",
+        help="describe several views of each image, e.g. the whole (1) and its center (0.7)",
     )
     parser.add_argument(
         "--shape", type=blob_shape, metavar="BLOB=N,C,H,W", help="the input blob's shape, if its data is not available"
@@ -130,7 +130,7 @@ def _extract(arguments: argparse.Namespace) -> None:
         if len(rows := np.flatnonzero(~np.all(np.isfinite(arrays[name]), axis=1))):
             said = f"{len(rows)} of {len(arrays[name])} rows have a NaN or an infinity, the first is row {rows[0]}"
             log.logger.warning(f"{name}: {said} (from 0); did the net diverge?")
-    if os.environ.get("SOURCE_DATE_EPOCH"):  # the same bytes are wanted each time: no time that was measured
+    if os.environ.get("SOURCE_DATE_EPOCH"):  # reproducible files contain no measured times
         arrays.update({name: np.array(np.nan) for name in arrays if name.startswith("seconds_per_")})
     with whole_file(out) as unfinished, unfinished.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
@@ -143,7 +143,7 @@ def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
     from netspec.inspect.features.scaling import Steps
 
     records = ("source", "iterations", "phase", "level", "stage", "allow_python_layers")
-    refuse(arguments, records, "is for records; --images are read, and run in phase TEST")
+    refuse(arguments, records, "is for records; --images reads files and uses phase TEST")
     if len(arguments.blob) != 1:
         raise WrongUsage(f"--images needs exactly one --blob, found {len(arguments.blob)}")
     if arguments.shape and arguments.shape[0] != arguments.input:
@@ -217,15 +217,15 @@ WRITTEN = {
     "pt2": "a torch.export archive",
     "safetensors": "weights",
 }
-EXPORT = """Write a net in another form, with its weights.
+EXPORT = """Write a net and its weights in another format.
 
---to onnx         an ONNX model (opset 21), batch, height and width free where the net allows it;
+--to onnx         an ONNX model (opset 21), with dynamic batch, height and width if the net allows it;
                   weights of more than 2 GB go into a second file
 --to torch        the source of a PyTorch module, OUT.py, and its weights, OUT.safetensors
 --to pt2          a torch.export archive
 --to safetensors  the weights alone: LAYER.INDEX, in Caffe's order
 
-Layers that read data become inputs; --shape says what they read, where the prototxt does not."""
+Data layers become inputs. Give their shapes with --shape if the prototxt does not."""
 
 
 def _add_export(commands: Commands) -> None:
@@ -240,7 +240,7 @@ def _add_export(commands: Commands) -> None:
     add_plugin(parser)
     add_limit(parser)
     parser.add_argument("file", metavar="FILE", help="the net's prototxt")
-    parser.add_argument("--to", required=True, choices=list(WRITTEN), help="the form")
+    parser.add_argument("--to", required=True, choices=list(WRITTEN), help="the format")
     parser.add_argument("--weights", metavar="WEIGHTS", help="the trained weights (default: random weights)")
     parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="the file to write")
     add_part(parser)
@@ -250,14 +250,16 @@ def _add_export(commands: Commands) -> None:
     parser.add_argument(
         "--input", default="data", metavar="BLOB", help="the input for the options below (default: %(default)s)"
     )
-    parser.add_argument("--crop", action="store_true", help="ONNX: take the middle of larger images")
-    parser.add_argument("--swap", action="store_true", help="ONNX: images come with reversed channels (RGB for BGR)")
-    parser.add_argument("--raw-scale", type=float, default=1.0, metavar="S", help="ONNX: multiply images by this first")
+    parser.add_argument("--crop", action="store_true", help="ONNX: crop larger images to their center")
     parser.add_argument(
-        "--mean", metavar="A,B,C|FILE", help="ONNX: then subtract this, numbers or a .binaryproto or .npy file"
+        "--swap", action="store_true", help="ONNX: the channels of the images are reversed (RGB for BGR)"
+    )
+    parser.add_argument("--raw-scale", type=float, default=1.0, metavar="S", help="ONNX: first multiply images by this")
+    parser.add_argument(
+        "--mean", metavar="A,B,C|FILE", help="ONNX: then subtract this: numbers, or a .binaryproto or .npy file"
     )
     parser.add_argument("--scale", type=float, default=1.0, metavar="S", help="ONNX: then multiply by this")
-    parser.add_argument("--uint8", action="store_true", help="ONNX: images are bytes")
+    parser.add_argument("--uint8", action="store_true", help="ONNX: images are uint8")
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -277,9 +279,7 @@ def _export(arguments: argparse.Namespace) -> None:
     if arguments.to != "onnx":
         refuse(arguments, ("input", "crop", "swap", "raw_scale", "mean", "scale", "uint8"), "needs --to onnx")
     elif not steps.changes_images:
-        refuse(
-            arguments, ("input",), "says which input --crop, --swap, --raw-scale, --mean, --scale and --uint8 change"
-        )
+        refuse(arguments, ("input",), "names the input of --crop, --swap, --raw-scale, --mean, --scale and --uint8")
     source = _source(arguments, not arguments.no_labels)
     for line in export_net(source, arguments.to, arguments.out, steps if steps.changes_images else None):
         print(f"note: {line}", file=sys.stderr)
@@ -287,19 +287,17 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _add_fold(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "fold", help="fold BatchNorm and Scale into the layers before them: write OUT.prototxt and OUT.caffemodel"
-    )
+    parser = commands.add_parser("fold", help="fold BatchNorm and Scale layers into the layers before them")
     parser.set_defaults(function=_fold, **QUIET)
     add_verbose(parser)
     add_plugin(parser)
     add_limit(parser)
     parser.add_argument(
-        "file", metavar="MODEL", help="the net's prototxt; labels and losses of a training net are removed"
+        "file", metavar="MODEL", help="the net's prototxt; the labels and losses of a training net are removed"
     )
     parser.add_argument("--weights", required=True, metavar="WEIGHTS", help="the trained weights")
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="PREFIX", help="write PREFIX.prototxt and .caffemodel"
+        "--out", type=Path, required=True, metavar="PREFIX", help="write PREFIX.prototxt and PREFIX.caffemodel"
     )
     add_part(parser)
 

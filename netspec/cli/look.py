@@ -1,4 +1,4 @@
-"""``netspec look``: pictures of what a net has learned."""
+"""``netspec look``: images of what a net has learned."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def _add_picture(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", required=True, metavar="F.png|svg", help="the picture to write")
+    parser.add_argument("--out", required=True, metavar="F.png|svg", help="the image to write")
 
 
 def _add_filters(commands: Commands) -> None:
@@ -36,9 +36,7 @@ def _add_filters(commands: Commands) -> None:
     parser.set_defaults(function=_filters, **QUIET)
     parser.add_argument("weights", metavar="WEIGHTS", help="a .caffemodel or .caffemodel.h5")
     parser.add_argument("--layer", metavar="LAYER", help="the layer (default: the first with filters)")
-    parser.add_argument(
-        "--rgb", action="store_true", help="the net was trained with red, green, blue (Caffe's order: BGR)"
-    )
+    parser.add_argument("--rgb", action="store_true", help="the net was trained on RGB images (Caffe's order is BGR)")
     _add_picture(parser)
 
 
@@ -74,7 +72,7 @@ def _add_described_blob(parser: argparse.ArgumentParser) -> None:
         "--input", default="data", metavar="BLOB", help="the blob that the image goes into (default: %(default)s)"
     )
     parser.add_argument(
-        "--shape", type=blob_shape, metavar="BLOB=N,C,H,W", help="its shape, if its data is not available"
+        "--shape", type=blob_shape, metavar="BLOB=N,C,H,W", help="the input blob's shape, if its data is not available"
     )
     add_steps(parser)
 
@@ -111,9 +109,11 @@ def _add_saliency(commands: Commands) -> None:
     _add_described_blob(parser)
     parser.add_argument("--image", required=True, metavar="IMAGE", help="the image file")
     parser.add_argument(
-        "--unit", type=int, metavar="K", help="index of the value in the blob (default: that of the largest)"
+        "--unit", type=int, metavar="K", help="index of the value in the blob (default: the largest value)"
     )
-    parser.add_argument("--to", metavar="IMAGE", help="explain the distance to the blob of this image instead")
+    parser.add_argument(
+        "--to", metavar="IMAGE", help="explain the distance between the blobs of the two images instead"
+    )
     parser.add_argument(
         "--samples", type=positive, default=16, metavar="N", help="average over N noisy copies (default: %(default)s)"
     )
@@ -127,7 +127,7 @@ def _saliency(arguments: argparse.Namespace) -> None:
     from netspec.log import number
 
     if arguments.to:
-        refuse(arguments, ("unit",), "and --to exclude each other: a number of the blob, or a distance")
+        refuse(arguments, ("unit",), "is for one value of the blob; --to explains a distance")
     ending_of(arguments.out, PICTURES)
     net = _net(arguments)
     images = [_image(net, path) for path in (arguments.image, arguments.to) if path]
@@ -143,17 +143,20 @@ def _saliency(arguments: argparse.Namespace) -> None:
 
 
 def _add_embedding(commands: Commands) -> None:
-    parser = commands.add_parser("embedding", help="draw descriptors in a plane, with the images as points")
+    parser = commands.add_parser("embedding", help="plot descriptors in two dimensions, one point per image")
     parser.set_defaults(function=_embedding, **QUIET)
-    parser.add_argument("features", metavar="FEATURES.npz", help="what netspec extract wrote")
+    parser.add_argument("features", metavar="FEATURES.npz", help="a file that netspec extract wrote")
     parser.add_argument(
-        "--array", default="", metavar="ARRAY", help="which array of the file (default: the first with descriptors)"
+        "--array", default="", metavar="ARRAY", help="array of the file (default: the first with descriptors)"
     )
     parser.add_argument(
-        "--images", metavar="FOLDER|LIST|DB", help="the images: a folder, a list, or the records' database"
+        "--images", metavar="FOLDER|LIST|DB", help="the images: a folder, a list, or a database of records"
     )
     parser.add_argument(
-        "--method", default="pca", choices=["pca", "tsne"], help="method that finds the plane (default: %(default)s)"
+        "--method",
+        default="pca",
+        choices=["pca", "tsne"],
+        help="method of dimensionality reduction (default: %(default)s)",
     )
     _add_picture(parser)
 

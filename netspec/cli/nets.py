@@ -41,7 +41,7 @@ def add_commands(commands: Commands) -> None:
 
 def _add_check(commands: Commands) -> None:
     parser = commands.add_parser(
-        "check", help="build a net, or a solver's nets, and report every error; nothing is written"
+        "check", help="build a net, or a solver's nets, and report all errors; no file is written"
     )
     parser.set_defaults(function=_check, **QUIET)
     add_verbose(parser)
@@ -50,19 +50,21 @@ def _add_check(commands: Commands) -> None:
     parser.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt, or a .caffemodel")
     add_phase(parser)
     add_state(parser)
-    add_shapes(parser, "shape of a data layer's top; its data is then not opened")
+    add_shapes(parser, "shape of a data layer's top, instead of opening its data")
     parser.add_argument("--data", action="store_true", help="open databases, lists and mean files too")
     parser.add_argument(
-        "--weights", metavar="WEIGHTS", help="weights that must fit the net, several separated by commas"
+        "--weights", metavar="WEIGHTS", help="check that these weights fit the net; several separated by commas"
     )
     parser.add_argument(
-        "--plan", action="store_true", help="print how the net runs without gradients; this allocates its memory"
+        "--plan",
+        action="store_true",
+        help="print the steps in which the net runs without gradients; this allocates its memory",
     )
     add_passes(parser)
     parser.add_argument(
         "--json",
         action="store_true",
-        help="print blobs, params, inputs and outputs as JSON, or the errors, if there are any",
+        help="print blobs, params, inputs and outputs as JSON, or the errors if there are any",
     )
     add_strict(parser)
     add_python(parser)
@@ -76,7 +78,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from netspec.net.table import table
 
     if not arguments.plan:
-        refuse(arguments, ("passes",), "needs --plan, which prints what they do")
+        refuse(arguments, ("passes",), "needs --plan, which prints their effect")
     elif arguments.json:
         refuse(arguments, ("plan",), "is not part of the JSON; leave out --json")
     how = {} if arguments.plan else {"device": "meta", "passes": ()}
@@ -87,7 +89,7 @@ def _check(arguments: argparse.Namespace) -> int:
         arguments.weights,
     )
     if len(checked) > 1:
-        refuse(arguments, ("phase",), "is for a net; of a solver the nets of both phases are checked")
+        refuse(arguments, ("phase",), "is for a net; for a solver, the nets of both phases are checked")
     elif is_net_binary(arguments.file):
         refuse(arguments, ("phase", "level", "stage", "weights", "strict"), f"is for a prototxt, not {arguments.file}")
     elif checked[0].net is not None and not arguments.weights:
@@ -116,11 +118,11 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _add_lint(commands: Commands) -> None:
-    parser = commands.add_parser("lint", help="find what is legal but probably a mistake, in nets and solvers")
+    parser = commands.add_parser("lint", help="find probable mistakes in nets and solvers")
     parser.set_defaults(function=_lint, **QUIET)
     add_plugin(parser)
     parser.add_argument("files", nargs="*", default=[], metavar="FILE", help="a net's or a solver's prototxt")
-    parser.add_argument("--rules", action="store_true", help="print the rules, with their reasons")
+    parser.add_argument("--rules", action="store_true", help="print the rules and their reasons")
     parser.add_argument(
         "--json", action="store_true", help="print errors and findings as JSON, one object for each file"
     )
@@ -165,16 +167,16 @@ def _add_draw(commands: Commands) -> None:
     parser = commands.add_parser("draw", help="draw a net: layers, shapes, shared parameters, multiply-adds")
     parser.set_defaults(function=_draw, **QUIET)
     add_plugin(parser)
-    parser.add_argument("file", metavar="FILE", help="a net, a .caffemodel, or a solver, whose training net is drawn")
+    parser.add_argument("file", metavar="FILE", help="a net, a .caffemodel, or a solver (its training net is drawn)")
     parser.add_argument("--out", type=Path, required=True, metavar="F.svg|F.png|F.html", help="the file to write")
     parser.add_argument(
         "--phase", type=str.upper, choices=["TEST", "TRAIN"], help="only this phase (default: both in one)"
     )
     add_state(parser)
-    add_shapes(parser, "the shape of a data layer's top; without it shapes may be unknown")
+    add_shapes(parser, "the shape of a data layer's top, if it is not known from the prototxt")
     parser.add_argument("--data", action="store_true", help="open databases and lists to learn their shapes")
     parser.add_argument(
-        "--unfold", action="store_true", help="draw each copy of a repeated block (an HTML page shows both)"
+        "--unfold", action="store_true", help="draw every copy of a repeated block (an HTML page has both forms)"
     )
     add_python(parser)
 
@@ -183,7 +185,7 @@ def _draw(arguments: argparse.Namespace) -> None:
     if arguments.out.suffix not in FORMATS:
         raise WrongUsage(f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}")
     if arguments.out.suffix == ".html":
-        refuse(arguments, ("unfold",), "is for .svg and .png; a page shows both")
+        refuse(arguments, ("unfold",), "is for .svg and .png; an HTML page has both forms")
     from netspec.inspect.draw.files import write_picture
 
     drawn = write_picture(
@@ -207,7 +209,9 @@ def _tolerance(text: str) -> float:
 
 
 def _add_diff(commands: Commands) -> None:
-    parser = commands.add_parser("diff", help="print the differences in meaning of two nets, solvers or weights")
+    parser = commands.add_parser(
+        "diff", help="print how two nets, solvers or weights differ, ignoring their formatting"
+    )
     parser.set_defaults(function=_diff, **QUIET, fault_status=UNREADABLE)
     add_plugin(parser)
     parser.add_argument("first", metavar="A", help="a prototxt, a .caffemodel or a .caffemodel.h5")
@@ -247,7 +251,7 @@ def _fmt(arguments: argparse.Namespace) -> int:
         try:
             text = sys.stdin.read() if path == STDIN else text_of(path)
             formatted = format_text(text, path)
-        except SpecError as fault:  # the other files are formatted all the same
+        except SpecError as fault:  # still format the other files
             print(fault, file=sys.stderr)
             status = UNREADABLE if arguments.check else max(status, FAULT)
             continue
@@ -256,7 +260,7 @@ def _fmt(arguments: argparse.Namespace) -> int:
         elif path == STDIN:
             print(formatted, end="")
         elif formatted == text:
-            print(f"{path}: was in this form already")
+            print(f"{path}: already formatted")
         else:
             write_whole(path, formatted, "surrogateescape")
             print(f"{path}: formatted")
@@ -264,7 +268,7 @@ def _fmt(arguments: argparse.Namespace) -> int:
 
 
 def _differs(path: str, text: str, formatted: str) -> int:
-    """Say where a file would change; return the status."""
+    """Print where a file would change; return the status."""
     if text == formatted:
         return DONE
     lines = zip(text.split("\n"), formatted.split("\n"), strict=False)

@@ -1,4 +1,4 @@
-"""``netspec run``: a program that was written for pycaffe."""
+"""``netspec run``, which runs a program written for pycaffe, ``install-caffe`` and ``remove-caffe``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return what is for ``netspec run``, and the script or module with its own arguments, which nobody else reads."""
+    """Split the words into the options of ``netspec run``, and the script or module with its own arguments."""
     position = 1
     while position < len(words) and words[position].startswith("-"):
         name = "--" + words[position].lstrip("-")
@@ -37,7 +37,7 @@ def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
 def _add_run(commands: Commands) -> None:
     parser = commands.add_parser(
         NAME,
-        help="run a Python script; in it `import caffe` finds netspec",
+        help="run a Python script in which `import caffe` imports netspec",
         usage="netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]",
     )
     parser.set_defaults(function=_run, **NO_LOG)
@@ -71,7 +71,9 @@ def _run(arguments: argparse.Namespace) -> None:
     name, *own = arguments.program
     if arguments.write_py3:
         if arguments.m or arguments.shadow_caffe or own:
-            raise WrongUsage("--write-py3 takes a script, and nothing runs")
+            raise WrongUsage(
+                "--write-py3 translates a script and runs nothing; leave out -m, --shadow-caffe and its arguments"
+            )
         write_translation(name, arguments.write_py3, arguments.python2)
         return
     if arguments.m:
@@ -84,9 +86,12 @@ def _add_install_caffe(commands: Commands) -> None:
         "install-caffe", help="put a package `caffe` and Caffe's commands into this Python environment"
     )
     parser.set_defaults(function=_install_caffe)
-    parser.add_argument("--replace", action="store_true", help="move a real Caffe that is installed out of the way")
+    parser.add_argument("--replace", action="store_true", help="if a real Caffe is installed, move it aside")
     parser.add_argument(
-        "--build", type=Path, metavar="FOLDER", help="only make FOLDER/tools/caffe and so on, for shell scripts"
+        "--build",
+        type=Path,
+        metavar="FOLDER",
+        help="only create FOLDER/tools/caffe and so on, for shell scripts that call build/tools/caffe",
     )
 
 
@@ -94,14 +99,14 @@ def _install_caffe(arguments: argparse.Namespace) -> None:
     from netspec.compat.scripts.environment import install_caffe, make_build_folder
 
     if arguments.build:
-        refuse(arguments, ("replace",), "is for this Python environment, not for --build")
+        refuse(arguments, ("replace",), "is for this Python environment; leave it out with --build")
     written = make_build_folder(arguments.build) if arguments.build else install_caffe(arguments.replace)
     for path in written:
         print(f"{path}: written")
     if arguments.build:
-        print(f"scripts find Caffe's commands in {arguments.build}; netspec remove-caffe --build undoes this")
+        print(f"Caffe's commands are in {arguments.build}; netspec remove-caffe --build removes them")
     else:
-        print("import caffe and Caffe's commands are netspec's now; netspec remove-caffe undoes this")
+        print("import caffe and Caffe's commands now use netspec; netspec remove-caffe undoes this")
 
 
 def _add_remove_caffe(commands: Commands) -> None:

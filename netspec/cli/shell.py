@@ -19,7 +19,7 @@ def add_commands(commands: Commands) -> None:
     _add_bug_report(commands)
 
 
-COMPLETION = """Print a script with which a shell completes the commands of netspec.
+COMPLETION = """Print a script that lets a shell complete netspec's commands.
 
 bash: netspec completion bash > ~/.local/share/bash-completion/completions/netspec
 zsh:  netspec completion zsh > a file _netspec in a folder of $fpath
@@ -38,7 +38,7 @@ def _add_completion(commands: Commands) -> None:
 
 
 def _completion(arguments: argparse.Namespace) -> None:
-    from netspec.cli import parser  # which makes the parser of all commands, this one among them
+    from netspec.cli import parser  # imported here, since it imports this module
 
     try:
         import shtab
@@ -63,7 +63,7 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 def _add_bug_report(commands: Commands) -> None:
     parser = commands.add_parser(
         "bug-report",
-        help="collect what a bug report needs: versions, and the shapes in files, without weights or images",
+        help="collect versions and the shapes in files for a bug report, without weights or images",
     )
     parser.set_defaults(function=_bug_report, **QUIET)
     parser.add_argument(
@@ -84,4 +84,4 @@ def _bug_report(arguments: argparse.Namespace) -> None:
         print(text, end="")
         return
     write_whole(arguments.out, text)
-    print(f"{arguments.out}: read it before you send it; a prototxt and a log are in it as they are")
+    print(f"{arguments.out}: read it before you send it; it contains prototxt files and logs in full")

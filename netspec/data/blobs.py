@@ -17,11 +17,11 @@ from netspec.proto.wire import PLACE, fields
 
 Shape = tuple[int, ...]
 LEGACY_AXES = ("num", "channels", "height", "width")
-_AT_ONCE = 1 << 20  # numbers that are read at once: the next copy finds them in the processor's cache
+_AT_ONCE = 1 << 20  # numbers to read at once, so that the next copy finds them in the CPU's cache
 _DATA, _DIFF = ("data", "double_data"), ("diff", "double_diff")
 
-# NVIDIA Caffe's BlobProto, which DIGITS 6 and OpenCV's half-precision tools write too: `raw_data_type`, an enum, and
-# `raw_data`, little-endian bytes beside the shape and instead of `data`.
+# NVIDIA Caffe, DIGITS 6 and OpenCV's half-precision tools write a BlobProto with `raw_data_type`, an enum, and
+# `raw_data`, little-endian bytes, instead of `data`.
 _RAW_TYPE, _RAW_DATA = ("raw_data_type", 10), ("raw_data", 12)
 _RAW_DTYPES = ("<f8", "<f4", "<f2", "<i4", "<u4")  # DOUBLE, FLOAT, FLOAT16, INT, UINT
 
@@ -41,7 +41,7 @@ def is_legacy(proto: Any) -> bool:
 def fits(proto: Any, shape: Sequence[int]) -> bool:
     """Return whether the blob may be copied into an array of ``shape`` (Caffe: Blob::ShapeEquals).
 
-    An old 4-D shape fits a shape of fewer axes if they are equal with ones put in front: (1, 1, 1, 500) fits (500,).
+    An old 4-D shape fits a shape with fewer axes if they differ only by leading ones: (1, 1, 1, 500) fits (500,).
     """
     if is_legacy(proto):
         return len(shape) <= 4 and shape_of(proto) == (1,) * (4 - len(shape)) + tuple(shape)
@@ -49,10 +49,10 @@ def fits(proto: Any, shape: Sequence[int]) -> bool:
 
 
 def to_array(proto: Any) -> np.ndarray:
-    """Return the values in the blob's shape: float32, or float64 if the blob holds doubles. The array is read-only.
+    """Return the values in the blob's shape: float32, or float64 for a blob of doubles. The array is read-only.
 
-    Where the blob has neither data nor double_data, the numbers in its raw_data are returned: half precision and
-    integers as float32. Raises ValueError where there are not as many values as the shape says.
+    If the blob has neither data nor double_data, the numbers in its raw_data are returned; half precision and
+    integers become float32. Raises ValueError if the number of values does not match the shape.
     """
     return _values(proto, _DATA)
 
@@ -63,7 +63,7 @@ def diff_to_array(proto: Any) -> np.ndarray | None:
 
 
 def from_array(values: np.ndarray, diff: np.ndarray | None = None) -> Any:
-    """Return a BlobProto of the values, and of their gradient: float32 as Caffe writes, or doubles from float64."""
+    """Return a BlobProto with the values and their gradient: float32 as in Caffe, or doubles for float64."""
     wide = values.dtype == np.float64
     runs = _Runs()
     for array, names in ((values, _DATA), (diff, _DIFF)):
@@ -75,7 +75,7 @@ def from_array(values: np.ndarray, diff: np.ndarray | None = None) -> Any:
 
 
 def in_half_precision(values: np.ndarray) -> Any:
-    """Return a BlobProto of the values, rounded to half precision, as NVIDIA Caffe and OpenCV write them: raw_data."""
+    """Return a BlobProto with the values in half precision as raw_data, as NVIDIA Caffe and OpenCV write it."""
     runs = _Runs(raw_data_type=_RAW_DTYPES.index("<f2"), raw_data=values.astype("<f2").tobytes())
     proto = _of_shape(values.shape)
     proto.MergeFromString(runs.SerializeToString())
@@ -83,7 +83,7 @@ def in_half_precision(values: np.ndarray) -> Any:
 
 
 def _of_shape(shape: Shape) -> Any:
-    """Return a BlobProto of a shape; like Caffe's, one of no axes has no field ``shape``."""
+    """Return a BlobProto with a shape. As in Caffe, the field ``shape`` is absent if there are no axes."""
     return BlobProto(shape=BlobShape(dim=shape)) if shape else BlobProto()
 
 
@@ -106,16 +106,16 @@ def _check_count(found: int, name: str, shape: Shape) -> None:
 
 
 class Elsewhere(NamedTuple):
-    """Numbers that were left in the file, little-endian float32: where, and their shape."""
+    """Numbers that were not read from a file (little-endian float32): their position and shape."""
 
     file: BinaryIO
     start: int
     shape: Shape
 
     def parts(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield all numbers in order, part by part, each with the count of those before it.
+        """Yield all numbers in order, in parts, each with the number of values before it.
 
-        A part is good until the next. Raises OSError where they cannot be read, ValueError where the file was cut.
+        A part is valid until the next one. Raises OSError if they cannot be read, ValueError for a truncated file.
         """
         count = math.prod(self.shape)
         part = np.empty(min(_AT_ONCE, count), "<f4")
@@ -123,12 +123,12 @@ class Elsewhere(NamedTuple):
         for done in range(0, count, len(part)):
             here = part[: count - done]
             if self.file.readinto(memoryview(here).cast("B")) < here.nbytes:  # type: ignore[attr-defined]
-                raise ValueError("was cut by another program while it was read")
+                raise ValueError("was truncated by another program while it was being read")
             yield done, here
 
 
 def elsewhere(proto: Any, file: BinaryIO | None) -> Elsewhere | None:
-    """Return where a blob's numbers lie that were left in the file; None if it has them itself.
+    """Return the position of a blob's numbers in the file; None if the blob contains them.
 
     Raises ValueError as :func:`to_array`.
     """
@@ -141,7 +141,7 @@ def elsewhere(proto: Any, file: BinaryIO | None) -> Elsewhere | None:
 
 
 def _raw_values(runs: Any, count: int) -> np.ndarray:
-    """Return the ``count`` numbers of raw_data; raises ValueError where its bytes are not as many."""
+    """Return the ``count`` numbers of raw_data; raises ValueError if its size does not match."""
     kind, size = runs.raw_data_type, len(runs.raw_data)
     if not 0 <= kind < len(_RAW_DTYPES):
         raise ValueError(f"found no data, and raw_data_type {kind}, expected 0 to {len(_RAW_DTYPES) - 1}")
@@ -156,10 +156,10 @@ def _raw_values(runs: Any, count: int) -> np.ndarray:
 
 
 def _runs_message() -> Any:
-    """Return a message of BlobProto's wire format whose packed numbers are ``bytes``.
+    """Return a message with BlobProto's wire format whose packed numbers are ``bytes``.
 
-    protobuf writes repeated floats one Python object at a time (10 s for the 70 million of a net of the paper); as
-    bytes, numpy writes them in place.
+    protobuf writes repeated floats one Python object at a time (10 s for the 70 million of a net in the paper). As
+    bytes, numpy can write them in place.
     """
     file = descriptor_pb2.FileDescriptorProto(name="netspec/blob_runs.proto", package="netspec")
     message = file.message_type.add(name="BlobRuns")

@@ -31,8 +31,8 @@ from netspec.files.limits import amount
 from netspec.files.whole_file import whole_folder
 
 BACKENDS = ("lmdb", "leveldb")
-_SCAN = 4096  # keys listed ahead of the requested one
-LITTLE = 1 << 16  # bytes that a full disk may have left
+_SCAN = 4096  # number of keys to list beyond the requested one
+LITTLE = 1 << 16  # free bytes below which a disk is considered full
 _FIRST_MAP_SIZE = 1 << 20  # Caffe's
 _COMMIT_RECORDS, _COMMIT_BYTES = 1000, 64 << 20  # a batch stays in memory until it is committed
 
@@ -50,7 +50,7 @@ class Reader(ABC):
 
     @abstractmethod
     def records(self, numbers: Sequence[int]) -> list[bytes]:
-        """Return the values of records; raises SpecError where the database is damaged or was changed."""
+        """Return the values of records; raises SpecError if the database is damaged or was changed."""
 
     def record(self, i: int) -> bytes:
         """Return the value of record ``i``; see :meth:`records`."""
@@ -59,19 +59,19 @@ class Reader(ABC):
     @property
     @abstractmethod
     def is_current(self) -> bool:
-        """Whether the database is still as it was when it was opened."""
+        """Whether the database has not changed since it was opened."""
 
 
-# Two nets (training and test, for example) that use one database share what is known of it. A forked process opens it
-# again, and so does a net that is built after another program has written to it.
+# Two nets that use the same database (training and test, for example) share its reader. A forked process opens it
+# again, and so does a net that is built after another program has changed the database.
 _open_readers: weakref.WeakValueDictionary[tuple[int, int, int], Reader] = weakref.WeakValueDictionary()
 _open_lock = threading.Lock()
 
 
 def open_reader(source: str, backend: str = "lmdb", where: Where | None = None) -> Reader:
-    """Open a database for reading; it is closed when the last reference to the reader is gone.
+    """Open a database for reading; it is closed when the last reference to the reader is deleted.
 
-    ``where`` is the place that names the source. Raises SpecError for a database that is missing, empty, damaged or has
+    ``where`` is the place in the prototxt. Raises SpecError for a database that is missing, empty, damaged, or has
     the other backend.
     """
     try:
@@ -146,7 +146,7 @@ class _LmdbReader(Reader):
         return self._file.is_current
 
     def _record(self, i: int) -> Record:
-        """Return a record, listing those before it: on a slow disk, listing a large database takes minutes."""
+        """Return a record, after listing only the records before it: listing a large database can take minutes."""
         if i >= len(self._records):
             with self._lock:
                 try:
@@ -154,7 +154,7 @@ class _LmdbReader(Reader):
                 except (ValueError, OSError) as fault:
                     raise self._fault(fault) from None
         if i >= len(self._records):
-            raise self._fault(ValueError("is damaged: it has fewer records than announced"))
+            raise self._fault(ValueError("is damaged: it has fewer records than its header says"))
         return self._records[i]
 
     def _fault(self, fault: ValueError | OSError) -> SpecError:
@@ -164,26 +164,28 @@ class _LmdbReader(Reader):
 class _LevelDbReader(Reader):
     """A LevelDB, opened in a folder of links to its files.
 
-    The library locks a database and rewrites parts of it, even to read. The links let several processes read one, and
-    one on read-only media. Without ``paranoid_checks`` and ``verify_checksums`` it would pass over what is damaged.
+    Even for reading, the library locks a database and rewrites parts of it. With links, several processes can read the
+    same database, also on read-only media. Without ``paranoid_checks`` and ``verify_checksums``, damage is ignored.
     """
 
     def __init__(self, source: str) -> None:
         plyvel = _plyvel()
         self._source, self._stamp = source, _contents(source)
         folder = mkdtemp(prefix="netspec-leveldb-")
-        # Unlike weakref's, this runs at the end of a worker too, and never in a process that was forked later.
+        # Unlike weakref's finalizers, this also runs at the end of a worker, and never in a process forked later.
         Finalize(self, shutil.rmtree, (folder, True), exitpriority=0)
         for name in set(os.listdir(source)) - {"LOCK", "LOG", "LOG.old"}:
             if name.endswith(".log") and _ends_within_a_record(Path(source, name)):
-                raise ValueError(f"is damaged: its file {name} ends within a record; copy or write the database again")
+                raise ValueError(
+                    f"is damaged: its file {name} ends in the middle of a record; copy or write the database again"
+                )
             os.symlink(os.path.abspath(os.path.join(source, name)), os.path.join(folder, name))
         try:
             self._db = plyvel.DB(folder, create_if_missing=False, paranoid_checks=True)
             with self._db.iterator(include_value=False, verify_checksums=True) as keys:
                 self._keys: list[bytes] = list(keys)
         except (plyvel.Error, OSError) as fault:
-            raise ValueError(f"cannot be opened as a LevelDB ({_said(fault)})") from None
+            raise ValueError(f"cannot be opened as a LevelDB ({_message(fault)})") from None
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -195,10 +197,10 @@ class _LevelDbReader(Reader):
         try:
             return [value for run in _runs(numbers) for value in self._values([self._keys[i] for i in numbers[run]])]
         except (_plyvel().Error, OSError) as fault:
-            raise SpecError(f'database "{self._source}" is damaged ({_said(fault)})') from None
+            raise SpecError(f'database "{self._source}" is damaged ({_message(fault)})') from None
 
     def _values(self, keys: Sequence[bytes]) -> list[bytes]:
-        """Return the values of keys that follow each other."""
+        """Return the values of consecutive keys."""
         if len(keys) == 1:
             return [self._db.get(keys[0], verify_checksums=True)]
         with self._db.iterator(
@@ -212,7 +214,7 @@ class _LevelDbReader(Reader):
 
 
 def _runs(numbers: Sequence[int]) -> Iterator[slice]:
-    """Yield the parts of a line of numbers in which each is one more than that before."""
+    """Yield the runs of consecutive numbers."""
     start = 0
     for end in range(1, len(numbers) + 1):
         if end == len(numbers) or numbers[end] != numbers[end - 1] + 1:
@@ -220,38 +222,38 @@ def _runs(numbers: Sequence[int]) -> Iterator[slice]:
             start = end
 
 
-def _said(fault: Exception) -> str:
-    """Return the message of an error of the library, which gives it as bytes."""
-    said = fault.args[0] if fault.args else ""
-    return said.decode(errors="replace") if isinstance(said, bytes) else str(fault)
+def _message(fault: Exception) -> str:
+    """Return the message of an error of the library, which is bytes."""
+    message = fault.args[0] if fault.args else ""
+    return message.decode(errors="replace") if isinstance(message, bytes) else str(fault)
 
 
 def _ends_within_a_record(log: Path) -> bool:
-    """Say whether a log of LevelDB was cut: the library takes the rest of it for what a dead writer left.
+    """Return whether a log of LevelDB is truncated, which the library takes for the work of an interrupted writer.
 
     LevelDB: doc/log_format.md
     """
     size, block, header = log.stat().st_size, 32768, 7
-    full, last = 1, 4  # kinds of parts; a record is one part, or several in several blocks
+    full, last = 1, 4  # types of parts; a record has one part, or several parts in several blocks
     place, kind = 0, full
     with log.open("rb") as file:
         while place < size:
             room = block - place % block
-            if room < header:  # zeros to the end of the block
+            if room < header:  # zeros up to the end of the block
                 place += room
                 continue
             file.seek(place)
             _, length, kind = struct.unpack("<IHB", file.read(header).ljust(header, b"\0"))
-            if kind == 0:  # space that was reserved and not used
+            if kind == 0:  # unused reserved space
                 return False
             place += header + length
     return place > size or kind not in (full, last)
 
 
 def _contents(folder: str) -> dict[str, tuple[int, int]]:
-    """Return number and size of the files that hold a LevelDB: none is written over, but one may grow. {}: it is gone.
+    """Return the inode numbers and sizes of a LevelDB's files, which may grow but are never overwritten; {} if none.
 
-    The numbers tell it from another one: that of a folder that was removed may be the next one's.
+    They distinguish it from a new database, whose folder may have the inode number of a removed one.
     """
     try:
         files = [entry for entry in os.scandir(folder) if not entry.name.startswith(("LO", "."))]
@@ -271,8 +273,8 @@ def _plyvel() -> ModuleType:
 class Writer:
     """Writes a new database that appears at its path only when it is complete.
 
-    A context manager: records are put into a hidden folder next to the path, which is renamed at the end, or removed
-    after an error. Missing parent folders are made. Memory use is constant, and real Caffe reads the result. Raises
+    A context manager: records are written to a hidden folder next to the path, which is renamed at the end, or removed
+    after an error. Missing parent folders are created. Memory use is constant, and Caffe can read the result. Raises
     SpecError if the path already exists (as Caffe does) or cannot be written to.
     """
 
@@ -300,7 +302,7 @@ class Writer:
         return self
 
     def put(self, key: bytes, value: bytes) -> None:
-        """Add a record; a second one with the same key replaces the first."""
+        """Add a record; it replaces an earlier one with the same key."""
         assert self._store is not None, "put() outside of the with block"
         try:
             self._store.put(key, value)
@@ -309,7 +311,7 @@ class Writer:
             raise SpecError(f'cannot write record "{name}" ({self._why(fault)})', Where(self.path)) from None
 
     def commit(self) -> None:
-        """Write the records put so far to the file system."""
+        """Write the records so far to the file system."""
         assert self._store is not None, "commit() outside of the with block"
         try:
             self._store.commit()
@@ -317,7 +319,7 @@ class Writer:
             raise SpecError(f"cannot write to the database ({self._why(fault)})", Where(self.path)) from None
 
     def _why(self, fault: Exception) -> str:
-        """Return why something could not be written. LMDB says "Input/output error" where a disk is full."""
+        """Return why writing failed. On a full disk, LMDB's error is "Input/output error"."""
         free = shutil.disk_usage(Path(self.path).absolute().parent).free
         return f"the disk is full: {amount(free)} left" if free < LITTLE else str(fault)
 
@@ -337,10 +339,10 @@ class Writer:
 
 
 class _LmdbStore:
-    """A growing LMDB: if the map is full, the batch is written again into a map twice as large.
+    """A growing LMDB: if the map is full, it is doubled and the batch is written again.
 
-    Caffe: LMDBTransaction (src/caffe/util/db_lmdb.cpp); the files are equal byte for byte as long as 1000 records are
-    no more than ``_COMMIT_BYTES``.
+    Caffe: LMDBTransaction (src/caffe/util/db_lmdb.cpp). The files are byte-identical if 1000 records have at most
+    ``_COMMIT_BYTES``.
     """
 
     def __init__(self, folder: str) -> None:

@@ -20,7 +20,7 @@ from netspec.proto.schema import Datum
 
 
 def array_to_datum(array: np.ndarray, label: int | None = None) -> Datum:
-    """Return a Datum of an array (C, H, W): uint8 goes into ``data``, any other type as floats into ``float_data``.
+    """Return a Datum of an array (C, H, W): uint8 in ``data``, any other type as floats in ``float_data``.
 
     Raises ValueError if the array does not have three axes.
     """
@@ -30,7 +30,7 @@ def array_to_datum(array: np.ndarray, label: int | None = None) -> Datum:
     datum = Datum(channels=channels, height=height, width=width)
     if array.dtype == np.uint8:
         datum.data = array.tobytes()
-        datum.encoded = False  # CVMatToDatum writes it out, though it is the default
+        datum.encoded = False  # CVMatToDatum writes the default value too
     else:
         datum.float_data.extend(np.asarray(array, np.float32).ravel().tolist())
     if label is not None:
@@ -39,10 +39,10 @@ def array_to_datum(array: np.ndarray, label: int | None = None) -> Datum:
 
 
 def encoded_datum(image: bytes, label: int | None = None, shape: tuple[int, int, int] | None = None) -> Datum:
-    """Return a Datum of an image file's bytes (PNG, JPEG, ...).
+    """Return a Datum of the bytes of an image file (PNG, JPEG, ...).
 
-    ``shape`` (C, H, W) is written for an image that was encoded here, and omitted for a file stored as it is, as in
-    Caffe (EncodeCVMatToDatum, ReadFileToDatum).
+    As in Caffe, ``shape`` (C, H, W) is written for an image encoded by the program, and omitted for a file stored
+    unchanged (EncodeCVMatToDatum, ReadFileToDatum).
     """
     datum = Datum(data=image, encoded=True)
     if shape is not None:
@@ -63,12 +63,12 @@ def parse_datum(record: bytes) -> Datum:
 def datum_to_array(datum: Any, color: bool | None = None, warn: Callable[[str], None] | None = None) -> np.ndarray:
     """Return the values (C, H, W): uint8 from ``data``, float32 from ``float_data``; ``data`` if both are given.
 
-    An encoded image is decoded: to three channels if ``color`` is true, to one if it is false, to the file's channels
-    if it is None. Raw data is not converted. The array may be read-only. Raises ValueError for a Datum that
-    contradicts itself or cannot be decoded.
+    An encoded image is decoded to three channels if ``color`` is true, to one if it is false, and to the file's
+    channels if it is None. Raw data is not converted. The array may be read-only. Raises ValueError for a Datum that is
+    inconsistent or cannot be decoded.
 
-    Where raw data is longer than its shape, Caffe's data layers read the first values (data_transformer.cpp), and its
-    other tools refuse it. The first values are read only if ``warn`` is given; it is called with the message.
+    If raw data is longer than its shape, Caffe's data layers read the first values (data_transformer.cpp), and its
+    other tools refuse it. With ``warn``, the first values are read, and ``warn`` is called with a message.
     """
     if datum.encoded:
         return decode_image(datum.data, color)
@@ -91,7 +91,7 @@ def decode_image(image: bytes, color: bool | None = None) -> np.ndarray:
 
 
 def decode_pixels(image: bytes, color: bool | None = None) -> np.ndarray:
-    """Decode an image file's bytes as OpenCV lays them out, uint8 (H, W) or (H, W, C); see :func:`decode_image`."""
+    """Decode an image file's bytes in OpenCV's layout, uint8 (H, W) or (H, W, C); see :func:`decode_image`."""
     flag = cv2.IMREAD_UNCHANGED if color is None else cv2.IMREAD_COLOR if color else cv2.IMREAD_GRAYSCALE
     try:
         pixels = cv2.imdecode(np.frombuffer(image, np.uint8), flag) if image and not is_cut_png(image) else None
@@ -105,7 +105,7 @@ def decode_pixels(image: bytes, color: bool | None = None) -> np.ndarray:
 
 
 def planar(pixels: np.ndarray) -> np.ndarray:
-    """Return OpenCV's (H, W) or (H, W, C) as contiguous (C, H, W)."""
+    """Convert OpenCV's (H, W) or (H, W, C) to contiguous (C, H, W)."""
     return np.ascontiguousarray(pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1))
 
 

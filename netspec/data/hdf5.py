@@ -1,4 +1,4 @@
-"""Rows of HDF5 files, and results written to one.
+"""Reading rows of HDF5 files, and writing results to one.
 
 Caffe: src/caffe/layers/hdf5_data_layer.cpp, src/caffe/layers/hdf5_output_layer.cpp
 """
@@ -22,15 +22,15 @@ from netspec.data.sources import ALONE, Arrays, Cursor, Draws, Shape
 from netspec.errors import SpecError, Where
 from netspec.files.hdf5 import new_hdf5, open_hdf5
 
-_FILES_IN_MEMORY = 2  # Caffe holds the one it reads from; a batch may span two
+_FILES_IN_MEMORY = 2  # files to keep in memory; Caffe keeps one, but a batch can span two
 
 
 class Hdf5Source:
-    """The datasets with the names of the tops, row by row, from the files that a list names (space-separated).
+    """The datasets named after the tops, row by row, from the files in a list (separated by spaces).
 
-    ``files`` is the path of the list, or the files' own paths. A batch may span files. With ``shuffle`` each epoch has
-    its own order of files, and of the rows within each file. Raises SpecError for a missing file or dataset, and if
-    rows differ in shape between files.
+    ``files`` is the path of the list, or the paths of the files. A batch can span files. With ``shuffle``, each epoch
+    has a different order of files, and of the rows within each file. Raises SpecError for a missing file or dataset,
+    and if rows differ in shape between files.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Hdf5Source:
         return self.together(iteration, 1)
 
     def together(self, iteration: int, count: int) -> Arrays:
-        """Return what :func:`netspec.data.sources.batches` splits."""
+        """Return the tops of several iterations; see :func:`netspec.data.sources.batches`."""
         rows = self._rows(iteration, count)
         files = np.searchsorted(self._starts, rows, side="right") - 1
         tops = tuple(np.empty((len(rows), *shape), np.float32) for shape in self._row_shapes)
@@ -84,7 +84,7 @@ class Hdf5Source:
         return [f"{self._files[f]}:{row - self._starts[f]}" for f, row in zip(files, rows, strict=True)]
 
     def _rows(self, iteration: int, count: int = 1) -> np.ndarray:
-        """Return the rows of iterations, counted through all files."""
+        """Return the indices of the rows of iterations, counted through all files."""
         rows = self.cursor.count
         places = np.array(self.cursor.positions(iteration, count))
         if not self._shuffle:
@@ -104,7 +104,7 @@ class Hdf5Source:
             arrays = tuple(opened.values(top).astype(np.float32) for top in self._tops)
             rows = int(self._starts[file + 1] - self._starts[file])
             if any(array.shape != (rows, *shape) for array, shape in zip(arrays, self._row_shapes, strict=True)):
-                raise SpecError("was changed by another program while it was read")
+                raise SpecError("was changed by another program while it was being read")
             return arrays
 
     def _rows_of(self, name: str, place: Where) -> int:
@@ -116,7 +116,7 @@ class Hdf5Source:
 
 
 def _listed(path: str, where: Where | None) -> list[tuple[str, Where]]:
-    """Return the files that a list names, and where it does. Raises SpecError if it names none."""
+    """Return the files in a list, and their places in it. Raises SpecError if there are none."""
     log.info("hdf5_data_layer.cpp:80", f"Loading list of HDF5 filenames from: {path}")
     named = [(name, place) for line, place in list_lines(path, where) for name in line.split()]
     log.info("hdf5_data_layer.cpp:94", f"Number of HDF5 files: {len(named)}")
@@ -144,11 +144,11 @@ def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list
 
 
 class Hdf5Sink:
-    """A new HDF5 file with the growing datasets ``data`` and ``label``, both 4-D as Caffe writes them.
+    """A new HDF5 file with growing datasets ``data`` and ``label``, both 4-D as in Caffe.
 
-    Caffe stops at the second batch, because its datasets then exist; here batches are appended. The file appears when
-    the sink is closed, or is no longer used; without a batch there is none. Raises SpecError, and leaves an older file
-    as it was, if the file cannot be written or a batch has another shape than those before it.
+    Caffe stops at the second batch, because its datasets already exist; here batches are appended. The file is renamed
+    to its path when the sink is closed or deleted; without a batch, no file is written. Raises SpecError, and keeps an
+    older file, if the file cannot be written or a batch has a different shape.
     """
 
     NAMES = ("data", "label")
@@ -172,7 +172,7 @@ class Hdf5Sink:
         log.info("hdf5_output_layer.cpp:36", f"Successfully saved {len(data)} rows")
 
     def close(self) -> None:
-        """Make the file appear."""
+        """Complete the file and rename it to its path."""
         self._end()
 
     def _open(self) -> None:
@@ -195,7 +195,7 @@ class Hdf5Sink:
         dataset[-len(rows) :] = rows
 
     def _end(self, fault: SpecError | None = None) -> None:
-        """Close the file that is being written: it appears at its path, or is removed after an error."""
+        """Close the file; rename it to its path, or remove it after an error."""
         writing, self._writing = self._writing, None
         if writing is not None:
             self._unused.detach()
@@ -204,7 +204,7 @@ class Hdf5Sink:
 
     @contextmanager
     def _said_here(self) -> Iterator[None]:
-        """Give a fault the place in the prototxt that names the file."""
+        """Return an error with the place in the prototxt that names the file."""
         try:
             yield
         except SpecError as fault:

@@ -27,10 +27,10 @@ class ListedImage:
 
 
 def read_image(path: str, color: bool = True, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Return an image file as uint8 (C, H, W): 3 channels (blue, green, red), or 1 where ``color`` is false.
+    """Return an image file as uint8 (C, H, W): 3 channels (blue, green, red), or 1 if ``color`` is false.
 
-    ``size`` is (height, width); images are resized bilinearly without low-pass filtering, as by cv::resize.
-    Raises ValueError, which names the file, if the file is missing or is not an image.
+    ``size`` is (height, width). Images are resized bilinearly without low-pass filtering, as by cv::resize.
+    Raises ValueError with the name of the file if it is missing or is not an image.
     """
     try:
         pixels = decode_pixels(read_bytes(path), color)
@@ -42,15 +42,15 @@ def read_image(path: str, color: bool = True, size: tuple[int, int] | None = Non
         height, width = size
         try:
             pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_LINEAR)
-        except cv2.error:  # it is too large
+        except cv2.error:  # too large
             raise ValueError(f'image "{path}" cannot be resized to {height} x {width}') from None
     return planar(pixels)
 
 
 def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Where]]:
-    """Yield the lines of a list file with their places, without blank lines and lines that begin with ``#``.
+    """Yield the lines of a list file with their places, except blank lines and lines that begin with ``#``.
 
-    ``where`` is the place that names the file. Raises SpecError if it cannot be read.
+    ``where`` is the place in the prototxt. Raises SpecError if the file cannot be read.
     """
     try:
         lines = read_bytes(path).decode("utf-8-sig").splitlines()
@@ -59,14 +59,14 @@ def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Whe
     except UnicodeDecodeError:
         raise SpecError(f'list file "{path}" is not UTF-8 text', where or Where(path)) from None
     if any("\0" in line for line in lines):
-        raise SpecError(f'list file "{path}" is not text: it has a NUL', where or Where(path))
+        raise SpecError(f'list file "{path}" is not text: it contains a NUL character', where or Where(path))
     for number, line in enumerate(lines, 1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield line.strip(), Where(path, number, 1)
 
 
 def read_image_list(path: str, where: Where | None = None) -> list[ListedImage]:
-    """Read lines of ``name label``, split at the last space, so that names may contain spaces.
+    """Read lines of the form ``name label``, split at the last space, so that names can contain spaces.
 
     Raises SpecError for a line without an integer label, and for a list without lines. (Caffe reads a label that is not
     a number as 0.)

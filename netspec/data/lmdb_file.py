@@ -1,11 +1,11 @@
-"""An LMDB's records, read from its file page by page.
+"""Reading the records of an LMDB from its file, page by page.
 
-The library maps the file into memory and trusts it: where the file is cut, damaged, or changed by another program
-meanwhile, the process dies. Here every page is read and checked, and what is wrong is a ValueError.
+The LMDB library maps the file into memory and trusts its contents. If the file is truncated, damaged, or changed by
+another program, the process crashes. This module reads and checks every page and raises ValueError instead.
 
-A file has pages of one size. Pages 0 and 1 each describe a state of the database; the one of the later transaction
-counts. From its root on, branch pages name pages, and leaf pages hold keys with their values, or with the number of the
-first of the pages that a large value fills.
+A file has pages of equal size. Pages 0 and 1 each describe a state of the database; the one with the later transaction
+is valid. Below its root, branch pages refer to pages. Leaf pages contain keys with their values, or with the number of
+the first page of a large value.
 
 LMDB: libraries/liblmdb/mdb.c (MDB_meta, MDB_db, MDB_page, MDB_node), format 1
 """
@@ -19,22 +19,22 @@ from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
 
-_HEADER = 16  # bytes of a page's header; in a meta page the meta follows
+_HEADER = 16  # bytes of a page's header; in a meta page, the meta data follows
 _META = struct.Struct("<IIQQ" + 2 * "IHHQQQQQ" + "QQ")
 _MAGIC, _VERSION = 0xBEEFC0DE, 1
-_PAGE = struct.Struct("<QHHHH")  # its own number, padding, kind, end of the pointers, start of the nodes
-_NODE = struct.Struct("<HHHH")  # size of the value or number of the page, in two or three parts; size of the key
-_BRANCH, _LEAF = 1, 2  # kinds of pages
-_LARGE = 1  # a node whose value is on pages of its own
+_PAGE = struct.Struct("<QHHHH")  # page number, padding, type, end of the pointers, start of the nodes
+_NODE = struct.Struct("<HHHH")  # size of the value or page number, in two or three parts; size of the key
+_BRANCH, _LEAF = 1, 2  # types of pages
+_LARGE = 1  # a node whose value is on separate pages
 _PAGE_SIZES = [1 << k for k in range(8, 17)]
 _DEEPEST = 32  # CURSOR_STACK
-_SMALLEST = 11  # bytes of a record: a node with a key of one byte, and its pointer
-_AT_ONCE = 1 << 22  # bytes: the most that is read for several values, whose copies take as many
+_SMALLEST = 11  # minimum bytes of a record: a node with a key of one byte, and its pointer
+_AT_ONCE = 1 << 22  # maximum bytes to read for several values; their copies need the same amount
 _NOWHERE = (1 << 64) - 1
 
 
 class Record(NamedTuple):
-    """A record's key, and where its value is in the file: offset and size in bytes."""
+    """The key of a record, and the offset and size of its value in the file, in bytes."""
 
     key: bytes
     offset: int
@@ -42,9 +42,9 @@ class Record(NamedTuple):
 
 
 class LmdbFile:
-    """The records of a data.mdb, in the order of their keys; ``len`` says how many there are.
+    """The records of a data.mdb, in the order of their keys; ``len()`` is their number.
 
-    Raises ValueError where the file is no LMDB, or is damaged, and OSError where it cannot be read.
+    Raises ValueError if the file is not an LMDB or is damaged, and OSError if it cannot be read.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -78,12 +78,12 @@ class LmdbFile:
                 break
             yield record
         if count != self._entries:
-            raise ValueError(f"is damaged: {self._entries} records are announced, {count} or more are there")
+            raise ValueError(f"is damaged: {self._entries} records expected from its header, found {count} or more")
 
     def values(self, records: Sequence[Record]) -> list[bytes]:
-        """Return the values of records; those that lie close together are read at once."""
+        """Return the values of records; adjacent values are read together."""
         if not self.is_current:
-            raise ValueError("was changed by another program while it was read")
+            raise ValueError("was changed by another program while it was being read")
         start = min(record.offset for record in records)
         size = max(record.offset + record.size for record in records) - start
         if len(records) > 1 and size <= min(_AT_ONCE, self._page_size + 2 * sum(record.size for record in records)):
@@ -93,7 +93,7 @@ class LmdbFile:
 
     @property
     def is_current(self) -> bool:
-        """Whether nobody has written to the file since it was opened."""
+        """Whether the file has not changed since it was opened."""
         return self._seen() == self._stamp
 
     def _seen(self) -> tuple[int, int]:
@@ -104,8 +104,10 @@ class LmdbFile:
         size, _ = self._stamp
         first = self._meta(0)
         if first is None:
-            raise ValueError("has a data.mdb that is not an LMDB, or one of another version or kind of machine")
-        self._page_size = first[4]  # of the list of free pages, which nobody uses
+            raise ValueError(
+                "has a data.mdb that is not an LMDB, or comes from another LMDB version or kind of machine"
+            )
+        self._page_size = first[4]  # the page size, in the unused entry of the list of free pages
         if self._page_size not in _PAGE_SIZES:
             raise ValueError(f"is damaged: it has pages of {self._page_size} bytes")
         meta = max(first, self._meta(self._page_size) or first, key=lambda found: found[-1])
@@ -114,20 +116,20 @@ class LmdbFile:
             found = f"flags {flags}, depth {self._depth}, {self._entries} records in {size} bytes"
             raise ValueError(f"is damaged, or has several values per key: {found}")
         if self._entries and self._root == _NOWHERE:
-            raise ValueError(f"is damaged: {self._entries} records are announced, and none are there")
+            raise ValueError(f"is damaged: {self._entries} records expected from its header, found none")
         expected = (last + 1) * self._page_size
         if size < 2 * self._page_size or (size < expected and not self._is_whole()):
             raise ValueError(f"is truncated: data.mdb has {size} bytes, expected at least {expected}")
 
     def _is_whole(self) -> bool:
-        """Say whether all records are there: the last pages may never have been used, and so never written."""
+        """Return whether all records are in the file; unused pages at the end may be missing."""
         try:
             return sum(1 for _ in self.records()) == self._entries
         except ValueError:
             return False
 
     def _meta(self, offset: int) -> tuple[int, ...] | None:
-        """Return the fields of a meta page, without those of its header; None if this is no meta page."""
+        """Return the fields of a meta page without its header; None if it is not a meta page."""
         data = self._read(_META.size, offset + _HEADER)
         fields = _META.unpack(data) if len(data) == _META.size else (0, 0)
         return fields if fields[:2] == (_MAGIC, _VERSION) else None
@@ -153,7 +155,7 @@ class LmdbFile:
                 raise self._damage(number)
 
     def _page(self, number: int) -> tuple[bytes, int, tuple[int, ...]]:
-        """Return a page, its kind, and where its nodes start."""
+        """Return a page, its type, and the offsets of its nodes."""
         page = self._bytes(number * self._page_size, self._page_size)
         own, _, kind, lower, _ = _PAGE.unpack_from(page)
         count, odd = divmod(lower - _HEADER, 2)
@@ -165,7 +167,7 @@ class LmdbFile:
         return page, kind, starts
 
     def _large(self, number: int, size: int) -> int:
-        """Return where a value on pages of its own starts."""
+        """Return the offset of a value on separate pages."""
         start = number * self._page_size + _HEADER
         if start + size > self._stamp[0]:
             raise self._damage(number)
@@ -175,10 +177,10 @@ class LmdbFile:
         if offset + size > self._stamp[0]:
             raise self._damage(offset // self._page_size)
         data = self._read(size, offset)
-        while len(data) < size:  # a read of more than 2 GiB is cut short; at the end nothing comes
+        while len(data) < size:  # a read returns at most 2 GiB, and nothing at the end of the file
             more = self._read(size - len(data), offset + len(data))
             if not more:
-                raise ValueError("was cut by another program while it was read")
+                raise ValueError("was truncated by another program while it was being read")
             data += more
         return data
 
@@ -190,4 +192,4 @@ class LmdbFile:
             return os.read(self._file, size)
 
     def _damage(self, number: int) -> ValueError:
-        return ValueError(f"is damaged: page {number} of data.mdb is not what it should be")
+        return ValueError(f"is damaged: page {number} of data.mdb is not valid")

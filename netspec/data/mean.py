@@ -1,4 +1,4 @@
-"""Mean images: read, computed and written as Caffe's .binaryproto.
+"""Reading, computing and writing mean images in Caffe's .binaryproto format.
 
 Caffe: src/caffe/data_transformer.cpp, tools/compute_image_mean.cpp
 """
@@ -24,7 +24,7 @@ from netspec.proto.schema import BlobProto
 def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     """Return the mean image of a .binaryproto file: float32 (C, H, W).
 
-    ``where`` is the place that names the file. Raises SpecError if it cannot be read or is not an image.
+    ``where`` is the place in the prototxt. Raises SpecError if the file cannot be read or is not an image.
     """
     log.info("data_transformer.cpp:25", f"Loading mean file from: {path}")
     try:
@@ -40,12 +40,12 @@ def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     if mean.ndim != 3 and not (mean.ndim == 4 and mean.shape[0] == 1):
         raise SpecError(f'mean file "{path}" contains a blob of shape {mean.shape}, expected one image', where)
     if not np.all(np.isfinite(mean)):
-        raise SpecError(f'mean file "{path}" has a NaN or an infinity', where)
+        raise SpecError(f'mean file "{path}" contains a NaN or an infinity', where)
     return mean.reshape(mean.shape[-3:]).astype(np.float32)
 
 
 def read_mean_option(text: str) -> np.ndarray:
-    """Return the mean of ``--mean``: numbers with commas between, or a .binaryproto or .npy file (C, H, W)."""
+    """Return the mean given by ``--mean``: numbers separated by commas, or a .binaryproto or .npy file (C, H, W)."""
     try:
         return np.array([float(part) for part in text.split(",")], np.float32)
     except ValueError:
@@ -53,16 +53,16 @@ def read_mean_option(text: str) -> np.ndarray:
     if not text.endswith(".npy"):
         return read_mean(text, Where("--mean"))
     try:
-        mapped = np.load(text, mmap_mode="r", allow_pickle=False)  # the size of the file limits that of the array
+        mapped = np.load(text, mmap_mode="r", allow_pickle=False)  # the file size limits the size of the array
         if not np.all(np.isfinite(mapped)):
-            raise ValueError("it has a NaN or an infinity")
+            raise ValueError("it contains a NaN or an infinity")
         return np.array(mapped, np.float32)
     except (OSError, ValueError, TypeError, EOFError, SyntaxError, OverflowError, TokenError) as fault:
         raise SpecError(f"cannot be read as an array: {' '.join(str(fault).split())}", Where(text)) from None
 
 
 def center(mean: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return the middle of a mean image (C, H, W) that is at least as large, as Caffe cuts images in phase TEST."""
+    """Return the center of a larger mean image (C, H, W), cropped as Caffe crops images in phase TEST."""
     top, left = (mean.shape[1] - height) // 2, (mean.shape[2] - width) // 2
     return mean[:, top : top + height, left : left + width]
 
@@ -70,8 +70,8 @@ def center(mean: np.ndarray, height: int, width: int) -> np.ndarray:
 def compute_mean(reader: Reader, where: Where) -> np.ndarray:
     """Return the mean of all records of a database, encoded or not: float32 (C, H, W).
 
-    Sums are exact; Caffe's floats begin to round at about 65,000 images. Raises SpecError for a record that is not an
-    image, or has another size than the first.
+    Sums are exact, while Caffe's float sums begin to round at about 65,000 images. Raises SpecError for a record that
+    is not an image, or has a different size than the first.
     """
     first, total = "", np.zeros(0)
     for i in range(len(reader)):

@@ -1,4 +1,4 @@
-"""Batches that threads make ahead of the net."""
+"""Making batches in threads, ahead of the net."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Made = list[tuple[T | None, BaseException | None]]
 
 
 class Feed(Generic[T]):
-    """Returns what ``make`` makes of the iterations 0, 1, ... in order; ``workers`` threads make up to ``ahead`` ahead.
+    """Returns the batches of iterations 0, 1, ... in order; ``workers`` threads make up to ``ahead`` in advance.
 
-    ``make(first, count)`` makes that of ``count`` iterations, as a function of their numbers alone, so batches depend
-    neither on the number of threads nor on timing. No thread runs before the first ``next()``; with ``ahead`` 0 none
-    ever does. ``next()`` raises what ``make`` raises for its iteration. Threads make ``at_once`` iterations at a time:
-    to wake a thread takes longer than to make a small batch.
+    ``make(first, count)`` returns the batches of ``count`` iterations and depends only on their numbers, so batches
+    depend neither on the number of threads nor on timing. No thread runs before the first ``next()``, or if ``ahead``
+    is 0. ``next()`` raises the exception of ``make`` for its iteration. Threads make ``at_once`` iterations at a time,
+    since waking a thread takes longer than making a small batch.
     """
 
     def __init__(self, make: Make[T], ahead: int, workers: int, at_once: int = 1) -> None:
@@ -29,11 +29,11 @@ class Feed(Generic[T]):
         self._pool: ThreadPoolExecutor | None = None
         self._pending: deque[Future[Made[T]]] = deque()
         self._made: deque[tuple[T | None, BaseException | None]] = deque()
-        self.position = 0  #: the iteration whose batch comes next
-        self.waited = 0.0  #: how many seconds calls of ``next`` have taken
+        self.position = 0  #: the iteration of the next batch
+        self.waited = 0.0  #: total seconds in calls of ``next``
 
     def next(self) -> T:
-        """Return the batch at ``position``, and go to the next."""
+        """Return the batch at ``position``, and advance."""
         start = time.perf_counter()
         try:
             return self._next()
@@ -57,7 +57,7 @@ class Feed(Generic[T]):
         return made  # pyright: ignore[reportReturnType]
 
     def restart(self, position: int = 0) -> None:
-        """Continue at iteration ``position``; batches made in advance are dropped."""
+        """Continue at iteration ``position``; discard batches made in advance."""
         self._made.clear()
         while self._pending:
             self._pending.popleft().cancel()
@@ -72,7 +72,7 @@ class Feed(Generic[T]):
 
 
 def _made(make: Make[T], first: int, count: int) -> Made[T]:
-    """Return what is made of iterations, or the fault of each; one by one where not all can be made at once."""
+    """Return the batches of iterations, or their exceptions; if making all at once fails, make them one by one."""
     try:
         return [(made, None) for made in make(first, count)]
     except Exception as fault:

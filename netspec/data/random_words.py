@@ -1,7 +1,7 @@
 """Random numbers by record: the numbers of record k depend only on the seed, the stream's name and k.
 
-So a batch does not depend on the order of reading or the number of threads, and a run can continue from any
-iteration. The generator is counter-based (Philox-4x64); numpy guarantees that its raw words never change.
+Batches therefore do not depend on the order of reading or the number of threads, and a run can continue from any
+iteration. The generator is counter-based (Philox-4x64); NumPy guarantees that its raw words never change.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ def words(seed: int, stream: str, first: int, count: int) -> np.ndarray:
 
 
 def words_at(seed: int, stream: str, records: range) -> np.ndarray:
-    """Return the words of these records, which may be every n-th one only: uint64 (len(records), 4)."""
+    """Return the words of a range of records, which can have a step: uint64 (len(records), 4)."""
     return words(seed, stream, records.start, len(range(records.start, records.stop)))[:: records.step]
 
 
 def derived(seed: int, name: str) -> int:
-    """Return a seed below 2^32 for one of several parts that share ``seed``."""
+    """Return a seed below 2^32 for one of several parts that are derived from ``seed``."""
     return int.from_bytes(hashlib.blake2b(f"{seed}:{name}".encode(), digest_size=4).digest(), "little")
 
 

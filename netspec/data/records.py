@@ -1,4 +1,4 @@
-"""The records of a database or of HDF5 files one by one, damaged ones included, for people to look at."""
+"""Reading the records of a database or of HDF5 files one by one for inspection, including damaged ones."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _SIGNATURES = {b"\xff\xd8\xff": "JPEG", b"\x89PNG": "PNG", b"BM": "BMP", b"II*\0
 
 @dataclass(frozen=True)
 class Record:
-    """One record: its key, values (C, H, W) uint8 or float32, and label (None: it has none).
+    """A record: its key, values (C, H, W) uint8 or float32, and label or None.
 
-    ``kind`` says how the values are stored, ``size`` in how many bytes. A record that cannot be read has ``fault``, one
-    line that says why, and no values.
+    ``kind`` describes how the values are stored, and ``size`` is their size in bytes. If a record cannot be read,
+    ``fault`` is the reason in one line, and there are no values.
     """
 
     key: str
@@ -39,14 +39,14 @@ class Record:
 
 
 class Records(Protocol):
-    """Records by number, in the order in which Caffe reads them."""
+    """Records by index, in the order in which Caffe reads them."""
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of records."""
         ...
 
     def __getitem__(self, number: int) -> Record:
-        """Return one of them."""
+        """Return a record."""
         ...
 
 
@@ -62,9 +62,9 @@ def open_records(path: str | Path) -> Records:
 
 
 def spread(count: int, wanted: int | None) -> list[int]:
-    """Return ``wanted`` of the numbers below ``count``, one from each of so many equal parts; all where it is None.
+    """Return ``wanted`` of the numbers below ``count``, one from each of ``wanted`` equal parts; all if it is None.
 
-    Each is drawn at random from its part, always the same: labels often alternate.
+    Each is drawn at random from its part, with a fixed seed, since labels often alternate.
     """
     if wanted is None or wanted >= count:
         return list(range(count))
@@ -95,7 +95,7 @@ class _DatumRecords:
 
 
 class _RowRecords:
-    """The rows of HDF5 files: of each the dataset ``data``, or the one with most axes, and ``label``."""
+    """The rows of HDF5 files: the dataset ``data``, or the one with the most axes, and ``label``."""
 
     def __init__(self, files: list[tuple[str, Where]]) -> None:
         self._files = files
@@ -118,7 +118,7 @@ class _RowRecords:
         with open_hdf5(name, place) as file:
             names = [each for each in file.names() if (found := file.dataset(each)) is not None and found.ndim]
             if not names:
-                raise SpecError("holds no dataset with rows")
+                raise SpecError("contains no dataset with rows")
             axes = {each: getattr(file.dataset(each), "ndim", 0) for each in names}
             chosen = "data" if "data" in names else max(names, key=lambda each: axes[each])
             data = file.values(chosen)

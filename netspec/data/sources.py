@@ -1,4 +1,4 @@
-"""Sources of batches: each source makes the batch of iteration i as a function of i alone.
+"""Sources of batches. The batch of iteration i depends only on i.
 
 Caffe: src/caffe/layers/data_layer.cpp, src/caffe/layers/image_data_layer.cpp
 """
@@ -25,7 +25,7 @@ Arrays = tuple[np.ndarray, ...]
 
 @dataclass(frozen=True)
 class Draws:
-    """What random numbers of a reader follow from, seed and stream; of ``ranks`` parallel readers it is ``rank``.
+    """The seed and stream of a reader's random numbers; the reader is number ``rank`` of ``ranks`` parallel ones.
 
     All nets that read the same data must have the same seed.
     """
@@ -40,10 +40,10 @@ ALONE = Draws()
 
 
 class Cursor:
-    """Which records each iteration reads: batch after batch; after the last record it starts again.
+    """The records that each iteration reads: batch after batch, starting again after the last record.
 
-    The first ``skip`` records are skipped once, at the start. With ``shuffle`` each epoch has its own order, which
-    follows from its number. Of several ranks each takes every ``ranks``-th record (Caffe: DataLayer::Skip).
+    The first ``skip`` records are skipped once, at the start. With ``shuffle``, each epoch has a different order that
+    depends on its number. Each of several ranks reads every ``ranks``-th record (Caffe: DataLayer::Skip).
     """
 
     def __init__(self, count: int, batch_size: int, skip: int = 0, shuffle: bool = False, draws: Draws = ALONE) -> None:
@@ -54,11 +54,11 @@ class Cursor:
         self._order = lru_cache(maxsize=2)(lambda epoch: permutation(seed, f"{stream}/shuffle/{epoch}", count))
 
     def records(self, iteration: int, count: int = 1) -> list[int]:
-        """Return the numbers of the records of an iteration, or of ``count`` iterations from this one on."""
+        """Return the indices of the records of ``count`` iterations, starting at this one."""
         return [self._record(position) for position in self.positions(iteration, count)]
 
     def first(self) -> int:
-        """Return the number of the first record of all."""
+        """Return the index of the first record."""
         return self._record(self.positions(0)[0])
 
     def _record(self, position: int) -> int:
@@ -71,7 +71,7 @@ class Cursor:
         return range(start + self._rank, end, self._ranks)
 
     def wraps(self, iteration: int) -> int:
-        """Return how often an iteration passes the last record."""
+        """Return how often an iteration starts again after the last record."""
         start, end = self._span(iteration)
         return end // self.count - start // self.count
 
@@ -83,12 +83,12 @@ class Cursor:
 
 
 def draw_skip(rand_skip: int, seed: int, stream: str) -> int:
-    """Return how many records to skip at the start: less than ``rand_skip``, or 0 if that is 0."""
+    """Return the number of records to skip at the start: below ``rand_skip``, or 0 if that is 0."""
     return int(words(seed, f"{stream}/rand_skip", 0, 1)[0, 0]) % rand_skip if rand_skip else 0
 
 
 class Source(Protocol):
-    """What a data layer needs to know about its data."""
+    """The interface between a data layer and its data."""
 
     cursor: Cursor
 
@@ -107,7 +107,7 @@ class Source(Protocol):
 
 
 def batches(source: Source, iteration: int, count: int) -> list[Arrays]:
-    """Return the tops of ``count`` iterations: made all at once where the source has ``together``, and can."""
+    """Return the tops of ``count`` iterations, made together if the source has ``together`` and can do so."""
     arrays = source.together(iteration, count) if count > 1 and isinstance(source, Together) else None
     if arrays is None:
         return [source.batch(i) for i in range(iteration, iteration + count)]
@@ -117,10 +117,10 @@ def batches(source: Source, iteration: int, count: int) -> list[Arrays]:
 
 @runtime_checkable
 class Together(Protocol):
-    """A source that can make the batches of several iterations at once."""
+    """A source that can make the batches of several iterations together."""
 
     def together(self, iteration: int, count: int) -> Arrays | None:
-        """Return the tops of ``count`` iterations one behind the other; None if this cannot be."""
+        """Return the concatenated tops of ``count`` iterations; None if this is not possible."""
         ...
 
 
@@ -133,10 +133,10 @@ class _Item:
 
 
 class _ImageSource:
-    """Images with labels, one at a time by number, made into batches by a Transformer.
+    """Images with labels, read one at a time and made into batches by a Transformer.
 
-    With a batch size of 1 each image may have its own size. Otherwise all transformed images must have the shape of the
-    first; raises SpecError, which names the record, if one does not.
+    With a batch size of 1, images can have different sizes. Otherwise all transformed images must have the shape of the
+    first; raises SpecError with the name of the record if one does not.
     """
 
     def __init__(self, cursor: Cursor, transformer: Transformer) -> None:
@@ -185,11 +185,11 @@ class DatabaseSource(_ImageSource):
         return self.together(iteration, 1) or super().batch(iteration)
 
     def together(self, iteration: int, count: int) -> Arrays | None:
-        """Return what :func:`batches` splits, of small records; None if they must be read one by one."""
+        """Return the concatenated tops of small records; None if records must be read one by one."""
         try:
             found = self._stacked(self._reader.records(self.cursor.records(iteration, count))) if self._small else None
         except SpecError:
-            return None  # one by one they say which record it is
+            return None  # reading one by one gives an error that names the record
         alike = found and (
             self.cursor.batch_size == 1 or self._transform.output_shape(found[0].shape[1:]) == self._shape
         )
@@ -208,7 +208,7 @@ class DatabaseSource(_ImageSource):
         try:
             datum = parse_datum(self._reader.record(record))
             return _Item(self._name(record), self._transform.decode(datum), datum.label, self._where)
-        except SpecError as fault:  # of the database itself
+        except SpecError as fault:  # an error of the database itself
             raise SpecError(fault.message, fault.where or self._where) from None
         except ValueError as fault:
             raise SpecError(f'record "{self._name(record)}" {fault}', self._where) from None
@@ -217,7 +217,7 @@ class DatabaseSource(_ImageSource):
 class ImageListSource(_ImageSource):
     """Image files of a list, as in Caffe's ImageData layer. Records are named as in the list.
 
-    Images are resized to ``size`` (height, width), unless it is None; ``root`` is put in front of each name.
+    Images are resized to ``size`` (height, width), unless it is None; ``root`` is prepended to each name.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
-"""Datums of one form, read together: the numbers of many small records as one array.
+"""Reading many small Datums of the same form together, as one array.
 
-To parse each record by itself takes longer than a small net needs for it. Records of a database are alike byte for byte
-but for their numbers and labels, so what was parsed of one holds for all that have its bytes elsewhere.
+Parsing each record takes longer than a small net needs to process it. The records of a database often differ only in
+the bytes of their numbers and labels. So the layout of one parsed record applies to all that have the same other bytes.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from netspec.data.datum import datum_to_array, parse_datum
 from netspec.proto.schema import Datum
 from netspec.proto.wire import BYTES, FOUR, fields
 
-MOST_BYTES = 1 << 16  # of a record: to copy a larger one together with others takes longer than to parse it
+MOST_BYTES = 1 << 16  # bytes of a record; for a larger one, copying takes longer than parsing
 _MOST_FORMS = 64
 _DATA, _LABEL, _FLOATS = (Datum.DESCRIPTOR.fields_by_name[name].number for name in ("data", "label", "float_data"))
 
 
 class _Form(NamedTuple):
-    """Where numbers and label lie in records of one size, and the bytes of the first one, equal in all elsewhere."""
+    """The positions of numbers and label in records of one size, and the first record, whose other bytes are equal."""
 
     record: np.ndarray
     shape: Shape
     values: slice
     label: slice
-    step: int  # bytes from number to number: 1 for uint8, 4 for floats, 5 for floats each with its tag
+    step: int  # bytes between numbers: 1 for uint8, 4 for floats, 5 for floats with tags
 
 
 class Stacker:
-    """Reads records as arrays; it remembers the forms that it has seen.
+    """Reads records as arrays, and remembers their forms.
 
-    ``decode`` returns the numbers (C, H, W) of a raw Datum: the first of those stored, or all.
+    ``decode`` returns the numbers (C, H, W) of a raw Datum: the first ones if there are more, or all.
     """
 
     def __init__(self, decode: Callable[[Any], np.ndarray] = datum_to_array) -> None:
@@ -45,7 +45,7 @@ class Stacker:
     def __call__(self, records: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray] | None:
         """Return images (N, C, H, W), uint8 or float32, and labels (N,), float32.
 
-        None if the records are not alike, encoded, large, or wrong: they must then be read one by one.
+        Returns None if the records have different forms, or are encoded, large or wrong. Read them one by one then.
         """
         sizes = list(map(len, records))
         if max(sizes) > MOST_BYTES:
@@ -73,7 +73,7 @@ class Stacker:
             return None
         rows = np.frombuffer(b"".join(records), np.uint8).reshape(len(records), size)
         found = _unpacked(rows, form)
-        if found is None and (rows[0] != form.record).any():  # a form of another database, or of its first records
+        if found is None and (rows[0] != form.record).any():  # a form of other records
             form = _form_of(records[0], self._decode)
             found = None if form is None else _unpacked(rows, form)
         if form is not None:
@@ -84,7 +84,7 @@ class Stacker:
 
 
 def _unpacked(rows: np.ndarray, form: _Form) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return images and labels of rows of bytes; None if one of them has another form."""
+    """Return images and labels of rows of bytes; None if one of them has a different form."""
     (first, second), start = sorted((form.values, form.label), key=lambda part: part.start), 0
     for part in (first, second, slice(rows.shape[1], rows.shape[1])):
         if (rows[:, start : part.start] != form.record[start : part.start]).any():
@@ -108,7 +108,7 @@ def _unpacked(rows: np.ndarray, form: _Form) -> tuple[np.ndarray, np.ndarray] | 
 
 
 def _form_of(record: bytes, decode: Callable[[Any], np.ndarray]) -> _Form | None:
-    """Return the form of a record; None if it is encoded, contradicts itself, or has a field several times."""
+    """Return the form of a record; None if it is encoded, inconsistent, or has a field several times."""
     try:
         found = list(fields(record, 0, len(record)))
         datum = parse_datum(record)

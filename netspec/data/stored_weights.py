@@ -1,4 +1,4 @@
-"""The weights of a .caffemodel or .caffemodel.h5 by themselves, without a net."""
+"""Reading the weights of a .caffemodel or .caffemodel.h5 without a net."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from netspec.proto.binary import read_net_binary
 
 @dataclass(frozen=True)
 class StoredLayer:
-    """A layer's weights in a file. HDF5 files do not say the ``type``; ``legacy``: shapes are those of old, 4-D."""
+    """The weights of a layer in a file. HDF5 files have no ``type``. ``legacy``: shapes are 4-D, as in old files."""
 
     name: str
     type: str
@@ -26,13 +26,13 @@ class StoredLayer:
 
     @property
     def has_filters(self) -> bool:
-        """Whether the first blob holds filters: four axes, and not those of an old InnerProduct (1, 1, M, N)."""
+        """Whether the first blob has filters: four axes, except for an old InnerProduct (1, 1, M, N)."""
         shape = self.blobs[0].shape
         return len(shape) == 4 and not (self.legacy and shape[:2] == (1, 1))
 
 
 def stored_layers(path: str | Path) -> list[StoredLayer]:
-    """Return the layers that have weights: in the net's order, in HDF5 in alphabetical order. Raises SpecError."""
+    """Return the layers with weights, in the net's order (HDF5: in alphabetical order). Raises SpecError."""
     if h5py.is_hdf5(path):
         return list(_hdf5_layers(path))
     layers = []

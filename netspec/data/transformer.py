@@ -20,7 +20,7 @@ from netspec.proto.schema import TRAIN
 
 
 def contradictions(param: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
-    """Yield a SpecError for each pair of settings of a transform_param that exclude each other."""
+    """Yield a SpecError for each pair of contradictory settings in a transform_param."""
     if param.force_color and param.force_gray:
         yield SpecError("force_color and force_gray cannot both be set", at("transform_param", "force_gray"))
     yield from mean_contradictions(param, at)
@@ -37,7 +37,7 @@ class Transformer:
 
     The window is random in TRAIN and central in TEST. The random numbers of record k, for mirror, h_off and w_off in
     Caffe's order, depend only on ``seed``, ``stream`` and k. ``at(*path)`` is the place of a field of the layer. Raises
-    SpecError for settings that contradict each other and for a mean file that cannot be read.
+    SpecError for contradictory settings and for a mean file that cannot be read.
     """
 
     def __init__(self, param: Any, phase: int, at: Callable[..., Where], seed: int = 0, stream: str = "") -> None:
@@ -62,7 +62,7 @@ class Transformer:
         return datum_to_array(datum, self.color, self._warn_long)
 
     def _warn_long(self, fault: str) -> None:
-        self._warn_once("data_transformer.cpp:63", f"{self._at()}: a record {fault}: only the first values are read")
+        self._warn_once("data_transformer.cpp:63", f"{self._at()}: a record {fault}; only the first values are used")
 
     def _warn_once(self, site: str, message: str) -> None:
         if site not in self._warned:
@@ -88,7 +88,7 @@ class Transformer:
     def __call__(self, images: Sequence[np.ndarray] | np.ndarray, positions: range) -> np.ndarray:
         """Return the images, uint8 or float32 (C, H, W), as one batch: float32 (N, C, H', W').
 
-        Images in one array (N, C, H, W) are transformed all at once. ``positions`` are the images' numbers in the
+        Images in one array (N, C, H, W) are transformed together. ``positions`` are the images' indices in the
         sequence of all records read; they determine the random numbers.
         """
         batch = np.empty((len(images), *self.output_shape(images[0].shape)), np.float32)
@@ -104,7 +104,7 @@ class Transformer:
         return batch
 
     def _transform(self, images: np.ndarray, out: np.ndarray, draws: np.ndarray) -> None:
-        """Write images of one size, but for the scale; ``draws`` (N, 4) are their random numbers."""
+        """Write transformed images of one size, without the scale; ``draws`` (N, 4) are their random numbers."""
         mean = self.mean_values[:, None, None] if len(self.mean_values) else self._mean
         if self.crop_size:
             spare = np.array(images.shape[2:], np.uint64) - np.uint64(self.crop_size)
@@ -124,9 +124,9 @@ class Transformer:
 
 
 def _windows(images: np.ndarray, corners: np.ndarray, size: int) -> np.ndarray:
-    """Return the square window of each of N images, or N windows of one image: (N, C, size, size).
+    """Return a square window of each of N images, or N windows of one image: (N, C, size, size).
 
-    ``corners`` (N, 2) are their upper left corners; a single one is that of all.
+    ``corners`` (N, 2) are their upper left corners; a single one applies to all.
     """
     if len(corners) == 1:
         top, left = map(int, corners[0])

@@ -1,4 +1,4 @@
-"""Random windows of images, object and background: the data of R-CNN.
+"""Random windows of images with objects and background, the data of R-CNN.
 
 Caffe: src/caffe/layers/window_data_layer.cpp
 """
@@ -29,7 +29,7 @@ CHANNELS = 3  # images are always read in color
 
 @dataclass(frozen=True)
 class Window:
-    """A box of an image, corners included."""
+    """A box in an image, including its corners."""
 
     image: int
     label: int
@@ -41,7 +41,7 @@ class Window:
 
 @dataclass(frozen=True)
 class WindowFile:
-    """The contents of a window file: images, windows with an object (foreground), windows without (background)."""
+    """The contents of a window file: images, windows with an object (foreground), and windows without (background)."""
 
     images: list[str]
     foreground: list[Window]
@@ -49,10 +49,10 @@ class WindowFile:
 
 
 def read_window_file(param: Any, where: Where | None) -> WindowFile:
-    """Read the window file of a window_data_param: images, each with its windows, one item per line.
+    """Read the window file of a window_data_param: images with their windows, one item per line.
 
-    For each image: ``# index``, path, channels, height, width, number of windows; then ``label overlap x1 y1 x2 y2``.
-    A window is foreground if its overlap is at least ``fg_threshold``, background if it is below ``bg_threshold``, and
+    For each image: ``# index``, path, channels, height, width, number of windows; then ``label overlap x1 y1 x2 y2``. A
+    window is foreground if its overlap is at least ``fg_threshold``, background if it is below ``bg_threshold``, and is
     otherwise ignored.
     """
     path: str = param.source
@@ -100,7 +100,7 @@ def read_window_file(param: Any, where: Where | None) -> WindowFile:
 
 
 class WindowSource:
-    """Batches of windows, background first, each warped to ``crop_size`` x ``crop_size`` with some context around.
+    """Batches of windows, background first, each warped to ``crop_size`` x ``crop_size`` with some context around it.
 
     ``file`` comes from :func:`read_window_file`, ``mean`` from :func:`window_mean`. As in Caffe,
     ``transform_param.scale`` is not used, and pixels outside of the image are 0 after the mean is subtracted.
@@ -172,12 +172,12 @@ class WindowSource:
     def _fit(
         self, window: Window, rows: int, columns: int, mirror: bool
     ) -> tuple[tuple[int, int, int, int], tuple[int, int], tuple[int, int]]:
-        """Return the box to cut out of the image, and its place (top, left) and size (height, width) in the output."""
+        """Return the box to crop from the image, and its position (top, left) and size (height, width) in the crop."""
         x1, y1, x2, y2 = window.x1, window.y1, window.x2, window.y2
         crop = self._crop
         if not (self._pad or self._square):
             return (x1, y1, x2, y2), (0, 0), (crop, crop)
-        # The box is widened so that, after it is warped to the crop, `pad` pixels of context are on each side.
+        # Enlarge the box so that, after warping, there are `pad` pixels of context on each side.
         context = crop / (crop - 2 * self._pad)
         half_h, half_w = (y2 - y1 + 1) / 2, (x2 - x1 + 1) / 2
         center_x, center_y = x1 + half_w, y1 + half_h
@@ -190,14 +190,14 @@ class WindowSource:
         beyond_top, beyond_bottom = max(0, -y1), max(0, y2 - rows + 1)
         box = (x1 + beyond_left, y1 + beyond_top, x2 - beyond_right, y2 - beyond_bottom)
         top = _round(beyond_top * scale_y)
-        left = _round((beyond_right if mirror else beyond_left) * scale_x)  # the margin is mirrored too
+        left = _round((beyond_right if mirror else beyond_left) * scale_x)  # mirror the margin too
         height = min(_round((box[3] - box[1] + 1) * scale_y), crop - top)
         width = min(_round((box[2] - box[0] + 1) * scale_x), crop - left)
         return box, (top, left), (height, width)
 
 
 def wrong_means(transform: Any, at: Callable[..., Where]) -> Iterator[SpecError]:
-    """Yield the errors in the mean of a transform_param, apart from its file."""
+    """Yield the errors in the mean of a transform_param, except for its file."""
     yield from mean_contradictions(transform, at)
     if len(transform.mean_value) not in (0, 1, CHANNELS):
         message = f"found {len(transform.mean_value)} mean_value, expected 1 or {CHANNELS}"

@@ -1,6 +1,6 @@
-'''Dialects: the layers of Caffe's forks, one file each, with what they add to the schema.
+'''Dialects: the layers of Caffe's forks, one file for each, with their additions to the schema.
 
-A prototxt with fields or layers that Caffe does not have switches on the dialects that define them: netspec's own (the
+A prototxt with fields or layers that Caffe does not have activates the dialects that define them: netspec's own (the
 files in this folder), and those of installed packages (entry points of the group ``netspec.dialects``). To add a
 dialect from a file, for every net of the process, pass ``--plugin FILE.py`` on the command line, or call
 ``netspec.use_dialect("FILE.py")``. The whole process then knows the new fields, because protobuf has one schema for a
@@ -8,7 +8,7 @@ process. A layer that replaces one of Caffe's is used only in nets that use the 
 or layer type that several dialects define is an error; ``--plugin NAME`` chooses one. If forks define different layers
 of one type, the table in netspec/dialects/signatures.py decides which one is meant.
 
-To write one, put this into a file, say ``doubling.py``, and pass ``--plugin doubling.py``::
+To write a dialect, save this as a file, for example ``doubling.py``, and pass ``--plugin doubling.py``::
 
     """A fork with a layer that multiplies."""
 
@@ -38,12 +38,12 @@ To write one, put this into a file, say ``doubling.py``, and pass ``--plugin dou
         def forward(self, data):
             return data * value(self.param, "times_param").factor
 
-``DECLARATIONS`` is one string in the language of caffe.proto (netspec/dialects/registry.py): the messages of the fork,
+``DECLARATIONS`` is a string in the syntax of caffe.proto (netspec/dialects/registry.py): the messages of the fork,
 and new fields of Caffe's messages in ``extend``. A layer is written like Caffe's own
 (netspec/layers/contract/base.py). ``@register`` gets its type and the fields of LayerParameter that it reads: a net
 warns of fields that no layer reads. ``@replace("Dropout", ...)`` of netspec/dialects/layers.py replaces one of Caffe's
-layers by a subclass, in nets that use the dialect, to support a field that the fork added to it. To offer a dialect
-with a package, name its module in that package's pyproject.toml::
+layers by a subclass, in nets that use the dialect, to support a field that the fork added to it. To provide a dialect
+in a package, name its module in the package's pyproject.toml::
 
     [project.entry-points."netspec.dialects"]
     doubling = "mypackage.doubling"
@@ -59,10 +59,10 @@ from netspec.dialects.files import find_file, switch_on
 def use_dialect(name: str | Path) -> None:
     """Add the fields and layers of a dialect to the whole process. ``name`` is its name, or the path of its file.
 
-    Does nothing if it was added before. Raises SpecError if there is no such dialect, if its file has a fault, or if
+    Does nothing if it was added before. Raises SpecError if there is no such dialect, if its file has an error, or if
     Caffe or another dialect already has one of its fields or layer types.
     """
-    from netspec.dialects.layers import use_everywhere  # it needs torch
+    from netspec.dialects.layers import use_everywhere  # imported here, since it needs torch
 
     file = find_file(name)
     switch_on(file)

@@ -1,4 +1,4 @@
-"""Implements the questions about forks in netspec/proto/forks.py with the dialects."""
+"""Implements the interface in netspec/proto/forks.py with the dialects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAMED = re.compile(r"^[ \t]*#[ \t]*dialect:[ \t]*(\w+)[ \t]*\r?$", re.MULTILINE)
 
 
 class Dialects(Forks):
-    """The dialects of this folder, of installed packages, and of files that a user named."""
+    """The dialects in this folder, in installed packages, and in files that a user named."""
 
     new_layer = "docs/layer.md shows how to add one with --plugin FILE.py"
     new_field = "docs/layer.md shows how to add a fork's with --plugin FILE.py"
@@ -43,16 +43,16 @@ class Dialects(Forks):
 
     @override
     def add_field(self, message: str, field: str, text: str, start: int, file: str) -> bool:
-        """If several dialects have the field, choose the only one with a message that has the given inner fields."""
+        """If several dialects have the field, choose the only one whose message has the given inner fields."""
         dialects = self.with_field(message, field)
         if len(dialects) > 1:
             inside = set(re.findall(r"\w+", text[start : text.find("}", start)]))
             dialects = registry.dialects_with_inner_fields(dialects, inside)
-        return _switched_on(dialects, file)
+        return _activated(dialects, file)
 
     @override
     def add_value(self, message: str, field: str, value: str, file: str) -> bool:
-        return _switched_on(self.with_value(message, field, value), file)
+        return _activated(self.with_value(message, field, value), file)
 
     @override
     def with_field(self, message: str, field: str) -> tuple[str, ...]:
@@ -136,8 +136,8 @@ class Dialects(Forks):
         return found
 
 
-def _switched_on(dialects: Collection[str], file: str) -> bool:
-    """Switch a dialect on if it is the only one; return whether it is."""
+def _activated(dialects: Collection[str], file: str) -> bool:
+    """Activate a dialect if it is the only one; return whether it is."""
     own = [name for name in dialects if name in known_files()]
     if len(own) != 1:
         return False

@@ -1,6 +1,6 @@
 """Functions for the boxes of SSD's layers: overlap, encoding, matching and suppression.
 
-A box is (xmin, ymin, xmax, ymax) in parts of the image, so 0 to 1 within it. Arrays are float32, as the fork's boxes.
+A box is (xmin, ymin, xmax, ymax), relative to the image, so 0 to 1 inside it. Arrays are float32, as in the fork.
 Fork: weiliu89/caffe (ssd), src/caffe/util/bbox_util.cpp
 """
 
@@ -18,9 +18,9 @@ from netspec.layers.contract.targets import OnnxGraph
 Array = np.ndarray
 
 CORNER, CENTER_SIZE, CORNER_SIZE = 1, 2, 3  # ssd.py: enum PriorBoxParameter.CodeType
-NO_MATCH, LEFT_OUT = -1, -2  # instead of the index of a matched box
-LEAST_OVERLAP = 1e-6  # a smaller overlap counts as none
-LEAST_SIZE = 1e-5  # smaller boxes do not take part in suppress_all
+NO_MATCH, LEFT_OUT = -1, -2  # special values instead of the index of a matched box
+LEAST_OVERLAP = 1e-6  # smaller overlaps count as none
+LEAST_SIZE = 1e-5  # suppress_all ignores smaller boxes
 
 
 def as_array(tensor: torch.Tensor) -> Array:
@@ -29,7 +29,7 @@ def as_array(tensor: torch.Tensor) -> Array:
 
 
 def check_predictions(layer: Layer, bottom_shapes: Sequence[Shape], kinds: int, classes: int) -> int:
-    """Return the number of priors. Raise SpecError if the sizes of boxes or confidences do not fit it.
+    """Return the number of priors. Raise SpecError if the sizes of boxes or confidences do not match it.
 
     The bottoms are boxes, confidences and priors. There are ``kinds`` boxes for each prior.
     """
@@ -44,19 +44,19 @@ def check_predictions(layer: Layer, bottom_shapes: Sequence[Shape], kinds: int, 
     return priors
 
 
-# Nets that were not trained predict boxes without bounds: areas are infinite, overlaps not a number, as in C++.
+# An untrained net can predict unbounded boxes: areas are infinite, and overlaps are NaN, as in C++.
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def sizes(boxes: Array) -> Array:
-    """Return the areas of boxes (..., 4): (...); 0 where a box is turned inside out."""
+    """Return the areas of boxes (..., 4): (...); 0 if xmax < xmin or ymax < ymin."""
     width, height = boxes[..., 2] - boxes[..., 0], boxes[..., 3] - boxes[..., 1]
     return np.where((width < 0) | (height < 0), np.float32(0), width * height)
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def shared(first: Array, second: Array) -> Array:
-    """Return the areas that each pair of boxes (..., 4), broadcast against each other, has in common."""
+    """Return the intersection areas of each pair of boxes (..., 4), broadcast against each other."""
     low = np.maximum(first[..., :2], second[..., :2])
     high = np.minimum(first[..., 2:], second[..., 2:])
     width, height = high[..., 0] - low[..., 0], high[..., 1] - low[..., 1]
@@ -65,14 +65,14 @@ def shared(first: Array, second: Array) -> Array:
 
 @np.errstate(invalid="ignore")
 def overlaps(first: Array, second: Array) -> Array:
-    """Return intersection over union of each pair of boxes (..., 4), broadcast against each other."""
+    """Return the intersection over union of each pair of boxes (..., 4), broadcast against each other."""
     common = shared(first, second)
     union = sizes(first) + sizes(second) - common
     return np.divide(common, union, out=np.zeros_like(common), where=common > 0)
 
 
 def coverage(first: Array, second: Array) -> Array:
-    """Return which part of the first box of each pair (..., 4) lies in the second."""
+    """Return the share of the first box of each pair (..., 4) that is inside the second."""
     common = shared(first, second)
     area = np.broadcast_to(sizes(first), common.shape)
     return np.divide(common, area, out=np.zeros_like(common), where=common > 0)
@@ -93,7 +93,7 @@ def encode(boxes: Array, priors: Array, variances: Array | None, code: int) -> A
 
 @np.errstate(over="ignore", invalid="ignore")
 def decode(codes: Array, priors: Array, variances: Array | None, code: int) -> Array:
-    """Return the boxes (n, 4) that :func:`encode` turns into ``codes``."""
+    """Return the boxes (n, 4) whose :func:`encode` is ``codes``."""
     (low, high), (extent, center) = _corners(priors), _centers(priors)
     if variances is not None:
         codes = codes * variances
@@ -114,7 +114,7 @@ def _centers(boxes: Array) -> tuple[Array, Array]:
 
 
 def around(centers: Array, extents: Array) -> Array:
-    """Return the boxes (..., 4) of these sizes (..., 2) around these points (..., 2)."""
+    """Return boxes (..., 4) with these sizes (..., 2) around these points (..., 2)."""
     half = extents / np.float32(2)
     return np.concatenate([centers - half, centers + half], axis=-1)
 
@@ -125,15 +125,15 @@ def sigmoid(x: Array) -> Array:
 
 
 def outside(boxes: Array) -> Array:
-    """Return which coordinates of boxes (..., 4) lie outside the image."""
+    """Return which coordinates of boxes (..., 4) are outside the image."""
     return (boxes < 0) | (boxes > 1)
 
 
 def match(boxes: Array, truth: Array, threshold: float | None, leave_out: Array) -> tuple[Array, Array]:
-    """Match boxes (p, 4) with true ones (g, 4): the index of the true box, or NO_MATCH or LEFT_OUT; largest overlaps.
+    """Match boxes (p, 4) with true ones (g, 4); return the true index, NO_MATCH or LEFT_OUT, and the largest overlaps.
 
-    First the pairs of the largest overlap, each box and each true box once; then, with a threshold, every box left
-    that overlaps one by at least that, with the one it overlaps most. ``leave_out`` (p,) says which boxes take no part.
+    First match the pairs with the largest overlap, using each box and each true box once. Then, with a threshold, match
+    every other box to the true box it overlaps most, if the overlap is large enough. ``leave_out`` (p,) excludes boxes.
     """
     found = np.where(leave_out, LEFT_OUT, NO_MATCH)
     table = overlaps(boxes[:, None], truth[None])
@@ -153,9 +153,9 @@ def match(boxes: Array, truth: Array, threshold: float | None, leave_out: Array)
 
 
 def suppress(boxes: Array, threshold: float, eta: float = 1.0) -> list[int]:
-    """Return which boxes (n, 4), in this order, overlap none kept before by more than the threshold.
+    """Return which boxes (n, 4) to keep: in this order, those that overlap no kept box by more than the threshold.
 
-    Where ``eta`` is below 1, the threshold is multiplied by it after each box kept, as long as it is above 0.5.
+    If ``eta`` is below 1, the threshold is multiplied by it after each kept box, as long as it is above 0.5.
     """
     limit = np.float32(threshold)
     kept: list[int] = []
@@ -171,10 +171,10 @@ def suppress(boxes: Array, threshold: float, eta: float = 1.0) -> list[int]:
 
 
 def highest(scores: Array, count: int) -> Array:
-    """Return the indices of the ``count`` highest of scores (n,), in the order in which the fork has them.
+    """Return the indices of the ``count`` highest scores (n,), in the fork's order.
 
-    It sorts with libstdc++'s std::sort, which is not stable: which of equal scores come first follows from its
-    partitions. They are repeated where equal scores stand among the highest, or at the cut.
+    The fork sorts with libstdc++'s std::sort, which is not stable: the order of equal scores depends on its
+    partitions. They are reproduced if there are equal scores among the highest ones or at the limit.
     """
     order = np.argsort(-scores, kind="stable")
     top = scores[order[: count + 1]]
@@ -184,10 +184,10 @@ def highest(scores: Array, count: int) -> Array:
 
 
 def _introsorted(keys: list[float]) -> list[int]:
-    """Return the order of keys that introsort gives, ascending.
+    """Return the order of keys in introsort, ascending.
 
-    Ranges of more than 16 are partitioned around the median of three; insertion, which is stable, does the rest. The
-    heap sort that follows on 2 log2(n) bad partitions in a row is left out.
+    Ranges of more than 16 are partitioned around the median of three; insertion sort, which is stable, does the rest.
+    The heap sort after 2 log2(n) bad partitions in a row is not implemented.
     """
     order, ranges = list(range(len(keys))), [(0, len(keys))]
     while ranges:
@@ -200,9 +200,9 @@ def _introsorted(keys: list[float]) -> list[int]:
 
 
 def _partition(keys: list[float], order: list[int], first: int, last: int) -> int:
-    """Move what is less than the median of three to the front of a range; return where the rest begins."""
+    """Move keys below the median of three to the front of a range; return the start of the rest."""
     middle = first + (last - first) // 2
-    # Which of equal keys is the median decides, as in std::__move_median_to_first.
+    # Choose among equal keys as std::__move_median_to_first does.
     a, b, c = first + 1, middle, last - 1
     ka, kb, kc = keys[order[a]], keys[order[b]], keys[order[c]]
     if ka < kb:
@@ -224,7 +224,7 @@ def _partition(keys: list[float], order: list[int], first: int, last: int) -> in
 
 
 def suppress_all(boxes: Array, scores: Array, threshold: float, top_k: int) -> Array:
-    """Return the indices of the boxes that :func:`suppress` keeps among the ``top_k`` (-1: all) of highest score."""
+    """Return the indices of the boxes that :func:`suppress` keeps among the ``top_k`` highest scores (-1: all)."""
     order = np.argsort(-scores, kind="stable")
     order = order[: top_k if top_k > -1 else None]
     order = order[sizes(boxes[order]) >= LEAST_SIZE]
@@ -232,7 +232,7 @@ def suppress_all(boxes: Array, scores: Array, threshold: float, top_k: int) -> A
 
 
 def detections(rows: Sequence[Array], like: torch.Tensor) -> torch.Tensor:
-    """Return the detections (d, 7) of all images as a top (1, 1, D, 7); of none at all a row (image, -1, ...) each."""
+    """Return the detections (d, 7) of all images as a top (1, 1, D, 7); without any, one row (image, -1, ...) each."""
     found = np.concatenate(rows)
     if not len(found):
         found = np.full((len(rows), 7), -1, np.float32)
@@ -241,7 +241,7 @@ def detections(rows: Sequence[Array], like: torch.Tensor) -> torch.Tensor:
 
 
 def onnx_decode(graph: OnnxGraph, codes: str, priors: str, variances: str | None, code: int) -> str:
-    """Write what :func:`decode` computes, for codes (..., P, 4) and priors and variances (1, P, 4)."""
+    """Write :func:`decode` for codes (..., P, 4) and priors and variances (1, P, 4)."""
     halves = graph.constant([2, 2])
     low, high = graph.nodes("Split", priors, halves, outputs=2, axis=-1)
     extent = graph.node("Sub", high, low)

@@ -1,7 +1,7 @@
-"""Parses the .proto language, as far as Caffe's schema and those of its forks use it, into descriptors.
+"""Parses the part of the .proto language that Caffe and its forks use, into descriptors.
 
-It supports messages, enums inside or outside of them, optional, repeated and required fields with ``default`` and
-``packed``, and ``extend``. protoc does more; this parser is for the additions of forks, which are added at run time.
+It supports messages, enums inside or outside messages, optional, repeated and required fields with ``default`` and
+``packed``, and ``extend``. It is for the additions of forks, which are added at run time.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class _Declarations:
         self._take(";")
 
     def _default(self, kind: int, value: str) -> str:
-        """Return a default value as in descriptors: strings without quotes, integers in decimal."""
+        """Return a default value in the format of descriptors: strings without quotes, integers in decimal."""
         if value.startswith('"'):
             return value[1:-1]
         return str(int(value, 0)) if kind in _INTEGERS and value.lower().startswith(("0x", "-0x")) else value

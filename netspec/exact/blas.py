@@ -151,8 +151,8 @@ def _without_gaps(matrices: torch.Tensor) -> torch.Tensor:
 def _step(matrices: torch.Tensor) -> int:
     """Return the bytes from one matrix to the next; 0 for a single one. The rows must have no gaps."""
     rows, columns = matrices.shape[-2:]
-    assert matrices.stride(-1) == 1 or columns == 1, "the numbers of a row lie side by side"
-    assert matrices.stride(-2) == columns or rows == 1, "the rows of a matrix lie side by side"
+    assert matrices.stride(-1) == 1 or columns == 1, "the numbers of a row must be contiguous"
+    assert matrices.stride(-2) == columns or rows == 1, "the rows of a matrix must be contiguous"
     return matrices.stride(0) * matrices.element_size() if matrices.dim() == 3 else 0
 
 

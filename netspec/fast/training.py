@@ -44,7 +44,7 @@ def obstacle(plan: Plan, parts: Sequence[Part], largest: float = LARGEST) -> str
         if layer.is_input:
             return f'"{node.name}" is an input'
         if node.bottoms and node.tops and (layer.counted_axis is not None or not layer.promises):
-            return f'"{node.name}" finds out the shapes of its tops in each pass'
+            return f'"{node.name}" determines the shapes of its tops in each pass'
         if any(blob.dtype != torch.float32 for blob in layer.blobs):
             return f'"{node.name}" does not compute in float32'
     readers = Counter(v for node in plan.nodes for v in node.bottoms)
@@ -133,7 +133,7 @@ class TrainingStep:
                 return self._run(prepared, values)
         except (MemoryError, RuntimeError) as fault:
             if is_out_of_memory(fault):
-                raise layer.error("the training needs more memory than there is") from None
+                raise layer.error("the training needs more memory than available") from None
             raise
 
     def _run(self, prepared: _Prepared, values: Values) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:

@@ -74,7 +74,7 @@ class Rows:
             self.shape, by_columns, self.dtype = _header(stream, os.fstat(stream.fileno()).st_size)
             self._start = stream.tell()
             if by_columns or not self.shape:
-                raise ValueError("an array that is not stored row by row")
+                raise ValueError("an array that is not stored in row-major (C) order")
         self.size = math.prod(self.shape)
 
     def __getitem__(self, rows: slice) -> np.ndarray:
@@ -85,7 +85,7 @@ class Rows:
             stream.seek(self._start + first * width)
             data = stream.read(shape[0] * width)
             if len(data) < shape[0] * width:
-                raise ValueError("it was cut since it was opened")
+                raise ValueError("it was truncated after it was opened")
         return np.frombuffer(data, self.dtype).reshape(shape) if data else np.zeros(shape, self.dtype)
 
 
@@ -93,7 +93,7 @@ def regular(path: str | Path, expected: str) -> Path:
     """Return the path of a file. Raises InputError for a pipe or a device, which might be waited for without end."""
     path = Path(path)
     if path.exists() and not path.is_file():
-        raise InputError(f"is no regular file; expected {expected}", path)
+        raise InputError(f"is not a regular file; expected {expected}", path)
     return path
 
 
@@ -121,7 +121,7 @@ def _header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dty
     else:
         raise ValueError(f"an array of format {version}")
     if dtype.hasobject:
-        raise ValueError("an array of Python objects, a pickle, which could run code; lists are read from .json")
+        raise ValueError("an array of Python objects (a pickle), which could run code; store lists in a .json file")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > size:
         raise ValueError(f"an array of shape {shape}, {dtype}, in {size} bytes")
     return shape, by_columns, dtype
@@ -134,7 +134,7 @@ def _read(stream: IO[bytes], size: int) -> np.ndarray:
     data = stream.read(count * dtype.itemsize)
     values = np.frombuffer(data, dtype, count).copy() if dtype.itemsize else np.zeros(count, dtype)
     if dtype.kind == "U" and np.any(values.view(np.dtype(np.uint32).newbyteorder(dtype.byteorder)) > sys.maxunicode):
-        raise ValueError("an array of characters that Unicode does not have")  # Python's strings would be broken
+        raise ValueError("an array with invalid Unicode characters")  # Python's strings would be broken
     return values.reshape(shape[::-1]).T if by_columns else values.reshape(shape)
 
 
@@ -150,14 +150,14 @@ def _fault(error: BaseException, path: Path, expected: str) -> InputError:
 
 
 def check_array(arrays: Mapping[str, Any], name: str, kinds: str, shape: tuple[int, ...], finite: bool = True) -> None:
-    """Raise ValueError for an array that is missing, of another kind or shape, or has a number that is not finite."""
+    """Raise ValueError for an array that is missing, of another kind or shape, or contains a NaN or an infinity."""
     values = arrays.get(name)
     if values is None:
         raise ValueError(f'has no array "{name}"')
     if values.dtype.kind not in kinds or values.shape != shape:
         raise ValueError(f'"{name}" has shape {values.shape}, {values.dtype}; expected {shape}')
     if finite and not np.all(np.isfinite(values)):
-        raise ValueError(f'"{name}" has a number that is not finite')
+        raise ValueError(f'"{name}" contains a NaN or an infinity')
 
 
 def from_json(made: type[T], values: Any) -> T:

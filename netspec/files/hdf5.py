@@ -80,7 +80,7 @@ class Hdf5Group:
         if not isinstance(found, h5py.Dataset):
             return None
         if found.external or found.is_virtual:
-            raise SpecError(f"dataset {self._path}/{name} is stored in another file, which is not read")
+            raise SpecError(f"dataset {self._path}/{name} is stored in another file; this is not supported")
         if too_large := bomb(found.nbytes, self._file_size):
             raise SpecError(f"dataset {self._path}/{name} {too_large}")
         if found.chunks is not None and (wrong := _wrong_chunks(found, found.chunks)):
@@ -104,7 +104,7 @@ class Hdf5Group:
             part = parts.pop(0)
             link = found.get(part, getlink=True) if isinstance(found, h5py.Group) else None
             if isinstance(link, h5py.ExternalLink):
-                raise SpecError(f'{self._path}/{name} is a link to "{link.filename}", which is not read')
+                raise SpecError(f'{self._path}/{name} is a link to "{link.filename}"; this is not supported')
             if isinstance(link, h5py.SoftLink) and links < _MOST_LINKS:
                 found = self._group.file if link.path.startswith("/") else found
                 parts, links = _parts(link.path) + parts, links + 1
@@ -123,7 +123,7 @@ def _wrong_chunks(dataset: h5py.Dataset, shape: tuple[int, ...]) -> str:
     packing = dataset.id.get_create_plist()
     filters = [packing.get_filter(i)[0] for i in range(packing.get_nfilters())]
     if set(filters) - _FILTERS or filters.count(h5z.FILTER_DEFLATE) > 1:
-        return "is packed in a way that is not read; write it with gzip, lzf, or not packed"
+        return "has an unsupported compression; write it with gzip, lzf, or uncompressed"
     size = math.prod(shape) * dataset.dtype.itemsize
     stored: list[tuple[tuple[int, ...], int]] = []
     dataset.id.chunk_iter(lambda chunk: stored.append((chunk.chunk_offset, chunk.size)))
@@ -133,7 +133,7 @@ def _wrong_chunks(dataset: h5py.Dataset, shape: tuple[int, ...]) -> str:
         if h5z.FILTER_DEFLATE in filters and packed * _MOST_DEFLATED > ALWAYS:
             mask, data = dataset.id.read_direct_chunk(place)
             if not mask and len(zlib.decompressobj().decompress(data, size + _SUM + 1)) > size + _SUM:
-                return f"has a chunk that unpacks to more than the {amount(size)} of its numbers"
+                return f"has a chunk that decompresses to more than its {amount(size)}"
     return ""
 
 

@@ -103,7 +103,7 @@ def _readings(text: str) -> Iterator[tuple[str, float | None]]:
     ends = [match.start() for match in _COMMENT.finditer(text)]
     for line in (text, *(text[:end] for end in reversed(ends))):
         match = _LINE.fullmatch(line)
-        assert match is not None, "a line is at least a name"
+        assert match is not None, "every line has a name"
         stamp = None if match["stamp"] is None else float(match["stamp"])
         yield line, None
         if stamp is not None:

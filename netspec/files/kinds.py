@@ -15,12 +15,12 @@ _LONGEST = 1024  # bytes; https://github.com/git-lfs/git-lfs/blob/main/docs/spec
 
 
 def pointer_fault(data: bytes) -> str:
-    """Return what to say of a file that begins with these bytes where it is a pointer, and "" where it is not."""
+    """Return the error for a file that begins with these bytes if it is a Git LFS pointer, else ""."""
     match = _POINTER.match(data[:_LONGEST])
     if not match:
         return ""
     remedy = "run `git lfs pull` in its repository, or download the file itself"
-    return f"is a Git LFS pointer to a file of {int(match[1]):,} bytes, not that file; {remedy}"
+    return f"is a Git LFS pointer to a file of {int(match[1]):,} bytes, not the file itself; {remedy}"
 
 
 def head_of(path: str | os.PathLike[str]) -> bytes:
@@ -35,15 +35,15 @@ def head_of(path: str | os.PathLike[str]) -> bytes:
 HDF5 = b"\x89HDF\r\n\x1a\n"
 _COPY = "copy its arrays into net.params[LAYER], then netspec.save_weights"
 _KINDS = {
-    b"\x1f\x8b": "a file packed by gzip",
+    b"\x1f\x8b": "a gzip file",
     b"\xff\xd8\xff": "a JPEG image",
     b"\x89PNG": "a PNG image",
     b"PK\x03\x04": f"a ZIP archive, as .npz and PyTorch's .pth are; {_COPY}",
     b"\x80\x02": f"a pickle, as old .pth files are; {_COPY}",
     b"\x93NUMPY": f"a NumPy array; {_COPY}",
     HDF5: "an HDF5 file; its name should end in .h5",
-    b"<!doctype html": "a web page: the download failed; look at it in a browser",
-    b"<html": "a web page: the download failed; look at it in a browser",
+    b"<!doctype html": "a web page: the download failed; open it in a browser",
+    b"<html": "a web page: the download failed; open it in a browser",
 }
 
 
@@ -64,7 +64,7 @@ def unreadable(path: object, fault: OSError | ValueError) -> str:
     """Return why a file cannot be read, and what to do where it is a web address or is not there."""
     text = str(path)
     if "://" in text or text.startswith(("http:/", "https:/")):
-        return "is a web address; download the file, and give its path"
+        return "is a web address; download the file and give its path"
     reason = f"cannot be read: {getattr(fault, 'strerror', None) or fault}"
     return f"{reason}{nearest_existing(text)}" if isinstance(fault, FileNotFoundError) else reason
 

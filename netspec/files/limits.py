@@ -46,7 +46,7 @@ def read_bytes(path: str | Path) -> bytes:
     Raises OSError, for a device too: it may have no end.
     """
     if "\0" in str(path):
-        raise OSError(errno.EINVAL, "a name has no character NUL", str(path))
+        raise OSError(errno.EINVAL, "a file name cannot contain a NUL character", str(path))
     with open(path, "rb") as file:
         if stat.S_ISCHR(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.ENODEV, "it is a device, not a file", str(path))
@@ -66,7 +66,7 @@ def bomb(size: int, stored: int) -> str:
     """Return what to say of data of ``size`` bytes in a file of ``stored`` bytes that cannot be meant; "" if it can."""
     if size <= ALWAYS or (size <= MOST_PACKED * stored and size <= memory()):
         return ""
-    return f"would take {amount(size)} of memory, in a file of {amount(stored)}; it is not read"
+    return f"would take {amount(size)} of memory, but the file has only {amount(stored)}; it was not read"
 
 
 def read_amount(text: str) -> int:

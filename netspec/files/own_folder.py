@@ -24,7 +24,7 @@ def inside(folder: str | Path, *names: str) -> Path:
     for name in names:
         path = path / name
         if path.is_symlink():
-            raise SpecError("is a link, and nothing is written through a link; move it away", Where(str(path)))
+            raise SpecError("is a symbolic link, which is not followed for writing; move it away", Where(str(path)))
     return path
 
 

@@ -67,4 +67,4 @@ def read_scores(path: str | Path) -> Scores:
     except OSError as fault:
         raise SpecError(unreadable(path, fault), where) from None
     except (ValueError, KeyError, TypeError) as fault:
-        raise SpecError(f"this is not a scores file (of netspec train --scores): {fault}", where) from None
+        raise SpecError(f"this is not a file written by netspec train --scores: {fault}", where) from None

@@ -30,7 +30,7 @@ try:
 except ImportError:  # Windows: there, a file that is open cannot be removed
     fcntl: Any = None
 
-NO_NUL = "a name has no character NUL"
+NO_NUL = "a file name cannot contain a NUL character"
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.unfinished")
 _MARK = re.compile(rb"a lock of netspec, held by process (\d+)\n")
 _AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # no link, and no pipe that nobody writes to
@@ -148,7 +148,7 @@ def only_one(path: str | Path, advice: str) -> Iterator[None]:
             os.write(held, mark)
         except FileExistsError:
             if path.is_symlink() or not path.is_file():
-                raise _fault("is no lock of netspec; move it away", path) from None
+                raise _fault("is not a lock file of netspec; move it away", path) from None
             held, locked = _open_locked(path, os.O_RDWR)
     except OSError as fault:
         raise _fault(f"cannot be written: {fault.strerror}", path) from None
@@ -157,9 +157,9 @@ def only_one(path: str | Path, advice: str) -> Iterator[None]:
         owner = _MARK.fullmatch(os.read(held, 100))
         if not locked:
             of = f" (process {int(owner[1])})" if owner else ""
-            raise _fault(f"is held by another run{of}; {advice}", path)
+            raise _fault(f"is locked by another process{of}; {advice}", path)
         if not owner:
-            raise _fault("is no lock of netspec; move it away", path)
+            raise _fault("is not a lock file of netspec; move it away", path)
         os.ftruncate(held, 0)
         os.lseek(held, 0, os.SEEK_SET)
         os.write(held, mark)
@@ -312,7 +312,8 @@ def _remove(path: Path) -> None:
 @cache
 def _warn_not_synced(reason: str) -> None:
     logging.getLogger(__name__).warning(
-        "folders cannot be brought to disk here (%s): after a power failure an old file may be back", reason
+        "folders cannot be synced to disk here (%s): after a power failure, an old version of a file may reappear",
+        reason,
     )
 
 

@@ -22,7 +22,7 @@ from netspec.proto.upgrade.rewrite import copy_without
 
 
 def in_state(net: NetParameter, *states: NetState) -> NetParameter:
-    """Return a copy of the net in the state given by ``states``: later ones override earlier ones, stages are added."""
+    """Return a copy of the net with the combined ``states``: later ones override earlier ones, and stages are added."""
     stated = NetParameter()
     stated.CopyFrom(net)
     stated.ClearField("state")
@@ -39,7 +39,7 @@ def with_state(
 
 
 def with_train_state(solver: SolverParameter, level: int | None, stages: Iterable[str]) -> SolverParameter:
-    """Return a copy of the solver; its training net gets this level (unless None) and these stages in addition."""
+    """Return a copy of the solver whose training net has this level (unless None) and these additional stages."""
     stated = SolverParameter()
     stated.CopyFrom(solver)
     stated.train_state.MergeFrom(NetState(level=level, stage=several(stages)))
@@ -70,7 +70,7 @@ def _remedy(state: NetState, layer: LayerParameter) -> str:
     """Return advice for a layer that is missing because the state of the net excludes it."""
     here, there = PHASE_NAMES[state.phase], PHASE_NAMES[1 - state.phase]
     if any(rule.HasField("phase") and rule.phase != state.phase for rule in layer.include):
-        return f"in phase {there}; say --phase {there}, or give phase {here} a layer that does"
+        return f"in phase {there}; use --phase {there}, or add such a layer for phase {here}"
     return "in another stage or level; see --stage and --level"
 
 

@@ -9,31 +9,31 @@ from typing import Any
 from netspec.errors import check_choice, several
 from netspec.exact import CHOICES, SMALL
 
-TORCH, ONNXRUNTIME, OPENVINO = ENGINES = ("torch", "onnxruntime", "openvino")  # what may run a net
-FP32, BF16 = PRECISIONS = ("fp32", "bf16")  # in what numbers
-FOLD, FUSE, SKIP, PACK = PASSES = ("fold", "fuse", "skip", "pack")  # netspec/fast/steps.py says what they do
+TORCH, ONNXRUNTIME, OPENVINO = ENGINES = ("torch", "onnxruntime", "openvino")  # engines
+FP32, BF16 = PRECISIONS = ("fp32", "bf16")  # number formats
+FOLD, FUSE, SKIP, PACK = PASSES = ("fold", "fuse", "skip", "pack")  # see netspec/fast/steps.py
 
 
 @dataclass(frozen=True)
 class BuildOptions:
     """How a net is built.
 
-    - ``level``, ``stages``: which layers are built, together with the phase. Level None: that of the prototxt.
-    - ``device``: where the blobs are, by torch's name. On "meta" they have shapes and no values.
-    - ``seed``: of random numbers. None: a random seed.
-    - ``open_data``: False opens no data; ``given_shapes`` then has the shapes of the tops of data layers, by blob.
-    - ``write_files``: False lets no layer write a file. On "meta" none does either.
-    - ``allow_python``: whether Python layers may run code.
+    - ``level``, ``stages``: with the phase, they determine which layers are built. Level None: the prototxt's.
+    - ``device``: torch's name of the device of the blobs. On "meta", blobs have shapes but no values.
+    - ``seed``: the seed of random numbers. None: a random seed.
+    - ``open_data``: if False, no data is opened; ``given_shapes`` then has the shapes of data layers' tops, by blob.
+    - ``write_files``: if False, or on "meta", no layer writes a file.
+    - ``allow_python``: whether Python layers are allowed to run code.
     - ``rank``, ``ranks``: the index and number of nets that train in parallel. Data layers read their share of records.
-    - ``data_seed``: of data layers, the same for all ranks. None: ``seed`` is used.
-    - ``exact``: which sums equal Caffe's in every bit: "none", "small" or "all" (netspec/exact/__init__.py).
+    - ``data_seed``: the seed of data layers, the same for all ranks. None: ``seed``.
+    - ``exact``: which sums are bit-identical to Caffe's: "none", "small" or "all" (netspec/exact/__init__.py).
     - ``accumulate_in_place``: layers add their gradients to ``grad`` themselves, like Caffe
       (netspec/exact/accumulate.py). Hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP do not see them.
-    - ``speed``: makes the net faster (:class:`netspec.run.speed.Speed`). None: nothing does.
-    - ``passes``: what ``speed`` may do to a net in phase TEST without gradients (netspec/fast/steps.py).
-    - ``strict``: files of weights must have every layer of the net.
-    - ``limit``: the memory in bytes that the net may need. None: the memory of its device.
-    - ``dialects``: of Caffe's forks that the net uses, in addition to those that its prototxt names.
+    - ``speed``: the code that makes the net faster (:class:`netspec.run.speed.Speed`), or None.
+    - ``passes``: the optimizations of ``speed`` for a net of phase TEST without gradients (netspec/fast/steps.py).
+    - ``strict``: whether weights files must contain every layer of the net.
+    - ``limit``: the maximum memory of the net, in bytes. None: the memory of its device.
+    - ``dialects``: forks of Caffe that the net uses, in addition to those that its prototxt names.
 
     A single string is accepted for a tuple of one. Raises SpecError for an unknown ``exact`` or pass.
     """

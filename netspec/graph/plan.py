@@ -1,4 +1,4 @@
-"""The execution plan of a net: which layer reads and writes which value, who owns each parameter, which are outputs.
+"""The execution plan of a net: the values that each layer reads and writes, the owners of parameters, the outputs.
 
 Blob *names* are Caffe's; *values* are numbered, one for each write of a layer. An in-place layer writes a new value
 under an old name, so a Plan has no in-place operations and each value is written once.
@@ -14,7 +14,7 @@ from netspec.errors import SpecError
 from netspec.proto.schema import LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
 
-AUTOMATIC = "(automatic)"  # the name of the top of a loss that has none
+AUTOMATIC = "(automatic)"  # the name of a loss's top without a name
 PERMISSIVE = 1  # caffe.proto: ParamSpec.DimCheckMode
 
 
@@ -47,7 +47,7 @@ class Plan:
     """A net in execution order.
 
     ``blobs[v]`` is the name of value ``v``; ``outputs`` maps names, in Caffe's order, to values;
-    ``final[v]`` is the value that finally replaces ``v`` in Caffe's memory: that of the last in-place layer.
+    ``final[v]`` is the value that finally replaces ``v`` in Caffe's memory, from the last in-place layer.
     """
 
     net: NetParameter
@@ -111,7 +111,7 @@ def make_plan(net: NetParameter, source: SourceMap) -> Plan:
 
 
 def _last_values(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
-    """Return for each value the one that is in its memory after all layers that compute in place."""
+    """Return, for each value, the value in its memory after all in-place layers."""
     final = list(range(count))
     for node in reversed(nodes):
         for j, replaces in enumerate(node.in_place):
@@ -121,7 +121,7 @@ def _last_values(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
 
 
 def _shared_multipliers(net: NetParameter, source: SourceMap) -> dict[str, tuple[float, float]]:
-    """Return lr_mult and decay_mult of each parameter name: given once, or several times with the same values."""
+    """Return lr_mult and decay_mult of each parameter name; if they are given several times, they must be equal."""
     found: dict[str, dict[str, float]] = {}
     for i, layer in enumerate(net.layer):
         for j, spec in enumerate(layer.param):
@@ -141,7 +141,7 @@ def _shared_multipliers(net: NetParameter, source: SourceMap) -> dict[str, tuple
 
 @dataclass(frozen=True)
 class Backward:
-    """What Caffe propagates backward: by layer, and by layer and bottom.
+    """Where Caffe propagates backward, by layer and by layer and bottom.
 
     ``computed`` also has the bottoms that get a gradient because their layer ignores propagate_down.
     """
@@ -161,8 +161,8 @@ def plan_backward(
     """Decide what needs backward computation, like Net::Init.
 
     ``learns[i]``: layer i has a parameter with a nonzero rate; ``has_loss[i][j]``: its top j has a loss weight (also
-    anonymous tops); ``label_bottoms[i]``: its bottoms that never receive a gradient; ``ignoring[i]``: those that
-    receive one even with ``propagate_down: false``, which is of use where the layer that made them goes backward.
+    anonymous tops); ``label_bottoms[i]``: its bottoms that never receive a gradient; ``ignoring[i]``: its bottoms that
+    receive one even with ``propagate_down: false``, which matters if the layer that computes them has a backward pass.
     """
     value_needs = [False] * len(plan.blobs)
     layer_needs: list[bool] = []
@@ -212,7 +212,7 @@ def plan_backward(
 
 
 def unblocked(plan: Plan, backward: Backward) -> Plan:
-    """Return the plan with ``blocked`` only where the gradient of a bottom is really not computed."""
+    """Return the plan with ``blocked`` set only where the gradient of a bottom is not computed."""
     nodes = [
         replace(node, blocked=tuple(stop and not made for stop, made in zip(node.blocked, computed, strict=True)))
         for node, computed in zip(plan.nodes, backward.computed, strict=True)
@@ -221,7 +221,7 @@ def unblocked(plan: Plan, backward: Backward) -> Plan:
 
 
 def origins(plan: Plan, passes_on: Sequence[bool]) -> tuple[int, ...]:
-    """Return for each value the one that it equals: a top of a Split, or of a Dropout in testing, equals its bottom."""
+    """Return, for each value, the one it equals: a top of a Split, or of a Dropout in phase TEST, equals its bottom."""
     found = list(range(len(plan.blobs)))
     for node, passes in zip(plan.nodes, passes_on, strict=True):
         if passes:

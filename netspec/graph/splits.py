@@ -16,8 +16,8 @@ from netspec.proto.upgrade.rewrite import copy_without
 
 SPLIT = "Split"
 Top = tuple[int, int]  # layer index, top index
-MOST_NAMES = 20  # blobs that an error names
-MOST_HINTS = 20  # unknown blobs for which similar names are looked for: that takes time for each blob there is
+MOST_NAMES = 20  # number of blobs in an error
+MOST_HINTS = 20  # number of unknown blobs for which to suggest similar names, which is slow in large nets
 
 
 def insert_splits(net: NetParameter, source: SourceMap) -> tuple[NetParameter, SourceMap]:
@@ -52,7 +52,7 @@ def insert_splits(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
 
 
 def is_split(name: str, kind: str) -> bool:
-    """Say whether a layer of this name and type is one of those that :func:`insert_splits` inserts."""
+    """Return whether :func:`insert_splits` inserts a layer with this name and type."""
     return kind == "Split" and name.endswith("_split")
 
 
@@ -72,7 +72,7 @@ def without_splits(net: NetParameter) -> list[LayerParameter]:
 
 
 def _last_names(blobs: Mapping[str, object]) -> str:
-    """Return the names of the blobs so far, in a large net those of the last."""
+    """Return the names of the blobs so far, or only of the last ones if there are many."""
     more = f"{len(blobs) - MOST_NAMES} more, " if len(blobs) > MOST_NAMES else ""
     return more + ", ".join([*blobs][-MOST_NAMES:]) or "none"
 

@@ -210,7 +210,7 @@ class Recurrent(Layer):
         if self.exposed:
             return ""
         names = ", ".join(self.state_names)
-        return f"its state ({names}) starts at zero in every run; Caffe carries it on to the next run where cont is 1"
+        return f"its state ({names}) starts at zero in every run; in Caffe it continues in the next run if cont is 1"
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         steps = graph.size(0, 0, "its time steps are unrolled")

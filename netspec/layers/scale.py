@@ -29,7 +29,7 @@ class _Affine(Layer):
             raise self.error(f"num_axes must be at least -1, found {param.num_axes}", field, "num_axes")
         end = len(shape) if param.num_axes == -1 else axis + param.num_axes
         if end > len(shape):
-            message = f"{param.num_axes} axes from axis {axis} on are more than the bottom has, shape {shape}"
+            message = f"{param.num_axes} axes from axis {axis} on exceed the bottom of shape {shape}"
             raise self.error(message, field, "num_axes")
         return shape[axis:end]
 

@@ -108,7 +108,7 @@ class Assembly:
             if not is_out_of_memory(fault):
                 raise
             there = f"this machine has {amount(memory())}"
-            raise SpecError(f"its blobs need more memory than there is: {there}", this.at()) from None
+            raise SpecError(f"its blobs need more memory than available: {there}", this.at()) from None
         this.take_from = None
         return layer
 
@@ -334,7 +334,7 @@ class Need:
             return None
         size, i = self._largest[0], -self._largest[1]
         node = self._plan.nodes[i]
-        most_of_all = f"needs {amount(size)} of memory, the most of all layers"
+        most_of_all = f"needs {amount(size)} of memory, more than any other layer"
         return SpecError(
             f"{most_of_all}; the net needs at least {self}; {limit_text(limit)}",
             self._plan.source.at(i, layer=node.name, type=node.type),
@@ -355,7 +355,7 @@ def limit_on(device: torch.device, limit: int | None = None) -> int:
 
 def limit_text(limit: int) -> str:
     """Return the words of a message that give the limit and say how to change it."""
-    return f"the limit is {amount(limit)}, --limit SIZE sets another"
+    return f"the limit is {amount(limit)}; change it with --limit SIZE"
 
 
 # What has no effect

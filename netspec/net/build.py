@@ -115,7 +115,7 @@ def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParam
     trained, source = parse_net_binary(path)
     where = Where(str(path))
     if not any(layer.type for layer in trained.layer):
-        raise SpecError("holds weights, but no net", where)
+        raise SpecError("contains weights but no net", where)
     layers = without_splits(trained)
     inputs = _inputs(layers)
     for name in shapes:
@@ -146,10 +146,12 @@ def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParam
         advice = " or ".join(_advice(inputs))
         sources = [path for layer in layers if (path := source_of(layer, class_of(layer)))]
         gone = f', and "{sources[0]}", which it was trained on, cannot be read here' if sources else ""
-        raise SpecError(f"the file does not tell the shape of its input{gone}; say {advice}", where)
+        raise SpecError(f"the shape of its input is not in the file{gone}; give {advice}", where)
     if without:
         blobs = ", ".join(name for name in inputs if name not in given)
-        log.logger.warning(f"{path}: left out, since no --shape says what {blobs} is: {', '.join(without)}")
+        log.logger.warning(
+            f"{path}: left out, since the shape of {blobs} is unknown (give it with --shape): {', '.join(without)}"
+        )
     return net, source.with_layers([source.net] * len(net.layer))
 
 

@@ -154,7 +154,7 @@ class Net(torch.nn.Module):
         if not more and not inputs and isinstance(first, Mapping):
             return first
         if more or len(self.inputs) != 1 or inputs:
-            known = ", ".join(f"{name}=..." for name in self.inputs) or "none (it reads its own data)"
+            known = ", ".join(f"{name}=..." for name in self.inputs) or "none (the net reads its own data)"
             found = f"{len(values)} values" if more else "a value"
             raise SpecError(f"found {found} without a name; give inputs by name: {known}", Where(self.plan.source.file))
         return {self.inputs[0]: first}
@@ -201,7 +201,7 @@ class Net(torch.nn.Module):
     def new_trainer(self) -> Trainer | str:
         """Return a trainer that is faster than autograd, or the reason why there is none."""
         if self.options.speed is None:
-            return "nothing makes it faster (netspec/fast)"
+            return "without netspec/fast"
         return self.options.speed.trainer(self.eager, self.largest_trained)
 
     def given(self, inputs: Mapping[str, Array]) -> dict[int, torch.Tensor]:
@@ -210,7 +210,7 @@ class Net(torch.nn.Module):
         missing = [name for name in self.inputs if name not in inputs]
         if unknown or missing:
             found = f"unknown input {unknown[0]!r}" if unknown else f"no value for input {missing[0]!r}"
-            known = ", ".join(self.inputs) or "none (it reads its own data)"
+            known = ", ".join(self.inputs) or "none (the net reads its own data)"
             raise SpecError(f"{found}; this net's inputs: {known}", Where(self.plan.source.file))
         return {v: self._as_input(inputs[self.plan.blobs[v]]) for v in self._given}
 
@@ -280,9 +280,7 @@ class Net(torch.nn.Module):
         """
         taker = next((layer for layer in self.layers if isinstance(layer, TakesArrays)), None)
         if taker is None:
-            message = (
-                "set_input_arrays is for nets with a MemoryData layer, and this one has none; call net(blob=array)"
-            )
+            message = "set_input_arrays needs a MemoryData layer, and this net has none; call net(blob=array)"
             raise SpecError(message, Where(self.plan.source.file))
         taker.set_input_arrays(data, np.zeros(len(data), np.float32) if labels is None else labels)
 

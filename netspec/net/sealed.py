@@ -54,8 +54,8 @@ class Digest:
     def check(self, path: Path, extra: Path) -> None:
         """Raise SpecError if a file is not the one that was written together with ``extra``."""
         if Digest.of(path) != self:
-            message = f"is not the file that was written with {extra.name}: it was cut or replaced"
-            raise SpecError(f"{message}; if you replaced it yourself, remove {extra.name}", Where(str(path)))
+            message = f"is not the file that was written with {extra.name}: it was truncated or replaced"
+            raise SpecError(f"{message}; if you replaced it intentionally, remove {extra.name}", Where(str(path)))
 
 
 def whole_number(value: Any, name: str, most: int = MOST) -> int:
@@ -84,7 +84,7 @@ def unsealed(path: Path) -> dict[str, Any]:
         if found["format"] != FORMAT or type(found["format"]) is not int:
             raise ValueError(f"found format {shown(found['format'])}, expected {FORMAT}")
         if found.pop("hash") != _hash(found):
-            raise ValueError("its own hash does not fit it")
+            raise ValueError("its hash does not match")
         return found
     except FileNotFoundError:
         raise
@@ -97,7 +97,7 @@ def unsealed(path: Path) -> dict[str, Any]:
 def damaged(path: Path, reason: Exception) -> SpecError:
     """Return the error of an .extra file that cannot be understood."""
     found = f"no {reason}" if isinstance(reason, KeyError) else " ".join(str(reason).split())
-    return SpecError(f"is damaged ({found}); without it the training resumes as Caffe's", Where(str(path)))
+    return SpecError(f"is damaged ({found}); if you remove it, the training resumes as in Caffe", Where(str(path)))
 
 
 def check_weights(path: Path) -> None:
@@ -112,7 +112,7 @@ def check_weights(path: Path) -> None:
     try:
         digest = Digest.read(unsealed(extra)["weights"])
     except SpecError as fault:
-        log.logger.warning(f"{fault.where}: {fault.message.partition(';')[0]}: {path.name} is not compared with it")
+        log.logger.warning(f"{fault.where}: {fault.message.partition(';')[0]}: {path.name} was not checked against it")
         return
     except FAULTS:
         return

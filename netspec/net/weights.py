@@ -130,14 +130,16 @@ def _report_missing(net: Net, loaded: set[int], paths: list[str], strict: bool, 
     files = ", ".join(map(str, paths))
     names = _names([layer.param.name for layer in missing])
     if nothing:
-        fault = f"holds weights for none of the net's {len(learning)} layers that have any: {names}"
+        fault = f"contains weights for none of the net's {len(learning)} layers with weights: {names}"
     else:
-        fault = f"lacks weights for {len(missing)} of the net's {len(learning)} layers that have any: {names}"
+        fault = f"lacks weights for {len(missing)} of the net's {len(learning)} layers with weights: {names}"
     if strict or (some and nothing):
-        advice = "is it the file of another net?" if nothing else "leave strict out to keep their fillers' values"
+        advice = (
+            "are they weights of another net?" if nothing else "without strict they keep the values of their fillers"
+        )
         net.plan.source.report(SpecError(f"{fault}; {advice}", Where(files)))
     else:
-        log.logger.warning(f"{files}: {fault}; they stay as they were filled")
+        log.logger.warning(f"{files}: {fault}; they keep the values of their fillers")
 
 
 def _names(layers: list[str]) -> str:
@@ -172,7 +174,7 @@ def binary_bytes(net: Net, diff: bool = False) -> int:
 
 def too_large(size: int) -> str:
     """Return the message for a binary file that would be too large, with advice."""
-    return f"{size / 2**30:.2f} GiB are more than the 2 GiB of a binary file; set snapshot_format: HDF5"
+    return f"{size / 2**30:.2f} GiB is more than the 2 GiB limit of a binary file; set snapshot_format: HDF5"
 
 
 def write_hdf5(net: Net, path: str | Path, diff: bool = False) -> None:
@@ -181,8 +183,8 @@ def write_hdf5(net: Net, path: str | Path, diff: bool = False) -> None:
     nested = [layer.param.name for layer in net.layers if "/" in layer.param.name and layer.blobs]
     if nested:
         log.logger.warning(
-            f'{path}: Caffe loads no weights of layers with "/" in their names from HDF5: {_names(nested)}; '
-            "for Caffe write the binary format: .caffemodel without .h5, or snapshot_format: BINARYPROTO"
+            f'{path}: Caffe cannot load weights of layers with "/" in their names from HDF5: {_names(nested)}; '
+            "for Caffe, write the binary format: .caffemodel without .h5, or snapshot_format: BINARYPROTO"
         )
     with new_hdf5(path) as file:
         data = file.create_group("data")

@@ -36,7 +36,7 @@ def read_binary(path: str | Path, message_class: type[M]) -> M:
 
 
 def parse_binary(data: bytes, file: str, message_class: type[M]) -> M:
-    """Return the message that ``data`` holds; ``file`` is what errors call it. Raises as :func:`read_binary`."""
+    """Return the message in ``data``; ``file`` is its name in errors. Raises as :func:`read_binary`."""
     where = Where(file)
     name = message_class.DESCRIPTOR.name
     if not data:
@@ -56,7 +56,7 @@ def parse_binary(data: bytes, file: str, message_class: type[M]) -> M:
 
 
 def _escape_names(message: Any) -> None:
-    """Write the bytes of names that are not UTF-8, which C++ takes and Python does not, as escapes."""
+    """Write bytes of names that are not UTF-8 as escapes, since Python's protobuf refuses them (C++ does not)."""
     for field, value in message.ListFields():
         parts: Any = value if isinstance(value, Sequence) and not isinstance(value, (str, bytes)) else [value]
         if field.message_type:
@@ -79,9 +79,9 @@ def read_net_binary(path: str | Path) -> NetParameter:
 
 @contextmanager
 def net_beside_numbers(path: str | Path) -> Iterator[tuple[NetParameter, BinaryIO | None]]:
-    """Yield the net of a .caffemodel without the numbers of its large blobs, and the open file where they lie.
+    """Yield the net of a .caffemodel without the numbers of its large blobs, and the open file that contains them.
 
-    See :func:`netspec.proto.wire.without_numbers`. A file that cannot be read that way is yielded whole, and None.
+    See :func:`netspec.proto.wire.without_numbers`. If this fails, yield the complete net and None instead.
     Raises SpecError as :func:`read_net_binary`.
     """
     with ExitStack() as stack:
@@ -91,14 +91,14 @@ def net_beside_numbers(path: str | Path) -> Iterator[tuple[NetParameter, BinaryI
             file = stack.enter_context(open(path, "rb", buffering=0))
             message = without_numbers(_Slices(file), 0, os.fstat(file.fileno()).st_size, "NetParameter")
             found = _upgraded(parse_binary(message, str(path), NetParameter), path)[0], file
-        except (OSError, ValueError):  # SpecError too: the whole file may say more
+        except (OSError, ValueError):  # also SpecError: reading the whole file may give a better error
             stack.close()
             found = read_net_binary(path), None
         yield found
 
 
 class _Slices:
-    """A file that is read where it is sliced."""
+    """A file that is read by slicing it."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -123,12 +123,12 @@ def _upgraded(net: NetParameter, path: str | Path, upgrade: bool = True) -> tupl
 
 
 def split_paths(paths: str | Path) -> list[str]:
-    """Return the files of weights that commas separate, as in Caffe's ``--weights``."""
+    """Return the weights files of a list separated by commas, as in Caffe's ``--weights``."""
     return [path.strip() for path in str(paths).split(",")]
 
 
 def check_readable(paths: Iterable[str]) -> None:
-    """Raise SpecError for the first path that cannot be opened: sooner than the net is built that would read it."""
+    """Raise SpecError for the first path that cannot be opened, before a net is built that would read it."""
     for path in paths:
         try:
             open(path, "rb").close()
@@ -137,10 +137,10 @@ def check_readable(paths: Iterable[str]) -> None:
 
 
 def is_net_binary(path: str | Path) -> bool:
-    """Say whether a file is a .caffemodel, by what it holds: the layers of a net in protobuf's binary form."""
+    """Return whether a file is a .caffemodel: whether it contains the layers of a net in protobuf's binary format."""
     try:
         data = read_bytes(path)
-        if b"\0" not in data:  # every number in it has one, and no text does
+        if b"\0" not in data:  # binary numbers contain NUL, and text does not
             return False
         net = NetParameter.FromString(data)
     except (OSError, DecodeError):
@@ -149,7 +149,7 @@ def is_net_binary(path: str | Path) -> bool:
 
 
 def _guess(data: bytes, message_class: type[Message]) -> str:
-    """Return a guess at what a file is that is no such message."""
+    """Return a guess at the contents of a file that is not such a message."""
     if kind := kind_of(data):
         return kind
     if all(32 <= byte < 127 or byte in b"\t\r\n" for byte in data[:1000]):
@@ -160,5 +160,5 @@ def _guess(data: bytes, message_class: type[Message]) -> str:
             if field.number not in known:
                 break
             if field.end > len(data):
-                return f"the beginning of one, {len(data):,} bytes: it was cut; copy or download it again"
+                return f"its first {len(data):,} bytes only: it was truncated; copy or download it again"
     return "another kind of data, or a truncated file"

@@ -1,7 +1,7 @@
 """Splits protobuf's text format into tokens with their line and column.
 
-Tokens: https://protobuf.dev/reference/protobuf/textformat-spec/. Where that is stricter than the C++ parser of Caffe
-(strings over several lines, a number directly before a name), the rules of the C++ parser.
+Tokens: https://protobuf.dev/reference/protobuf/textformat-spec/. Where the specification is stricter than Caffe's C++
+parser (strings over several lines, a number directly before a name), the parser's rules apply.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Lexer:
     """
 
     def __init__(self, text: str, file: str) -> None:
-        """``file`` is the file name in tokens' places and in errors."""
+        """``file`` is the file name for the places of tokens and for errors."""
         self.text = text
         self.file = file
         self._long_strings: list[Token] = []
@@ -76,17 +76,17 @@ class Lexer:
         return Where(self.file, line, start - self._lines[line - 1] + 1)
 
     def suspicion(self, start: int) -> str:
-        """Return a hint for an error at a placeholder, or right after a string over several lines; or an empty string.
+        """Return a hint for an error at a placeholder, or directly after a string over several lines; else "".
 
         If a closing quote is missing, the string continues to the next opening quote, and the error appears there.
         """
         if found := _PLACEHOLDER.match(self.text, start):
-            return f"; is this file a template? put a value in the place of {found[0]}"
+            return f"; is this file a template? replace {found[0]} with a value"
         for token in reversed(self._long_strings):
             end = token.start + len(token.text)
             if token.start < start and self.where(start).line <= self.where(end).line + 1:
                 line = self.where(token.start).line
-                return f"; is a closing quote missing for the string that begins in line {line}?"
+                return f"; is the closing quote of the string in line {line} missing?"
         return ""
 
     def unquote(self, token: Token) -> bytes:
@@ -109,11 +109,11 @@ class Lexer:
         if short or long:
             code = int(short or long, 16)
             if code > 0x10FFFF or 0xD800 <= code <= 0xDFFF:
-                raise SpecError(f"{match.group()} is not a character of Unicode", self.where(start))
+                raise SpecError(f"{match.group()} is not a Unicode character", self.where(start))
             return chr(code).encode()
         if simple not in _SIMPLE_ESCAPES:
             raise SpecError(
-                f"unknown escape {match.group()!r} in a string; a backslash itself is \\\\", self.where(start)
+                f"unknown escape {match.group()!r} in a string; write a backslash as \\\\", self.where(start)
             )
         return bytes([_SIMPLE_ESCAPES[simple]])
 

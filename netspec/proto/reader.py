@@ -1,9 +1,9 @@
 """Reads protobuf's text format into a message, by reflection, with the place of every part.
 
-It accepts what the C++ parser of Caffe accepts: a file that Caffe reads is read here, and a file that Caffe refuses is
-refused here, with one line that says where and why. One field is added: ``ceil_mode: true`` in a pooling_param, which
-many forks write for ``round_mode: CEIL``. A field or a value that Caffe lacks and one known fork has is added to the
-schema where it is met (netspec/proto/forks.py).
+It accepts exactly the files that Caffe's C++ parser accepts, and refuses others with one line that gives the place and
+the reason. One field is added: ``ceil_mode: true`` in a pooling_param, which
+many forks use for ``round_mode: CEIL``. If Caffe lacks a field or value and exactly one known fork has it, it is added
+to the schema when it is read (netspec/proto/forks.py).
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ _RANGES: dict[int, tuple[int, int]] = {
     Declared.TYPE_UINT32: (0, (1 << 32) - 1),
     Declared.TYPE_UINT64: (0, (1 << 64) - 1),
 }
-_LONGEST = 100  # digits: more than any number has, and less than Python refuses to print
+_LONGEST = 100  # digits: more than any valid number has, and few enough for Python to print
 _BOOLEANS = {"true": True, "True": True, "t": True, "false": False, "False": False, "f": False}
 _V1_TYPES = V1LayerParameter.LayerType.keys()
 _LAYERS = ("caffe.LayerParameter", "caffe.V1LayerParameter")
 
-_DEVICES = ("caffe.SolverParameter", "device_id")  # a list in yjxiong/caffe: the GPUs of its processes
+_DEVICES = ("caffe.SolverParameter", "device_id")  # in yjxiong/caffe this is a list, the GPUs of its processes
 _ALIASES = {("caffe.PoolingParameter", "ceil_mode"): ("round_mode", {True: "CEIL", False: "FLOOR"})}
 
-# What else a file may be, if a field is unknown in its outermost message.
+# Other kinds of files, to suggest if a field is unknown in the outermost message.
 _OTHER_FILE: dict[str, tuple[Any, str]] = {
     "caffe.NetParameter": (SolverParameter, "solver"),
     "caffe.SolverParameter": (NetParameter, "net"),
 }
 
-_LABEL_MAP = "item"  # the one field of a LabelMap of SSD
+_LABEL_MAP = "item"  # the only field of SSD's LabelMap
 
 _CLOSING = {"{": "}", "<": ">", "[": "]"}
 
@@ -52,7 +52,7 @@ Children = dict[str, list[Place]]
 def read_text(text: str, file: str, message: Message, report: Callable[[SpecError], None] | None = None) -> Place:
     """Read a text into an empty ``message``; return the places of its parts.
 
-    ``report``, if given, gets a ForkFault for each unknown field, which then is left out with all that it holds.
+    ``report``, if given, gets a ForkFault for each unknown field, which is then left out with its contents.
 
     Raises SpecError for unknown fields, values of the wrong type or out of range, singular fields given twice, missing
     required fields, and text that is not protobuf's text format.
@@ -61,7 +61,7 @@ def read_text(text: str, file: str, message: Message, report: Callable[[SpecErro
 
 
 class _Reader:
-    """A recursive descent over the tokens; ``self.token`` is the next one."""
+    """A recursive descent parser; ``self.token`` is the next token."""
 
     def __init__(self, text: str, file: str, report: Callable[[SpecError], None] | None) -> None:
         self._report = report
@@ -82,7 +82,7 @@ class _Reader:
 
     def _field(self, message: Message, children: Children) -> None:
         if self.token.kind != NAME:
-            advice = '; is there one "}" too many?' if self._at("}") and len(self._open) == 1 else ""
+            advice = '; is there an extra "}"?' if self._at("}") and len(self._open) == 1 else ""
             raise self._expected("a field name", advice=advice)
         name = self._next()
         key = (message.DESCRIPTOR.full_name, name.text)
@@ -115,7 +115,7 @@ class _Reader:
         elif self._at("[") and (field.repeated or key == _DEVICES):
             self._list(field, message, nodes)
             if key == _DEVICES:
-                advice = "the first is taken; train --gpu 0,1 takes several"
+                advice = "only the first is used; for several GPUs, use train --gpu 0,1"
                 log.logger.warning(f"{self.lexer.where(name.start)}: device_id is a list: {advice}")
         else:
             nodes.append(self._value(field, message, name))
@@ -123,7 +123,7 @@ class _Reader:
             self._next()
 
     def _with_value(self, message: Message, field: Field, value: str) -> Field:
-        """Return the field of an enum that has a value: ``field``, or that of the values that forks add to it."""
+        """Return the enum field that has a value: ``field``, or the one for values that forks add to it."""
         if value in field.descriptor.enum_type.values_by_name:
             return field
         for is_last in (False, True):
@@ -135,7 +135,7 @@ class _Reader:
         return field
 
     def _skip(self, name: Token) -> None:
-        """Pass over the value of an unknown field: a scalar, a list or a message, whatever is in it."""
+        """Skip the value of an unknown field: a scalar, a list or a message with any contents."""
         has_colon = self._at(":")
         if has_colon:
             self._next()
@@ -276,7 +276,7 @@ class _Reader:
             if self.token.kind == STRING and self.token.text[1:-1] in values:
                 advice = "; leave out the quotes"
             elif self.token.kind == STRING and field.descriptor.full_name == "caffe.V1LayerParameter.type":
-                advice = '; a layer whose type is in quotes begins with "layer", not "layers"'
+                advice = '; a quoted layer type belongs in "layer", not "layers"'
             raise self._expected(f"a name such as {list(values)[-1]}", f'for "{field.name}"', start, advice)
         number = self._natural(self._next())
         number = -number if negative else number
@@ -289,7 +289,7 @@ class _Reader:
         if start.kind != STRING:
             advice = "; put it in quotes" if start.kind in (NAME, INTEGER, FLOAT) else ""
             if field.descriptor.full_name == "caffe.LayerParameter.type" and start.text in _V1_TYPES:
-                advice = '; a layer whose type is not in quotes begins with "layers", the older format'
+                advice = '; an unquoted layer type belongs in "layers", the older format'
             raise self._expected("a string", f'for "{field.name}"', start, advice)
         value = b""
         while self.token.kind == STRING:
@@ -304,7 +304,7 @@ class _Reader:
     def _natural(self, token: Token) -> int:
         text = token.text
         if len(text) > _LONGEST:
-            raise self._error(f"a number of {len(text):,} digits is out of every range", token)
+            raise self._error(f"a number of {len(text):,} digits is out of range", token)
         if text[:2] in ("0x", "0X"):
             return int(text, 16)
         if text[0] != "0":
@@ -362,15 +362,15 @@ class _Reader:
             if open_message.DESCRIPTOR.full_name in _LAYERS:
                 layer: Any = open_message
                 name, kind = layer.name, layer.type if isinstance(layer.type, str) else ""
-                if (name + kind).isprintable():  # a missing quote makes them run over several lines
+                if (name + kind).isprintable():  # with a missing quote, they extend over several lines
                     place = replace(place, layer=name, type=kind)
                 break
         return SpecError(message, place)
 
     def _unknown_field(self, message: Message, token: Token) -> SpecError:
-        """Say that a field is unknown, and as well as can be guessed what was meant.
+        """Return the error for an unknown field, with a suggestion if possible.
 
-        That is a ForkFault unless the fault seems to lie elsewhere: in a bracket, a quotation mark, the kind of file.
+        It is a ForkFault, unless the cause seems to be a bracket, a quotation mark or the kind of file.
         """
         descriptor, name = message.DESCRIPTOR, token.text
         dialects = forks().with_field(descriptor.full_name, name)
@@ -387,7 +387,7 @@ class _Reader:
         return ForkFault(error.message + own, error.where, "field", name, dialects, descriptor.name)
 
     def _elsewhere(self, message: Message, name: str) -> str:
-        """Return the sentence that a field belongs into another message or file; or an empty string."""
+        """Return a message that a field belongs to another message or file; else ""."""
         inner = self._open[-1][1]
         for outer, _ in reversed(self._open[:-1]):
             if name in fields_of(outer.DESCRIPTOR):
@@ -401,7 +401,7 @@ class _Reader:
         return ""
 
     def _meant(self, message: Message, name: str) -> str:
-        """Return the field that may be meant, or where this one belongs; or an empty string."""
+        """Return a suggestion: a similar field, or the message that this field belongs to; else ""."""
         known = fields_of(message.DESCRIPTOR)
         if close := did_you_mean(name, known):
             return close

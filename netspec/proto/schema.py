@@ -1,8 +1,8 @@
-"""Caffe's messages as Python classes, in a descriptor pool of their own.
+"""Caffe's messages as Python classes, in a separate descriptor pool.
 
 The pool is private: another "caffe.proto" in the process (pycaffe's, a converter's) does not clash with this one, and
-no generated module ties netspec to one version of protobuf. ``caffe.desc`` is the compiled ``caffe.proto``, which says
-how to compile it; ``caffe_pb2.pyi`` is made with it and gives the fields to type checkers.
+no generated module ties netspec to one version of protobuf. ``caffe.desc`` is the compiled ``caffe.proto``, which
+contains the command to compile it. ``caffe_pb2.pyi`` is generated with it, for type checkers.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from google.protobuf.message import Message
 from netspec.errors import SpecError
 
 PACKAGE = "caffe"
-MORE = "+"  # no name in a text ends in it
-_LAST_NUMBER = 1 << 29  # field numbers end before this
+MORE = "+"  # no name in a text ends with this
+_LAST_NUMBER = 1 << 29  # field numbers are below this
 
 #: The pool; forks add their messages and fields to it (netspec/dialects/registry.py).
 pool = descriptor_pool.DescriptorPool()
@@ -26,7 +26,7 @@ _declarations: dict[str, descriptor_pb2.DescriptorProto] = {}  # by the message'
 
 
 def add_file(file: descriptor_pb2.FileDescriptorProto) -> None:
-    """Add the messages of a file to the schema. Raises TypeError where they do not fit it."""
+    """Add the messages of a file to the schema. Raises TypeError if they conflict with it."""
     pool.Add(file)
     for declared in file.message_type:
         _declare(f"{file.package}.{declared.name}", declared)
@@ -43,7 +43,7 @@ def _load() -> None:
     files.ParseFromString(Path(__file__).with_name("caffe.desc").read_bytes())
     for file in files.file:
         for declared in file.message_type:
-            # Numbers above Caffe's own are free for the fields of forks: as extensions they can be added later, and do
+            # Numbers above Caffe's own are reserved for the fields of forks. Extensions can be added later and do
             # not change the classes below.
             declared.extension_range.add(start=max(f.number for f in declared.field) + 1, end=_LAST_NUMBER)
         add_file(file)
@@ -62,7 +62,7 @@ def message(name: str) -> type[CaffeMessage]:
 
 
 if TYPE_CHECKING:
-    from netspec.proto import caffe_pb2  # a stub; import-linter knows it as part of the package
+    from netspec.proto import caffe_pb2  # a stub, which import-linter counts as part of the package
 
     BlobProto = caffe_pb2.BlobProto
     BlobProtoVector = caffe_pb2.BlobProtoVector
@@ -79,7 +79,7 @@ if TYPE_CHECKING:
     TransformationParameter = caffe_pb2.TransformationParameter
     V0LayerParameter = caffe_pb2.V0LayerParameter
     V1LayerParameter = caffe_pb2.V1LayerParameter
-    CaffeMessage = Any  # a message of any kind, its fields and enums included
+    CaffeMessage = Any  # a message of any type, including its fields and enums
     PhaseValue = caffe_pb2.Phase.ValueType
 
 else:
@@ -95,7 +95,7 @@ PHASE_NAMES = ("TRAIN", "TEST")
 
 
 def phase_of(phase: str | int) -> PhaseValue:
-    """Return a phase by its name, in small letters too, or by its number. Raises SpecError for an unknown name."""
+    """Return a phase by its name, in upper or lower case, or by its number. Raises SpecError for an unknown name."""
     if isinstance(phase, str) and phase.upper() in PHASES:
         return PHASES[phase.upper()]
     if phase in PHASES.values():
@@ -105,10 +105,10 @@ def phase_of(phase: str | int) -> PhaseValue:
 
 @dataclass(frozen=True)
 class Field:
-    """A field, Caffe's own or a fork's, for reading and writing text.
+    """A field of Caffe or of a fork, for reading and writing text.
 
-    ``type`` is a FieldDescriptorProto.Type. ``descriptor`` is protobuf's, whose property for the label changed between
-    its versions.
+    ``type`` is a FieldDescriptorProto.Type. ``descriptor`` is protobuf's; its property for the label differs between
+    versions of protobuf.
     """
 
     name: str
@@ -137,14 +137,14 @@ class Field:
         return message.HasField(self.name)
 
 
-#: Fields that active dialects add: full name of the message -> name of the field -> Field. Values that they add to an
-#: enum of Caffe's are a field too, which has the name of Caffe's field, under that name and MORE.
+#: Fields that active dialects add: full name of the message -> name of the field -> Field. Values added to one of
+#: Caffe's enums are stored as a Field with the name of Caffe's field, under that name followed by MORE.
 added_fields: dict[str, dict[str, Field]] = {}
 _own_fields: dict[str, dict[str, Field]] = {}
 
 
 def as_field(declared: descriptor_pb2.FieldDescriptorProto, descriptor: Any) -> Field:
-    """Return the Field of a declaration and of its descriptor in the pool."""
+    """Return the Field for a declaration and its descriptor in the pool."""
     return Field(
         declared.name,
         descriptor.type,
@@ -155,7 +155,7 @@ def as_field(declared: descriptor_pb2.FieldDescriptorProto, descriptor: Any) -> 
 
 
 def fields_of(descriptor: Any) -> dict[str, Field]:
-    """Return the fields of a message's descriptor by name: the schema's own, then those of the active dialects."""
+    """Return the fields of a message by name: the schema's own, then those of the active dialects."""
     name = descriptor.full_name
     if name not in _own_fields:
         declared = _declarations[name].field
@@ -183,7 +183,7 @@ def added_value(message: Message, name: str) -> str:
 
 
 def given(message: Message) -> set[str]:
-    """Return the names of the fields that were given, those of active dialects too."""
+    """Return the names of the fields that were given, including those of active dialects."""
     return {field.name for field, _ in message.ListFields()}
 
 

@@ -1,4 +1,4 @@
-"""The line and column of each part of a net; passed along with the NetParameter through every pass."""
+"""The line and column of each part of a net. Every pass takes and returns it together with the NetParameter."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 
 from netspec.errors import Report, Where, raise_fault
 
-_NONE: dict[str, tuple[Place, ...]] = {}  # one for all places without fields
+_NONE: dict[str, tuple[Place, ...]] = {}  # shared by all places without fields
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Position of one message in its file and, by field name, the positions of all values of its fields, in order."""
+    """The position of a message in its file, and the positions of the values of its fields, by field name, in order."""
 
     where: Where
     fields: Mapping[str, tuple[Place, ...]] = field(default_factory=lambda: _NONE)
@@ -20,7 +20,7 @@ class Place:
     def find(self, *path: str | int) -> Where:
         """Return the place of ``path``, e.g. ``("convolution_param", "pad", 1)``, or of its nearest known ancestor.
 
-        A name selects the first value of that field, an index after it the value of that index.
+        A name selects the first value of that field; an index after it selects the value with that index.
         """
         node = self
         steps = list(path)
@@ -38,9 +38,9 @@ class Place:
 class SourceMap:
     """``layers[i]`` is the place of layer ``i`` of the NetParameter.
 
-    ``report`` gets each fault that is found in the net, from its first pass until it is built and has its weights. It
-    raises the first one; with another, work goes on where it can. ``dialects`` are those that a comment names.
-    ``left_out`` has the blobs that a layer makes which the net's state leaves out: that layer, and what to do.
+    ``report`` gets each error in the net, from the first pass until the net is built and has its weights. By default it
+    raises the first one; another function can collect them. ``dialects`` are those that a comment names.
+    ``left_out`` maps the blobs of excluded layers to a text that names the layer and says what to do.
     """
 
     file: str
@@ -62,7 +62,7 @@ class SourceMap:
         return SourceMap(file, node, (node,) * count)
 
     def as_net(self) -> Place:
-        """Return the places of the net with those of its current layers; see :meth:`of`."""
+        """Return the place of the net, including those of its current layers; see :meth:`of`."""
         others = {name: nodes for name, nodes in self.net.fields.items() if name not in ("layer", "layers")}
         return replace(self.net, fields={**others, "layer": self.layers})
 

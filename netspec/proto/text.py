@@ -1,4 +1,4 @@
-"""The functions to read text files into upgraded messages, with the places of their parts, and to write text."""
+"""Reading text files into upgraded messages, with the places of their parts, and writing text."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def read_solver(path: str | Path) -> SolverParameter:
 
 
 def parse_net(path: str | Path, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
-    """Return the net of a .prototxt and where its parts stand. Raises SpecError.
+    """Return the net of a .prototxt, and the places of its parts. Raises SpecError.
 
-    ``report``, if given, gets a ForkFault for each unknown field, which then is left out. A field that one fork of
-    Caffe has is added to the schema (netspec/proto/forks.py).
+    ``report``, if given, gets a ForkFault for each unknown field, which is then left out. If one known fork has the
+    field, it is added to the schema instead (netspec/proto/forks.py).
     """
     return parse_net_text(text_of(path), str(path), upgrade, report)
 
 
 def parse_net_text(text: str, file: str, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
-    """Return the net that a text describes and where its parts stand; ``file`` is what errors call it."""
+    """Return the net in a text, and the places of its parts; ``file`` is its name in errors."""
     net = NetParameter()
     named = forks().named_in(text, file)
     source = replace(SourceMap.of(read_text(text, file, net, report)), dialects=named)
@@ -50,7 +50,7 @@ def parse_net_text(text: str, file: str, upgrade: bool = True, report: Report = 
 
 
 def parse_solver(path: str | Path, upgrade: bool = True, report: Report = None) -> tuple[SolverParameter, Place]:
-    """Return the solver of a .prototxt and where its parts stand. Raises SpecError.
+    """Return the solver of a .prototxt, and the places of its parts. Raises SpecError.
 
     The nets in it are upgraded too; ``SourceMap.of(node.fields["net_param"][0])`` is the map of one. For ``report``
     see :func:`parse_net`.
@@ -61,7 +61,7 @@ def parse_solver(path: str | Path, upgrade: bool = True, report: Report = None) 
 def parse_solver_text(
     text: str, file: str, upgrade: bool = True, report: Report = None
 ) -> tuple[SolverParameter, Place]:
-    """Return the solver that a text describes and where its parts stand; ``file`` is what errors call it."""
+    """Return the solver in a text, and the places of its parts; ``file`` is its name in errors."""
     solver = SolverParameter()
     node = read_text(text, file, solver, report)
     if upgrade:

@@ -1,6 +1,6 @@
-"""protobuf's wire format: where the fields of a message lie, without parsing it.
+"""protobuf's wire format: the positions of a message's fields, without parsing it.
 
-protobuf copies all numbers of a net's weights while it parses them, and hands them to Python one by one.
+protobuf copies all numbers of a net's weights while it parses them, and passes them to Python one by one.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from typing import NamedTuple, Protocol
 from netspec.proto.schema import PACKAGE, BlobProto, pool
 
 VARINT, EIGHT, BYTES, FOUR = 0, 1, 2, 5  # wire types: how a field's contents are stored
-PLACE = (1 << 29) - 1  # the last number that a field can have: see without_numbers
-_LEAST = 256  # bytes of numbers: fewer are copied
+PLACE = (1 << 29) - 1  # the largest field number; see without_numbers
+_LEAST = 256  # bytes: smaller blobs are copied
 _HEAD = 20  # bytes: a tag and a size take at most 10 each
 _WITH_BLOBS = ("BlobProto", "LayerParameter", "V1LayerParameter", "V0LayerParameter")
 _DATA, _DOUBLE = (BlobProto.DESCRIPTOR.fields_by_name[name].number for name in ("data", "double_data"))
 
 
 class Data(Protocol):
-    """Bytes, or a file that is read where it is sliced."""
+    """Bytes, or a file that is read by slicing it."""
 
     def __getitem__(self, part: slice, /) -> bytes:
         """Return a part."""
@@ -28,7 +28,7 @@ class Data(Protocol):
 
 
 class Field(NamedTuple):
-    """A field's number and wire type, where its tag starts, and where its contents start and end."""
+    """The number and wire type of a field, the offset of its tag, and the start and end of its contents."""
 
     number: int
     kind: int
@@ -55,7 +55,7 @@ def fields(data: Data, start: int, end: int) -> Iterator[Field]:
         else:
             raise ValueError(f"has a field of wire type {kind}")
         if after > end or not tag >> 3:
-            raise ValueError("is cut, or no message")
+            raise ValueError("is truncated, or is not a protobuf message")
         yield Field(tag >> 3, kind, start, contents, after)
         start = after
 
@@ -68,14 +68,14 @@ def _varint(head: bytes, place: int) -> tuple[int, int]:
         if head[end] < 128:
             return found, end + 1
         shift += 7
-    raise ValueError("is cut, or no message")
+    raise ValueError("is truncated, or is not a protobuf message")
 
 
 def without_numbers(data: Data, start: int, end: int, message: str) -> bytes:
-    """Return a message of Caffe's without the numbers of its large blobs.
+    """Return a serialized message of Caffe without the numbers of its large blobs.
 
-    Such a blob has the field PLACE twice instead: where its numbers, little-endian float32, start in ``data``, and how
-    many bytes they take. Raises ValueError for what is no such message.
+    Such a blob has the field PLACE twice instead: the offset of its numbers (little-endian float32) in ``data``, and
+    their size in bytes. Raises ValueError if the data is not such a message.
     """
     if message == "BlobProto":
         return _blob_without_numbers(data, start, end)
@@ -91,7 +91,7 @@ def without_numbers(data: Data, start: int, end: int, message: str) -> bytes:
 def _blob_without_numbers(data: Data, start: int, end: int) -> bytes:
     found = list(fields(data, start, end))
     if any(field.number == PLACE for field in found):
-        raise ValueError("uses the field that stands for numbers")
+        raise ValueError("uses a field number that is reserved for numbers")
     runs = [field for field in found if field.number in (_DATA, _DOUBLE)]
     if len(runs) != 1 or runs[0].number != _DATA or runs[0].kind != BYTES:
         return data[start:end]
@@ -104,7 +104,7 @@ def _blob_without_numbers(data: Data, start: int, end: int) -> bytes:
 
 @cache
 def _messages_with_blobs(message: str) -> dict[int, str]:
-    """Return the names of the messages within one that have blobs, by the number of their fields."""
+    """Return the names of the messages in a message that contain blobs, by field number."""
     inner = pool.FindMessageTypeByName(f"{PACKAGE}.{message}").fields
     kinds = {field.number: field.message_type.name for field in inner if field.message_type}
     return {number: name for number, name in kinds.items() if name in _WITH_BLOBS}

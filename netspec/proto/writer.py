@@ -1,4 +1,4 @@
-"""A message as text, as Caffe prints it in its log (DebugString of protobuf for C++)."""
+"""Writing a message as text, as in Caffe's log (DebugString of protobuf for C++)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _write(message: Message, indent: str, lines: list[str]) -> None:
 
 
 def scalar_text(field: Field, value: Any) -> str:
-    """Return the value of a scalar field as text, as it stands in a prototxt."""
+    """Return the value of a scalar field as text, as in a prototxt."""
     if field.type == Declared.TYPE_FLOAT:
         return _shortest(value, 6, 9, "f")
     if field.type == Declared.TYPE_DOUBLE:
@@ -48,7 +48,7 @@ def scalar_text(field: Field, value: Any) -> str:
 
 
 def _shortest(value: float, digits: int, all_digits: int, kind: str) -> str:
-    """Print with few digits if they give the same value when read, else with enough digits for any value."""
+    """Format a number with few digits if they give the same value when read, else with enough digits for any value."""
     text = f"{value:.{digits}g}"
     same = struct.unpack(kind, struct.pack(kind, float(text)))[0] == value
     return text if same or value != value else f"{value:.{all_digits}g}"

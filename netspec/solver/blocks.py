@@ -1,9 +1,9 @@
-"""The learned blobs of a training, side by side in memory, so that one operation updates many of them.
+"""Packs the learnable blobs of a training into contiguous memory, so that one operation updates many of them.
 
-An operation of torch takes as long for a bias of ten numbers as for ten thousand. So small blobs that have the same
-multipliers are put into one piece of memory, and so are their gradients and their history: parameters stay what they
-are, views of that memory. Large ones stay where they are, and are cut into blocks that fit into a CPU's cache. All of
-Caffe's rules work number by number, so this changes no number.
+An operation of torch takes as long for a bias of ten numbers as for ten thousand. So small blobs with the same
+multipliers share one piece of memory, and so do their gradients and their history. Parameters become views of
+that memory. Large blobs stay in place and are divided into blocks that fit into a CPU's cache. All of
+Caffe's rules are elementwise, so the results do not change.
 """
 
 # pyright: reportPrivateImportUsage=false
@@ -19,12 +19,12 @@ from netspec.layers.contract.learned import Seen, values_of
 from netspec.net.assembly import Learnable
 from netspec.solver import update
 
-LINE = 16  # numbers, 64 bytes: where each blob begins
+LINE = 16  # numbers (64 bytes): each blob begins at a multiple of this
 
 
 @dataclass(frozen=True)
 class _Block:
-    """Numbers that lie side by side, with their gradients and their history, a tensor for each set."""
+    """A contiguous block of numbers, with its gradients and its history, one tensor per set."""
 
     weights: torch.Tensor
     diffs: torch.Tensor
@@ -34,9 +34,9 @@ class _Block:
 
 
 class Blocks:
-    """The parameters that a solver updates, and the rule's history of each: ``sets`` after one another.
+    """The parameters that a solver updates, and the history of each, in ``sets`` sets.
 
-    Parameters move in memory when this is made, on a CPU; nobody may hold aliases of them yet.
+    On a CPU, the constructor moves the parameters in memory, so no aliases of them may exist yet.
     """
 
     def __init__(self, learnable: Sequence[Learnable], sets: int) -> None:
@@ -61,7 +61,7 @@ class Blocks:
         self._seen = Seen(self._placed)
 
     def _put_together(self, indices: Sequence[int]) -> None:
-        """Put blobs with the same multipliers into pieces of memory of at most ``BLOCK`` numbers."""
+        """Pack blobs with the same multipliers into pieces of memory of at most ``BLOCK`` numbers."""
         piece: list[int] = []
         room = update.BLOCK
         for i in indices:
@@ -92,7 +92,7 @@ class Blocks:
         self._blocks.append(_Block(weights, diffs, history, first.lr_mult, first.decay_mult))
 
     def _keep(self, i: int) -> None:
-        """Cut a large blob, which stays where it is, into blocks."""
+        """Divide a large blob, which stays in place, into blocks."""
         item = self._learnable[i]
         blob = item.parameter
         if blob.requires_grad:
@@ -106,7 +106,7 @@ class Blocks:
             self._blocks.append(_Block(weights, gradient, history, item.lr_mult, item.decay_mult))
 
     def _are_in_place(self) -> bool:
-        """Return whether parameters and gradients are where they were put."""
+        """Return whether parameters and gradients are still in the packed memory."""
         return bool(self._blocks) and self._seen.are(self._placed)
 
     def clear(self) -> None:
@@ -118,7 +118,7 @@ class Blocks:
             update.clear(item.parameter for item in self._learnable)
 
     def diffs(self) -> list[torch.Tensor]:
-        """Return the gradient of each parameter, zeros where it has none."""
+        """Return the gradient of each parameter, or zeros if it has none."""
         found = []
         for item in self._learnable:
             blob = item.parameter
@@ -126,7 +126,7 @@ class Blocks:
         return found
 
     def pieces(self, rate: float, decay: float) -> Iterator[update.Piece]:
-        """Yield what an iteration updates, part by part, for the rate and the decay before their multipliers."""
+        """Yield the pieces that an iteration updates, with their rates and decays."""
         if self._are_in_place():
             for block in self._blocks:
                 own = [rate * block.lr_mult], [decay * block.decay_mult]
@@ -139,5 +139,5 @@ class Blocks:
 
 
 def _lines(blob: torch.Tensor) -> int:
-    """Return how many numbers a blob takes, in whole lines."""
+    """Return the size of a blob, rounded up to whole lines."""
     return -(-blob.numel() // LINE) * LINE

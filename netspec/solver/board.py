@@ -1,4 +1,4 @@
-"""A training for TensorBoard, through the optional package tensorboard."""
+"""Writing a training for TensorBoard, with the optional package tensorboard."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from netspec.solver.solver import Solver
 
 
 def writer_class() -> Any:
-    """Return torch's writer for TensorBoard. Raises SpecError where the package is missing."""
+    """Return torch's writer for TensorBoard. Raises SpecError if the package is missing."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
@@ -23,10 +23,10 @@ def writer_class() -> Any:
 
 @contextmanager
 def board(solver: Solver, folder: str | Path) -> Iterator[None]:
-    """Write what a solver does within the block: loss and rate of each iteration, and the outputs of its tests.
+    """Within the block, write the loss and rate of each iteration, and the outputs of tests.
 
-    A training that is resumed goes on in its folder; what was written there of later iterations is hidden. Raises
-    SpecError if the package is missing, or the folder cannot be written.
+    A resumed training continues in its folder; results of later iterations in it are hidden. Raises
+    SpecError if the package is missing or the folder cannot be written.
     """
     try:
         os.makedirs(folder, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Checks of a training: its settings before anything is built, its threads, and where a NaN comes from.
+"""Checks of a training: its settings before anything is built, its threads, and the origin of a NaN.
 
 In Caffe some of these errors appear only after days.
 """
@@ -29,7 +29,7 @@ _NOT_NEGATIVE = ("max_iter", "display", "test_interval", "snapshot")
 
 
 def check_settings(param: Any, node: Place, report: Report = raise_fault) -> None:
-    """Report every error in the solver's own settings; its nets are checked separately."""
+    """Report all errors in the solver's own settings; its nets are checked separately."""
     for fault in (*rule_faults(param, node), *policy_faults(param, node)):
         report(fault)
     if param.regularization_type not in REGULARIZATIONS:
@@ -47,16 +47,16 @@ def check_settings(param: Any, node: Place, report: Report = raise_fault) -> Non
 
 
 def fields_without_effect(param: Any, node: Place, read: frozenset[str] = frozenset()) -> Iterator[str]:
-    """Yield a line for each field of a fork that is given: the layers of the test nets read only ``read`` of them."""
+    """Yield a line for each field of a fork without effect; ``read`` are those that layers of the test nets read."""
     for name, field in added_fields.get(param.DESCRIPTOR.full_name, {}).items():
         if field.present(param) and name not in read:
-            yield f"{node.find(name)}: {name} has no effect: it is a fork's, and nothing in these nets reads it"
+            yield f"{node.find(name)}: {name} has no effect: it is a fork's field, and nothing in these nets reads it"
 
 
 def check_prefix(param: Any, node: Place, report: Report = raise_fault, *, try_it: bool = True) -> None:
     """Report a snapshot_prefix that is not writable.
 
-    The permissions are checked; with ``try_it`` a file is also written (Caffe: CheckSnapshotWritePermissions).
+    The permissions are checked; with ``try_it``, a file is also written (Caffe: CheckSnapshotWritePermissions).
     """
     probe = Path(f"{param.snapshot_prefix}_iter_0.tempfile")
     reason = why_unwritable(probe)
@@ -68,14 +68,14 @@ def check_prefix(param: Any, node: Place, report: Report = raise_fault, *, try_i
         except SpecError as fault:
             reason = fault.message.removeprefix("cannot be written: ")
     if reason:
-        begins = "" if probe.is_absolute() else f"; relative paths begin at {Path.cwd()}"
-        advice = f"make sure that the directory exists and is writeable{begins}"
+        begins = "" if probe.is_absolute() else f"; relative paths start from {Path.cwd()}"
+        advice = f"make sure that the directory exists and is writable{begins}"
         message = f'cannot write to snapshot prefix "{param.snapshot_prefix}": {reason}; {advice}'
         report(SpecError(message, node.find("snapshot_prefix")))
 
 
 def divided_sums(net: Net) -> list[str]:
-    """Return the layers on the CPU whose sums torch divides among its threads: those not computed in Caffe's order."""
+    """Return the layers on the CPU whose sums torch divides among threads, since they are not in Caffe's order."""
     if net.options.exact == ALL or net.device.type != "cpu":
         return []
     return [
@@ -92,13 +92,13 @@ def dependence(net: Net, threads: int) -> str:
         return ""
     others = f" and {len(layers) - 1} more" if len(layers) > 1 else ""
     return (
-        f"{threads} threads share the sums of {layers[0]}{others}: another number of threads changes the last bits of "
-        "the weights. To prevent it, set --exact all (slower), or OMP_NUM_THREADS=1"
+        f"{threads} threads share the sums of {layers[0]}{others}; another number of threads would change the last "
+        "bits of the weights. To prevent this, set --exact all (slower) or OMP_NUM_THREADS=1"
     )
 
 
 def bad_parameter(net: Net) -> str:
-    """Return the first learnable blob that has a NaN or an infinity, in words; "" if none has."""
+    """Return a description of the first learnable blob with a NaN or an infinity; "" if there is none."""
     for layer in net.layers:
         for j, blob in enumerate(layer.blobs):
             if not _is_finite(blob):
@@ -108,9 +108,10 @@ def bad_parameter(net: Net) -> str:
 
 @torch.no_grad()
 def bad_top(net: Net, passes: int, part: str) -> str:
-    """Run the last passes again, on the same data with the same draws; return the first bad top, in words.
+    """Repeat the last passes with the same data and random numbers; return a description of the first bad top.
 
-    ``part`` is what :meth:`Random.begin` got for them. "" if no top is bad: what layers remember has changed.
+    ``part`` is the argument of :meth:`Random.begin` for them. Returns "" if no top is bad, since layers may have
+    changed state.
     """
     for layer in net.layers:
         state = running_state(layer)

@@ -21,7 +21,7 @@ from netspec.net.net import Net
 def debug_info(net: Net) -> Iterator[None]:
     """Log the mean absolute values of the blobs of forward passes within the block and, at its end, of the gradients.
 
-    For a shared parameter each layer shows the sum of all gradients; Caffe shows the sum so far.
+    For a shared parameter, each layer shows the sum of all gradients; Caffe shows the sum so far.
     """
     diffs: dict[tuple[int, int], torch.Tensor] = {}
     hooks = [layer.register_forward_hook(partial(_forward, net, i, diffs)) for i, layer in enumerate(net.layers)]

@@ -1,9 +1,9 @@
-"""``X.solverstate.extra``: what Caffe's ``X.solverstate`` lacks to go on as if a training had never stopped.
+"""``X.solverstate.extra``: the state that Caffe's ``X.solverstate`` lacks for resuming with bit-identical results.
 
-Caffe keeps neither its place in the data nor its random numbers. Here all draws of an iteration follow from the seed
-and the iteration alone, so the file has the seeds, the places in the data, what layers remember from pass to pass, and
-the losses that ``average_loss`` still needs. It also has the settings that the numbers follow from, and the sizes and
-hashes of the weights and of the state that belong together (netspec/net/sealed.py). Caffe never reads it.
+Caffe saves neither its position in the data nor its random numbers. In netspec, all random numbers depend only on the
+seed and the iteration. The file has the seeds, the positions in the data, the state that layers keep between passes,
+and the losses that ``average_loss`` still needs. It also has the settings that affect the results, and the sizes and
+hashes of the weights and the state that belong to it (netspec/net/sealed.py). Caffe does not read it.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from netspec.net.sealed import FAULTS, Digest, damaged, sealed, shown, unsealed,
 from netspec.proto.schema import fields_of
 from netspec.solver.snapshot import find_learned_net, read_state
 
-Settings = dict[str, dict[str, Any]]  # of the solver, and of each net: name -> a value of JSON
-MOST_TOLD = 6
+Settings = dict[str, dict[str, Any]]  # for the solver and for each net: name -> JSON value
+MOST_LISTED = 6
 
-_SOLVER_ASIDE = frozenset(  # what the log shows, what is written, and what is compared elsewhere
+_SOLVER_ASIDE = frozenset(  # settings of the log and of output files, and settings that are compared elsewhere
     {
         *("net", "net_param", "train_net", "train_net_param", "test_net", "test_net_param"),
         *("train_state", "test_state", "weights", "random_seed", "solver_mode", "device_id"),
@@ -41,12 +41,12 @@ _SOLVER_ASIDE = frozenset(  # what the log shows, what is written, and what is c
 )
 _LAYER_ASIDE = WITHOUT_EFFECT | {
     *("name", "bottom", "top", "blobs", "include", "exclude", "phase", "prefetch"),
-    *("weight_filler", "bias_filler", "filler"),  # they have done their work
+    *("weight_filler", "bias_filler", "filler"),  # they no longer have an effect
 }
 
 
 def settings_of(param: Any, nets: Mapping[str, Net], manner: Mapping[str, Any]) -> Settings:
-    """Return the settings of a solver, of its nets by name, and ``manner``: how they are run."""
+    """Return the settings of a solver, of its nets by name, and of ``manner``, how they are run."""
     aside = _SOLVER_ASIDE if param.lr_policy == "poly" else _SOLVER_ASIDE | {"max_iter"}
     found: Settings = {"solver": {**manner, **dict(_fields(param, aside))}}
     for name, net in nets.items():
@@ -60,7 +60,7 @@ def settings_of(param: Any, nets: Mapping[str, Net], manner: Mapping[str, Any]) 
 
 
 def _fields(message: Any, aside: frozenset[str] | set[str]) -> Iterator[tuple[str, Any]]:
-    """Yield the fields that have another value than their default; those of messages inside with a path."""
+    """Yield the fields whose value is not the default; fields of inner messages have a path."""
     for name, field in fields_of(message.DESCRIPTOR).items():
         if name in aside or not field.present(message):
             continue
@@ -79,22 +79,22 @@ def _fields(message: Any, aside: frozenset[str] | set[str]) -> Iterator[tuple[st
 
 
 def changes(before: Settings, now: Settings) -> str:
-    """Return what has changed, in words; "" where nothing is. Nets that only one side has are left out."""
+    """Return a description of the changed settings; "" if there are none. Nets that only one side has are ignored."""
     found = []
     for part in now:
         if part in before:
             was, is_now = dict(before[part]), now[part]
-            if was.get("compiled") is False:  # as snapshots said while a training could also be compiled
+            if was.get("compiled") is False:  # written by versions with the option --compile
                 del was["compiled"]
             of = "" if part == "solver" else f"{part}, "
             for name in [*is_now, *(name for name in was if name not in is_now)]:
                 if was.get(name) != is_now.get(name):
-                    found.append(f"{of}{name} is {_told(is_now, name)}, was {_told(was, name)}")
-    more = f"; and {len(found) - MOST_TOLD} more" if len(found) > MOST_TOLD else ""
-    return "; ".join(found[:MOST_TOLD]) + more
+                    found.append(f"{of}{name} is {_value_text(is_now, name)}, was {_value_text(was, name)}")
+    more = f"; and {len(found) - MOST_LISTED} more" if len(found) > MOST_LISTED else ""
+    return "; ".join(found[:MOST_LISTED]) + more
 
 
-def _told(settings: Mapping[str, Any], name: str) -> str:
+def _value_text(settings: Mapping[str, Any], name: str) -> str:
     if name not in settings:
         return "the default"
     value = settings[name]
@@ -102,15 +102,15 @@ def _told(settings: Mapping[str, Any], name: str) -> str:
 
 
 _MOST_LAYERS = 1 << 24
-Remembered = dict[str, dict[str, Any]]  # by the layer's number, then by name: what JSON has of it
+Remembered = dict[str, dict[str, Any]]  # index of the layer -> name -> JSON value
 
 
 @dataclass(frozen=True)
 class Extra:
-    """What the file has.
+    """The contents of the file.
 
-    ``seed`` is the solver's; ``losses`` are the last ``average_loss`` ones; ``nets`` has, for the training nets of all
-    ranks and the test nets, in this order, what each of their layers remembers (netspec/layers/contract/reading.py).
+    ``seed`` is the solver's. ``losses`` are the last ``average_loss`` losses. ``nets`` has the state of the layers of
+    the training nets of all ranks, then of the test nets (netspec/layers/contract/reading.py).
     """
 
     seed: int
@@ -127,16 +127,16 @@ def path_beside(state: str | Path) -> Path:
 
 
 def running_state(net: Net) -> Remembered:
-    """Return what the layers of a net remember, as JSON has it."""
+    """Return the state of a net's layers as JSON values."""
     states = {str(i): reading.running_state(layer) for i, layer in enumerate(net.layers)}
     return {i: {name: _packed(value) for name, value in state.items()} for i, state in states.items() if state}
 
 
 def resume(net: Net, states: Remembered) -> None:
-    """Make the layers of a net remember what :func:`running_state` returned. Raises SpecError if it does not fit."""
+    """Restore the state that :func:`running_state` returned. Raises SpecError if it does not fit the net."""
     for i, state in states.items():
         if int(i) >= len(net.layers):
-            raise SpecError(f"remembers layer {i} of a net of {len(net.layers)} layers")
+            raise SpecError(f"has the state of layer {i}, but the net has {len(net.layers)} layers")
         reading.resume(net.layers[int(i)], {name: _unpacked(value) for name, value in state.items()})
 
 
@@ -146,7 +146,7 @@ def write_extra(path: str | Path, extra: Extra) -> None:
 
 
 def read_extra(state: str | Path) -> Extra | None:
-    """Return the Extra of a state; None if there is no such file, as with Caffe's. Raises SpecError if it is bad."""
+    """Return the Extra of a state; None if there is no such file, as for Caffe's states. Raises SpecError."""
     path = path_beside(state)
     try:
         found = unsealed(path)
@@ -167,17 +167,17 @@ def read_extra(state: str | Path) -> Extra | None:
 
 
 def check_pair(state: str | Path, weights: Path | None, extra: Extra) -> None:
-    """Raise SpecError where the weights or the state are not those that were written together."""
+    """Raise SpecError if the weights or the state were not written together with the file."""
     for path, stamp in ((weights, extra.weights), (Path(state), extra.state)):
         if path is not None:
             stamp.check(path, path_beside(state))
 
 
 def newest_pair(prefix: str) -> Path | None:
-    """Return the state, of the snapshots with a prefix, of the latest iteration that is whole with its weights.
+    """Return the newest state with a prefix that is complete, together with its weights.
 
-    Those that are not whole are named in the log. None if there is no snapshot at all; raises SpecError if there are
-    some, and none is whole: a training must not begin anew, and write over them, without a word.
+    The log names incomplete snapshots. Returns None if there is no snapshot. Raises SpecError if there are
+    snapshots but none is complete, since a new training would overwrite them silently.
     """
     passed = 0
     for state in _newest_first(prefix):
@@ -188,10 +188,10 @@ def newest_pair(prefix: str) -> Path | None:
                 check_pair(state, found, extra)
             return state
         except (SpecError, OSError) as fault:
-            log.logger.warning(f"passed over: {fault}")
+            log.logger.warning(f"skipped: {fault}")
             passed += 1
     if passed:
-        message = f'none of the {passed} snapshots with the prefix "{prefix}" is whole; move them away to start anew'
+        message = f'none of the {passed} snapshots with the prefix "{prefix}" is complete; move them away to start anew'
         raise SpecError(f"{message}, or give one with --snapshot", Where(prefix))
     return None
 
@@ -211,7 +211,7 @@ def _list(value: Any) -> list[Any]:
 
 
 def _loss(value: Any) -> float:
-    if type(value) not in (int, float):  # NaN is possible: ``--nan warn``
+    if type(value) not in (int, float):  # may be NaN with ``--nan warn``
         raise ValueError(f"found loss {shown(value)}, expected a number")
     return float(value)
 

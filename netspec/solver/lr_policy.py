@@ -30,7 +30,7 @@ class Policy:
     rate: Rate
 
 
-#: Intel's ramp and NVIDIA's: its length, its first rate, its exponent (netspec/dialects/blocks/settings.py)
+#: The warm-up of Intel and NVIDIA: its length, initial rate and exponent (netspec/dialects/blocks/settings.py)
 _RAMPS = (("warmup_iter", "warmup_start_lr", 1), ("rampup_interval", "rampup_lr", 2))
 RATES_OF_FORKS = frozenset({"stagelr", "stageiter", "min_lr", *(name for ramp in _RAMPS for name in ramp[:2])})
 
@@ -58,7 +58,7 @@ def _sigmoid(p: Any, iteration: int, step: int) -> np.float32:
 
 
 def _power(base: float, exponent: float) -> np.float64:
-    return np.power(np.float64(base), np.float64(exponent))  # inf and nan, for which Python's ** raises an error
+    return np.power(np.float64(base), np.float64(exponent))  # gives inf or nan, where Python's ** raises an error
 
 
 def _powf(base: np.float32, exponent: float) -> float:
@@ -80,8 +80,8 @@ POLICIES: dict[str, Policy] = {
 def policy_faults(param: Any, node: Place) -> Iterator[SpecError]:
     """Yield a SpecError for an unknown policy, or for each required field that is missing.
 
-    Caffe detects a stepsize of 0 and a negative gamma only when it uses them; with a missing gamma or max_iter its rate
-    becomes 0 or infinite.
+    Caffe detects a stepsize of 0 and a negative gamma only when it uses them. With a missing gamma or max_iter, its
+    rate becomes 0 or infinite.
     """
     policy = POLICIES.get(param.lr_policy)
     if policy is None:
@@ -93,7 +93,9 @@ def policy_faults(param: Any, node: Place) -> Iterator[SpecError]:
     stages = [len(_fork(param, name, ())) for name in ("stagelr", "stageiter")]
     if param.lr_policy == "multifixed" and (not stages[0] or stages[0] != stages[1]):
         found = f"found {stages[0]} and {stages[1]}"
-        yield SpecError(f'lr_policy "multifixed" needs as many stagelr as stageiter, {found}', node.find("lr_policy"))
+        yield SpecError(
+            f'lr_policy "multifixed" needs equal numbers of stagelr and stageiter, {found}', node.find("lr_policy")
+        )
     for field in policy.needs:
         value = getattr(param, field)
         if not param.HasField(field):
@@ -105,7 +107,7 @@ def policy_faults(param: Any, node: Place) -> Iterator[SpecError]:
 
 
 def next_step(param: Any, iteration: int, step: int) -> int:
-    """Return the step of iteration ``iteration``; ``step`` is that of the iteration before.
+    """Return the step of ``iteration``; ``step`` is that of the previous iteration.
 
     multistep increases by at most one per iteration, even if several stepvalues were passed (sgd_solver.cpp:46).
     """

@@ -1,4 +1,4 @@
-"""The nets that a solver trains and tests, each in its state.
+"""The nets that a solver trains and tests, each with its NetState.
 
 Caffe: Solver::InitTrainNet, Solver::InitTestNets (src/caffe/solver.cpp)
 """
@@ -17,13 +17,13 @@ from netspec.proto.text import parse_net
 
 TRAIN_NET = "train net"
 TRAIN_FIELDS = ("net", "net_param", "train_net", "train_net_param")
-_GENERIC = ("net_param", "net")  # used for training, and for one test net per further test_iter
+_GENERIC = ("net_param", "net")  # used for training, and for one test net per remaining test_iter
 _Read = tuple[str, NetParameter, SourceMap]
 
 
 @dataclass(frozen=True)
 class SolverNet:
-    """A net of a solver, not yet filtered: its ``state`` is set. ``origin`` describes its source in Caffe's words."""
+    """A net of a solver with its ``state``, not yet filtered. ``origin`` describes its source as in Caffe's log."""
 
     label: str
     origin: str
@@ -32,18 +32,18 @@ class SolverNet:
 
 
 def seed_of(seed: int, label: str) -> int:
-    """Return the seed of one of a solver's nets: all differ, and the training net has the solver's own."""
-    from netspec.data.random_words import derived  # NumPy is not loaded to read a solver
+    """Return the seed of one of a solver's nets. All differ; the training net has the solver's seed."""
+    from netspec.data.random_words import derived  # imported here, since reading a solver does not need NumPy
 
     return seed if label == TRAIN_NET else derived(seed, label)
 
 
 def solver_nets(param: SolverParameter, node: Place, report: Report = raise_fault) -> list[SolverNet]:
-    """Return the training net and the test nets; a file is read once, even if it is used for several nets.
+    """Return the training net and the test nets. A file is read once, even if several nets use it.
 
-    The test nets are in Caffe's order: each test_net_param, each test_net, then the general net for every further
-    test_iter. ``report`` gets a SpecError for all that the solver does not say clearly and for each file that cannot be
-    read; the nets concerned are left out. It also gets a ForkFault for each unknown field, which is left out itself.
+    The test nets are in Caffe's order: each test_net_param, each test_net, then the general net for every remaining
+    test_iter. ``report`` gets a SpecError for each wrong setting and each file that cannot be
+    read; these nets are left out. It also gets a ForkFault for each unknown field, which is left out.
     """
     read = _Reader(param, node, report)
     described = []
@@ -71,7 +71,7 @@ def _test_nets(param: SolverParameter, node: Place, read: _Reader, report: Repor
     found = [read(name, i) for name in ("test_net_param", "test_net") for i in range(len(getattr(param, name)))]
     general = next((name for name in _GENERIC if param.HasField(name)), None)
     missing = len(param.test_iter) - len(found)
-    a_net_is_named = any(param.HasField(name) for name in TRAIN_FIELDS)  # otherwise that is the error
+    a_net_is_named = any(param.HasField(name) for name in TRAIN_FIELDS)  # otherwise this was already reported
     if missing < 0 or (missing > 0 and general is None and a_net_is_named):
         expected = f"{len(found)}, one for each test_net and test_net_param" + (" (or more)" if general else "")
         report(SpecError(f"found {len(param.test_iter)} test_iter, expected {expected}", node.find("test_iter")))
@@ -81,7 +81,7 @@ def _test_nets(param: SolverParameter, node: Place, read: _Reader, report: Repor
         expected = f"expected none or one for each of the {len(found)} test nets"
         report(SpecError(f"found {len(param.test_state)} test_state, {expected}", node.find("test_state")))
     if found and param.test_interval <= 0:
-        message = f"found test_interval {param.test_interval}, expected more than 0, since there is a net to test"
+        message = f"found test_interval {param.test_interval}, expected more than 0, since the solver has a test net"
         report(SpecError(message, node.find("test_interval")))
     return found
 

@@ -1,4 +1,4 @@
-"""What is chosen for a training besides its solver.prototxt."""
+"""The options of a training that are not in its solver.prototxt."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ NAN = ("stop", "warn")
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """How a training runs, and how its nets are built: ``build`` as far as it is one for all of them.
+    """How a training runs. ``build`` has the options that all of its nets share.
 
     ``devices`` override solver_mode and device_id: the training net is on the first, replicas of it are on the others.
     ``build.seed`` is used if there is no random_seed; without it one is drawn. Level and stages are the training net's.
-    ``nan`` says what a loss of NaN or infinity does: "stop" raises SpecError, "warn" warns once. In another
-    ``precision`` than "fp32" (netspec/solver/precision.py) the training net computes no sums in Caffe's order, whatever
-    ``build.exact`` says. Of several ``processes`` each has one training net and calls the same methods; the root tests
+    ``nan`` determines the effect of a loss that is NaN or infinite: "stop" raises SpecError, "warn" warns once. In a
+    ``precision`` other than "fp32" (netspec/solver/precision.py), no sums of the training net are in Caffe's order, for
+    any ``build.exact``. Each of several ``processes`` has one training net and calls the same methods; the root tests
     and writes the snapshots.
     ``action`` is called between iterations, also those of a test: "stop" ends the training, "snapshot" takes one.
     ``clock`` gives the seconds for "iter/s".
@@ -50,7 +50,7 @@ class TrainingOptions:
 
     @property
     def exact_sums(self) -> str:
-        """Which sums the training net computes as Caffe does, to the last bit."""
+        """Which sums of the training net are bit-identical to Caffe's."""
         return self.build.exact if self.precision == FP32 else NONE
 
 
@@ -61,7 +61,7 @@ def choose_device(param: Any, node: Place) -> torch.device:
     count = torch.cuda.device_count()
     if not count:
         place = node.find("solver_mode")
-        log.warning("caffe.cpp:197", f"{place}: solver_mode GPU, but torch finds no GPU: running on the CPU")
+        log.warning("caffe.cpp:197", f"{place}: solver_mode GPU, but torch finds no GPU; running on the CPU")
         return torch.device("cpu")
     if not 0 <= param.device_id < count:
         raise SpecError(

@@ -1,7 +1,7 @@
-"""In which numbers a training's passes compute. Weights, gradients, history and losses are float32 in each.
+"""The precision of a training's passes. Weights, gradients, history and losses are always float32.
 
-``fp32``   float32, the default; on GPUs without TF32, which torch allows cuDNN by itself
-``tf32``   float32 whose products drop 13 bits of the mantissa, on GPUs that have it; elsewhere as fp32
+``fp32``   float32, the default; on GPUs without TF32, which torch enables for cuDNN by default
+``tf32``   float32 with 13 fewer bits of mantissa in products, on GPUs that support it; elsewhere the same as fp32
 ``bf16``   products and the blobs between layers in bfloat16, 8 bits of mantissa, as torch.autocast chooses
 ``fp16``   the same in float16, 11 bits of mantissa, but a small range: the loss is scaled (:class:`LossScale`)
 """
@@ -24,7 +24,7 @@ FIRST_SCALE, LARGEST_SCALE, PATIENCE = 2.0**16, 2.0**24, 2000
 
 @contextmanager
 def computing(precision: str, device: torch.device) -> Iterator[None]:
-    """Within the block passes on the device compute in a precision."""
+    """Within the block, compute passes on the device in a precision."""
     cuda: tuple[Any, ...] = (torch.backends.cuda.matmul, torch.backends.cudnn)
     before = [library.allow_tf32 for library in cuda]
     try:
@@ -39,11 +39,11 @@ def computing(precision: str, device: torch.device) -> Iterator[None]:
 
 
 class LossScale:
-    """What the loss is multiplied by before the backward pass, so that small gradients do not vanish in float16.
+    """The factor of the loss before the backward pass, so that small gradients do not vanish in float16.
 
-    It is a power of two, so it changes no gradient but those that would vanish. Where a gradient overflows, the
-    iteration is to update nothing, and the factor is halved; after ``PATIENCE`` iterations without that it is doubled.
-    Of the other precisions it is always 1.
+    It is a power of two, so it only affects gradients that would vanish. If a gradient overflows, the
+    iteration must not update anything, and the factor is halved. After ``PATIENCE`` iterations without overflow it is
+    doubled. For the other precisions it is always 1.
     """
 
     def __init__(self, precision: str) -> None:
@@ -55,10 +55,10 @@ class LossScale:
         return loss * self.factor if self._scales else loss
 
     def remove(self, gradients: list[torch.Tensor]) -> bool:
-        """Divide the gradients by the factor, then set the next; return whether all of them are finite."""
+        """Divide the gradients by the factor, and update the factor; return whether all gradients are finite."""
         if not self._scales or not gradients:
             return True
-        largest = torch._foreach_norm(gradients, torch.inf)  # gradients ask for none themselves
+        largest = torch._foreach_norm(gradients, torch.inf)  # gradients have no gradients themselves
         if not bool(torch.stack(largest).isfinite().all()):
             self.factor, self._good = self.factor / 2, 0
             return False
@@ -70,6 +70,6 @@ class LossScale:
 
 
 def has_bfloat16() -> bool | None:
-    """Return whether the CPU multiplies bfloat16 numbers, None where torch cannot tell."""
+    """Return whether the CPU has bfloat16 instructions; None if torch does not know."""
     found = [getattr(torch.cpu, name, None) for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported")]
     return any(test() for test in found if test) if any(found) else None

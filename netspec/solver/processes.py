@@ -1,8 +1,8 @@
-"""The processes that train one net together, as torchrun starts them: each is a rank with one net on one device.
+"""The processes of a training, started by torchrun. Each is a rank with one net on one device.
 
-Tensors of the CPU travel by gloo, those of GPUs by NCCL. Every collective call ends: where a process is gone, or has
-not answered for ``TIMEOUT``, it raises :class:`Lost`; a process that was asked to end waits ``GRACE`` only, since gloo
-can miss the death of another.
+Tensors on the CPU are exchanged with gloo, and those on GPUs with NCCL. Every collective call returns: if a process has
+ended or does not answer for ``TIMEOUT``, the call raises :class:`Lost`. After a request to end, a process waits only
+``GRACE``, since gloo may not notice that another has ended.
 
 Caffe: src/caffe/parallel.cpp
 """
@@ -22,19 +22,19 @@ from torch import distributed
 
 from netspec.errors import SpecError
 
-TIMEOUT = timedelta(minutes=30)  # a test, which only the root runs, must take less
-GRACE = 15.0  # seconds; torchrun kills what has not ended 30 s after its SIGTERM
-_LOOK = timedelta(seconds=1)  # how often a waiting process looks whether it was asked to end
-_REQUESTS = (None, "snapshot", "stop")  # a later one wins
+TIMEOUT = timedelta(minutes=30)  # a test must take less, since only the root runs it
+GRACE = 15.0  # seconds; torchrun kills processes 30 s after its SIGTERM
+_LOOK = timedelta(seconds=1)  # how often a waiting process checks for a request to end
+_REQUESTS = (None, "snapshot", "stop")  # later ones have priority
 T = TypeVar("T")
 
 
 class Lost(SpecError):
-    """Another process ended, or does not answer."""
+    """Another process has ended, or does not answer."""
 
 
 class FaultOfAll(SpecError):
-    """An error that every process knows of, so that only one of them reports it."""
+    """An error that every process has received, so that only one of them reports it."""
 
 
 class Processes:
@@ -64,7 +64,7 @@ class Processes:
             self._wait(lambda: [(distributed.broadcast(tensor, 0, async_op=True), tensor) for tensor in tensors])
 
     def gather(self, value: T) -> list[T]:
-        """Return what each process gave, in every process."""
+        """Return the values of all processes, in every process."""
         if self.count == 1:
             return [value]
         own = torch.frombuffer(bytearray(pickle.dumps(value)), dtype=torch.uint8)
@@ -74,7 +74,7 @@ class Processes:
         return [pickle.loads(row.numpy().tobytes()) for row in found]
 
     def _all(self, own: torch.Tensor) -> list[torch.Tensor]:
-        """Return the tensor of each process; all have one shape."""
+        """Return the tensors of all processes, which must have the same shape."""
         found = [torch.empty_like(own) for _ in range(self.count)]
         self._wait(lambda: [(distributed.all_gather(found, own, async_op=True), own)])
         return found
@@ -88,7 +88,7 @@ class Processes:
         return _REQUESTS[int(code)]
 
     def together(self, function: Callable[[], T]) -> T:
-        """Return what a function returns; raises FaultOfAll in every process if it raises a fault in one."""
+        """Call a function and return its result; raises FaultOfAll in every process if it raises an error in one."""
         made, fault = None, None
         try:
             made = function()
@@ -102,15 +102,15 @@ class Processes:
         return made  # type: ignore[return-value]  # no fault: the function has returned
 
     def leave(self) -> None:
-        """Leave the group, at the end of a training."""
+        """Leave the process group at the end of a training."""
         if distributed.is_available() and distributed.is_initialized():
             distributed.destroy_process_group()
 
     def _wait(self, begin: Callable[[], list[tuple[Any, torch.Tensor]]]) -> None:
-        """Begin operations, each with its tensor, and wait for all. Raises Lost."""
+        """Start operations, each with its tensor, and wait for all. Raises Lost."""
         try:
             for work, tensor in begin():
-                if tensor.is_cuda:  # NCCL would give up the operation after the first look
+                if tensor.is_cuda:  # NCCL would abort the operation after the first timeout
                     work.wait()
                 else:
                     self._look_and_wait(work)
@@ -120,7 +120,7 @@ class Processes:
             raise _lost(f"rank {self.rank} of {self.count}", fault) from None
 
     def _look_and_wait(self, work: Any) -> None:
-        """Wait for an operation of gloo, and after a request to end no longer than GRACE."""
+        """Wait for an operation of gloo, but no longer than GRACE after a request to end."""
         end = float("inf")
         while True:
             try:
@@ -136,23 +136,23 @@ class Processes:
 
 
 def join(count: int | None = None, rank: int | None = None, store: str | None = None) -> Processes:
-    """Join the processes of this training and return this one; waits for all of them.
+    """Join the processes of this training, wait for all of them, and return this one.
 
-    By default count, rank and meeting place are those that torchrun gives in the environment. Raises Lost.
+    By default, count, rank and address come from torchrun's environment variables. Raises Lost.
     """
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and distributed.is_nccl_available() else "gloo"
     where: dict[str, Any] = {} if store is None else {"world_size": count, "rank": rank}
     try:
         distributed.init_process_group(backend, store or "env://", timeout=TIMEOUT, **where)
     except (RuntimeError, ValueError) as fault:
-        raise _lost("the processes do not meet", fault) from None
+        raise _lost("the processes cannot connect to each other", fault) from None
     joined = Processes(distributed.get_rank(), distributed.get_world_size())
     joined.seed = joined.gather(int.from_bytes(os.urandom(4), "little"))[0]
     return joined
 
 
 def _lost(who: str, fault: Exception | None) -> Lost:
-    """Return the fault of an operation that failed, or of one that was given up."""
+    """Return the error for an operation that failed or timed out."""
     if fault is None:
         return Lost(f"{who}: another process ended, or has not answered for {GRACE:.0f} seconds")
     reason = re.sub(r"^\[\S+\] ", "", str(fault)).partition("\n")[0].partition(". ")[0]
@@ -161,7 +161,7 @@ def _lost(who: str, fault: Exception | None) -> Lost:
 
 
 def started_by_torchrun() -> bool:
-    """Return whether torchrun started this process, with others or alone."""
+    """Return whether torchrun started this process, even if it is the only one."""
     return distributed.is_available() and distributed.is_torchelastic_launched()
 
 

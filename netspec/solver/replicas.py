@@ -1,7 +1,7 @@
-"""Copies of the training net on further devices: each runs its share of the records.
+"""Copies of the training net on other devices, which run their share of the records.
 
-So an iteration uses batch_size records per device, and the gradient is the mean over the devices, here and in other
-processes. Each process updates its own weights, all alike; its root's are copied to its replicas.
+An iteration uses batch_size records per device, and the gradient is the mean over the devices of this and other
+processes. Each process makes the same update of its own weights, and copies its root's weights to its replicas.
 Each device has its own BatchNorm statistics during a run; those of the root are tested and saved.
 
 Caffe: src/caffe/parallel.cpp (NCCL: all-reduce of the gradients, scaled by 1 / solver_count)
@@ -20,13 +20,13 @@ from netspec.solver.processes import Processes
 
 
 class Replicas:
-    """The training nets besides the root: those of this process, and the nets of the other ``processes``."""
+    """The training nets other than the root: those of this process, and the nets of the other ``processes``."""
 
     def __init__(self, root: Net, nets: Sequence[Net], processes: Processes) -> None:
         self._root, self.nets, self._processes = root, nets, processes
 
     def begin(self) -> None:
-        """Copy the root's parameters, including BatchNorm's statistics, to every replica, here and elsewhere."""
+        """Copy the root's parameters, including BatchNorm's statistics, to every replica in all processes."""
         if self._processes.count > 1:
             self._processes.copy_root(item.parameter.detach() for item in self._root.learnable)
         self._copy(everything=True)
@@ -70,7 +70,7 @@ class Replicas:
         self._copy(everything=False)
 
     def restart_data(self) -> None:
-        """Make every replica start again at its first record."""
+        """Restart every replica at its first record."""
         for net in self.nets:
             net.restart_data()
 

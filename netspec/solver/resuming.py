@@ -1,4 +1,4 @@
-"""Snapshots of a training, and how it goes on from one.
+"""Taking snapshots of a training, and resuming from them.
 
 Caffe: Solver::Snapshot, Solver::Restore (src/caffe/solver.cpp), SGDSolver::RestoreSolverState (sgd_solver.cpp)
 """
@@ -36,7 +36,7 @@ from netspec.solver.training import Training
 
 
 class Snapshots:
-    """Takes snapshots of a training, and lets it go on from one."""
+    """Takes snapshots of a training, and restores them."""
 
     def __init__(self, training: Training, tests: Tests) -> None:
         self._training, self._tests = training, tests
@@ -44,7 +44,7 @@ class Snapshots:
     def take(self) -> tuple[str, str]:
         """Write the weights and the state; return their paths, ``PREFIX_iter_N.caffemodel`` and ``.solverstate``.
 
-        With ``snapshot_format: HDF5`` both end in ``.h5``. Of several processes the root writes them.
+        With ``snapshot_format: HDF5`` both end in ``.h5``. If there are several processes, the root writes them.
         Raises SpecError if they cannot be written.
         """
         training = self._training
@@ -77,7 +77,7 @@ class Snapshots:
         return model, state
 
     def _running_states(self) -> list[dict[str, dict[str, Any]]]:
-        """Return the running state of each net. During a test, test nets have that of before: a resume tests again."""
+        """Return the running state of each net; for test nets during a test, that from before the test."""
         training = self._training
         trained = [running_state(net) for net in (training.net, *training.replicas.nets)]
         tested = list(self._tests.states_before) or [running_state(net) for net in training.test_nets]
@@ -86,9 +86,9 @@ class Snapshots:
     def restore(self, path: str | Path) -> None:
         """Resume from a .solverstate or .solverstate.h5, of Caffe or of netspec, and from its weights.
 
-        With the file ``X.solverstate.extra`` next to it the training goes on as if it had never stopped; without it, as
-        in Caffe, the data layers start again at their first record. Raises SpecError, and changes nothing, if the state
-        does not fit this solver's type and net.
+        With the file ``X.solverstate.extra`` next to it, the results are as if the training had never stopped. Without
+        it, the data layers start again at their first record, as in Caffe. Raises SpecError, and changes nothing, if
+        the state does not fit this solver's type and net.
         """
         training = self._training
         where = Where(str(path))
@@ -116,18 +116,22 @@ class Snapshots:
             net.restart_data()
         training.replicas.restart_data()
         if extra is None:
-            log.logger.info(f"{path} is Caffe's: the data starts again at its first record, with other random numbers")
+            log.logger.info(
+                f"{path} was written by Caffe: the data starts again at its first record, with different random numbers"
+            )
         else:
             self._resume_data(extra, Where(str(path_beside(path))))
 
     def _resume_data(self, extra: Extra, where: Where) -> None:
-        """Go on in the data where a training stopped, with the losses of its average."""
+        """Restore the position in the data and the losses of the average."""
         training = self._training
         trained, rank = (training.net, *training.replicas.nets), training.options.processes.rank
         ranks = len(trained) * training.options.processes.count
         if len(extra.nets) != ranks + training.count_of_tests:
             expected = f"{ranks} of training and {training.count_of_tests} of testing"
-            log.logger.warning(f"{where}: is of {len(extra.nets)} nets, not {expected}: the data starts again")
+            log.logger.warning(
+                f"{where}: has the state of {len(extra.nets)} nets, expected {expected}; the data starts again"
+            )
             return
         all_nets = (*trained, *training.test_nets)
         remembered = extra.nets[rank : rank + len(trained)] + extra.nets[ranks:][: len(training.test_nets)]
@@ -138,14 +142,14 @@ class Snapshots:
             raise SpecError(fault.message, where) from None
         training.losses_before = tuple(extra.losses)
         if extra.seed != training.seed:
-            log.logger.warning(f"{where}: random_seed was {extra.seed}: the random numbers are others from here on")
+            log.logger.warning(f"{where}: random_seed was {extra.seed}; the random numbers differ from here on")
         elif changed := changes(extra.settings, self._settings()):
-            log.logger.warning(f"{where}: the training goes on with other numbers: {changed}")
+            log.logger.warning(f"{where}: the training continues, but its results will differ: {changed}")
         else:
-            log.logger.info(f"{where}: the training goes on as if it had never stopped")
+            log.logger.info(f"{where}: the training continues as if it had never stopped")
 
     def _settings(self) -> Settings:
-        """Return the settings that the numbers of this training depend on."""
+        """Return the settings that affect the results of this training."""
         training = self._training
         manner: dict[str, Any] = {
             "precision": training.options.precision,
@@ -159,7 +163,7 @@ class Snapshots:
         return settings_of(training.param, {nets.TRAIN_NET: training.net, **tests}, manner)
 
     def _in_current_form(self, state: State, where: Where) -> State:
-        """Return a state in today's form, where it has a history for each layer that shares a parameter."""
+        """Return a state with one history per parameter, from one with a history for each layer that shares it."""
         training = self._training
         number = {id(learnable.parameter): i for i, learnable in enumerate(training.net.learnable)}
         owners = [number[id(blob)] for layer in training.net.layers for blob in layer.blobs]
@@ -167,16 +171,16 @@ class Snapshots:
         if len(state.history) == len(training.history) or len(state.history) != training.rule.sets * len(owners):
             return state
         if len(state.history) == 2 * len(training.history) and has_squares(state.history, training.param.type):
-            return state  # not of this type: the second half is another type's second set
+            return state  # of another type: the second half is that type's second set
         for i, theirs in enumerate(state.history):
             mine = shapes[i % len(shapes)]
             if not _same_shape(mine, theirs.shape):
                 raise SpecError(f"history blob {i} has shape {theirs.shape}, expected {mine}", where)
-        message = "has a history for each layer, as before August 2015; those of shared parameters are added up"
+        message = "has a history for each layer, as before August 2015; the histories of shared parameters are added"
         log.warning("sgd_solver.cpp:336", f"{where}: {message}")
         return replace(state, history=merge_shared(state.history, owners))
 
 
 def _same_shape(mine: tuple[int, ...], theirs: tuple[int, ...]) -> bool:
-    """Return whether two shapes are equal, or theirs is an old shape of four axes, with ones in front."""
+    """Return whether two shapes are equal, or the second is an old shape of four axes with leading ones."""
     return theirs == mine or theirs == (1,) * (4 - len(mine)) + mine

@@ -25,7 +25,7 @@ from netspec.proto.schema import SolverState
 class State:
     """The state of a training.
 
-    ``history`` has one float32 array per learnable parameter, in the net's order; the second set of Adam and AdaDelta
+    ``history`` has one float32 array per learnable parameter, in the net's order. The second set of Adam and AdaDelta
     follows the first. ``iteration`` is the number of updates done. ``learned_net`` is the path of the weights as in
     the file, relative to the working directory of that run.
     """
@@ -37,9 +37,9 @@ class State:
 
 
 def read_state(path: str | Path) -> State:
-    """Read a .solverstate or .solverstate.h5, Caffe's or ours.
+    """Read a .solverstate or .solverstate.h5 of Caffe or netspec.
 
-    Raises SpecError for any other file, and for a state that no training can have been in.
+    Raises SpecError for any other file, and for an impossible state.
     """
     state = _read_hdf5(path) if h5py.is_hdf5(path) else _read_binary(path)
     for name, value in (("iter", state.iteration), ("current_step", state.current_step)):
@@ -47,7 +47,9 @@ def read_state(path: str | Path) -> State:
             raise SpecError(f"found {name} {value}, expected at least 0", Where(str(path)))
     for i, array in enumerate(state.history):
         if not np.all(np.isfinite(array)):
-            raise SpecError(f"history blob {i} has a NaN or an infinity; the training had diverged", Where(str(path)))
+            raise SpecError(
+                f"history blob {i} contains a NaN or an infinity; the training had diverged", Where(str(path))
+            )
     return state
 
 
@@ -63,24 +65,24 @@ def _read_binary(path: str | Path) -> State:
 
 
 def has_squares(history: Sequence[np.ndarray], solver_type: str) -> bool:
-    """Say whether the second half of a history is a second set, such as Adam's: squares, where the type has none."""
+    """Return whether the second half of a history is a second set, such as Adam's squares, that the type lacks."""
     half = len(history) // 2
     first, second = (any((array < 0).any() for array in part) for part in (history[:half], history[half:]))
     return not second and (first or solver_type in ("SGD", "Nesterov"))
 
 
 def merge_shared(history: list[np.ndarray], owners: Sequence[int]) -> list[np.ndarray]:
-    """Return one array for each learnable parameter, of a history with one for each layer that shares it.
+    """Return one array for each learnable parameter, from a history with one for each layer that shares it.
 
-    So wrote Caffe before its commit of August 2015 that gave shared parameters one gradient: ``owners`` has, for each
-    blob of each layer, the number of its parameter. There each layer's gradient had its own history, and the sum of
-    their updates moved the parameter, so the histories are added up. Equal ones are copies, and count once.
+    Caffe wrote such a history before August 2015, when shared parameters got a single gradient. ``owners`` has, for
+    each blob of each layer, the index of its parameter. Before, each layer's gradient had its own history, and the sum
+    of their updates changed the parameter, so the histories are added. Equal ones are copies, and are counted once.
     """
     sets = len(history) // len(owners)
     parts: dict[tuple[int, int], list[np.ndarray]] = {}
     for i, array in enumerate(history):
         parts.setdefault((i // len(owners), owners[i % len(owners)]), []).append(array)
-    assert len(parts) == sets * (max(owners) + 1), "every parameter is some layer's"
+    assert len(parts) == sets * (max(owners) + 1), "every parameter belongs to a layer"
     merged = []
     for _, arrays in sorted(parts.items(), key=lambda item: item[0]):
         first = arrays[0]
@@ -91,7 +93,7 @@ def merge_shared(history: list[np.ndarray], owners: Sequence[int]) -> list[np.nd
 
 
 def write_state(path: str | Path, state: State, before: Callable[[Path], object] = lambda unfinished: None) -> None:
-    """Write the state atomically; ``before`` is called with the finished file, before it appears at its path.
+    """Write the state atomically; ``before`` is called with the complete file before it is renamed to its path.
 
     Raises SpecError if it cannot be written.
     """
@@ -117,7 +119,7 @@ def find_learned_net(state: State, path: str | Path) -> Path:
     for candidate in (near, written):
         if os.path.isfile(candidate):
             return candidate
-    raise SpecError(f"its weights are neither at {near} nor at {written}", Where(str(path)))
+    raise SpecError(f"its weights are neither {near} nor {written}", Where(str(path)))
 
 
 def _read_hdf5(path: str | Path) -> State:
@@ -137,7 +139,7 @@ def _read_hdf5(path: str | Path) -> State:
 def _whole_number(group: Hdf5Group, name: str) -> int:
     values = group.values(name)
     if values.size != 1 or values.dtype.kind not in "iu":
-        raise SpecError(f"/{name} is not one whole number")
+        raise SpecError(f"/{name} is not a single integer")
     return int(values.item())
 
 

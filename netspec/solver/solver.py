@@ -40,7 +40,7 @@ def make_solver(
 ) -> Solver:
     """Build a solver from ``proto.text.parse_solver`` and its nets, as ``netspec.load_solver`` does (netspec/load.py).
 
-    Where no device is given, each of several processes has the GPU of its number on its machine.
+    If no device is given, each of several processes uses the GPU of its local rank.
     """
     if weights is not None and snapshot is not None:
         raise SpecError("give a snapshot to resume training or weights to fine-tune, not both", node.where)
@@ -59,7 +59,7 @@ def make_solver(
 
 
 class Solver(Training):
-    """A training: the loop and its updates; tests, snapshots and display are its parts and share what Training has."""
+    """A training: the loop and its updates. Tests, snapshots and display are separate parts that share a Training."""
 
     _overflowed = False
 
@@ -75,7 +75,7 @@ class Solver(Training):
         return learning_rate(self.param, self.iteration, next_step(self.param, self.iteration, self.current_step))
 
     def solve(self) -> None:
-        """Train up to max_iter, then show the loss and test once more if the settings require it."""
+        """Train up to max_iter, then log the loss and test again if the settings require it."""
         log.info("solver.cpp:289", f"Solving {self.net.name}")
         log.info("solver.cpp:290", f"Learning Rate Policy: {self.param.lr_policy}")
         if self.param.snapshot_after_train:
@@ -95,10 +95,10 @@ class Solver(Training):
         log.info("solver.cpp:332", "Optimization Done.")
 
     def step(self, iterations: int) -> None:
-        """Run some iterations. The window of the averaged loss starts again, unless the training was just resumed.
+        """Run ``n`` iterations. The window of the averaged loss restarts, unless the training was just resumed.
 
-        Ctrl-C raises KeyboardInterrupt at the end of the iteration that runs, so that a later call goes on as if
-        nothing had happened; a second one raises it at once. Raises SpecError if a net has inputs: a solver cannot fill
+        Ctrl-C raises KeyboardInterrupt at the end of the current iteration, so that a later call can
+        continue. A second Ctrl-C raises it at once. Raises SpecError if a net has inputs, since a solver cannot fill
         them.
         """
         self.check_inputs()
@@ -116,7 +116,7 @@ class Solver(Training):
                 interrupt()
 
     def _iterate(self) -> None:
-        """Run one iteration, with what comes before and after it: the tests, and the snapshot."""
+        """Run one iteration, including the tests before it and the snapshot after it."""
         if self.is_due(self.param.test_interval) and (self.iteration > 0 or self.param.test_initialization):
             self.test_all()
             if self.stopped:
@@ -155,13 +155,13 @@ class Solver(Training):
         return float(total / np.float32(self.param.iter_size)), outputs
 
     def clear_gradients(self) -> None:
-        """Clear the gradients, before an iteration sums them up."""
+        """Clear the gradients before an iteration."""
         self.blocks.clear()
 
     def _reduce(self) -> None:
         """Make the gradients the mean over all devices, without the loss scale.
 
-        Where one has overflowed float16, this iteration will update nothing.
+        If one has overflowed float16, this iteration will not update anything.
         """
         self.replicas.reduce()
         if self.options.precision != FP16:
@@ -175,9 +175,9 @@ class Solver(Training):
                 self.tell_nan("the gradients overflow float16")
 
     def apply_update(self) -> None:
-        """Update the weights and count the iteration; the gradients then contain the subtracted values, as in Caffe.
+        """Update the weights and count the iteration. The gradients then contain the subtracted values, as in Caffe.
 
-        An iteration whose gradients overflowed is counted only.
+        If the gradients overflowed, only count the iteration.
         Caffe: SGDSolver::ApplyUpdate, SGDSolver::GetLearningRate (src/caffe/solvers/sgd_solver.cpp)
         """
         param, step = self.param, next_step(self.param, self.iteration, self.current_step)

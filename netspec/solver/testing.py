@@ -1,4 +1,4 @@
-"""What a training shows: the tests of its weights, and a display every ``display`` iterations.
+"""The output of a training: tests, and a display every ``display`` iterations.
 
 Caffe: Solver::TestAll, Solver::Test, Solver::Step (src/caffe/solver.cpp), test() (tools/caffe.cpp)
 """
@@ -23,14 +23,14 @@ Scorer = Callable[[Sequence[torch.Tensor]], list[float]]
 
 
 def scorers(net: Net, solver: Any = None) -> dict[str, Scorer]:
-    """Return, by output, how its score follows from all batches, where its layer scores by itself."""
+    """Return, by output, the function that computes its score from all batches, for layers that define one."""
     makers = {v: layer for node, layer in zip(net.plan.nodes, net.layers, strict=True) for v in node.tops}
     found = [(name, makers.get(v)) for name, v in net.plan.outputs.items()]
     return {name: partial(layer.score, solver=solver) for name, layer in found if isinstance(layer, Scores)}
 
 
 class Tally:
-    """Sums up the losses and outputs of batches; ``loss`` and ``scores`` are their means so far.
+    """Sums the losses and outputs of batches; ``loss`` and ``scores`` are their means so far.
 
     Outputs in ``scorers`` are kept instead, and scored together.
     """
@@ -43,7 +43,7 @@ class Tally:
         self._gathered: dict[str, list[torch.Tensor]] = {name: [] for name in self._scorers}
 
     def add(self, loss: torch.Tensor, outputs: Mapping[str, torch.Tensor]) -> Outputs:
-        """Add what ``Net.forward_loss`` returned for a batch; return the batch's own scores."""
+        """Add the result of ``Net.forward_loss`` for a batch; return the scores of the batch."""
         self.batches += 1
         self._loss += loss.item()
         for name, gathered in self._gathered.items():
@@ -61,7 +61,7 @@ class Tally:
 
     @property
     def scores(self) -> Outputs:
-        """The mean of each element of each output blob, then the scores of those that are gathered."""
+        """The mean of each element of each output blob, then the scores of outputs in ``scorers``."""
         means = {name: [value / self.batches for value in values] for name, values in self._sums.items()}
         return means | {name: score(self._gathered[name]) for name, score in self._scorers.items()}
 
@@ -81,7 +81,7 @@ def score_lines(scores: Outputs, weights: Mapping[str, float]) -> Iterator[str]:
 
 
 class Tests:
-    """The tests of a training. ``states_before`` is what the test nets remembered before the test that runs now."""
+    """The tests of a training. ``states_before`` is the state of the test nets before the current test."""
 
     def __init__(self, training: Training) -> None:
         self._training = training
@@ -108,7 +108,7 @@ class Tests:
         for _ in range(batches):
             while training.options.processes.count == 1 and (
                 request := training.options.action()
-            ):  # several agree after an iteration
+            ):  # several processes agree after an iteration
                 if request == "snapshot":
                     snapshot()
                 training.stopped |= request == "stop"
@@ -125,13 +125,13 @@ class Tests:
 
 
 def log_scores(site: str, phase: str, scores: Outputs, weights: dict[str, float]) -> None:
-    """Log the outputs of a net as Caffe does; ``phase`` is the word before them."""
+    """Log the outputs of a net as Caffe does; ``phase`` is the first word."""
     for i, line in enumerate(score_lines(scores, weights)):
         log.info(site, f"    {phase} net output #{i}: {line}")
 
 
 class Display:
-    """Logs the pace, the loss, the outputs, and how long the training waited for data."""
+    """Logs the speed, the loss, the outputs, and the time that the training waited for data."""
 
     def __init__(self, training: Training) -> None:
         self._training = training
@@ -144,7 +144,7 @@ class Display:
         self._waited = self._seconds_waited()
 
     def show(self, outputs: Blobs) -> None:
-        """Log one display, since the last one."""
+        """Log the progress since the last call."""
         training = self._training
         now, waited = training.options.clock(), self._seconds_waited()
         seconds = now - self._time

@@ -1,4 +1,4 @@
-"""What a training has: its settings, its nets, its history, and where it stands.
+"""The state of a training: its settings, its nets, its history and its progress.
 
 Caffe: src/caffe/solver.cpp (Solver::Init); the sites in the log calls are the lines of that file that print the same.
 """
@@ -53,12 +53,12 @@ _CREATING = {
 
 
 class Training:
-    """The nets of a solver, how they are run, and where their training stands: what all parts of a solver share.
+    """The nets, options and progress of a training, which all parts of a solver share.
 
-    ``iteration`` is the number of updates done; ``net`` is the training net, ``test_nets`` the others; ``scores`` has,
-    for each test net, the mean of each output element in its last test. ``on_start()`` is called before the passes of
-    each iteration, ``on_gradients()`` between them and the update, ``on_iteration()`` after it; ``on_test(i)`` after
-    test net i was run, ``on_snapshot(model)`` after weights and state were written, with the path of the weights.
+    ``iteration`` is the number of updates done. ``net`` is the training net, and ``test_nets`` are the others.
+    ``scores`` has the mean of each output element in the last test of each test net. ``on_start()`` is called before
+    the passes of each iteration, ``on_gradients()`` before the update, ``on_iteration()`` after it, ``on_test(i)``
+    after a test of test net i, and ``on_snapshot(model)`` after a snapshot, with the path of the weights.
     ``last_snapshot`` is the path of the last state of this run, or "".
     """
 
@@ -73,7 +73,7 @@ class Training:
 
     net: Net
     test_nets: list[Net]
-    count_of_tests: int  # in a process that is not the root there are no test nets
+    count_of_tests: int  # only the root process has test nets
     replicas: Replicas
     blocks: Blocks
 
@@ -82,7 +82,7 @@ class Training:
     stopped = False
     last_snapshot = ""
     losses: deque[float]
-    losses_before: tuple[float, ...] = ()  # of a training that is resumed
+    losses_before: tuple[float, ...] = ()  # from before a training was resumed
     _told_nan = False
     _prefix_is_checked = False
 
@@ -93,7 +93,7 @@ class Training:
         if param.snapshot:
             self.check_prefix()
         check_readable(self._weights())
-        with log.held_back() as lines:  # what is missing is said before Caffe's log, which is long
+        with log.held_back() as lines:  # report missing files before Caffe's log, which is long
             described = nets.solver_nets(param, self.node)
             for part in described if self.options.processes.is_root else described[:1]:
                 check_sources(part.net, part.source, self.options.build)
@@ -114,23 +114,23 @@ class Training:
         self.scale = LossScale(self.options.precision)
 
     def check_prefix(self) -> None:
-        """Refuse a snapshot_prefix that cannot be written; it is tried once, and by the root alone."""
+        """Raise SpecError for a snapshot_prefix that is not writable; only the root tries it, once."""
         if not self._prefix_is_checked and self.options.processes.is_root:
             check_prefix(self.param, self.node)
             self._prefix_is_checked = True
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Refuse to be copied or pickled. Raises TypeError."""
-        raise TypeError("a Solver cannot be copied or pickled: take a snapshot(), and load_solver(snapshot=...) it")
+        raise TypeError("a Solver cannot be copied or pickled; use snapshot() and load_solver(snapshot=...)")
 
     @property
     def history(self) -> list[torch.Tensor]:
-        """The values that the update rule keeps, for each learnable parameter, set after set."""
+        """The history of each learnable parameter, set after set."""
         return self.blocks.history
 
     @property
     def exact(self) -> str:
-        """Which sums are Caffe's to the last bit."""
+        """Which sums are bit-identical to Caffe's."""
         return self.options.exact_sums
 
     @property
@@ -198,7 +198,7 @@ class Training:
         return [path for paths in self.param.weights for path in split_paths(paths)]
 
     def _check_size(self) -> None:
-        """Raise SpecError now, not after days, where a snapshot could not be written."""
+        """Raise SpecError at the start if a snapshot would be too large to write."""
         writes = self.param.snapshot or self.param.snapshot_after_train
         if not writes or self.param.snapshot_format == SolverParameter.SnapshotFormat.Value("HDF5"):
             return
@@ -209,7 +209,7 @@ class Training:
             raise SpecError(message, self.node.find("snapshot_format"))
 
     def _warn_of_settings(self) -> None:
-        """Warn of fields without effect, and of what makes the training slow or its bits depend on the machine."""
+        """Warn of fields without effect, and of settings that make the training slow or dependent on the machine."""
         read = RATES_OF_FORKS.union(
             *(layer.solver_reads for net in self.test_nets for layer in net.layers if isinstance(layer, Scores))
         )
@@ -218,7 +218,7 @@ class Training:
         if said := dependence(self.net, torch.get_num_threads()):
             log.info("solver.cpp:57", said)
         if self.options.precision == FP16 and self.device.type == "cpu":
-            log.logger.warning("precision fp16: CPUs compute it slowly; bf16 is for CPUs that have it")
+            log.logger.warning("precision fp16 is slow on CPUs; use bf16 on CPUs that support it")
         if self.options.precision == BF16 and self.device.type == "cpu" and has_bfloat16() is False:
             log.logger.warning("precision bf16: this CPU has no instructions for it, so it is slower than fp32")
 
@@ -241,17 +241,17 @@ class Training:
         return debug_info(net)
 
     def check_inputs(self) -> None:
-        """Raise SpecError if a net has inputs: a training has no values for them."""
+        """Raise SpecError if a net has inputs, since a training has no values for them."""
         for net in (self.net, *self.test_nets):
             for fault in net.missing_inputs():
                 raise fault
 
     def is_due(self, interval: int) -> bool:
-        """Return whether this iteration is one of every ``interval``; never for 0."""
+        """Return whether the iteration is a multiple of ``interval``; False for 0."""
         return interval > 0 and self.iteration % interval == 0
 
     def tell_nan(self, what: str) -> None:
-        """Stop, or warn, and say where the NaN or infinity is."""
+        """Raise SpecError or warn, with the location of the NaN or infinity."""
         found = bad_parameter(self.net)
         if not found and self.options.nan == "stop":
             found = bad_top(self.net, self.param.iter_size, f"iteration {self.iteration}")
@@ -259,9 +259,9 @@ class Training:
         message = f"Iteration {self.iteration}: {what}{first}"
         if self.options.nan == "stop":
             kept = f"; the last good snapshot is {self.last_snapshot}" if self.last_snapshot else ""
-            raise SpecError(f"{message}{kept}; lower base_lr, or go on with --nan warn", self.node.where)
+            raise SpecError(f"{message}{kept}; lower base_lr, or continue with --nan warn", self.node.where)
         if not self._told_nan:
-            log.logger.warning(f"{message}; the training goes on")
+            log.logger.warning(f"{message}; the training continues")
         self._told_nan = True
 
     def close(self) -> None:

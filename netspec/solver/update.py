@@ -1,9 +1,9 @@
-"""How gradients become new weights: one rule for each of Caffe's solver types, on lists of tensors.
+"""The update rules of Caffe's solver types, on lists of tensors.
 
-As in Caffe, a solver overwrites the gradients step by step until they contain what is subtracted from the weights.
-The lists are in the order of the net's learnable parameters. ``torch._foreach_*`` does the same to each tensor of a
-list; on a GPU in one kernel. All rules work number by number, so :func:`cut` makes pieces that fit into a CPU's cache,
-and all steps are done to one piece before the next: memory is passed over only once.
+As in Caffe, a solver overwrites the gradients step by step until they contain the values to subtract from the weights.
+The lists are in the order of the net's learnable parameters. ``torch._foreach_*`` applies an operation to each tensor
+of a list; on a GPU, in one kernel. All rules are elementwise, so :func:`cut` makes pieces that fit into a CPU's cache.
+All steps are applied to one piece before the next, so memory is read only once.
 
 Caffe: src/caffe/solvers/*.cpp
 """
@@ -25,13 +25,13 @@ from netspec.exact.libm import power
 from netspec.proto.source_map import Place
 
 Tensors = list[torch.Tensor] | tuple[torch.Tensor, ...]
-BLOCK = 2**18  # numbers: of weights, gradients and history they are 3 MB, or 4 MB
+BLOCK = 2**18  # numbers; with gradients and history, 3 MB or 4 MB
 
 
 def clear(parameters: Iterable[torch.nn.Parameter]) -> None:
-    """Set all gradients to 0 where they are; a parameter without one has none afterward either.
+    """Set all gradients to 0 in place; parameters without a gradient are not changed.
 
-    Their memory is kept: memory that is given back to the system costs more to get again than the gradients themselves.
+    Their memory is kept, since allocating it again would cost more than computing the gradients.
     """
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     if gradients:
@@ -41,7 +41,7 @@ def clear(parameters: Iterable[torch.nn.Parameter]) -> None:
 def clip(diffs: Tensors, limit: float) -> tuple[float, float] | None:
     """Scale all gradients so that their common L2 norm is at most ``limit`` (SGDSolver::ClipGradients).
 
-    Returns the norm and the factor if it scaled. A negative limit means no limit.
+    Returns the norm and the factor if it scaled them. A negative limit means no limit.
     """
     if limit < 0 or not diffs:
         return None
@@ -60,7 +60,7 @@ def normalize(diffs: Tensors, iter_size: int) -> None:
 
 
 def regularize(diffs: Tensors, weights: Tensors, decays: Sequence[float], kind: str) -> None:
-    """Add weight decay, each parameter's own (SGDSolver::Regularize): L2 decay * w, L1 decay * sign(w), sign(0) = 0."""
+    """Add each parameter's weight decay (SGDSolver::Regularize): L2 decay * w, L1 decay * sign(w), sign(0) = 0."""
     chosen = [i for i, decay in enumerate(decays) if decay]
     if not chosen:
         return
@@ -89,9 +89,9 @@ class Rule:
 
 @dataclass(frozen=True)
 class Piece:
-    """Weights that are updated together, their gradients, and their history: one list like theirs for each set.
+    """Weights that are updated together, with their gradients and their history, one list for each set.
 
-    ``rates`` and ``decays`` are each tensor's own.
+    ``rates`` and ``decays`` have one value for each tensor.
     """
 
     weights: Tensors
@@ -102,9 +102,9 @@ class Piece:
 
 
 def move(rule: Rule, param: Any, piece: Piece, iteration: int) -> None:
-    """Update the weights by their gradients, summed over ``iter_size`` passes (SGDSolver::ApplyUpdate, Net::Update).
+    """Update the weights with their gradients, summed over ``iter_size`` passes (SGDSolver::ApplyUpdate, Net::Update).
 
-    The gradients then contain what was subtracted.
+    The gradients then contain the subtracted values.
     """
     normalize(piece.diffs, param.iter_size)
     regularize(piece.diffs, piece.weights, piece.decays, param.regularization_type)
@@ -131,9 +131,9 @@ def cut(piece: Piece) -> Iterator[Piece]:
 
 
 def _blocks(tensors: Tensors) -> Iterator[list[tuple[int, slice]]]:
-    """Yield blocks of about ``BLOCK`` numbers: which tensors, of one axis, and which part of each.
+    """Yield blocks of about ``BLOCK`` numbers: the one-dimensional tensors, and the part of each.
 
-    Tensors on a GPU make up one block, as each of its kernels costs time by itself.
+    On a GPU, all tensors form one block, since every kernel has a fixed cost.
     """
     block: list[tuple[int, slice]] = []
     room = BLOCK
@@ -234,8 +234,8 @@ def rule_faults(param: Any, node: Place) -> Iterator[SpecError]:
 
 
 def _accelerate(diffs: Tensors, rates: Sequence[float], history: Tensors, momentum: float) -> None:
-    """History = momentum * history + rate * diff."""
-    if len(history) == 1:  # of one tensor, the call for lists takes longer than what it does
+    """Compute history = momentum * history + rate * diff."""
+    if len(history) == 1:  # for one tensor, the overhead of the list operation is larger than the operation
         history[0].mul_(momentum)
     else:
         torch._foreach_mul_(history, momentum)
@@ -243,7 +243,7 @@ def _accelerate(diffs: Tensors, rates: Sequence[float], history: Tensors, moment
 
 
 def _add_scaled(sums: Tensors, terms: Tensors, factors: Sequence[float]) -> None:
-    """Sum = sum + factor * term, rounded once, as BLAS' axpy does."""
+    """Compute sum = sum + factor * term, rounded once, like BLAS's axpy."""
     if len(sums) == 1:
         sums[0].add_(terms[0], alpha=factors[0])
         return
@@ -261,13 +261,13 @@ def _powers(values: Tensors, exponent: float) -> Tensors:
 
 
 def _fade_in(history: Tensors, values: Tensors, keep: float) -> None:
-    """History = keep * history + (1 - keep) * value."""
+    """Compute history = keep * history + (1 - keep) * value."""
     torch._foreach_mul_(history, keep)
     torch._foreach_add_(history, values, alpha=1 - keep)
 
 
 def _divide_by_root(diffs: Tensors, squares: Tensors, delta: float) -> None:
-    """Diff = diff / (sqrt(squares) + delta)."""
+    """Compute diff = diff / (sqrt(squares) + delta)."""
     roots = _powers(squares, 0.5)
     torch._foreach_add_(roots, delta)
     torch._foreach_div_(diffs, roots)

@@ -69,9 +69,9 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
         return arguments.fault_status
     except Exception as fault:
         if is_out_of_memory(fault):
-            line = f"there is not enough memory: this machine has {amount(memory())}"
-        elif wing := _missing_wing(fault):
-            line = f"this command needs {wing}, which was removed from this installation"
+            line = f"out of memory; this machine has {amount(memory())}"
+        elif part := _missing_part(fault):
+            line = f"this command needs {part}, which is missing from this installation"
         elif not (line := _fault_of_plugin(fault, getattr(arguments, "plugin", None) or ())):
             raise
         print(line, file=sys.stderr)
@@ -81,7 +81,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
         return 128 + int(end.args[0] if end.args else signal.SIGINT)
 
 
-def _missing_wing(fault: Exception) -> str:
+def _missing_part(fault: Exception) -> str:
     """Return the folder of netspec that a command looked for in vain, "" for any other fault."""
     missing = (fault.name or "").split(".") if isinstance(fault, ModuleNotFoundError) else []
     return "/".join(missing[:2]) if missing[:1] == ["netspec"] and len(missing) > 1 else ""

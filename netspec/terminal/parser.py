@@ -21,13 +21,13 @@ from netspec.terminal.commands import FAULT, version
 
 TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
 
-# The defaults of a command (``parser.set_defaults``) that decide what its log shows.
+# Defaults of a command (``parser.set_defaults``) for its log.
 CAFFES_LOG = {"log_level": logging.INFO, "log_form": log.GlogFormatter()}
 QUIET = {"log_level": logging.WARNING, "log_form": logging.Formatter("warning: %(message)s")}
 NO_LOG = {"log_level": logging.WARNING, "log_form": None}
 
-# Flags that gflags gives every command of Caffe, and glog's. A command that lacks one accepts it and says that it has
-# no effect, so that scripts written for Caffe run.
+# Caffe's commands accept each other's flags, and glog's. A command without such a flag accepts it, and prints that it
+# has no effect, so that scripts for Caffe run.
 _CAFFES_COMMANDS = ("train", "test", "time", "device_query")
 _CAFFES_FLAGS = (
     "gpu",
@@ -64,10 +64,10 @@ def program(name: str, description: str) -> Parser:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser with gflags' spellings, without abbreviations; it suggests what a mistyped word was meant to be.
+    """A parser with gflags' spellings and without abbreviations; it suggests corrections for mistyped words.
 
-    An argument with ``action="store_true"`` is a Boolean flag in all spellings of gflags. The namespace of a command
-    has ``given``: the options that were typed, by their names in the namespace, each as it was spelled.
+    An argument with ``action="store_true"`` is a Boolean flag in all of gflags' spellings. The namespace of a command
+    has ``given``: a dict from the names of the typed options in the namespace to their spelling.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -76,12 +76,12 @@ class Parser(argparse.ArgumentParser):
         self._has_commands = False
 
     def add_subparsers(self, **options: Any) -> Any:
-        """Add what holds the commands; from then on their parsers, not this one, read the spellings of gflags."""
+        """Add subparsers; from then on they, and not this parser, read gflags' spellings."""
         self._has_commands = True
         return super().add_subparsers(**options)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse as argparse does, after the words were translated; an unknown option is an error with a hint."""
+        """Translate gflags' spellings, then parse as argparse does; an unknown option is an error with a suggestion."""
         if self._has_commands:
             return super().parse_known_args(args, namespace)
         words = [self._translated(word) for word in self._without_effect(list(args or ()))]
@@ -102,7 +102,7 @@ class Parser(argparse.ArgumentParser):
         super()._check_value(action, value)
 
     def _without_effect(self, words: list[str]) -> Iterator[str]:
-        """Yield the words, and those of a ``-flagfile``, without the flags of Caffe and glog that have no effect."""
+        """Yield the words, with those of a ``-flagfile``, without the flags of Caffe and glog that have no effect."""
         caffes = _CAFFES_FLAGS if self.prog.split()[-1] in _CAFFES_COMMANDS else ()
         own = {name.lstrip("-") for name in self._option_string_actions}
         while words:
@@ -123,12 +123,12 @@ class Parser(argparse.ArgumentParser):
             elif name in _GLOGS_FLAGS + caffes or name.removeprefix("no") in _GLOGS_SWITCHES:
                 if not equals and name in _GLOGS_FLAGS + caffes and words:
                     words.pop(0)
-                print(f"{self.prog}: -{name} is a flag of Caffe's or glog's that has no effect here", file=sys.stderr)
+                print(f"{self.prog}: -{name} is a flag of Caffe or glog that has no effect here", file=sys.stderr)
             else:
                 yield word
 
     def _suggestion(self, unknown: Sequence[str]) -> str:
-        """Return a hint at the option that is most like the first unknown one."""
+        """Return a suggestion for the first unknown option."""
         wrong = next((word for word in unknown if word.startswith("-")), "").partition("=")[0].lstrip("-")
         names = [name[2:] for name in self._option_string_actions if name.startswith("--")]
         meant = did_you_mean(wrong, [name for name in names if name[:1] == wrong[:1]])
@@ -152,10 +152,10 @@ class Parser(argparse.ArgumentParser):
 
 
 class Commands:
-    """The commands of a parser. Its help lists them below headings.
+    """The commands of a parser, whose help lists them under headings.
 
-    ``heading`` is the heading of the commands that are added next. ``defaults`` are those of every command, as
-    ``parser.set_defaults`` takes them, for example ``**QUIET``.
+    ``heading`` is the heading for the commands that are added next. ``defaults`` are those of every command, as for
+    ``parser.set_defaults``, for example ``**QUIET``.
     """
 
     def __init__(self, parser: Parser, **defaults: Any) -> None:
@@ -183,13 +183,13 @@ class Commands:
         return parser
 
     def add_group(self, name: str, *, help: str) -> Commands:
-        """Add a command that has commands of its own, and return these."""
+        """Add a command that has commands of its own; return them."""
         return Commands(self._add(name, help=help), **self._defaults)
 
     def _add(self, name: str, *, help: str, **options: Any) -> Parser:
         self._listed.setdefault(self.heading, []).append(f"  {name:25} {help}")
         lists = ("\n".join((f"{heading}:", *lines)) for heading, lines in self._listed.items())
-        self._parser.epilog = "\n\n".join([*lists, "Every command takes -q, for warnings and errors only."])
+        self._parser.epilog = "\n\n".join([*lists, "Every command has -q: log warnings and errors only."])
         return self._subparsers.add_parser(name, help=help, **{"description": help, **options})
 
 

@@ -162,7 +162,7 @@ def test_two_trainings_on_one_prefix(here: Path, capsys: pytest.CaptureFixture[s
     with whole_file.only_one("out/.x.lock", ""):
         assert case.main(case.words) == 1
     line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith("out/.x.lock: is held by another run")
+    assert line.startswith("out/.x.lock: is locked by another process")
     assert line.endswith('give each training a snapshot_prefix of its own, not "out/x" to both')
     assert not contents()
     Path("out/x.lock").write_text("another program's")

@@ -34,8 +34,8 @@ def little_memory() -> Iterator[None]:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (NET, 'net.prototxt:2:1: layer "large" (InnerProduct): its blobs need more memory than there is'),
-        (WIDE, 'net.prototxt:1:1: layer "wide" (DummyData): its pass needs more memory than there is'),
+        (NET, 'net.prototxt:2:1: layer "large" (InnerProduct): its blobs need more memory than available'),
+        (WIDE, 'net.prototxt:1:1: layer "wide" (DummyData): its pass needs more memory than available'),
     ],
     ids=["a parameter", "a blob"],
 )

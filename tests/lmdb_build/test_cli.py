@@ -52,7 +52,7 @@ def test_what_it_says_of_its_lists_is_what_convert_needs(
     assert main(pairs(walks, "--out", str(out), "--train", "20", "--val", "10", "--different-scenes")) == 0
     said = capsys.readouterr().out
     assert "lmdb-build" not in said  # nothing looks as if it had run
-    found = re.fullmatch(r"wrote (.+); the names of images in them are relative to (.+)", said.splitlines()[-1])
+    found = re.fullmatch(r"wrote (.+); their image names are relative to (.+)", said.splitlines()[-1])
     assert found
     lists, root = found[1].split(", "), found[2]
     assert lists == [f"{out}/train.txt", f"{out}/val.txt"]

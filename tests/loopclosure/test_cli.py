@@ -235,7 +235,7 @@ def expanded(line: str, **names: object) -> list[str]:
     [
         ("NOWHERE: no such folder", "evaluate NOWHERE --method thumbnails --out OUT"),
         ('unknown method "magic"', "evaluate LAPS --method magic --out OUT"),
-        ("has no truth, which says what frames show the same place", "evaluate LAPS/rgb --method thumbnails --out OUT"),
+        ("has no ground truth of which frames show the same place", "evaluate LAPS/rgb --method thumbnails --out OUT"),
         ("no judged pair shows the same place", "evaluate LAPS,start=50% --method thumbnails --out OUT"),
         ("test images are training images", "evaluate LAPS --method bow --train LAPS --out OUT"),
         ("NOWHERE.npz: no such file", "evaluate LAPS --method features:NOWHERE.npz --out OUT"),
@@ -263,15 +263,24 @@ def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_fea
         ('a sequence has no setting "camera"', "evaluate LAPS,camera=left --method thumbnails --out OUT"),
         ("needs ,truth=MASK", "evaluate images:LAPS --method thumbnails --out OUT"),
         ("--fov is for sequences with poses, not for ", "evaluate pairs:LAPS --fov 60 --method thumbnails --out OUT"),
-        ("nothing is near in time", "evaluate LAPS,references=LAPS --exclude-seconds 3 --method thumbnails --out OUT"),
+        (
+            "--exclude-frames cannot be used with references",
+            "evaluate LAPS,references=LAPS --exclude-seconds 3 --method thumbnails --out OUT",
+        ),
         ("expected KEY=VALUE", "detect LAPS --threshold 1 --with width --out OUT"),
-        ("--with belongs to --describe", "detect LAPS --threshold 1 --features FEATURES --with width=8 --out OUT"),
-        ("leave out others", "detect LAPS --resume OUT --metric cosine --out OUT"),
-        ("--top-k means nothing without --threshold", "detect LAPS --top-k 3 --out OUT"),
-        ("--verify means nothing without --threshold", "detect LAPS --verify --out OUT"),
-        ("--odometry means nothing to a search frame by frame", "detect LAPS --threshold 1 --odometry O --out OUT"),
-        ("belongs to --top-k", "similarity FEATURES --exclude-frames 3 --out OUT"),
-        ("one sequence", "similarity FEATURES --references FEATURES --top-k 1 --exclude-frames 3 --out OUT"),
+        ("--with is for --describe", "detect LAPS --threshold 1 --features FEATURES --with width=8 --out OUT"),
+        ("leave out all others", "detect LAPS --resume OUT --metric cosine --out OUT"),
+        ("--top-k needs --threshold", "detect LAPS --top-k 3 --out OUT"),
+        ("--verify needs --threshold", "detect LAPS --verify --out OUT"),
+        (
+            "--odometry cannot be used with --threshold, --resume or --video, which decide frame by frame",
+            "detect LAPS --threshold 1 --odometry O --out OUT",
+        ),
+        ("--exclude-frames and --exclude-seconds need --top-k", "similarity FEATURES --exclude-frames 3 --out OUT"),
+        (
+            "cannot be used with --references",
+            "similarity FEATURES --references FEATURES --top-k 1 --exclude-frames 3 --out OUT",
+        ),
     ],
 )
 def test_options_that_do_not_go_together_are_one_line_and_status_2(

@@ -120,7 +120,7 @@ class FileNet:
                 f'no layer "{layer}" in this net{did_you_mean(layer, names) or ";"} it has: {", ".join(names[1:])}'
             )
         else:
-            message = f"no layer of number {layer} in this net; it has 0 to {len(self.table) - 1}"
+            message = f"no layer {layer} in this net; its layers are 0 to {len(self.table) - 1}"
         raise DnnError(message, self.where(), NOT_FOUND, func)
 
     def check_not_empty(self, func: str) -> None:

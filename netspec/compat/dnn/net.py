@@ -172,7 +172,7 @@ class Net:
     def _blob(self, entry: Entry, index: int, func: str) -> torch.Tensor:
         blobs = () if entry.name == INPUT else self._caffe.layer(self._caffe.net, entry).blobs
         if not 0 <= index < len(blobs):
-            message = f'layer "{entry.name}" has {len(blobs)} learnable blobs, there is no number {index}'
+            message = f'layer "{entry.name}" has {len(blobs)} learnable blobs, found index {index}'
             raise DnnError(message, code=BAD_ARGUMENT, func=func)
         return blobs[index]
 
@@ -322,9 +322,9 @@ class Net:
     registerOutput = _refused("registerOutput", AS_WRITTEN)
     quantize = _refused(
         "quantize",
-        "nets of Caffe's files are not quantized here; export the net to ONNX (netspec export) and quantize that",
+        "quantizing Caffe nets is not supported; export the net to ONNX (netspec export) and quantize that",
     )
-    forwardAsync = _refused("forwardAsync", "forwardAsync needs a backend that is not here; use forward")
+    forwardAsync = _refused("forwardAsync", "forwardAsync is not supported; use forward")
     getInputDetails = _refused("getInputDetails", "the net is not quantized", UNSPECIFIED)
     getOutputDetails = _refused("getOutputDetails", "the net is not quantized", UNSPECIFIED)
 
@@ -335,7 +335,7 @@ class Net:
         for blob, shown in self._caffe.shown.items():
             if name in ("", shown):
                 return blob
-        found = f'no input "{name}" in this net' if name else "this net takes no input"
+        found = f'no input "{name}" in this net' if name else "this net has no inputs"
         known = ", ".join(self._caffe.shown.values()) or "none"
         raise DnnError(f"{found}; its inputs: {known}", self._caffe.where(), NOT_FOUND, func)
 
@@ -350,14 +350,14 @@ class Net:
 
     def _check_weights(self, func: str) -> None:
         if not self._runnable:
-            message = "this net was read without weights; give the .caffemodel as well, or call setParam"
+            message = "this net was read without weights; also give the .caffemodel, or call setParam"
             raise DnnError(message, self._caffe.where(), func=func)
 
     def _with_shapes(self, fault: ValueError, func: str) -> DnnError:
         """Return a fault of a run with the shapes of the inputs that are not as the prototxt has them."""
         caffe = self._caffe
         changed = [
-            f'input "{caffe.shown[key]}" has shape {value.shape}, the prototxt declares {caffe.declared[key]}'
+            f'input "{caffe.shown[key]}" has shape {value.shape}, but the prototxt declares {caffe.declared[key]}'
             for key, value in caffe.values.items()
             if value.shape != caffe.declared[key]
         ]

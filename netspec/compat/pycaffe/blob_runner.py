@@ -182,7 +182,7 @@ class BlobRunner:
             thread = threading.current_thread()
             if self._last is not None and thread is not self._last:
                 if not forward and thread in self._overtaken:
-                    advice = "give each thread a net of its own (share_with), or a lock around both passes"
+                    advice = "give each thread its own net (share_with), or hold a lock during both passes"
                     raise RuntimeError(f"backward: another thread has run this net since; {advice}")
                 self._leave_views()
             if forward:

@@ -70,7 +70,9 @@ def compose(base_map: Mapping, next_map: Mapping) -> Mapping:
     base_axis, base_scale, base_shift = base_map
     next_axis, next_scale, next_shift = next_map
     if None not in (base_axis, next_axis) and base_axis != next_axis:
-        raise AxisMismatchException(f"one mapping is of the axes behind {base_axis}, the other behind {next_axis}")
+        raise AxisMismatchException(
+            f"one mapping is for the axes after {base_axis}, the other for the axes after {next_axis}"
+        )
     axis = next_axis if base_axis is None else base_axis
     return axis, base_scale * next_scale, base_scale * next_shift + base_shift
 

@@ -37,7 +37,7 @@ def draw_net(
     caffe_net: Any, rankdir: str, ext: str = "png", phase: int | None = None, display_lrm: bool = False
 ) -> bytes:
     """Return the picture of a net in a format of Graphviz. Raises SpecError for one that it does not have."""
-    from netspec.inspect.draw.graphviz import render  # here, so that pycaffe can be imported without the wing inspect
+    from netspec.inspect.draw.graphviz import render  # here, so that pycaffe works without netspec/inspect
 
     graph = get_pydot_graph(caffe_net, rankdir, phase=phase, display_lrm=display_lrm)
     text = graph.to_string()

@@ -45,7 +45,7 @@ def set_mode_gpu() -> None:
     _mode.gpu = torch.cuda.is_available()
     if not _mode.gpu and not _mode.warned:
         _mode.warned = True
-        log.warning("common.cpp:152", "set_mode_gpu: torch finds no GPU here: nets run on the CPU")
+        log.warning("common.cpp:152", "set_mode_gpu: torch finds no GPU here; nets run on the CPU")
 
 
 def set_device(device_id: int) -> None:

@@ -17,7 +17,7 @@ from netspec.compat.scripts.finder import MARK, NAME, real_caffe
 from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
 
-_PACKAGE = f'''{MARK}: written by `netspec install-caffe`, taken away by `netspec remove-caffe`.
+_PACKAGE = f'''{MARK}: written by `netspec install-caffe`, removed by `netspec remove-caffe`.
 """Caffe's Python interface, which netspec provides."""
 
 import importlib
@@ -59,7 +59,7 @@ def install_caffe(replace: bool = False) -> list[Path]:
         in_the_way.append(real)
     if in_the_way and not replace:
         there = ", ".join(in_the_way)
-        raise SpecError(f"{there}: is there already and not netspec's; --replace puts netspec's in its place")
+        raise SpecError(f"{there}: already exists and is not netspec's; use --replace to move it aside")
     for path, text in paths.items():
         owner = path.parent if path.name == "__init__.py" else path
         if owner.exists() and not _is_ours(path):
@@ -97,7 +97,7 @@ def make_build_folder(folder: Path) -> list[Path]:
     paths = _build_paths(folder)
     there = [str(path) for path in paths if path.exists() and not _is_ours(path)]
     if there:
-        raise SpecError(f"{', '.join(there)}: is there already and not netspec's; name another folder")
+        raise SpecError(f"{', '.join(there)}: already exists and is not netspec's; choose another folder")
     for path, (module, words) in paths.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, _command(module, words))
@@ -132,7 +132,7 @@ def _scripts() -> Path:
 
 def _command(module: str, words: list[str]) -> str:
     return f"""#!{sys.executable}
-{MARK}: written by `netspec install-caffe`, taken away by `netspec remove-caffe`.
+{MARK}: written by `netspec install-caffe`, removed by `netspec remove-caffe`.
 import sys
 
 from netspec.terminal.main import program

@@ -70,7 +70,7 @@ class CaffeFinder(importlib.abc.MetaPathFinder):
     def _in_a_tree(self, fullname: str) -> ModuleSpec:
         spec = self._search(fullname)
         if spec is None:
-            advice = 'Python files of a Caffe tree are found where its folder "python" is on sys.path or PYTHONPATH'
+            advice = 'to import Python files of a Caffe tree, add its folder "python" to sys.path or PYTHONPATH'
             raise ModuleNotFoundError(f"No module named '{fullname}'; {advice}", name=fullname)
         return spec
 
@@ -87,6 +87,6 @@ class CaffeFinder(importlib.abc.MetaPathFinder):
         found = None if self.shadow else real_caffe()
         if found is None:
             return ModuleSpec(NAME, Alias(HOME), is_package=True)
-        advice = "netspec run --shadow-caffe uses netspec's"
-        print(f"netspec: the Caffe that is installed at {found} is used; {advice}", file=sys.stderr)
+        advice = "to use netspec instead, run netspec run --shadow-caffe"
+        print(f"netspec: using the Caffe installed at {found}; {advice}", file=sys.stderr)
         return None

@@ -123,7 +123,9 @@ def _numpy(np: Any) -> None:
     _let_threshold_be_nan(np)
 
 
-_TOO_NEW = "NumPy {} takes no array of one element for a number, as old programs expect: pip install 'numpy<2.4'"
+_TOO_NEW = (
+    "NumPy {} does not convert an array of one element to a number, as old programs expect; pip install 'numpy<2.4'"
+)
 
 
 def _is_too_new(np: Any) -> bool:
@@ -141,8 +143,8 @@ def remedy(fault: BaseException) -> str:
     place = next((f for f in reversed(traceback.extract_tb(fault.__traceback__)) if f.filename in TRANSLATED), None)
     if place and isinstance(fault, (TypeError, UnicodeError)):
         return (
-            f"{place.filename}:{place.lineno} is Python 2, which took text for bytes and 2.0 for 2: write what is due "
-            "there, such as text.encode(), data.decode() or int(x)"
+            f"{place.filename}:{place.lineno} is Python 2 code, which does not distinguish text from bytes, or 2.0 "
+            "from 2; convert explicitly, for example with text.encode(), data.decode() or int(x)"
         )
     np = sys.modules.get("numpy")
     one_element = "only 0-dimensional arrays can be converted", "setting an array element with a sequence"

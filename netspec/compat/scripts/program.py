@@ -55,7 +55,7 @@ def run_module(name: str, arguments: Sequence[str], options: Options) -> NoRetur
     except ImportError as fault:
         raise SpecError(f"-m {name}: {fault}") from None
     if spec is None or spec.origin is None:
-        raise SpecError(f"-m {name}: there is no module of that name that can be run")
+        raise SpecError(f"-m {name}: no such module, or it cannot be run")
     path = spec.origin
     sys.argv[0] = path
     main = ModuleType("__main__")

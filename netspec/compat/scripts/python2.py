@@ -177,7 +177,7 @@ def translated(data: bytes, path: str, alone: bool = False) -> str:
     package = _translator()
     if not package:
         advice = "pip install fissix, or pip install 'netspec-caffe[py2]'"
-        raise SpecError(f"this is Python 2, and Python's own translator was dropped after 3.12: {advice}", Where(path))
+        raise SpecError(f"this is Python 2, and Python 3.13 and later have no translator for it: {advice}", Where(path))
     text = io.TextIOWrapper(io.BytesIO(data), _encoding(data), errors="surrogateescape").read()
     text = _spaces(text.rstrip() + "\n", package)
     try:

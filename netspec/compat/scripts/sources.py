@@ -40,7 +40,7 @@ def write_translation(path: str, out: Path, always: bool) -> None:
     """
     data = bytes_of(path)
     if not (always or python2.is_python2(data, path)):
-        raise SpecError(f"is Python 3 already: there is no translation to write to {out}", Where(path))
+        raise SpecError(f"is already Python 3: no translation was written to {out}", Where(path))
     write_whole(out, python2.translated(data, path, alone=True), "surrogateescape")
 
 
@@ -88,7 +88,7 @@ class Reader(importlib.abc.MetaPathFinder):
         if ours:
             return _compiled(data, path)
         kept = "--write-py3 FILE writes the translation"
-        return self._code(data, path, self.python2, f"is Python 2, and runs translated to Python 3; {kept}")
+        return self._code(data, path, self.python2, f"is Python 2 and was translated to Python 3 to run; {kept}")
 
     def module_code(self, data: bytes, path: str, package: str) -> CodeType:
         """Return the code of a module of the program, in a package unless that is "". Raises as :meth:`main_code`."""

@@ -1,6 +1,6 @@
-"""Building blocks that many forks added, for classification and segmentation: SENet, PSPNet, SegNet, MobileNet, ...
+"""Building blocks of many forks for classification and segmentation: SENet, PSPNet, SegNet, MobileNet, ...
 
-If two forks have different layers with the same type (BN, Upsample), the fields that are set show which is meant.
+If two forks have different layers with the same type (BN, Upsample), the given fields determine which is meant.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ extend LayerParameter {
 
 @register("Axpy")
 class Axpy(Layer):
-    """a x + y with one factor a per channel of each image: the end of a squeeze-and-excitation block.
+    """Compute a x + y with one factor a per channel of each image, as at the end of a squeeze-and-excitation block.
 
     bottom[0]  a (N, C) or (N, C, 1, 1)
     bottom[1]  x (N, C, ...)
@@ -124,7 +124,7 @@ class Axpy(Layer):
 
 @register("ReLU6", "relu6_param")
 class ReLU6(Capped):
-    """min(max(x, 0) + negative_slope min(x, 0), 6); the gradient at 0 is the negative side's, at 6 none.
+    """min(max(x, 0) + negative_slope min(x, 0), 6). The gradient at 0 is that of the negative side; at 6 it is 0.
 
     bottom[0]  any shape
     top[0]     the same shape
@@ -137,7 +137,7 @@ class ReLU6(Capped):
 
 @register("DepthwiseConvolution", "convolution_param")
 class DepthwiseConvolution(Convolution):
-    """A separate convolution of each channel: group, where it is given, must be the number of channels.
+    """A separate convolution of each channel; if group is given, it must be the number of channels.
 
     bottom[i]  (N, C, H, W)
     top[i]     (N, num_output, H', W') as Convolution's
@@ -147,7 +147,7 @@ class DepthwiseConvolution(Convolution):
     """
 
     def setup(self) -> None:
-        """Set up as Convolution; refuse filters over more than one channel."""
+        """Set up like Convolution; raise SpecError for filters over more than one channel."""
         if not self.param.convolution_param.HasField("group"):
             param = LayerParameter()
             param.CopyFrom(self.param)
@@ -189,7 +189,7 @@ class ConvolutionDepthwise(Convolution):
 
 @register("ShuffleChannel", "shuffle_channel_param")
 class ShuffleChannel(Layer):
-    """Deal the channels of ``group`` groups out in turn: the first of each group, then the second of each.
+    """Interleave the channels of ``group`` groups: the first channel of each group, then the second of each, and so on.
 
     bottom[0]  (N, C, ...), C a multiple of group
     top[0]     the same shape
@@ -216,10 +216,10 @@ class ShuffleChannel(Layer):
 
 @register("Interp", "interp_param")
 class Interp(Layer):
-    """Resize each map bilinearly, corner pixels on corner pixels, after cutting off a border.
+    """Crop a border of each map, then resize it bilinearly with aligned corner pixels.
 
-    The new size is height and width, or the second bottom's, or follows from shrink_factor s and zoom_factor z (where
-    both are given, one after the other): (H - 1) // s + 1 and H + (H - 1) (z - 1).
+    The new size is height and width, or that of the second bottom, or is computed from shrink_factor s and zoom_factor
+    z (if both are given, one after the other): (H - 1) // s + 1 and H + (H - 1) (z - 1).
 
     bottom[0]  (N, C, H, W)
     bottom[1]  optional: a blob of the new height and width; gets no gradient
@@ -303,7 +303,7 @@ class Interp(Layer):
 
 @register("DeephiResize", "deephi_resize_param")
 class DeephiResize(Layer):
-    """Resize each map as OpenCV does: to new_height and new_width, or by scale_h and scale_w, rounded down.
+    """Resize each map like OpenCV, to new_height and new_width, or by scale_h and scale_w, rounded down.
 
     bottom[0]  (N, C, H, W)
     top[0]     (N, C, H', W')
@@ -359,13 +359,13 @@ register("BN", "bn_param")(BN)
 
 @register("SegAccuracy", "seg_accuracy_param")
 class SegAccuracy(Layer):
-    """How well the pixels are classified, by counts of pairs of label and best class: they go on with reset: false.
+    """The accuracy of pixel classification, from a confusion matrix, which accumulates over passes with reset: false.
 
-    Of equal scores the last class counts. A class that is neither there nor found has 1 in the mean of intersections.
+    If scores are equal, the last class counts. A class that neither occurs nor is predicted has intersection / union 1.
 
     bottom[0]  scores (N, C, H, W)
-    bottom[1]  labels (N, 1, H, W); those of ignore_label do not count
-    top[0]     (1, 1, 1, 3): share of the pixels that are right, its mean over the classes that are there, mean of
+    bottom[1]  labels (N, 1, H, W); ignore_label is ignored
+    top[0]     (1, 1, 1, 3): share of correct pixels, its mean over the classes that occur, and the mean of
                intersection / union over all classes
     Fork: hszhao/PSPNet, src/caffe/layers/seg_accuracy_layer.cpp
     """

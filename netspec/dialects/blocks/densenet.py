@@ -1,4 +1,4 @@
-"""A block of DenseNet as one layer, without copies of the maps that it concatenates. Fork: Tongcheng/caffe."""
+"""A block of DenseNet as one layer, which does not copy the maps that it concatenates. Fork: Tongcheng/caffe."""
 
 from __future__ import annotations
 
@@ -46,19 +46,19 @@ FIXED = {"pad_h": 1, "pad_w": 1, "conv_verticalStride": 1, "conv_horizentalStrid
 
 @register("DenseBlock", GROUP)
 class DenseBlock(NotLearned):
-    """Append growthRate channels numTransition times: of all channels so far, BN, ReLU and a convolution of 3 x 3.
+    """Append growthRate channels numTransition times, by BN, ReLU and a 3 x 3 convolution of all channels so far.
 
-    With use_BC the convolution has 4 growthRate channels to read, which a convolution of 1 x 1, BN and ReLU make
-    first. BN goes by the batch in training, where its averages move by moving_average_fraction toward the batch's mean
-    and unbiased variance, and by these averages in testing. In training what is appended passes a Dropout of
-    dropout_amount if use_dropout says so. The fork's code for GPUs is meant; that for CPUs has other averages.
+    With use_BC, a 1 x 1 convolution, BN and ReLU first reduce the input of the 3 x 3 convolution to 4 growthRate
+    channels. In training, BN uses the batch, and its averages move by moving_average_fraction toward the batch's mean
+    and unbiased variance; in testing it uses these averages. With use_dropout, the appended channels pass a Dropout of
+    dropout_amount in training. This is the fork's code for GPUs; its code for CPUs has other averages.
 
-    bottom[0]  (N, C, H, W); C is initChannel in Tongcheng's files, and counts in those of caffe_ocr, which differ
+    bottom[0]  (N, C, H, W); C replaces initChannel, which is wrong in caffe_ocr's files
     top[0]     (N, C + numTransition growthRate, H, W)
-    blobs[0 T ...]  of T = numTransition steps, step i's at 0 T + i: filters (growthRate, C_i, 3, 3), in which C_i is
+    blobs[0 T ...]  for T = numTransition steps, step i's at 0 T + i: filters (growthRate, C_i, 3, 3), where C_i is
                C + i growthRate, or 4 growthRate with use_BC; then at 1 T slopes, at 2 T biases, at 3 T means
                and at 4 T variances (1, C, 1, 1); with use_BC at 5 T filters (4 growthRate, C, 1, 1), and at 6 T to 9 T
-               slopes, biases, means and variances of the second BN; last one number, not used
+               slopes, biases, means and variances of the second BN; finally one unused number
     Fork: Tongcheng/caffe, src/caffe/layers/DenseBlock_layer.cu
     """
 

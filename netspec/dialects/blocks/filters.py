@@ -1,7 +1,7 @@
 """Fields that forks added to Caffe's layers.
 
-DeepLab's holes; a pad for each side, AVE_EXC_PAD and relu6 (Synopsys); a Dropout that scales in testing (Fast R-CNN) or
-draws in testing (SegNet).
+DeepLab's hole; separate pads for each side, AVE_EXC_PAD and relu6 (Synopsys); a Dropout that scales in testing (Fast
+R-CNN) or is random in testing (SegNet).
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Convolution(convolution.Convolution):
                 raise self.error(f"{first} is for 2 spatial axes, the bottom has {self.spatial_axes}", GROUP, first)
 
     def _framed(self, shape: Shape) -> Shape:
-        """Return a bottom's shape with the pad of its sides."""
+        """Return a bottom's shape including the pads of its sides."""
         left, right, top, bottom = self.sides
         if not any(self.sides) or len(shape) < 2:
             return shape
@@ -137,13 +137,13 @@ def _differs(param: LayerParameter) -> bool:
 
 @replace("Pooling", POOLING, *(f"{POOLING}.{name}" for name in ("pool", *SIDES)), where=_differs)
 class Pooling(pooling.Pooling):
-    """Caffe's Pooling, with pad_l, pad_r, pad_t and pad_b, and AVE_EXC_PAD: the mean of a window's pixels alone.
+    """Caffe's Pooling, with pad_l, pad_r, pad_t and pad_b, and AVE_EXC_PAD, the mean without padding.
 
-    With AVE, padding counts as zeros, up to each side's pad. AVE_TF is an older name of AVE_EXC_PAD.
+    With AVE, padding counts as zeros, up to the pad of each side. AVE_TF is an older name of AVE_EXC_PAD.
 
     bottom[0]  (N, C, H, W)
     top[0]     (N, C, H', W'),  H' = ceil((H + pad_t + pad_b - kernel) / stride) + 1 by Caffe's rules
-    top[1]     only without these fields: as Caffe's
+    top[1]     only without these fields, as in Caffe
     Fork: foss-for-synopsys-dwc-arc-processors/synopsys-caffe, src/caffe/layers/pooling_layer.cpp
     """
 
@@ -165,7 +165,7 @@ class Pooling(pooling.Pooling):
         self.sides = ((up, down), (left, right)) if any((left, right, up, down)) else [(p, p) for p in self.pad]
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape; each side's pad must be less than the kernel."""
+        """Return the shape of the top; the pad of each side must be less than the kernel."""
         shape, param = bottom_shapes[0], self.param.pooling_param
         if len(shape) != 4:
             raise self.error(f"pooling needs a bottom of 4 axes (N, C, H, W), found shape {shape}", "bottom")
@@ -219,7 +219,7 @@ class Pooling(pooling.Pooling):
     where=lambda param: value(param.relu_param, "relu6"),
 )
 class ReLU(Capped):
-    """Caffe's ReLU; with relu6 no more than 6: min(max(x, 0) + negative_slope min(x, 0), 6).
+    """Caffe's ReLU; with relu6, limited to 6: min(max(x, 0) + negative_slope min(x, 0), 6).
 
     bottom[0]  any shape
     top[0]     the same shape
@@ -237,9 +237,9 @@ class ReLU(Capped):
     "dropout_param.sample_weights_test",
 )
 class Dropout(common.Dropout):
-    """As Caffe's; with scale_train: false it does not scale in training but, by 1 - p, in testing.
+    """Caffe's Dropout; with scale_train: false, it scales by 1 - p in testing instead of scaling in training.
 
-    With sample_weights_test it is in testing as it is in training: Bayesian SegNet's samples of what a net may say.
+    With sample_weights_test, it is random in testing too, for the samples of Bayesian SegNet.
 
     bottom[0]  any shape
     top[0]     the same shape

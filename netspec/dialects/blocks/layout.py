@@ -1,4 +1,4 @@
-"""Layers of forks that only move numbers: Transpose (OCR), Reorg (YOLO v2), MergeCrop (U-Net), CropCenter (waifu2x)."""
+"""Layers that only rearrange values: Transpose (OCR), Reorg (YOLO v2), MergeCrop (U-Net), CropCenter (waifu2x)."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ STACK = 0  # MergeCropParameter.MergeOp
 
 @register("Transpose", "transpose_param")
 class Transpose(Reordered):
-    """Bring the axes into another order: axis i of the top is axis ``dim``[i] of the bottom.
+    """Permute the axes: axis i of the top is axis ``dim``[i] of the bottom.
 
     bottom[0]  any shape
     top[0]     its axes in the new order
@@ -51,7 +51,7 @@ class Transpose(Reordered):
     """
 
     def setup(self) -> None:
-        """Read the order, in which each axis has its place."""
+        """Read the order of the axes."""
         self.perm = list(value(self.param, "transpose_param").dim)
         axes = len(self.bottom_shapes[0])
         if sorted(self.perm) != list(range(axes)):
@@ -61,11 +61,11 @@ class Transpose(Reordered):
 
 @register("Reorg", "reorg_param")
 class Reorg(Layer):
-    """Trade pixels for channels, as Darknet does: it reads the bottom's numbers as if they had another shape.
+    """Convert pixels to channels, as Darknet does, which interprets the bottom's values with a different shape.
 
-    The bottom counts as C / s^2 channels of s H x s W pixels, s being ``stride``; pixel (s y + i, s x + j) of channel c
-    goes to pixel (y, x) of channel (s i + j) C / s^2 + c. The top is then given its shape. With ``reverse`` the bottom
-    counts as what such a step made, and it is undone.
+    The bottom is interpreted as C / s^2 channels of s H x s W pixels, where s is ``stride``. Pixel (s y + i, s x + j)
+    of channel c becomes pixel (y, x) of channel (s i + j) C / s^2 + c. The result is reshaped to the top's shape. With
+    ``reverse``, such a step is undone.
 
     bottom[0]  (N, C, H, W), C a multiple of s^2
     top[0]     (N, C s^2, H / s, W / s); with reverse (N, C / s^2, H s, W s)
@@ -101,21 +101,21 @@ class Reorg(Layer):
 
 @register("MergeCrop", "mergecrop_param")
 class MergeCrop(Layer):
-    """Put a larger blob, cut at its center to the smaller one's size, behind its channels, or add it.
+    """Crop the center of a larger blob to the size of the smaller one; append it as channels, or add it.
 
-    ``forward`` says of each bottom whether it is copied, zeros standing for one that is not; ``backward`` whether it
-    gets a gradient: by default the first does, the second does not.
+    ``forward`` says for each bottom whether it is copied; if not, zeros are used. ``backward`` says whether it
+    gets a gradient; by default only the first does.
 
     bottom[0]  the smaller (N, C, ...)
-    bottom[1]  the larger (N, C', ...), as many axes; with operation: ADD, C' = C
-    top[0]     (N, C + C', ...) of the first one's size; with operation: ADD, its shape
+    bottom[1]  the larger (N, C', ...), with as many axes; with operation: ADD, C' = C
+    top[0]     (N, C + C', ...) with the first bottom's size; with operation: ADD, its shape
     Fork: naibaf7/caffe, src/caffe/layers/mergecrop_layer.cu
     """
 
     bottoms = (2, 2)
 
     def setup(self) -> None:
-        """Read what passes each bottom."""
+        """Read ``forward`` and ``backward``."""
         param: Any = value(self.param, "mergecrop_param")
         for name in ("forward", "backward"):
             if len(getattr(param, name)) > 2:
@@ -145,7 +145,7 @@ class MergeCrop(Layer):
 
 @register("CropCenter", "crop_center_param")
 class CropCenter(Layer):
-    """Cut as much off both ends of each axis as ``crop_size`` says, one number for each axis.
+    """Crop both ends of each axis by ``crop_size``, which has one number for each axis.
 
     bottom[0]  any shape
     top[0]     as many axes; axis i is shorter by 2 crop_size[i]

@@ -1,4 +1,4 @@
-"""Normalize, a layer type that computes different things in several forks: SSD, TSN, and happynear's Caffe."""
+"""Normalize, which computes different things in the forks SSD, TSN and happynear's Caffe."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ HAPPYNEARS_EPS = 1e-6  # added to the sum
 
 
 class _Normalized(torch.autograd.Function):
-    """Normalize's formula. Its gradient is the fork's, not the derivative: the sum leaves the scales out.
+    """Normalize's formula. Its gradient is the fork's, not the derivative: the sum omits the scales.
 
-    dx = scale / length (dy - x sum(x dy) / length^2), where the derivative has sum(scale x dy). With one scale for all
-    channels the two are the same up to the place of the scale. Every SSD300 was trained with it.
+    dx = scale / length (dy - x sum(x dy) / length^2), while the derivative has sum(scale x dy). With one scale for all
+    channels, the difference is only the position of the scale. Every SSD300 was trained with it.
     Fork: src/caffe/layers/normalize_layer.cpp, Backward_cpu
     """
 
@@ -45,14 +45,14 @@ class Normalize(Layer):
     """Divide by the length over the channels of each pixel, or over the whole image.
 
     SSD's (norm_param): y = scale x / sqrt(sum of squares + eps), over the whole image unless across_spatial is false;
-    the scales are learned. TSN's has no scale and no eps, and is over the whole image. happynear's (normalize_param, or
-    a second top) has no scale and is over the channels; with normalize_type: "L1" it divides by the sum of absolute
-    values. The gradient of its second top counts with bp_norm only.
+    the scales are learnable. TSN's has no scale and no eps, and is over the whole image. happynear's (normalize_param,
+    or a second top) has no scale and is over the channels; with normalize_type: "L1" it divides by the sum of absolute
+    values. The gradient of its second top is used only with bp_norm.
 
     bottom[0]  (N, C, ...)
     top[0]     the same shape
     top[1]     optional, happynear's: the lengths (N, 1, H, W)
-    blobs[0]   scales (), or (C,) where channel_shared is false; 1 unless scale_filler is given        SSD's only
+    blobs[0]   scales (), or (C,) if channel_shared is false; 1 unless scale_filler is given           SSD's only
     Fork: weiliu89/caffe (ssd), yjxiong/caffe and happynear/caffe-windows, src/caffe/layers/normalize_layer.cpp
     """
 
@@ -82,7 +82,7 @@ class Normalize(Layer):
         self.eps, self.squares, self.passes_length = HAPPYNEARS_EPS, kind == "L2", bool(param and param.bp_norm)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the bottom's shape, and that of the lengths; there must be a scale for each channel."""
+        """Return the shapes of the bottom and of the lengths; there must be one scale per channel."""
         shape = bottom_shapes[0]
         if self.blobs and self.blob_shapes[0] not in ((), shape[1:2]):
             raise self.error(f"bottom of shape {shape} does not have the {self.blob_shapes[0][0]} channels", "bottom")
@@ -126,7 +126,7 @@ class Normalize(Layer):
 
 
 def normalize(x, scale, axes, eps):
-    """Divide by the length over some axes, and multiply by learned scales."""
+    """Divide by the length over some axes, and multiply by learnable scales."""
     length = (x.square().sum(axes, keepdim=True) + eps).sqrt()
     return scale * x / length
 

@@ -28,13 +28,13 @@ SLOPES, BIASES = 3, 4
     *(f"{GROUP}.{name}" for name in ("scale_filler", "bias_filler", "scale_bias")),
 )
 class BatchNorm(NotLearned, normalization.BatchNorm):
-    """Caffe's BatchNorm; with scale_bias its top is multiplied by learned slopes, and learned biases are added.
+    """Caffe's BatchNorm; with scale_bias, the top is multiplied by learnable slopes, and learnable biases are added.
 
     bottom[0]  (N, C) or (N, C, ...)
     top[0]     the same shape
     blobs[0]   sum of means     (C,)
     blobs[1]   sum of variances (C,)
-    blobs[2]   sum of weights   (1,)                                   what the others are to be divided by
+    blobs[2]   sum of weights   (1,)                                   the divisor of the other two
     blobs[3]   slopes (C,), 1 unless scale_filler is given             only with scale_bias
     blobs[4]   biases (C,), 0 unless bias_filler is given              only with scale_bias
     Fork: NVIDIA/caffe, src/caffe/layers/batch_norm_layer.cpp

@@ -1,4 +1,4 @@
-"""ReLU with an upper limit of 6, under the names that forks give it."""
+"""ReLU with an upper limit of 6, with the names of several forks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 class Capped(Activation):
-    """min(max(x, 0) + slope min(x, 0), 6); the gradient at 0 is the negative side's, at 6 none.
+    """min(max(x, 0) + slope min(x, 0), 6). The gradient at 0 is that of the negative side; at 6 it is 0.
 
     A subclass sets ``slope`` in its ``setup``.
     """

@@ -1,6 +1,6 @@
-"""Ristretto: layers that compute as a chip with few bits would, in the test phase. Training them is not supported.
+"""Ristretto: layers that simulate a chip with few bits, in the test phase. Training them is not supported.
 
-Not here are MINIFLOAT and LRNRistretto.
+MINIFLOAT and LRNRistretto are not supported.
 """
 
 from __future__ import annotations
@@ -43,25 +43,25 @@ NEAREST = 0  # QuantizationParameter.Rounding
 
 
 def rounded_half_up(x: torch.Tensor) -> torch.Tensor:
-    """Round to whole numbers, halves away from zero, as C's round; in double, where the half is exact."""
+    """Round to integers, halves away from zero, like C's round; computed in double, where a half is exact."""
     return torch.sign(x) * torch.floor(x.abs() + 0.5)
 
 
 def fixed_point(x: torch.Tensor, bits: int, fraction: int) -> torch.Tensor:
-    """Return the nearest numbers of ``bits`` bits, ``fraction`` of them behind the point, cut off at the ends."""
+    """Return the nearest fixed-point numbers with ``bits`` bits, ``fraction`` of them fractional, with saturation."""
     step, most = 2.0**-fraction, 2.0 ** (bits - 1)
     whole = rounded_half_up(x.double().clamp(-most * step, (most - 1) * step) / step)
     return (whole * step).to(x)
 
 
 def power_of_two(x: torch.Tensor, least: int, most: int) -> torch.Tensor:
-    """Return x rounded to plus or minus a power of two between 2^least and 2^most."""
+    """Round x to plus or minus a power of two between 2^least and 2^most."""
     exponent = rounded_half_up(x.abs().log2().double()).clamp(least, most)
     return torch.where(x >= 0, 1.0, -1.0) * torch.exp2(exponent).to(x)
 
 
 class _Quantized(Layer):
-    """Base of the layers. Bottoms, blobs and tops are rounded as quantization_param says."""
+    """Base of the layers. Bottoms, blobs and tops are rounded according to quantization_param."""
 
     not_exported = "its numbers are rounded to few bits"
 
@@ -94,32 +94,32 @@ class _Quantized(Layer):
 
 @register("ConvolutionRistretto", "convolution_param", GROUP)
 class ConvolutionRistretto(_Quantized, Convolution):
-    """A Convolution of rounded numbers.
+    """A Convolution with rounded numbers.
 
     bottom[i]  (N, C, H, W)
     top[i]     (N, num_output, H', W') as Convolution's
-    blobs      as Convolution's; they are rounded where they are used
+    blobs      as Convolution's; they are rounded when they are used
     Fork: Ristretto, src/caffe/ristretto/layers/conv_ristretto_layer.cpp, base_ristretto_layer.cpp
     """
 
 
 @register("DeconvolutionRistretto", "convolution_param", GROUP)
 class DeconvolutionRistretto(_Quantized, Deconvolution):
-    """A Deconvolution of rounded numbers.
+    """A Deconvolution with rounded numbers.
 
     bottom[i]  (N, C, H, W)
     top[i]     (N, num_output, H', W') as Deconvolution's
-    blobs      as Deconvolution's; they are rounded where they are used
+    blobs      as Deconvolution's; they are rounded when they are used
     Fork: Ristretto, src/caffe/ristretto/layers/deconv_ristretto_layer.cpp
     """
 
 
 @register("FcRistretto", "inner_product_param", GROUP)
 class FcRistretto(_Quantized, InnerProduct):
-    """An InnerProduct of rounded numbers.
+    """An InnerProduct with rounded numbers.
 
     bottom[0]  (N, ...)
     top[0]     (N, num_output)
-    blobs      as InnerProduct's; they are rounded where they are used
+    blobs      as InnerProduct's; they are rounded when they are used
     Fork: Ristretto, src/caffe/ristretto/layers/fc_ristretto_layer.cpp
     """

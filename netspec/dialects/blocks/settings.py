@@ -1,7 +1,7 @@
 """Settings of whole nets and solvers that forks added: Intel's, NVIDIA's and Yuanjun Xiong's Caffe.
 
-The rates are computed by netspec/solver/lr_policy.py. Types and memory say how a fork computes: here they have no
-effect, and a warning says so.
+netspec/solver/lr_policy.py computes the rates. Settings of types and memory affect only how a fork computes. Here they
+have no effect, and a warning says so.
 """
 
 DECLARATIONS = """

@@ -1,4 +1,4 @@
-"""Recognizing faces: the center loss, and products with an angular margin.
+"""Face recognition: the center loss, and products with an angular margin.
 
 Forks: ydwen/caffe-face, wy1iu/sphereface, wy1iu/LargeMargin_Softmax_Loss; happynear/caffe-windows has them all.
 """
@@ -45,9 +45,9 @@ extend LayerParameter {
 
 
 class _Distance(torch.autograd.Function):
-    """Distances to the centers, summed and divided by M. The centers' gradient is no derivative.
+    """Distances to the centers, summed and divided by M. The gradient of the centers is not the derivative.
 
-    It is the sum of the differences of a class, divided by 1 + their number n, and not scaled by the loss's weight;
+    It is the sum of the differences of a class, divided by 1 + their number n, and not scaled by the loss weight;
     happynear's code adds it n times.
     """
 
@@ -73,7 +73,7 @@ class _Distance(torch.autograd.Function):
 class CenterLoss(Loss, Classified):
     """Half the squared distances of vectors to the centers of their classes, divided by their number M.
 
-    With distance_type: "L1" (happynear's), the sums of absolute differences. Without loss_weight it does not count.
+    With distance_type: "L1" (happynear's), the sums of absolute differences. Without loss_weight, it is not a loss.
 
     bottom[0]  (M, ...): vectors of length K from ``axis`` on
     bottom[1]  labels (M,)
@@ -116,7 +116,7 @@ class CenterLoss(Loss, Classified):
 
 
 class _SphereProduct(torch.autograd.Function):
-    """Products with the margin at the labels. There the gradient's two parts are divided by their common length."""
+    """Products with the margin at the labels, where the gradient's two parts are divided by their common length."""
 
     @staticmethod
     def forward(
@@ -125,7 +125,7 @@ class _SphereProduct(torch.autograd.Function):
         rows, top = torch.arange(len(x), device=x.device), x @ weight.t()
         length = x.norm(dim=1)
         found, slope = margin(top[rows, labels] / length)
-        along = (found - top[rows, labels] / length * slope) / length  # of the derivative, the factor of x
+        along = (found - top[rows, labels] / length * slope) / length  # the factor of x in the derivative
         ctx.save_for_backward(x, weight, labels, slope, along)
         ctx.share = share
         top[rows, labels] += share * (length * found - top[rows, labels])
@@ -142,10 +142,10 @@ class _SphereProduct(torch.autograd.Function):
 
 @register("MarginInnerProduct", "margin_inner_product_param")
 class MarginInnerProduct(MarginProduct):
-    """The angular softmax of SphereFace: products with weights of length 1, which each pass makes so.
+    """The angular softmax of SphereFace: products with weights that each pass normalizes to length 1.
 
-    At the label it is (|x| psi(angle) + lambda x w) / (1 + lambda). The gradient is the fork's: the label's two parts
-    divided by their common length; the weights' as without a margin.
+    At the label, it is (|x| psi(angle) + lambda x w) / (1 + lambda). The gradient is the fork's: at the label, its two
+    parts are divided by their common length; that of the weights is as without a margin.
     Fork: wy1iu/sphereface, src/caffe/layers/margin_inner_product_layer.cpp
     """
 

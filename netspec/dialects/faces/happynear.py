@@ -1,7 +1,7 @@
 """happynear/caffe-windows, for face recognition: Normalize without a scale (blocks/normalize.py), losses, margins.
 
 Its BN keeps 1 / std in blobs[3] (segmentation/segnet.py), as do wy1iu/LargeMargin_Softmax_Loss and Cysu/caffe, branch
-domain-guided-dropout. If no field shows the fork, the dialect must be named.
+domain-guided-dropout. If no field determines the fork, the dialect must be named.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ extend LayerParameter {
 
 @register("LargeMarginInnerProduct", "largemargin_inner_product_param")
 class LargeMarginInnerProduct(MarginProduct):
-    """L-Softmax: products, at the label (|x| |w| psi(angle) + lambda x w) / (1 + lambda).
+    """L-Softmax: products, which at the label are (|x| |w| psi(angle) + lambda x w) / (1 + lambda).
 
     Fork: wy1iu/LargeMargin_Softmax_Loss, src/caffe/layers/largemargin_inner_product_layer.cpp
     """
@@ -122,9 +122,9 @@ def normalizes(param: Any) -> bool:
     where=normalizes,
 )
 class NormalizedInnerProduct(common.InnerProduct):
-    """Products with weights of length 1, which each pass makes so: of each num_output-th part of the memory.
+    """Products with weights that each pass normalizes to length 1, in each num_output-th part of the memory.
 
-    The gradient does not go through the length.
+    The gradient ignores the normalization.
     Fork: happynear/caffe-windows, src/caffe/layers/inner_product_layer.cpp
     """
 
@@ -139,10 +139,10 @@ class NormalizedInnerProduct(common.InnerProduct):
 
 @register("LabelSpecificAdd", "label_specific_add_param")
 class LabelSpecificAdd(Layer):
-    """Add a bias to each item's score of its label, where that is above -bias; in TRAIN only. The margin of AM-Softmax.
+    """Add a bias to the score of each item's label if the score is above -bias, in TRAIN only: AM-Softmax's margin.
 
-    With bias_base the bias of pass i, from ``iteration`` on, is bias_base + (1 + bias_gamma i)^bias_power - 1, within
-    bias_min and bias_max. The gradient is the top's.
+    With bias_base, the bias of pass i, starting at ``iteration``, is bias_base + (1 + bias_gamma i)^bias_power - 1,
+    within bias_min and bias_max. The gradient is that of the top.
 
     bottom[0]  scores (N, ...)
     bottom[1]  labels (N,)
@@ -216,7 +216,7 @@ ONEADDP = 2  # FocalLossParameter.Type
 
 
 class _Focal(torch.autograd.Function):
-    """-(base -+ p)^gamma log(p) of each label's p; the gradient is the fork's, right where base is 1."""
+    """-(base -+ p)^gamma log(p) for each label's p. The gradient is the fork's, which is correct if base is 1."""
 
     @staticmethod
     def forward(
@@ -239,14 +239,14 @@ class _Focal(torch.autograd.Function):
 
 @register("FocalLoss", "focal_loss_param", "loss_param", "softmax_param")
 class FocalLoss(Loss, Classified):
-    """-(alpha - p)^gamma log(p), p the softmax of the label; (alpha + p)^gamma with type: ONEADDP.
+    """-(alpha - p)^gamma log(p), where p is the softmax of the label; (alpha + p)^gamma with type: ONEADDP.
 
-    In nets of detectors (rcnn, ssd) it is zimenglan's: -alpha (1 - p)^gamma log(p), alpha 0.25 unless it is given.
+    In nets of detectors (rcnn, ssd), it is zimenglan's: -alpha (1 - p)^gamma log(p) with a default alpha of 0.25.
 
     bottom[0]  scores (N, C, ...), C at softmax_param.axis
     bottom[1]  labels, one per prediction
-    top[0]     the loss, (): the sum, normalized as loss_param says (default VALID)
-    top[1]     optional: the softmax, bottom[0]'s shape; brings no gradient
+    top[0]     the loss, (): the sum, normalized according to loss_param (default VALID)
+    top[1]     optional: the softmax, in bottom[0]'s shape; its gradient is ignored
     Fork: happynear/caffe-windows, src/caffe/layers/focal_loss_layer.cpp; zimenglan-sysu-512/Focal-Loss, that of the
     paper (Lin et al., ICCV 2017)
     """
@@ -302,7 +302,7 @@ class Flip(Layer):
 
 
 class _Scaled(torch.autograd.Function):
-    """x times factor; the gradients are those of x times scale, where they are wanted."""
+    """x times factor; the gradients, if needed, are those of x times scale."""
 
     @staticmethod
     def forward(
@@ -321,16 +321,16 @@ class _Scaled(torch.autograd.Function):
 
 @register("ChannelScale", "channel_scale_param")
 class ChannelScale(NotLearned):
-    """Multiply all channels of a pixel by one number; with global_scale, everything by their running mean.
+    """Multiply all channels of a pixel by a number; with global_scale, multiply everything by a running mean of them.
 
-    do_forward: false leaves the maps as they are, do_backward_feature: false their gradient; do_backward_scale: false
-    brings the numbers none. The gradients are those of the numbers with global_scale too.
+    do_forward: false does not change the maps, and do_backward_feature: false does not change their gradient. With
+    do_backward_scale: false, the numbers have no gradient. With global_scale, the gradients are the same as without.
 
     bottom[0]  (N, C, ...)
     bottom[1]  the numbers (N, 1, ...)
     top[0]     the shape of bottom[0]
     top[1]     optional, with global_scale: the scale (1,)
-    blobs[0]   with global_scale: the scale (1,), kept within its bounds; below 0 before the first pass
+    blobs[0]   with global_scale: the scale (1,), limited to its bounds; below 0 before the first pass
     Fork: happynear/caffe-windows, src/caffe/layers/channel_scale_layer.cu; its code for CPUs keeps no running mean
     """
 
@@ -364,7 +364,7 @@ class ChannelScale(NotLearned):
         return top if self.num_tops == 1 else (top, factor)
 
     def _averaged(self, scale: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
-        """Return the scale; in TRAIN a hundredth of the new mean goes into it, all of the first."""
+        """Return the scale; in TRAIN, it moves by 1/100 to the new mean; the first mean replaces it."""
         if self.phase == TEST:
             return scale
         p, found = self.settings, torch.where(scale < 0, mean, 0.99 * scale + 0.01 * mean)
@@ -377,7 +377,7 @@ class Cosine(Layer):
 
     bottom[0]  any shape
     top[0]     the same shape
-    Fork: happynear/caffe-windows, src/caffe/layers/cosine_layer.cu; its gradient for CPUs leaves the top's out
+    Fork: happynear/caffe-windows, src/caffe/layers/cosine_layer.cu; its gradient for CPUs omits that of the top
     """
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
@@ -388,7 +388,7 @@ class Cosine(Layer):
 
 
 class _Arccos(torch.autograd.Function):
-    """The arc cosine. Above 0.99 its gradient is the one at 0.99."""
+    """The arc cosine. Above 0.99, its gradient is that at 0.99."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
@@ -402,7 +402,7 @@ class _Arccos(torch.autograd.Function):
 
 @register("Arccos")
 class Arccos(Cosine):
-    """The arc cosine of each number, nan beyond 1; above 0.99 the gradient is that of 0.99.
+    """The arc cosine of each number, NaN beyond 1; above 0.99, the gradient is that at 0.99.
 
     Fork: happynear/caffe-windows, src/caffe/layers/arccos_layer.cpp
     """

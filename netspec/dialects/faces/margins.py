@@ -1,4 +1,4 @@
-"""Products of vectors with the weights of classes, the label's with a larger angle: L-Softmax and SphereFace."""
+"""Products of vectors with class weights, with a larger angle at the label: L-Softmax and SphereFace."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ Margin = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 
 
 def double(c: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return psi of an angle with cosine c, which goes on falling where cos(2 angle) rises again, and its slope."""
+    """Return psi(angle) for cosine c, the monotonically decreasing extension of cos(2 angle), and its slope."""
     sign = c.sign()
     return 2 * sign * c**2 - 1, 4 * sign * c
 
 
 def triple(c: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """As :func:`double`, for cos(3 angle)."""
+    """Like :func:`double`, for cos(3 angle)."""
     far = (c.abs() - 0.5).sign()
     return far * (4 * c**3 - 3 * c) + c.sign() * (1 + far) - 2, far * (12 * c**2 - 3)
 
 
 def quadruple(c: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """As :func:`double`, for cos(4 angle)."""
+    """Like :func:`double`, for cos(4 angle)."""
     sign = c.sign() * (2 * c**2 - 1).sign()
     return sign * (8 * c**4 - 8 * c**2 + 1) + 2 * c.sign() + sign - 3, sign * (32 * c**3 - 16 * c)
 
 
-MARGINS: Sequence[Margin | None] = (None, double, triple, quadruple)  # by the values of the enum
+MARGINS: Sequence[Margin | None] = (None, double, triple, quadruple)  # indexed by the values of the enum
 
 
 class MarginProduct(Classified):

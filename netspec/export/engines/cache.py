@@ -90,7 +90,7 @@ def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, b
         if _is_whole(place):
             return place, False
         aside = Path(tempfile.mkdtemp(prefix=".damaged-", dir=folder))
-        log.logger.warning(f"{place}: is damaged, and is made again; what was there is {aside.name} now")
+        log.logger.warning(f"{place}: was damaged and is being recreated; the damaged one was renamed to {aside.name}")
         with suppress(FileNotFoundError):  # another process moved it
             place.rename(aside)
     folder.mkdir(parents=True, exist_ok=True)

@@ -77,7 +77,7 @@ class Model:
                 folder, made = entry(self.choice.cache, key, make)
             except OSError as fault:
                 where = self.choice.cache
-                log.logger.warning(f"{where}: cannot be written: {fault.strerror}; the exported model is not kept")
+                log.logger.warning(f"{where}: cannot be written: {fault.strerror}; the exported model will not be kept")
             else:
                 if not made:
                     _warn_again(folder / WARNINGS)

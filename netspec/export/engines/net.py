@@ -63,9 +63,9 @@ def with_engine(net: Net, choice: Choice, path: str | Path, weights: Iterable[st
     weights = list(weights)
     reason = ""
     if net.phase != TEST:
-        reason = f"it runs nets in phase TEST, this one is in {PHASE_NAMES[net.phase]}"
+        reason = f"it runs nets in phase TEST, but this net is in phase {PHASE_NAMES[net.phase]}"
     elif net.device.type != "cpu":
-        reason = f"it runs on the CPU, this net is on {net.device}"
+        reason = f"it runs on the CPU, but this net is on {net.device}"
     if reason:
         warn_unable(choice, reason)
         return net
@@ -119,7 +119,7 @@ class Engine:
         aliased = any(map(may_have_alias, self._blobs()))
         if aliased and not self._warned:
             self._warned = True
-            warn_unable(self._choice, "a program could change parameters by .data or an array that it holds")
+            warn_unable(self._choice, "a program could change the parameters through .data or an array it holds")
         return aliased
 
     def _pass(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
@@ -175,7 +175,7 @@ def _writer(net: Net, path: Path) -> Write:
 
     def write(to: Path, blobs: Sequence[str]) -> None:
         original = held()
-        assert original is not None, "it is run by what calls this"
+        assert original is not None, "the caller runs it"
         if readers:
             shapes = {blob: original.shapes[blob] for blob in readers}
             given = BuildOptions(level=chosen.level, stages=chosen.stages, given_shapes=shapes)

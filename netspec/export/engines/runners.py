@@ -164,7 +164,7 @@ class OpenVino:
             with signal_stack_kept():
                 able = self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
             if BF16.upper() not in able:
-                raise Unable("this CPU has no bf16")
+                raise Unable("this CPU has no bf16 instructions")
         self._path, self._precision = folder / MODEL, "bf16" if precision == BF16 else "f32"
         self._compiled: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
 
@@ -216,7 +216,7 @@ def open_runner(engine: str, folder: Path, precision: str) -> Runner:
         if engine == OPENVINO:
             return OpenVino(folder, precision)
         if precision == BF16:
-            raise Unable(f"{engine} has no bf16 here")
+            raise Unable(f"{engine} does not support bf16 here")
         return OnnxRuntime(folder)
     except Unable:
         raise

@@ -79,7 +79,7 @@ def export_net(source: Source, target: str, out: Path, preprocess: Preprocess | 
     Raises SpecError for any error in the files, and for a layer that cannot be exported.
     """
     if not out.parent.is_dir():
-        raise SpecError(f"there is no folder {out.parent}; make it first", Where(str(out)))
+        raise SpecError(f"there is no folder {out.parent}; create it first", Where(str(out)))
     net = source.net()
     if target == "onnx":
         if preprocess and preprocess.blob not in net.inputs:
@@ -110,7 +110,7 @@ def blob_tensors(net: Net) -> dict[str, torch.Tensor]:
 def fold_files(source: Source, prefix: Path) -> tuple[int, int]:
     """Write the folded net as PREFIX.prototxt and PREFIX.caffemodel; return the layer counts before and after."""
     if not prefix.parent.is_dir():
-        raise SpecError(f"there is no folder {prefix.parent}; make it first", Where(str(prefix)))
+        raise SpecError(f"there is no folder {prefix.parent}; create it first", Where(str(prefix)))
     net = source.net()
     message = fold(net)
     write_caffe(message, prefix)

@@ -96,7 +96,7 @@ def fold(net: Net) -> NetParameter:
 
 def _found_folds(net: Net) -> list[Any]:
     if find_spec("netspec.fast") is None:
-        raise SpecError("to fold a net needs netspec/fast, which is not installed", Where(net.plan.source.file))
+        raise SpecError("folding a net needs netspec/fast, which is not installed", Where(net.plan.source.file))
     from netspec.fast.fold import find_folds
 
     return find_folds(net.plan, list(net.layers))

@@ -222,7 +222,7 @@ class _Writer:
             name = blob
             if blob in taken:
                 name = self.unique(f"{blob}_of_{layer_of[v]}")
-                descriptions[name] = f'blob "{blob}" as layer "{layer_of[v]}" leaves it'
+                descriptions[name] = f'blob "{blob}" after layer "{layer_of[v]}"'
             taken.add(name)
             new_names[old] = name
         for node in self.nodes:
@@ -317,7 +317,7 @@ class _LayerGraph(_Steps):
             found = self._like(number, axis)
             if found is None and inferred:
                 raise Fixed(
-                    number, axis, f'layer "{self.name}" ({self.layer.type}): its shape has several sizes to infer'
+                    number, axis, f'layer "{self.name}" ({self.layer.type}): more than one size of its shape is unknown'
                 )
             inferred = inferred or found is None
             parts.append(found or self.constant([-1]))

@@ -41,7 +41,7 @@ class Preprocess:
     def description(self) -> str:
         """The input of the exported model, in one line."""
         steps = [
-            *(["the middle part of the net's size is taken"] if self.crop else []),
+            *(["images are cropped to the net's size"] if self.crop else []),
             *(["the channels are reversed"] if self.swap else []),
             *([f"multiplied by {self.raw_scale:g}"] if self.raw_scale != 1 else []),
             *(["the mean is subtracted"] if self.mean is not None else []),
@@ -92,7 +92,7 @@ class Preprocess:
 
     def _crop(self, graph: Any, value: str, shape: Sizes) -> str:
         if shape[2] is None or shape[3] is None:
-            raise SpecError(f"--crop: the height and width of {self.blob} are free, so there is no size to crop to")
+            raise SpecError(f"--crop: the height and width of {self.blob} are dynamic, so there is no size to crop to")
         size = graph.constant([shape[2], shape[3]])
         start = graph.node("Div", graph.node("Sub", graph.shape_of(value, 2, 4), size), graph.constant([2, 2]))
         return graph.node("Slice", value, start, graph.node("Add", start, size), graph.constant([2, 3]))

@@ -60,9 +60,7 @@ def export_pt2(net: Net, path: str | Path) -> list[str]:
         except Exception as fault:
             reason = str(fault).strip().splitlines()
             if not names:
-                raise SpecError(
-                    f"torch.export cannot take it: {reason[0] if reason else fault}", Where(str(path))
-                ) from fault
+                raise SpecError(f"torch.export failed: {reason[0] if reason else fault}", Where(str(path))) from fault
             continue
         with whole_file(path) as unfinished:
             buffer = io.BytesIO()
@@ -70,7 +68,7 @@ def export_pt2(net: Net, path: str | Path) -> list[str]:
             unfinished.write_bytes(buffer.getvalue())
         fixed = [free.name for free in shapes.free if not free.counted and free.name not in names]
         return [*notes, *([f"torch.export fixes the sizes {' and '.join(fixed)}"] if fixed else [])]
-    raise AssertionError("the last choice has no free size")
+    raise AssertionError("the last choice has no dynamic size")
 
 
 def torch_module(net: Net) -> nn.Module:

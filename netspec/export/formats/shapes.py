@@ -113,7 +113,7 @@ def find_shapes(net: Net) -> NetShapes:
             free.append(FreeSize(name, size, axes, tried))
         else:
             culprit = fault.where and fault.where.layer
-            fixed.append(_line(name, size, f"{fault.where} takes no other" if culprit else str(fault)))
+            fixed.append(_line(name, size, f"{fault.where} accepts no other size" if culprit else str(fault)))
     for node, layer in zip(net.plan.nodes, net.layers, strict=True):
         if layer.counted_axis is not None:
             axes = tuple((v, layer.counted_axis) for v in node.tops)

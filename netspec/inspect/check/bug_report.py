@@ -64,7 +64,7 @@ def _about(path: Path) -> Iterator[str]:
             shapes = ((layer, ", ".join(str(blob.shape) for blob in layer.blobs)) for layer in stored_layers(path))
             yield from _block(f"{layer.name} ({layer.type}): {blobs}" for layer, blobs in shapes)
         else:
-            yield "no text, and no .caffemodel"
+            yield "neither text nor a .caffemodel"
     except SpecError as fault:
         yield str(fault)
     except OSError as fault:

@@ -26,7 +26,9 @@ def compare_files(first: str | Path, second: str | Path, tolerance: float = 0.0)
     """
     old, new = _read(first), _read(second)
     if old[0] != new[0]:
-        raise SpecError(f"is {new[0]}, and {first} is {old[0]}; expected two files of one kind", Where(str(second)))
+        raise SpecError(
+            f"is {new[0]}, and {first} is {old[0]}; expected two files of the same kind", Where(str(second))
+        )
     if old[0] == WEIGHTS:
         from netspec.inspect.check.compare_weights import compare_weights  # NumPy is not loaded for two prototxts
 

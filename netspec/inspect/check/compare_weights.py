@@ -60,7 +60,7 @@ def _difference(was: np.ndarray, now: np.ndarray, tolerance: float) -> str:
     largest = np.abs(a[np.isfinite(a)]).max(initial=0.0)
     changed = difference[difference > tolerance]
     return (
-        f"{count} of {a.size} values differ, by {changed.mean():.3g} in the mean and {changed.max():.3g} at most; "
+        f"{count} of {a.size} values differ, by {changed.mean():.3g} on average and {changed.max():.3g} at most; "
         f"the largest was {largest:.3g}"
     )
 

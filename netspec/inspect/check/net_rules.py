@@ -46,7 +46,7 @@ def _transforms(net: NetParameter, source: SourceMap) -> Said:
                 yield (
                     source.at(i, "transform_param", name, layer=layer.name, type=layer.type),
                     f'{name} is {_as_text(here)} here, and {_as_text(there)} in line {line}, where "{layer.top[0]}" of '
-                    "another phase is read; give both the same",
+                    "the other phase is read; use the same value in both",
                 )
 
 
@@ -75,7 +75,7 @@ def _weightless(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
     for i, weights in enumerate(_loss_weights(plan) if _is_training(plan) else ()):
         cls = layer_class(plan.nodes[i].type)
         if cls is not None and cls.is_loss and not any(weights):
-            yield _place(plan, i, "loss_weight"), "nothing is learned from a loss of weight 0; give it another weight"
+            yield _place(plan, i, "loss_weight"), "a loss of weight 0 trains nothing; set another loss_weight"
 
 
 @rule("batchnorm-without-scale", PLAN)
@@ -112,7 +112,7 @@ def _global_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said
     for i, node in enumerate(plan.nodes if _is_training(plan) else ()):
         if node.type == "BatchNorm" and plan.net.layer[i].batch_norm_param.use_global_stats:
             place = _place(plan, i, "batch_norm_param", "use_global_stats")
-            yield place, "use_global_stats is true in a training; leave it out, and each phase does what it should"
+            yield place, "use_global_stats is true in phase TRAIN; remove it, so that each phase uses its default"
 
 
 @rule("batch-stats-in-test", PLAN)
@@ -122,7 +122,7 @@ def _batch_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
         param = plan.net.layer[i].batch_norm_param
         if node.type == "BatchNorm" and param.HasField("use_global_stats") and not param.use_global_stats:
             place = _place(plan, i, "batch_norm_param", "use_global_stats")
-            yield place, "use_global_stats is false in phase TEST; leave it out, and each phase does what it should"
+            yield place, "use_global_stats is false in phase TEST; remove it, so that each phase uses its default"
 
 
 @rule("zero-weights", PLAN)
@@ -137,7 +137,10 @@ def _zero_weights(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
         for name, param in own_settings(plan.net.layer[i]):
             fields = fields_of(param.DESCRIPTOR)
             if "weight_filler" in fields and not fields["weight_filler"].present(param):
-                yield _place(plan, i, name), 'its weights begin at 0; add weight_filler { type: "xavier" } or another'
+                yield (
+                    _place(plan, i, name),
+                    'its initial weights are all 0; add weight_filler { type: "xavier" } or another',
+                )
 
 
 @rule("softmax-twice", PLAN)
@@ -148,7 +151,10 @@ def _softmax_twice(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
         maker = makers.get(node.bottoms[0], -1) if node.type == "SoftmaxWithLoss" and node.bottoms else -1
         if maker >= 0 and plan.nodes[maker].type == "Softmax":
             name = plan.nodes[maker].name
-            yield _place(plan, i), f'it reads Softmax "{name}", and computes a softmax itself; read what "{name}" reads'
+            yield (
+                _place(plan, i),
+                f'its bottom is Softmax "{name}", but it computes a softmax itself; use the bottom of "{name}"',
+            )
 
 
 @rule("towers-not-shared", NET)
@@ -177,7 +183,7 @@ def _towers(net: Net) -> Said:
                 total = len(net.layers[i].blobs)
                 yield (
                     _place(net.plan, i),
-                    f"{count} of its {total} parameter blobs are not shared with the other tower of "
+                    f"{count} of its {total} parameter blobs are not shared with the other branch of "
                     f'"{node.name}"; give them the same param {{ name }}',
                 )
 
@@ -187,7 +193,7 @@ def _losses(net: Net) -> Said:
     """A loss that depends on no learnable parameter teaches nothing."""
     for i, weights in enumerate(net.loss_weights if net.phase == TRAIN else ()):
         if any(weights) and not net.backward_plan.layers[i]:
-            yield (_place(net.plan, i), "this loss depends on no learnable parameter; is an lr_mult 0?")
+            yield (_place(net.plan, i), "this loss depends on no learnable parameter; is lr_mult 0?")
 
 
 @rule("caffe-stops", NET)
@@ -204,7 +210,7 @@ def _caffe_stops(net: Net) -> Said:
                 message = f"Caffe stops here: {node.type} takes {fewest} to {most} axes, bottom {j} has {len(shape)}"
                 yield _place(net.plan, i, "bottom", j), f"{message}; put a Reshape before it"
         if node.type == "Pooling" and net.plan.net.layer[i].pooling_param.pool == STOCHASTIC:
-            message = "Caffe stops here without a GPU: STOCHASTIC pooling is written for CUDA alone; set another pool"
+            message = "Caffe stops here without a GPU: it has STOCHASTIC pooling only for CUDA; set another pool"
             yield _place(net.plan, i, "pooling_param", "pool"), message
         asked = net.backward_plan.bottoms[i] if net.phase == TRAIN and net.backward_plan.layers[i] else ()
         for j, wanted in enumerate(asked):

@@ -12,11 +12,11 @@ from netspec.proto.schema import TRAIN
 from netspec.solver.precision import has_bfloat16
 
 KINDS = {
-    "packed": "by oneDNN, weights laid out in advance, channels side by side",
+    "packed": "by oneDNN, with packed weights and channels-last layout",
     "exact": "sums in Caffe's order (--exact)",
     "prepared": "by torch's kernels",
-    "as is": "like a layer in training: its parameters may be written to",
-    "by value": "like a layer in training: the shapes follow from values",
+    "as is": "like a layer in training, since its parameters may be modified",
+    "by value": "like a layer in training, since its shapes depend on values",
 }
 
 _BFLOAT16 = {True: "yes", False: "no", None: "unknown"}
@@ -33,7 +33,7 @@ def plan_text(net: Net) -> str:
         how = f"each pass goes through autograd: {why}" if isinstance(why, str) else "by kernels prepared once"
         return f"no passes: nets run layer by layer in phase TRAIN. Training in fp32, {how}; {bfloat16}"
     if net.prepared is None:
-        return f"no passes: nets run layer by layer where passes are switched off; {bfloat16}"
+        return f"no passes: nets run layer by layer if passes are switched off; {bfloat16}"
     given = tuple(
         (v, shape, torch.float32)
         for node, layer in zip(net.plan.nodes, net.layers, strict=True)

@@ -33,7 +33,7 @@ RULE_SETTINGS = {
 def _snapshots(solver: Any, node: Place) -> Said:
     """A training without a snapshot leaves no weights behind."""
     if solver.snapshot > solver.max_iter:
-        message = f"snapshot {solver.snapshot} is more than max_iter {solver.max_iter}: no effect; make it smaller"
+        message = f"snapshot {solver.snapshot} is more than max_iter {solver.max_iter}, so it has no effect; lower it"
         yield node.find("snapshot"), message
     elif not solver.snapshot and not solver.snapshot_after_train:
         yield node.where, "no snapshot is taken; set snapshot, or snapshot_after_train: true"
@@ -54,7 +54,7 @@ def _steps(solver: Any, node: Place) -> Said:
     name, values = steps.get(solver.lr_policy, ("", []))
     for k, value in enumerate(values):
         if value >= solver.max_iter > 0:
-            message = f"{name} {value} is not below max_iter {solver.max_iter}: that step never comes; change either"
+            message = f"{name} {value} is not below max_iter {solver.max_iter}, so it never happens; change one of them"
             yield node.find(name, k), message
 
 
@@ -62,7 +62,7 @@ def _steps(solver: Any, node: Place) -> Said:
 def _tests(solver: Any, node: Place) -> Said:
     """A test that comes after the last iteration is run only at the start, if at all."""
     if solver.test_iter and solver.test_interval > solver.max_iter:
-        message = f"test_interval {solver.test_interval} is more than max_iter {solver.max_iter}; make it smaller"
+        message = f"test_interval {solver.test_interval} is more than max_iter {solver.max_iter}; lower it"
         yield node.find("test_interval"), message
 
 
@@ -96,12 +96,14 @@ def _same_data(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
         for i, layer, field, source in _sources(net):
             if os.path.realpath(source) in trained:
                 place = net.plan.source.at(i, field, "source", layer=layer.name, type=layer.type)
-                yield place, f'the test reads "{source}", which the net is trained on; name another database'
+                yield place, f'the test reads "{source}", which the net is trained on; use another database'
     if len(nets) == 1 and (solver.net or solver.HasField("net_param")):
         for i, layer, field, source in _sources(nets[0]):
             if not layer.include and not layer.exclude:
                 place = nets[0].plan.source.at(i, field, "source", layer=layer.name, type=layer.type)
-                message = f'a test would read "{source}" too, which the net is trained on; give phase TEST a data layer'
+                message = (
+                    f'a test would also read "{source}", which the net is trained on; add a data layer for phase TEST'
+                )
                 yield place, message
 
 
@@ -119,7 +121,7 @@ def _filled_by_script(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
     for net in nets:
         for fault in net.missing_inputs():
             if fault.where:
-                yield fault.where, f"{fault.message}, or fill them from a script"
+                yield fault.where, f"{fault.message}, or fill them in a script"
 
 
 @rule("untrained-in-test", SOLVER)

@@ -132,7 +132,7 @@ class _Watch:
             first = f'the first record, "{self._first.key}", {times(self._first.values.shape)}'
             return f"is {times(values.shape)}, {first}"
         if values.dtype != np.uint8 and not np.isfinite(values).all():
-            return "has a NaN or an infinity"
+            return "contains a NaN or an infinity"
         return ""
 
     def see(self, record: Record, sound: bool) -> None:
@@ -154,7 +154,7 @@ class _Watch:
         labels = np.array(self._labels)
         _, place, counts = np.unique(np.array(self._hashes, np.uint64), return_inverse=True, return_counts=True)
         if (twice := int((counts - 1).sum())) > 0:
-            yield f"records with the values of another one: {twice:,}"
+            yield f"records with the same values as another record: {twice:,}"
         least, most = (np.full(len(counts), end) for end in (np.inf, -np.inf))
         known = ~np.isnan(labels)
         np.minimum.at(least, place[known], labels[known])
@@ -162,11 +162,11 @@ class _Watch:
         if differing := int((most > least).sum()):
             yield f"images that occur with different labels: {differing:,}"
         if self._flat:
-            yield f"records with one value everywhere: {self._flat:,}"
+            yield f"records in which all values are equal: {self._flat:,}"
         if 0 < self._found.unlabeled < self._found.records:
             yield f"records without a label, which Caffe reads as 0: {self._found.unlabeled:,}"
         if len(labels) >= _SORTED and len(self._found.labels) > 1 and (np.diff(labels) >= 0).all():
-            yield "the records are in the order of their labels: batches hold few classes; shuffle when converting"
+            yield "the records are sorted by label, so batches have few classes; shuffle when converting"
 
 
 def as_json(found: Survey) -> dict[str, Any]:
@@ -193,7 +193,7 @@ def as_json(found: Survey) -> dict[str, Any]:
 
 def as_lines(found: Survey, name: str) -> list[str]:
     """Return the survey as lines of text."""
-    looked = "" if found.records == found.total else f", looked at {found.records:,} spread over them"
+    looked = "" if found.records == found.total else f", {found.records:,} of them read"
     lines = [f"{name}: {found.total:,} records{looked}, {amount(found.size)} of values"]
     lines += [f"  {count:>9,}  {form}" for form, count in found.forms.most_common(10)]
     lines += [f"labels: {labels_line(found)}"]

@@ -34,7 +34,8 @@ def write_picture(
     diagram = diagram_of(*_net_of(path, options), phases, options)
     if len(diagram.boxes) > MANY:
         log.warning(
-            "draw_net.py:1", f"drawing {len(diagram.boxes)} boxes takes minutes; Graphviz' time grows with their square"
+            "draw_net.py:1",
+            f"drawing {len(diagram.boxes)} boxes takes minutes, since Graphviz's time grows with their square",
         )
     if out.suffix == ".html":
         content = net_page(diagram).encode()

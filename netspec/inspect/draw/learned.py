@@ -67,7 +67,7 @@ def maps_figure(maps: np.ndarray, image: np.ndarray, title: str) -> Figure:
     count = int(np.prod(maps.shape[:-2]))
     words += f" ({len(shown)} of them shown)" if count > len(shown) else ""
     still = int((np.ptp(maps.reshape(count, -1), axis=1) == 0).sum())
-    words += f"; {still} of one value everywhere" if still else ""
+    words += f"; {still} constant" if still else ""
     columns = min(_TILES_WIDE, int(np.ceil(np.sqrt(len(shown)))))
     return _mosaic(list(shown), columns, words, ("viridis", float(low), float(high)), image)
 
@@ -90,7 +90,7 @@ def saliency_figure(images: Sequence[np.ndarray], maps: Sequence[np.ndarray], ti
             for axis, shown, name in zip(
                 grid[row],
                 (picture, heat, picture / 255 * dim),
-                ("image", "saliency", "what matters is bright"),
+                ("image", "saliency", "bright pixels matter most"),
                 strict=True,
             ):
                 axis.imshow(shown)
@@ -198,7 +198,7 @@ def _numbers(values: np.ndarray, image: np.ndarray, title: str) -> Figure:
         axis.margins(x=0.01)
         greatest = np.argsort(-values)[:5]
         listed = ", ".join(f"{k} ({number(float(f'{values[k]:.3g}'))})" for k in greatest)
-        words = textwrap.wrap(f"{title}: {len(values)} values; greatest: {listed}", 105)
+        words = textwrap.wrap(f"{title}: {len(values)} values; largest: {listed}", 105)
         figure.suptitle("\n".join(words), fontsize=10, parse_math=False, x=0.01, ha="left")
         return figure
 
@@ -223,7 +223,7 @@ def _point_colors(
     norm = Normalize(np.nanmin(values), max(float(np.nanmax(values)), float(np.nanmin(values)) + 1))
     drawn = axis.scatter(points[:, 0], points[:, 1], c=values, cmap="viridis", norm=norm, s=14)
     bar = figure.colorbar(drawn, ax=axis, fraction=0.03, pad=0.01, aspect=40)
-    bar.set_label("label" if by_label else "number of the image, in order")
+    bar.set_label("label" if by_label else "index of the image")
     return [tuple(color) for color in matplotlib.colormaps["viridis"](norm(values))]
 
 

@@ -87,7 +87,7 @@ def _fault_lines(found: Survey) -> list[str]:
     if not found.num_faults:
         return ["faults: none"]
     examples = [f"  {fault.key}: {fault.text}" for fault in found.faults[:3]]
-    return [f"faults: {found.num_faults:,} records that a data layer refuses", *examples]
+    return [f"errors: {found.num_faults:,} records that a data layer refuses", *examples]
 
 
 def _draw_head(figure: Figure, whole: Axes, lines: Sequence[str], found: Survey, height: float, head: float) -> None:

@@ -107,7 +107,7 @@ def what_is_shown(values: np.ndarray) -> str:
     """Return a note if a picture of values (C, H, W) cannot show the channels themselves; "" if it can."""
     if values.shape[1:] == (1, 1) and len(values) > 4:
         return f"vectors of {len(values)} numbers as blocks"
-    return f"{times(values.shape)}, the mean of the channels" if len(values) not in (1, 3, 4) else ""
+    return f"{times(values.shape)}, mean of the channels" if len(values) not in (1, 3, 4) else ""
 
 
 def draw_tile(axis: Axes, picture: np.ndarray, left: float, bottom: float, width: float, height: float) -> None:

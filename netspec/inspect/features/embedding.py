@@ -32,7 +32,7 @@ class Features:
 def read_features(path: str | Path, array: str = "") -> Features:
     """Return the descriptors of a features.npz (docs/features.md); ``array`` names one of several. Raises SpecError."""
     where = Where(str(path))
-    arrays = read_npz(path, "a features.npz of netspec extract")
+    arrays = read_npz(path, "a features.npz written by netspec extract")
     found = {name: values for name, values in arrays.items() if name not in _BESIDE and values.ndim == 2}
     chosen = array or next(iter(found), "")
     if chosen not in found:
@@ -64,7 +64,7 @@ def in_plane(values: np.ndarray, method: str = PCA) -> tuple[np.ndarray, str]:
     perplexity = min(_PERPLEXITY, (len(values) - 1) / 3)
     start: Any = points / max(float(points[:, 0].std()), 1e-12) * 1e-4
     moved = TSne(init=start, perplexity=perplexity, random_state=0, learning_rate="auto").fit_transform(values)
-    return np.asarray(moved), f"t-SNE, perplexity {perplexity:g}: only who is near whom has a meaning"
+    return np.asarray(moved), f"t-SNE, perplexity {perplexity:g}: only neighborhoods are meaningful"
 
 
 SIDE = 112  # pixels on the longer side
@@ -110,11 +110,11 @@ def _numbers(names: list[str] | None, known: dict[str, int], size: int, count: i
     """Return which image each descriptor belongs to."""
     if names is None:
         if size != count:
-            raise SpecError(f"has {size} images; the descriptors are {count}, without names", Where(str(path)))
+            raise SpecError(f"has {size} images, but there are {count} descriptors (without names)", Where(str(path)))
         return list(range(count))
     for name in names:
         if name not in known:
-            raise SpecError(f'has no image "{name}", but there is a descriptor of it', Where(str(path)))
+            raise SpecError(f'has no image "{name}", which has a descriptor', Where(str(path)))
     return [known[name] for name in names]
 
 

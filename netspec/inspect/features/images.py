@@ -107,7 +107,7 @@ class ImageNet:
     def _open(self, origin: Origin, device: str) -> None:
         """Open the model of the chosen engine, or let torch run the net."""
         if self._choice.engine == TORCH or device != "cpu":
-            self._use_torch("" if self._choice.engine == TORCH else f"it runs on the CPU, this net is on {device}")
+            self._use_torch("" if self._choice.engine == TORCH else f"it runs on the CPU, but this net is on {device}")
             return
         try:
             self._model = Model(self._choice, origin, self._export)
@@ -229,8 +229,8 @@ def _warn_of_other_pixels(weights: str | Path, model: str | Path, readers: Seque
         if p.scale != 1 or p.mean_value or p.mean_file:
             settings = " ".join(write_text(p).split())
             log.logger.warning(
-                f"{weights} was trained with transform_param {{ {settings} }}, but {model} has no transform_param: its "
-                "pixels stay 0 to 255; use the training prototxt as the model"
+                f"{weights} was trained with transform_param {{ {settings} }}, but {model} has no transform_param, so "
+                "its pixels stay 0 to 255; use the training prototxt as the model"
             )
             return
 

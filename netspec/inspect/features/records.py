@@ -50,7 +50,7 @@ def extract_records(
     """
     readers = [layer for layer in net.layers if getattr(layer, "num_records", 0)]
     if not readers:
-        raise SpecError("no layer of this net reads records; give image files instead", Where(net.plan.source.file))
+        raise SpecError("no layer of this net reads records; use image files instead", Where(net.plan.source.file))
     check_blobs(blobs, net.shapes, net.plan.source.file)
     reader = readers[0]
     batch = reader.top_shapes[0][0]

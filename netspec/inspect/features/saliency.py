@@ -54,7 +54,7 @@ def _gradients(
         inputs = [_noisy(torch.from_numpy(part), generator if samples > 1 else None) for part in data]
         total = score([net.differentiable(part) for part in inputs])
         if not total.requires_grad:
-            raise SpecError(f"blob {net.blob} has no gradient by {net.input}", Where(net.file))
+            raise SpecError(f"blob {net.blob} has no gradient with respect to {net.input}", Where(net.file))
         total.backward()
         for found, part in zip(sums, inputs, strict=True):
             if part.grad is not None:

@@ -129,7 +129,7 @@ def read_zooms(zooms: str | float) -> tuple[float, ...]:
         raise SpecError(f'found zooms "{zooms}", expected numbers separated by commas, e.g. "1,0.7"') from None
     for zoom in found:
         if not 0 < zoom <= 1:
-            raise SpecError(f"found zoom {zoom:g}, expected more than 0 and at most 1 (the whole image)")
+            raise SpecError(f"found zoom {zoom:g}, expected a number above 0 and at most 1 (the whole image)")
     return found
 
 

@@ -252,7 +252,7 @@ def read_log(path: str | Path, name: str = "") -> TrainingLog:
         raise SpecError(unreadable(path, fault), Where(str(path))) from None
     if not any(len(curve) for curve in reader.log.curves()):
         advice = "expected what `netspec train` or `caffe train` writes to stderr (2> train.log), with display above 0"
-        raise SpecError(f"holds no iteration of a training; {advice}", Where(str(path)))
+        raise SpecError(f"contains no iteration of a training; {advice}", Where(str(path)))
     return reader.log
 
 

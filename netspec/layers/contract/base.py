@@ -127,7 +127,7 @@ class Layer(torch.nn.Module):
         except (MemoryError, RuntimeError) as fault:
             if is_out_of_memory(fault):
                 there = f"this machine has {amount(memory())}"
-                raise self.error(f"its pass needs more memory than there is; {there}") from None
+                raise self.error(f"its pass needs more memory than available; {there}") from None
             raise
         tops = tops if isinstance(tops, tuple) else (tops,)
         if not self._kept_promise:
@@ -140,7 +140,7 @@ class Layer(torch.nn.Module):
         found = [tuple(top.shape) if isinstance(top, torch.Tensor) else None for top in tops]
         if self.promises and list(map(self._counted, found)) != list(map(self._counted, self.top_shapes)):
             one, other = (" and ".join(map(str, shapes)) or "no top" for shapes in (found, self.top_shapes))
-            raise self.error(f"forward returned a top of shape {one}, but reshape promised {other}", "type")
+            raise self.error(f"forward returned a top of shape {one}, but reshape returned {other}", "type")
 
     def _counted(self, shape: Shape | None) -> Shape | None:
         """Return a shape without the size of ``counted_axis``."""
@@ -264,4 +264,4 @@ def is_in_place(layer: Layer) -> bool:
 def refuse_in_place(layer: Layer) -> None:
     """Raise a SpecError if a layer's first top is its first bottom. For layers where Caffe refuses it too."""
     if is_in_place(layer):
-        raise layer.error("may not work in place, as in Caffe; give its top another name", "top")
+        raise layer.error("cannot be computed in place, as in Caffe; give its top another name", "top")

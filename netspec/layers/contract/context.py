@@ -25,7 +25,7 @@ def device_of(name: str | torch.device) -> torch.device:
         raise SpecError(f'found device "{name}", expected cpu, cuda or cuda:NUMBER') from None
     count = torch.cuda.device_count() if device.type == "cuda" else 0
     if device.type == "cuda" and (device.index or 0) >= count:
-        raise SpecError(f'found device "{name}", but torch finds {count or "no"} GPU(s) on this machine; "cpu" is here')
+        raise SpecError(f'found device "{name}", but torch finds {count or "no"} GPU(s) on this machine; use "cpu"')
     return device
 
 

@@ -61,5 +61,5 @@ def passes_on(layer: Layer) -> bool:
 
 def refusal(layer: Layer, target: str, reason: str = "") -> SpecError:
     """Return the error for a layer that cannot be exported, with this reason or the one of its class."""
-    reason = reason or getattr(layer, "not_exported", "its class does not define it")
+    reason = reason or getattr(layer, "not_exported", "its class does not support it")
     return layer.error(f"cannot be exported to {target}: {reason}")

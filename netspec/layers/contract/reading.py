@@ -134,6 +134,6 @@ def resume(layer: Layer, state: Mapping[str, Any]) -> None:
         for each in (state, running_state(layer))
     )
     if found != mine:
-        raise layer.error(f"found {found} to remember, expected {mine or 'nothing'}")
+        raise layer.error(f"found a saved state with {found}, expected {mine or 'nothing'}")
     if isinstance(layer, Remembers):
         layer.resume(state)

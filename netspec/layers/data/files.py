@@ -56,7 +56,7 @@ class ReadingLayer(Layer):
     def __getstate__(self) -> dict[str, Any]:
         """Refuse to be copied or pickled with open files. Raises TypeError."""
         if self._source is not None:
-            raise TypeError(f"{self.error('reads open files: it cannot be copied or pickled; build its net again')}")
+            raise TypeError(f"{self.error('reads open files, so it cannot be copied or pickled; build its net again')}")
         return dict(self.__dict__)
 
     def open(self) -> Source | None:
@@ -170,7 +170,7 @@ class ReadingLayer(Layer):
 
     def resume(self, state: Mapping[str, Any]) -> None:
         if state["iteration"] < 0:
-            raise self.error(f"found iteration {state['iteration']} to go on from, expected at least 0")
+            raise self.error(f"found iteration {state['iteration']} to resume from, expected at least 0")
         self.restart(state["iteration"])
 
     def close(self) -> None:
@@ -351,7 +351,7 @@ class WindowData(ReadingLayer):
             message = f'unknown crop_mode "{p.crop_mode}"; expected warp or square'
             yield self.error(message, self.group, "crop_mode")
         if crop > 0 and 2 * p.context_pad >= crop:
-            message = f"context_pad {p.context_pad} on both sides leaves nothing of crop_size {crop}"
+            message = f"context_pad {p.context_pad} on both sides leaves no pixels of crop_size {crop}"
             yield self.error(message, self.group, "context_pad")
         yield from wrong_means(self.param.transform_param, self.context.at)
 

@@ -186,7 +186,7 @@ class MemoryData(Layer):
     def resume(self, state: Mapping[str, Any]) -> None:
         following = state["next"]
         if following % self.shape[0] or (self._arrays is not None and not 0 <= following < len(self._arrays[0])):
-            raise self.error(f"found row {following} to go on from; no batch starts there")
+            raise self.error(f"found row {following} to resume from, but no batch starts there")
         self._next = following
 
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:

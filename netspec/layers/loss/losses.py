@@ -121,7 +121,7 @@ class SigmoidCrossEntropyLoss(Loss):
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         if self.ignore_label is not None:
-            raise refusal(self, "PyTorch", "torch's cross entropy of sigmoids ignores no label")
+            raise refusal(self, "PyTorch", "torch's binary cross entropy cannot ignore a label")
         x, y = bottoms
         if self.bottom_shapes[0] != self.bottom_shapes[1]:
             y = code.call("{y}.reshape({x}.shape)", x=x, y=y)
@@ -149,7 +149,9 @@ class EuclideanLoss(Loss):
         shapes = super().reshape(bottom_shapes)
         a, b = bottom_shapes
         if math.prod(a[1:]) != math.prod(b[1:]):
-            raise self.error(f"found bottoms of shapes {a} and {b}, expected as many values per item", "bottom")
+            raise self.error(
+                f"found bottoms of shapes {a} and {b}, expected equal numbers of values per item", "bottom"
+            )
         return shapes
 
     def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

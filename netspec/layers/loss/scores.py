@@ -147,7 +147,7 @@ class InfogainLoss(SoftmaxLoss):
     """
 
     bottoms = (2, 3)
-    not_exported = "PyTorch has no loss with a matrix of weights"
+    not_exported = "PyTorch has no loss with an infogain matrix"
     label_bottoms = frozenset({1, 2})
 
     def setup(self) -> None:
@@ -194,7 +194,7 @@ class InfogainLoss(SoftmaxLoss):
         x, label = self.scores_and_labels(scores, labels)
         valid = self.valid(label, self.ignore_label)
         matrix = given[0] if given else self.matrix
-        assert matrix is not None, "setup reads the matrix where no bottom brings it"
+        assert matrix is not None, "setup reads the matrix unless it is a bottom"
         gain = matrix.detach().to(x.dtype).reshape(self.classes, self.classes)
         weights = gain[label if valid is None else label * valid]  # (outer, inner, classes)
         if self.is_exact(x):

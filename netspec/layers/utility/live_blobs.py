@@ -142,7 +142,7 @@ class BorrowedMemory(Memory):
     def reserve(self, count: int) -> None:
         """Refuse more numbers than there are."""
         if count > self.capacity:
-            raise ValueError(f"this blob has {self.capacity} numbers, and cannot become one of {count}")
+            raise ValueError(f"this blob has {self.capacity} numbers and cannot be reshaped to {count}")
 
     @override
     def view(self, shape: Shape) -> np.ndarray:

@@ -89,7 +89,7 @@ class Slice(Layer):
                 message = f"found slice_point {points} for a bottom of shape {shape}, expected {expected}"
                 raise self.error(message, "slice_param", "slice_point")
         elif size % self.num_tops:
-            message = f"axis {axis} of the bottom, shape {shape}, cannot be cut evenly into {self.num_tops} tops"
+            message = f"axis {axis} of the bottom, shape {shape}, cannot be divided evenly into {self.num_tops} tops"
             raise self.error(message, "slice_param")
         else:
             self.sizes = [size // self.num_tops] * self.num_tops
@@ -142,7 +142,7 @@ class Crop(Layer):
         axis = self.canonical_axis(param.axis, data, "crop_param", "axis")
         cut = len(data) - axis
         if len(wanted) < len(data):
-            raise self.error(f"cannot crop a blob of shape {data} to one of fewer axes, {wanted}", "bottom", 1)
+            raise self.error(f"cannot crop a blob of shape {data} to shape {wanted}, which has fewer axes", "bottom", 1)
         offsets = tuple(param.offset or (0,))
         if len(offsets) not in (1, cut):
             message = f"found offset {len(offsets)} times, expected once or once for each of {cut} cropped axes"
@@ -151,7 +151,7 @@ class Crop(Layer):
         self.window = [slice(None)] * axis
         for i, offset in enumerate(offsets, start=axis):
             if offset + wanted[i] > data[i]:
-                message = f"offset {offset} and size {wanted[i]} of the crop leave axis {i}, of size {data[i]}"
+                message = f"offset {offset} and size {wanted[i]} of the crop exceed axis {i}, of size {data[i]}"
                 raise self.error(message, "crop_param", "offset", i - axis)
             self.window.append(slice(offset, offset + wanted[i]))
         return [(*data[:axis], *wanted[axis : len(data)])]
@@ -236,9 +236,7 @@ class Filter(Layer):
             raise self.error(f"found a selector of shape {selector}, expected one number per item", "bottom", len(data))
         for i, shape in enumerate(data):
             if shape[:1] != selector[:1]:
-                message = (
-                    f"found a bottom of shape {shape} and a selector of shape {selector}, expected equally many items"
-                )
+                message = f"found shape {shape} and a selector of shape {selector}, expected equal numbers of items"
                 raise self.error(message, "bottom", i)
         return data
 

@@ -39,7 +39,7 @@ class Layer:
 
 
 def __getattr__(name: str) -> NoReturn:
-    raise AttributeError(f"netspec's replacement for pycaffe has no {name}; it has Layer, TRAIN and TEST")
+    raise AttributeError(f"netspec's module caffe for Python layers has no {name}; it has Layer, TRAIN and TEST")
 
 
 _home = __name__  # of what ``import caffe`` gives

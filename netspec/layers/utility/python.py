@@ -63,7 +63,7 @@ class Python(Layer):
     """
 
     not_allowed = "a Python layer runs code named in the prototxt; pass --allow-python-layers if you trust it"
-    not_exported = "it runs Python code of its own"
+    not_exported = "it runs Python code"
     bottoms = (0, None)
     tops = (0, None)
     takes_shapes = True  # where its code must not run
@@ -140,7 +140,7 @@ class Python(Layer):
             try:
                 found = json.loads(state["code"])
             except ValueError as fault:
-                raise self._fault("resume", f"what it remembers is not JSON ({fault})") from None
+                raise self._fault("resume", f"its saved state is not JSON ({fault})") from None
             self._call("resume", found)
 
     @staticmethod
@@ -189,7 +189,7 @@ class Python(Layer):
 def _describe(fault: Exception) -> str:
     """Return the exception's class, text and place in one line."""
     if isinstance(fault, SyntaxError):
-        remedy = "where it is Python 2, `netspec run --python2 -m netspec train ...` translates it"
+        remedy = "if it is Python 2, translate it with `netspec run --python2 -m netspec train ...`"
         return f"{type(fault).__name__}: {fault.msg} ({fault.filename}:{fault.lineno}); {remedy}"
     frames = traceback.extract_tb(fault.__traceback__)
     of_user = [frame for frame in frames if not frame.filename.startswith(_not_of_user())]

@@ -89,7 +89,7 @@ class Reshape(_OtherShape):
         if math.prod(top) != math.prod(shape):
             message = (
                 f"cannot make shape {tuple(self.new_axes)} of a bottom of shape {shape}: {tuple(top)} holds "
-                f"{math.prod(top)} numbers, the bottom {math.prod(shape)}"
+                f"{math.prod(top)} numbers, but the bottom {math.prod(shape)}"
             )
             raise self.error(message, "reshape_param", "shape")
         return [tuple(top)]

@@ -54,7 +54,7 @@ class Convolution(SlidingFilter):
         self.read_geometry()
         if self.spatial_axes > 3:
             raise self.error(
-                f"{self.type} of {self.spatial_axes} spatial axes is not supported, at most 3 are", "bottom"
+                f"{self.type} of {self.spatial_axes} spatial axes is not supported; at most 3 are", "bottom"
             )
         param = self.param.convolution_param
         self.channels = self.bottom_shapes[0][self.channel_axis]
@@ -171,7 +171,7 @@ class Convolution(SlidingFilter):
         overhang = tuple(reversed(self.overhang(self.bottom_shapes[0])[1::2]))
         for axis, zeros in enumerate(overhang, self.channel_axis + 1):
             if zeros:
-                graph.size(0, axis, "its filter is longer than the map")
+                graph.size(0, axis, "its filter is larger than the map")
         return overhang
 
     def _onnx_maps(self, graph: OnnxGraph, bottom: str) -> str:

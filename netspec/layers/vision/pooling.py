@@ -55,7 +55,9 @@ class _PoolingBase(Layer):
         """Return the pooled maps, and the mask if wanted."""
         if any(r >= k for r, k in zip(windows.reach, windows.kernel, strict=True)):
             raise refusal(
-                self, "ONNX", "unpadded windows at a stride above the kernel can miss the map; use round_mode: FLOOR"
+                self,
+                "ONNX",
+                "unpadded windows with a stride above the kernel can lie outside the map; use round_mode: FLOOR",
             )
         pads = [*windows.pad, *windows.reach]
         geometry = {"kernel_shape": list(windows.kernel), "strides": list(windows.stride), "pads": pads}
@@ -99,7 +101,7 @@ class _PoolingBase(Layer):
             raise refusal(self, "PyTorch", "STOCHASTIC pooling draws random numbers in the training phase")
         geometry = list(zip(windows.kernel, windows.stride, windows.pad, windows.reach, strict=True))
         if any(r >= k for k, _, _, r in geometry) or (method != MAX and any(2 * p > k for k, _, p, _ in geometry)):
-            raise refusal(self, "PyTorch", "windows that can miss the map; use round_mode: FLOOR, or less padding")
+            raise refusal(self, "PyTorch", "windows can lie outside the map; use round_mode: FLOOR, or less padding")
         numbers: dict[str, Any] = {"kernel_size": windows.kernel, "stride": windows.stride, "padding": windows.pad}
         options = ["{kernel_size}"]
         if windows.stride != windows.kernel:
@@ -188,7 +190,7 @@ class Pooling(_PoolingBase):
             return [graph.node("GlobalMaxPool" if self.method == MAX else "GlobalAveragePool", *bottoms)]
         if self.param.pooling_param.global_pooling:
             for axis in (2, 3):
-                graph.size(0, axis, "its one window is the whole map")
+                graph.size(0, axis, "its only window is the whole map")
         return self.onnx_pool(graph, bottoms[0], self.windows, self.method, mask=self.num_tops > 1)
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
@@ -211,7 +213,7 @@ class SPP(_PoolingBase):
         if self.param.spp_param.pyramid_height < 1:
             raise self.error("pyramid_height must be at least 1", "spp_param", "pyramid_height")
         if self.param.spp_param.pyramid_height > HIGHEST_PYRAMID:
-            message = f"pyramid_height must be at most {HIGHEST_PYRAMID}: more windows than an int counts"
+            message = f"pyramid_height must be at most {HIGHEST_PYRAMID}, so that an int can count its windows"
             raise self.error(message, "spp_param", "pyramid_height")
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
@@ -235,7 +237,7 @@ class SPP(_PoolingBase):
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         for axis in (2, 3):
-            graph.size(0, axis, "the windows of its pyramid follow from the map's size")
+            graph.size(0, axis, "the windows of its pyramid depend on the map's size")
         method = self.param.spp_param.pool
         levels = [self.onnx_pool(graph, bottoms[0], windows, method)[0] for windows in self.levels]
         if len(levels) == 1:
@@ -244,7 +246,7 @@ class SPP(_PoolingBase):
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         for axis in (2, 3):
-            code.size(0, axis, "the windows of its pyramid follow from the map's size")
+            code.size(0, axis, "the windows of its pyramid depend on the map's size")
         method = self.param.spp_param.pool
         levels = [self.torch_pool(code, bottoms[0], windows, method) for windows in self.levels]
         if len(levels) == 1:

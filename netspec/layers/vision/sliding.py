@@ -50,7 +50,9 @@ class SlidingFilter(Layer):
             if given:
                 raise self.error(f"found both {name} and {pair[0]}; give one of them", field, pair[0])
             if axes != 2:
-                raise self.error(f"{pair[0]} is for 2 spatial axes, the bottom has {axes}; use {name}", field, pair[0])
+                raise self.error(
+                    f"{pair[0]} is for 2 spatial axes, but the bottom has {axes}; use {name}", field, pair[0]
+                )
             given = (getattr(param, str(name_h)), getattr(param, str(name_w)))
         elif len(given) <= 1:
             given = (given or (default,)) * axes
@@ -95,7 +97,7 @@ class SlidingFilter(Layer):
             )
         for i, other in enumerate(bottom_shapes):
             if other != shape:
-                raise self.error(f"all bottoms must have one shape, found {shape} and {other}", "bottom", i)
+                raise self.error(f"all bottoms must have the same shape, found {shape} and {other}", "bottom", i)
 
     def overhang(self, shape: Shape) -> list[int]:
         """Return, in the order of F.pad, the zeros to append where the filter is longer than the padded map."""
@@ -193,7 +195,7 @@ class Im2col(SlidingFilter):
         numbers = self.torch_geometry()
         options = ", ".join(f"{name}={{{name}}}" for name, value in numbers.items() if value != TORCH_USUAL.get(name))
         rows = self.top_shapes[0][2]
-        code.size(0, 2, "the rows of windows are counted beforehand")
+        code.size(0, 2, "the rows of windows are counted in advance")
         template = f"{code.function(lay_out_windows)}({{x}}, {{rows}}, {options})"
         return code.call(template, x=bottoms[0], rows=rows, **numbers)
 

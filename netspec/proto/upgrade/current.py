@@ -1,6 +1,6 @@
 """Upgrades Caffe's nets and solvers from all older formats to the current one, with the places of their parts.
 
-Each pass takes a net and its map and returns new ones, or the same ones if nothing is to be done. They run in Caffe's
+Each pass takes a net and its map and returns new ones, or the same ones if nothing changes. The passes run in Caffe's
 order, for text and for weights. Caffe silently drops some fields (in a net that is partly V0: its V1 layers, its
 ``state``); here they are kept.
 
@@ -25,7 +25,7 @@ from netspec.proto.upgrade.v0 import needs_v0_upgrade, upgrade_v0
 
 Upgraded = tuple[NetParameter, SourceMap]
 
-# V1's name of a type is today's in capitals, with underscores.
+# V1's name of a type is the current name in capitals, with underscores.
 _TYPES = """AbsVal Accuracy ArgMax BNLL Concat ContrastiveLoss Convolution Data Deconvolution Dropout DummyData Eltwise
     EuclideanLoss Exp Flatten HDF5Data HDF5Output HingeLoss Im2col ImageData InfogainLoss InnerProduct LRN MemoryData
     MultinomialLogisticLoss MVN Pooling Power ReLU Sigmoid SigmoidCrossEntropyLoss Silence Slice Softmax Split TanH
@@ -46,7 +46,7 @@ _SOLVER_NETS = ("net_param", "train_net_param", "test_net_param")
 
 @dataclass(frozen=True)
 class _Pass:
-    """A pass, and what Caffe logs about it: ``lines`` of upgrade_proto.cpp, and the variable parts of the messages."""
+    """A pass, and Caffe's log of it: ``lines`` of upgrade_proto.cpp, and the variable parts of the messages."""
 
     needed: Callable[[NetParameter], bool]
     run: Callable[[NetParameter, SourceMap], Upgraded]
@@ -57,7 +57,7 @@ class _Pass:
 
 
 def upgrade_net(net: NetParameter, source: SourceMap) -> Upgraded:
-    """Return a net in the current format, and its map; log what was done in Caffe's words.
+    """Return a net in the current format, and its map; log the upgrades as Caffe does.
 
     Raises SpecError for a net that has both ``layer`` and ``layers``, and for the errors of the passes.
     """
@@ -65,7 +65,7 @@ def upgrade_net(net: NetParameter, source: SourceMap) -> Upgraded:
         line = source.net.find("layer").line
         current = f" of line {line}" if line else ""
         raise SpecError(
-            f'"layers" is the older format, and the net has "layer"{current} too; write all layers in the current '
+            f'"layers" is the older format, but the net has "layer"{current} too; write all layers in the current '
             'format, layer { type: "Convolution" ... }',
             source.net.find("layers"),
         )
@@ -80,7 +80,7 @@ def upgrade_net(net: NetParameter, source: SourceMap) -> Upgraded:
 
 
 def net_needs_upgrade(net: NetParameter) -> bool:
-    """Return whether any pass has something to do."""
+    """Return whether any pass would change a net."""
     return any(step.needed(net) for step in _PASSES)
 
 
@@ -158,7 +158,7 @@ def _upgrade_param_specs(layer: V1LayerParameter, place: Place, draft: Draft) ->
 
 
 def needs_input_upgrade(net: NetParameter) -> bool:
-    """Return whether a net declares inputs by fields of its own."""
+    """Return whether a net declares inputs with its own fields, without Input layers."""
     return len(net.input) > 0
 
 
@@ -218,7 +218,7 @@ def _input_shape(net: NetParameter, place: Place, index: int) -> tuple[Message, 
 
 
 def needs_batch_norm_upgrade(net: NetParameter) -> bool:
-    """Return whether a BatchNorm layer declares, for its three arrays, ParamSpecs that let training change them."""
+    """Return whether a BatchNorm layer has ParamSpecs that let training change its three arrays."""
     return any(_old_batch_norm(layer) for layer in net.layer)
 
 

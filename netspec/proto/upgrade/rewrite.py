@@ -1,4 +1,4 @@
-"""Shared by the upgrade passes: messages rebuilt from parts of others; each part keeps its original place."""
+"""Functions for the upgrade passes: building messages from parts of others, which keep their original places."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Draft:
         self._inner: dict[str, Draft] = {}
 
     def copy(self, message: Message, places: Place, leave_out: Collection[str] = ()) -> None:
-        """Copy all fields of a message that this one has too, except those to omit."""
+        """Copy all fields of a message that this one also has, except those to omit."""
         for name, field in fields_of(message.DESCRIPTOR).items():
             if name not in leave_out and name in fields_of(self.message.DESCRIPTOR) and field.present(message):
                 self.put(name, field.get(message), places.fields.get(field.name, ()))
@@ -38,7 +38,7 @@ class Draft:
         self.places[field.name] = (*before, *places)
 
     def inner(self, name: str, where: Where) -> Draft:
-        """Return the draft of a singular message field; a new one is empty and has the place ``where``."""
+        """Return the draft of a singular message field; a new draft is empty and has the place ``where``."""
         if name not in self._inner:
             places = self.places.pop(name, ())
             self._inner[name] = draft = Draft(getattr(self.message, name), places[0].where if places else where)

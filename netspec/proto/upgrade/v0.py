@@ -13,13 +13,13 @@ from netspec.proto.schema import NetParameter, V0LayerParameter, V1LayerParamete
 from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.upgrade.rewrite import Draft, copy_without
 
-# V0's names of types are mostly those of V1 in small letters; a type's own parameters are named after V1's.
+# V0's names of types are mostly V1's in lower case; a type's own parameters are named after V1's.
 _SAME = """accuracy bnll concat data dropout euclidean_loss flatten hdf5_data hdf5_output im2col infogain_loss lrn
     multinomial_logistic_loss relu sigmoid softmax softmax_loss split tanh window_data"""
 _RENAMED = {"conv": "CONVOLUTION", "images": "IMAGE_DATA", "innerproduct": "INNER_PRODUCT", "pool": "POOLING"}
 _TYPES = _RENAMED | {name: name.upper() for name in _SAME.split()}
 
-# V0 field -> its name in the parameters of the layer types that took it.
+# V0 field -> its name in the parameters of each layer type.
 _FIELDS = {
     "num_output": ("num_output", {"conv", "innerproduct"}),
     "biasterm": ("bias_term", {"conv", "innerproduct"}),
@@ -90,7 +90,7 @@ def merge_padding(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
             for what in ("bottom", "top"):
                 if len(getattr(layer, what)) != 1:
                     raise _error(
-                        f"a padding layer has one {what}, found {len(getattr(layer, what))}", layer, place, what
+                        f"a padding layer must have one {what}, found {len(getattr(layer, what))}", layer, place, what
                     )
         else:
             draft = Draft(result.layers.add(), place.where)
@@ -110,7 +110,9 @@ def merge_padding(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
 def _merge(producer: tuple[V1LayerParameter, Place], layer: V1LayerParameter, place: Place, draft: Draft) -> None:
     padding, padding_place = producer
     if layer.layer.type not in ("conv", "pool") or len(layer.bottom) != 1:
-        fault = f'padding layer "{padding.layer.name}" feeds it; only a conv or pool layer with one bottom can pad'
+        fault = (
+            f'padding layer "{padding.layer.name}" feeds it, but only conv and pool layers with one bottom have padding'
+        )
         raise _error(fault, layer, place, "bottom")
     draft.message.ClearField("bottom")
     draft.places.pop("bottom", None)

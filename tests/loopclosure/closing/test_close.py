@@ -133,8 +133,8 @@ def test_odometry_from_a_file(walk: Path, tmp_path: Path, capsys: pytest.Capture
         ("--drift 2 --loops NAMED", 1, 'named.csv:2:1: no image of the sequence has the name "x.jpg"'),
         ("--drift 200 --loops LOOPS", 1, "a drift of 200 %; expected"),
         ("--drift 2 --loops LOOPS --camera 1,2,3", 1, "expected FX,FY,CX,CY"),
-        ("--drift 2 --loops LOOPS --odometry-form tum", 2, "--odometry-form means nothing without --odometry"),
-        ("--odometry FAR --seed 4 --loops LOOPS", 2, "--seed means nothing without --drift"),
+        ("--drift 2 --loops LOOPS --odometry-form tum", 2, "--odometry-form needs --odometry"),
+        ("--odometry FAR --seed 4 --loops LOOPS", 2, "--seed needs --drift"),
         ("--loops LOOPS", 2, "one of the arguments --odometry --drift is required"),
     ],
 )
@@ -159,7 +159,7 @@ def test_without_a_camera_the_numbers_are_asked_for(two_laps: Path, tmp_path: Pa
     (tmp_path / "loops.csv").write_text("query_id,match_id\n25,5\n")
     line = f"close {two_laps} --loops {tmp_path / 'loops.csv'} --drift 1 --out {tmp_path / 'out'}"
     assert main(line.split()) == 1
-    assert "has no calibration of its camera; give --camera FX,FY,CX,CY" in capsys.readouterr().err
+    assert "has no camera calibration; give --camera FX,FY,CX,CY" in capsys.readouterr().err
 
 
 def test_fr1_rpy_where_the_camera_turns_gets_rotations_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

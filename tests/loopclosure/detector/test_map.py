@@ -183,7 +183,7 @@ def test_a_run_that_is_killed_leaves_the_map_as_it_was(a_map: Map, drives: Path,
 def test_one_adds_at_a_time_and_others_read(a_map: Map, drives: Path, tmp_path: Path) -> None:
     other = Map(tmp_path / "M")
     with only_one(tmp_path / "M" / ".lock", ""):
-        with pytest.raises(SpecError, match="held by another run"):
+        with pytest.raises(SpecError, match="locked by another process"):
             a_map.add(read_sequence(drives / "b"), Thumbnailer())
         assert len(Map(tmp_path / "M").detector(Thumbnailer())) == PLACES
     other.add(read_sequence(drives / "b"), Thumbnailer())
@@ -234,10 +234,10 @@ def test_a_map_that_another_net_described_is_refused(
         (lambda m: np.save(m / "000000" / "rows.npy", np.full((10, 8), np.nan)), "a number that is not finite"),
         (lambda m: np.savez(older(m), mean=np.zeros(3)), "loopclosure map add makes it again"),
         (lambda m: other_width(m), "000001/rows.npy: has 5 numbers a frame, that of 000000 768; they are of one net"),
-        (lambda m: pipe(m / "map.json"), "is no regular file"),
-        (lambda m: pipe(m / "000000" / "rows.npy"), "rows.npy: is no regular file"),
-        (lambda m: pipe(m / "000000" / "frames.npz"), "frames.npz: is no regular file"),
-        (lambda m: pipe(older(m)), "projection.npz: is no regular file"),
+        (lambda m: pipe(m / "map.json"), "is not a regular file"),
+        (lambda m: pipe(m / "000000" / "rows.npy"), "rows.npy: is not a regular file"),
+        (lambda m: pipe(m / "000000" / "frames.npz"), "frames.npz: is not a regular file"),
+        (lambda m: pipe(older(m)), "projection.npz: is not a regular file"),
         (lambda m: shutil.rmtree(m / "000000"), "000000/frames.npz: no such file; expected a session of a map"),
     ],
 )
@@ -269,7 +269,7 @@ def test_a_file_that_is_cut_while_it_is_open_is_a_fault(name: str, a_map: Map, d
     """A mapped one would end the process (SIGBUS)."""
     before = a_map.detector(Thumbnailer())
     os.truncate(a_map.folder / "000000" / f"{name}.npy", 200)
-    with pytest.raises(InputError, match=f"{name}.npy: cannot be read .it was cut since it was opened"):
+    with pytest.raises(InputError, match=f"{name}.npy: cannot be read .it was truncated after it was opened"):
         a_map.detector(Thumbnailer()) if name == "rows" else run_detector(before, read_sequence(drives / "b"))
 
 

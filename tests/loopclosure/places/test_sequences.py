@@ -183,7 +183,7 @@ def test_lists_of_matches_run_nothing(tmp_path: Path, monkeypatch: pytest.Monkey
     rows = np.empty(2, dtype=object)
     rows[:] = [Harmful(), [1]]
     np.save("truth.npy", rows)
-    with pytest.raises(InputError, match=r"a pickle, which could run code; lists are read from \.json"):
+    with pytest.raises(InputError, match=r"\(a pickle\), which could run code; store lists in a \.json file"):
         read_matches("truth.npy", 2, 2)
     assert not Path("harmed").exists()
 
@@ -212,10 +212,10 @@ def test_evaluate_reads_them_all(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_images_with_both_a_mask_and_poses_are_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = "evaluate images:x,truth=t.npy,poses=p.txt --method thumbnails --out o"
     assert main(line.split()) == 2
-    assert "truth and poses both say" in capsys.readouterr().err
+    assert "give either truth or poses, not both" in capsys.readouterr().err
     line = "evaluate tum:x,pose-form=kitti --method thumbnails --out o"
     assert main(line.split()) == 2
-    assert "pose-form means nothing without poses" in capsys.readouterr().err
+    assert "pose-form needs poses" in capsys.readouterr().err
 
 
 def test_detect_takes_euroc_with_its_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

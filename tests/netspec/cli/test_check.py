@@ -143,7 +143,7 @@ def test_check_warns_and_succeeds(run: Run) -> None:
     assert result.status == 0
     assert result.err.splitlines() == [
         f"warning: {SOLVER}: no snapshot is taken; set snapshot, or snapshot_after_train: true [no-snapshot]",
-        f"warning: {SOLVER}:3:1: test_interval 1000 is more than max_iter 60; make it smaller [test-after-end]",
+        f"warning: {SOLVER}:3:1: test_interval 1000 is more than max_iter 60; lower it [test-after-end]",
     ]
 
 

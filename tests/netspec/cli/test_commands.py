@@ -108,7 +108,7 @@ def test_quiet_is_no_log_and_every_warning(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, NET, "other.prototxt", "max_iter: 60", "max_iter: 1")
     result = run("train", solver, "--weights", INIT, "-q")
     assert result.status == 0
-    assert "holds weights for none of the net's" in result.err
+    assert "contains weights for none of the net's" in result.err
     assert {line[0] for line in result.err.splitlines()} == {"W"}
 
 
@@ -234,14 +234,14 @@ def test_without_a_gpu_the_cpu_is_used_and_a_wish_for_a_gpu_refused(run: Run, ed
     result = run("train", edited(SOLVER, "solver_mode: CPU", "solver_mode: GPU", "max_iter: 60", "max_iter: 0"))
     assert result.status == 0
     warnings = [line for line in result.messages if "solver_mode" in line and "running on the CPU" in line]
-    assert warnings == ["edited.prototxt:11:1: solver_mode GPU, but torch finds no GPU: running on the CPU"]
+    assert warnings == ["edited.prototxt:11:1: solver_mode GPU, but torch finds no GPU; running on the CPU"]
 
 
 # What is wrong, in one line
 
 
 def test_gpus_that_are_not_numbers_or_not_there(run: Run) -> None:
-    fault = "--gpu first: expected the number of a GPU, several numbers separated by commas, or all"
+    fault = "--gpu first: expected a GPU's number, several numbers separated by commas, or all"
     assert run("train", SOLVER, "--gpu=first").fault == fault
     count = torch.cuda.device_count()
     assert f"torch finds {count or 'no'} GPU(s)" in run("train", SOLVER, "--gpu", f"0,{count + 1}").fault
@@ -333,7 +333,7 @@ def test_a_prefix_that_cannot_be_written_to(run: Run, edited: Edit) -> None:
     assert fault.startswith(
         'edited.prototxt:9:1: cannot write to snapshot prefix "nowhere/ref": No such file or directory'
     )
-    assert fault.endswith(f"; relative paths begin at {Path.cwd()}")
+    assert fault.endswith(f"; relative paths start from {Path.cwd()}")
 
 
 def test_weights_that_are_missing_or_no_weights(run: Run) -> None:
@@ -416,8 +416,8 @@ def test_weights_of_which_no_layer_fits_are_refused(run: Run) -> None:
     extract = ("extract", *words, "--blob", "feat", "--out", "f.npz")
     for command in (("test", *words), extract, (*extract, "--images", "images")):
         fault = run(*command).fault
-        assert fault.startswith("other.caffemodel: holds weights for none of the net's ")
-        assert fault.endswith("is it the file of another net?")
+        assert fault.startswith("other.caffemodel: contains weights for none of the net's ")
+        assert fault.endswith("are they weights of another net?")
 
 
 @pytest.mark.slow
@@ -427,7 +427,7 @@ def test_weights_that_lack_a_layer_get_one_warning_and_with_strict_a_fault(run: 
     for layer in part.layer:
         layer.name = layer.name.replace("conv1", "gone")
     Path("part.caffemodel").write_bytes(part.SerializeToString())
-    lacks = "part.caffemodel: lacks weights for 2 of the net's 8 layers that have any: conv1, conv1_p"
+    lacks = "part.caffemodel: lacks weights for 2 of the net's 8 layers with weights: conv1, conv1_p"
     for command in (
         ["test", "--model", NET, "--weights", "part.caffemodel", "--iterations", 1],
         ["train", solver, "--weights", "part.caffemodel"],
@@ -435,8 +435,8 @@ def test_weights_that_lack_a_layer_get_one_warning_and_with_strict_a_fault(run: 
     ):
         result = run(*command)
         assert result.status == 0, result.err
-        assert result.err.count(f"{lacks}; they stay as they were filled") == 1
-        assert run(*command, "--strict").fault == f"{lacks}; leave strict out to keep their fillers' values"
+        assert result.err.count(f"{lacks}; they keep the values of their fillers") == 1
+        assert run(*command, "--strict").fault == f"{lacks}; without strict they keep the values of their fillers"
 
 
 # What other systems lack is said once, and the command goes on

@@ -151,7 +151,7 @@ def test_images_steps(onnx: Any, net: Net, run: Run) -> None:
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("no/net.onnx: there is no folder no; make it first", "--to onnx --out no/net.onnx"),
+        ("no/net.onnx: there is no folder no; create it first", "--to onnx --out no/net.onnx"),
         ("--out net.txt: expected a name that ends in .py", "--to torch --out net.txt"),
         ('no data layer has a top "dat"; did you mean "data"?', "--to onnx --out n.onnx --shape dat=1,3,8,8"),
         ("no.npy: cannot be read as an array", "--to onnx --out n.onnx --mean no.npy"),
@@ -205,4 +205,4 @@ def test_steps_for_images_are_for_onnx(net: Net, run: Run) -> None:
     assert "--swap needs --to onnx" in result.err
     result = run("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "n.onnx", "--input", "data")
     assert result.status == 2
-    assert "--input says which input --crop, --swap" in result.err
+    assert "--input names the input of --crop, --swap" in result.err

@@ -180,7 +180,7 @@ def test_extract_says_in_one_line_what_is_wrong(run: Run, images: Path, words: s
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("found zoom 2, expected more than 0 and at most 1", "--images walk/rgb --zooms 1,2"),
+        ("found zoom 2, expected a number above 0 and at most 1", "--images walk/rgb --zooms 1,2"),
         ('found zooms "1,x", expected numbers separated by commas', "--images walk/rgb --zooms 1,x"),
         ("--images needs exactly one --blob, found 2", "--images walk/rgb --blob sim"),
         ("--shape names x, expected the input blob data", "--images walk/rgb --shape x=1,1,9,9"),
@@ -188,13 +188,13 @@ def test_extract_says_in_one_line_what_is_wrong(run: Run, images: Path, words: s
         ("--input is for --images", "--input x"),
         ("--shape is for --images", "--shape data=1,1,9,9"),
         ("--mean is for --images", "--mean 1"),
-        ("--phase is for records; --images are read, and run in phase TEST", "--images walk/rgb --phase TRAIN"),
-        ("--level is for records; --images are read, and run in phase TEST", "--images walk/rgb --level 7"),
-        ("--stage is for records; --images are read, and run in phase TEST", "--images walk/rgb --stage x"),
-        ("--iterations is for records; --images are read, and run in phase TEST", "--images walk/rgb --iterations 99"),
-        ("--source is for records; --images are read, and run in phase TEST", "--images walk/rgb --source no=/nowhere"),
+        ("--phase is for records; --images reads files and uses phase TEST", "--images walk/rgb --phase TRAIN"),
+        ("--level is for records; --images reads files and uses phase TEST", "--images walk/rgb --level 7"),
+        ("--stage is for records; --images reads files and uses phase TEST", "--images walk/rgb --stage x"),
+        ("--iterations is for records; --images reads files and uses phase TEST", "--images walk/rgb --iterations 99"),
+        ("--source is for records; --images reads files and uses phase TEST", "--images walk/rgb --source no=/nowhere"),
         (
-            "--allow-python-layers is for records; --images are read, and run in phase TEST",
+            "--allow-python-layers is for records; --images reads files and uses phase TEST",
             "--images walk/rgb --allow-python-layers",
         ),
     ],

@@ -89,7 +89,7 @@ def test_the_layer_that_fixes_a_size_is_named(net_of: Callable[..., Net]) -> Non
     assert sizes_of(model.graph.input) == {"data": ["N", 3, 12, 10]}
     assert len(notes) == 2
     assert notes[0].startswith("the height is fixed at 12: net.prototxt:4:")
-    assert notes[0].endswith('layer "ip" (InnerProduct) takes no other'), "not the shape that was tried"
+    assert notes[0].endswith('layer "ip" (InnerProduct) accepts no other size'), "not the shape that was tried"
 
 
 @pytest.mark.parametrize(("layer_type", "state"), [("RNN", "h"), ("LSTM", "h, c")])
@@ -106,7 +106,7 @@ def test_a_note_says_that_the_state_of_a_recurrent_layer_starts_at_zero(
         notes = export_pt2(net, tmp_path / "net.pt2")
     note = (
         f'net.prototxt:3:3: layer "r" ({layer_type}): its state ({state}) starts at zero in every run; '
-        "Caffe carries it on to the next run where cont is 1"
+        "in Caffe it continues in the next run if cont is 1"
     )
     assert note in notes
 

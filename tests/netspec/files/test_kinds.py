@@ -28,7 +28,7 @@ POINTER = (
     b"size 243862418\n"
 )
 SAID = (
-    r"is a Git LFS pointer to a file of 243,862,418 bytes, not that file; "
+    r"is a Git LFS pointer to a file of 243,862,418 bytes, not the file itself; "
     r"run `git lfs pull` in its repository, or download the file itself$"
 )
 

@@ -38,7 +38,7 @@ def test_another_file_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "f.json").write_text(text)
     with pytest.raises(SpecError) as fault:
         read_scores(tmp_path / "f.json")
-    assert str(fault.value).startswith(f"{tmp_path}/f.json: this is not a scores file (of netspec train --scores): ")
+    assert str(fault.value).startswith(f"{tmp_path}/f.json: this is not a file written by netspec train --scores: ")
     assert "\n" not in str(fault.value)
 
 

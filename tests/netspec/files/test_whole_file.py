@@ -80,7 +80,7 @@ def test_a_folder_that_cannot_be_synced_is_no_fault_and_said_once(
             unfinished.write_text(text)
     assert (tmp_path / "file").read_text() == "newer"
     (record,) = caplog.records
-    assert record.getMessage().startswith("folders cannot be brought to disk here (Permission denied)")
+    assert record.getMessage().startswith("folders cannot be synced to disk here (Permission denied)")
 
 
 def test_where_files_have_no_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,7 +157,7 @@ def test_what_a_killed_run_left_is_swept_by_the_next(tmp_path: Path, monkeypatch
 
 def test_a_lock_dies_with_its_process(tmp_path: Path) -> None:
     with start('held = only_one("x.lock", ""); held.__enter__()', tmp_path) as process:
-        message = rf"x\.lock: is held by another run \(process {process.pid}\); choose another name"
+        message = rf"x\.lock: is locked by another process \(process {process.pid}\); choose another name"
         with pytest.raises(ValueError, match=message), package.only_one(tmp_path / "x.lock", "choose another name"):
             pass
         process.send_signal(signal.SIGKILL)
@@ -173,7 +173,10 @@ def test_a_lock_leaves_what_others_made_as_it_was(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "folder").mkdir()
     for name in ("poetry", "link", "fifo", "folder"):
-        with pytest.raises(ValueError, match=f"{name}: is no lock of netspec"), package.only_one(tmp_path / name, ""):
+        with (
+            pytest.raises(ValueError, match=f"{name}: is not a lock file of netspec"),
+            package.only_one(tmp_path / name, ""),
+        ):
             pass
     assert theirs.read_text() == "[[package]]\n"
     assert link.is_symlink()

@@ -282,7 +282,7 @@ def test_a_top_without_a_pixel_and_unlike_bottoms_are_refused(build) -> None:
         build(text.format("Convolution", "kernel_size: 4"), (1, 1, 3, 6))
     with pytest.raises(SpecError, match="does not fit"):
         build(text.format("Deconvolution", "kernel_size: 1 pad: 2"), (1, 1, 4, 4))
-    with pytest.raises(SpecError, match=r"^bottom\.1: all bottoms must have one shape"):
+    with pytest.raises(SpecError, match=r"^bottom\.1: all bottoms must have the same shape"):
         build(text.format("Convolution", "kernel_size: 1"), (1, 1, 4, 4), (1, 1, 4, 5), tops=2)
     with pytest.raises(SpecError, match="1 top blob"):
         build(text.format("Convolution", "kernel_size: 1"), (1, 1, 4, 4), (1, 1, 4, 4))

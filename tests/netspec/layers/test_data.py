@@ -358,7 +358,7 @@ def test_window_data_gives_windows_and_takes_no_scale_of_transform_param(tmp_pat
     [
         ("", "crop_size must be above 0"),
         ('transform_param { crop_size: 8 } window_data_param { crop_mode: "round" }', "unknown crop_mode"),
-        ("transform_param { crop_size: 8 } window_data_param { context_pad: 4 }", "leaves nothing of crop_size 8"),
+        ("transform_param { crop_size: 8 } window_data_param { context_pad: 4 }", "leaves no pixels of crop_size 8"),
     ],
 )
 def test_bad_window_params_are_refused(more: str, message: str) -> None:
@@ -464,5 +464,5 @@ def test_a_net_hands_its_arrays_to_its_memory_data(net_of: Callable[..., Any]) -
     assert net.blobs["data"].unique().tolist() == [1]
     with pytest.raises(SpecError, match=r'net.prototxt:1:38: layer "m" \(MemoryData\): found images \(3, 1, 1, 3\)'):
         net.set_input_arrays(np.ones((3, 1, 1, 3)))
-    with pytest.raises(SpecError, match="for nets with a MemoryData layer, and this one has none"):
+    with pytest.raises(SpecError, match="needs a MemoryData layer, and this net has none"):
         net_of("").set_input_arrays(np.ones((2, 1, 1, 3)))

@@ -185,7 +185,9 @@ def test_what_the_stand_in_lacks_is_named(python, tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(pycaffe_shim, "_home", pycaffe_shim.__name__)  # as if nobody had imported netspec.pycaffe
     (tmp_path / "wants_more.py").write_text("import caffe\nnet = caffe.Net('a', 'b', caffe.TEST)\n")
-    with pytest.raises(SpecError, match=r"netspec's replacement for pycaffe has no Net; it has Layer, TRAIN and TEST"):
+    with pytest.raises(
+        SpecError, match=r"netspec's module caffe for Python layers has no Net; it has Layer, TRAIN and TEST"
+    ):
         python("Mine", (2,), module="wants_more")
 
 
@@ -220,7 +222,7 @@ def test_faults_of_old_python_name_file_and_line(python, tmp_path: Path) -> None
     text = str(fault.value)
     assert "SyntaxError: " in text
     assert text.endswith(
-        "of_2014.py:2); where it is Python 2, `netspec run --python2 -m netspec train ...` translates it"
+        "of_2014.py:2); if it is Python 2, translate it with `netspec run --python2 -m netspec train ...`"
     )
 
 

@@ -83,7 +83,7 @@ def build(name: str, text: str, shapes: list[tuple[int, ...]], exact: str) -> La
 def test_kernels_are_what_autograd_computes(
     name: str, text: str, shapes: list[tuple[int, ...]], exact: str, sideways: bool
 ) -> None:
-    """``sideways``: the channels of a pixel lie side by side, as torch's kernels leave them."""
+    """``sideways``: the channels of a pixel are contiguous, as torch's kernels leave them."""
     watched = build(name, text, shapes, exact)
     wanted = tuple(i not in watched.label_bottoms for i in range(len(shapes)))
     mine = copy.deepcopy(watched)

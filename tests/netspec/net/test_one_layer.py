@@ -113,7 +113,7 @@ def test_what_reads_open_files_or_trains_is_not_copied(work_in: Callable[..., Pa
         with pytest.raises(TypeError, match=r"train_val.prototxt:\d+:\d+: layer .* cannot be copied or pickled"):
             copied(net)
     for copied in COPIES:
-        with pytest.raises(TypeError, match=r"a Solver cannot be copied or pickled: take a snapshot\(\)"):
+        with pytest.raises(TypeError, match=r"a Solver cannot be copied or pickled; use snapshot\(\)"):
             copied(solver)
     net.close()
     solver.close()

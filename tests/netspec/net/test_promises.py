@@ -76,7 +76,7 @@ def test_a_top_of_another_shape_than_promised_is_refused(made: Callable[..., Net
         whole(data=torch.ones(2, 3))
         whole(data=torch.ones(5, 4))
     assert str(found.value) == (
-        'net.prototxt:3:21: layer "odd" (Odd): forward returned a top of shape (1, 3), but reshape promised (2, 3)'
+        'net.prototxt:3:21: layer "odd" (Odd): forward returned a top of shape (1, 3), but reshape returned (2, 3)'
     )
 
 

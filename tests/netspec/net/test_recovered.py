@@ -55,7 +55,7 @@ def test_the_deploy_net_of_a_training_computes_the_same(trained: Callable[..., A
     assert not any(layer.blobs or layer.include or layer.HasField("phase") for layer in deploy.layer)
     assert warnings() == [
         'the net was trained with transform_param { scale: 0.5 crop_size: 9 } for blob "data"',
-        "w.caffemodel: left out, since no --shape says what label is: loss",
+        "w.caffemodel: left out, since the shape of label is unknown (give it with --shape): loss",
     ]
     Path("deploy.prototxt").write_text(write_text(deploy))
     built = netspec.load_net("deploy.prototxt", weights="w.caffemodel", strict=True)
@@ -68,7 +68,9 @@ def test_the_deploy_net_of_a_training_computes_the_same(trained: Callable[..., A
 
 def test_a_shape_that_the_file_does_not_tell_is_asked_for(trained: Callable[..., Any]):
     trained("mirror: true")
-    with pytest.raises(SpecError, match=r"w\.caffemodel: the file does not tell .*; say --shape data=1,3,H,W or"):
+    with pytest.raises(
+        SpecError, match=r"w\.caffemodel: the shape of its input is not in the file.*; give --shape data=1,3,H,W or"
+    ):
         recover_net("w.caffemodel", {})
     with pytest.raises(SpecError, match=r'--shape names "date"; did you mean "data"\? inputs of this net: data, label'):
         recover_net("w.caffemodel", {"date": (1, 3, 9, 9)})
@@ -85,7 +87,7 @@ def test_the_shape_of_records_is_read_where_they_are(trained: Callable[..., Any]
     assert list(deploy.layer[0].input_param.shape[0].dim) == [1, datum.channels, datum.height, datum.width]
     assert deploy.layer[-1].name == "ip"
     Path("gone/data.mdb").write_bytes(b"")
-    with pytest.raises(SpecError, match='its input, and "gone", which it was trained on, cannot be read here; say'):
+    with pytest.raises(SpecError, match='in the file, and "gone", which it was trained on, cannot be read here; give'):
         recover_net("w.caffemodel", {})
 
 
@@ -111,7 +113,7 @@ def test_inputs_of_old_nets_are_blobs_that_nothing_makes(tmp_path: Path):
     net.layers.append(layer)
     path = tmp_path / "old.caffemodel"
     path.write_bytes(net.SerializeToString())
-    with pytest.raises(SpecError, match="say --shape data=1,3,H,W"):
+    with pytest.raises(SpecError, match="give --shape data=1,3,H,W"):
         recover_net(path, {})
     deploy, _ = recover_net(path, {"data": (1, 3, 5, 5)})
     assert [layer.type for layer in deploy.layer] == ["Input", "Convolution"]
@@ -120,7 +122,7 @@ def test_inputs_of_old_nets_are_blobs_that_nothing_makes(tmp_path: Path):
 def test_what_holds_no_net(tmp_path: Path):
     path = tmp_path / "w.caffemodel"
     path.write_bytes(NetParameter(layer=[LayerParameter(name="c", blobs=[BlobProto(data=[0.0])])]).SerializeToString())
-    with pytest.raises(SpecError, match="holds weights, but no net"):
+    with pytest.raises(SpecError, match="contains weights but no net"):
         recover_net(path, {})
     path.write_text('layer { name: "c" }')
     assert not is_net_binary(path)

@@ -82,7 +82,7 @@ def test_hdf5_weights_that_caffe_would_not_load_are_warned_of(
         f'layer {{ name: "{name}" type: "InnerProduct" bottom: "x" top: "y" inner_product_param {{ num_output: 1 }} }}'
     )
     save_weights(net, tmp_path / f"w.caffemodel{ending}")
-    reported = [record.getMessage() for record in caplog.records if "Caffe loads no weights" in record.getMessage()]
+    reported = [record.getMessage() for record in caplog.records if "Caffe cannot load weights" in record.getMessage()]
     assert len(reported) == warned
     assert all("a/b" in text and "BINARYPROTO" in text for text in reported)
 
@@ -297,9 +297,7 @@ def test_what_is_cut_or_has_too_few_numbers_is_refused(tmp_path: Path) -> None:
     before = blobs_of(net)["ip"][0]
     for size in (len(whole) - 1, len(whole) // 2, 30):
         (tmp_path / "cut.caffemodel").write_bytes(whole[:size])
-        with pytest.raises(
-            SpecError, match=r"cut\.caffemodel: expected a binary NetParameter, found the beginning of one"
-        ):
+        with pytest.raises(SpecError, match=r"cut\.caffemodel: expected a binary NetParameter, found its first"):
             load_weights(net, tmp_path / "cut.caffemodel")
     short = NetParameter.FromString(whole)
     del short.layer[0].blobs[0].data[-1]
@@ -407,10 +405,10 @@ def test_one_warning_names_the_layers_that_the_weights_lack(tmp_path: Path, warn
     before = blobs_of(net)["two"][0]
     load_weights(net, path)
     assert warnings() == [
-        f"{path}: lacks weights for 1 of the net's 2 layers that have any: two; they stay as they were filled"
+        f"{path}: lacks weights for 1 of the net's 2 layers with weights: two; they keep the values of their fillers"
     ]
     np.testing.assert_array_equal(blobs_of(net)["two"][0], before)
-    with pytest.raises(SpecError, match=r"lacks weights for 1 of the net's 2 layers that have any: two; leave strict"):
+    with pytest.raises(SpecError, match=r"lacks weights for 1 of the net's 2 layers with weights: two; without strict"):
         load_weights(net, path, strict=True)
 
 
@@ -418,8 +416,8 @@ def test_a_warning_where_nothing_fits_and_an_error_where_something_must(tmp_path
     path = holding(tmp_path, "in")
     load_weights(net_of(TWO), path)
     (line,) = warnings()
-    assert "holds weights for none of the net's 2 layers that have any: one, two; they stay" in line
-    with pytest.raises(SpecError, match="none of the net's 2 layers that have any: one, two; is it the file of an"):
+    assert "contains weights for none of the net's 2 layers with weights: one, two; they keep" in line
+    with pytest.raises(SpecError, match="none of the net's 2 layers with weights: one, two; are they weights of an"):
         load_weights(net_of(TWO), path, some=True)
     load_weights(net_of(TWO), holding(tmp_path, "two"), some=True)
 

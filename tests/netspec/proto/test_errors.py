@@ -70,6 +70,6 @@ def test_files_that_are_not_utf8(data: bytes, message: str, tmp_path: Path) -> N
 @pytest.mark.parametrize("field", ["max_iter", "random_seed", "solver_mode"])
 def test_a_number_of_very_many_digits(field: str, number: str) -> None:
     """Python itself refuses to read one of 5,000 digits."""
-    with pytest.raises(SpecError, match=r"a number of [\d,]+ digits is out of every range") as caught:
+    with pytest.raises(SpecError, match=r"a number of [\d,]+ digits is out of range") as caught:
         parse_solver_text(f"{field}: {number}", "solver.prototxt")
     assert len(str(caught.value)) < 100

@@ -68,7 +68,10 @@ def test_not_a_number() -> None:
 def test_a_list_of_devices_is_its_first(caplog: pytest.LogCaptureFixture) -> None:
     solver = read("base_lr: 1\ndevice_id: [2, 3] max_iter: 5", SolverParameter())
     assert (solver.device_id, solver.max_iter) == (2, 5)
-    assert "test.prototxt:2:1: device_id is a list: the first is taken; train --gpu 0,1 takes several" in caplog.text
+    assert (
+        "test.prototxt:2:1: device_id is a list: only the first is used; for several GPUs, use train --gpu 0,1"
+        in caplog.text
+    )
 
 
 def test_what_only_the_cpp_parser_takes() -> None:

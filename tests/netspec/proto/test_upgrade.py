@@ -199,10 +199,10 @@ def test_transform_of_v1_data_layers(old: str) -> None:
 
 
 def test_mixture_of_layer_and_layers_is_refused() -> None:
-    with pytest.raises(SpecError, match=r'^f:2:1: "layers" is the older format, and the net has "layer" of line 3 too'):
+    with pytest.raises(SpecError, match=r'^f:2:1: "layers" is the older format, but the net has "layer" of line 3 too'):
         parse_net_text('name: "n"\nlayers { type: RELU }\nlayer { type: "ReLU" }', "f")
     both = net_of("layers {} layer {}")
-    with pytest.raises(SpecError, match=r'^w: "layers" is the older format, and the net has "layer" too'):
+    with pytest.raises(SpecError, match=r'^w: "layers" is the older format, but the net has "layer" too'):
         upgrade.upgrade_net(both, SourceMap.unknown("w", 2))
 
 

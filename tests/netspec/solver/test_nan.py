@@ -44,7 +44,7 @@ def test_a_training_that_diverges_keeps_its_last_good_snapshot(
     line = capsys.readouterr().err.splitlines()[-1]
     states = sorted(Path().glob("*.solverstate"), key=lambda path: int(path.stem.rpartition("_")[2]))
     assert line.startswith("solver.prototxt: Iteration ")
-    assert f"; the last good snapshot is {states[-1]}; lower base_lr, or go on with --nan warn" in line
+    assert f"; the last good snapshot is {states[-1]}; lower base_lr, or continue with --nan warn" in line
     solver = load_solver("solver.prototxt", snapshot=states[-1])
     assert all(item.parameter.isfinite().all() for item in solver.net.learnable)
 
@@ -83,7 +83,7 @@ def test_a_mean_that_is_no_number(tmp_path: Path) -> None:
     mean[1, 1, 1] = np.nan
     write_mean(str(tmp_path / "m.binaryproto"), mean)
     np.save(tmp_path / "m.npy", mean)
-    with pytest.raises(SpecError, match="has a NaN or an infinity"):
+    with pytest.raises(SpecError, match="contains a NaN or an infinity"):
         read_mean(str(tmp_path / "m.binaryproto"))
-    with pytest.raises(SpecError, match="has a NaN or an infinity"):
+    with pytest.raises(SpecError, match="contains a NaN or an infinity"):
         read_mean_option(str(tmp_path / "m.npy"))

@@ -122,6 +122,6 @@ test_state { } test_state { }"""
         's.prototxt:2:29: test_net "missing.prototxt" is not a file',
         "s.prototxt:4:1: found 1 test_iter, expected 3, one for each test_net and test_net_param (or more)",
         "s.prototxt:5:1: found 2 test_state, expected none or one for each of the 3 test nets",
-        "s.prototxt: found test_interval 0, expected more than 0, since there is a net to test",
+        "s.prototxt: found test_interval 0, expected more than 0, since the solver has a test net",
     ]
     assert [part.label for part in found] == ["test net #2"]

@@ -63,8 +63,8 @@ layer { name: "relu" type: "ReLU" bottom: "large" top: "relu" }
 @pytest.mark.parametrize(
     ("exact", "threads", "said"),
     [
-        ("small", 2, "2 threads share the sums of large: "),
-        ("none", 4, "4 threads share the sums of small and 1 more: "),
+        ("small", 2, "2 threads share the sums of large; "),
+        ("none", 4, "4 threads share the sums of small and 1 more; "),
         ("small", 1, ""),
         ("all", 2, ""),
     ],

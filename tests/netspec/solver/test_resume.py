@@ -188,7 +188,7 @@ def test_without_the_file_a_state_resumes_as_caffe_does(caplog: pytest.LogCaptur
     path_beside(state).unlink()
     caplog.set_level(logging.INFO, "netspec")
     resumed = load_solver("solver.prototxt", snapshot=state)
-    assert "is Caffe's: the data starts again at its first record" in caplog.text
+    assert "was written by Caffe: the data starts again at its first record" in caplog.text
     assert [layer.iteration for layer in resumed.net.layers if hasattr(layer, "iteration")] == [0]
 
 
@@ -198,7 +198,7 @@ def test_another_random_seed_is_said(warnings: Callable[[], list[str]]) -> None:
     _, state = solver.snapshot()
     write(NETS["crop and mirror"], "random_seed: 4")
     load_solver("solver.prototxt", snapshot=state)
-    assert warnings() == [f"{state}.extra: random_seed was 3: the random numbers are others from here on"]
+    assert warnings() == [f"{state}.extra: random_seed was 3; the random numbers differ from here on"]
 
 
 OTHERWISE = [
@@ -224,7 +224,7 @@ def test_what_changes_the_numbers_is_said(
             path.write_text(path.read_text().replace(old, new))
     load_solver("solver.prototxt", snapshot=state, **options)
     (said,) = [line for line in warnings() if line.startswith(state)]
-    assert said.startswith(f"{state}.extra: the training goes on with other numbers: ")
+    assert said.startswith(f"{state}.extra: the training continues, but its results will differ: ")
     assert reported in said
 
 
@@ -312,7 +312,7 @@ def refused(state: Path, message: str) -> None:
         ({"iteration": -1}, "found iter -1, expected at least 0"),
         ({"current_step": -1}, "found current_step -1, expected at least 0"),
         ({"learned_net": ""}, "names no weights to resume with"),
-        ({"learned_net": "gone.caffemodel"}, "its weights are neither at gone.caffemodel nor at"),
+        ({"learned_net": "gone.caffemodel"}, "its weights are neither gone.caffemodel nor "),
         ({"history": [np.full((4, 300), np.nan, np.float32), np.zeros(4, np.float32)]}, "history blob 0 has a NaN"),
     ],
 )
@@ -351,21 +351,21 @@ def test_every_command_compares_weights_with_what_was_written(form: str, capsys:
     capsys.readouterr()
     for command in commands:
         assert main(command) == 1
-        (line,) = [line for line in capsys.readouterr().err.splitlines() if "cut or replaced" in line]
+        (line,) = [line for line in capsys.readouterr().err.splitlines() if "truncated or replaced" in line]
         assert line.startswith(f"{weights}: is not the file that was written with x_iter_0.solverstate")
-        assert line.endswith("; if you replaced it yourself, remove " + path_beside(state_of(weights)).name)
+        assert line.endswith("; if you replaced it intentionally, remove " + path_beside(state_of(weights)).name)
     path_beside(state_of(weights)).write_text("{}")
     assert main(commands[0]) == 0
-    assert f"{weights.name} is not compared with it" in capsys.readouterr().err
+    assert f"{weights.name} was not checked against it" in capsys.readouterr().err
 
 
 def test_the_weights_of_another_net(state: Path) -> None:
     path_beside(state).unlink()
     write(NETS["batches of 8 of 37"].replace('"ip"', '"other"'))
-    refused(state, r"x_iter_1.caffemodel: holds weights for none of the net's 1 layers")
+    refused(state, r"x_iter_1.caffemodel: contains weights for none of the net's 1 layers")
 
 
-DAMAGED = r"x_iter_1.solverstate.extra: is damaged .*; without it the training resumes as Caffe's"
+DAMAGED = r"x_iter_1.solverstate.extra: is damaged .*; if you remove it, the training resumes as in Caffe"
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": 2}', '{"format": 1, "seed": "x"}', "[" * 5000])
@@ -377,7 +377,7 @@ def test_a_damaged_file_beside_a_state(state: Path, text: str) -> None:
 def test_one_changed_digit_beside_a_state(state: Path) -> None:
     path = path_beside(state)
     path.write_text(path.read_text().replace('"iteration": 1', '"iteration": 7'))
-    refused(state, r"x_iter_1.solverstate.extra: is damaged \(its own hash does not fit it\)")
+    refused(state, r"x_iter_1.solverstate.extra: is damaged \(its hash does not match\)")
 
 
 def forged(state: Path, *path: str | int, value: object) -> None:
@@ -421,9 +421,9 @@ def test_a_value_that_no_training_wrote(state: Path, path: list[str | int], valu
 @pytest.mark.parametrize(
     ("remembered", "message"),
     [
-        ({"iteration": []}, r"found iteration \(tuple\) to remember, expected iteration \(int\)"),
-        ({"iteration": "x"}, r"found iteration \(str\) to remember, expected iteration \(int\)"),
-        ({"next": 3}, r"found next \(int\) to remember, expected iteration \(int\)"),
+        ({"iteration": []}, r"found a saved state with iteration \(tuple\), expected iteration \(int\)"),
+        ({"iteration": "x"}, r"found a saved state with iteration \(str\), expected iteration \(int\)"),
+        ({"next": 3}, r"found a saved state with next \(int\), expected iteration \(int\)"),
     ],
 )
 def test_what_another_layer_remembers(state: Path, remembered: dict, message: str) -> None:
@@ -455,7 +455,7 @@ def test_resume_finds_the_newest_whole_pair(
     Path("x_iter_11.solverstate").write_bytes(b"half a st")
     Path("x_iter_10.caffemodel").write_bytes(expected[:-9])
     assert newest_pair("x") == Path("x_iter_5.solverstate")
-    assert [line.partition(": x")[0] for line in warnings()] == ["passed over"] * 2
+    assert [line.partition(": x")[0] for line in warnings()] == ["skipped"] * 2
     assert main(["train", "solver.prototxt", "--resume"]) == 0
     assert Path("x_iter_10.caffemodel").read_bytes() == expected
     for path in Path().glob("x_iter*"):

@@ -77,7 +77,7 @@ def test_the_weights_are_looked_for_beside_the_state_then_as_written(tmp_path: P
     monkeypatch.chdir(tmp_path)
     Path("moved").mkdir()
     state, path = State(1, "run/x.caffemodel", 0, []), Path("moved/x.solverstate")
-    with pytest.raises(SpecError, match=r"its weights are neither at moved/x\.caffemodel nor at run/x\.caffemodel"):
+    with pytest.raises(SpecError, match=r"its weights are neither moved/x\.caffemodel nor run/x\.caffemodel"):
         find_learned_net(state, path)
     Path("run").mkdir()
     Path("run/x.caffemodel").touch()
@@ -235,7 +235,7 @@ def test_a_state_with_a_history_for_each_sharer_is_that_of_their_sum(
         torch.testing.assert_close(mine, torch.tensor(expected))
     assert warnings() == [
         "sgd_step/old.solverstate: has a history for each layer, as before August 2015; "
-        "those of shared parameters are added up"
+        "the histories of shared parameters are added"
     ]
     old.history[9].num = 7
     old.history[9].data.extend([0] * 6 * len(old.history[9].data))

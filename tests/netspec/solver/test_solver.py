@@ -295,7 +295,7 @@ def test_gpu_mode_without_a_gpu_runs_on_the_cpu_and_warns_once(make, monkeypatch
         solver.step(1)
     assert solver.net.device.type == "cpu"
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert warnings == ["s.prototxt:4:1: solver_mode GPU, but torch finds no GPU: running on the CPU"]
+    assert warnings == ["s.prototxt:4:1: solver_mode GPU, but torch finds no GPU; running on the CPU"]
 
 
 def test_a_gpu_that_is_not_there_is_refused(make, monkeypatch):

@@ -148,10 +148,7 @@ def test_the_options_of_a_command_in_a_group_are_its_own(capsys: pytest.CaptureF
     maps.add_argument("--out")
     assert run(parser, ["look", "maps", "-v", "-out", "a.png", "-vmodule", "x=1"]) == 0
     assert (found[0].v, found[0].out) == (True, "a.png")
-    assert (
-        capsys.readouterr().err
-        == "program look maps: -vmodule is a flag of Caffe's or glog's that has no effect here\n"
-    )
+    assert capsys.readouterr().err == "program look maps: -vmodule is a flag of Caffe or glog that has no effect here\n"
 
 
 # The log

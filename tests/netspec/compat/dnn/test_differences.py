@@ -145,7 +145,7 @@ def test_a_parameter_of_another_size_is_refused() -> None:
 def test_a_net_without_weights_says_so() -> None:
     net = dnn.readNetFromCaffe(str(HERE / "classify.prototxt"))
     net.setInput(np.zeros((1, 3, 20, 20)))
-    with pytest.raises(dnn.DnnError, match=r"this net was read without weights; give the \.caffemodel"):
+    with pytest.raises(dnn.DnnError, match=r"this net was read without weights; also give the \.caffemodel"):
         net.forward()
 
 

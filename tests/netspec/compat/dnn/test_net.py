@@ -51,7 +51,7 @@ def test_a_wrong_shape_says_both_shapes() -> None:
     net.setInput(DATA[:, :2])
     with pytest.raises(dnn.DnnError, match=r"bottom of shape \(1, 2, 20, 20\) .* made for 3 channels") as caught:
         net.forward()
-    ending = 'input "data" has shape (1, 2, 20, 20), the prototxt declares (1, 3, 20, 20)'
+    ending = 'input "data" has shape (1, 2, 20, 20), but the prototxt declares (1, 3, 20, 20)'
     assert str(caught.value).endswith(ending)
 
 

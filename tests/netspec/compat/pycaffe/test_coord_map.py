@@ -89,7 +89,7 @@ def test_a_crop_of_a_crop() -> None:
 def test_a_crop_of_other_axes_does_not_go_with_a_convolution() -> None:
     n = spec()
     n.crop = L.Crop(n.deconv, n.data, axis=3, offset=3)
-    with pytest.raises(AxisMismatchException, match="behind 2, the other behind 1"):
+    with pytest.raises(AxisMismatchException, match="after 2, the other for the axes after 1"):
         coord_map_from_to(n.crop, n.data)
 
 

@@ -460,7 +460,7 @@ def test_forward_backward_all(net_of: Callable[..., caffe.Net]) -> None:
         ("caffe.Net('nowhere.prototxt', caffe.TEST)", RuntimeError, "Could not open file nowhere.prototxt"),
         ("net.blobs['data'].reshape(1, 3, 1, 1); net.forward()", ValueError, 'net.prototxt:4:3: layer "conv1" (Con'),
         ("net.blobs['data'].reshape(1, 4, 9, 9); net.forward()", ValueError, "(1, 4, 9, 9) does not fit the filters"),
-        ("net.params['conv1'][0].reshape(99, 99)", ValueError, "this blob has 270 numbers, and cannot become one of 9"),
+        ("net.params['conv1'][0].reshape(99, 99)", ValueError, "this blob has 270 numbers and cannot be reshaped to 9"),
         ("net.blobs['data'].reshape(1, 1, 1, 1, 1); net.blobs['data'].num", ValueError, "num_axes() <= 4"),
     ],
 )

@@ -98,7 +98,7 @@ def test_no_gpu_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.Log
     caffe.set_device(0)
     caffe.set_mode_gpu()
     assert [record.getMessage() for record in caplog.records] == [
-        "set_mode_gpu: torch finds no GPU here: nets run on the CPU"
+        "set_mode_gpu: torch finds no GPU here; nets run on the CPU"
     ]
     assert mode.device().type == "cpu"
     caffe.set_mode_cpu()

@@ -50,7 +50,7 @@ def test_it_is_put_in_and_taken_away(environment: Path) -> None:
     run(environment, "python", "-c", IMPORT, rc=1)
     said = run(environment, "python", "-m", "netspec", "install-caffe").stdout.splitlines()
     assert {Path(line.removesuffix(": written")) for line in said[:-1]} == files(environment) - before
-    assert said[-1] == "import caffe and Caffe's commands are netspec's now; netspec remove-caffe undoes this"
+    assert said[-1] == "import caffe and Caffe's commands now use netspec; netspec remove-caffe undoes this"
     assert run(environment, "python", "-c", IMPORT).stdout == "netspec.compat.pycaffe 1\n"
     for name in COMMANDS:
         assert "usage" in run(environment, name, "--help").stdout
@@ -90,7 +90,7 @@ def test_what_is_there_already_is_refused_or_moved_aside(environment: Path) -> N
     before = files(environment)
     refused = run(environment, "python", "-m", "netspec", "install-caffe", rc=1).stderr
     assert refused.count("\n") == 1
-    assert f"{site / 'caffe' / '__init__.py'}, {environment / 'bin' / 'caffe'}: is there already" in refused
+    assert f"{site / 'caffe' / '__init__.py'}, {environment / 'bin' / 'caffe'}: already exists" in refused
     assert files(environment) == before
     run(environment, "python", "-m", "netspec", "install-caffe", "--replace")
     assert run(environment, "python", "-c", IMPORT).stdout == "netspec.compat.pycaffe 1\n"
@@ -103,7 +103,7 @@ def test_what_is_there_already_is_refused_or_moved_aside(environment: Path) -> N
 def test_a_real_caffe_elsewhere_on_the_path_is_refused(environment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (environment / "caffe.py").write_text("real = 1")
     monkeypatch.setenv("PYTHONPATH", str(environment))
-    assert "caffe.py: is there already" in run(environment, "python", "-m", "netspec", "install-caffe", rc=1).stderr
+    assert "caffe.py: already exists" in run(environment, "python", "-m", "netspec", "install-caffe", rc=1).stderr
 
 
 CREATE = (Path(__file__).parent / "programs" / "create.sh").read_text()
@@ -150,6 +150,6 @@ def test_a_real_build_is_left_alone(environment: Path) -> None:
     tool.parent.mkdir(parents=True)
     tool.write_text("#!/bin/sh\necho real\n")
     refused = run(environment, "python", "-m", "netspec", "install-caffe", "--build", "build", rc=1).stderr
-    assert "build/tools/caffe: is there already and not netspec's; name another folder" in refused
+    assert "build/tools/caffe: already exists and is not netspec's; choose another folder" in refused
     run(environment, "python", "-m", "netspec", "remove-caffe", "--build", "build")
     assert [path for path in (environment / "build").rglob("*") if path.is_file()] == [tool]

@@ -67,14 +67,14 @@ def test_caffe_and_its_submodules_are_found(run: Run) -> None:
 
 def test_a_module_that_caffe_has_not(run: Run) -> None:
     fault = run("s.py", rc=1, s="import caffe.nothing").stderr
-    assert "No module named 'caffe.nothing'; Python files of a Caffe tree are found where its folder " in fault
+    assert "No module named 'caffe.nothing'; to import Python files of a Caffe tree, add its folder " in fault
 
 
 def test_a_real_caffe_is_used_unless_asked(run: Run) -> None:
     script = "import caffe; print(caffe.__name__)"
     done = run("s.py", s=script, files={"caffe/__init__.py": ""})
     assert done.stdout == "caffe\n"
-    assert "netspec: the Caffe that is installed at " in done.stderr
+    assert "netspec: using the Caffe installed at " in done.stderr
     assert run("--shadow-caffe", "s.py", s=script).stdout == "netspec.compat.pycaffe\n"
 
 
@@ -122,8 +122,11 @@ def test_arrays_of_one_element_are_numbers(run: Run) -> None:
 
 def test_a_numpy_that_is_too_new_is_named(run: Run) -> None:
     if tuple(map(int, np.__version__.split(".")[:2])) < (2, 4):
-        pytest.skip("this NumPy takes arrays of one element for numbers")
-    said = f"NumPy {np.__version__} takes no array of one element for a number, as old programs expect: pip install "
+        pytest.skip("this NumPy converts arrays of one element to numbers")
+    said = (
+        f"NumPy {np.__version__} does not convert an array of one element to a number, as old programs expect; "
+        "pip install "
+    )
     done = run("s.py", rc=1, s="import numpy as np\na = np.zeros(3)\na[0] = np.ones(1)")
     first, *_, last = done.stderr.splitlines()
     assert first.startswith(f"netspec run: warning: {said}")

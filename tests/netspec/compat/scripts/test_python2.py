@@ -92,7 +92,7 @@ def test_a_whole_script(run: Run, python: Run, tmp_path: Path) -> None:
         *("3 3.5 1.5 4", "[0, 0, 1, 1, 2] [0, 0, 0, 0, 1] [0.0, 0.0, 0.5, 0.5, 1.0]"),
         *("3.0 ['a', 'b'] [1]", "3 -4 500.0 0.25 -1 2", "1"),
     ]
-    said = "old.py is Python 2, and runs translated to Python 3; --write-py3 FILE writes the translation"
+    said = "old.py is Python 2 and was translated to Python 3 to run; --write-py3 FILE writes the translation"
     assert said in done.stderr
     (tmp_path / "binary.txt").unlink()
     written = run("--write-py3", "new.py", "old.py")
@@ -105,7 +105,7 @@ def test_a_whole_script(run: Run, python: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize("words", [["--shadow-caffe", "s.py"], ["-m", "s"], ["s.py", "argument"]])
 def test_a_translation_that_is_only_written_takes_nothing_for_a_run(words: list[str], run: Run) -> None:
     said = run("--write-py3", "n.py", *words, s="print 1", rc=2).stderr
-    assert "--write-py3 takes a script, and nothing runs" in said
+    assert "--write-py3 translates a script and runs nothing" in said
 
 
 HALF = "def half(n):\n    return n / 2\n"
@@ -158,7 +158,10 @@ socket.socketpair()[0].send(u'text')
     assert done.stdout == "['x'] 3 3\n"
     last = done.stderr.splitlines()[-1]
     assert last.startswith("netspec run: ")
-    assert "s.py:12 is Python 2, which took text for bytes and 2.0 for 2: write what is due there, such as " in last
+    assert (
+        "s.py:12 is Python 2 code, which does not distinguish text from bytes, or 2.0 from 2; "
+        "convert explicitly, for example with "
+    ) in last
 
 
 def test_a_python_layer_in_python_2_is_trained(python: Run) -> None:
@@ -177,7 +180,7 @@ class L(caffe.Layer):
     base_lr: 0.1 lr_policy: "fixed" max_iter: 1 solver_mode: CPU snapshot_after_train: false"""
     files = {"lay.py": layer, "s.prototxt": net}
     words = ("-m", "netspec", "train", "s.prototxt", "--allow-python-layers")
-    assert "`netspec run --python2 -m netspec train ...` translates it" in python(*words, files=files, rc=1).stderr
+    assert "translate it with `netspec run --python2 -m netspec train ...`" in python(*words, files=files, rc=1).stderr
     done = python("-m", "netspec", "run", "--python2", *words)
     assert done.stdout == "set up 3\n"
     assert "__main__.py is Python 2" not in done.stderr
@@ -210,7 +213,7 @@ def test_a_script_can_be_said_to_be_python_2(run: Run) -> None:
 def test_nothing_to_translate_is_said(run: Run) -> None:
     done = run("--write-py3", "n.py", "s.py", s="print('x')", rc=1)
     assert done.stdout == ""
-    assert "s.py: is Python 3 already: there is no translation to write to n.py" in done.stderr
+    assert "s.py: is already Python 3: no translation was written to n.py" in done.stderr
 
 
 def test_quotients() -> None:

@@ -90,7 +90,9 @@ def test_a_damaged_entry_is_made_again(
         assert entry(tmp_path, "key", make) == (folder, False)
     assert (folder / "model").read_bytes() == b"m" * 10
     (aside,) = (path for path in tmp_path.iterdir() if path != folder)
-    assert caplog.messages == [f"{folder}: is damaged, and is made again; what was there is {aside.name} now"]
+    assert caplog.messages == [
+        f"{folder}: was damaged and is being recreated; the damaged one was renamed to {aside.name}"
+    ]
 
 
 def test_a_key_is_of_contents_and_options(tmp_path: Path) -> None:

@@ -140,7 +140,7 @@ def test_parameters_that_may_change_unseen_are_read_at_every_pass(
             expected.params["feat"][1].data.fill_(value)
             torch.testing.assert_close(found, expected(data=data)["feat"].detach(), rtol=1e-5, atol=1e-5)
     (line,) = caplog.messages
-    assert "a program could change parameters" in line
+    assert "a program could change the parameters" in line
     del held
     torch.testing.assert_close(net(data=data)["feat"], found, rtol=1e-5, atol=1e-5)
     assert not net(data=data)["feat"].requires_grad
@@ -172,7 +172,7 @@ def test_a_pass_that_needs_gradients_is_torchs(engine: str, data: np.ndarray) ->
             "TEST",
             'layer "noise"',
         ),
-        ("", "TRAIN", "it runs nets in phase TEST, this one is in TRAIN"),
+        ("", "TRAIN", "it runs nets in phase TEST, but this net is in phase TRAIN"),
     ],
 )
 def test_what_it_cannot_do_is_torchs(
@@ -233,7 +233,7 @@ def test_a_cache_that_cannot_be_written_is_reported(
     Path("file").write_text("")
     with caplog.at_level(logging.WARNING):
         load(engine, cache="file/cache")(data=data)
-    assert caplog.messages == ["file/cache: cannot be written: Not a directory; the exported model is not kept"]
+    assert caplog.messages == ["file/cache: cannot be written: Not a directory; the exported model will not be kept"]
 
 
 @pytest.mark.slow
@@ -309,7 +309,9 @@ def test_time_is_of_the_whole_forward_pass(engine: str, capsys: pytest.CaptureFi
     words[4] = "TRAIN"
     assert main(words) == 0
     reported = capsys.readouterr().err
-    assert f"engine {engine}: it runs nets in phase TEST, this one is in TRAIN; torch runs the net" in reported
+    assert (
+        f"engine {engine}: it runs nets in phase TEST, but this net is in phase TRAIN; torch runs the net" in reported
+    )
     assert "Average Backward pass: " in reported
 
 
@@ -348,7 +350,7 @@ def test_warnings_of_the_files_are_given_at_every_start(
         with caplog.at_level(logging.WARNING):
             Describer("net.prototxt", "net.caffemodel", engine=engine)
         (line,) = caplog.messages
-        assert "lacks weights for 1 of the net's 2 layers that have any: conv_renamed" in line
+        assert "lacks weights for 1 of the net's 2 layers with weights: conv_renamed" in line
     assert len(entries(files)) == 1
 
 
@@ -364,7 +366,7 @@ def test_a_damaged_model_is_made_again(
     caplog.clear()
     assert torch.equal(load(engine)(data=data)["feat"], first)
     (line,) = caplog.messages
-    assert line.startswith(f"{kept}: is damaged, and is made again")
+    assert line.startswith(f"{kept}: was damaged and is being recreated")
     caplog.clear()
     assert torch.equal(load(engine)(data=data)["feat"], first)
     assert caplog.messages == []

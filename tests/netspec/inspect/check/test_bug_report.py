@@ -71,9 +71,9 @@ def test_weights_logs_folders_and_what_is_none_of_them(tmp_path: Path) -> None:
         "conv1 (Convolution): (6, 1, 5, 5), (6,)\n",
         "Optimization Done.",
         "a folder; `netspec data stat` describes a database",
-        "27 bytes\nno text, and no .caffemodel",
+        "27 bytes\nneither text nor a .caffemodel",
         "no regular file",
-        "3 GiB\nno text",
+        "3 GiB\nneither text",
         "caf\\udce9",
         "cannot be read: No such file or directory",
     ):

@@ -102,7 +102,7 @@ def test_weights() -> None:
     write_weights("b.caffemodel", one=[moved, values[0]], two=[values.reshape(1, 1, 2, 3)], four=[values])
     assert [str(each) for each in compare_files("a.caffemodel", "b.caffemodel")] == [
         'a.caffemodel: layer "three" is only here, not in the second file',
-        'b.caffemodel: layer "one", blob 0: 3 of 6 values differ, by 0.25 in the mean and 0.25 at most; '
+        'b.caffemodel: layer "one", blob 0: 3 of 6 values differ, by 0.25 on average and 0.25 at most; '
         "the largest was 5",
         'b.caffemodel: layer "four" is only here, not in the first file',
     ]
@@ -127,7 +127,7 @@ def test_weights_of_both_formats_and_odd_values() -> None:
     with pytest.raises(SpecError, match=r'd\.caffemodel: layer "z": found 1 numbers'):
         list(compare_files("a.caffemodel", "d.caffemodel"))
     Path("cut.caffemodel").write_bytes(Path("a.caffemodel").read_bytes()[:-5])
-    with pytest.raises(SpecError, match=r"cut\.caffemodel: expected .* the beginning of one, .* bytes: it was cut"):
+    with pytest.raises(SpecError, match=r"cut\.caffemodel: expected .* its first .* bytes only: it was truncated"):
         list(compare_files("a.caffemodel", "cut.caffemodel"))
 
 
@@ -139,7 +139,7 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["diff", "A", "B"]) == 1
     assert capsys.readouterr() == ('B:1:1: name is "m", was "n" (A:1:1)\n', "")
     assert main(["diff", "A", "S"]) == 2
-    assert capsys.readouterr() == ("", "S: is a solver, and A is a net; expected two files of one kind\n")
+    assert capsys.readouterr() == ("", "S: is a solver, and A is a net; expected two files of the same kind\n")
     assert main(["diff", "A", "gone"]) == 2
 
 

@@ -44,11 +44,11 @@ def test_what_is_wrong_is_named_once(run: Run, case: dict[str, str]) -> None:
 @pytest.mark.parametrize(
     ("content", "kind"),
     [
-        (b" <!DOCTYPE html><html>", "found a web page: the download failed; look at it in a browser"),
+        (b" <!DOCTYPE html><html>", "found a web page: the download failed; open it in a browser"),
         (b"", "the file is empty, expected a binary NetParameter"),
         (
             b"\x0a\x03net\xa2\x06\xff\x7f cut",
-            "found the beginning of one, 13 bytes: it was cut; copy or download it again",
+            "found its first 13 bytes only: it was truncated; copy or download it again",
         ),
         (b"\x0a\x03net\xa8\x1f\xff\x7f cut", "found another kind of data, or a truncated file"),
         (b'layer { name: "a" }', "expected a binary NetParameter, found text"),

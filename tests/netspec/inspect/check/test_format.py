@@ -149,7 +149,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert main(["fmt", "good", "link"]) == 0
     assert Path("link").is_symlink()
     assert Path("other").read_text() == 'name: "x"\nlayer { name: "y" }\n'
-    assert capsys.readouterr().out == "good: was in this form already\nlink: formatted\n"
+    assert capsys.readouterr().out == "good: already formatted\nlink: formatted\n"
     Path("bad").write_text("name")
     assert main(["fmt", "bad", "none", "good"]) == 1
     assert main(["fmt", "--check", "bad", "other"]) == 2

@@ -70,8 +70,8 @@ def filled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 @pytest.mark.parametrize(
     ("text", "limit", "said"),
     [
-        (PARAMETERS, "100MiB", '3:1: layer "two" (InnerProduct): needs 235 MiB of memory, the most of all layers'),
-        (DUMMY, "100MiB", '1:1: layer "first" (DummyData): needs 244 MiB of memory, the most of all layers'),
+        (PARAMETERS, "100MiB", '3:1: layer "two" (InnerProduct): needs 235 MiB of memory, more than any other layer'),
+        (DUMMY, "100MiB", '1:1: layer "first" (DummyData): needs 244 MiB of memory, more than any other layer'),
         (HUGE, "100TiB", '2:1: layer "ip" (InnerProduct): found shape (4000000, 1000000), 4,000,000,000,000 numbers'),
     ],
     ids=["parameters", "a blob", "more than Caffe counts"],
@@ -146,7 +146,7 @@ def test_a_pass_that_takes_too_much(text: str, capsys: pytest.CaptureFixture[str
     )
     assert main(COMMANDS["time"]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith('net.prototxt:2:1: layer "conv" (Convolution): its pass needs more memory than there is; ')
+    assert said.startswith('net.prototxt:2:1: layer "conv" (Convolution): its pass needs more memory than available; ')
 
 
 def test_the_memory_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,8 +182,8 @@ def test_what_is_said_of_a_sum(capsys: pytest.CaptureFixture[str]) -> None:
     Path("net.prototxt").write_text(PARAMETERS)
     assert main(["check", "net.prototxt", "--limit", "200MiB"]) == 1
     assert capsys.readouterr().err.endswith(
-        "the net needs at least 239 MiB: parameters 239 MiB, tops 477 KiB; the limit is 200 MiB, --limit SIZE sets "
-        "another\n"
+        "the net needs at least 239 MiB: parameters 239 MiB, tops 477 KiB; the limit is 200 MiB; "
+        "change it with --limit SIZE\n"
     )
     assert main(["check", "net.prototxt", "--limit", "1G"]) == 0
     assert "\nmemory: at least 239 MiB: parameters 239 MiB, tops 477 KiB\n" in capsys.readouterr().out
@@ -281,5 +281,5 @@ def test_similar_names_are_looked_for_only_so_often(
 
 def test_a_pyramid_of_more_windows_than_can_be_counted(net_of: Callable[..., Net]) -> None:
     spp = 'layer { name: "s" type: "SPP" bottom: "data" top: "s" spp_param { pyramid_height: 4000000000 } }'
-    with pytest.raises(SpecError, match="pyramid_height must be at most 16: more windows than an int counts"):
+    with pytest.raises(SpecError, match="pyramid_height must be at most 16, so that an int can count its windows"):
         net_of(INPUT + spp)

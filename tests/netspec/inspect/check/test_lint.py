@@ -67,7 +67,7 @@ def test_nothing_is_said_of_a_sound_net(advice: Callable[..., list[str]]) -> Non
 
 def test_towers_that_share_only_some_of_their_parameters(advice: Callable[..., list[str]]) -> None:
     assert advice(siamese(('param { name: "w" }', 'param { name: "w" }'))) == [
-        'net.prototxt:6:1: layer "ip2" (InnerProduct): 1 of its 2 parameter blobs are not shared with the other tower '
+        'net.prototxt:6:1: layer "ip2" (InnerProduct): 1 of its 2 parameter blobs are not shared with the other branch '
         'of "loss"; give them the same param { name }'
     ]
 
@@ -75,8 +75,7 @@ def test_towers_that_share_only_some_of_their_parameters(advice: Callable[..., l
 def test_a_loss_that_nothing_reaches(advice: Callable[..., list[str]]) -> None:
     fixed = 'param { name: "w" lr_mult: 0 } param { name: "b" lr_mult: 0 }'
     assert advice(siamese((fixed, fixed))) == [
-        'net.prototxt:8:1: layer "loss" (ContrastiveLoss): this loss depends on no learnable parameter; '
-        "is an lr_mult 0?"
+        'net.prototxt:8:1: layer "loss" (ContrastiveLoss): this loss depends on no learnable parameter; is lr_mult 0?'
     ]
     assert advice(siamese((fixed, fixed)), phase=1) == []
 
@@ -120,7 +119,7 @@ def test_a_phase_without_its_data_layer(advice: Callable[..., list[str]], tmp_pa
     (checked,) = check_file("net.prototxt")
     assert [str(fault) for fault in checked.faults] == [
         'net.prototxt:3:35: layer "cut" (Slice): unknown bottom blob "pair": layer "d" of line 1 makes it '
-        "in phase TRAIN; say --phase TRAIN, or give phase TEST a layer that does"
+        "in phase TRAIN; use --phase TRAIN, or add such a layer for phase TEST"
     ]
     assert lint_file("net.prototxt", replace(ON_META, given_shapes={"pair": (2, 6, 8, 8)})).faults == []
 
@@ -135,25 +134,25 @@ def test_nothing_is_said_of_a_sound_solver(advice: Callable[..., list[str]]) -> 
 def test_a_test_on_what_the_net_is_trained_on(advice: Callable[..., list[str]]) -> None:
     source = str(GOLDEN / "pairs" / "train_lmdb")
     tested = SOLVER + "test_interval: 10\ntest_iter: 30\n"
-    reported = 'layer "d" (Data): the test reads "%s", which the net is trained on; name another database'
+    reported = 'layer "d" (Data): the test reads "%s", which the net is trained on; use another database'
     assert [line.partition(": ")[2] for line in advice(in_phases(siamese(source=source)), tested)] == [
         reported % source
     ]
     same = siamese(source=source)
     assert f"net.prototxt:2:16: {reported % source}" in advice(same, tested, open_data=True)
     assert advice(same, SOLVER) == [
-        f'net.prototxt:2:16: layer "d" (Data): a test would read "{source}" too, which the net is trained on; '
-        "give phase TEST a data layer"
+        f'net.prototxt:2:16: layer "d" (Data): a test would also read "{source}", which the net is trained on; '
+        "add a data layer for phase TEST"
     ]
 
 
 def test_no_snapshot_is_ever_taken(advice: Callable[..., list[str]]) -> None:
     without = SOLVER + "snapshot_after_train: false\n"
     assert advice(in_phases(siamese()), without + "snapshot: 101") == [
-        "solver.prototxt:4:1: snapshot 101 is more than max_iter 100: no effect; make it smaller"
+        "solver.prototxt:4:1: snapshot 101 is more than max_iter 100, so it has no effect; lower it"
     ]
     assert advice(in_phases(siamese()), SOLVER + "snapshot: 101") == [
-        "solver.prototxt:3:1: snapshot 101 is more than max_iter 100: no effect; make it smaller"
+        "solver.prototxt:3:1: snapshot 101 is more than max_iter 100, so it has no effect; lower it"
     ]
     assert advice(in_phases(siamese()), without) == [
         "solver.prototxt: no snapshot is taken; set snapshot, or snapshot_after_train: true"

@@ -78,10 +78,10 @@ def test_the_phases_of_a_net_see_the_same_images() -> None:
     test = data.format("TEST", "crop_size: 4 scale: 0.25")
     linted = lint(train + test)
     assert [str(each) for each in linted.found] == [
-        'net.prototxt:5:3: layer "d" (Data): mean_value is absent here, and 1 2 3 in line 1, where "x" of another '
-        "phase is read; give both the same [transform-differs]",
-        'net.prototxt:5:34: layer "d" (Data): scale is 0.25 here, and 0.5 in line 1, where "x" of another phase is '
-        "read; give both the same [transform-differs]",
+        'net.prototxt:5:3: layer "d" (Data): mean_value is absent here, and 1 2 3 in line 1, where "x" of the '
+        "other phase is read; use the same value in both [transform-differs]",
+        'net.prototxt:5:34: layer "d" (Data): scale is 0.25 here, and 0.5 in line 1, where "x" of the other phase is '
+        "read; use the same value in both [transform-differs]",
     ]
     assert len(linted.unknown) == 1  # three means tell the channels
 

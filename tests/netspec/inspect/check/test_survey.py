@@ -72,7 +72,7 @@ def test_what_a_data_layer_refuses_is_a_fault(tmp_path: Path) -> None:
         (1, "is not a Datum (3 bytes)"),
         (2, "cannot be decoded as an image"),
         (3, 'is 3 x 6 x 9, the first record, "00000000", 3 x 6 x 8'),
-        (4, "has a NaN or an infinity"),
+        (4, "contains a NaN or an infinity"),
     ]
     np.testing.assert_allclose(found.channels.mean, np.stack([image(0), image(2)]).mean(axis=(0, 2, 3)))
 
@@ -82,11 +82,11 @@ def test_what_is_worth_a_look_is_noted(tmp_path: Path) -> None:
     images += [(image(0), 2), (image(0), 2), (np.zeros((3, 6, 8), np.uint8), 3)]
     notes = look(write(tmp_path / "db", images)).notes
     assert notes[:3] == [
-        "records with the values of another one: 2",
+        "records with the same values as another record: 2",
         "images that occur with different labels: 1",
-        "records with one value everywhere: 1",
+        "records in which all values are equal: 1",
     ]
-    assert "in the order of their labels" in notes[3]
+    assert "sorted by label" in notes[3]
     some = [array_to_datum(image(k), None if k else 1).SerializeToString() for k in range(3)]
     assert look(write(tmp_path / "some", some)).notes == ["records without a label, which Caffe reads as 0: 2"]
 

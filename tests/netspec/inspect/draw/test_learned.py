@@ -131,9 +131,9 @@ def test_maps_and_numbers() -> None:
     maps = np.random.default_rng(0).normal(size=(5, 4, 6))
     maps[2] = 0
     figure = maps_figure(maps, image(), "x")
-    assert figure.get_suptitle() == "x: 5 x 4 x 6; 1 of one value everywhere"
+    assert figure.get_suptitle() == "x: 5 x 4 x 6; 1 constant"
     figure = maps_figure(np.array([1.0, 7, 2]), image(shape=(4, 5)), "x")
-    assert "greatest: 1 (7), 2 (2), 0 (1)" in figure.get_suptitle()
+    assert "largest: 1 (7), 2 (2), 0 (1)" in figure.get_suptitle()
 
 
 def test_a_picture_of_saliency_has_a_row_per_image() -> None:
@@ -163,7 +163,7 @@ def test_thumbnails_by_name_and_by_key(tmp_path: Path) -> None:
     assert records.images[0].shape == (28, 28)
     with pytest.raises(ValueError, match=r'has no image "9.png"'):
         thumbnails(tmp_path, ["9.png"], 1)
-    with pytest.raises(ValueError, match="has 3 images; the descriptors are 2"):
+    with pytest.raises(ValueError, match="has 3 images, but there are 2 descriptors"):
         thumbnails(tmp_path, None, 2)
 
 
@@ -216,13 +216,13 @@ def test_the_embedding_of_a_siamese_net(run: Run) -> None:
         (("look", "maps", *NET, "--blob", "conv1", "--image", "no.png"), "no.png: cannot be read"),
         (
             ("look", "embedding", "a.png"),
-            "a.png: cannot be read (File is not a zip file); expected a features.npz of netspec extract",
+            "a.png: cannot be read (File is not a zip file); expected a features.npz written by netspec extract",
         ),
         (
             ("look", "embedding", "cut.npz"),
-            "cut.npz: cannot be read (File is not a zip file); expected a features.npz of netspec extract",
+            "cut.npz: cannot be read (File is not a zip file); expected a features.npz written by netspec extract",
         ),
-        (("look", "embedding", "no.npz"), "no.npz: no such file; expected a features.npz of netspec extract"),
+        (("look", "embedding", "no.npz"), "no.npz: no such file; expected a features.npz written by netspec extract"),
         (
             ("look", "embedding", "f.npz", "--array", "fea"),
             'f.npz: has no descriptors "fea"; did you mean "feat"? it has: feat',

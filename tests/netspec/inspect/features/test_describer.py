@@ -70,7 +70,9 @@ def test_zooms_are_views_of_the_middle_and_a_detector_sees_through_them(describe
     assert [detector.add(images[3][14:42, 14:42]).accepted for detector in detectors] == [None, 3]
 
 
-@pytest.mark.parametrize(("zooms", "fault"), [("1,x", "expected numbers"), (1.5, "at most 1"), ("0", "more than 0")])
+@pytest.mark.parametrize(
+    ("zooms", "fault"), [("1,x", "expected numbers"), (1.5, "at most 1"), ("0", "a number above 0")]
+)
 def test_odd_zooms(describe: Describer, zooms: str | float, fault: str) -> None:
     with pytest.raises(SpecError, match=fault):
         Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel", zooms=zooms)

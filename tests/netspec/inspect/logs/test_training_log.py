@@ -122,7 +122,7 @@ def test_the_years_end_does_not_turn_time_back() -> None:
         ("I0101 00:00:00.000000 1 solver.cpp:311] Optimization stopped early.", "stopped early"),
         ("F0101 00:00:00.000000 1 math.cpp:1] Check failed: error == cudaSuccess (2 vs. 0)  out of memory", "failed"),
         ("*** Aborted at 1 (unix time) try SIGABRT", "failed"),
-        ("a b.prototxt:3:1: Iteration 500: the loss is nan; lower base_lr, or go on with --nan warn", "failed"),
+        ("a b.prototxt:3:1: Iteration 500: the loss is nan; lower base_lr, or continue with --nan warn", "failed"),
         ("I0101 00:00:00.000000 1 net.cpp:1] something", "running"),
     ],
 )
@@ -132,7 +132,7 @@ def test_how_a_training_ended(line: str, state: str) -> None:
     assert reader.log.state == state
 
 
-@pytest.mark.parametrize(("data", "what"), [(b"\xff\x00 no log", "holds no iteration"), (None, "cannot be read")])
+@pytest.mark.parametrize(("data", "what"), [(b"\xff\x00 no log", "contains no iteration"), (None, "cannot be read")])
 def test_what_is_no_log_is_refused(tmp_path: Path, data: bytes | None, what: str) -> None:
     path = tmp_path / "x.log"
     if data is not None:
