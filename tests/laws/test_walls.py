@@ -1,4 +1,4 @@
-"""The rules for imports between packages, and light imports that must stay light."""
+"""The rules for imports between packages, and modules that must not import torch."""
 
 import ast
 import re
@@ -36,13 +36,13 @@ def test_importing_needs_no_torch(module: str) -> None:
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
-GROUND = {"errors", "log", "process", "files", "terminal"}
+BASE = {"errors", "log", "process", "files", "terminal"}
 OURS = ("netspec", "loopclosure", "lmdb_build")
 STANDARD = {*sys.stdlib_module_names, "typing_extensions"} - {"argparse"}
 LIBRARIES = {"cv2": "OpenCV", "google": "protobuf", "sklearn": "scikit-learn", "PIL": "Pillow"}
 
 
-def room_of(module: str) -> str:
+def package_of(module: str) -> str:
     """The row of the table that a module belongs to."""
     top, *inside = module.split(".")
     if top != "netspec" or not inside:
@@ -51,11 +51,11 @@ def room_of(module: str) -> str:
 
 
 def imported() -> dict[str, set[str]]:
-    """What each room imports directly, in functions and for type checkers too: rooms by name, libraries likewise."""
+    """What each package imports directly, also in functions and for type checkers: packages and libraries by name."""
     found: dict[str, set[str]] = {}
-    for path in (path for package in OURS for path in (ROOT / package).rglob("*.py")):
-        room = room_of(".".join(path.relative_to(ROOT).with_suffix("").parts))
-        names = found.setdefault(room, set())
+    for path in (path for top in OURS for path in (ROOT / top).rglob("*.py")):
+        package = package_of(".".join(path.relative_to(ROOT).with_suffix("").parts))
+        names = found.setdefault(package, set())
         for node in ast.walk(ast.parse(path.read_text())):
             modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom):
@@ -64,39 +64,39 @@ def imported() -> dict[str, set[str]]:
             for module in modules:
                 top = module.partition(".")[0]
                 if top not in STANDARD:
-                    names.add(room_of(module) if top in OURS else LIBRARIES.get(top, top))
-        names.discard(room)
+                    names.add(package_of(module) if top in OURS else LIBRARIES.get(top, top))
+        names.discard(package)
     return found
 
 
-def test_the_table_of_rooms_is_true() -> None:
+def test_the_table_of_imports_is_true() -> None:
     page = (ROOT / "ARCHITECTURE.md").read_text()
     table = re.findall(
-        r"^\| `([\w/]+)` \| ([^|]*) \| ([^|]*) \|$", page.partition("## What a room may")[2], re.MULTILINE
+        r"^\| `([\w/]+)` \| ([^|]*) \| ([^|]*) \|$", page.partition("## Imports between")[2], re.MULTILINE
     )
     entrance = {"netspec", "__init__", "__main__", "pycaffe", "dnn"}
     found = imported()
-    assert {room for room, _, _ in table} == set(found) - entrance
-    for room, rooms, libraries in table:
-        listed = {name.strip() for name in f"{rooms},{libraries}".split(",") if name.strip()}
-        reads = {"argparse"} if room in ("terminal", "cli", "loopclosure", "lmdb_build") else set()
-        ground = GROUND if room not in GROUND else set()
-        assert found[room] - ground - entrance - reads == listed, room
+    assert {package for package, _, _ in table} == set(found) - entrance
+    for package, packages, libraries in table:
+        listed = {name.strip() for name in f"{packages},{libraries}".split(",") if name.strip()}
+        reads = {"argparse"} if package in ("terminal", "cli", "loopclosure", "lmdb_build") else set()
+        base = BASE if package not in BASE else set()
+        assert found[package] - base - entrance - reads == listed, package
 
 
-WINGS = {"fast", "dialects", "export", "compat", "inspect"}
-CORE = {"proto", "graph", "data", "exact", "layers", "layers/contract", "run", "net", "solver", *GROUND}
+OPTIONAL = {"fast", "dialects", "export", "compat", "inspect"}
+CORE = {"proto", "graph", "data", "exact", "layers", "layers/contract", "run", "net", "solver", *BASE}
 
 
-def test_the_core_imports_no_wing() -> None:
-    """But for the public doors: ``load``, and the package itself."""
+def test_the_core_imports_no_optional_package() -> None:
+    """The exceptions are ``load`` and ``netspec/__init__.py``."""
     found = imported()
-    assert {room: names & (WINGS | {"cli", "load"}) for room, names in found.items() if room in CORE} == {
-        room: set() for room in CORE
+    assert {name: names & (OPTIONAL | {"cli", "load"}) for name, names in found.items() if name in CORE} == {
+        name: set() for name in CORE
     }
-    assert not found["fast"] & (WINGS | {"load", "cli"})
+    assert not found["fast"] & (OPTIONAL | {"load", "cli"})
 
 
-def test_nobody_imports_the_doors() -> None:
+def test_nothing_imports_the_scripts() -> None:
     forbidden = {"tools", "prototxt", "tests", "benchmarks"}
-    assert not [room for room, names in imported().items() if names & forbidden]
+    assert not [name for name, names in imported().items() if names & forbidden]

@@ -1,4 +1,4 @@
-"""Each wing can be deleted, and all of them: what the others do goes on with the same numbers, to the last bit."""
+"""Any optional package, or all of them, can be deleted: everything else works with bit-identical results."""
 
 import json
 import os
@@ -14,20 +14,20 @@ from paths import GOLDEN, ROOT
 
 pytestmark = pytest.mark.slow
 
-WINGS = ("fast", "dialects", "export", "compat", "inspect")
+OPTIONAL = ("fast", "dialects", "export", "compat", "inspect")
 RANDOM_NETS = 100
-MOST_LINES = 19_740  # of the core, Python; to be lowered whenever it falls, to 18,000 in the end
-NOT_CORE = (*WINGS, "cli", "terminal", "pycaffe.py", "dnn.py")
+MOST_LINES = 19_740  # of Python in the core; lower it whenever the number falls, finally to 18,000
+NOT_CORE = (*OPTIONAL, "cli", "terminal", "pycaffe.py", "dnn.py")
 
 
 def copy_without(missing: Sequence[str], folder: Path) -> Path:
     shutil.copytree(ROOT / "netspec", folder / "netspec", ignore=shutil.ignore_patterns("__pycache__"))
-    for wing in missing:
-        shutil.rmtree(folder / "netspec" / wing)
+    for package in missing:
+        shutil.rmtree(folder / "netspec" / package)
     return folder
 
 
-# An editable installation finds modules that are missing here in the project itself.
+# An editable installation would find the missing modules in the project itself.
 START = """
 import runpy, sys
 sys.meta_path[:] = [each for each in sys.meta_path if "Editable" not in getattr(each, "__name__", "")]
@@ -39,7 +39,7 @@ assert all(file.startswith(sys.path[0]) for file in found), found
 
 
 def run(program: Path, package: Path, *arguments: str) -> str:
-    """Run a program with the package of a folder, and the helpers of tests; return what it prints."""
+    """Run a program with the package in a folder and the test helpers; return its output."""
     path = os.pathsep.join([str(package), str(ROOT / "tests")])
     environment = {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
     command = [sys.executable, "-c", START, str(program), *arguments]
@@ -49,7 +49,7 @@ def run(program: Path, package: Path, *arguments: str) -> str:
 
 
 def numbers(package: Path, nets: int = RANDOM_NETS) -> dict[str, str]:
-    """Return the hashes of what the core of a package computes."""
+    """Return hashes of the results of the core of a package."""
     return json.loads(run(ROOT / "tests" / "core_program.py", package, str(nets)))
 
 
@@ -58,14 +58,14 @@ def whole() -> dict[str, str]:
     return numbers(ROOT)
 
 
-@pytest.mark.parametrize("missing", [("fast",), WINGS], ids=["fast", "all"])
+@pytest.mark.parametrize("missing", [("fast",), OPTIONAL], ids=["fast", "all"])
 def test_the_core_computes_the_same_without(missing: tuple[str, ...], whole: dict[str, str], tmp_path: Path) -> None:
     found = numbers(copy_without(missing, tmp_path))
     assert {name: value for name, value in found.items() if value != whole[name]} == {}
 
 
-@pytest.mark.parametrize("missing", WINGS[1:])
-def test_the_core_computes_the_same_without_a_wing_that_it_does_not_use(
+@pytest.mark.parametrize("missing", OPTIONAL[1:])
+def test_the_core_computes_the_same_without_an_unused_package(
     missing: str, whole: dict[str, str], tmp_path: Path
 ) -> None:
     found = numbers(copy_without([missing], tmp_path), nets=3)
@@ -85,7 +85,9 @@ def test_the_core_computes_the_same_without_a_wing_that_it_does_not_use(
     ],
     ids=["dialect", "engine", "fold"],
 )
-def test_what_needs_a_wing_says_so_when_it_is_asked_for(missing: str, asked: str, message: str, tmp_path: Path) -> None:
+def test_a_missing_package_is_reported_when_it_is_needed(
+    missing: str, asked: str, message: str, tmp_path: Path
+) -> None:
     folder = copy_without([missing], tmp_path)
     text = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } }'
     (folder / "net.prototxt").write_text(text)
@@ -95,8 +97,8 @@ def test_what_needs_a_wing_says_so_when_it_is_asked_for(missing: str, asked: str
 
 
 def test_the_commands_of_the_core_alone(tmp_path: Path) -> None:
-    """It trains as the whole does; a command of a wing says in one line what it lacks."""
-    folder = copy_without(WINGS, tmp_path)
+    """The core trains with identical results; a command that needs a missing package reports it in one line."""
+    folder = copy_without(OPTIONAL, tmp_path)
     for part in ("train/sgd_step", "pairs"):
         shutil.copytree(GOLDEN / part, folder / Path(part).name)
     program = folder / "program.py"
@@ -111,7 +113,7 @@ def test_the_commands_of_the_core_alone(tmp_path: Path) -> None:
     )
     assert (folder / "sgd_step" / "ref_iter_60.caffemodel").read_bytes() == trained
     program.write_text("import sys\nsys.stderr = sys.stdout\nfrom netspec.cli import main\nmain(sys.argv[1:])\n")
-    line = "this command needs netspec/export, which was removed from this installation\n"
+    line = "this command needs netspec/export, which is missing from this installation\n"
     assert run(program, folder, "export", "sgd_step/train_val.prototxt", "--to", "onnx", "--out", "x.onnx") == line
 
 
