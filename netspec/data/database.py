@@ -176,9 +176,7 @@ class _LevelDbReader(Reader):
         Finalize(self, shutil.rmtree, (folder, True), exitpriority=0)
         for name in set(os.listdir(source)) - {"LOCK", "LOG", "LOG.old"}:
             if name.endswith(".log") and _ends_within_a_record(Path(source, name)):
-                raise ValueError(
-                    f"is damaged: its file {name} ends in the middle of a record; copy or write the database again"
-                )
+                raise ValueError(f"is damaged: its file {name} is truncated; copy or write the database again")
             os.symlink(os.path.abspath(os.path.join(source, name)), os.path.join(folder, name))
         try:
             self._db = plyvel.DB(folder, create_if_missing=False, paranoid_checks=True)

@@ -104,9 +104,7 @@ class LmdbFile:
         size, _ = self._stamp
         first = self._meta(0)
         if first is None:
-            raise ValueError(
-                "has a data.mdb that is not an LMDB, or comes from another LMDB version or kind of machine"
-            )
+            raise ValueError("has a data.mdb that is not an LMDB, or from another LMDB version or kind of machine")
         self._page_size = first[4]  # the page size, in the unused entry of the list of free pages
         if self._page_size not in _PAGE_SIZES:
             raise ValueError(f"is damaged: it has pages of {self._page_size} bytes")

@@ -312,7 +312,7 @@ def _remove(path: Path) -> None:
 @cache
 def _warn_not_synced(reason: str) -> None:
     logging.getLogger(__name__).warning(
-        "folders cannot be synced to disk here (%s): after a power failure, an old version of a file may reappear",
+        "folders cannot be synced to disk here (%s): an old file may reappear after a power failure",
         reason,
     )
 

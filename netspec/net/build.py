@@ -149,9 +149,7 @@ def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParam
         raise SpecError(f"the shape of its input is not in the file{gone}; give {advice}", where)
     if without:
         blobs = ", ".join(name for name in inputs if name not in given)
-        log.logger.warning(
-            f"{path}: left out, since the shape of {blobs} is unknown (give it with --shape): {', '.join(without)}"
-        )
+        log.logger.warning(f"{path}: left out, since --shape does not give {blobs}: {', '.join(without)}")
     return net, source.with_layers([source.net] * len(net.layer))
 
 

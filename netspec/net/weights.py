@@ -134,9 +134,7 @@ def _report_missing(net: Net, loaded: set[int], paths: list[str], strict: bool, 
     else:
         fault = f"lacks weights for {len(missing)} of the net's {len(learning)} layers with weights: {names}"
     if strict or (some and nothing):
-        advice = (
-            "are they weights of another net?" if nothing else "without strict they keep the values of their fillers"
-        )
+        advice = "is it the file of another net?" if nothing else "without strict they keep their fillers' values"
         net.plan.source.report(SpecError(f"{fault}; {advice}", Where(files)))
     else:
         log.logger.warning(f"{files}: {fault}; they keep the values of their fillers")

@@ -93,9 +93,7 @@ def policy_faults(param: Any, node: Place) -> Iterator[SpecError]:
     stages = [len(_fork(param, name, ())) for name in ("stagelr", "stageiter")]
     if param.lr_policy == "multifixed" and (not stages[0] or stages[0] != stages[1]):
         found = f"found {stages[0]} and {stages[1]}"
-        yield SpecError(
-            f'lr_policy "multifixed" needs equal numbers of stagelr and stageiter, {found}', node.find("lr_policy")
-        )
+        yield SpecError(f'lr_policy "multifixed" needs as many stagelr as stageiter, {found}', node.find("lr_policy"))
     for field in policy.needs:
         value = getattr(param, field)
         if not param.HasField(field):

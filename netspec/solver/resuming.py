@@ -116,9 +116,7 @@ class Snapshots:
             net.restart_data()
         training.replicas.restart_data()
         if extra is None:
-            log.logger.info(
-                f"{path} was written by Caffe: the data starts again at its first record, with different random numbers"
-            )
+            log.logger.info(f"{path} is from Caffe: the data starts at its first record, with different random numbers")
         else:
             self._resume_data(extra, Where(str(path_beside(path))))
 
@@ -129,9 +127,7 @@ class Snapshots:
         ranks = len(trained) * training.options.processes.count
         if len(extra.nets) != ranks + training.count_of_tests:
             expected = f"{ranks} of training and {training.count_of_tests} of testing"
-            log.logger.warning(
-                f"{where}: has the state of {len(extra.nets)} nets, expected {expected}; the data starts again"
-            )
+            log.logger.warning(f"{where}: found {len(extra.nets)} nets, expected {expected}; the data starts again")
             return
         all_nets = (*trained, *training.test_nets)
         remembered = extra.nets[rank : rank + len(trained)] + extra.nets[ranks:][: len(training.test_nets)]

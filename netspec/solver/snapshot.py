@@ -47,9 +47,7 @@ def read_state(path: str | Path) -> State:
             raise SpecError(f"found {name} {value}, expected at least 0", Where(str(path)))
     for i, array in enumerate(state.history):
         if not np.all(np.isfinite(array)):
-            raise SpecError(
-                f"history blob {i} contains a NaN or an infinity; the training had diverged", Where(str(path))
-            )
+            raise SpecError(f"history blob {i} has a NaN or an infinity; the training had diverged", Where(str(path)))
     return state
 
 

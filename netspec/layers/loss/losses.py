@@ -149,9 +149,7 @@ class EuclideanLoss(Loss):
         shapes = super().reshape(bottom_shapes)
         a, b = bottom_shapes
         if math.prod(a[1:]) != math.prod(b[1:]):
-            raise self.error(
-                f"found bottoms of shapes {a} and {b}, expected equal numbers of values per item", "bottom"
-            )
+            raise self.error(f"found bottoms of shapes {a} and {b}, expected as many values per item", "bottom")
         return shapes
 
     def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

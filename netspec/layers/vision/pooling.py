@@ -57,7 +57,7 @@ class _PoolingBase(Layer):
             raise refusal(
                 self,
                 "ONNX",
-                "unpadded windows with a stride above the kernel can lie outside the map; use round_mode: FLOOR",
+                "windows with stride > kernel can lie outside the map; use round_mode: FLOOR",
             )
         pads = [*windows.pad, *windows.reach]
         geometry = {"kernel_shape": list(windows.kernel), "strides": list(windows.stride), "pads": pads}

@@ -50,9 +50,7 @@ class SlidingFilter(Layer):
             if given:
                 raise self.error(f"found both {name} and {pair[0]}; give one of them", field, pair[0])
             if axes != 2:
-                raise self.error(
-                    f"{pair[0]} is for 2 spatial axes, but the bottom has {axes}; use {name}", field, pair[0]
-                )
+                raise self.error(f"{pair[0]} is for 2 spatial axes, found {axes}; use {name}", field, pair[0])
             given = (getattr(param, str(name_h)), getattr(param, str(name_w)))
         elif len(given) <= 1:
             given = (given or (default,)) * axes

@@ -110,9 +110,7 @@ def merge_padding(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
 def _merge(producer: tuple[V1LayerParameter, Place], layer: V1LayerParameter, place: Place, draft: Draft) -> None:
     padding, padding_place = producer
     if layer.layer.type not in ("conv", "pool") or len(layer.bottom) != 1:
-        fault = (
-            f'padding layer "{padding.layer.name}" feeds it, but only conv and pool layers with one bottom have padding'
-        )
+        fault = f'padding layer "{padding.layer.name}" feeds it; only a conv or pool with one bottom can be padded'
         raise _error(fault, layer, place, "bottom")
     draft.message.ClearField("bottom")
     draft.places.pop("bottom", None)

@@ -417,7 +417,7 @@ def test_weights_of_which_no_layer_fits_are_refused(run: Run) -> None:
     for command in (("test", *words), extract, (*extract, "--images", "images")):
         fault = run(*command).fault
         assert fault.startswith("other.caffemodel: contains weights for none of the net's ")
-        assert fault.endswith("are they weights of another net?")
+        assert fault.endswith("is it the file of another net?")
 
 
 @pytest.mark.slow
@@ -436,7 +436,7 @@ def test_weights_that_lack_a_layer_get_one_warning_and_with_strict_a_fault(run: 
         result = run(*command)
         assert result.status == 0, result.err
         assert result.err.count(f"{lacks}; they keep the values of their fillers") == 1
-        assert run(*command, "--strict").fault == f"{lacks}; without strict they keep the values of their fillers"
+        assert run(*command, "--strict").fault == f"{lacks}; without strict they keep their fillers' values"
 
 
 # What other systems lack is said once, and the command goes on

@@ -325,7 +325,7 @@ def flip(data: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("kind", "damage", "says"),
     [
-        pytest.param("*.log", cut, "000003.log ends in the middle of a record", id="a log that is cut"),
+        pytest.param("*.log", cut, "000003.log is truncated", id="a log that is cut"),
         pytest.param("*.log", flip, "checksum mismatch", id="a log with another bit"),
         pytest.param("*.ldb", cut, "Corruption|Invalid argument", id="a table that is cut"),
         pytest.param("*.ldb", flip, "checksum mismatch|Corruption", id="a table with another bit"),

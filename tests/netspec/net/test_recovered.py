@@ -55,7 +55,7 @@ def test_the_deploy_net_of_a_training_computes_the_same(trained: Callable[..., A
     assert not any(layer.blobs or layer.include or layer.HasField("phase") for layer in deploy.layer)
     assert warnings() == [
         'the net was trained with transform_param { scale: 0.5 crop_size: 9 } for blob "data"',
-        "w.caffemodel: left out, since the shape of label is unknown (give it with --shape): loss",
+        "w.caffemodel: left out, since --shape does not give label: loss",
     ]
     Path("deploy.prototxt").write_text(write_text(deploy))
     built = netspec.load_net("deploy.prototxt", weights="w.caffemodel", strict=True)
@@ -94,7 +94,7 @@ def test_the_shape_of_records_is_read_where_they_are(trained: Callable[..., Any]
 @pytest.mark.slow
 def test_the_commands_show_and_write_it(trained: Callable[..., Any], run: Callable[..., Any]):
     trained("mirror: true")
-    assert "say --shape data=1,3,H,W" in run("check", "w.caffemodel").fault
+    assert "give --shape data=1,3,H,W" in run("check", "w.caffemodel").fault
     result = run("check", "w.caffemodel", "--shape", "data=1,3,9,9")
     assert result.status == 0
     assert "classifier" in result.out

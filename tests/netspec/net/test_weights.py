@@ -417,7 +417,7 @@ def test_a_warning_where_nothing_fits_and_an_error_where_something_must(tmp_path
     load_weights(net_of(TWO), path)
     (line,) = warnings()
     assert "contains weights for none of the net's 2 layers with weights: one, two; they keep" in line
-    with pytest.raises(SpecError, match="none of the net's 2 layers with weights: one, two; are they weights of an"):
+    with pytest.raises(SpecError, match="none of the net's 2 layers with weights: one, two; is it the file of an"):
         load_weights(net_of(TWO), path, some=True)
     load_weights(net_of(TWO), holding(tmp_path, "two"), some=True)
 

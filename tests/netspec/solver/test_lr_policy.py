@@ -121,7 +121,7 @@ def test_poly_has_no_rate_beyond_max_iter():
         ({"lr_policy": "inv", "gamma": -1}, "s.prototxt:5:1: .* gamma of at least 0, found -1"),
         ({"lr_policy": "poly"}, "needs max_iter, found none"),
         ({"lr_policy": "sigmoid", "gamma": 1}, "needs stepsize, found none"),
-        ({"lr_policy": "multifixed"}, "needs equal numbers of stagelr and stageiter, found 0 and 0"),
+        ({"lr_policy": "multifixed"}, "needs as many stagelr as stageiter, found 0 and 0"),
     ],
 )
 def test_what_is_refused_before_the_first_iteration(fields: dict, message: str):

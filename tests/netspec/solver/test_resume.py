@@ -188,7 +188,7 @@ def test_without_the_file_a_state_resumes_as_caffe_does(caplog: pytest.LogCaptur
     path_beside(state).unlink()
     caplog.set_level(logging.INFO, "netspec")
     resumed = load_solver("solver.prototxt", snapshot=state)
-    assert "was written by Caffe: the data starts again at its first record" in caplog.text
+    assert "is from Caffe: the data starts at its first record" in caplog.text
     assert [layer.iteration for layer in resumed.net.layers if hasattr(layer, "iteration")] == [0]
 
 
