@@ -1,4 +1,4 @@
-"""The files of dialects, and their declarations, which are read without running the files.
+"""Finding the files of dialects, and reading their declarations without running them.
 
 ``DECLARATIONS`` and the types of the layers are read from a file's syntax (how to write one: netspec/dialects), so
 that a hint about a dialect needs neither torch nor the execution of installed code.
@@ -18,12 +18,12 @@ from netspec import log
 from netspec.dialects.registry import Dialect, activate, announce
 from netspec.errors import SpecError, Where, did_you_mean
 
-GROUP = "netspec.dialects"  # of entry points: other packages' dialects, a name and a module each
+GROUP = "netspec.dialects"  # entry points of other packages: the name of a dialect and its module
 
 
 @dataclass(frozen=True)
 class DialectFile:
-    """A file that was not read yet. ``module`` is its name for import, or "" for a file that is given by its path."""
+    """A file that has not been read. ``module`` is its module name, or "" for a file given by its path."""
 
     name: str
     path: Path
@@ -32,8 +32,8 @@ class DialectFile:
 
 @cache
 def known_files() -> dict[str, DialectFile]:
-    """Return the dialects found by name: those of the families here, and those of installed packages' entry points."""
-    from importlib.metadata import entry_points  # it takes longer to import than a command takes to start
+    """Return the dialects by name: those in this folder, and those of installed packages' entry points."""
+    from importlib.metadata import entry_points  # imported here, since it is slow to import
 
     found = {}
     for point in entry_points(group=GROUP):
@@ -81,7 +81,7 @@ def read_dialect(file: DialectFile) -> Dialect:
             if not (isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)):
                 place = Where(str(file.path), node.lineno, node.col_offset + 1)
                 raise SpecError("DECLARATIONS must be one plain string: it is read without running the file", place)
-            # Blank lines before it, so that the lines of errors are those of the file.
+            # Prepend blank lines, so that errors have the line numbers of the file.
             source = "\n" * (node.value.lineno - 1) + node.value.value
     types = list(_registered_types(tree))
     if not source and not types:
@@ -103,13 +103,13 @@ def _name(node: ast.expr) -> str:
     return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
 
 
-waiting: list[tuple[DialectFile, Dialect]] = []  # switched on; their layers are not registered yet
+waiting: list[tuple[DialectFile, Dialect]] = []  # active dialects whose layers are not registered yet
 
 
 def switch_on(file: DialectFile) -> None:
     """Add the fields of a dialect to the schema. Its layers are registered when the next layer is looked up.
 
-    Raises SpecError where its file has a fault, or Caffe or another dialect has one of its fields.
+    Raises SpecError if its file has an error, or Caffe or another dialect has one of its fields.
     """
     dialect = read_dialect(file)
     activate(dialect)

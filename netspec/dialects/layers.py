@@ -21,18 +21,18 @@ from netspec.layers.contract.base import Layer
 from netspec.layers.contract.registry import layer_class, registered
 from netspec.proto.schema import PACKAGE, LayerParameter, NetParameter
 
-_owners: dict[str, str] = {}  # layer type -> the dialect that has it; Caffe's own are not here
+_owners: dict[str, str] = {}  # layer type -> the dialect that defines it, without Caffe's types
 Wants = Callable[[LayerParameter], bool]
-_replacing: dict[str, dict[str, tuple[type[Layer], Wants]]] = {}  # layer type of Caffe's -> dialect -> class, for which
-_everywhere: set[str] = set()  # dialects that count for every net of the process: a user asked for them
-_loading = ""  # the dialect that is being loaded
+_replacing: dict[str, dict[str, tuple[type[Layer], Wants]]] = {}  # type -> dialect -> class, condition
+_everywhere: set[str] = set()  # dialects that a user requested for every net of the process
+_loading = ""  # the dialect being loaded
 L = TypeVar("L", bound=type[Layer])
 
 
 def replace(type_name: str, *reads: str, where: Wants = lambda param: True) -> Callable[[L], L]:
-    """Class decorator: put a subclass of one of Caffe's layers in its place, in nets that use the dialect.
+    """Class decorator: let a subclass of one of Caffe's layers replace it in nets that use the dialect.
 
-    It takes the place in those layers ``where`` the LayerParameter asks for it. ``reads`` are as for
+    It replaces only the layers for which ``where(LayerParameter)`` is true. ``reads`` are as for
     :func:`netspec.layers.register`, with the fields that the dialect adds: ``"pooling_param.extra"``.
     """
 
@@ -46,9 +46,9 @@ def replace(type_name: str, *reads: str, where: Wants = lambda param: True) -> C
 
 
 def dialects_of(net: NetParameter) -> set[str]:
-    """Return the dialects that a net uses: those of its fields and layer types, and those switched on for every net.
+    """Return the dialects that a net uses: those of its fields and layer types, and those activated for every net.
 
-    A layer type that several forks define does not show which one is used (netspec/dialects/signatures.py).
+    A layer type of several forks does not determine the dialect (netspec/dialects/signatures.py).
     """
     types = {layer.type for layer in net.layer}
     shown = {each for each in types if layer_class(each) and not has_several(each)}
@@ -78,7 +78,7 @@ def use_everywhere(dialect: str) -> None:
 
 
 def register_type(layer_type: str) -> None:
-    """Register the layers of the dialects that were switched on, and of the only dialect that defines a layer type."""
+    """Register the layers of the active dialects, and of a dialect that is the only one to define a layer type."""
     run_dialects()
     if registered(layer_type) is None:
         announce_known()
@@ -89,10 +89,10 @@ def register_type(layer_type: str) -> None:
 
 
 def class_of(param: LayerParameter, options: BuildOptions | None = None) -> type[Layer] | None:
-    """Return the class of a layer where the dialects in ``options`` have another than that of its type, or None.
+    """Return the class with which the dialects in ``options`` replace that of a layer's type, or None.
 
-    A Python layer that a dialect knows by its module and class, ``"rpn.proposal_layer.ProposalLayer"``, is the
-    dialect's, unless Python code is allowed to run and its module is there.
+    If a dialect implements the module and class of a Python layer, such as ``"rpn.proposal_layer.ProposalLayer"``, its
+    class is used, unless Python code is allowed to run and the module exists.
     """
     run_dialects()
     for dialect in options.dialects if options else ():
@@ -108,7 +108,7 @@ def class_of(param: LayerParameter, options: BuildOptions | None = None) -> type
 
 
 def run_dialects() -> None:
-    """Register the layers of the dialects that were switched on. Raises SpecError for one that cannot be loaded."""
+    """Register the layers of the active dialects. Raises SpecError for one that cannot be loaded."""
     global _loading
     while waiting:
         file, dialect = waiting.pop(0)

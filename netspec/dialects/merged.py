@@ -1,8 +1,8 @@
 """Caffe's schema with the additions of the active dialects as ordinary messages and fields.
 
-:mod:`netspec.dialects.registry` adds the fields of dialects as extensions, so that they can come and go. Programs
-that were written for a fork know them as fields of the fork's own ``caffe_pb2``: ``layer.permute_param.order``. Their
-classes come from here. They have the same text; the same bytes too, but for values added to an enum of Caffe's.
+:mod:`netspec.dialects.registry` adds the fields of dialects as extensions, so that they can be removed again. Programs
+for a fork use them as fields of the fork's ``caffe_pb2``: ``layer.permute_param.order``. This module makes their
+classes. They have the same text format, and the same binary format except for values added to Caffe's enums.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _FILE = "caffe.proto"
 
 
 def merged_file() -> Any:
-    """Return the descriptor of caffe.proto as the active dialects have it; without any, the schema's own.
+    """Return the descriptor of caffe.proto with the active dialects; without any, the schema's own.
 
-    Raises SpecError where two active dialects have different messages of one name.
+    Raises SpecError if two active dialects have different messages with the same name.
     """
     return _merged(active_dialects())
 
@@ -58,7 +58,7 @@ def _merged(dialects: tuple[Dialect, ...]) -> Any:
 
 
 def _add_values(extended: descriptor_pb2.DescriptorProto, field: str, names: Sequence[str]) -> None:
-    """Add the values ``names`` to the enum of a field of Caffe's, under numbers after its own."""
+    """Add the values ``names`` to the enum of one of Caffe's fields, with numbers after its own."""
     enum = next(f.type_name for f in extended.field if f.name == field).rpartition(".")[2]
     values = next(found.value for found in extended.enum_type if found.name == enum)
     for name in names:

@@ -78,7 +78,7 @@ class MarginProduct(Classified):
         return top if self.num_tops == 1 else (top, x.new_full((1,), weight))
 
     def products(self, x: torch.Tensor, labels: torch.Tensor, share: float) -> torch.Tensor:
-        """Return the products (M, num_output) of vectors (M, K); the margin counts with its ``share``."""
+        """Return the products (M, num_output) of vectors (M, K); the margin is weighted by ``share``."""
         raise NotImplementedError
 
     def running_state(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""ROIAlign: pools regions by interpolation between pixels. Two forks do so at different points."""
+"""ROIAlign, which pools regions by interpolating between pixels. Two forks interpolate at different points."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class ROIAlign(RegionPooling):
                 weigh(regions[:, 1 + k], regions[:, 3 + k], self.bins[1 - k], maps.shape[3 - k]).to(maps)
                 for k in (0, 1)
             )
-            if self.cascade:  # a region is empty if one of its sides is
+            if self.cascade:  # a region is empty if one of its sides is empty empty
                 rows = rows * (self._lengths(regions).amin(1) > 0)[:, None, None]
         top = maps.new_zeros(self.top_shapes[0])
         for i in image.unique().tolist():
@@ -64,12 +64,12 @@ class ROIAlign(RegionPooling):
         return top
 
     def _lengths(self, regions: torch.Tensor) -> torch.Tensor:
-        """Return how long Cascade R-CNN's regions are, grown and scaled: (R, 2)."""
+        """Return the lengths of Cascade R-CNN's regions, enlarged and scaled: (R, 2)."""
         sizes = regions[:, 3:] - regions[:, 1:3]
         return (sizes + 2 * (sizes + 1) * self.pad_ratio) * self.scale
 
     def _corners(self, first: torch.Tensor, last: torch.Tensor, bins: int, size: int) -> torch.Tensor:
-        """Return how much of each pixel of an axis the corners of the bins are made of: (R, bins + 1, size)."""
+        """Return the weights of an axis' pixels in the corners of the bins: (R, bins + 1, size)."""
         pad = (last - first + 1) * self.pad_ratio
         start, end = (first - pad) * self.scale - 0.5, (last + pad) * self.scale - 0.5
         steps = torch.arange(bins + 1, dtype=first.dtype, device=first.device) * ((end - start) / bins)[:, None]
@@ -77,7 +77,7 @@ class ROIAlign(RegionPooling):
         return between(at, size) * ((at >= -0.5) & (at <= size - 0.5))[..., None]
 
     def _means(self, first: torch.Tensor, last: torch.Tensor, bins: int, size: int) -> torch.Tensor:
-        """Return how much of each pixel of an axis the means of the bins are made of: (R, bins, size)."""
+        """Return the weights of an axis' pixels in the means of the bins: (R, bins, size)."""
         start = first * self.scale
         length = (last * self.scale - start).clamp(min=1)
         counts = (length / bins).ceil() if self.samples < 1 else torch.full_like(length, self.samples)
@@ -90,6 +90,6 @@ class ROIAlign(RegionPooling):
 
 
 def between(at: torch.Tensor, size: int) -> torch.Tensor:
-    """Return the weights of an axis' pixels in a value read at places (...), moved into the map: (..., size)."""
+    """Return the weights of an axis' pixels in values at positions (...), clamped to the map: (..., size)."""
     pixels = torch.arange(size, dtype=at.dtype, device=at.device)
     return (1 - (at.clamp(0, size - 1)[..., None] - pixels).abs()).clamp(min=0)

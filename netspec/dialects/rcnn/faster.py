@@ -1,6 +1,6 @@
-"""Layers of Faster R-CNN that are Python code in py-faster-rcnn: images, proposals, and the targets of both heads.
+"""The Python layers of py-faster-rcnn: images, proposals, and the targets of both heads.
 
-A Python layer with one of these modules and classes runs here without foreign code. The settings are those of
+A Python layer with one of these modules and classes runs without the original code. The settings are those of
 experiments/cfgs/faster_rcnn_end2end.yml. A box is (x1, y1, x2, y2) in pixels, both corners included. Random numbers
 come from the net, not from numpy.
 Fork: rbgirshick/py-faster-rcnn, lib/rpn, lib/roi_data_layer; peteanderson80/bottom-up-attention, which has attributes
@@ -24,13 +24,13 @@ from netspec.files.opencv import cv2
 from netspec.layers.contract.base import Layer, Shape
 
 RATIOS, SCALES = (0.5, 1, 2), (8, 16, 32)
-ANCHORS, OBJECTS = 256, 0.5  # a minibatch of the region proposals: its size, and the most that are objects
-OBJECT, BACKGROUND = 0.7, 0.3  # an anchor of at least, and of less than this overlap
-REGIONS, FOREGROUND = 128, 0.25  # a minibatch of the classifier: its size, and the most that are objects
-ATTRIBUTES, OF_ATTRIBUTES, WITH_ATTRIBUTES = 16, 64, 0.5  # of a region; with them REGIONS and FOREGROUND are these
-OVERLAP = 0.5  # a region of at least this overlap is an object
-DEVIATIONS = np.array([0.1, 0.1, 0.2, 0.2], np.float32)  # the classifier's targets are divided by them
-SHORTEST, LONGEST = 600, 1000  # sides to which images are scaled
+ANCHORS, OBJECTS = 256, 0.5  # a minibatch of the region proposals, and its maximum share of objects
+OBJECT, BACKGROUND = 0.7, 0.3  # overlaps of an object (at least) and of background (below)
+REGIONS, FOREGROUND = 128, 0.25  # a minibatch of the classifier, and its maximum share of objects
+ATTRIBUTES, OF_ATTRIBUTES, WITH_ATTRIBUTES = 16, 64, 0.5  # their number; REGIONS and FOREGROUND with them
+OVERLAP = 0.5  # minimum overlap of an object
+DEVIATIONS = np.array([0.1, 0.1, 0.2, 0.2], np.float32)  # divisors of the classifier's targets
+SHORTEST, LONGEST = 600, 1000  # short and long side of scaled images
 MEANS = np.array([102.9801, 115.9465, 122.7717], np.float32)  # blue, green, red
 
 
@@ -39,10 +39,10 @@ _SETTING = r"""(\w+)['"]?\s*:\s*(?:[^\s\[(]*\s*[\[(]([^\])]*)[\])]|([-+.\w]+))""
 
 
 def settings(layer: Layer, *others: str, **least: int | None) -> dict[str, Any]:
-    """Return the numbers and lists of numbers of ``param_str``, a line of YAML each: ``'feat_stride': 16``.
+    """Return the numbers and lists of numbers in ``param_str``, one per line in YAML: ``'feat_stride': 16``.
 
-    ``least`` names the integers that must be given, with the least value, None for those that may be missing;
-    ``others`` the rest of what is read. Raises SpecError for any other name.
+    ``least`` maps integers to their minimum, or to None if they may be missing.
+    ``others`` are other names to read. Raises SpecError for any other name.
     """
     text = layer.param.python_param.param_str
     found: dict[str, Any] = {}
@@ -60,12 +60,12 @@ def settings(layer: Layer, *others: str, **least: int | None) -> dict[str, Any]:
 
 
 def anchors_of(found: Mapping[str, Any]) -> Array:
-    """Return the anchors of py-faster-rcnn, or those of the ``scales`` and ``ratios`` that a param_str has."""
+    """Return the anchors of py-faster-rcnn, or those for the ``scales`` and ``ratios`` of a param_str."""
     return base_anchors(16, found.get("ratios", RATIOS), found.get("scales", SCALES))
 
 
 def overlaps(boxes: Array, others: Array) -> Array:
-    """Return intersection over union of each of (n, 4) with each of (m, 4): (n, m)."""
+    """Return the intersection over union of each of (n, 4) with each of (m, 4): (n, m)."""
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     shared = np.prod(np.maximum(high - low + 1, 0), axis=2)
@@ -74,14 +74,14 @@ def overlaps(boxes: Array, others: Array) -> Array:
 
 
 def targets(boxes: Array, truth: Array) -> Array:
-    """Return how to move and scale each box (n, 4) to its true one (n, 4): dx, dy, log dw, log dh."""
+    """Return the offsets from each box (n, 4) to its true one (n, 4): dx, dy, log dw, log dh."""
     sizes, true_sizes = (b[:, 2:] - b[:, :2] + 1 for b in (boxes, truth))
     shift = truth[:, :2] + true_sizes / 2 - boxes[:, :2] - sizes / 2
     return np.concatenate([shift / sizes, np.log(true_sizes / sizes)], axis=1).astype(np.float32)
 
 
 class _Sampling(Layer):
-    """Base of layers that choose at random. They have no gradient."""
+    """Base of layers with random choices. They have no gradient."""
 
     not_exported = "it is for training, and chooses at random"
 
@@ -93,7 +93,7 @@ class _Sampling(Layer):
         return indices[order[:count].numpy()]
 
     def tops_of(self, like: torch.Tensor, arrays: Sequence[Array]) -> tuple[torch.Tensor, ...]:
-        """Return the tops, and keep their shapes, which follow from the values."""
+        """Return the tops, and keep their shapes, which depend on the values."""
         tops = tuple(torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(like) for a in arrays)
         self.top_shapes = [tuple(top.shape) for top in tops]
         return tops
@@ -102,17 +102,17 @@ class _Sampling(Layer):
 class AnchorTarget(_Sampling):
     """Label the anchors that show an object, and compute the offsets from anchor to object.
 
-    An anchor within the image is an object if it overlaps a true box by 0.7 or more, or most of all anchors;
-    background if it overlaps none by 0.3. Of both together 256 are chosen, at most half of them objects.
+    An anchor inside the image is an object if it overlaps a true box by at least 0.7, or more than all other anchors
+    do. It is background if it overlaps no true box by 0.3. Of both, 256 are chosen, at most half of them objects.
 
-    bottom[0]  scores (1, 2 A, H, W); only their size counts
+    bottom[0]  scores (1, 2 A, H, W); only the shape is used
     bottom[1]  true boxes (n, 5): x1, y1, x2, y2, class
     bottom[2]  height, width and scale of the image (1, 3)
-    bottom[3]  optional, not used: the image
+    bottom[3]  optional: the image; not used
     top[0]     labels (1, 1, A H, W): 1 object, 0 background, -1 not chosen
     top[1]     targets (1, 4 A, H, W): dx, dy, log dw, log dh
     top[2]     inside weights, the same shape: 1 for objects
-    top[3]     outside weights, the same shape: 1 / the number chosen
+    top[3]     outside weights, the same shape: 1 / the number of chosen anchors
     Fork: py-faster-rcnn, lib/rpn/anchor_target_layer.py
     """
 
@@ -162,8 +162,8 @@ class AnchorTarget(_Sampling):
 class ProposalTarget(_Sampling):
     """Choose regions for training, and compute their classes and the offsets from region to object.
 
-    128 of the proposals and the true boxes: at most a quarter that overlap a true box by half or more, the rest
-    background. With num_attr_classes (bottom-up attention) 64, at most half of them objects.
+    Chooses 128 of the proposals and true boxes: at most a quarter that overlap a true box by at least 0.5, and
+    background. With num_attr_classes (bottom-up attention), 64, of which at most half are objects.
 
     bottom[0]  proposals (R, 5): 0, x1, y1, x2, y2
     bottom[1]  true boxes (n, 5): x1, y1, x2, y2, class; with num_attr_classes (n, 21): and 16 attributes
@@ -172,8 +172,8 @@ class ProposalTarget(_Sampling):
     top[2]     targets (r, 4 num_classes), divided by (0.1, 0.1, 0.2, 0.2), at the region's class
     top[3]     inside weights, the same shape: 1 there
     top[4]     outside weights, the same shape: 1 there
-    top[5]     with num_attr_classes: attributes of the objects (32, 16), ignore_label (-1) where there is none
-    In an R-FCN the tops have four axes, and only the fork's own code chooses.
+    top[5]     with num_attr_classes: attributes of the objects (32, 16), or ignore_label (-1)
+    In R-FCN the tops have four axes, and the regions are not chosen here.
     Fork: py-faster-rcnn and bottom-up-attention, lib/rpn/proposal_target_layer.py
     """
 
@@ -203,7 +203,7 @@ class ProposalTarget(_Sampling):
 
     @property
     def columns(self) -> int:
-        """The numbers of a true box."""
+        """The number of values of a true box."""
         return 5 + ATTRIBUTES * self.attributes
 
     def _wrong(self, shape: Shape) -> SpecError:
@@ -211,7 +211,7 @@ class ProposalTarget(_Sampling):
 
     @property
     def is_rfcn(self) -> bool:
-        """Whether R-FCN's layers are in the net."""
+        """Whether the net has R-FCN's layers."""
         return "rfcn" in self.context.options.dialects
 
     def forward(self, proposals: torch.Tensor, boxes: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -246,11 +246,11 @@ class ProposalTarget(_Sampling):
 
 
 class RoIData(_Sampling):
-    """Read images and their true boxes, one image a pass, in random order.
+    """Read images and their true boxes, one image per pass, in random order.
 
-    The short side is scaled to 600 pixels, the long one at most to 1000. ``net.layers[0].set_roidb(entries)`` gives
-    the images: each entry is a dict with "image" (a path), "boxes" (n, 4), "gt_classes" (n,) and, if it is mirrored,
-    "flipped": True, with boxes that are mirrored already. "gt_attributes" (n, 16) are added to the boxes.
+    The short side is scaled to 600 pixels, but the long one to at most 1000. ``net.layers[0].set_roidb(entries)`` sets
+    the images. Each entry is a dict with "image" (a path), "boxes" (n, 4), "gt_classes" (n,) and, if it is mirrored,
+    "flipped": True, with mirrored boxes. "gt_attributes" (n, 16) are appended to the boxes.
 
     top[0]     the image (1, 3, H, W): blue, green, red, minus their means
     top[1]     its height, width and scale (1, 3)
@@ -259,7 +259,7 @@ class RoIData(_Sampling):
     """
 
     bottoms, tops = (0, 0), (3, None)
-    promises = False  # images differ in size
+    promises = False  # images have different sizes
 
     def setup(self) -> None:
         if self.num_tops != 3:
@@ -270,11 +270,11 @@ class RoIData(_Sampling):
 
     @property
     def code(self) -> RoIData:
-        """The object that ``net.layers[0]`` of pycaffe returns; in the fork the layer is Python code."""
+        """The object that pycaffe's ``net.layers[0]`` returns; in the fork, the layer is Python code."""
         return self
 
     def set_roidb(self, entries: Sequence[Mapping[str, Any]]) -> None:
-        """Read these images from now on; see the class. Raises SpecError where an entry lacks something."""
+        """Set the images to read; see the class. Raises SpecError if an entry lacks something."""
         for i, entry in enumerate(entries):
             if missing := {"image", "boxes", "gt_classes"} - set(entry):
                 raise self.error(f"entry {i} has no {' and no '.join(sorted(missing))}")

@@ -1,4 +1,4 @@
-"""Region proposals as Faster R-CNN makes them: anchors, moved by what is predicted, the best ones kept.
+"""Region proposals of Faster R-CNN: anchors, moved by the predicted offsets, of which the best are kept.
 
 A box is (x1, y1, x2, y2) in pixels of the image, both corners included. Arrays are float32.
 Forks: Intel's caffe and PVANet, src/caffe/layers/proposal_layer.cpp; the Python layer of py-faster-rcnn
@@ -14,7 +14,7 @@ Array = np.ndarray
 
 
 def base_anchors(base_size: int, ratios: Sequence[float], scales: Sequence[float]) -> Array:
-    """Return the boxes (R S, 4) around the square of a first pixel of the map: for each ratio each scale.
+    """Return the boxes (R S, 4) around the first pixel of the map, for each ratio and each scale.
 
     A ratio is height / width; sides are rounded to pixels before they are scaled.
     """
@@ -30,14 +30,14 @@ def base_anchors(base_size: int, ratios: Sequence[float], scales: Sequence[float
 
 
 def all_anchors(base: Array, stride: int, height: int, width: int) -> Array:
-    """Return the anchors of all pixels of a map: (height width A, 4), the pixels row after row."""
+    """Return the anchors of all pixels of a map, in row-major order: (height width A, 4)."""
     y, x = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
     shifts = np.stack([x, y, x, y], axis=2).reshape(-1, 1, 4) * stride
     return (shifts + base).reshape(-1, 4).astype(np.float32)
 
 
 def moved(anchors: Array, deltas: Array, height: float, width: float) -> Array:
-    """Return the anchors (n, 4) moved and scaled by the deltas (dx, dy, log dw, log dh), cut at the image's border."""
+    """Return the anchors (n, 4) moved and scaled by the deltas (dx, dy, log dw, log dh), clipped to the image."""
     sizes = anchors[:, 2:] - anchors[:, :2] + 1
     centers = anchors[:, :2] + sizes / 2 + deltas[:, :2] * sizes
     halves = np.exp(deltas[:, 2:]) * sizes / 2
@@ -46,8 +46,8 @@ def moved(anchors: Array, deltas: Array, height: float, width: float) -> Array:
 
 
 def suppress(boxes: Array, threshold: float, most: int) -> list[int]:
-    """Return the first ``most`` of boxes (n, 4), in this order, that overlap none kept before by more than that."""
-    left, rows = np.arange(len(boxes)), np.ascontiguousarray(boxes.T)  # rows of x1, y1, x2, y2: each in one piece
+    """Return the first ``most`` boxes (n, 4), in this order, that overlap no kept box by more than the threshold."""
+    left, rows = np.arange(len(boxes)), np.ascontiguousarray(boxes.T)  # contiguous rows of x1, y1, x2 and y2
     areas = (rows[2] - rows[0] + 1) * (rows[3] - rows[1] + 1)
     kept: list[int] = []
     while len(left) and len(kept) < most:

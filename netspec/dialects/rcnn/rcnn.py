@@ -1,6 +1,6 @@
 """Fast and Faster R-CNN: rbgirshick/caffe-fast-rcnn; R-FCN's layers are in rfcn.py.
 
-The Python layers of py-faster-rcnn are here too, by module and class. Where ``--allow-python-layers`` is given and
+It also has the Python layers of py-faster-rcnn, by module and class. If ``--allow-python-layers`` is given and
 their module can be imported, the module's code runs instead.
 """
 
@@ -66,9 +66,9 @@ extend LayerParameter {
 class ROIPooling(RegionPooling):
     """Divide each region of a map into pooled_h x pooled_w bins and return the maximum of each.
 
-    Where pad_ratio is given (MSCNN), a region first grows on each side by so much of its length. Its corners are scaled
+    With pad_ratio (MSCNN), a region is first enlarged on each side by this share of its length. Its corners are scaled
     by spatial_scale and rounded to pixels, both included. The first of equal pixels gets the gradient; a bin without a
-    pixel is 0. A region that ends before it begins is one pixel, without a gradient.
+    pixel is 0. A region with x2 < x1 or y2 < y1 is one pixel, without a gradient.
 
     bottom[0]  the map (N, C, H, W)
     bottom[1]  regions (R, 5): image, x1, y1, x2, y2; gets no gradient
@@ -114,7 +114,7 @@ class ROIPooling(RegionPooling):
 
     @staticmethod
     def _bins(first: torch.Tensor, last: torch.Tensor, count: int, size: int) -> torch.Tensor:
-        """Return where each bin of each region begins and ends along one axis, in pixels of the map: (R, count, 2)."""
+        """Return the begin and end of each region's bins along one axis, in pixels of the map: (R, count, 2)."""
         length = (last - first + 1).clamp(min=1)
         steps = torch.arange(count + 1, dtype=first.dtype, device=first.device) * (length / count)[:, None]
         ends = torch.stack([steps[:, :-1].floor(), steps[:, 1:].ceil()], dim=2) + first[:, None, None]
@@ -127,14 +127,14 @@ class ROIPooling(RegionPooling):
         return graph.node("MaxRoiPool", bottoms[0], regions, pooled_shape=self.bins, spatial_scale=self.scale)
 
 
-Table = tuple[torch.Tensor, torch.Tensor]  # values and the pixels that they come from
+Table = tuple[torch.Tensor, torch.Tensor]  # values and their pixels
 
 
 def _first_maxima(maps: torch.Tensor, windows: torch.Tensor) -> torch.Tensor:
     """Return the pixel, row * width + column, of the first maximum of each window of maps (C, H, W): (n, C).
 
-    Windows (n, 4) are begin and end of their rows, begin and end of their columns; an empty one yields -1. Each is
-    covered by four, which may overlap, of sides that are powers of two; the maxima of those are made by doubling.
+    Windows (n, 4) are begin and end of their rows, begin and end of their columns; an empty one gives -1. Each is
+    covered by four possibly overlapping windows whose sides are powers of two; their maxima are computed by doubling.
     """
     height, width = maps.shape[1:]
     sides = windows[:, 1::2] - windows[:, ::2]
@@ -159,26 +159,26 @@ def _first_maxima(maps: torch.Tensor, windows: torch.Tensor) -> torch.Tensor:
 
 
 def _doubled(table: Table, axis: int, side: int) -> Table:
-    """Return the first maxima of windows of twice a side along an axis, from those of that side."""
+    """Return the first maxima of windows of twice the size along an axis."""
     count = table[0].shape[axis] - side
     values, pixels = ([part.narrow(axis, start, count) for start in (0, side)] for part in table)
     return _first_of((values[0], pixels[0]), (values[1], pixels[1]))
 
 
 def _first_of(a: Table, b: Table) -> Table:
-    """Return the greater values; of equal ones those of the first pixel."""
+    """Return the larger values; of equal ones, that of the first pixel."""
     second = (b[0] > a[0]) | ((b[0] == a[0]) & (b[1] < a[1]))
     return torch.where(second, b[0], a[0]), torch.where(second, b[1], a[1])
 
 
 @register("Proposal", "proposal_param")
 class Proposal(Layer):
-    """Propose regions: anchors moved by what is predicted, the best of those that do not overlap.
+    """Propose regions: anchors moved by the predicted offsets, of which the best that do not overlap are kept.
 
-    An anchor for each ``ratio`` (height / width; 0.5, 1, 2) and each ``scale`` (8, 16, 32) of base_size pixels lies at
+    There is an anchor for each ``ratio`` (height / width; 0.5, 1, 2) and ``scale`` (8, 16, 32) of base_size pixels at
     every feat_stride pixels. From the pre_nms_topn boxes of highest score, those that overlap a better one by more than
-    nms_thresh are removed, and at most post_nms_topn stay. A box with a side below min_size times the image's scale
-    counts as score 0. There may be fewer regions than the top's declared shape says.
+    nms_thresh are removed, and at most post_nms_topn are kept. A box with a side below min_size times the image's scale
+    has score 0. There may be fewer regions than in the declared shape of the top.
 
     bottom[0]  scores (1, 2 A, H, W): background, then object, of the A anchors
     bottom[1]  (1, 4 A, H, W): dx, dy, log dw, log dh of each anchor
@@ -188,13 +188,13 @@ class Proposal(Layer):
     Fork: PVANet's and Intel's caffe, src/caffe/layers/proposal_layer.cpp
     """
 
-    promises = False  # it may find fewer
+    promises = False  # there may be fewer
     bottoms = (3, 3)
     tops = (1, 2)
     label_bottoms = frozenset({0, 1, 2})
 
     def setup(self) -> None:
-        """Make the anchors of one pixel."""
+        """Compute the anchors of one pixel."""
         self.settings = param = value(self.param, "proposal_param")
         for name in ("feat_stride", "base_size", "pre_nms_topn", "post_nms_topn"):
             if getattr(param, name) < 1:
@@ -239,7 +239,7 @@ class Proposal(Layer):
 class ProposalLayer(Proposal):
     """Proposal with the settings of py-faster-rcnn. It replaces the Python layer rpn.proposal_layer.ProposalLayer.
 
-    In training 2000 of 12000 regions stay, in testing 300 of 6000; param_str has feat_stride, scales, ratios.
+    In training, 2000 of 12000 regions are kept, in testing 300 of 6000. param_str has feat_stride, scales, ratios.
 
     bottom[0]  scores (1, 2 A, H, W): background, then object, of the A anchors
     bottom[1]  (1, 4 A, H, W): dx, dy, log dw, log dh of each anchor

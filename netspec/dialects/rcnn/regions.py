@@ -11,12 +11,12 @@ from netspec.layers.contract.base import Layer, Shape
 
 
 class RegionPooling(Layer):
-    """Base of the layers that pool the part of a map that a region of the image covers."""
+    """Base of layers that pool the part of a map that a region of the image covers."""
 
     bottoms = (2, 2)
 
     def check_regions(self, bottom_shapes: Sequence[Shape]) -> int:
-        """Return how many regions there are; refuse other bottoms than a map and regions."""
+        """Return the number of regions; raise SpecError if the bottoms are not a map and regions."""
         maps, regions = bottom_shapes
         if len(maps) != 4:
             raise self.error(f"found a map of shape {maps}, expected 4 axes (N, C, H, W)", "bottom", 0)
@@ -28,7 +28,7 @@ class RegionPooling(Layer):
         return self.error(f"found regions of shape {regions}, expected (R, 5): image, x1, y1, x2, y2", "bottom", 1)
 
     def rows(self, regions: torch.Tensor) -> torch.Tensor:
-        """Return the regions as (R, 5). Raises SpecError for a placeholder of another shape that nobody reshaped."""
+        """Return the regions as (R, 5). Raises SpecError for a placeholder that was not reshaped."""
         if regions.shape[1] != 5:
             raise self._wrong(tuple(regions.shape))
         return regions.reshape(-1, 5)
@@ -43,6 +43,6 @@ class RegionPooling(Layer):
 
 
 def whole(x: torch.Tensor) -> torch.Tensor:
-    """Return the nearest whole numbers; halves away from zero, as C's round does."""
+    """Round to integers, halves away from zero, like C's round."""
     whole = x.trunc()
     return whole + x.sign() * ((x - whole).abs() >= 0.5)

@@ -1,6 +1,6 @@
-"""R-FCN: position-sensitive pooling, and losses of the hardest examples only (OHEM).
+"""R-FCN: position-sensitive pooling, and online hard example mining (OHEM).
 
-Fork: daijifeng001/caffe-rfcn; the losses on a CPU: Intel's caffe
+Fork: daijifeng001/caffe-rfcn; for the losses on a CPU, Intel's caffe
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ extend LayerParameter {
 
 @register("PSROIPooling", "psroi_pooling_param")
 class PSROIPooling(RegionPooling):
-    """Divide each region of a map into g x g bins and return the mean of each, from a channel of its own.
+    """Divide each region of a map into g x g bins and return the mean of each, from a separate channel for each bin.
 
-    Channel d of the top, row i and column j of the bins, is read from channel (d g + i) g + j of the map, g being
+    Channel d of the top at row i and column j of the bins is the mean of channel (d g + i) g + j of the map, where g is
     group_size. A region's corners are rounded to pixels of the image, both included, then scaled by spatial_scale; a
-    bin is made of all pixels that it touches, and is 0 where there are none.
+    bin has all pixels that it touches, and is 0 if there are none.
 
     bottom[0]  the map (N, output_dim g g, H, W)
     bottom[1]  regions (R, 5): image, x1, y1, x2, y2; gets no gradient
@@ -66,7 +66,7 @@ class PSROIPooling(RegionPooling):
         self.channels, self.bins, self.scale = param.output_dim, param.group_size, param.spatial_scale
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of all regions' bins; the map must have a channel for each."""
+        """Return the shape of the bins of all regions; the map must have a channel for each bin."""
         regions = self.check_regions(bottom_shapes)
         expected = self.channels * self.bins * self.bins
         if bottom_shapes[0][1] != expected:
@@ -92,7 +92,7 @@ class PSROIPooling(RegionPooling):
         return sums / areas.clamp(min=1)[:, None]
 
     def _inside(self, first: torch.Tensor, last: torch.Tensor, size: int) -> torch.Tensor:
-        """Return 1 for each pixel of the map that a bin touches along one axis, else 0: (R, bins, size)."""
+        """Return 1 for pixels of the map that a bin touches along one axis, else 0: (R, bins, size)."""
         start = first * self.scale
         length = ((last + 1) * self.scale - start).clamp(min=0.1)
         steps = torch.arange(self.bins + 1, dtype=first.dtype, device=first.device) * (length / self.bins)[:, None]
@@ -103,14 +103,14 @@ class PSROIPooling(RegionPooling):
 
 @register("SoftmaxWithLossOHEM", "softmax_param", *NORMALIZED)
 class SoftmaxWithLossOHEM(SoftmaxWithLoss):
-    """Caffe's SoftmaxWithLoss, which also returns the loss of each prediction; 0 for one that does not count.
+    """Caffe's SoftmaxWithLoss, which also returns the loss of each prediction, or 0 if it is ignored.
 
-    With normalization: PRE_FIXED the sum is divided by pre_fixed_normalizer.
+    With normalization: PRE_FIXED, the sum is divided by pre_fixed_normalizer.
 
     bottom[0]  scores (N, C, ...), C at softmax_param.axis
     bottom[1]  labels, one per prediction
     top[0]     the loss, ()
-    top[1]     optional: the softmax, bottom[0]'s shape; as top[2] it brings no gradient
+    top[1]     optional: the softmax, in bottom[0]'s shape; the gradients of top[1] and top[2] are ignored
     top[2]     optional: the loss of each prediction, bottom[1]'s shape
     Fork: intel/caffe, src/caffe/layers/softmax_loss_ohem_layer.cpp
     """
@@ -144,16 +144,16 @@ register("SmoothL1LossOHEM", *NORMALIZED)(SmoothL1LossOHEM)
 
 @register("BoxAnnotatorOHEM", "box_annotator_ohem_param")
 class BoxAnnotatorOHEM(Layer):
-    """Keep the labels and weights of each image's roi_per_img regions of the greatest loss; take away the others'.
+    """Keep the labels and weights of the roi_per_img regions with the largest loss in each image; remove the others'.
 
-    Of equal losses those come first that the fork's std::sort brings first.
+    Equal losses are in the order of the fork's std::sort.
 
     bottom[0]  regions (R, 5) or (R, 5, 1, 1): image, x1, y1, x2, y2
     bottom[1]  the loss of each (R, 1, 1, 1)
     bottom[2]  labels (R,)
     bottom[3]  weights (R, C)
     top[0]     labels (R, 1, 1, 1): ignore_label for a region that was not chosen
-    top[1]     weights (R, C, 1, 1): 0 there
+    top[1]     weights (R, C, 1, 1): 0 for a region that was not chosen
     Fork: daijifeng001/caffe-rfcn, src/caffe/layers/box_annotator_ohem_layer.cu
     """
 

@@ -22,12 +22,12 @@ NORMALIZED = ("loss_param", "loss_param.normalization", "loss_param.pre_fixed_no
 
 
 def four(shape: Shape) -> Shape:
-    """Return a shape with ones at its end, as Caffe counts up to four axes."""
+    """Return a shape with trailing ones, up to four axes."""
     return (*shape, 1, 1, 1)[: max(4, len(shape))]
 
 
 def divisor(layer: Layer, items: int, each: int, valid: torch.Tensor | None) -> torch.Tensor | float:
-    """Return what the losses of ``items`` times ``each`` predictions are divided by: at least 1."""
+    """Return the divisor of the losses of ``items`` times ``each`` predictions, at least 1."""
     param = layer.param.loss_param
     if added_value(param, "normalization") == "PRE_FIXED":
         return max(1.0, value(param, "pre_fixed_normalizer"))
@@ -35,7 +35,7 @@ def divisor(layer: Layer, items: int, each: int, valid: torch.Tensor | None) -> 
 
 
 class _Weighted(torch.autograd.Function):
-    """weight x, with a gradient that leaves out the weight, as in R-FCN (its weights are 0 and 1)."""
+    """weight x, with a gradient that omits the weight, as in R-FCN (whose weights are 0 and 1)."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
@@ -49,16 +49,16 @@ class _Weighted(torch.autograd.Function):
 class SmoothL1Loss(Loss):
     """Sum of outside weight x smooth(inside weight x (prediction - target)), divided by the number of items N.
 
-    smooth(d) = 0.5 (sigma d)^2 where |d| < 1 / sigma^2, else |d| - 0.5 / sigma^2. Without loss_weight the loss does not
-    count, but in SSD. R-FCN's (with loss_param or a second top) has no outside weights, divides by N H W, or as
-    loss_param says, and its gradient leaves the weights out.
+    smooth(d) = 0.5 (sigma d)^2 if |d| < 1 / sigma^2, else |d| - 0.5 / sigma^2. Without loss_weight, it is a loss only
+    in SSD. R-FCN's (with loss_param or a second top) has no outside weights, is divided by N H W or according to
+    loss_param, and its gradient omits the weights.
 
     bottom[0]  predictions (N, ...)
     bottom[1]  targets, the same shape
     bottom[2]  optional: inside weights, the same shape; gets no gradient
     bottom[3]  optional: outside weights, the same shape; gets no gradient
     top[0]     the loss, ()
-    top[1]     optional, R-FCN's: the loss of each region (N, 1, H, W); brings no gradient
+    top[1]     optional, R-FCN's: the loss of each region (N, 1, H, W); its gradient is ignored
     Fork: rbgirshick/caffe-fast-rcnn, src/caffe/layers/smooth_L1_loss_layer.cu; daijifeng001/caffe-rfcn; weiliu89/caffe
     """
 
@@ -87,7 +87,7 @@ class SmoothL1Loss(Loss):
         return float(self.fork in ("ssd", "yolo"))
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the tops' shapes; the bottoms must be of one shape, but for ones at its end."""
+        """Return the shapes of the tops; the bottoms must have the same shape, except for trailing ones."""
         full = [four(shape) for shape in bottom_shapes]
         for i, shape in enumerate(full):
             if shape != full[0]:
@@ -143,22 +143,22 @@ class SmoothL1Loss(Loss):
 
 
 def weighted_smooth_l1_loss(predictions, targets, inside, outside=1.0, beta=1.0):
-    """Return the smooth L1 loss of weighted differences, weighted and summed up, / N."""
+    """Return the weighted sum of the smooth L1 losses of weighted differences, divided by N."""
     x, y = inside * predictions, inside * targets
     losses = F.smooth_l1_loss(x, y, beta=beta, reduction="none")
     return (outside * losses).sum() / predictions.shape[0]
 
 
 class SmoothL1LossOHEM(SmoothL1Loss):
-    """R-FCN's SmoothL1Loss, as Microsoft's and Intel's forks name it: the sum, and the sum of each region.
+    """R-FCN's SmoothL1Loss, with the name in Microsoft's and Intel's forks: the sum, and the sum of each region.
 
-    With normalization: PRE_FIXED the sum is divided by pre_fixed_normalizer.
+    With normalization: PRE_FIXED, the sum is divided by pre_fixed_normalizer.
 
     bottom[0]  predictions (N, C) or (N, C, H, W)
     bottom[1]  targets, the same shape
-    bottom[2]  optional: weights, the same shape; gets no gradient, and the gradient leaves them out
+    bottom[2]  optional: weights, the same shape; gets no gradient, and the gradient omits them
     top[0]     the loss, ()
-    top[1]     optional: the loss of each region (N, 1, H, W); brings no gradient
+    top[1]     optional: the loss of each region (N, 1, H, W); its gradient is ignored
     Fork: intel/caffe, src/caffe/layers/smooth_L1_loss_ohem_layer.cpp
     """
 
