@@ -1,4 +1,4 @@
-"""Activations: one number in, one number out.
+"""Activations, which are computed elementwise.
 
 Caffe: the neuron layers, include/caffe/layers/neuron_layer.hpp
 """
@@ -35,7 +35,7 @@ class Rounded(Activation):
         return Pointwise.apply(x, self.as_caffe, self.caffes_gradient) if self.is_exact(x) else self.as_torch(x)
 
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the activated bottom by torch's functions, with gradients by autograd."""
+        """Return the activated bottom, computed by torch's functions, with gradients by autograd."""
         return self.compute(x, torch)
 
     def as_caffe(self, x: torch.Tensor) -> torch.Tensor:
@@ -43,7 +43,7 @@ class Rounded(Activation):
         return self.compute(x, libm)
 
     def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:
-        """Return the activated bottom by the ``functions`` of a module: torch, or netspec.exact.libm."""
+        """Return the activated bottom, computed by the functions of a module: torch or netspec.exact.libm."""
         raise NotImplementedError
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
@@ -51,14 +51,14 @@ class Rounded(Activation):
 
 
 def scaled_and_shifted(graph: OnnxGraph, value: str, scale: float, shift: float) -> str:
-    """Return scale value + shift as nodes, without those that change nothing."""
+    """Return scale value + shift as nodes, without nodes that have no effect."""
     if scale != 1:
         value = graph.node("Mul", value, graph.constant(float(scale)))
     return graph.node("Add", value, graph.constant(float(shift))) if shift else value
 
 
 def torch_scaled_and_shifted(code: TorchCode, value: str, scale: float, shift: float) -> str:
-    """Return the expression of scale value + shift, without what changes nothing."""
+    """Return the expression of scale value + shift, without parts that have no effect."""
     template = ("{scale} * {x}" if scale != 1 else "{x}") + (
         " + {shift}" if shift > 0 else " - {shift}" if shift else ""
     )
@@ -67,7 +67,7 @@ def torch_scaled_and_shifted(code: TorchCode, value: str, scale: float, shift: f
 
 @register("ReLU", "relu_param")
 class ReLU(Activation):
-    """max(x, 0) + negative_slope min(x, 0); the gradient at 0 is the negative side's.
+    """max(x, 0) + negative_slope min(x, 0); the gradient at 0 is that of the negative side.
 
     bottom[0]  any shape
     top[0]     the same shape
@@ -76,7 +76,7 @@ class ReLU(Activation):
 
     def setup(self) -> None:
         self.slope: float = self.param.relu_param.negative_slope
-        self.gradient_reads = frozenset({"sign" if self.slope >= 0 else "bottom"})  # the top's sign is the bottom's
+        self.gradient_reads = frozenset({"sign" if self.slope >= 0 else "bottom"})  # the top has the sign of the bottom
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return F.leaky_relu(x, self.slope) if self.slope else F.relu(x)
@@ -99,11 +99,11 @@ class ReLU(Activation):
 
 @register("PReLU", "prelu_param")
 class PReLU(Activation):
-    """max(x, 0) + slope min(x, 0), with one learned slope per channel, or one for all (channel_shared).
+    """max(x, 0) + slope min(x, 0), with one learnable slope per channel, or one for all (channel_shared).
 
     bottom[0]  (N, C, ...)
     top[0]     the same shape
-    blobs[0]   slopes (C,), or () where channel_shared; 0.25 unless a filler is given
+    blobs[0]   slopes (C,), or () if channel_shared; 0.25 unless a filler is given
     Caffe: src/caffe/layers/prelu_layer.cpp
     """
 
@@ -135,7 +135,7 @@ class PReLU(Activation):
 
 @register("ELU", "elu_param")
 class ELU(Rounded):
-    """Return x where x > 0, else alpha (exp(x) - 1); the gradient at 0 is alpha.
+    """x if x > 0, else alpha (exp(x) - 1); the gradient at 0 is alpha.
 
     bottom[0]  any shape
     top[0]     the same shape
@@ -179,7 +179,7 @@ class Sigmoid(Rounded):
         return functions.sigmoid(x)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        return (diff * top * (1 - top.double())).to(diff.dtype)  # 1. is a double to C, and so are its results
+        return (diff * top * (1 - top.double())).to(diff.dtype)  # 1. is a double in C, and so are the results
 
 
 @register("TanH", "tanh_param")
@@ -229,7 +229,7 @@ class BNLL(Rounded):
 
 @register("Threshold", "threshold_param")
 class Threshold(Activation):
-    """1 where x > threshold (strictly), else 0; no gradient.
+    """1 if x > threshold, else 0; no gradient.
 
     bottom[0]  any shape
     top[0]     the same shape
@@ -250,7 +250,7 @@ class Threshold(Activation):
 
 @register("Clip", "clip_param")
 class Clip(Activation):
-    """max(min, min(x, max)); the gradient passes where min <= x <= max, both ends included.
+    """max(min, min(x, max)); the gradient is passed if min <= x <= max.
 
     bottom[0]  any shape
     top[0]     the same shape

@@ -19,7 +19,7 @@ from netspec.proto.schema import TRAIN
 
 @register("InnerProduct", "inner_product_param")
 class InnerProduct(Layer):
-    """Multiply each vector by a learned matrix; the axes from ``axis`` on are one vector of length K.
+    """Multiply each vector by a learnable matrix; the axes from ``axis`` on form a vector of length K.
 
     bottom[0]  (N, ...), e.g. (N, C, H, W) with K = C H W
     top[0]     (N, num_output); the bottom's axes before ``axis``, then num_output
@@ -42,7 +42,7 @@ class InnerProduct(Layer):
         return self.canonical_axis(self.param.inner_product_param.axis, shape, "inner_product_param", "axis")
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the axes before ``axis`` and num_output; refuse vectors of another length than the weights'."""
+        """Return the axes before ``axis`` and num_output; raise SpecError if the vectors do not fit the weights."""
         shape = bottom_shapes[0]
         self.axis = self._axis(shape)
         found = math.prod(shape[self.axis :])
@@ -98,7 +98,7 @@ class Dropout(Layer):
 
     def setup(self) -> None:
         self.ratio: float = self.param.dropout_param.dropout_ratio
-        if not 0 <= self.ratio < 1 and (self.phase == TRAIN or self.ratio != 1):  # in a test it is not read
+        if not 0 <= self.ratio < 1 and (self.phase == TRAIN or self.ratio != 1):  # not read in the test phase
             message = f"dropout_ratio must be at least 0 and less than 1, found {self.ratio:g}"
             raise self.error(message, "dropout_param", "dropout_ratio")
 
@@ -106,7 +106,7 @@ class Dropout(Layer):
         return bottom_shapes
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the values that are kept, scaled; in the test phase the bottom itself."""
+        """Return the kept values, scaled; in the test phase, the bottom."""
         if self.phase != TRAIN:
             return data
         kept = torch.empty_like(data).bernoulli_(1 - self.ratio, generator=self.context.random.on(data.device))
@@ -129,9 +129,9 @@ class Dropout(Layer):
 
 @register("Embed", "embed_param")
 class Embed(Layer):
-    """Replace each index by a learned row.
+    """Replace each index by a learnable row.
 
-    bottom[0]  any shape; whole numbers from 0 to input_dim - 1, in floating point; gets no gradient
+    bottom[0]  any shape; integers from 0 to input_dim - 1, in floating point; gets no gradient
     top[0]     the bottom's shape, then num_output
     blobs[0]   rows (input_dim, num_output)
     blobs[1]   bias (num_output,)                                      unless bias_term: false

@@ -1,4 +1,4 @@
-"""Layers that normalize each image by itself: LRN, MVN."""
+"""Layers that normalize each image separately: LRN, MVN."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ ACROSS_CHANNELS = 0  # caffe.proto: enum LRNParameter.NormRegion
 
 @register("LRN", "lrn_param")
 class LRN(Layer):
-    """Divide each value by a power of the squares around it: (k + alpha times their mean) ** beta.
+    """Divide each value by a power of the squares of its neighbors: (k + alpha times their mean) ** beta.
 
     The n = ``local_size`` neighbors are channels (ACROSS_CHANNELS), or n x n pixels (WITHIN_CHANNEL, where k is
-    ignored: it is 1); those outside count as zeros.
+    1 and cannot be set); neighbors outside count as zeros.
 
     bottom[0]  (N, C, H, W)
     top[0]     the same shape
@@ -60,12 +60,12 @@ class LRN(Layer):
         return data * base.pow(-param.beta)
 
     def _base(self, data: torch.Tensor) -> torch.Tensor:
-        """Return what a power of is divided by: k + alpha times the mean of the squares in the channels around."""
+        """Return the base of the divisor: k + alpha times the mean of the squares in the neighboring channels."""
         param = self.param.lrn_param
         return param.k + param.alpha / param.local_size * self._window_sums(data * data)
 
     def _window_sums(self, maps: torch.Tensor) -> torch.Tensor:
-        """Return the sums over the channels around each."""
+        """Return the sums over the neighboring channels."""
         size, channels = self.param.lrn_param.local_size, maps.shape[1]
         framed = F.pad(maps, (0, 0, 0, 0, size // 2, size // 2))
         total = framed[:, :channels]
@@ -110,7 +110,7 @@ class LRN(Layer):
 class MVN(Layer):
     """Subtract the mean of each map and divide by its standard deviation plus ``eps``.
 
-    A map is one channel of one image, or with ``across_channels`` all of an image.
+    A map is one channel of an image or, with ``across_channels``, the whole image.
 
     bottom[0]  (N, C, H, W); up to four axes
     top[0]     (N, C, H, W); always four axes, missing ones are 1
@@ -177,10 +177,10 @@ class MVN(Layer):
 
 
 class _Standardize(torch.autograd.Function):
-    """Rows to mean 0 and deviation 1, with Caffe's gradient.
+    """Normalize rows to mean 0 and standard deviation 1, with Caffe's gradient.
 
-    Caffe differentiates as if ``eps`` were not there, then divides by the deviation plus eps: a constant row has a
-    finite gradient, where autograd's is not a number.
+    Caffe differentiates without ``eps``, then divides by the deviation plus eps, so a constant row has a
+    finite gradient, while autograd's is NaN.
     """
 
     @staticmethod

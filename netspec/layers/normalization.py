@@ -1,4 +1,4 @@
-"""BatchNorm, and what it shares with the layers of forks that normalize a batch."""
+"""BatchNorm, and functions for layers of forks that normalize a batch."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ MAX_OFFSET = 8  # the largest mean, in standard deviations, for which torch's CP
 
 @register("BatchNorm", "batch_norm_param")
 class BatchNorm(Layer):
-    """Subtract each channel's mean, divide by its standard deviation: of the batch in training, averages in testing.
+    """Subtract each channel's mean and divide by its standard deviation, of the batch, or averages in testing.
 
-    y = (x - mean) / sqrt(var + eps) with the biased variance of the batch, or with blobs[0 and 1] / blobs[2] where
-    ``use_global_stats`` (by default: in the test phase). Training adds to the sums: S = S moving_average_fraction + the
-    batch's mean, its unbiased variance, 1. Layers that share the blobs add one after the other.
+    y = (x - mean) / sqrt(var + eps) with the biased variance of the batch, or with blobs[0 and 1] / blobs[2] if
+    ``use_global_stats`` (the default in the test phase). Training adds to the sums: S = S moving_average_fraction + the
+    batch's mean, its unbiased variance, or 1. Layers that share the blobs add one after the other.
 
     bottom[0]  (N, C) or (N, C, ...)
     top[0]     the same shape
     blobs[0]   sum of means     (C,)
     blobs[1]   sum of variances (C,)
-    blobs[2]   sum of weights   (1,)        what the others are to be divided by; all three are not learned: lr_mult 0
+    blobs[2]   sum of weights   (1,)        the divisor of the others; all three are not learned (lr_mult 0)
     Caffe: src/caffe/layers/batch_norm_layer.cpp
     """
 
     ignores_propagate_down = frozenset({0})
-    joined: tuple[Layer, ...] = ()  # a Scale and a ReLU after it that it computes too, in training
-    rectifies = False  # whether there is a ReLU among them
+    joined: tuple[Layer, ...] = ()  # a Scale and a ReLU after it that it also computes, in training
+    rectifies = False  # whether they include a ReLU
 
     def setup(self) -> None:
         """Add the sums, all zero. Raise SpecError for a ``param`` that would train them."""
@@ -73,7 +73,7 @@ class BatchNorm(Layer):
 
     @property
     def eps(self) -> float:
-        """The constant that is added to the variance."""
+        """The constant added to the variance."""
         return self.param.batch_norm_param.eps
 
     def past(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -82,7 +82,7 @@ class BatchNorm(Layer):
             return means(*(self.blob(i) for i in range(3)))
 
     def by_past(self, exact: bool) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return a function that normalizes a bottom of the present shape by the present stored statistics."""
+        """Return a function that normalizes a bottom of the current shape with the current stored statistics."""
         mean, variance = self.past()
         eps, axes = self.param.batch_norm_param.eps, (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
         by_channel = mean.view(axes)
@@ -94,7 +94,7 @@ class BatchNorm(Layer):
         return lambda data: torch.batch_norm(data - by_channel if far else data, None, None, *arguments)
 
     def joined_with(self, after: Layer) -> Layer | None:
-        """Return this layer joined with a Scale of its channels, or a ReLU, after it: one kernel of torch does it."""
+        """Return this layer joined with a Scale of its channels or a ReLU after it, for one kernel of torch."""
         kind = offered(after, "joins_as")
         fits = (kind == "scale" and not self.joined) or (kind == "relu" and not self.rectifies)
         if not fits or self.use_global_stats or self.is_exact(self.blob(0), self.small):
@@ -104,7 +104,7 @@ class BatchNorm(Layer):
         return made
 
     def factors(self) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-        """Return the learned factors and biases of the Scale that it was joined with."""
+        """Return the factors and biases of the Scale that it was joined with."""
         blobs = [layer.blob(j) for layer in self.joined for j in range(len(layer.blobs))]
         return blobs[0] if blobs else None, blobs[1] if len(blobs) > 1 else None
 
@@ -121,13 +121,13 @@ class BatchNorm(Layer):
         return top.relu_() if self.rectifies else top
 
     def normalized(self, data: torch.Tensor, normalize: Callable[..., Any], *options: Any) -> tuple[Any, torch.Tensor]:
-        """Normalize a batch by torch's function ``normalize``; return the result and its input. Add up statistics."""
+        """Normalize a batch with torch's ``normalize``; return the result and its input. Add to the statistics."""
         made, mean, variance = self._by_torch(data, normalize, options)
         if _far_from_zero(mean, variance, self.eps):
-            # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
+            # Subtracting a constant from each channel changes only the rounding of the result and the gradient.
             data = data - mean.view(-1, *(1,) * (data.dim() - 2))
             made, _, variance = self._by_torch(data, normalize, options)
-        # Torch's unbiased variance of one value is 0 / 0, Caffe's 0.
+        # Torch's unbiased variance of one value is 0 / 0, and Caffe's is 0.
         self._add(mean, torch.zeros_like(variance) if data.numel() == self.channels else variance)
         return made, data
 
@@ -177,7 +177,7 @@ def as_before(layer: Layer, shapes: Sequence[Shape], channels: int) -> Sequence[
 
 
 def means(means: torch.Tensor, variances: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the sums divided by their weight; 0 if nothing was added yet."""
+    """Return the sums divided by their weight, or 0 if nothing was added yet."""
     factor = torch.where(weight == 0, 0, 1 / weight)
     return means * factor, variances * factor
 
@@ -195,21 +195,21 @@ def torch_batch_norm(
 
 
 def onnx_normalized(graph: OnnxGraph, data: str, axes: int, eps: float) -> str:
-    """Write the normalization of a batch: minus the mean of each channel, divided by its standard deviation."""
+    """Write the normalization of a batch: subtract each channel's mean and divide by its standard deviation."""
     centered = graph.node("Sub", data, _onnx_channel_means(graph, data, axes))
     variance = _onnx_channel_means(graph, graph.node("Mul", centered, centered), axes)
     return graph.node("Div", centered, graph.node("Sqrt", graph.node("Add", variance, graph.constant(eps))))
 
 
 def _onnx_channel_means(graph: OnnxGraph, data: str, axes: int) -> str:
-    # One after the other: OpenCV 5.0 gets means over axes that do not lie side by side wrong.
+    # One after the other, since means over nonadjacent axes are wrong in OpenCV 5.0.
     for part in ([0], list(range(2, axes))):
         data = graph.node("ReduceMean", data, graph.constant(part), keepdims=1) if part else data
     return data
 
 
 def _far_from_zero(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> bool:
-    """Return whether torch's kernel would lose digits: on a CPU it computes x / std - mean / std.
+    """Return whether torch's kernel would lose precision, since on a CPU it computes x / std - mean / std.
 
     Compiled by torch.compile, it subtracts the mean first.
     """

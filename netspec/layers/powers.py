@@ -33,19 +33,19 @@ class AbsVal(Activation):
 
 
 def over_its_diff(bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor, slope: torch.Tensor) -> torch.Tensor:
-    """Return the gradient diff * slope as Caffe's Power and Log compute it: the slope is written to the bottom's diff.
+    """Return the gradient diff * slope like Caffe's Power and Log, which write the slope to the bottom's diff.
 
-    In place that is the top's diff too: what came from the loss is lost, and the result is the slope's square.
+    In place, this is also the top's diff, so the gradient of the loss is lost, and the result is the slope squared.
     """
     return (slope if bottom is top else diff) * slope
 
 
 @register("Power", "power_param")
 class Power(Rounded):
-    """(shift + scale x) ^ power; the constant shift ^ power where scale or power is 0, whatever x is.
+    """(shift + scale x) ^ power; if scale or power is 0, the constant shift ^ power for any x.
 
-    Where shift is 0, Caffe's gradient divides by x and is NaN at x = 0; this one is the derivative there too. In place,
-    the gradient is Caffe's too, the square of the slope: see :func:`over_its_diff`.
+    If shift is 0, Caffe's gradient divides by x and is NaN at x = 0, while this one is the derivative. In place,
+    the gradient is Caffe's, the square of the slope: see :func:`over_its_diff`.
 
     bottom[0]  any shape
     top[0]     the same shape
@@ -105,7 +105,7 @@ class Power(Rounded):
 
 
 def _log(base: float) -> float:
-    """Return the logarithm of a base, a float as Caffe's; -1 stands for e."""
+    """Return the logarithm of a base as a float, as in Caffe; -1 stands for e."""
     return 1.0 if base == -1 else libm.log(torch.tensor(base)).item()
 
 
@@ -139,7 +139,7 @@ class Exp(Rounded):
         if p.shift == 0:
             return libm.exp(x * self.scale)
         factor = libm.exp(x.new_tensor(p.shift)) if p.base == -1 else libm.power(x.new_tensor(p.base), p.shift)
-        # Caffe makes 0 * infinity of what a large shift would bring back to a number.
+        # With a large shift, Caffe computes 0 * infinity for a finite result.
         return libm.exp(x * self.scale) * factor if factor.isfinite() else self.as_torch(x)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
@@ -158,7 +158,7 @@ class Log(Rounded):
 
     bottom[0]  any shape
     top[0]     the same shape
-    In place, the gradient is Caffe's too, the square of the slope: see :func:`over_its_diff`.
+    In place, the gradient is Caffe's, the square of the slope: see :func:`over_its_diff`.
     Caffe: src/caffe/layers/log_layer.cpp
     """
 

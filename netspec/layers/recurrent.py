@@ -1,6 +1,6 @@
-"""Recurrent layers, time step by time step.
+"""Recurrent layers, computed one time step at a time.
 
-Caffe: src/caffe/layers/recurrent_layer.cpp, which unrolls the time steps into a net of their own
+Caffe: src/caffe/layers/recurrent_layer.cpp, which unrolls the time steps into a separate net
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
-# Functions that are copied into exported source; they take a net's blobs and states one by one.
+# These functions are copied into exported source code.
 
 
 def rnn(x, cont, w_x, bias, w_h, w_o, bias_o, x_static, w_static, h):
@@ -71,10 +71,10 @@ def lstm_unit(cell, gates, cont):
 class Recurrent(Layer):
     """Base of RNN and LSTM.
 
-    The hidden state lives on from one forward pass to the next until a cont of 0 ends its sequence. It is 0 at first,
-    and again when the number of streams changes. With expose_hidden the caller carries it instead, as bottoms and tops.
-    No gradient passes from a batch into the one before, through these bottoms and tops neither. Unlike Caffe's, the
-    number of time steps may change from batch to batch.
+    The hidden state continues in the next forward pass until a cont of 0 ends its sequence. It is 0 at first,
+    and when the number of streams changes. With expose_hidden, the state is bottoms and tops instead.
+    No gradient passes from a batch to the previous one, not even through these bottoms and tops. Unlike in Caffe, the
+    number of time steps can differ between batches.
     """
 
     bottoms = (2, 5)
@@ -85,10 +85,10 @@ class Recurrent(Layer):
     torch_function: Callable[..., Any]
     blob_names: ClassVar[tuple[str, ...]]
     remembers = True
-    gates: ClassVar[int] = 1  # how many numbers a hidden unit takes in
+    gates: ClassVar[int] = 1  # number of inputs of a hidden unit
 
     def setup(self) -> None:
-        """Add the blobs that take x, x_static and h in; subclasses append theirs."""
+        """Add the blobs for x, x_static and h; subclasses append theirs."""
         p = self.param.recurrent_param
         if p.num_output <= 0:
             message = f"found num_output {p.num_output}, expected a positive number"
@@ -135,7 +135,7 @@ class Recurrent(Layer):
         return [(steps, streams, self.hidden), *[state] * (self.num_tops - 1)]
 
     def forward(self, x: torch.Tensor, cont: torch.Tensor, *others: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the output of every time step and, where exposed, the last state."""
+        """Return the output of every time step and, if exposed, the last state."""
         steps, streams = x.shape[:2]
         self.exact = self.is_exact(x)
         inputs = self.multiply(x.reshape(steps * streams, -1), 0, bias=1).reshape(steps, streams, -1)
@@ -166,7 +166,7 @@ class Recurrent(Layer):
         self.state = found
 
     def multiply_adds(self) -> int:
-        """Return the weights of every matrix, times the time steps (x_static's: once) and the streams."""
+        """Return the number of weights, times the time steps (once for x_static) and the streams."""
         steps, streams = self.bottom_shapes[0][:2]
         matrices = [math.prod(shape) for shape in self.blob_shapes if len(shape) == 2]
         once = matrices.pop(1) if self.has_static else 0
@@ -175,22 +175,22 @@ class Recurrent(Layer):
     def step(
         self, inputs: tuple[torch.Tensor, ...], keep: torch.Tensor, state: tuple[torch.Tensor, ...]
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-        """Do one time step: return its output (streams, hidden) and the state after it.
+        """Compute one time step; return its output (streams, hidden) and the state after it.
 
-        ``inputs`` are what x, with the bias, and x_static bring in, (streams, gates * hidden) each; ``keep`` (streams,
-        1) is cont.
+        ``inputs`` are the products for x (with the bias) and x_static, (streams, gates * hidden) each; ``keep``
+        (streams, 1) is cont.
         """
         raise NotImplementedError
 
     def multiply(self, vectors: torch.Tensor, weight: int, bias: int | None = None) -> torch.Tensor:
-        """Return the products of vectors (M, K) with a matrix, its blob's index given, and the bias added."""
+        """Return the products of vectors (M, K) with a matrix, given by the index of its blob, plus the bias."""
         matrix, added = self.blob(weight), None if bias is None else self.blob(bias)
         if self.exact:
             return VectorProducts.apply(vectors, matrix, added, False, self.context.options.accumulate_in_place)
         return F.linear(vectors, matrix, added)
 
     def carry(self, hidden: torch.Tensor, keep: torch.Tensor, inputs: tuple[torch.Tensor, ...]) -> torch.Tensor:
-        """Return what the hidden state before, unless a sequence begins, and the inputs bring in together."""
+        """Return the sum of the inputs and, unless a sequence begins, the product for the previous hidden state."""
         total = self.multiply(keep * hidden, 2 + self.has_static)
         for brought in inputs:
             total = total + brought
@@ -206,7 +206,7 @@ class Recurrent(Layer):
 
     @property
     def export_note(self) -> str:
-        """Say that the state is lost between two runs; with expose_hidden it is an input and an output instead."""
+        """Return a note that the state is lost between runs; with expose_hidden, it is an input and an output."""
         if self.exposed:
             return ""
         names = ", ".join(self.state_names)
@@ -240,11 +240,11 @@ class Recurrent(Layer):
         return (top, *state) if self.exposed else (top,)
 
     def onnx_step(self, graph: OnnxGraph, inputs: str, keep: str, state: Sequence[str]) -> tuple[str, list[str]]:
-        """Write one time step: as :meth:`step`, with an axis of 1 before the streams."""
+        """Write one time step like :meth:`step`, with an axis of size 1 before the streams."""
         raise NotImplementedError
 
     def onnx_product(self, graph: OnnxGraph, value: str, blob: int) -> str:
-        """Return the product with a learned matrix."""
+        """Return the product with a learnable matrix."""
         return graph.node("MatMul", value, graph.node("Transpose", graph.blob(blob), perm=[1, 0]))
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
@@ -288,7 +288,7 @@ class RNN(Recurrent):
     def step(
         self, inputs: tuple[torch.Tensor, ...], keep: torch.Tensor, state: tuple[torch.Tensor, ...]
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-        """Do one time step; see :meth:`Recurrent.step`."""
+        """Compute one time step; see :meth:`Recurrent.step`."""
         last = 2 + self.has_static
         h = self._tanh(self.carry(state[0], keep, inputs))
         return self._tanh(self.multiply(h, last + 1, bias=last + 2)), (h,)
@@ -308,7 +308,7 @@ class RNN(Recurrent):
 def _lstm_unit(
     cell: torch.Tensor, gate_input: torch.Tensor, keep: torch.Tensor, exact: bool
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the next cell and hidden state; the gates come as input, forget, output, then the candidate."""
+    """Return the next cell and hidden state; the order of the gates is input, forget, output, candidate."""
     return CellUpdate.apply(cell, gate_input, keep) if exact else lstm_unit(cell, gate_input, keep)
 
 
@@ -348,7 +348,7 @@ class LSTM(Recurrent):
     def step(
         self, inputs: tuple[torch.Tensor, ...], keep: torch.Tensor, state: tuple[torch.Tensor, ...]
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-        """Do one time step; see :meth:`Recurrent.step`."""
+        """Compute one time step; see :meth:`Recurrent.step`."""
         h, c = state
         c, h = _lstm_unit(c, self.carry(h, keep, inputs), keep, self.exact)
         return h, (h, c)
@@ -363,7 +363,7 @@ class LSTM(Recurrent):
 
 @register("LSTMUnit")
 class LSTMUnit(Layer):
-    """One time step of an LSTM from its gates' inputs; the part without blobs.
+    """One time step of an LSTM from the inputs of its gates, without blobs.
 
     bottom[0]  c_{t-1} (1, N, D)
     bottom[1]  gate inputs (1, N, 4 D): input, forget, output, candidate
@@ -378,7 +378,7 @@ class LSTMUnit(Layer):
     label_bottoms = frozenset({2})
 
     def setup(self) -> None:
-        if any(self.param.propagate_down[:2]):  # Caffe computes both gradients where one is asked for
+        if any(self.param.propagate_down[:2]):  # Caffe computes both gradients if one is needed
             self.ignores_propagate_down = frozenset({0, 1})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:

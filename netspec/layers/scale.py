@@ -1,4 +1,4 @@
-"""Layers that scale and shift values by numbers that are learned or come from another blob: Scale, Bias."""
+"""Scale and Bias, which scale and shift values by learnable numbers or another blob."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 class _Affine(Layer):
-    """What Scale and Bias have in common: an operand that is learned or a second bottom, laid over some axes."""
+    """Base of Scale and Bias: an operand, learnable or a second bottom, is broadcast over some axes."""
 
     bottoms = (1, 2)
 
     def learned_shape(self, param: Any, field: str) -> Shape:
-        """Return the shape of a learned operand: ``num_axes`` axes of the bottom from ``axis`` on (-1: all)."""
+        """Return the shape of a learnable operand: ``num_axes`` axes of the bottom from ``axis`` on (-1: all)."""
         shape = self.bottom_shapes[0]
         axis = self.canonical_axis(param.axis, shape, field, "axis")
         if param.num_axes < -1:
@@ -34,7 +34,7 @@ class _Affine(Layer):
         return shape[axis:end]
 
     def locate(self, shapes: Sequence[Shape], param: Any, field: str) -> int:
-        """Return the axis of the first bottom where the operand begins; refuse an operand that does not match."""
+        """Return the first axis of the operand in the first bottom; raise SpecError if the shapes do not match."""
         shape = shapes[0]
         axis = 0
         for operand in (*shapes[1:], *self.blob_shapes):
@@ -47,7 +47,7 @@ class _Affine(Layer):
     def apply_exactly(
         self, data: torch.Tensor, factors: torch.Tensor | None, bias: torch.Tensor | None, axis: int
     ) -> torch.Tensor:
-        """Multiply and add in Caffe's order; the operands lie over the axes from ``axis`` on."""
+        """Multiply and add in Caffe's order; the operands apply to the axes from ``axis`` on."""
         operand = bias if factors is None else factors
         assert operand is not None
         values = data.reshape(math.prod(data.shape[:axis]), operand.numel(), -1)
@@ -55,7 +55,7 @@ class _Affine(Layer):
         return tops.reshape(data.shape)
 
     def onnx_operand(self, graph: OnnxGraph, bottoms: Sequence[str], blob: int, axis: int) -> str:
-        """Return the second bottom, or else a learned blob, laid over the first bottom's axes from ``axis`` on."""
+        """Return the second bottom or a learnable blob, broadcast over the first bottom's axes from ``axis`` on."""
         axes = len(self.bottom_shapes[0]) - axis
         if len(bottoms) == 1:
             shape = self.blob_shapes[blob]
@@ -66,7 +66,7 @@ class _Affine(Layer):
         return graph.node("Unsqueeze", bottoms[1], graph.constant(list(range(given, axes))))
 
     def torch_operand(self, code: TorchCode, bottoms: Sequence[str], blob: int, axis: int) -> str:
-        """Return the expression of the second bottom, or else of a learned blob, laid over axes from ``axis`` on."""
+        """Return the expression of the second bottom or a learnable blob, broadcast over axes from ``axis`` on."""
         axes = len(self.bottom_shapes[0]) - axis
         if len(bottoms) == 1:
             shape = self.blob_shapes[blob]
@@ -78,10 +78,10 @@ class _Affine(Layer):
 
 @register("Scale", "scale_param")
 class Scale(_Affine):
-    """Multiply by a learned factor, or by a second bottom, and, with bias_term, add a learned bias.
+    """Multiply by learnable factors or by a second bottom; with bias_term, add a learnable bias.
 
     bottom[0]  any shape
-    bottom[1]  optional, the factors: bottom[0]'s shape from ``axis`` on, as many axes as it has
+    bottom[1]  optional, the factors: bottom[0]'s shape from ``axis`` on, for the number of its axes
     top[0]     bottom[0]'s shape
     blobs[0]   factors, bottom[0]'s shape from ``axis`` for ``num_axes``    unless bottom[1] is given
     blobs[1]   bias, the shape of the factors                               with bias_term: true; blobs[0] if bottom[1]
@@ -124,7 +124,7 @@ class Scale(_Affine):
 
     @property
     def by_channel(self) -> bool:
-        """Whether it multiplies each channel by a learned factor."""
+        """Whether it multiplies each channel by a learnable factor."""
         return len(self.bottom_shapes) == 1 and self.axis == 1 and len(self.blob_shapes[0]) == 1
 
     @property
@@ -144,10 +144,10 @@ class Scale(_Affine):
 
 @register("Bias", "bias_param")
 class Bias(_Affine):
-    """Add a learned bias, or a second bottom.
+    """Add a learnable bias or a second bottom.
 
     bottom[0]  any shape
-    bottom[1]  optional, the bias: bottom[0]'s shape from ``axis`` on, as many axes as it has
+    bottom[1]  optional, the bias: bottom[0]'s shape from ``axis`` on, for the number of its axes
     top[0]     bottom[0]'s shape
     blobs[0]   bias, bottom[0]'s shape from ``axis`` for ``num_axes``       unless bottom[1] is given
     Caffe: src/caffe/layers/bias_layer.cpp
@@ -176,11 +176,11 @@ class Bias(_Affine):
 
 
 def scaled_by_channel(scale: torch.Tensor, bias: torch.Tensor | None) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return what scales each channel: batch normalization with mean 0 and variance 1, thrice as fast, backward too."""
+    """Scale each channel with torch's batch normalization (mean 0, variance 1), which is three times as fast."""
     arguments = (scale, bias, torch.zeros_like(scale), torch.ones_like(scale), False, 0.0, 0.0)
     return lambda data: torch.batch_norm(data, *arguments, torch.backends.cudnn.enabled)
 
 
 def _laid_over(values: torch.Tensor, axis: int, data: torch.Tensor) -> torch.Tensor:
-    """Return ``values`` shaped to meet the axes of ``data`` from ``axis`` on."""
+    """Reshape ``values`` for broadcasting over the axes of ``data`` from ``axis`` on."""
     return values.reshape(*values.shape, *(1,) * (data.dim() - axis - values.dim()))

@@ -1,4 +1,4 @@
-"""Losses by margins and distances: HingeLoss, SigmoidCrossEntropyLoss, EuclideanLoss, ContrastiveLoss."""
+"""Losses of margins and distances: HingeLoss, SigmoidCrossEntropyLoss, EuclideanLoss, ContrastiveLoss."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ from netspec.layers.loss.base import (
 
 @register("HingeLoss", "hinge_loss_param")
 class HingeLoss(ClassLoss):
-    """One against all: the sum of max(0, 1 - s x) / N, s being 1 at the label and -1 elsewhere.
+    """One-vs-all hinge loss: the sum of max(0, 1 - s x) / N, where s is 1 at the label and -1 elsewhere.
 
-    With norm L2 each term is squared; there is no half.
+    With norm L2, each term is squared, without a factor 1/2.
 
     bottom[0]  scores (N, C, ...): all but the first axis are the classes
     bottom[1]  labels, N of them
@@ -76,10 +76,10 @@ class HingeLoss(ClassLoss):
 
 @register("SigmoidCrossEntropyLoss", "loss_param", "sigmoid_param")
 class SigmoidCrossEntropyLoss(Loss):
-    """Cross entropy of sigmoid(x) and targets of any value, summed and normalized (default BATCH_SIZE).
+    """Cross entropy of sigmoid(x) and targets with any values, summed and normalized (default BATCH_SIZE).
 
     bottom[0]  x (N, ...)
-    bottom[1]  targets, as many; those that cast to loss_param.ignore_label are left out
+    bottom[1]  targets, as many; those whose integer part is loss_param.ignore_label are ignored
     top[0]     the loss, ()
     Caffe: src/caffe/layers/sigmoid_cross_entropy_loss_layer.cpp
     """
@@ -138,7 +138,7 @@ class EuclideanLoss(Loss):
     """The sum of (a - b)^2 / (2 N).
 
     bottom[0]  a (N, ...)
-    bottom[1]  b, as many values per item; gets a gradient too
+    bottom[1]  b, as many values per item; also gets a gradient
     top[0]     the loss, ()
     Caffe: src/caffe/layers/euclidean_loss_layer.cpp
     """
@@ -203,7 +203,7 @@ class _Contrastive(torch.autograd.Function):
 class ContrastiveLoss(Loss):
     """The sum of d^2 over similar pairs and of max(margin - d, 0)^2 over the others, / (2 N); d = |a - b|.
 
-    legacy_version takes max(margin - d^2, 0) for dissimilar pairs.
+    With legacy_version, dissimilar pairs have max(margin - d^2, 0).
 
     bottom[0]  a (N, C) or (N, C, 1, 1)
     bottom[1]  b, the same shape
@@ -257,27 +257,27 @@ class ContrastiveLoss(Loss):
 
 
 def sigmoid_loss(scores, targets):
-    """Return the cross entropy of sigmoid(scores), summed up for each item; their mean."""
+    """Return the cross entropy of sigmoid(scores), summed for each item and averaged over the items."""
     total = F.binary_cross_entropy_with_logits(scores, targets, reduction="sum")
     return total / scores.shape[0]
 
 
 def contrastive_loss(a, b, similar, margin):
-    """Return the mean over pairs of d**2 / 2, if not similar of max(margin - d, 0)**2 / 2."""
+    """Return the mean over pairs of d**2 / 2 if similar, else max(margin - d, 0)**2 / 2."""
     squared = (a - b).flatten(1).square().sum(1)
     dissimilar = F.relu(margin - squared.sqrt()).square()
     return torch.where(similar.flatten().long() != 0, squared, dissimilar).mean() / 2
 
 
 def legacy_contrastive_loss(a, b, similar, margin):
-    """Return the mean over pairs of d**2 / 2, if not similar of max(margin - d**2, 0) / 2."""
+    """Return the mean over pairs of d**2 / 2 if similar, else max(margin - d**2, 0) / 2."""
     squared = (a - b).flatten(1).square().sum(1)
     dissimilar = F.relu(margin - squared)
     return torch.where(similar.flatten().long() != 0, squared, dissimilar).mean() / 2
 
 
 def hinge_loss(scores, labels, norm):
-    """Return the sum of max(0, 1 - s x)**norm / N, s being 1 at the label, else -1."""
+    """Return the sum of max(0, 1 - s x)**norm / N, where s is 1 at the label, else -1."""
     scores, labels = scores.flatten(1), labels.flatten().long()
     sign = torch.ones_like(scores).scatter(1, labels[:, None], -1)
     return F.relu(1 + sign * scores).pow(norm).sum() / scores.shape[0]

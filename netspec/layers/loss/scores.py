@@ -35,24 +35,24 @@ from netspec.layers.loss.base import (
 )
 from netspec.proto.schema import BlobProto
 
-FLT_MIN = 1.17549435e-38  # the least argument of the logarithm in SoftmaxWithLoss
+FLT_MIN = 1.17549435e-38  # the minimum argument of the logarithm in SoftmaxWithLoss
 LOG_THRESHOLD = 1e-20  # the same in MultinomialLogisticLoss and InfogainLoss
 
 
 class SoftmaxLoss(Loss, Classified):
-    """Base of the two losses that begin with a softmax. It is their optional second top, without a gradient."""
+    """Base of the two losses that begin with a softmax, which is their optional second top, without a gradient."""
 
     tops = (1, 2)
     normalization: int
 
     def reshape_tops(self, bottom_shapes: Sequence[Shape], axis: int, *path: str) -> Sequence[Shape]:
-        """Return the shapes of the tops; the classes lie along an axis."""
+        """Return the shapes of the tops; ``axis`` is the axis of the classes."""
         shapes = [*super().reshape(bottom_shapes), bottom_shapes[0]]
         self.reshape_scores(bottom_shapes, axis, *path)
         return shapes[: self.num_tops]
 
     def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, exact: bool) -> torch.Tensor:
-        """Return the normalized sum of the losses (outer, inner) that count."""
+        """Return the normalized sum of the losses (outer, inner) that are not ignored."""
         if valid is not None:
             losses = losses.where(valid, 0)
         return total(losses, exact) / normalizer(self.normalization, self.outer, self.inner, valid)
@@ -227,7 +227,7 @@ class InfogainLoss(SoftmaxLoss):
 
 @register("MultinomialLogisticLoss")
 class MultinomialLogisticLoss(ClassLoss):
-    """-log(probabilities[label]) / N; the probability is floored at 1e-20, for the gradient -1 / p as well.
+    """-log(probabilities[label]) / N; the probability is at least 1e-20, also in the gradient -1 / p.
 
     bottom[0]  probabilities (N, C, ...): all but the first axis are the classes
     bottom[1]  labels, N of them
@@ -253,7 +253,7 @@ class MultinomialLogisticLoss(ClassLoss):
 
 @register("Accuracy", "accuracy_param")
 class Accuracy(Classified):
-    """The share of predictions with their label among the top_k scores. A tie with the label's score counts against it.
+    """The share of predictions whose label is among the top_k scores. Scores equal to the label's count as higher.
 
     It is 0 if every label is ignored. It has no gradient.
 
@@ -286,7 +286,7 @@ class Accuracy(Classified):
         if valid is None:
             valid = torch.ones_like(label, dtype=torch.bool)
         label = label * valid
-        better = (x >= x.gather(1, label.unsqueeze(1))).sum(1) - 1  # the label's own score is no better
+        better = (x >= x.gather(1, label.unsqueeze(1))).sum(1) - 1  # the label's own score is not higher
         right = ((better < self.top_k) & valid).to(x.dtype)
         accuracy = right.sum() / valid.sum().clamp(min=1)
         if self.num_tops == 1:
@@ -307,7 +307,7 @@ class Accuracy(Classified):
         if self.num_tops == 1:
             return (accuracy,)
         classes = graph.constant(torch.arange(self.classes).reshape(-1, 1))
-        of_class = graph.cast(graph.node("Equal", labels, classes), "float32")  # an ignored label may be one, too
+        of_class = graph.cast(graph.node("Equal", labels, classes), "float32")  # an ignored label may also be a class
         of_class = graph.node("Mul", of_class, counted) if counted else of_class
         axes = graph.constant([0, 2])
         occurrences = graph.node("ReduceSum", of_class, axes, keepdims=0)
@@ -323,7 +323,7 @@ class Accuracy(Classified):
 
 
 def softmax_loss(scores, labels, divide_by, ignore=-100):
-    """Return the cross entropy of softmax(scores) summed up, divided by a number of labels."""
+    """Return the sum of the cross entropy of softmax(scores), divided by the number of labels."""
     labels = labels.long()
     total = F.cross_entropy(scores, labels, ignore_index=ignore, reduction="sum")
     counted = (labels != ignore).sum().clamp(min=1)

@@ -1,1 +1,1 @@
-"""Layers that compute between blobs, move numbers, or run Python code."""
+"""Layers for arithmetic between blobs, for rearranging values, and for Python code."""

@@ -1,4 +1,4 @@
-"""Arithmetic between blobs and over axes; and a learnable blob without bottoms."""
+"""Arithmetic between blobs and over axes, and Parameter, a learnable blob without bottoms."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 @register("Eltwise", "eltwise_param")
 class Eltwise(Layer):
-    """Element by element: SUM (coeff_i bottom_i), PROD, or MAX.
+    """Combine the bottoms elementwise: SUM (coeff_i bottom_i), PROD, or MAX.
 
-    In a MAX of equals the second bottom beats the first, and a later one never beats an earlier: it alone gets the
-    gradient. PROD's gradient is the stable one, product of the others; Caffe's for stable_prod_grad: false is top /
-    bottom, the same number but for rounding, which ``exact: all`` follows, or NaN at 0, which it does not.
+    If values in a MAX are equal, the second bottom wins over the first, and earlier ones over later ones; only the
+    winner gets the gradient. PROD's gradient is the product of the others. With stable_prod_grad: false, Caffe computes
+    top / bottom, which differs in rounding (``exact: all`` reproduces this) and is NaN at 0 (not reproduced).
 
-    bottom[i]  equal shapes, two at least
+    bottom[i]  equal shapes, at least two
     top[0]     the same shape
     Caffe: src/caffe/layers/eltwise_layer.cpp
     """
@@ -60,7 +60,7 @@ class Eltwise(Layer):
         if exact and self.operation == self.SUM:
             top = bottoms[0] * self.coeff[0]
             for x, factor in zip(bottoms[1:], self.coeff[1:], strict=True):
-                top = torch.add(top, x, alpha=factor)  # rounds once, as BLAS' axpy does
+                top = torch.add(top, x, alpha=factor)  # rounds once, like BLAS's axpy
             return top
         if self.operation == self.SUM:
             bottoms = tuple(x if c == 1 else x * c for x, c in zip(bottoms, self.coeff, strict=True))
@@ -163,13 +163,13 @@ class Reduction(Layer):
 
 @register("ArgMax", "argmax_param")
 class ArgMax(Layer):
-    """Find the top_k largest along an axis, or among all numbers of an item where no axis is given. No gradient.
+    """Find the top_k largest values along an axis, or of each item if no axis is given. No gradient.
 
     Of equal values the larger index comes first.
 
     bottom[0]  any shape
-    top[0]     with axis: that axis top_k long, indices, or values where out_max_val;
-               without: (N, 1, top_k) of indices, or (N, 2, top_k) of indices and values, then a 1 for each further axis
+    top[0]     with axis: that axis has size top_k; indices, or values if out_max_val;
+               without: (N, 1, top_k) of indices, or (N, 2, top_k) of indices and values, then 1 for each further axis
     Caffe: src/caffe/layers/argmax_layer.cpp
     """
 
@@ -189,7 +189,7 @@ class ArgMax(Layer):
         axis = 1 if self.axis is None else self.axis
         if self.axis is None:
             x = x.reshape(x.shape[0], math.prod(x.shape[1:]))
-        # A stable sort keeps equal values in order; in the reversed axis the larger index is the earlier.
+        # A stable sort keeps equal values in order; in the reversed axis, the larger index comes first.
         values, order = torch.sort(x.flip(axis), dim=axis, descending=True, stable=True)
         values, order = values.narrow(axis, 0, p.top_k), order.narrow(axis, 0, p.top_k)
         indices = (x.shape[axis] - 1 - order).to(x.dtype)
@@ -203,7 +203,7 @@ class ArgMax(Layer):
         axis = 1 if self.axis is None else self.axis
         if self.axis is None:
             data = graph.node("Flatten", data, axis=1)
-        # Of equal values TopK takes the smaller index first; in the reversed axis that is the larger one.
+        # For equal values, TopK returns the smaller index first; in the reversed axis, that is the larger one.
         backwards = (graph.constant([-1]), graph.constant([-(2**62)]), graph.constant([axis]), graph.constant([-1]))
         reverse = graph.node("Slice", data, *backwards)
         values, order = graph.nodes("TopK", reverse, graph.constant([p.top_k]), outputs=2, axis=axis)
@@ -232,7 +232,7 @@ class ArgMax(Layer):
 
 @register("Softmax", "softmax_param")
 class Softmax(Layer):
-    """exp(x) / the sum of exp(x) along an axis (default 1).
+    """exp(x), divided by the sum of exp(x) along an axis (default 1).
 
     bottom[0]  any shape
     top[0]     the same shape
@@ -265,7 +265,7 @@ class Softmax(Layer):
 
 @register("Silence")
 class Silence(Layer):
-    """Use blobs that would otherwise be the net's outputs.
+    """Consume blobs that would otherwise be outputs of the net.
 
     bottom[i]  any shape
     top        none
@@ -290,7 +290,7 @@ class Silence(Layer):
 
 @register("Parameter", "parameter_param")
 class Parameter(Layer):
-    """Show a learnable blob as a top.
+    """Output a learnable blob.
 
     bottom     none
     top[0]     parameter_param.shape
@@ -318,7 +318,7 @@ class Parameter(Layer):
 
 
 def arg_max(x, dim, top_k):
-    """Return the indices, as numbers of x's type, and the values of the largest; of equal ones the last comes first."""
+    """Return the indices (in x's type) and values of the largest; of equal ones, the last comes first."""
     values, order = torch.sort(x.flip(dim), dim=dim, descending=True, stable=True)
     indices = (x.shape[dim] - 1 - order).to(x.dtype)
     return indices.narrow(dim, 0, top_k), values.narrow(dim, 0, top_k)

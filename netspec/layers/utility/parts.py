@@ -1,4 +1,4 @@
-"""Layers that cut blobs and join them: Concat, Slice, Crop, BatchReindex, Filter."""
+"""Layers that divide and join blobs: Concat, Slice, Crop, BatchReindex, Filter."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:
 class Concat(Layer):
     """Join the bottoms along an axis (default 1; concat_dim is its older name).
 
-    bottom[i]  shapes that are equal but for that axis
+    bottom[i]  shapes that are equal except for that axis
     top[0]     the bottoms, one after the other
     Caffe: src/caffe/layers/concat_layer.cpp
     """
@@ -36,7 +36,7 @@ class Concat(Layer):
     onnx_op, onnx_attributes = "Concat", ("axis",)
 
     def setup(self) -> None:
-        if len(self.bottom_shapes) == 1:  # it is not copied
+        if len(self.bottom_shapes) == 1:  # not copied
             self.shares = frozenset({"data", "diff"})
             self.ignores_propagate_down = frozenset({0})
 
@@ -61,17 +61,17 @@ class Concat(Layer):
 
 @register("Slice", "slice_param")
 class Slice(Layer):
-    """Cut the bottom along an axis (default 1; slice_dim is its older name): before each slice_point, or evenly.
+    """Split the bottom along an axis (default 1; slice_dim is its older name), before each slice_point, or evenly.
 
     bottom[0]  any shape
-    top[i]     part i of that axis, the other axes whole
+    top[i]     part i of that axis; the other axes are unchanged
     Caffe: src/caffe/layers/slice_layer.cpp
     """
 
     tops = (1, None)
 
     def setup(self) -> None:
-        if self.num_tops == 1:  # it is not copied
+        if self.num_tops == 1:  # not copied
             self.shares = frozenset({"data", "diff"})
             self.ignores_propagate_down = frozenset({0})
 
@@ -125,10 +125,10 @@ class Slice(Layer):
 
 @register("Crop", "crop_param")
 class Crop(Layer):
-    """Cut a blob to the size of another, from ``axis`` on.
+    """Crop a blob to the size of another, from ``axis`` on.
 
-    bottom[0]  the blob to cut, any shape
-    bottom[1]  the blob of the wanted size, at least as many axes; gets no gradient
+    bottom[0]  the blob to crop, any shape
+    bottom[1]  a blob of the wanted size, with at least as many axes; gets no gradient
     top[0]     bottom[0]'s shape before ``axis``, bottom[1]'s from there on
     Caffe: src/caffe/layers/crop_layer.cpp
     """
@@ -136,7 +136,7 @@ class Crop(Layer):
     bottoms = (2, 2)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the wanted shape; place the window."""
+        """Return the wanted shape, and set the position of the window."""
         data, wanted = bottom_shapes
         param = self.param.crop_param
         axis = self.canonical_axis(param.axis, data, "crop_param", "axis")
@@ -181,7 +181,7 @@ class Crop(Layer):
 
 @register("BatchReindex")
 class BatchReindex(Layer):
-    """Choose items of the batch by index; the gradients of an item chosen more than once add up.
+    """Select items of the batch by index; the gradients of an item that is selected several times are added.
 
     bottom[0]  (N, ...)
     bottom[1]  indices (M,), each from 0 to N - 1
@@ -212,7 +212,7 @@ class BatchReindex(Layer):
 
 @register("Filter")
 class Filter(Layer):
-    """Keep the items with a selector other than 0. Their number is known only at run time.
+    """Keep the items whose selector is not 0. Their number is known only at run time.
 
     bottom[i]  (N, ...)
     bottom[-1] the selector (N,) or (N, 1, ...)

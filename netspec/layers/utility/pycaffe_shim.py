@@ -1,4 +1,4 @@
-"""A stand-in for pycaffe, for the code of Python layers that imports ``caffe``: Layer, TRAIN, TEST.
+"""The module ``caffe`` for the code of Python layers: Layer, TRAIN, TEST.
 
 Caffe: python/caffe/_caffe.cpp
 """
@@ -35,25 +35,25 @@ class Layer:
         """Prepare the layer; called once."""
 
     def reshape(self, bottom: list[Blob], top: list[Blob]) -> None:
-        """Give the tops their shapes."""
+        """Set the shapes of the tops."""
 
 
 def __getattr__(name: str) -> NoReturn:
     raise AttributeError(f"netspec's module caffe for Python layers has no {name}; it has Layer, TRAIN and TEST")
 
 
-_home = __name__  # of what ``import caffe`` gives
+_home = __name__  # the attributes of this ``caffe``
 
 
 def offer(package: str) -> None:
-    """Let the code of Python layers import a package as ``caffe`` instead of this module."""
+    """Let Python layers import a package as ``caffe`` instead of this module."""
     global _home
     _home = package
 
 
 @contextmanager
 def importable() -> Iterator[None]:
-    """A block in which code can import modules of the current directory, and ``caffe`` even if it is missing."""
+    """Within the block, code can import modules of the current directory, and ``caffe`` even if it is not installed."""
     directory = os.getcwd()
     sys.path.insert(0, directory)
     stand_in = "caffe" not in sys.modules and not _is_installed(directory)
@@ -76,12 +76,12 @@ def can_import(module: str) -> bool:
     with importable():
         try:
             return importlib.util.find_spec(module) is not None
-        except Exception:  # its package's code may raise anything
+        except Exception:  # the code of its package may raise anything
             return False
 
 
 @cache
 def _is_installed(directory: str) -> bool:
-    """Return whether Python finds a caffe in a directory. A plain folder of that name (Caffe's sources) is none."""
+    """Return whether a directory has a package caffe. A folder with Caffe's sources does not count."""
     spec = importlib.util.find_spec("caffe")
     return spec is not None and spec.origin is not None

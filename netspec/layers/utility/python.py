@@ -1,4 +1,4 @@
-"""The Python layer: runs users' code for pycaffe.
+"""The Python layer, which runs users' code for pycaffe.
 
 Caffe: include/caffe/layers/python_layer.hpp
 """
@@ -50,15 +50,15 @@ class _Phase(int):
 class Python(Layer):
     """Run the class python_param.layer of python_param.module, on numpy views of the blobs.
 
-    The module is looked for in the current directory, then where Python looks (PYTHONPATH). Its class has setup,
-    reshape and forward(bottom, top) and backward(top, propagate_down, bottom), and finds self.param_str, self.phase and
+    The module is searched in the current directory, then in Python's path (PYTHONPATH). Its class has setup,
+    reshape and forward(bottom, top) and backward(top, propagate_down, bottom), and has self.param_str, self.phase and
     self.blobs. As in Caffe, backward belongs to the last forward. On a GPU the arrays are copies in main memory.
-    A class that remembers more than its blobs has running_state(), which returns what JSON can hold, and resume(state):
-    they are called when a snapshot is taken and when its training is resumed.
+    A class with state other than its blobs can define running_state(), which returns JSON values, and resume(state).
+    They are called when a snapshot is taken and when a training is resumed.
 
     bottom[i]  any shape
-    top[i]     the shape that reshape or forward gives it
-    blobs[i]   those that setup adds by self.blobs.add_blob(...)
+    top[i]     the shape set by reshape or forward
+    blobs[i]   added by setup with self.blobs.add_blob(...)
     Caffe: include/caffe/layers/python_layer.hpp
     """
 
@@ -66,7 +66,7 @@ class Python(Layer):
     not_exported = "it runs Python code"
     bottoms = (0, None)
     tops = (0, None)
-    takes_shapes = True  # where its code must not run
+    takes_shapes = True  # if its code must not run
     promises = False  # as in Caffe, the code may reshape its tops in forward
 
     def setup(self) -> None:
@@ -122,7 +122,7 @@ class Python(Layer):
         ]
 
     def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
-        """Return what the code's running_state returns, as JSON; "" where it has none."""
+        """Return the result of the code's running_state as JSON, or "" if it has none."""
         if not hasattr(self.code, "running_state"):
             return {"code": ""}
         state = self._call("running_state")
@@ -145,7 +145,7 @@ class Python(Layer):
 
     @staticmethod
     def is_there(param: LayerParameter) -> bool:
-        """Return whether the module of a Python layer would be found."""
+        """Return whether the module of a Python layer can be found."""
         return can_import(param.python_param.module)
 
     def _load(self) -> Any:
@@ -167,7 +167,7 @@ class Python(Layer):
             raise self.error(f"{p.module}.{p.layer}: {_describe(fault)}", "python_param", "layer") from fault
         if not hasattr(code, "blobs"):
             raise self.error(f"{p.module}.{p.layer} is not a caffe.Layer", "python_param", "layer")
-        code.param_str = code.param_str_ = p.param_str  # the second is the name of 2014
+        code.param_str = code.param_str_ = p.param_str  # the second is the name in 2014
         code.phase = _Phase(self.phase)
         return code
 

@@ -37,7 +37,7 @@ class Flatten(_OtherShape):
     """Join the axes from axis (default 1) to end_axis (default the last) into one.
 
     bottom[0]  any shape
-    top[0]     the same numbers, shape[:axis] + (product,) + shape[end_axis + 1:]
+    top[0]     the same values, shape[:axis] + (product,) + shape[end_axis + 1:]
     Caffe: src/caffe/layers/flatten_layer.cpp
     """
 
@@ -53,10 +53,10 @@ class Flatten(_OtherShape):
 
 @register("Reshape", "reshape_param")
 class Reshape(_OtherShape):
-    """Replace num_axes axes (default all) from axis on by those of shape: 0 copies the bottom's axis, -1 is inferred.
+    """Replace num_axes axes (default all) from axis on by those of shape; 0 copies the bottom's axis, -1 is inferred.
 
     bottom[0]  any shape
-    top[0]     the same numbers, shape[:axis] + reshape_param.shape + shape[axis + num_axes:]
+    top[0]     the same values, shape[:axis] + reshape_param.shape + shape[axis + num_axes:]
     Caffe: src/caffe/layers/reshape_layer.cpp
     """
 
@@ -97,7 +97,7 @@ class Reshape(_OtherShape):
 
 @register("Split")
 class Split(Layer):
-    """Give the bottom to several layers; their gradients are added. Nets insert it automatically.
+    """Pass the bottom to several layers and add their gradients. Nets insert it automatically.
 
     bottom[0]  any shape
     top[i]     the bottom
@@ -113,7 +113,7 @@ class Split(Layer):
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return one tensor per top, so that each has its own gradient."""
-        if self.num_tops > 2 and self.is_exact(x):  # of two, either order gives the same sum
+        if self.num_tops > 2 and self.is_exact(x):  # for two, the order does not matter
             return Copies.apply(x, self.num_tops)
         return tuple(x.view_as(x) for _ in range(self.num_tops))
 

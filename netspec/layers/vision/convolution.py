@@ -30,9 +30,9 @@ from netspec.layers.vision.sliding import TORCH_USUAL, SlidingFilter
 
 @register("Convolution", "convolution_param")
 class Convolution(SlidingFilter):
-    """Cross-correlate each map with learned filters; any number of bottoms, one set of filters for all.
+    """Cross-correlate maps with learnable filters; any number of bottoms share the filters.
 
-    bottom[i]  (N, C, H, W); with ``axis`` and other kernels (..., C, spatial axes: up to three)
+    bottom[i]  (N, C, H, W); in general (..., C, up to three spatial axes), where ``axis`` is the axis of C
     top[i]     (N, num_output, H', W'),  H' = (H + 2 pad - dilation (kernel - 1) - 1) // stride + 1
     blobs[0]   filters (num_output, C / group, kernel_h, kernel_w)
     blobs[1]   bias    (num_output,)                                   unless bias_term: false
@@ -45,7 +45,7 @@ class Convolution(SlidingFilter):
 
     @staticmethod
     def channels_read(param: Any) -> int:
-        """Return the channels of the bottoms that the filters in a LayerParameter have."""
+        """Return the number of channels that the filters in a LayerParameter need."""
         filters = param.blobs[0]
         channels = filters.shape.dim[1] if len(filters.shape.dim) > 1 else filters.channels
         return channels * param.convolution_param.group
@@ -93,7 +93,7 @@ class Convolution(SlidingFilter):
         geometry = [v or (n,) for v, n in ((self.stride, 1), (self.pad, 0), (self.dilation, 1))]
         sliding = Filter(tuple(weight.shape[2:]), *geometry)
         tops = []
-        for bottom in reversed(bottoms):  # autograd goes backward from the last: as in Caffe, through the first bottom
+        for bottom in reversed(bottoms):  # autograd starts with the last: the first bottom, as in Caffe
             images = math.prod(bottom.shape[: self.channel_axis])
             maps = bottom.reshape(images, self.channels, *(bottom.shape[self.channel_axis + 1 :] or (1,)))
             tops.append(self.apply_filters(maps, weight, bias, sliding).reshape(self.top_shapes[0]))
@@ -102,7 +102,7 @@ class Convolution(SlidingFilter):
     def apply_filters(
         self, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter
     ) -> torch.Tensor:
-        """Return the responses to maps (N, C, spatial axes), at least one."""
+        """Return the responses to maps (N, C, spatial axes) with at least one spatial axis."""
         overhang = self.overhang(self.bottom_shapes[0])
         if any(overhang):
             maps = F.pad(maps, overhang)
@@ -113,7 +113,7 @@ class Convolution(SlidingFilter):
         if self.reads_padding_alone:
             maps = F.pad(maps, [p for p in reversed(sliding.pad) for _ in range(2)])
             sliding = replace(sliding, pad=(0,) * len(sliding.pad))
-        if not torch.is_grad_enabled():  # in channels_last, weights would be copied for each product
+        if not torch.is_grad_enabled():  # with channels_last, each product would copy the weights
             return convolution(of_one_channel(maps), weight, bias, sliding, self.group)
         lay_out = channels_side_by_side if maps.numel() > 2 * weight.numel() else map_by_map
         return self.convolved(maps, weight, bias, sliding, lay_out)
@@ -198,9 +198,9 @@ class Convolution(SlidingFilter):
 
 @register("Deconvolution", "convolution_param")
 class Deconvolution(Convolution):
-    """Spread each pixel by learned filters, like the backward pass of a convolution.
+    """Spread each pixel with learnable filters, like the backward pass of a convolution.
 
-    bottom[i]  (N, C, H, W); with ``axis`` and other kernels (..., C, spatial axes: up to three)
+    bottom[i]  (N, C, H, W); in general (..., C, up to three spatial axes), where ``axis`` is the axis of C
     top[i]     (N, num_output, H', W'),  H' = stride (H - 1) + dilation (kernel - 1) + 1 - 2 pad
     blobs[0]   filters (C, num_output / group, kernel_h, kernel_w)
     blobs[1]   bias    (num_output,)                                   unless bias_term: false
@@ -212,7 +212,7 @@ class Deconvolution(Convolution):
 
     @override
     def filter_shape(self) -> Shape:
-        """Return the shape of blobs[0]: a convolution's with its ends exchanged."""
+        """Return the shape of blobs[0], with the channels of a convolution's filters exchanged."""
         return (self.channels, self.num_output // self.group, *self.kernel)
 
     @override
@@ -226,7 +226,7 @@ class Deconvolution(Convolution):
     def apply_filters(
         self, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter
     ) -> torch.Tensor:
-        """Return the maps (N, C, spatial axes), at least one, spread by the filters."""
+        """Return the maps (N, C, spatial axes), with at least one spatial axis, spread by the filters."""
         if self.is_exact(maps):
             size = self.top_shapes[0][self.channel_axis + 1 :] or (1,)
             in_place = self.context.options.accumulate_in_place
@@ -245,5 +245,5 @@ class Deconvolution(Convolution):
 
     @override
     def overhang(self, shape: Shape) -> list[int]:
-        """Return zeros: any filter fits."""
+        """Return zeros, since any filter fits."""
         return [0] * (2 * self.spatial_axes)

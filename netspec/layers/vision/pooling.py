@@ -33,7 +33,7 @@ class _PoolingBase(Layer):
     """Base of Pooling and SPP."""
 
     def check_pad(self, windows: Windows, method: int, field: str) -> None:
-        """Refuse padding as Caffe does: as long as the kernel, or for another method than MAX and AVE."""
+        """Raise SpecError for padding as long as the kernel, or for a method other than MAX and AVE, as in Caffe."""
         if any(windows.pad) and method == STOCHASTIC:
             raise self.error("STOCHASTIC pooling does not support padding", field)
         if any(p and p >= k for p, k in zip(windows.pad, windows.kernel, strict=True)):
@@ -125,13 +125,13 @@ class _PoolingBase(Layer):
 
 @register("Pooling", "pooling_param")
 class Pooling(_PoolingBase):
-    """Reduce each window of a map to its maximum, its average, or a pixel drawn at random.
+    """Reduce each window of a map to its maximum, its average, or a random pixel.
 
     bottom[0]  (N, C, H, W)
-    top[0]     (N, C, H', W'),  H' = ceil((H + 2 pad - kernel) / stride) + 1, floor with round_mode: FLOOR; one less
-               where padded and the last window would begin past the map and its padding; 1 with global_pooling
-    top[1]     MAX only, optional: of each maximum, its index row * W + column in the map; -1 for none
-    Caffe: src/caffe/layers/pooling_layer.cpp; STOCHASTIC, which Caffe has on GPUs only, pooling_layer.cu
+    top[0]     (N, C, H', W'),  H' = ceil((H + 2 pad - kernel) / stride) + 1, or floor with round_mode: FLOOR; one less
+               if there is padding and the last window would begin past the padded map; 1 with global_pooling
+    top[1]     MAX only, optional: the index row * W + column of each maximum in the map, or -1 for none
+    Caffe: src/caffe/layers/pooling_layer.cpp; for STOCHASTIC, which Caffe has only on GPUs, pooling_layer.cu
     """
 
     tops = (1, 2)
@@ -202,7 +202,7 @@ class Pooling(_PoolingBase):
 
 @register("SPP", "spp_param")
 class SPP(_PoolingBase):
-    """Pool a map into 1, then 2 x 2, then 4 x 4, ... windows: the same number of features for every size of the map.
+    """Pool a map into 1, 2 x 2, 4 x 4, ... windows, which gives the same number of features for any size of the map.
 
     bottom[0]  (N, C, H, W)
     top[0]     (N, C (1 + 4 + 16 + ...)) with ``pyramid_height`` terms, level by level; (N, C, 1, 1) for height 1
@@ -229,7 +229,7 @@ class SPP(_PoolingBase):
         return [(shape[0], shape[1] * sum(w.count[0] * w.count[1] for w in self.levels))]
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        several = len(self.levels) > 2 and self.is_exact(data)  # Caffe's SPP is a net of its own, with a Split
+        several = len(self.levels) > 2 and self.is_exact(data)  # Caffe's SPP is a separate net with a Split
         copies = Copies.apply(data, len(self.levels)) if several else [data] * len(self.levels)
         method = self.param.spp_param.pool
         pooled = [self.pool(copy, windows, method)[0] for copy, windows in zip(copies, self.levels, strict=True)]

@@ -22,7 +22,7 @@ def _by(sizes: Shape) -> str:
 
 
 class SlidingFilter(Layer):
-    """Base of the layers described by a ConvolutionParameter: the filter's geometry, one number per spatial axis."""
+    """Base of layers with a ConvolutionParameter: the geometry of the filter, one number per spatial axis."""
 
     kernel: Shape
     stride: Shape
@@ -68,15 +68,15 @@ class SlidingFilter(Layer):
         return tuple(d * (k - 1) + 1 for k, d in zip(self.kernel, self.dilation, strict=True))
 
     def slide(self, shape: Shape) -> Shape:
-        """Return how often the filter fits, along each spatial axis of a bottom of ``shape``."""
+        """Return the number of positions of the filter along each spatial axis of a bottom of ``shape``."""
         axes = zip(shape[self.channel_axis + 1 :], self.pad, self.extent, self.stride, strict=True)
-        # C++ rounds a quotient toward zero: a filter too long by less than a stride still fits once, over zeros.
+        # C++ rounds toward zero, so a filter that is too long by less than a stride still has one position, over zeros.
         fits = tuple(int((size + 2 * p - e) / s) + 1 for size, p, e, s in axes)
         self.check_output(fits, shape)
         return fits
 
     def check_output(self, spatial: Shape, shape: Shape) -> None:
-        """Refuse tops without a single pixel."""
+        """Raise SpecError for tops without pixels."""
         if any(size < 1 for size in spatial):
             raise self.error(
                 f"the filter does not fit: a bottom of shape {shape} would give a map of {_by(spatial)} (kernel "
@@ -141,7 +141,7 @@ class Im2col(SlidingFilter):
     """Return the pixels under each position of a filter as channels.
 
     bottom[0]  (N, C, H, W); with ``axis`` and other kernels (..., C, spatial axes: any number, at least one)
-    top[0]     (N, C kernel_h kernel_w, H', W'),  H' as Convolution's; zero where the filter leaves the map
+    top[0]     (N, C kernel_h kernel_w, H', W'),  H' as for Convolution; zero where the filter is outside the map
     Caffe: src/caffe/layers/im2col_layer.cpp
     """
 
@@ -173,7 +173,7 @@ class Im2col(SlidingFilter):
         first = self.channel_axis + 1
         geometry = zip(self.extent, self.stride, self.dilation, strict=True)
         for axis, (extent, stride, dilation) in enumerate(geometry, start=first):
-            windows = windows.unfold(axis, extent, stride)[..., ::dilation]  # the filter's pixels, as a last axis
+            windows = windows.unfold(axis, extent, stride)[..., ::dilation]  # the pixels of the filter as the last axis
         last = first + self.spatial_axes
         order = (*range(first), *range(last, windows.dim()), *range(first, last))
         return windows.permute(order).reshape(self.top_shapes[0])

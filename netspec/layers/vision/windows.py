@@ -14,7 +14,7 @@ CEIL, FLOOR = 0, 1  # caffe.proto: enum PoolingParameter.RoundMode
 Pair = tuple[int, int]
 
 
-LOWEST = torch.finfo(torch.float32).min  # what a maximum starts from: Caffe's -FLT_MAX
+LOWEST = torch.finfo(torch.float32).min  # the initial value of a maximum: Caffe's -FLT_MAX
 
 
 SMALLEST = torch.finfo(torch.float32).tiny  # Caffe's FLT_MIN
