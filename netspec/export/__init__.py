@@ -1,1 +1,1 @@
-"""Ways for a net to leave: files of other formats, and other engines that run it."""
+"""Export of nets to other formats, and to other engines."""

@@ -35,7 +35,7 @@ DIGESTS = "digests.json"  # of the files of an entry, by name
 
 
 def key_of(files: Sequence[str | Path], options: Mapping[str, Any]) -> str:
-    """Return a key, 64 hexadecimal digits, by the content of files, by options, and by netspec's own code.
+    """Return a key of 64 hexadecimal digits for the content of files, for options, and for netspec's own code.
 
     Raises SpecError for a file that cannot be read.
     """
@@ -80,9 +80,9 @@ def _digest(path: str | Path) -> str:
 
 
 def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, bool]:
-    """Return the folder of a key, and whether it is new. A missing one is made, and ``make`` fills it.
+    """Return the folder of a key, and whether it is new. A missing folder is created and filled by ``make``.
 
-    An entry with damaged files is moved to another name, with a warning, and made again. Raises OSError if the folder
+    An entry with damaged files is renamed, with a warning, and created again. Raises OSError if the folder
     cannot be written.
     """
     place = folder / key
@@ -108,12 +108,12 @@ def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, b
             if not place.is_dir():  # another process may have made the same entry
                 raise
     finally:
-        shutil.rmtree(unfinished, ignore_errors=True)  # what this call made
+        shutil.rmtree(unfinished, ignore_errors=True)  # created by this call
     return place, True
 
 
 def _is_whole(place: Path) -> bool:
-    """Return whether the files of an entry are unchanged. Files that were added later do not count."""
+    """Return whether the files of an entry are unchanged. Files that were added later are ignored."""
     try:
         digests = json.loads((place / DIGESTS).read_bytes())
         return all(_digest(place / name) == digest for name, digest in digests.items())

@@ -15,7 +15,7 @@ _NEEDS = {ONNXRUNTIME: ("onnx", "onnxruntime"), OPENVINO: ("onnx", "openvino")} 
 
 @dataclass(frozen=True)
 class Choice:
-    """An engine. ``cache`` is the folder in which exported models are kept, None if they are not."""
+    """An engine. ``cache`` is the folder for exported models, or None to keep none."""
 
     engine: str = TORCH
     precision: str = FP32

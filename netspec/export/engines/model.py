@@ -50,7 +50,7 @@ class Model:
     def run(self, inputs: Arrays) -> dict[str, np.ndarray]:
         """Return the outputs, float32 by name, for inputs by name.
 
-        Raises Unable where the library fails. In bf16 the first pass measures how far outputs are from those in fp32.
+        Raises Unable if the library fails. In bf16, the first pass measures the difference from fp32.
         """
         found = _run(self._runner, inputs)
         if not self._difference_shown:
@@ -67,7 +67,7 @@ class Model:
                 _export(export, folder / MODEL)
             try:
                 runner.prepare(folder)
-            except Exception as fault:  # each library has its own
+            except Exception as fault:  # each library has its own exceptions
                 raise Unable(reason(fault)) from None
             (folder / WARNINGS).write_text("\n".join(warnings), "utf-8", "backslashreplace")
 
@@ -97,7 +97,7 @@ class Model:
             return open_runner(self.choice.engine, self.folder, FP32), FP32
 
     def _show_difference(self, inputs: Arrays, found: Arrays) -> None:
-        """Log how far bf16 is from fp32. It is measured once, on the first inputs, and kept with the model."""
+        """Log the difference of bf16 from fp32. It is measured once, on the first inputs, and kept with the model."""
         place = self.folder / DIFFERENCE
         if place.exists():
             return _warn_again(place)
@@ -108,12 +108,12 @@ class Model:
         ]
         for line in lines:
             log.logger.warning(line)
-        with suppress(SpecError):  # it is measured again
+        with suppress(SpecError):  # measure it again
             write_whole(inside(self.folder, DIFFERENCE), "\n".join(lines), "backslashreplace")
 
 
 def _warn_again(path: Path) -> None:
-    """Log the lines of a file, which is missing in the cache of an older netspec."""
+    """Log the lines of a file, which the cache of an older netspec does not have."""
     with suppress(OSError):
         for line in path.read_text("utf-8", "replace").splitlines():
             log.logger.warning(line)
@@ -122,7 +122,7 @@ def _warn_again(path: Path) -> None:
 def _run(runner: Runner, inputs: Arrays) -> dict[str, np.ndarray]:
     try:
         return runner.run(inputs)
-    except Exception as fault:  # each library has its own
+    except Exception as fault:  # each library has its own exceptions
         raise Unable(reason(fault)) from None
 
 

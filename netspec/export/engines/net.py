@@ -1,4 +1,4 @@
-"""An engine as a runner of a net: it computes the forward passes, and the net does everything else."""
+"""A runner that uses an engine: it computes the forward passes, and the net does everything else."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from netspec.run.walk import Result, losses_of, walk, weighted_sum
 
 
 def write_model(net: Net, path: Path, blobs: Iterable[str] = ()) -> None:
-    """Write a net as an ONNX model. Those of ``blobs`` that are not inputs become outputs too.
+    """Write a net as an ONNX model. ``blobs`` that are not inputs become additional outputs.
 
-    Raises SpecError where a layer cannot be exported. Raises Unable where an exported layer would compute something
+    Raises SpecError if a layer cannot be exported. Raises Unable if an exported layer would compute something
     else, and for a blob that the model does not have.
     """
     import onnx
@@ -49,7 +49,7 @@ def write_model(net: Net, path: Path, blobs: Iterable[str] = ()) -> None:
     path.write_bytes(model.SerializeToString())
 
 
-Write = Callable[[Path, Sequence[str]], None]  # exports the net to a path; these blobs become outputs too
+Write = Callable[[Path, Sequence[str]], None]  # exports the net to a path, with these blobs as additional outputs
 
 
 def with_engine(net: Net, choice: Choice, path: str | Path, weights: Iterable[str | Path]) -> Net:
@@ -75,7 +75,7 @@ def with_engine(net: Net, choice: Choice, path: str | Path, weights: Iterable[st
 
 
 class Engine:
-    """Runs a net by an engine. It keeps the plan of ``net``, and its layers, because they read the data.
+    """Runs a net with an engine. It keeps the plan of ``net``, and its layers, because they read the data.
 
     ``origin`` names the files that the net is made from; it is None if the parameters are random. ``write`` exports the
     net. Outputs have no gradient. Torch runs a pass if an input requires a gradient, and every pass after the engine
@@ -88,7 +88,7 @@ class Engine:
         self._choice, self._from, self._write = choice, origin, write
         self._blobs = blobs_of(net.layers)
         losses = zip(net.plan.nodes, losses_of(net.loss_weights), strict=True)
-        # The values that are losses with a name, and their weights.
+        # The values of named losses, and their weights.
         self._weighted = [(node.tops[j], w) for node, own in losses for j, w in own if j < len(node.tops)]
         self._readers = [step for step in net.eager.one_by_one() if reads_data(self._layers[step.node])]
         layers = zip(net.plan.nodes, net.layers, strict=True)
@@ -98,10 +98,10 @@ class Engine:
         }  # inputs, and tops of layers that read data
         self._built = {blob: net.shapes[blob] for blob in self._ends.values()}
         self._model: Model | None = None
-        self._opened_for: tuple[str, ...] = ()  # the blobs that the model has
-        self._loaded = self._exported = self._seen()  # the learned blobs as they were then
+        self._opened_for: tuple[str, ...] = ()  # the blobs of the model
+        self._loaded = self._exported = self._seen()  # the state of the learnable blobs at that time
         self._unable, self._warned = False, False
-        self._fits: tuple[dict[int, Shape], dict[int, Shape]] = {}, {}  # of the inputs at the last pass, of all values
+        self._fits: tuple[dict[int, Shape], dict[int, Shape]] = {}, {}  # shapes of inputs and of all values
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
         """Run the net on the values of its inputs. Return None if torch must run it."""
@@ -141,7 +141,7 @@ class Engine:
         return loss, values
 
     def _shapes(self, given: dict[int, Shape]) -> dict[int, Shape]:
-        """Return the shapes of the values for inputs of these. Raises SpecError where a layer cannot take them."""
+        """Return the shapes of the values for these inputs. Raises SpecError if a layer refuses them."""
         if given != self._fits[0]:
             self._fits = given, fitted(self._plan, self._layers, given)[1]
         return self._fits[1]
@@ -150,7 +150,7 @@ class Engine:
         return Seen(self._blobs(), values=True)
 
     def _current(self, blobs: tuple[str, ...]) -> Model:
-        """Return the model of the net with its present parameters and these blobs."""
+        """Return the model of the net with its current parameters and these blobs."""
         if self._model is None or self._opened_for != blobs or not self._exported.are(self._blobs()):
             computed, as_loaded = [blob for blob in blobs if blob not in self._built], self._loaded.are(self._blobs())
             origin = self._origin(blobs) if as_loaded else None
@@ -161,7 +161,7 @@ class Engine:
         return self._model
 
     def _origin(self, blobs: tuple[str, ...]) -> Origin | None:
-        """Return the files and options that the net is made from; None if its parameters are not those of files."""
+        """Return the files and options that the net is made from; None if its parameters do not come from files."""
         if self._from is None and self._blobs():
             return None
         files, options = (self._from.files, self._from.options) if self._from else ([], {})

@@ -51,11 +51,11 @@ Arrays = Mapping[str, np.ndarray]
 
 
 class Unable(Exception):
-    """An engine cannot run this net, or not in this way; the text says why."""
+    """An engine cannot run a net with the given options; the text is the reason."""
 
 
 def warn_unable(choice: Choice, reason: str) -> None:
-    """Warn that torch runs the net instead of the chosen engine, if there is a reason, and that it does so in fp32."""
+    """Warn that torch runs the net instead of the chosen engine, with the reason, if any, and that it uses fp32."""
     if reason:
         log.logger.warning(f"engine {choice.engine}: {reason}; torch runs the net")
     if choice.precision != FP32:
@@ -64,7 +64,7 @@ def warn_unable(choice: Choice, reason: str) -> None:
 
 @contextmanager
 def _no_telemetry() -> Iterator[None]:
-    """A block in which a library can be imported without telemetry: no network access, no file in the home folder.
+    """Within the block, import a library without telemetry: no network access, and no file in the home folder.
 
     OpenVINO uses an empty stub if its telemetry package is missing. onnxruntime reads a variable when it is imported.
     """
@@ -91,7 +91,7 @@ class Runner(Protocol):
 
 
 def threads() -> int:
-    """Return how many threads a pass may use: as many as torch would."""
+    """Return the number of threads for a pass: as many as torch would use."""
     if torch := sys.modules.get("torch"):
         return torch.get_num_threads()
     given = os.environ.get("OMP_NUM_THREADS", "")
@@ -101,7 +101,7 @@ def threads() -> int:
 
 
 class OnnxRuntime:
-    """onnxruntime on the CPU. Its optimizations of a model are done once for each version and processor."""
+    """onnxruntime on the CPU. It optimizes a model once for each version and processor."""
 
     def __init__(self, folder: Path) -> None:
         with _no_telemetry():
@@ -111,7 +111,7 @@ class OnnxRuntime:
         options.intra_op_num_threads = threads()
         options.graph_optimization_level = (
             onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-        )  # they were done by prepare
+        )  # prepare has already done this
         self._session = onnxruntime.InferenceSession(
             str(folder / OPTIMIZED), options, providers=["CPUExecutionProvider"]
         )
@@ -120,7 +120,7 @@ class OnnxRuntime:
 
     @staticmethod
     def identity() -> dict[str, str]:
-        """Return what a prepared model depends on."""
+        """Return the properties that a prepared model depends on."""
         with _no_telemetry():
             import onnxruntime
 
@@ -170,7 +170,7 @@ class OpenVino:
 
     @staticmethod
     def identity() -> dict[str, str]:
-        """Return what a prepared model depends on."""
+        """Return the properties that a prepared model depends on."""
         with _no_telemetry():
             import openvino
         return {"openvino": openvino.__version__}
@@ -211,7 +211,7 @@ RUNNERS: dict[str, type[OnnxRuntime] | type[OpenVino]] = {ONNXRUNTIME: OnnxRunti
 
 
 def open_runner(engine: str, folder: Path, precision: str) -> Runner:
-    """Return a runner for the model in a folder. Raises Unable where its library cannot run it."""
+    """Return a runner for the model in a folder. Raises Unable if its library cannot run it."""
     try:
         if engine == OPENVINO:
             return OpenVino(folder, precision)
@@ -225,6 +225,6 @@ def open_runner(engine: str, folder: Path, precision: str) -> Runner:
 
 
 def reason(fault: Exception) -> str:
-    """Return the message of a library's exception in one short line."""
+    """Return the message of a library's exception as one short line."""
     text = " ".join(str(fault).split()) or type(fault).__name__
     return text if len(text) <= 200 else f"{text[:197]}..."

@@ -1,1 +1,1 @@
-"""A net in another form: ONNX, PyTorch source, torch.export, safetensors. Each layer defines its own export."""
+"""Export of nets as ONNX, PyTorch source, torch.export or safetensors. Each layer defines its own export."""

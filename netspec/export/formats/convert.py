@@ -1,4 +1,4 @@
-"""``netspec export`` and ``netspec fold``: from the user's files to files of another form."""
+"""``netspec export`` and ``netspec fold``, which convert the user's files to another format."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from netspec.terminal.commands import version
 
 @dataclass(frozen=True)
 class Source:
-    """The net to export: a prototxt, for a phase, and files of weights, which are loaded in order.
+    """The net to export: a prototxt, a phase, and weights files, which are loaded in order.
 
     ``options`` gives the level and stages, the shapes of inputs and of the tops of data layers, and whether Python
     layers may run. ``blobs``: only the layers that compute these are exported. Without ``labels``, layers that need
@@ -74,7 +74,7 @@ class Source:
 
 
 def export_net(source: Source, target: str, out: Path, preprocess: Preprocess | None = None) -> list[str]:
-    """Write a net as ``onnx``, ``torch``, ``pt2`` or ``safetensors``; return notes for its user, in lines.
+    """Write a net as ``onnx``, ``torch``, ``pt2`` or ``safetensors``; return notes for the user, as lines.
 
     Raises SpecError for any error in the files, and for a layer that cannot be exported.
     """
@@ -96,7 +96,7 @@ def export_net(source: Source, target: str, out: Path, preprocess: Preprocess | 
 
 
 def blob_tensors(net: Net) -> dict[str, torch.Tensor]:
-    """Return the learned blobs of a net in Caffe's order, as ``layer.index``. Shared blobs have their owner's name."""
+    """Return a net's learnable blobs in Caffe's order, as ``layer.index``. Shared blobs have their owner's name."""
     found: dict[str, torch.Tensor] = {}
     seen: set[int] = set()
     for layer in net.layers:

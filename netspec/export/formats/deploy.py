@@ -1,4 +1,4 @@
-"""Makes the deploy form of a net: inputs for data layers, no labels and losses, BatchNorm and Scale in the weights.
+"""Converts a net for deployment: inputs for data layers, no labels and losses, BatchNorm and Scale in the weights.
 
 The result is a NetParameter with its weights, for Caffe or any reader of its files.
 """
@@ -32,9 +32,9 @@ from netspec.proto.upgrade.rewrite import copy_without
 def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool = True) -> tuple[Any, SourceMap]:
     """Return a net in which layers that read data are Input layers; ``options`` has the shapes of their tops.
 
-    Without ``labels``, only the first top of such a layer is kept. Layers that need another one, losses and accuracies,
+    Without ``labels``, only the first top of such a layer is kept. Layers that need another top (losses, accuracies)
     are left out, and the scores that they read become outputs. The ``state`` of the net determines its layers. Raises
-    SpecError for faults of the net, and for a given shape of a blob that no such layer makes.
+    SpecError for errors in the net, and for a given shape of a blob that no such layer makes.
     """
     filtered, source = filter_net(net, source)
     for fault in not_to_be_given(options.given_shapes, [filtered], source.file):
@@ -62,7 +62,7 @@ def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool
 def fold(net: Net) -> NetParameter:
     """Return the folded net with its weights, without Split, Dropout and other layers that return their bottom.
 
-    netspec/fast/fold.py says what is folded. Blobs that remain keep their names, and outputs always do. Layers that
+    See netspec/fast/fold.py for what is folded. The remaining blobs and all outputs keep their names. Layers that
     share parameters still share them if they are equal after folding.
     """
     folds = _found_folds(net)

@@ -1,6 +1,6 @@
-"""``--to onnx``: a net as an ONNX model, written layer by layer.
+"""``--to onnx``: writes a net as an ONNX model, layer by layer.
 
-Caffe: the net is what Net::Reshape makes of it for the sizes that are chosen when the model runs
+Caffe: the model corresponds to Net::Reshape for the sizes at run time
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LARGEST = 2**31 - 2**24  # bytes of weights: protobuf's limit, with room for the
 LARGE, PAGE = (
     1024,
     4096,
-)  # bytes: smaller weights stay in the model; the others start at pages, so that they can be mapped
+)  # bytes: smaller weights stay in the model; others are aligned to pages, for memory mapping
 DTYPES = {np.dtype(np.float32): 1, np.dtype(np.uint8): 2, np.dtype(np.int64): 7, np.dtype(bool): 9}  # TensorProto's
 CAST_TO = {"float32": 1, "int64": 7, "bool": 9}
 
@@ -49,10 +49,10 @@ def export_onnx(
     preprocess: Preprocess | None = None,
     largest: int = LARGEST,
 ) -> list[str]:
-    """Write a net, with its weights as they are, as an ONNX model; return notes for its user, in lines.
+    """Write a net with its current weights as an ONNX model; return notes for the user, as lines.
 
     Weights of more than ``largest`` bytes are in a file next to it: ``path`` with ``.data`` appended.
-    Raises SpecError where a layer cannot be written, or the file.
+    Raises SpecError if a layer cannot be exported or the file cannot be written.
     """
     writer, notes = _written(net, preprocess)
     path = Path(path)
@@ -70,7 +70,7 @@ def export_onnx(
 def onnx_model(
     net: Net, metadata: Mapping[str, str] | None = None, preprocess: Preprocess | None = None
 ) -> tuple[Any, list[str]]:
-    """Return an onnx.ModelProto of a net, and notes for its user, in lines."""
+    """Return an onnx.ModelProto of a net, and notes for the user, as lines."""
     writer, notes = _written(net, preprocess)
     return writer.model(metadata or {}), notes
 
@@ -82,7 +82,7 @@ def _written(net: Net, preprocess: Preprocess | None) -> tuple[_Writer, list[str
 
 
 def _write_layer(layer: Layer, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
-    """Write a layer into the graph; return the values of its tops. Raises SpecError where it cannot be written."""
+    """Write a layer into the graph; return the values of its tops. Raises SpecError if it cannot be exported."""
     write, op = offered(layer, "to_onnx"), offered(layer, "onnx_op")
     if write is not None:
         return write(graph, *bottoms)
@@ -98,7 +98,7 @@ class _DataFile:
         self.file, self.name = file, name
 
     def write(self, array: np.ndarray) -> dict[str, str]:
-        """Append an array. Return its place in the form of ONNX."""
+        """Append an array; return its location in ONNX's format."""
         self.file.seek(-(-self.file.tell() // PAGE) * PAGE)
         place = {"location": self.name, "offset": str(self.file.tell()), "length": str(array.nbytes)}
         self.file.write(array.data)
@@ -139,7 +139,7 @@ class _Writer:
         return made
 
     def store(self, values: np.ndarray, name: str) -> str:
-        """Add an initializer, one for all equal small ones; return its name."""
+        """Add an initializer; return its name. Equal small ones are stored once."""
         key = f"{values.dtype} {values.shape} ".encode() + values.tobytes() if values.size <= 64 else b""
         if key and key in self._constants:
             return self._constants[key]
@@ -150,14 +150,14 @@ class _Writer:
         return unique
 
     def store_blob(self, blob: torch.Tensor, shape: tuple[int, ...], name: str) -> str:
-        """Add a learned blob, one for all layers that share it; return its name."""
+        """Add a learnable blob, once for all layers that share it; return its name."""
         key = (blob.data_ptr(), shape)
         if key not in self._blobs:
             self._blobs[key] = self.store(values_of(blob).cpu().float().reshape(shape).numpy(), name)
         return self._blobs[key]
 
     def add_input(self, value: int, blob: str) -> str:
-        """Add an input of the net, with the preparation of images. Return the value that the net reads."""
+        """Add an input of the net, with the preprocessing of images; return the value that the net reads."""
         sizes = self.symbols(value)
         if self.preprocess is None or self.preprocess.blob != blob:
             self.inputs.append(_value_info(blob, np.float32, sizes))
@@ -168,7 +168,7 @@ class _Writer:
         return read
 
     def symbols(self, value: int) -> list[int | str]:
-        """Return the shape of a value for ONNX: numbers, and names for free sizes."""
+        """Return the shape of a value for ONNX: numbers, and names for dynamic sizes."""
         sizes: list[int | str] = []
         for axis, size in enumerate(self.shapes.sizes(value)):
             name = self.shapes.name(value, axis) if size is None else ""

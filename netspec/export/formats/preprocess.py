@@ -1,4 +1,4 @@
-"""The preparation of images as part of the exported model.
+"""Preprocessing of images as part of the exported model.
 
 Caffe: Transformer.preprocess (python/caffe/io.py), DataTransformer::Transform (src/caffe/data_transformer.cpp)
 """
@@ -17,11 +17,11 @@ from netspec.layers.contract.targets import Sizes
 
 @dataclass(frozen=True)
 class Preprocess:
-    """The steps before input ``blob``, in this order: crop, swap, raw_scale, mean, scale.
+    """The preprocessing steps of input ``blob``, in this order: crop, swap, raw_scale, mean, scale.
 
-    ``crop``: images may be larger than the input, the middle is taken. ``swap``: the channels come in reverse order,
+    ``crop``: larger images are cropped to their center. ``swap``: the channels are reversed, that is,
     RGB for a net that was trained with BGR. ``raw_scale`` multiplies, ``mean`` is subtracted, ``scale`` multiplies;
-    ``mean`` is one number for each channel, or an array (C, H, W) of the input's size. ``uint8``: images are bytes.
+    ``mean`` is one number for each channel, or an array (C, H, W) of the input's size. ``uint8``: images are uint8.
     """
 
     blob: str = "data"
@@ -39,7 +39,7 @@ class Preprocess:
 
     @property
     def description(self) -> str:
-        """The input of the exported model, in one line."""
+        """A description of the exported model's input, in one line."""
         steps = [
             *(["images are cropped to the net's size"] if self.crop else []),
             *(["the channels are reversed"] if self.swap else []),
@@ -52,7 +52,7 @@ class Preprocess:
         return f"{self.blob}: {kind} (N, C, H, W), {order}; inside the model: {', then '.join(steps) or 'nothing else'}"
 
     def mean_for(self, shape: Sizes) -> np.ndarray | None:
-        """Return the mean, shaped to be subtracted from an input (N, C, H, W) of this shape."""
+        """Return the mean in a shape for subtraction from an input (N, C, H, W) of this shape."""
         if self.mean is None:
             return None
         mean = np.asarray(self.mean, np.float32)
@@ -70,7 +70,7 @@ class Preprocess:
         )
 
     def to_onnx(self, graph: Any, value: str, shape: Sizes) -> tuple[Any, list[int | str | None], str]:
-        """Write the steps for an input of this shape; return its dtype, its sizes (None: the net's), and the result."""
+        """Write the steps for an input of this shape; return its dtype, its sizes (None: the net's) and the result."""
         if len(shape) != 4:
             raise SpecError(f"{self.blob} has shape {shape}, expected images (N, C, H, W)")
         if self.uint8:

@@ -1,6 +1,6 @@
-"""``--to pt2``: a net as a torch.export archive, which computes what the exported source does.
+"""``--to pt2``: writes a net as a torch.export archive, which computes the same as the exported source.
 
-No source is written and run for it: the expressions of the layers are parsed and computed one by one.
+It does not write and run source: the expressions of the layers are parsed and computed one by one.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ OPERATORS: dict[type, Callable[..., Any]] = {
 def export_pt2(net: Net, path: str | Path) -> list[str]:
     """Write a net as a torch.export archive; return notes for its user.
 
-    The sizes are free as in the exported source if torch.export supports it, or else only the batch, or none.
+    The sizes are dynamic as in the exported source if torch.export supports it, otherwise only the batch, or none.
     Raises SpecError if torch.export cannot export the net, or if the file cannot be written.
     """
     module, shapes = _made(net)
@@ -52,7 +52,7 @@ def export_pt2(net: Net, path: str | Path) -> list[str]:
             {axis: dims[axes[v, axis]] for axis in range(len(shapes.built[v])) if (v, axis) in axes} for v in inputs
         ]
         example = []
-        for v in inputs:  # a size of 1 would be taken for a constant
+        for v in inputs:  # torch.export treats a size of 1 as a constant
             sizes = [max(2, size) if (v, axis) in axes else size for axis, size in enumerate(shapes.built[v])]
             example.append(torch.zeros(sizes))
         try:
@@ -72,7 +72,7 @@ def export_pt2(net: Net, path: str | Path) -> list[str]:
 
 
 def torch_module(net: Net) -> nn.Module:
-    """Return a module that computes what the exported source does, with its weights, for inference."""
+    """Return a module for inference that computes the same as the exported source, with its weights."""
     return _made(net)[0]
 
 
@@ -127,12 +127,12 @@ class _Defined(nn.Module):
 
 
 def _parsed(expression: str) -> ast.expr:
-    """Return the tree of an expression, in which names such as v3 stand for its marks."""
+    """Return the syntax tree of an expression, with names such as v3 for its marks."""
     return ast.parse(MARK.sub(r"\1\2", expression), mode="eval").body
 
 
 def _value(node: ast.AST | None, names: Mapping[str, Any]) -> Any:
-    """Return the value of an expression. Only the kinds of expressions that layers write are supported."""
+    """Return the value of an expression, for the kinds of expressions that layers write."""
     match node:
         case None | ast.Constant():
             return None if node is None else node.value

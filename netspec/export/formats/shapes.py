@@ -1,6 +1,6 @@
-"""Finds the free sizes of an exported net, which its caller may choose: batch, height and width, if the net allows it.
+"""Finds the dynamic sizes of an exported net: batch, height and width, if the net allows it.
 
-Each size is tried: the shapes of all blobs are computed for inputs of other sizes, as when Caffe reshapes a net. A size
+Each size is tried by computing the shapes of all blobs for inputs of other sizes, as when Caffe reshapes a net. A size
 is fixed if a layer refuses the others.
 """
 
@@ -22,13 +22,13 @@ WORDS = {"N": "batch", "H": "height", "W": "width"}
 
 
 def _other_sizes(size: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return sizes to try (a size is free if one of them is possible), and further ones to find what varies."""
+    """Return sizes to try (a size is dynamic if one of them is possible), and more to find which shapes vary."""
     return (2 * size, 3 * size, size + 32), (size + 7, size + 1)
 
 
 @dataclass(frozen=True)
 class FreeSize:
-    """A size that is known only when the exported net runs.
+    """A dynamic size, which is known only when the exported net runs.
 
     ``axes`` are the axes with this size: of inputs, or of the top of a layer that counts its results (``counted``).
     ``size`` is the size in the built net. ``tried`` are the shapes of all values for some other sizes.
@@ -43,9 +43,9 @@ class FreeSize:
 
 @dataclass(frozen=True)
 class NetShapes:
-    """The shapes of all values in the built net, and their free sizes.
+    """The shapes of all values in the built net, and their dynamic sizes.
 
-    ``fixed`` has a note for the user for each batch, height and width of an input that is not free.
+    ``fixed`` has a note for the user for each batch, height and width of an input that is not dynamic.
     """
 
     built: Shapes
@@ -53,11 +53,11 @@ class NetShapes:
     fixed: tuple[str, ...] = ()
 
     def sizes(self, value: int) -> Sizes:
-        """Return the shape of a value; None where it varies."""
+        """Return the shape of a value, with None for sizes that vary."""
         return tuple(None if self.chosen(value, axis) else size for axis, size in enumerate(self.built[value]))
 
     def chosen(self, value: int, axis: int) -> list[FreeSize]:
-        """Return the free sizes on which the size of an axis depends."""
+        """Return the dynamic sizes on which the size of an axis depends."""
         size = self.built[value][axis]
         return [free for free in self.free if any(shapes[value][axis] != size for shapes in free.tried)]
 
@@ -67,7 +67,7 @@ class NetShapes:
         return all(shapes[first[0]][first[1]] == shapes[second[0]][second[1]] for shapes in every)
 
     def name(self, value: int, axis: int) -> str:
-        """Return the name of the free size of an axis, or ``?`` if its size only depends on one."""
+        """Return the name of the dynamic size of an axis, or ``?`` if its size only depends on one."""
         return next((free.name for free in self.free if self.same(free.axes[0], (value, axis))), "?")
 
     def without(self, fixed: FreeSize, why: str) -> NetShapes:
@@ -90,7 +90,7 @@ class Fixed(Exception):
 
 
 def settled(net: Net, write: Callable[[NetShapes], T]) -> tuple[T, NetShapes]:
-    """Call ``write`` with the shapes, and return its result and them. After each Fixed, retry with fewer free sizes."""
+    """Call ``write`` with the shapes; return its result and the shapes. After each Fixed, retry with it fixed."""
     shapes = find_shapes(net)
     while True:
         try:
@@ -103,7 +103,7 @@ def settled(net: Net, write: Callable[[NetShapes], T]) -> tuple[T, NetShapes]:
 
 
 def find_shapes(net: Net) -> NetShapes:
-    """Return the shapes of the values of a net, with every size free that Caffe's net could be reshaped to."""
+    """Return the shapes of the values of a net. A size is dynamic if Caffe could reshape the net to other sizes."""
     built = _propagate(net, {})
     free, fixed = [], []
     for name, axes in _input_sizes(net).items():
@@ -122,12 +122,12 @@ def find_shapes(net: Net) -> NetShapes:
             if fault is not None:
                 raise fault
             free.append(FreeSize(f"N_{node.name}", size, axes, tried, counted=True))
-    _propagate(net, {})  # layers keep the geometry that they saw last
+    _propagate(net, {})  # layers keep the geometry of the last shapes
     return NetShapes(built, tuple(free), tuple(fixed))
 
 
 def input_shapes(net: Net, shapes: NetShapes) -> dict[str, tuple[int | str, ...]]:
-    """Return the shapes of the inputs, by blob. A free size is a name.
+    """Return the shapes of the inputs, by blob. A dynamic size is a name.
 
     Sizes with the same name must be equal, as Caffe's layers require it.
     """
@@ -146,7 +146,7 @@ def input_shapes(net: Net, shapes: NetShapes) -> dict[str, tuple[int | str, ...]
 
 
 def _input_sizes(net: Net) -> dict[str, tuple[Axis, ...]]:
-    """Return the sizes of the inputs that may be free, by name. Equal sizes of the same kind count as one."""
+    """Return the sizes of the inputs that may be dynamic, by name. Equal sizes of the same kind count as one."""
     found: dict[tuple[str, int], list[Axis]] = {}
     names: dict[tuple[str, int], str] = {}
     for node, layer in zip(net.plan.nodes, net.layers, strict=True):
@@ -161,7 +161,7 @@ def _input_sizes(net: Net) -> dict[str, tuple[Axis, ...]]:
 
 
 def _try(net: Net, axes: tuple[Axis, ...], size: int) -> tuple[tuple[Shapes, ...], SpecError | None]:
-    """Return the shapes for other sizes of these axes, and the fault if none is possible."""
+    """Return the shapes for other sizes of these axes, and the error if none is possible."""
     tried, faults = [], []
     for sizes in _other_sizes(size):
         for other in sizes:
@@ -175,7 +175,7 @@ def _try(net: Net, axes: tuple[Axis, ...], size: int) -> tuple[tuple[Shapes, ...
 
 
 def _propagate(net: Net, given: Mapping[Axis, int]) -> Shapes:
-    """Return the shapes of all values where some axes have the sizes given."""
+    """Return the shapes of all values if some axes have the given sizes."""
     shapes: list[Shape] = []
     for node, layer in zip(net.plan.nodes, net.layers, strict=True):
         bottoms = [shapes[v] for v in node.bottoms]

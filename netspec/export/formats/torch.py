@@ -1,6 +1,6 @@
-"""``--to torch``: a net as the source of a PyTorch module, with its weights in a file next to it.
+"""``--to torch``: writes a net as the source of a PyTorch module, with its weights in a file next to it.
 
-The source reads as if a person had written it. Submodules have the names of the layers. Only the line that gives the
+The source looks like handwritten code. Submodules have the names of the layers. Only the line that gives the
 origin mentions this project. The module computes the same as the net.
 """
 
@@ -39,7 +39,7 @@ from netspec.net.net import Net
 def export_torch(net: Net, path: str | Path, origin: str = "a prototxt") -> list[str]:
     """Write a net as PyTorch source, and its weights to a ``.safetensors`` file next to it; return notes for the user.
 
-    ``origin`` says in the source where it came from. Raises SpecError where a layer cannot be written, or a file.
+    ``origin`` is the text about its origin. Raises SpecError if a layer cannot be exported or a file not written.
     """
     path = Path(path)
     if path.suffix != ".py":
@@ -72,7 +72,7 @@ def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: Mappi
 
 
 def torch_source(net: Net, origin: str = "a prototxt") -> tuple[str, dict[str, torch.Tensor], list[str]]:
-    """Return a net as PyTorch source, the state_dict of the class in it, and notes for its user, in lines."""
+    """Return a net as PyTorch source, the state_dict of its class, and notes for the user, as lines."""
     definition, shapes = settled(net, lambda shapes: write_definition(net, shapes))
     attributes = definition.attributes()
     body = _parts(net, definition, attributes, shapes)
@@ -148,7 +148,7 @@ def _docstring(text: str) -> list[str]:
     text = quoted(text)[1:-1]
     if len(text) + 10 <= WIDTH:
         return [f'    """{text}"""']
-    wrapped = textwrap.wrap(text, WIDTH - 4, break_long_words=False)  # which could part an escape
+    wrapped = textwrap.wrap(text, WIDTH - 4, break_long_words=False)  # which could split an escape sequence
     return ['    """Inputs and outputs.', "", *(f"    {line}" for line in wrapped), '    """']
 
 
@@ -160,9 +160,9 @@ def _constructed(module: Module, attribute: str) -> str:
 
 
 def _forward(definition: Definition, inputs: Mapping[int, str], attributes: Mapping[int, str]) -> list[str]:
-    """Return the statements of the forward method, in lines.
+    """Return the statements of the forward method, as lines.
 
-    A value that only the next statement reads is called ``x``, so that its memory is freed. Others have the name
+    A value that only the next statement reads is named ``x``, so that its memory is freed. Others have the name
     of their blob.
     """
     names, statements = dict(inputs), definition.statements

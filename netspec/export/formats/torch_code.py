@@ -1,4 +1,4 @@
-"""Builds the source of a PyTorch module layer by layer: its statements, and the submodules that they call.
+"""Builds the source of a PyTorch module, layer by layer: its statements and submodules.
 
 In the text of an expression, marks stand for values and modules. They are replaced by names at the end.
 """
@@ -37,7 +37,7 @@ def mark(kind: str, number: int) -> str:
 
 @dataclass(eq=False)
 class Module:
-    """A submodule, or a parameter or buffer of the module: the call of its constructor, and its tensors by name.
+    """A submodule, or a parameter or buffer of the module: its constructor call, and its tensors by name.
 
     ``numbers`` are the values for the fields of the template. Arguments with their ``usual`` value are left out.
     """
@@ -58,7 +58,7 @@ class Module:
         return template.format(**{name: number(value) for name, value in self.numbers.items()})
 
     def tensors(self, prefix: str) -> dict[str, torch.Tensor]:
-        """Return all tensors as they are named in a state_dict, for the attribute ``prefix``."""
+        """Return all tensors by their names in a state_dict, for the attribute ``prefix``."""
         return {f"{prefix}.{name}" if name else prefix: tensor for name, tensor in self.state.items()}
 
 
@@ -80,10 +80,10 @@ class Statement:
 
 @dataclass
 class Definition:
-    """A whole module: its inputs, outputs and statements.
+    """A complete module: its inputs, outputs and statements.
 
-    ``names`` are the names of the blobs, by value. ``inputs`` and ``outputs`` are values. ``modules`` are what marks of
-    modules stand for. ``functions`` are copied into the file.
+    ``names`` are the names of the blobs, by value. ``inputs`` and ``outputs`` are values. ``modules`` are the modules
+    of the marks. ``functions`` are copied into the file.
     """
 
     statements: list[Statement] = field(default_factory=list)
@@ -94,13 +94,13 @@ class Definition:
     functions: dict[str, Callable[..., Any]] = field(default_factory=dict)
 
     def attributes(self) -> dict[int, str]:
-        """Return the attribute of each module that the net's class has, in the order in which they are used."""
+        """Return the attribute names of the modules, in the order of their use."""
         taken: set[str] = set()
         used = dict.fromkeys(m for statement in self.statements for m in statement.modules())
         return {m: unique(legal(self.modules[m].layer), taken) for m in used}
 
 
-# Names: text of a file becomes an identifier or a quoted string in the source, nothing else
+# Names: text from a file becomes only identifiers or quoted strings in the source
 
 
 def legal(name: str, prefix: str = "layer_") -> str:
@@ -110,13 +110,13 @@ def legal(name: str, prefix: str = "layer_") -> str:
 
 
 def _free(identifier: str, ending: str) -> str:
-    """Return an identifier, with the ending if Python or the file already uses the name."""
+    """Return an identifier, with a suffix if Python or the file already uses the name."""
     used = keyword.iskeyword(identifier) or identifier in _TAKEN or hasattr(builtins, identifier)
     return identifier + ending if used else identifier
 
 
 def quoted(text: str) -> str:
-    """Return a text as a literal in double quotes; without its quotes it can stand in a docstring too."""
+    """Return a text as a literal in double quotes; without the quotes, it can also be part of a docstring."""
     return '"' + repr('"' + text)[2:-1].replace('"', '\\"') + '"'
 
 
@@ -139,7 +139,7 @@ def class_name(text: str) -> str:
 def number(value: Any) -> str:
     """Return a number, a bool or a tuple of them as source; floats with as few digits as float32 allows.
 
-    A text, which is the name of a free size, is quoted.
+    A text (the name of a dynamic size) is quoted.
     """
     if isinstance(value, (tuple, list)):
         inner = ", ".join(number(v) for v in value)
@@ -156,7 +156,7 @@ def number(value: Any) -> str:
 
 
 def lay_out(statement: str, indent: int) -> list[str]:
-    """Return a statement in lines. In one longer than ``WIDTH``, each part of the widest bracket gets its own line."""
+    """Return a statement as lines. If it is longer than ``WIDTH``, each part of the widest bracket is a line."""
     space = " " * indent
     whole = [space + statement]
     if indent + len(statement) <= WIDTH:
@@ -187,7 +187,7 @@ def _parts(node: ast.AST) -> list[tuple[int, int]]:
 
 
 def check_shapes(expected, *inputs):
-    """Refuse inputs of other shapes; a name is any size, the same wherever it stands."""
+    """Raise an error for inputs of other shapes. A name stands for any size, and equal names for equal sizes."""
     sizes = {}
     for (name, shape), x in zip(expected.items(), inputs, strict=True):
         for size, wanted in zip(x.shape, shape, strict=False):
@@ -203,7 +203,7 @@ _ONE_MARK = re.compile(f"^{MARK.pattern}$")
 
 
 def write_definition(net: Net, shapes: NetShapes) -> Definition:
-    """Return the definition of a net. Raises SpecError where a layer cannot be written."""
+    """Return the definition of a net. Raises SpecError if a layer cannot be exported."""
     collector = _Collector(net, shapes)
     plan = net.plan
     for i, node in enumerate(plan.nodes):
@@ -215,7 +215,7 @@ def write_definition(net: Net, shapes: NetShapes) -> Definition:
 
 
 def _write_layer(layer: Layer, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
-    """Write a layer; return the expressions of its tops. Raises SpecError where it cannot be written."""
+    """Write a layer; return the expressions of its tops. Raises SpecError if it cannot be exported."""
     write, template = offered(layer, "to_torch"), offered(layer, "torch_call")
     if write is not None:
         return write(code, *bottoms)
@@ -241,7 +241,7 @@ class _Collector:
         for v in net.plan.outputs.values():
             self.readers[origin[v]] += 1
         self.made_by: dict[int, Statement] = {}
-        self.modules_of: list[tuple[frozenset[int], int]] = []  # the learned blobs of a module, and its number
+        self.modules_of: list[tuple[frozenset[int], int]] = []  # the learnable blobs of a module, and its number
 
     def add(self, targets: Sequence[int], tops: str | Sequence[str]) -> None:
         """Add the statements of a layer."""
@@ -323,7 +323,7 @@ class _LayerCode:
         module = self.made.modules[number]
         uses = sum(number in other.modules() for other in self.made.statements)
         affine = {"weight": scale, "bias": shift}
-        if uses > 1 and not module.template.count("affine=False"):  # towers that share it
+        if uses > 1 and not module.template.count("affine=False"):  # branches that share it
             return all(torch.equal(module.state[name], tensor) for name, tensor in affine.items())
         if ", affine=False" not in module.template or uses > 1:
             return False

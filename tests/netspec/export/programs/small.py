@@ -9,7 +9,7 @@ from torch import nn
 
 
 def check_shapes(expected, *inputs):
-    """Refuse inputs of other shapes; a name is any size, the same wherever it stands."""
+    """Raise an error for inputs of other shapes. A name stands for any size, and equal names for equal sizes."""
     sizes = {}
     for (name, shape), x in zip(expected.items(), inputs, strict=True):
         for size, wanted in zip(x.shape, shape, strict=False):
