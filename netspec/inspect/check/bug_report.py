@@ -21,13 +21,13 @@ from netspec.terminal.commands import UNKNOWN, version
 
 PACKAGES = ("netspec-caffe", "protobuf", "scipy", "lmdb", "opencv-python-headless", "h5py", "onnxruntime", "openvino")
 VARIABLES = re.compile(r"(OMP|GOMP|KMP|MKL|OPENBLAS|CUDA|GLOG|NETSPEC|OPENCV)_\w*")
-LAST_LINES, MOST_LINES, LONGEST = 60, 400, 300  # of a log; of another text; characters of a line
-MOST_TEXT = 2**20  # bytes; what is longer is no prototxt
+LAST_LINES, MOST_LINES, LONGEST = 60, 400, 300  # lines of a log; lines of another text; characters of a line
+MOST_TEXT = 2**20  # bytes; a longer file is not a prototxt
 _LOG = re.compile(r"^[IWEF]\d{4,8} \d\d:\d\d:", re.M)
 
 
 def bug_report(paths: list[str]) -> str:
-    """Return the report as Markdown. For each path it says what it is, or why it cannot be read."""
+    """Return the report as Markdown. It describes each file, or says why the file cannot be read."""
     parts = ["## Machine", *_block(_machine())]
     for path in paths:
         parts += ["", f"## {printable(path)}", *_about(Path(path))]
@@ -41,7 +41,7 @@ def _machine() -> Iterator[str]:
     yield f"BLAS kernels: {', '.join(sorted(kernels())) or 'another BLAS'}"
     yield f"Memory: {amount(memory())}"
     yield from (f"{name}: {os.environ[name]}" for name in sorted(os.environ) if VARIABLES.fullmatch(name))
-    with environment({"PIP_DISABLE_PIP_VERSION_CHECK": "1"}):  # torch sets that and leaves it set
+    with environment({"PIP_DISABLE_PIP_VERSION_CHECK": "1"}):  # torch sets this variable
         versions = get_pretty_env_info()
     yield from versions.splitlines()
 

@@ -1,8 +1,8 @@
 """Checks a net or solver: its shapes, parameters, memory and multiply-adds, and all of its errors at once.
 
-It finds every fault that would stop a training before its first iteration. Nothing is written, and data is opened only
-if asked. All unknown fields are reported, together with the faults in other layers; a layer with an unknown field is
-not checked further. Of syntax errors in the text, and of faults in the settings of one layer, only the first is
+It finds all errors that would stop a training before its first iteration. No file is written, and data is opened only
+on request. All unknown fields are reported, together with the errors in other layers; a layer with an unknown field is
+not checked further. For syntax errors, and for errors in the settings of one layer, only the first is
 reported.
 """
 
@@ -35,7 +35,7 @@ from netspec.solver.options import choose_device
 
 @dataclass
 class Checked:
-    """The result for one net of the file, named by ``label``. ``advice`` lists what is legal but likely wrong.
+    """The result for one net of the file, named by ``label``. ``advice`` lists probable mistakes.
 
     The result for a solver itself comes first. Its label is the path of the file, and it has no net.
     """
@@ -61,7 +61,7 @@ def check_file(
     :func:`netspec.inspect.check.plan.plan_text` needs it.
     """
     given = [weights] if weights else []
-    if Path(path).suffix == ".caffemodel" or is_net_binary(path):  # also a damaged one: its reader reports the damage
+    if Path(path).suffix == ".caffemodel" or is_net_binary(path):  # also if damaged; its reader reports the damage
         return [_check_weights(path, options)]
     unknown: list[SpecError] = []
     try:
@@ -75,7 +75,7 @@ def check_file(
             return [Checked(str(path), None, gathered(last))]
         solver = with_train_state(solver, options.level, options.stages)
         return _check_solver(solver, node, path, given or solver.weights, options, of_solver)
-    if unknown:  # the build finds unknown types itself, but not behind what it cannot build
+    if unknown:  # the build finds unknown types itself, but not after something that it cannot build
         unknown += _unknown_layers(net, source, options)
     net = with_state(net, phase, options.level, options.stages)
     checked = _check_net(net, source, str(path), [] if unknown else given, options)
@@ -89,7 +89,7 @@ def _unknown_layers(net: NetParameter, source: SourceMap, options: BuildOptions)
 
 
 def _reach(faults: Sequence[SpecError]) -> tuple[int, int]:
-    """Return how far a file could be read. It is taken for a net or a solver, whichever can be read further."""
+    """Read a file as a net and as a solver; return the result that got further."""
     where = faults[-1].where
     return (where.line, where.column) if where else (0, 0)
 

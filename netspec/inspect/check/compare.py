@@ -1,4 +1,4 @@
-"""Compares two nets, two solvers or two files of weights by their meaning, not by their text. Does not use torch."""
+"""Compares the meaning of two nets, two solvers or two weights files. Does not use torch."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def compare_files(first: str | Path, second: str | Path, tolerance: float = 0.0)
 
 def _read(path: str | Path) -> tuple[Any, ...]:
     """Return the kind of a file, and for a net or a solver also the message and its places."""
-    named = Path(path).suffix in (".caffemodel", ".h5")  # a damaged one too: its own reader says what is wrong
+    named = Path(path).suffix in (".caffemodel", ".h5")  # also if damaged; its reader reports the damage
     if Path(path).is_file() and (named or is_net_binary(path) or head_of(path).startswith(HDF5)):
         return (WEIGHTS,)
     try:
@@ -51,7 +51,7 @@ def _read(path: str | Path) -> tuple[Any, ...]:
 
 
 def _compare_solvers(first: tuple[Any, Place], second: tuple[Any, Place]) -> Differences:
-    """Yield the differences between the settings, and between the nets. Paths of nets that can be read do not count."""
+    """Yield the differences between the settings and between the nets. Paths of readable nets are not compared."""
     (one, there), (other, here) = first, second
     yield from differences(one, other, here, there, _NETS)
     faults: list[SpecError] = []

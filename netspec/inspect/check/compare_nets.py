@@ -16,17 +16,17 @@ from netspec.proto.source_map import SourceMap
 
 _WIRING = ("name", "bottom", "top", "param", "blobs", "phase", "include", "exclude", "propagate_down", "loss_weight")
 _NOT_THE_NET = ("layer", "layers", "state", "input", "input_shape", "input_dim")
-LOSS = "Loss"  # the end of the names of types with a default loss weight of 1
-Key = tuple[str, int]  # a layer's name, and its index among the layers of that name
+LOSS = "Loss"  # the ending of types with a default loss weight of 1
+Key = tuple[str, int]  # the name of a layer, and its index among layers with that name
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """A net in one state."""
+    """A net in one NetState."""
 
     plan: Plan
     keys: dict[Key, int]  # the number of each layer in the plan
-    makers: dict[int, tuple[Key, int]]  # the layer and the top that make each value
+    makers: dict[int, tuple[Key, int]]  # the layer and the top that compute each value
 
 
 def compare_nets(first: tuple[NetParameter, SourceMap], second: tuple[NetParameter, SourceMap]) -> Differences:
@@ -79,7 +79,7 @@ def _keys(names: Iterable[str]) -> list[Key]:
 
 
 def _matched(old: _Seen, new: _Seen) -> dict[Key, Key]:
-    """Match the layers of the second net to those of the first: by name, or else by equal settings, in order."""
+    """Match the layers of the second net to those of the first, by name, or by equal settings, in order."""
     names = {key: key for key in old.keys if key in new.keys}
     left = [key for key in new.keys if key not in names]
     for key in old.keys:
@@ -133,7 +133,7 @@ def _own(old: Node, new: Node, one: Any, other: Any, here: Any, there: Any) -> D
 
 
 def _reads(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
-    """Yield the bottoms that come from another layer, or from another top of it."""
+    """Yield the bottoms that now come from a different layer or top."""
     before, after = old.plan.nodes[i], new.plan.nodes[j]
     there, here = old.plan.source.layers[i], new.plan.source.layers[j]
     if len(before.bottoms) != len(after.bottoms):
@@ -157,7 +157,7 @@ def _maker_text(seen: _Seen, maker: tuple[Key, int] | None) -> str:
 
 
 def _params(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
-    """Yield changed multipliers, and parameters that are now shared with other layers."""
+    """Yield changed multipliers, and parameters that are shared with different layers."""
     one, other = old.plan.net.layer[i], new.plan.net.layer[j]
     there, here = old.plan.source.layers[i], new.plan.source.layers[j]
     for k in range(max(len(one.param), len(other.param))):

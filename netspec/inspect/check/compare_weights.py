@@ -1,4 +1,4 @@
-"""Compares two files of weights: the layers with different values, and by how much they differ."""
+"""Compares two weights files: which layers differ, and by how much."""
 
 from __future__ import annotations
 

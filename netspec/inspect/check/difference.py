@@ -13,7 +13,7 @@ from netspec.proto.schema import Field, fields_of
 from netspec.proto.source_map import Place
 from netspec.proto.writer import scalar_text
 
-#: Fields that mean something else when absent than when set to their default.
+#: Fields whose absence has a different meaning than their default.
 PRESENCE_MATTERS = {
     ("caffe.BatchNormParameter", "use_global_stats"),
     ("caffe.LossParameter", "ignore_label"),
@@ -23,7 +23,7 @@ PRESENCE_MATTERS = {
     ("caffe.PReLUParameter", "filler"),
     ("caffe.ScaleParameter", "filler"),
 }
-#: Fields of windows: the two fields that give the same for each side, and the default.
+#: Fields of windows: the two fields for each direction, and the default.
 WINDOWS = {
     "kernel_size": ("kernel_h", "kernel_w", 0),
     "stride": ("stride_h", "stride_w", 1),

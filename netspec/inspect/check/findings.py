@@ -1,4 +1,4 @@
-"""Rules that find likely mistakes in a file that is legal. Each rule has a name, so that a comment can silence it.
+"""Rules that find probable mistakes in a legal file. Each rule has a name, so that a comment can disable it.
 
 The comment ``# lint: ignore=NAME`` (several names with commas) applies to its line, or to the next line if it stands
 alone. On the first line of a layer it applies to the whole layer. On the first line of a file it applies to findings
@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from netspec.errors import SpecError, Where, did_you_mean, printable
 from netspec.proto.source_map import Place
 
-# What a rule looks at, see Rule.
+# Kinds of input for rules, see Rule.
 TEXT, PLAN, NET, SETTINGS, SOLVER = "text", "plan", "net", "settings", "solver"
 UNKNOWN_RULE = "unknown-rule"
 
@@ -108,7 +108,7 @@ def _place(where: Where) -> dict[str, Any]:
 
 
 def not_ignored(found: Iterable[Finding], file: str, layers: Sequence[Place] = ()) -> list[Finding]:
-    """Return the findings that no comment in the file silences, and findings about such comments.
+    """Return the findings that no comment in the file disables, and findings about such comments.
 
     ``layers`` are the places of the net's layers.
     """

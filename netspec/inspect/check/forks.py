@@ -10,7 +10,7 @@ from netspec.proto.forks import forks
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 
-MOST_LINES = 8  # line numbers that a fault names
+MOST_LINES = 8  # number of lines to list in an error
 
 
 def unknown_types(net: NetParameter, source: SourceMap) -> Iterator[ForkFault]:
@@ -32,7 +32,7 @@ def python_layers(net: NetParameter, source: SourceMap) -> Iterator[SpecError]:
 def gathered(faults: Sequence[SpecError]) -> list[SpecError]:
     """Return the faults with those of the same unknown field or layer type joined, at the place of the first.
 
-    A fault that several nets of a solver have counts once.
+    An error in several nets of a solver counts once.
     """
     groups: dict[object, list[SpecError]] = {}
     for fault in {(fault.message, fault.where): fault for fault in faults}.values():

@@ -1,7 +1,7 @@
-"""Protobuf text in one form: two spaces a level, one field per line, comments kept.
+"""Formats protobuf text: two spaces per level, one field per line, with its comments.
 
-A message that was written on one line stays there if it fits. The values are spelled as they were. Only the
-syntax is checked, so unknown fields do no harm.
+A message that was written on one line stays on one line if it fits. The spelling of values does not change. Only the
+syntax is checked, so unknown fields are allowed.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer
 
 WIDTH = 120  # of a line, in characters
 INDENT = "  "
-DEEPEST = 100  # levels of messages: protobuf reads no more
+DEEPEST = 100  # maximum nesting of messages in protobuf
 _CLOSING = {"{": "}", "<": ">"}
 
 
 def format_text(text: str, file: str) -> str:
-    """Return a text in the one form; ``file`` is what errors call it. Raises SpecError where it is not protobuf text.
+    """Return the formatted text; ``file`` is its name in errors. Raises SpecError for text that is not protobuf text.
 
-    Only spaces, line ends, separators, brackets and quotation marks change: what the text means stays. To format
-    twice changes nothing.
+    Only spaces, line ends, separators, brackets and quotation marks change, but not the meaning. Formatting
+    again changes nothing.
     """
     fields, rest = _Parser(text, file).read()
     lines = [*_block(fields, ""), *_comments(rest, "")]
@@ -33,10 +33,10 @@ def format_text(text: str, file: str) -> str:
 
 @dataclass
 class _Field:
-    """A field: its value is the words after the colon, or the fields of a message.
+    """A field. Its value is the tokens after the colon, or the fields of a message.
 
-    ``before`` are the comment lines above it, and an empty text for a blank line; ``opening`` is the comment behind
-    the "{", ``end`` are the comment lines before the "}", ``after`` is the comment behind it all.
+    ``before`` are the comment lines before it, with "" for a blank line. ``opening`` is the comment after
+    the "{", ``end`` are the comment lines before the "}", and ``after`` is the comment after the field.
     """
 
     name: str
@@ -54,7 +54,7 @@ class _Field:
 
 
 class _Parser:
-    """A recursive descent; ``self.token`` is the next token, ``self.gap`` the comments between it and the last."""
+    """A recursive descent parser; ``self.token`` is the next token, ``self.gap`` the comments before it."""
 
     def __init__(self, text: str, file: str) -> None:
         self.lexer = Lexer(text, file)
@@ -62,7 +62,7 @@ class _Parser:
         self.depth = 0
         self.last_end = 0
         self.token = Token(SYMBOL, "", 0)
-        self.trailing = ""  # the comment behind the last token, on its line
+        self.trailing = ""  # the comment after the last token, on its line
         self.lines: list[str] = []  # the comment and blank lines before the next token
         self._next()
 
@@ -74,7 +74,7 @@ class _Parser:
         return fields, self.lines
 
     def _next(self) -> Token:
-        """Take the next token, and note the comments that come after it."""
+        """Consume the next token, and record the comments after it."""
         token = self.token
         self.token = next(self.tokens)
         gap = self.lexer.text[self.last_end : self.token.start]
@@ -180,7 +180,7 @@ class _Parser:
         return [sign + self._next().text]
 
     def _finished(self, one: _Field) -> _Field:
-        """Pass over a separator, and take the comment behind the field."""
+        """Skip a separator, and record the comment after the field."""
         if self._at(",") or self._at(";"):
             kept = self._odd()
             self._next()
@@ -197,7 +197,7 @@ class _Parser:
         return lines
 
     def _odd(self) -> list[str]:
-        """Return the comments before a token that is not the first of its field: they move above it."""
+        """Return the comments inside a field, which move above it."""
         found = [line for line in (self.trailing, *self._take_lines()) if line]
         self.trailing = ""
         return found
@@ -217,7 +217,7 @@ def _clean(gap: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a string in double quotes, unless it has some inside."""
+    """Return a string in double quotes, unless it contains double quotes."""
     inner = text[1:-1]
     return f'"{inner}"' if text[0] == "'" and '"' not in inner and "\\'" not in inner else text
 
@@ -233,7 +233,7 @@ def _block(fields: list[_Field], indent: str) -> Iterator[str]:
 
 
 def _comments(lines: list[str], indent: str, at_end: bool = True) -> Iterator[str]:
-    """Return comment lines and single blank lines; at the end of a message none of those."""
+    """Return comment lines and single blank lines, but no blank lines at the end of a message."""
     kept = list(lines)
     while at_end and kept and not kept[-1]:
         kept.pop()
@@ -263,7 +263,7 @@ def _lines(one: _Field, indent: str) -> Iterator[str]:
 
 
 def _on_one_line(one: _Field) -> str:
-    """Return a field on one line; an empty text for a message that does not belong there."""
+    """Return a field on one line; "" for a message that needs several lines."""
     if one.fields is None:
         return f"{one.name}: [{', '.join(one.words)}]" if one.is_list else f"{one.name}: {' '.join(one.words)}"
     inner = [_on_one_line(each) for each in one.fields]
@@ -274,7 +274,7 @@ def _on_one_line(one: _Field) -> str:
 
 
 def _filled(one: _Field, indent: str, after: str) -> Iterator[str]:
-    """Return a list on as many lines as it needs."""
+    """Return a list, on several lines if necessary."""
     line = f"{indent}{one.name}: ["
     yield line + after
     line = indent + INDENT

@@ -17,7 +17,7 @@ from netspec.proto.schema import TEST, TRAIN, PhaseValue
 class Linted:
     """The findings in a file.
 
-    ``faults`` are errors that prevent a net from being built. ``unknown`` ask for shapes; rules that need these shapes
+    ``faults`` are errors that prevent a net from being built. ``unknown`` ask for shapes; rules that need them
     were not applied. A file that is not ``readable`` has only faults. ``nets`` are the nets that were built.
     """
 

@@ -14,8 +14,8 @@ from netspec.proto.schema import TEST, TRAIN, NetParameter, fields_of
 from netspec.proto.source_map import SourceMap
 
 WITHOUT_GRADIENT = frozenset({"Accuracy", "ArgMax", "Threshold"})
-OLD_ACCESSORS = 4  # axes: more are a fault of num(), channels(), height() and width() of Caffe's blobs
-AXES = {  # how many axes the bottoms of a layer may have in Caffe, where it has more or fewer here
+OLD_ACCESSORS = 4  # axes: with more, num(), channels(), height() and width() of Caffe's blobs fail
+AXES = {  # the numbers of axes that Caffe allows for the bottoms of a layer, if netspec allows others
     "BatchReindex": (1, 32),
     "ContrastiveLoss": (1, OLD_ACCESSORS),
     "EuclideanLoss": (1, OLD_ACCESSORS),
@@ -30,9 +30,9 @@ BEFORE_NET = ("mean_value", "mean_file", "scale")  # fields of transform_param t
 
 @rule("transform-differs", TEXT)
 def _transforms(net: NetParameter, source: SourceMap) -> Said:
-    """A net should be tested on what it is trained on.
+    """A net should be tested with the preprocessing it is trained with.
 
-    The layers that make the same blob in the two phases should subtract the same mean and multiply by the same scale.
+    The layers that make a blob in the two phases should subtract the same mean and multiply by the same scale.
     """
     first: dict[str, int] = {}
     for i, layer in enumerate(net.layer):
@@ -52,12 +52,12 @@ def _transforms(net: NetParameter, source: SourceMap) -> Said:
 
 @rule("unused-blob", PLAN)
 def _unused(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
-    """In a net with a loss, a blob that no layer reads costs time, and its reader may be missing.
+    """In a net with a loss, an unused blob costs time, and a layer that should read it may be missing.
 
-    Losses and scores are printed, so they are used. ``Silence`` takes what is not wanted.
+    Losses and scores are printed, so they count as used. Use ``Silence`` for unwanted blobs.
     """
     if not any(map(any, _loss_weights(plan))):
-        return  # a deploy net: its outputs are its purpose
+        return  # a deploy net, whose outputs are its purpose
     weights = _loss_weights(plan)
     for i, node in enumerate(plan.nodes):
         cls = layer_class(node.type)
@@ -71,7 +71,7 @@ def _unused(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 @rule("loss-without-weight", PLAN)
 def _weightless(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
-    """A loss of weight 0 is computed and printed, but nothing is learned from it."""
+    """A loss with weight 0 is computed and printed, but has no effect on the training."""
     for i, weights in enumerate(_loss_weights(plan) if _is_training(plan) else ()):
         cls = layer_class(plan.nodes[i].type)
         if cls is not None and cls.is_loss and not any(weights):
@@ -80,7 +80,7 @@ def _weightless(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 @rule("batchnorm-without-scale", PLAN)
 def _bare_batch_norms(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
-    """Caffe's BatchNorm only normalizes; other frameworks' layers of that name also scale and shift."""
+    """Caffe's BatchNorm only normalizes, while in other frameworks it also scales and shifts."""
     readers: dict[int, set[str]] = {}
     for node in plan.nodes:
         for v in node.bottoms:
@@ -92,7 +92,7 @@ def _bare_batch_norms(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 @rule("bias-before-batchnorm", PLAN)
 def _lost_biases(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
-    """BatchNorm subtracts the mean, and with it any bias added before: such a bias has no effect."""
+    """BatchNorm subtracts the mean, including any bias that was added before, so such a bias has no effect."""
     makers = {v: i for i, node in enumerate(plan.nodes) for v in node.tops}
     for node in plan.nodes if _is_training(plan) else ():
         i = makers.get(node.bottoms[0], -1) if node.type == "BatchNorm" and node.bottoms else -1
@@ -105,9 +105,9 @@ def _lost_biases(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 @rule("global-stats-in-training", PLAN)
 def _global_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
-    """With use_global_stats: true a training neither uses the statistics of its batches nor updates the stored ones.
+    """With use_global_stats: true, a training neither uses the statistics of its batches nor updates the stored ones.
 
-    A net from scratch then learns without normalization. To fine-tune with fixed statistics it is right.
+    A net that is trained from scratch then has no normalization. For fine-tuning with fixed statistics, it is correct.
     """
     for i, node in enumerate(plan.nodes if _is_training(plan) else ()):
         if node.type == "BatchNorm" and plan.net.layer[i].batch_norm_param.use_global_stats:
@@ -117,7 +117,7 @@ def _global_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said
 
 @rule("batch-stats-in-test", PLAN)
 def _batch_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
-    """With use_global_stats: false a test's result depends on which images share a batch."""
+    """With use_global_stats: false, the result of a test depends on which images are in the same batch."""
     for i, node in enumerate(plan.nodes if plan.net.state.phase == TEST else ()):
         param = plan.net.layer[i].batch_norm_param
         if node.type == "BatchNorm" and param.HasField("use_global_stats") and not param.use_global_stats:
@@ -127,7 +127,7 @@ def _batch_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 @rule("zero-weights", PLAN)
 def _zero_weights(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
-    """Without a weight_filler all weights begin at 0, and pass no gradient on.
+    """Without a weight_filler, all initial weights are 0 and propagate no gradient.
 
     A training that starts from trained weights needs no filler.
     """
@@ -145,7 +145,7 @@ def _zero_weights(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 @rule("softmax-twice", PLAN)
 def _softmax_twice(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
-    """SoftmaxWithLoss computes the softmax of what it reads: a Softmax layer before it flattens the gradient."""
+    """SoftmaxWithLoss computes a softmax of its bottom, so a Softmax layer before it makes the gradient too small."""
     makers = {v: i for i, node in enumerate(plan.nodes) for v in node.tops}
     for i, node in enumerate(plan.nodes):
         maker = makers.get(node.bottoms[0], -1) if node.type == "SoftmaxWithLoss" and node.bottoms else -1
@@ -159,7 +159,7 @@ def _softmax_twice(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 @rule("towers-not-shared", NET)
 def _towers(net: Net) -> Said:
-    """The towers that a ContrastiveLoss compares should share all their parameters."""
+    """The branches that a ContrastiveLoss compares should share all their parameters."""
     producer = {v: i for i, node in enumerate(net.plan.nodes) for v in node.tops}
 
     def upstream(v: int) -> set[int]:
@@ -190,7 +190,7 @@ def _towers(net: Net) -> Said:
 
 @rule("loss-learns-nothing", NET)
 def _losses(net: Net) -> Said:
-    """A loss that depends on no learnable parameter teaches nothing."""
+    """A loss that depends on no learnable parameter has no effect on the training."""
     for i, weights in enumerate(net.loss_weights if net.phase == TRAIN else ()):
         if any(weights) and not net.backward_plan.layers[i]:
             yield (_place(net.plan, i), "this loss depends on no learnable parameter; is lr_mult 0?")
@@ -198,10 +198,10 @@ def _losses(net: Net) -> Said:
 
 @rule("caffe-stops", NET)
 def _caffe_stops(net: Net) -> Said:
-    """Caffe ends the program at blobs of more axes than some layers can name, and where a gradient is asked for that
+    """Caffe ends the program if a blob has more axes than a layer supports, or if a gradient is needed that
     a layer does not compute.
 
-    Here such a net runs; no gradient passes there.
+    netspec runs such a net, without that gradient.
     """
     for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
         for j, shape in enumerate(layer.bottom_shapes):
@@ -221,7 +221,7 @@ def _caffe_stops(net: Net) -> Said:
 
 @rule("never-learns", NET)
 def _never_learns(net: Net) -> Said:
-    """A layer with a learning rate that no loss depends on keeps its first weights through the training."""
+    """If no loss depends on a layer, its weights never change, although it has a learning rate."""
     if net.phase != TRAIN or not any(map(any, net.loss_weights)):
         return
     learned = {item.layer for item in net.learnable if item.lr_mult}
@@ -261,7 +261,7 @@ def _is_training(plan: Plan) -> bool:
 
 
 def own_settings(layer: Any) -> Iterator[tuple[str, Any]]:
-    """Yield a layer's settings of its own: the names of its fields and their messages."""
+    """Yield the names and messages of the fields with a layer's own settings."""
     for name, field in fields_of(layer.DESCRIPTOR).items():
         if name.endswith("_param") and not field.repeated and field.present(layer):
             yield name, field.get(layer)

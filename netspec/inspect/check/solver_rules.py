@@ -11,7 +11,7 @@ from netspec.inspect.check.net_rules import own_settings
 from netspec.net.net import Net
 from netspec.proto.source_map import Place
 
-FAR = 0.1  # share of the records that a test may skip, or read twice
+FAR = 0.1  # share of the records that a test may skip or read twice
 #: The settings that each rate policy, and each update rule, reads.
 POLICY_SETTINGS = {
     "step": ("gamma", "stepsize"),
@@ -31,7 +31,7 @@ RULE_SETTINGS = {
 
 @rule("no-snapshot", SETTINGS)
 def _snapshots(solver: Any, node: Place) -> Said:
-    """A training without a snapshot leaves no weights behind."""
+    """Without a snapshot, the trained weights are lost."""
     if solver.snapshot > solver.max_iter:
         message = f"snapshot {solver.snapshot} is more than max_iter {solver.max_iter}, so it has no effect; lower it"
         yield node.find("snapshot"), message
@@ -41,7 +41,7 @@ def _snapshots(solver: Any, node: Place) -> Said:
 
 @rule("no-effect", SETTINGS)
 def _settings(solver: Any, node: Place) -> Said:
-    """A setting that the chosen policy or rule does not read may be meant for another one."""
+    """A setting that the chosen policy or rule ignores may be meant for another one."""
     for name in settings_without_effect(solver):
         message = f"{name} has no effect with type {solver.type} and lr_policy {solver.lr_policy}; remove it"
         yield node.find(name), message
@@ -49,7 +49,7 @@ def _settings(solver: Any, node: Place) -> Said:
 
 @rule("step-after-end", SETTINGS)
 def _steps(solver: Any, node: Place) -> Said:
-    """A step of the learning rate after the last iteration never comes."""
+    """A step of the learning rate after the last iteration has no effect."""
     steps = {"step": ("stepsize", [solver.stepsize]), "multistep": ("stepvalue", solver.stepvalue)}
     name, values = steps.get(solver.lr_policy, ("", []))
     for k, value in enumerate(values):
@@ -60,7 +60,7 @@ def _steps(solver: Any, node: Place) -> Said:
 
 @rule("test-after-end", SETTINGS)
 def _tests(solver: Any, node: Place) -> Said:
-    """A test that comes after the last iteration is run only at the start, if at all."""
+    """If the test interval is longer than the training, tests run only at the start, if at all."""
     if solver.test_iter and solver.test_interval > solver.max_iter:
         message = f"test_interval {solver.test_interval} is more than max_iter {solver.max_iter}; lower it"
         yield node.find("test_interval"), message
@@ -70,7 +70,7 @@ def _tests(solver: Any, node: Place) -> Said:
 def _test_sizes(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
     """A test should read each record of its data once.
 
-    Known where the data is open (``--data``); a tenth more or less is allowed.
+    This rule needs the data (``--data``). It allows a tenth more or less.
     """
     for k, net in enumerate(nets[1:]):
         for layer in net.layers:
@@ -87,9 +87,9 @@ def _test_sizes(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
 
 @rule("tested-on-training-data", SOLVER)
 def _same_data(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
-    """A test over what the net learns from does not say how good it is on anything else.
+    """A test on the training data does not show how good the net is on other data.
 
-    A data layer without a phase is read in phase TEST too: by `netspec test`, or by `lmdb-build compare`.
+    A data layer without a phase is also used in phase TEST, by `netspec test` or `lmdb-build compare`.
     """
     trained = {os.path.realpath(source): layer for _, layer, _, source in _sources(nets[0])} if nets else {}
     for net in nets[1:]:
@@ -117,7 +117,7 @@ def _sources(net: Net) -> Iterator[tuple[int, Any, str, str]]:
 
 @rule("filled-by-script", SOLVER)
 def _filled_by_script(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
-    """A net whose inputs no layer fills can be trained by a script only; ``netspec train`` refuses it."""
+    """A net with inputs that no layer fills can only be trained by a script; ``netspec train`` refuses it."""
     for net in nets:
         for fault in net.missing_inputs():
             if fault.where:

@@ -1,4 +1,4 @@
-"""Examines a database: counts, labels, statistics of the values, and faults."""
+"""Examines a database: counts, labels, statistics of the values, and errors."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from netspec.data.records import Record, Records
 from netspec.files.limits import amount
 
 Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm: wraps an iterable
-_MOST_FAULTS = 100  # that are kept with their keys; all are counted
-MOST_LABELS = 8  # that are listed one by one
-_SORTED = 100  # with so many records, the order of labels is no coincidence
+_MOST_FAULTS = 100  # errors to keep with their keys; all are counted
+MOST_LABELS = 8  # labels to list one by one
+_SORTED = 100  # with this many records, sorted labels are no coincidence
 
 
 @dataclass
 class Channels:
-    """Statistics over all values of each channel of records of one number of channels."""
+    """Statistics over all values of each channel, for records with the same number of channels."""
 
     count: int = 0
     sums: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -32,7 +32,7 @@ class Channels:
     histogram: np.ndarray | None = None
 
     def add(self, values: np.ndarray) -> None:
-        """Add the values (C, H, W) of a record; of bytes, how often each of the 256 occurs is counted."""
+        """Add the values (C, H, W) of a record; for bytes, count how often each of the 256 values occurs."""
         flat = values.reshape(len(values), -1)
         if not len(self.sums):
             size = len(values)
@@ -62,7 +62,7 @@ class Channels:
 
 @dataclass(frozen=True)
 class Fault:
-    """A faulty record: its number, its key, and a line that describes the fault."""
+    """A wrong record: its index, its key, and a line that describes the error."""
 
     number: int
     key: str
@@ -112,7 +112,7 @@ def survey(records: Records, numbers: Sequence[int], progress: Progress = iter) 
 
 
 class _Watch:
-    """Keeps what is needed to compare later records with earlier ones."""
+    """The state for comparing later records with earlier ones."""
 
     def __init__(self, found: Survey) -> None:
         self._found = found
@@ -122,7 +122,7 @@ class _Watch:
         self._flat = 0
 
     def fault(self, record: Record) -> str:
-        """Return the fault of a record that can be read; "" if it has none."""
+        """Return the error in a readable record; "" if there is none."""
         values = record.values
         assert values is not None
         if self._first is None:

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 from netspec.inspect.draw.diagram import Diagram, Output
 
-LEAST_SAVED = 4  # boxes that folding a block must save
+LEAST_SAVED = 4  # minimum number of boxes that folding a block must save
 LONGEST = 300  # boxes of a block
 
 
 @dataclass(frozen=True)
 class Block:
-    """A repeated part: ``copies`` copies of ``length`` boxes, from box ``first`` on. Each has one input and one output.
+    """A repeated part: ``copies`` copies of ``length`` boxes, starting at box ``first``, with one input and one output.
 
     ``entry`` is the output that the first copy reads. ``exit`` is the output of the first copy: a box and its top.
     """
@@ -36,7 +36,7 @@ class Block:
 
 
 def find_blocks(diagram: Diagram) -> list[Block]:
-    """Return the repeated parts in order, without overlaps. Of several at one box, the one that saves most is used."""
+    """Return the repeated parts in order, without overlaps. If several start at a box, use the one that saves most."""
     kinds: dict[object, int] = {}
     same = [
         kinds.setdefault((box.type, box.same, box.shapes, bool(box.owner), box.work), len(kinds))
@@ -64,10 +64,10 @@ def find_blocks(diagram: Diagram) -> list[Block]:
 
 
 def _copies(diagram: Diagram, same: Sequence[int], first: int, length: int) -> int:
-    """Return how often the ``length`` boxes from ``first`` on repeat, by their kinds only, not by their wires."""
+    """Return how often the ``length`` boxes from ``first`` on repeat, by their kinds, ignoring their connections."""
     second = first + length
     if same[first] != same[second] or not all(first <= source < second for source, _ in diagram.reads[second]):
-        return 1  # a copy begins with what the copy before gives
+        return 1  # a copy reads the output of the previous copy
     copies = 1
     while same[first + copies * length : second + copies * length] == same[first:second]:
         copies += 1
@@ -75,7 +75,7 @@ def _copies(diagram: Diagram, same: Sequence[int], first: int, length: int) -> i
 
 
 def _longest(diagram: Diagram, readers: dict[Output, list[int]], first: int, length: int, copies: int) -> Block | None:
-    """Return the block with as many consecutive copies as have the same wires."""
+    """Return the block with as many consecutive copies as have the same connections."""
     within = range(first, first + length)
     entries = {output for k in within for output in diagram.reads[k] if output[0] < first}
     given = {
@@ -96,7 +96,7 @@ def _longest(diagram: Diagram, readers: dict[Output, list[int]], first: int, len
 
 
 def _is_alike(diagram: Diagram, readers: dict[Output, list[int]], block: Block, copy: int) -> bool:
-    """Return whether a copy has the same wires as the first one, and reads the exit of the copy before it."""
+    """Return whether a copy has the same connections as the first one, and reads the exit of the previous copy."""
     first, length, entry, exit_ = block.first, block.length, block.entry, block.exit
     shift = copy * length
     before = (exit_[0] + shift - length, exit_[1])
@@ -109,5 +109,5 @@ def _is_alike(diagram: Diagram, readers: dict[Output, list[int]], block: Block, 
             leaves = any(reader >= end for reader in readers.get((k + shift, j), ()))
             if leaves != ((k, j) == exit_) and not ((k, j) == exit_ and not readers.get((k + shift, j))):
                 return False
-    # Only this copy may read the output of the copy before it.
+    # Only this copy may read the output of the previous copy.
     return all(reader < first + length + shift for reader in readers.get(before, ()))

@@ -1,6 +1,6 @@
-"""Works out what a picture of a net shows: layers as boxes, blobs as wires, with shapes and costs.
+"""Computes the diagram of a net: layers as boxes, blobs as lines, with shapes and costs.
 
-Both phases are in one diagram. A layer that computes in place is in the box of the layer that made
+Both phases are in one diagram. An in-place layer is in the box of the layer that computed
 the blob, if no other layer reads the blob before.
 """
 
@@ -26,9 +26,9 @@ from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import write_text
 from netspec.proto.writer import scalar_text
 
-MOST = 6  # settings that are shown
-OWN = "_param"  # how the names of the fields end that hold a layer's own settings
-COMMON = ("loss_param", "transform_param")  # and of those, these belong to many layers
+MOST = 6  # number of settings to show
+OWN = "_param"  # endings of fields with a layer's own settings
+COMMON = ("loss_param", "transform_param")  # fields with these endings that many layers have
 SILENT = ("engine", "bias_term", "axis", "source", "backend", "root_folder", "mean_file", "prefetch", "rand_skip")
 WINDOWS = {"kernel_size": ("kernel_h", "kernel_w"), "stride": ("stride_h", "stride_w"), "pad": ("pad_h", "pad_w")}
 DEFAULTS = {"kernel_size": "0", "stride": "1", "pad": "0"}
@@ -80,7 +80,7 @@ Output = tuple[int, int]  # a box, and the index of its top
 
 @dataclass(frozen=True)
 class Attached:
-    """A layer that computes in place. It is drawn in the box of the layer that made its blob."""
+    """An in-place layer, drawn in the box of the layer that computed its blob."""
 
     name: str
     type: str
@@ -91,11 +91,11 @@ class Attached:
 
 @dataclass(frozen=True)
 class Box:
-    """A layer, as it is drawn.
+    """A layer in the diagram.
 
-    ``kind`` is the room of netspec.layers that defines it. ``phases`` are the phases that have it, or empty if all
-    drawn phases do. ``weights`` counts its own learned numbers; ``owner`` is the layer that it shares parameters with.
-    ``work`` is its multiply-adds in one forward pass. ``text`` is its prototxt and that of the attached layers.
+    ``kind`` is the module of netspec.layers that defines it. ``phases`` are the phases that have it, or empty if all
+    drawn phases do. ``weights`` is the number of its own weights; ``owner`` is the layer that it shares parameters
+    with. ``work`` is its multiply-adds in one forward pass. ``text`` is its prototxt and that of the attached layers.
     ``same`` is equal for layers that differ only in names.
     """
 
@@ -116,7 +116,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Diagram:
-    """Boxes in the order of the net, and the outputs that each reads, in the order of its bottoms.
+    """The boxes in the order of the net, and the outputs that each reads, in the order of its bottoms.
 
     ``faults`` are the errors in parts of the net that could not be built. Shapes and costs are missing there.
     """
@@ -135,13 +135,13 @@ class _Seen:
     phase: str
     plan: Plan
     numbers: list[int]
-    layers: Mapping[int, Layer]  # the built ones, by their number in the file
+    layers: Mapping[int, Layer]  # the layers that were built, by their index in the file
 
 
 def diagram_of(
     net: NetParameter, source: SourceMap, phases: Sequence[PhaseValue], options: BuildOptions | None = None
 ) -> Diagram:
-    """Return the diagram of an upgraded net in the given phases. No file is written; blobs get no memory."""
+    """Return the diagram of an upgraded net in the given phases. Writes no file and allocates no blobs."""
     faults: list[SpecError] = []
     options = replace(options or BuildOptions(open_data=False), device="meta", seed=0, write_files=False, passes=())
     with log.silent():
@@ -159,7 +159,7 @@ def _look(net: NetParameter, source: SourceMap, phase: str, options: BuildOption
     filtered, numbers = filter_net(net, numbered)
     numbers = [int(place.where.file) for place in numbers.layers]
     placed = source.with_layers(source.layers[k] for k in numbers)
-    # A fault of the wiring is reported by the build, which plans again, with splits.
+    # The build, which plans again with splits, reports errors in the connections.
     plan = make_plan(filtered, placed.telling(lambda fault: None))
     waiting: dict[str, list[int]] = {}
     for number, layer in zip(numbers, filtered.layer, strict=True):
@@ -179,7 +179,7 @@ def _look(net: NetParameter, source: SourceMap, phase: str, options: BuildOption
 def _merged(net: NetParameter, source: SourceMap, seen: Sequence[_Seen], faults: tuple[SpecError, ...]) -> Diagram:
     """Return one diagram of all phases."""
     phases_of: dict[int, list[str]] = {}
-    boxed: set[int] = set()  # layers that have a box of their own in some phase
+    boxed: set[int] = set()  # layers with a separate box in some phase
     for one in seen:
         for number in one.numbers:
             phases_of.setdefault(number, []).append(one.phase)
@@ -228,7 +228,7 @@ def _merged(net: NetParameter, source: SourceMap, seen: Sequence[_Seen], faults:
 
 
 def _alone(plan: Plan) -> list[bool]:
-    """Return for each layer whether it has a box of its own.
+    """Return for each layer whether it has a separate box.
 
     It has none if it computes in place, is the only reader of its bottom, and its bottom is the only top of its layer.
     """
@@ -270,7 +270,7 @@ def _own_weights(node: Node, layer: Layer) -> int:
 
 
 def _shape_text(shapes: Sequence[Shape]) -> str:
-    """Return ``64×1×28×28``; of phases that differ ``64|100×1×28×28``; empty where it is unknown."""
+    """Return ``64×1×28×28``, or ``64|100×1×28×28`` if the phases differ, or "" if it is unknown."""
     if not shapes:
         return ""
     if len({len(shape) for shape in shapes}) > 1:
@@ -296,7 +296,7 @@ def _text(layer: Any) -> str:
 
 
 def _without_names(layer: Any) -> str:
-    """Return a layer's prototxt without the names of itself, its blobs and its parameters."""
+    """Return a layer's prototxt without the names of the layer, its blobs and its parameters."""
     bare = type(layer)()
     bare.CopyFrom(layer)
     for name in ("name", "bottom", "top", "blobs"):

@@ -1,4 +1,4 @@
-"""A diagram in the language of Graphviz: a table for each box, an edge for each wire, a cluster for what repeats."""
+"""Writes a diagram for Graphviz: a table for each box, an edge for each blob, a cluster for each repeated block."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from netspec.inspect.draw.diagram import Attached, Box, Diagram
 
 INK, PALE, TRACK, EDGE, SHARED, WIRE = "#1f2933", "#52606d", "#e4e7eb", "#cbd2d9", "#b83280", "#7b8794"
 PHASE_COLORS = {"TRAIN": "#9c4221", "TEST": "#2b6cb0"}
-COLORS = {  # by the room of netspec.layers, the most special first
+COLORS = {  # by module of netspec.layers, the most specific first
     "vision.pooling": ("pooling", "#e08e0b"),
     "vision": ("convolution", "#2f6fb7"),
     "common": ("inner product", "#7c4fc4"),
@@ -60,7 +60,7 @@ def dot_of(diagram: Diagram, unfolded: bool = False) -> str:
 
 
 def _nodes(diagram: Diagram) -> list[str]:
-    """Return the name of each box's node, in quotes: the name of the layer, with a number if it repeats."""
+    """Return the node names of the boxes, in quotes: the names of the layers, with a number if they repeat."""
     names: dict[str, None] = {}
     for box in diagram.boxes:
         name, count = printable(box.name), 1
@@ -112,7 +112,7 @@ def _header(diagram: Diagram) -> str:
 
 
 def _table(diagram: Diagram, k: int, most: int) -> str:
-    """Return the label of a box: its lines, and below it a cell for each top, where the wires begin."""
+    """Return the label of a box: its lines, and below them a cell for each top, where the edges begin."""
     box = diagram.boxes[k]
     lines = list(_lines(box))
     if box.work:
@@ -153,7 +153,7 @@ def _tops(diagram: Diagram, k: int) -> list[str]:
 
 
 def _bar(box: Box, most: int) -> str:
-    """Return a bar as long as the share of a box in ``most`` work."""
+    """Return a bar whose length is the work of a box relative to ``most``."""
     filled = max(2, round(BAR * box.work / most))
     cells = [(filled, color_of(box.kind)[1]), (BAR - filled, TRACK)]
     row = "".join(
@@ -202,5 +202,5 @@ def amount_text(number: int) -> str:
 
 
 def shortened(text: str, most: int = LONGEST) -> str:
-    """Return a text of at most ``most`` characters. The middle of a longer text is left out."""
+    """Shorten a text to at most ``most`` characters by removing its middle."""
     return text if len(text) <= most else f"{text[: most // 2]}…{text[len(text) - most // 2 + 1 :]}"

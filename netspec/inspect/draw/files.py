@@ -1,4 +1,4 @@
-"""Writes the picture of a net to a file."""
+"""Writes the drawing of a net to a file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.nets import solver_nets
 
-MANY = 5000  # boxes, which take about half a minute to draw
+MANY = 5000  # boxes; drawing them takes about half a minute
 
 
 def write_picture(
@@ -28,8 +28,8 @@ def write_picture(
 ) -> Diagram:
     """Draw the net of a file, or the training net of a solver, as SVG, PNG or HTML by the ending of ``out``.
 
-    For a .caffemodel, the net inside it is drawn. Returns the diagram. Its faults are the errors in parts that could
-    not be built; the picture has no shapes there. Raises SpecError for a file that cannot be read, or without Graphviz.
+    For a .caffemodel, draws the net inside it. Returns the diagram. Its faults are the errors in parts that could
+    not be built and have no shapes. Raises SpecError for a file that cannot be read, or if Graphviz is missing.
     """
     diagram = diagram_of(*_net_of(path, options), phases, options)
     if len(diagram.boxes) > MANY:

@@ -15,9 +15,9 @@ PNG_DPI = 144  # for text of 10 points
 
 
 def render(text: str, kind: str) -> bytes:
-    """Return the picture of a graph in DOT, of a kind that Graphviz has, such as "svg", "png" or "pdf".
+    """Draw a graph in DOT, in one of Graphviz's formats, such as "svg", "png" or "pdf".
 
-    Raises SpecError if Graphviz is missing, or cannot draw this graph as this kind.
+    Raises SpecError if Graphviz is missing or cannot draw the graph in this format.
     """
     scripts = sysconfig.get_path("scripts")
     brought = shutil.which("graphviz-pure", path=scripts) or shutil.which("graphviz-pure")

@@ -1,4 +1,4 @@
-"""Pictures of what a net has learned: filters, maps of a blob, saliency, descriptors in a plane."""
+"""Drawings of what a net has learned: filters, maps of a blob, saliency, descriptors in two dimensions."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ WIDTH = 9.0  # inches
 MOST_FILTERS, MOST_CHANNELS, MOST_MAPS = 256, 24, 256
 THUMBNAIL = 0.52  # inches on the longer side
 _TILES_WIDE = 16
-_BAR = 0.7  # inches of the picture's height for its title and color bar
+_BAR = 0.7  # inches of height for the title and the color bar
 
 
 def filters_figure(filters: np.ndarray, title: str, of_images: bool = True, rgb: bool = False) -> Figure:
-    """Draw filters (O, I, h, w): those ``of_images`` side by side, others as a table of maps.
+    """Draw filters (O, I, h, w): those for images side by side (``of_images``), others as a table of maps.
 
-    Gray (in color) or white (in maps) is zero, and the scale is the same for all. Filters of 3 channels are in color,
-    blue, green, red unless ``rgb``; those of 2 or 6 are of two images.
+    Gray (in color) or white (in maps) is zero, and all have the same scale. Filters with 3 channels are in color:
+    blue, green, red unless ``rgb``. Filters with 2 or 6 channels are for two images.
     """
     images = 2 if of_images and filters.shape[1] in (2, 6) else 1
     shown = filters[:MOST_FILTERS]
@@ -54,9 +54,9 @@ def filters_figure(filters: np.ndarray, title: str, of_images: bool = True, rgb:
 
 
 def maps_figure(maps: np.ndarray, image: np.ndarray, title: str) -> Figure:
-    """Draw the maps (C, H, W) or numbers (D,) of a blob, next to the image (H, W, 3) or (H, W) it is computed from.
+    """Draw the maps (C, H, W) or values (D,) of a blob, next to its image (H, W, 3) or (H, W).
 
-    All maps have the same scale. It leaves out the largest and the smallest half percent of the values.
+    All maps have the same scale, which excludes the largest and the smallest half percent of the values.
     """
     if maps.ndim < 3 or maps.shape[-2:] == (1, 1):
         return _numbers(maps.reshape(-1), image, title)
@@ -109,7 +109,7 @@ def embedding_figure(
 ) -> Figure:
     """Draw points (N, 2). Points with an image (BGR or gray, uint8) are drawn as the image if there is room.
 
-    Colors show the ``labels``, or without them the order of the points.
+    Colors show the ``labels`` or, without them, the order of the points.
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, WIDTH * 0.86), layout="constrained")
@@ -141,7 +141,7 @@ def _mosaic(
     scale: tuple[str, float, float] | None,
     image: np.ndarray | None = None,
 ) -> Figure:
-    """Draw tiles of one size in rows; ``scale`` is a color map with the values of its ends, ``image`` comes first."""
+    """Draw tiles of equal size in rows, after ``image``; ``scale`` is a color map with the values of its ends."""
     rows = -(-len(tiles) // columns)
     height, width = tiles[0].shape[:2]
     seam = max(1, round(max(height, width) / 14))
@@ -186,7 +186,7 @@ def _mosaic(
 
 
 def _numbers(values: np.ndarray, image: np.ndarray, title: str) -> Figure:
-    """Draw numbers as bars, the five greatest with their index."""
+    """Draw values as bars, the five largest with their index."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
         left, axis = figure.subplots(1, 2, width_ratios=(2.2, WIDTH - 2.2))
@@ -232,14 +232,14 @@ def _put_images(
 ) -> None:
     """Put images at their points, one after the other, without overlaps."""
     places = axis.transData.transform(points) / axis.figure.dpi  # inches
-    taken: list[tuple[np.ndarray, np.ndarray]] = []  # middles and sizes
+    taken: list[tuple[np.ndarray, np.ndarray]] = []  # centers and sizes
     for index in _spread_order(places, list(images)):
         picture = rgb_of(images[index])
         size = np.array(picture.shape[1::-1]) * THUMBNAIL / max(picture.shape[:2]) + 0.08
         if any((np.abs(places[index] - other) < (size + its) / 2).all() for other, its in taken):
             continue
         taken.append((places[index], size))
-        zoom = THUMBNAIL * 72 / max(picture.shape[:2])  # points: OffsetImage takes a pixel for one
+        zoom = THUMBNAIL * 72 / max(picture.shape[:2])  # points: OffsetImage draws a pixel as a point
         box = AnnotationBbox(
             OffsetImage(picture, zoom=zoom),
             (float(points[index, 0]), float(points[index, 1])),
@@ -250,7 +250,7 @@ def _put_images(
 
 
 def _spread_order(places: np.ndarray, chosen: list[int]) -> list[int]:
-    """Return the points in an order in which each is far from those before it, the outer ones first."""
+    """Order the points so that each is far from the previous ones, starting with the outer ones."""
     if not chosen:
         return []
     spots = places[chosen]

@@ -1,4 +1,4 @@
-"""Writes pictures as HTML pages that need no other files. All values are escaped."""
+"""Writes drawings as HTML pages that need no other files. All values are escaped."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def page(template: str, **values: object) -> str:
 
 
 def net_page(diagram: Diagram) -> str:
-    """Return the page of a net: blocks that repeat can be unfolded, and a click on a layer shows its prototxt."""
+    """Return the page of a net: repeated blocks can be unfolded, and a click on a layer shows its prototxt."""
     drawings = dict.fromkeys(_svg_element(diagram, unfolded) for unfolded in (False, True))  # one if nothing repeats
     layers = [
         {"name": printable(box.name), "where": printable(str(box.where)), "text": box.text} for box in diagram.boxes

@@ -1,4 +1,4 @@
-"""Draws a sheet of records: images with keys and labels, statistics of the database, and its faults."""
+"""Draws a sheet of records: images with keys and labels, statistics of the database, and its errors."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ CHANNEL_COLORS = {1: ("#555555",), 2: ("#0072B2", "#D55E00"), 3: ("#2b5fd9", "#2
 def sheet(records: Sequence[Record], found: Survey, name: str, images: int | None = None) -> Figure:
     """Draw records as tiles below the statistics that :func:`netspec.inspect.check.survey.survey` found.
 
-    ``images`` says how many images a record holds, side by side; by default two where it has 2 or 6 channels.
+    ``images`` is the number of images in a record, drawn side by side; the default is two for 2 or 6 channels.
     """
     usual = _usual(records)
     side_by_side = images or (1 if usual is None else images_in(usual))

@@ -1,4 +1,4 @@
-"""The style of pictures, how they are written, and arrays as tiles of a picture."""
+"""The style of drawings, writing them to files, and drawing arrays as tiles."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ STYLE: dict[Any, Any] = {
     "axes.titlelocation": "left",
     "axes.formatter.useoffset": False,
     "figure.dpi": DPI,
-    "svg.fonttype": "none",  # text stays text, so that it can be searched, copied and read by screen readers
-    "svg.hashsalt": "netspec",  # equal pictures give equal files
+    "svg.fonttype": "none",  # keep text as text, for searching, copying and screen readers
+    "svg.hashsalt": "netspec",  # equal drawings give equal files
 }
 
 
 def ending_of(path: str | Path, endings: Sequence[str] = ENDINGS) -> str:
-    """Return the kind of picture that a file name asks for. Raises SpecError for another, and for a bad folder."""
+    """Return the format of a file name. Raises SpecError for another format, and for a folder that is not writable."""
     ending = Path(path).suffix.lower().lstrip(".")
     if ending not in endings:
         raise SpecError(f"expected a name that ends in {', '.join(f'.{each}' for each in endings)}", Where(str(path)))
@@ -44,7 +44,7 @@ def ending_of(path: str | Path, endings: Sequence[str] = ENDINGS) -> str:
 
 
 def write_figure(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG or SVG, as the name asks for. Raises SpecError."""
+    """Write a figure as PNG or SVG, by the ending of the name. Raises SpecError."""
     data = svg(figure).encode() if ending_of(path) == "svg" else figures.png(figure)
     write_whole(path, data)
 
@@ -63,7 +63,7 @@ def text_at(axis: Axes, x: float, y: float, text: str, **options: Any) -> None:
 
 
 def stretched(values: np.ndarray, low: float | None = None, high: float | None = None) -> np.ndarray:
-    """Return values as brightness, 0 to 1: ``low`` and ``high``, else the least and the greatest, are black and white.
+    """Scale values to brightness, 0 to 1: black is ``low`` or the minimum, and white is ``high`` or the maximum.
 
     NaN and infinity become 0.
     """
@@ -77,10 +77,10 @@ FRAME = 0.06  # of a tile's side, between tiles
 
 
 def as_picture(values: np.ndarray) -> np.ndarray:
-    """Return values (C, H, W) as brightness (H, W) or (H, W, 3), 0 to 1, for a picture.
+    """Return values (C, H, W) as brightness (H, W) or (H, W, 3), 0 to 1, for drawing.
 
-    Bytes are shown as they are, other values from the least (black) to the greatest (white). Three channels are blue,
-    green, red, as OpenCV decodes them. Of two, or of more than four, the mean is shown; a vector becomes a block.
+    Bytes are not scaled; other values are scaled from the minimum (black) to the maximum (white). Three channels are
+    blue, green, red, as in OpenCV. For two or more than four channels, the mean is drawn; a vector becomes a block.
     """
     if values.shape[1:] == (1, 1):
         values = _block(values.reshape(-1))[None]
@@ -99,19 +99,19 @@ def split(values: np.ndarray, images: int) -> list[np.ndarray]:
 
 
 def images_in(values: np.ndarray) -> int:
-    """Return how many images a record (C, H, W) seems to hold: 2 for two gray ones or two in color, else 1."""
+    """Return the probable number of images in a record (C, H, W): 2 for two gray or two color images, else 1."""
     return 2 if len(values) in (2, 6) and values.shape[1:] != (1, 1) else 1
 
 
 def what_is_shown(values: np.ndarray) -> str:
-    """Return a note if a picture of values (C, H, W) cannot show the channels themselves; "" if it can."""
+    """Return a note if a drawing of values (C, H, W) cannot show the channels themselves, else ""."""
     if values.shape[1:] == (1, 1) and len(values) > 4:
         return f"vectors of {len(values)} numbers as blocks"
     return f"{times(values.shape)}, mean of the channels" if len(values) not in (1, 3, 4) else ""
 
 
 def draw_tile(axis: Axes, picture: np.ndarray, left: float, bottom: float, width: float, height: float) -> None:
-    """Draw a picture as large as fits into a rectangle, in its middle."""
+    """Draw an image in the center of a rectangle, as large as possible."""
     rows, columns = picture.shape[:2]
     scale = min(width / columns, height / rows)
     x, y = left + (width - scale * columns) / 2, bottom + (height - scale * rows) / 2
@@ -127,7 +127,7 @@ def draw_tile(axis: Axes, picture: np.ndarray, left: float, bottom: float, width
 
 
 def _block(vector: np.ndarray) -> np.ndarray:
-    """Return a vector as a block of about equal width and height, filled up with the least value."""
+    """Return a vector as an approximately square block, padded with the minimum."""
     columns = int(np.ceil(np.sqrt(len(vector))))
     rows = -(-len(vector) // columns)
     block = np.full(rows * columns, vector.min() if len(vector) else 0, vector.dtype)

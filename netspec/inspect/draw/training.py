@@ -1,4 +1,4 @@
-"""Draws the curves of trainings: losses, test outputs and rates, with several runs in one picture."""
+"""Draws the curves of one or several trainings: losses, test outputs and learning rates."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from netspec.inspect.logs.training_log import Curve, TrainingLog, shown_range, s
 from netspec.log import logger
 
 WIDTH, LOSS_HEIGHT, HEIGHT = 9.0, 3.4, 2.3  # inches
-MOST_POINTS = 2000  # of a curve; more cannot be seen in a picture
-MOST_ELEMENTS = 6  # of an output blob; blobs of more numbers are left out
+MOST_POINTS = 2000  # maximum number of points of a curve
+MOST_ELEMENTS = 6  # maximum number of values of an output blob; larger blobs are left out
 LEGEND_WIDTH = 100  # characters
 MARKERS = "osDv^<>"
-MOST_MARKERS = 80  # in the width of the picture
+MOST_MARKERS = 80  # maximum number of points in the width of the drawing
 _DASHED = (0, (4, 2))
 
 
 @dataclass(frozen=True)
 class Look:
-    """How curves are drawn: the window of the smoothing in points (None: a 25th of them), and a logarithmic axis.
+    """The options for curves: the smoothing window in points (None: a 25th of them), and a logarithmic axis.
 
     Tests get markers if ``marker_distance`` iterations or more lie between them.
     """
@@ -41,9 +41,9 @@ class Look:
 
 
 def training_figure(logs: Sequence[TrainingLog], look: Look | None = None) -> Figure:
-    """Draw trainings, each in its color: a panel of losses, one for each other output, one for the rate.
+    """Draw trainings in different colors: a panel for losses, one for each other output, and one for the rate.
 
-    The training loss is drawn pale, and its smoothed curve strong. Tests are dashed, with markers. The parts have ids,
+    The training loss is drawn light, and its smoothed curve dark. Tests are dashed, with markers. The parts have ids,
     such as ``run0-raw``, so that a page can hide them.
     """
     look = replace(look or Look(), marker_distance=max((log.iteration for log in logs), default=0) / MOST_MARKERS)

@@ -1,4 +1,4 @@
-"""Curves of trainings as one HTML file: the picture, boxes that hide runs and curves, a cursor, a table of numbers."""
+"""An HTML page with curves of trainings: checkboxes for runs and curves, a cursor, and a table of values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FEW = 6  # test outputs that the cursor reads
 
 
 def training_page(logs: Sequence[TrainingLog], figure: Figure, title: str) -> str:
-    """Return the page, which needs no other files. ``figure`` is the picture of the runs."""
+    """Return the page, which needs no other files. ``figure`` is the drawing of the runs."""
     summaries = [summary(log) for log in logs]
     columns = list(dict.fromkeys(name for line in summaries for name in line))
     shown = [
@@ -40,7 +40,7 @@ def training_page(logs: Sequence[TrainingLog], figure: Figure, title: str) -> st
 
 
 def _horizontal(figure: Figure) -> dict[str, float]:
-    """Return the left and right ends of the panels, as shares of the picture's width, and the iterations there."""
+    """Return the left and right ends of the panels, as shares of the drawing's width, and the iterations there."""
     panel = figure.axes[0]
     place, (first, last) = panel.get_position(), panel.get_xlim()
     return {"left": place.x0, "right": place.x1, "first": first, "last": last}
@@ -64,7 +64,7 @@ def _points(curve: Curve) -> list[tuple[int, float | None]]:
 
 
 def describe(logs: Sequence[TrainingLog]) -> str:
-    """Return a description of the picture in words."""
+    """Return a description of the drawing in words."""
     lines = []
     for log in logs:
         cells = ", ".join(f"{name} {value}" for name, value in summary(log).items())

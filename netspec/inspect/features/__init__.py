@@ -1,1 +1,1 @@
-"""Blobs of a net as files: for records, for images, for a loop-closure detector."""
+"""Blobs of a net for records, for images, and for a loop-closure detector."""

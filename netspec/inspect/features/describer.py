@@ -1,4 +1,4 @@
-"""One image in, one descriptor out: a net as the ``describe`` callable of a loop-closure detector."""
+"""A net as the ``describe`` callable of a loop-closure detector, from an image to its descriptor."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from netspec.proto.binary import split_paths
 
 
 class Describer:
-    """A callable that returns blob ``blob`` of a net for an image given as its blob ``input``.
+    """A callable that returns the blob ``blob`` of a net for an image, which is its blob ``input``.
 
-    The net is the prototxt ``model`` in phase TEST, cut down to what computes the blob. ``weights`` are one file, or
-    several with commas between them. The pixels are scaled as its data layer's transform_param says or, where any of
+    The net is the part of the prototxt ``model`` in phase TEST that computes the blob. ``weights`` are one file, or
+    several separated by commas. The pixels are scaled by the data layer's transform_param or, if any of
     these is given, by ``swap``, ``raw_scale``, ``mean`` and ``scale``, in this order
-    (:class:`netspec.inspect.features.scaling.Steps`); each may be text, as on the command line.
-    ``zooms``, "1,0.7", describes so many views of each image; ``views`` says how many. ``engine`` and ``precision`` say
-    what runs the net (docs/engines.md), ``cache`` which folder keeps its model. Raises SpecError for faults of the
-    files.
+    (:class:`netspec.inspect.features.scaling.Steps`), which can be texts, as on the command line.
+    ``zooms``, such as "1,0.7", describes several views of each image; ``views`` is their number. ``engine`` and
+    ``precision`` choose what runs the net (docs/engines.md), and ``cache`` the folder for its model. Raises SpecError
+    for errors in the files.
 
         >>> describe = Describer("deploy.prototxt", "x.caffemodel", blob="feat")
         >>> describe(numpy.zeros((48, 64, 3), numpy.uint8)).shape
@@ -62,12 +62,12 @@ class Describer:
 
     @property
     def engine(self) -> str:
-        """The engine that runs the net: the chosen one, or torch where that could not."""
+        """The engine that runs the net: the chosen one, or torch if that one cannot."""
         return self.image_net.engine
 
     @property
     def fingerprint(self) -> str:
-        """16 hexadecimal digits: those of another net, of other weights or scaling differ; those of engines do not."""
+        """16 hexadecimal digits that identify the net, its weights and its scaling, but not the engine."""
         return self.image_net.fingerprint
 
     def __call__(self, image: np.ndarray) -> np.ndarray:

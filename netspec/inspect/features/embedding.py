@@ -17,7 +17,7 @@ from netspec.inspect.features.images import read_pixels
 
 PCA, TSNE = "pca", "tsne"
 _BESIDE = ("stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms", "names", "keys")
-_PERPLEXITY = 30.0  # of t-SNE: the approximate number of neighbors of a point
+_PERPLEXITY = 30.0  # perplexity of t-SNE: the approximate number of neighbors of a point
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ def read_features(path: str | Path, array: str = "") -> Features:
 
 
 def in_plane(values: np.ndarray, method: str = PCA) -> tuple[np.ndarray, str]:
-    """Return descriptors (N, D) as points (N, 2), and a sentence that describes the plane.
+    """Reduce descriptors (N, D) to points (N, 2); also return a description of the method.
 
-    The signs of principal components are chosen so that the entry of greatest size is positive; t-SNE starts from them.
+    Each principal component has the sign that makes its largest entry positive. t-SNE starts from the components.
     """
     centered = values - values.mean(axis=0)
     left, sizes, right = np.linalg.svd(centered, full_matrices=False)
@@ -79,10 +79,10 @@ class Thumbnails:
 
 
 def thumbnails(source: str | Path, names: list[str] | None, count: int) -> Thumbnails:
-    """Return the images of ``count`` descriptors with these names or keys; without names, those in the source's order.
+    """Return the images of ``count`` descriptors by names or keys; without names, in the order of the source.
 
-    ``source`` is a folder or a list of images, or a database; of a record that holds two images the first is shown.
-    Raises SpecError where an image is missing.
+    ``source`` is a folder, a list of images or a database; for a record with two images, the first is used.
+    Raises SpecError if an image is missing.
     """
     path = Path(source)
     if path.is_dir() and ((path / "data.mdb").is_file() or (path / "CURRENT").is_file()):
@@ -107,7 +107,7 @@ def _of_records(path: Path, names: list[str] | None, count: int) -> Thumbnails:
 
 
 def _numbers(names: list[str] | None, known: dict[str, int], size: int, count: int, path: Path) -> list[int]:
-    """Return which image each descriptor belongs to."""
+    """Return the index of each descriptor's image."""
     if names is None:
         if size != count:
             raise SpecError(f"has {size} images, but there are {count} descriptors (without names)", Where(str(path)))

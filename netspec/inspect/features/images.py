@@ -1,4 +1,4 @@
-"""A blob of a net for image files, as users of Caffe compute it with pycaffe. The file format: docs/features.md."""
+"""Computing a blob of a net for image files. docs/features.md describes the file format."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ BATCH = 16  # images per forward pass
 
 @dataclass(frozen=True)
 class ImageInput:
-    """How images become the input of a net.
+    """The options for converting images to the input of a net.
 
     ``shape`` (N, C, H, W) is that of the input ``blob``. None: it is taken from the net's Input layer, or from the
     first record of its data layer. ``zooms`` are the views of each image. ``steps``, if given, replace the
@@ -56,12 +56,12 @@ class ImageInput:
 
 
 class ImageNet:
-    """The part of a net that computes ``blob`` from images, and how their pixels are prepared.
+    """The part of a net that computes ``blob`` from images, including preprocessing.
 
     The net is the prototxt ``model`` in phase TEST. ``weights`` are files; a later one overrides an earlier one, and
     at least one layer must get weights. ``choice`` is the engine that runs the net. If it is not torch, and the cache
-    has the model, torch is not imported. Raises SpecError for faults of the files. Warns if the weights were trained
-    on pixels that were prepared in another way.
+    has the model, torch is not imported. Raises SpecError for errors in the files. Warns if the weights were trained
+    with different preprocessing.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class ImageNet:
             self._use_torch(str(fault))
 
     def _use_torch(self, reason: str) -> None:
-        """Let torch run the net. ``reason`` says why the chosen engine does not."""
+        """Let torch run the net; ``reason`` is why the chosen engine does not."""
         warn_unable(self._choice, reason)
         self._model, self._net = None, self._build()
         self._net.keep = [self.blob]
@@ -127,12 +127,12 @@ class ImageNet:
 
     @property
     def engine(self) -> str:
-        """The engine that runs the net: the chosen one, or torch where that could not."""
+        """The engine that runs the net: the chosen one, or torch if that one cannot."""
         return TORCH if self._model is None else self._choice.engine
 
     @cached_property
     def fingerprint(self) -> str:
-        """A hash of everything that determines the blob, except the engine: net, weights, and preparation of images."""
+        """A hash of everything that determines the blob except the engine: net, weights and preprocessing."""
         s = self.scaling
         done = f"{self.input} {self.blob} {self.shape} {self.zooms} {s.mean.tolist()} {s.scale} {s.raw_scale} {s.swap}"
         digest = hashlib.sha256(self._read.SerializeToString(deterministic=True) + done.encode())
@@ -162,7 +162,7 @@ class ImageNet:
             return self.differentiable(torch.from_numpy(data)).cpu().numpy()
 
     def differentiable(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the blob with a gradient. It is computed by torch, whatever the engine is."""
+        """Return the blob with a gradient, computed by torch for any engine."""
         assert self._net is not None, "torch runs this net"
         self._net(**{self.input: data})
         return self._net.blobs[self.blob]
@@ -191,9 +191,9 @@ def extract_images(describe: ImageNet, images: ImageList, progress: Progress = i
 
 
 def _shape_of(blob: str, net: NetParameter, source: SourceMap, options: BuildOptions) -> Shape:
-    """Return the shape of a blob of a net; data is opened, but no memory for blobs is used."""
+    """Return the shape of a blob of a net. Opens data, but allocates no blobs."""
     if len(net.layer) == 1 and is_input(net.layer[0]) and (known := shapes_of_input(net.layer[0]).get(blob)):
-        return known  # torch is not needed
+        return known  # does not need torch
     from netspec.net.build import build_filtered
 
     built = build_filtered(net, source, replace(options, device="meta"))

@@ -1,4 +1,4 @@
-"""Blobs of a net for the records of its data layer, as arrays or, as Caffe's own tool writes them, in databases.
+"""Computing blobs of a net for the records of its data layer, as arrays or, like Caffe's tool, in databases.
 
 Caffe: tools/extract_features.cpp
 """
@@ -43,9 +43,9 @@ def extract_records(
 ) -> dict[str, np.ndarray]:
     """Return each blob for the records of the net's data layer, flattened to (N, D) float32.
 
-    Also returns ``keys`` (N,), ``seconds_per_record`` (reading and the net) and ``parameters`` (how many are learned).
+    Also returns ``keys`` (N,), ``seconds_per_record`` (for reading and the net) and ``parameters`` (their number).
 
-    ``iterations`` batches are run; by default as many as needed to read every record once (repeated ones are dropped).
+    Runs ``iterations`` batches; by default, as many as needed to read every record once (repeated ones are dropped).
     Raises SpecError if the net reads no records or lacks a blob.
     """
     readers = [layer for layer in net.layers if getattr(layer, "num_records", 0)]
@@ -79,7 +79,7 @@ def extract_records(
     return arrays
 
 
-COMMITTED = 1000  # records between two commits; each commit is logged
+COMMITTED = 1000  # records per commit; each commit is logged
 
 
 def extract_features(net: Net, blobs: Sequence[str], databases: Sequence[str], batches: int, backend: str) -> None:

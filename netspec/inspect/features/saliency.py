@@ -1,4 +1,4 @@
-"""Computes which pixels of an image matter for a blob, by the size of the gradient.
+"""Computes which pixels of an image matter for a blob, from the magnitude of the gradient.
 
 Simonyan, Vedaldi, Zisserman: Deep Inside Convolutional Networks (2014), section 3; averaged over noisy copies:
 Smilkov et al.: SmoothGrad (2017).
@@ -20,11 +20,11 @@ NOISE = 0.1  # standard deviation, as a share of the range of the input
 def of_unit(
     net: ImageNet, image: np.ndarray, unit: int | None = None, samples: int = 16
 ) -> tuple[np.ndarray, int, float]:
-    """Return the saliency (H, W) of an image, uint8 BGR, for one number of the blob, and its index and value.
+    """Return the saliency (H, W) of an image, uint8 BGR, for one value of the blob, and its index and value.
 
-    ``unit`` is the flat index of the number; None: the greatest one. The saliency is the greatest absolute gradient
-    over the channels, averaged over ``samples`` copies of the input with noise; one sample has no noise. Raises
-    SpecError where the blob has no such unit.
+    ``unit`` is the flat index of the value, or None for the largest. The saliency is the maximum absolute gradient
+    over the channels, averaged over ``samples`` noisy copies of the input; a single sample has no noise. Raises
+    SpecError if the blob has no such unit.
     """
     data = net.inputs([image])
     values = net.values(data).reshape(-1)

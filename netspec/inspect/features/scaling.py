@@ -19,10 +19,10 @@ from netspec.proto.schema import LayerParameter
 
 @dataclass(frozen=True)
 class Steps:
-    """The steps that a user asks for, in this order: swap, raw_scale, mean, scale.
+    """The preprocessing steps given by the user, in this order: swap, raw_scale, mean, scale.
 
-    Images come as OpenCV reads them: BGR, 0 to 255. ``swap`` reverses their channels, for a net that was trained with
-    RGB. ``raw_scale`` multiplies; ``mean`` is subtracted: numbers, one or one per channel of the net, or a mean image
+    Images are as read by OpenCV: BGR, 0 to 255. ``swap`` reverses their channels, for a net that was trained with
+    RGB. ``raw_scale`` multiplies. ``mean`` is subtracted: one number, or one per channel of the net, or a mean image
     (C, H, W); ``scale`` multiplies.
     """
 
@@ -41,7 +41,7 @@ class Steps:
         raw_scale: str | float,
         swap: str | bool,
     ) -> Steps:
-        """Return the steps; each may be the text of an option, a mean that of ``--mean``. Raises SpecError."""
+        """Return the steps, which can be texts as on the command line. Raises SpecError."""
         values = read_mean_option(mean) if isinstance(mean, str) else mean
         try:
             factors = float(scale), float(raw_scale)
@@ -57,7 +57,7 @@ class Steps:
 class Scaling:
     """(raw_scale x - mean) * scale for images (N, C, H, W). With ``swap``, their channels are reversed first.
 
-    ``mean`` broadcasts against (C, H, W). ``source`` says where it comes from.
+    ``mean`` broadcasts against (C, H, W). ``source`` describes its origin.
     """
 
     mean: np.ndarray
@@ -82,9 +82,9 @@ class Scaling:
 
 
 def scaling_of(steps: Steps, layer: LayerParameter | None, shape: Shape, file: str) -> Scaling:
-    """Return the scaling of images of ``shape`` (C, H, W): that of ``steps`` if any, else of a layer's transform_param.
+    """Return the scaling for images of ``shape`` (C, H, W), from ``steps`` if given, else a layer's transform_param.
 
-    ``file`` is the prototxt that the layer is from. Raises SpecError for a mean that does not fit.
+    ``file`` is the layer's prototxt. Raises SpecError for a mean that does not fit.
     """
     if steps:
         mean = np.zeros(1) if steps.mean is None else _fitted(steps.mean, shape, "the mean", Where("--mean"))
@@ -94,7 +94,7 @@ def scaling_of(steps: Steps, layer: LayerParameter | None, shape: Shape, file: s
     param: Any = layer.transform_param
     source = f'transform_param of layer "{layer.name}"'
     if param.mean_file:
-        mean = read_mean(param.mean_file, Where(file))[: shape[0]]  # a pair's mean: that of its first image
+        mean = read_mean(param.mean_file, Where(file))[: shape[0]]  # for a pair, use the mean of its first image
         return Scaling(_fitted(mean, shape, param.mean_file, Where(file)), param.scale, source)
     values = np.array(param.mean_value or [0], np.float32)
     if len(values) == 2 * shape[0]:  # a pair's
@@ -105,7 +105,7 @@ def scaling_of(steps: Steps, layer: LayerParameter | None, shape: Shape, file: s
 def _fitted(mean: np.ndarray, shape: Shape, name: str, where: Where) -> np.ndarray:
     """Return a mean that broadcasts against ``shape`` (C, H, W).
 
-    A mean image larger than the blob is cut at its center, as Caffe cuts it with the image in phase TEST.
+    A mean image larger than the blob is cropped to its center, as in Caffe in phase TEST.
     """
     channels, height, width = shape
     if mean.ndim < 2:
@@ -119,9 +119,9 @@ def _fitted(mean: np.ndarray, shape: Shape, name: str, where: Where) -> np.ndarr
 
 
 def read_zooms(zooms: str | float) -> tuple[float, ...]:
-    """Return the zooms of ``"1,0.7"``: each is the share of the image's height and width that the view shows.
+    """Return the zooms in a text such as ``"1,0.7"``: the share of the image's height and width in each view.
 
-    Raises SpecError unless each is more than 0 and at most 1.
+    Raises SpecError unless each is above 0 and at most 1.
     """
     try:
         found = tuple(float(text) for text in str(zooms).split(","))
@@ -134,7 +134,7 @@ def read_zooms(zooms: str | float) -> tuple[float, ...]:
 
 
 def middle(image: np.ndarray, zoom: float) -> np.ndarray:
-    """Return the middle part of an image, ``zoom`` of its height and width; 1 is the whole image."""
+    """Return the center of an image, with ``zoom`` times its height and width; 1 is the whole image."""
     height, width = image.shape[:2]
     top, left = round(height * (1 - zoom) / 2), round(width * (1 - zoom) / 2)
     return image[top : max(height - top, top + 1), left : max(width - left, left + 1)]

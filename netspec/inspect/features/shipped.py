@@ -1,9 +1,9 @@
-"""The nets that come with the package, by name, as describers for a loop-closure detector.
+"""The included nets, by name, as describers for a loop-closure detector.
 
-``prototxt/`` is their one source: building the wheel copies it into this package (setup.py); in an editable
-installation or a checkout it is next to the package. The entry points ``loopclosure.describers`` of pyproject.toml
-name the functions here. To recommend another net, change :data:`DEFAULT` or :data:`SMALL`, and what setup.py copies
-follows.
+Their only source is ``prototxt/``: building the wheel copies it into this package (setup.py). In an editable
+installation or a checkout, it is next to the package. The entry points ``loopclosure.describers`` in pyproject.toml
+name the functions of this module. To change a net, change :data:`DEFAULT` or :data:`SMALL`; setup.py then copies
+the new one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SMALL = "many_negatives/siamese_words_256"
 
 
 def folder(net: str = "") -> Path:
-    """Return the folder of a net that comes with the package, ``siamese_8`` or one in a folder of ``prototxt/``."""
+    """Return the folder of an included net: ``siamese_8``, or one in a folder of ``prototxt/``."""
     package = Path(__file__).parents[2]
     for nets in (package / "prototxt", package.parent / "prototxt"):
         if (nets / net).is_dir():
@@ -30,7 +30,7 @@ def folder(net: str = "") -> Path:
 def default(**options: Any) -> Any:
     """Return the recommended net as a :class:`~netspec.inspect.features.describer.Describer` with these keywords.
 
-    Without ``engine`` the fastest one that is installed runs it.
+    Without ``engine``, the fastest installed engine runs it.
     """
     return _describer(DEFAULT, options)
 
@@ -41,7 +41,7 @@ def small(**options: Any) -> Any:
 
 
 def _describer(net: str, options: dict[str, Any]) -> Any:
-    # setup.py reads this file, and has none of these.
+    # setup.py reads this file without these packages.
     from netspec.export.engines.choice import fastest
     from netspec.inspect.features.describer import Describer
 

@@ -1,6 +1,6 @@
-"""The log of a training, line by line: what ``caffe train`` and ``netspec train`` write to stderr.
+"""Reads the log of a training, which ``caffe train`` and ``netspec train`` write to stderr.
 
-Caffe: src/caffe/solver.cpp, src/caffe/solvers/sgd_solver.cpp; the sentences differ a little from version to version.
+Caffe: src/caffe/solver.cpp, src/caffe/solvers/sgd_solver.cpp; the messages differ slightly between versions.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
 from netspec.log import number
 
-_POINTS_OF_WINDOW = 25  # a curve is smoothed over this part of its points
-_USUAL, _MANY = 98, 20  # the percentage of values that a drawing shows, if there are at least so many
+_POINTS_OF_WINDOW = 25  # a curve is smoothed over this share of its points
+_USUAL, _MANY = 98, 20  # the percentage of values to show, and the minimum number of values for it
 
 
 @dataclass
 class Curve:
-    """Values at iterations, which increase."""
+    """Values at increasing iterations."""
 
     iterations: list[int] = field(default_factory=list)
     values: list[float] = field(default_factory=list)
@@ -33,13 +33,13 @@ class Curve:
         return len(self.values)
 
     def add(self, iteration: int, value: float) -> None:
-        """Add a value; it replaces those of this and of later iterations."""
+        """Add a value; it replaces the values of this and later iterations."""
         self.cut(iteration)
         self.iterations.append(iteration)
         self.values.append(value)
 
     def cut(self, iteration: int) -> None:
-        """Remove the values from an iteration on: a training was resumed there."""
+        """Remove the values from an iteration on, where a training was resumed."""
         if self.iterations and self.iterations[-1] >= iteration:
             end = bisect_left(self.iterations, iteration)
             del self.iterations[end:], self.values[end:]
@@ -55,10 +55,10 @@ class Curve:
 
 
 def smoothed(values: np.ndarray, window: int | None = None) -> np.ndarray:
-    """Return the mean of the ``window`` values around each value (n,); near the ends of those that are there.
+    """Return the mean of the ``window`` values around each value (n,), with fewer values near the ends.
 
-    NaN and infinity are left out; where nothing is left, the mean is NaN. Without a window a 25th of the values is
-    taken.
+    NaN and infinity are ignored; if nothing is left, the mean is NaN. The default window is a 25th of the
+    values.
     """
     size = max(1, len(values) // _POINTS_OF_WINDOW) if window is None else min(window, 2 * len(values))
     half = size // 2
@@ -72,7 +72,7 @@ def smoothed(values: np.ndarray, window: int | None = None) -> np.ndarray:
 
 
 def thinned(x: np.ndarray, y: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most about ``most`` of the points (n,): of each stretch the least and the greatest value."""
+    """Return about ``most`` of the points (n,): the minimum and the maximum of each section."""
     if len(x) <= most:
         return x, y
     keep: set[int] = {0, len(x) - 1}
@@ -85,9 +85,9 @@ def thinned(x: np.ndarray, y: np.ndarray, most: int) -> tuple[np.ndarray, np.nda
 
 
 def shown_range(curves: list[np.ndarray]) -> tuple[float, float] | None:
-    """Return the least and the greatest value to draw of curves (n,); None where no value is finite.
+    """Return the minimum and maximum to draw for curves (n,); None if no value is finite.
 
-    A few values of a curve far above the rest, which a loss often has at its start, are left out.
+    A few values far above the rest, which a loss often has at its start, are excluded.
     """
     finite = [values[np.isfinite(values)] for values in curves]
     finite = [values for values in finite if len(values)]
@@ -102,7 +102,7 @@ def shown_range(curves: list[np.ndarray]) -> tuple[float, float] | None:
 
 RUNNING, DONE, STOPPED, FAILED = "running", "done", "stopped early", "failed"
 
-# `I1121 00:36:27.939015 12135 solver.cpp:239] ...`; newer versions of glog write the year too.
+# `I1121 00:36:27.939015 12135 solver.cpp:239] ...`; newer versions of glog also write the year.
 _COUNT = "([0-9]{1,10})(?![0-9])"  # an int of 32 bits
 _PREFIX = re.compile(rf"([IWEF])(?:\d{{4}})?(\d\d)(\d\d) (\d\d):(\d\d):(\d\d)\.(\d{{6}}) +{_COUNT} (\S+?)\] ?(.*)")
 _LOSS = re.compile(rf"Iteration {_COUNT}[^=]*, loss = (\S+)")
@@ -120,10 +120,10 @@ _GREATEST = float(np.finfo(np.float32).max)
 
 @dataclass
 class TrainingLog:
-    """What a log tells of a training.
+    """The contents of a training's log.
 
-    ``loss`` is averaged over ``average_loss`` iterations; ``train`` and ``tests`` hold the outputs of the training net
-    and, by the number of the test net, of the test nets: name -> curve. Of a blob of several numbers, the second is
+    ``loss`` is averaged over ``average_loss`` iterations. ``train`` and ``tests`` are the outputs of the training net
+    and, by index, of the test nets: name -> curve. For a blob with several values, the second is
     ``name[1]``. ``losses`` are the names of outputs that have a loss weight. ``times`` are seconds since the first
     line, at the iterations of ``loss``.
     """
@@ -139,12 +139,12 @@ class TrainingLog:
 
     @property
     def iteration(self) -> int:
-        """The last iteration that the log names."""
+        """The last iteration in the log."""
         curves = (self.loss, self.rate, *(curve for net in self.tests.values() for curve in net.values()))
         return max((curve.iterations[-1] for curve in curves if len(curve)), default=0)
 
     def test_label(self, net: int) -> str:
-        """Return what a test net is called: "test" where it is the only one."""
+        """Return the name of a test net: "test" if it is the only one."""
         return "test" if len(self.tests) == 1 else f"test net {net}"
 
     def curves(self) -> list[Curve]:
@@ -154,12 +154,12 @@ class TrainingLog:
 
 
 class LogReader:
-    """Reads a log line by line into ``run``; a training that is resumed in the same log replaces what it repeats."""
+    """Reads a log line by line into ``run``; a training resumed in the same log replaces repeated iterations."""
 
     def __init__(self, name: str) -> None:
         self.log = TrainingLog(name)
         self._position = 0  # the iteration of the last line
-        self._net = 0  # the test net that is tested
+        self._net = 0  # the test net being tested
         self._first: float | None = None
         self._last = 0.0
         self._names: dict[tuple[str, int, int], tuple[str, str]] = {}
@@ -172,7 +172,7 @@ class LogReader:
             if _FAULT.match(line):
                 self.log.state = FAILED
             else:
-                self._read(line, None)  # where GLOG_log_prefix=false left out the beginning of the lines
+                self._read(line, None)  # lines without prefix, for GLOG_log_prefix=false
             return
         message = prefix[10]
         if message.startswith("Initializing solver from parameters"):
@@ -205,7 +205,7 @@ class LogReader:
             log.state = DONE
 
     def _at(self, text: str) -> int:
-        """Return the iteration of a line; where it is before that of the last line, the training was resumed."""
+        """Return the iteration of a line; if it is before that of the last line, the training was resumed."""
         iteration = int(text)
         if iteration < self._position:
             for curve in self.log.curves():
@@ -226,7 +226,7 @@ class LogReader:
             self.log.losses.add(name)
 
     def _seconds(self, prefix: re.Match[str]) -> float:
-        """Return the seconds since the first line; logs of Caffe's time have no year."""
+        """Return the seconds since the first line; old logs have no year."""
         month, day, hour, minute, second, micros = (int(prefix[k]) for k in range(2, 8))
         try:
             now = datetime(2000, month, day, hour, minute, second, micros).timestamp()
@@ -242,7 +242,7 @@ class LogReader:
 
 
 def read_log(path: str | Path, name: str = "") -> TrainingLog:
-    """Return the training of a log. Raises SpecError if the file cannot be read or holds no training."""
+    """Return the training in a log. Raises SpecError if the file cannot be read or contains no training."""
     reader = LogReader(name or str(path))
     try:
         with open(path, encoding="utf-8", errors="replace", newline="\n") as file:
@@ -257,7 +257,7 @@ def read_log(path: str | Path, name: str = "") -> TrainingLog:
 
 
 def _number(text: str) -> float:
-    """Read a float of 32 bits: what is greater is infinite; what is no number is NaN."""
+    """Read a 32-bit float: larger values are infinite, and anything that is not a number is NaN."""
     try:
         value = float(_WINDOWS.get(text.rstrip(","), text.rstrip(",")))
     except ValueError:
@@ -269,7 +269,7 @@ _MOST_OUTPUTS = 6  # of each test net in a summary
 
 
 def summary(log: TrainingLog) -> dict[str, str]:
-    """Return, by name: state, iterations, the last losses and test outputs, the least test loss, iter/s."""
+    """Return by name: state, iterations, the last losses and test outputs, the minimum test loss, iter/s."""
     found = {"state": "unfinished" if log.state == RUNNING else log.state, "iterations": f"{log.iteration:,}"}
     if log.loss.last is not None:
         found["last loss"] = number(log.loss.last)
@@ -287,7 +287,7 @@ def summary(log: TrainingLog) -> dict[str, str]:
 
 
 def iterations_per_second(log: TrainingLog) -> float | None:
-    """Return the speed by the stamps of the log's lines, tests included."""
+    """Return the speed from the times in the log, including tests."""
     iterations, seconds = log.times.iterations, log.times.values
     if len(iterations) < 2 or seconds[-1] <= seconds[0]:
         return None
