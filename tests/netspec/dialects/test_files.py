@@ -32,7 +32,7 @@ layer { name: "times" type: "Times" bottom: "x" top: "y" times_param { factor: 5
 def example() -> str:
     """The file that the documentation shows."""
     shown = str(netspec.dialects.__doc__).split("pass ``--plugin doubling.py``::")[1]
-    lines = shown.split("``DECLARATIONS`` is one string")[0].splitlines()
+    lines = shown.split("``DECLARATIONS`` is a string")[0].splitlines()
     return "\n".join(line.removeprefix("    ") for line in lines)
 
 
