@@ -1,4 +1,4 @@
-"""Finds out which fork a layer belongs to, if several forks define its type, by what only one of them has."""
+"""Determines the fork of a layer whose type several forks define, from properties that only one of them has."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Fork:
     """One fork's definition of a layer type.
 
     ``fields`` are fields that only this fork has, in the layer (``norm_param``) or in one of its messages
-    (``bn_param.bn_mode``). ``shows`` checks for anything else that only this fork's layers have. ``numbers`` says what
-    the layer computes; it is "" if an earlier fork in the list computes the same.
+    (``bn_param.bn_mode``). ``shows`` checks for anything else that only this fork's layers have. ``numbers`` describes
+    what the layer computes; it is "" if an earlier fork in the list computes the same.
     """
 
     dialect: str
@@ -32,7 +32,7 @@ class Fork:
     shows: Callable[[Layer], bool] = never
 
     def is_shown_by(self, layer: Layer) -> bool:
-        """Return whether a layer has something that only this fork has."""
+        """Return whether a layer has a property that only this fork has."""
         return any(_has(layer, field) for field in self.fields) or self.shows(layer)
 
 
@@ -143,7 +143,7 @@ SIGNATURES = {
 
 
 def _shown_fork(layer: Layer) -> str:
-    """Return the dialect that defines this layer, or "" if the net does not show it. The last of several wins."""
+    """Return the dialect that the net shows for this layer, or "". The last of several wins."""
     signature = SIGNATURES[layer.type]
     if shown := [fork.dialect for fork in signature.forks if fork.is_shown_by(layer)]:
         return shown[-1]
@@ -159,12 +159,12 @@ def has_several(layer_type: str) -> bool:
 
 
 def is_loose(layer: Layer) -> bool:
-    """Return whether the blobs of a layer have other axes of size 1 in the files of some forks."""
+    """Return whether the blobs of a layer have different axes of size 1 in the files of some forks."""
     return layer.type in SIGNATURES and SIGNATURES[layer.type].loose
 
 
 def fork_of(layer: Layer) -> str:
-    """Return the dialect that defines this layer: the one it shows, or one that the net uses, or the default."""
+    """Return the dialect of this layer: the one it shows, or one that the net uses, or the default."""
     return _shown_fork(layer) or SIGNATURES[layer.type].forks[0].dialect
 
 

@@ -1,8 +1,8 @@
-"""Crop without crop_param: in some forks it aligns its bottoms, where Caffe cuts from the corner.
+"""Crop without crop_param, which aligns its bottoms in some forks, while Caffe crops from the corner.
 
-Pixel i of a convolution's top, of kernel k, stride s and pad p, lies at s i + (k - 1) / 2 - p of its bottom; of a
-deconvolution it is the other way round. HED's branch, and nets that follow it (OSVOS, early fcn-8s), cut where the
-pixels of both bottoms lie on each other.
+Pixel i of the top of a convolution with kernel k, stride s and pad p is at s i + (k - 1) / 2 - p in its bottom; for a
+deconvolution, it is the inverse. HED's branch, and nets that follow it (OSVOS, early fcn-8s), crop so that the
+pixels of both bottoms are aligned.
 Fork: s9xie/hed, src/caffe/layers/crop_layer.cpp. The rule became BVLC's python/caffe/coord_map.py.
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 from netspec.graph.plan import Plan
 from netspec.proto.schema import LayerParameter
 
-Line = tuple[Fraction, Fraction]  # (scale, shift): pixel i lies at scale i + shift
+Line = tuple[Fraction, Fraction]  # (scale, shift): pixel i is at scale i + shift
 SAME = (Fraction(1), Fraction(0))
 ELEMENTWISE = (
     "AbsVal",
@@ -55,10 +55,10 @@ EDGES = "; SigmoidCrossEntropyLoss is computed as Caffe's: HED's and RCF's, whic
 
 
 def align_crops(plan: Plan, dialects: Collection[str]) -> Iterator[str]:
-    """Give each Crop without crop_param the offsets of HED's branch, if the net is made for it; yield warnings.
+    """Set the offsets of each Crop without crop_param as in HED's branch, if the net is made for it; yield warnings.
 
-    It is if the dialect is named, or if the padding of a convolution before it exceeds its kernel, because only such a
-    Crop removes the surplus again.
+    It is if the dialect is named, or if a convolution before the Crop has more padding than its kernel, because only
+    such a Crop removes the surplus.
     """
     makers = {value: i for i, node in enumerate(plan.nodes) for value in node.tops}
     found: dict[str, list[int]] = {}
@@ -110,7 +110,7 @@ def _offsets(plan: Plan, makers: dict[int, int], crop: int) -> tuple[list[int], 
 
 
 def _ancestors(plan: Plan, makers: dict[int, int], value: int) -> dict[int, int]:
-    """Return the values from which a value comes, by first bottoms, and the layers that make them; -1 for an input."""
+    """Return the ancestors of a value, by first bottoms, and the layers that compute them; -1 for an input."""
     way: dict[int, int] = {}
     while value >= 0:
         maker = makers.get(value, -1)
@@ -121,7 +121,7 @@ def _ancestors(plan: Plan, makers: dict[int, int], value: int) -> dict[int, int]
 
 
 def _line_below(layer: LayerParameter, axis: int, line: Line) -> tuple[Line | None, bool]:
-    """Return where pixels that lie on a line of a layer's top lie on its bottom; whether it pads beyond its kernel."""
+    """Return the (scale, shift) of a layer's bottom from that of its top, and whether it pads beyond its kernel."""
     scale, shift = line
     if layer.type in ELEMENTWISE:
         return line, False

@@ -1,4 +1,4 @@
-"""Nets that find edges (HED, RCF): images with edge maps, and a loss that balances edges and background.
+"""Nets for edge detection (HED, RCF): images with edge maps, and a loss that balances edges and background.
 
 Forks: s9xie/hed (Xie and Tu, Holistically-Nested Edge Detection, ICCV 2015), yun-liu/rcf (Liu et al., Richer
 Convolutional Features for Edge Detection, CVPR 2017)
@@ -22,9 +22,9 @@ from netspec.layers.loss.losses import SigmoidCrossEntropyLoss
 
 
 class EdgeMaps(ImageData):
-    """Base of the two layers ImageLabelmapData: images and their edge maps, mirrored and cut alike.
+    """Base of the two layers ImageLabelmapData: images and edge maps, mirrored and cropped in the same way.
 
-    A list has lines ``image edges``; both are resized bilinearly where asked.
+    A list has lines ``image edges``; both can be resized bilinearly.
     """
 
     def edges(self, gray: Array) -> Array:
@@ -44,7 +44,7 @@ class EdgeMaps(ImageData):
         bare.CopyFrom(self.param.transform_param)
         for name in ("mean_file", "mean_value", "scale"):
             bare.ClearField(name)
-        as_images = Transformer(bare, self.phase, self.context.at, draws.seed, draws.stream)  # of the same draws
+        as_images = Transformer(bare, self.phase, self.context.at, draws.seed, draws.stream)  # the same random numbers
 
         def read(pair: Pair) -> tuple[Array, Array]:
             return read_image(root + pair.image, color, size), read_labels(root + pair.labels, size, nearest=False)
@@ -68,7 +68,7 @@ class Balanced(SigmoidCrossEntropyLoss):
     """Base of the two losses: the cross entropy of each image, balanced between edges and background.
 
     Edges are weighted by the share of background pixels, and background pixels by the share of edges. Labels other
-    than 1 and 0 do not count. The sum is divided by N only.
+    than 1 and 0 are ignored. The sum is divided by N only.
     """
 
     of_others: ClassVar[float]  # an additional weight of background pixels

@@ -1,4 +1,4 @@
-"""Images with label images: a list names both, line by line, and both are mirrored and cut alike.
+"""Images with label images, from a list of pairs; both are mirrored and cropped in the same way.
 
 Forks: alexgkendall/caffe-segnet, src/caffe/layers/dense_image_data_layer.cpp; s9xie/hed, yun-liu/rcf,
 src/caffe/layers/image_labelmap_data_layer.cpp
@@ -54,10 +54,10 @@ def read_labels(path: str, size: tuple[int, int] | None, nearest: bool) -> Array
 
 
 class PairSource:
-    """Batches of images and labels (N, 1, H', W'); ``cut`` changes both of a record alike, before ``transform``.
+    """Batches of images and labels (N, 1, H', W'); ``cut`` changes both in the same way before ``transform``.
 
     ``read(pair)`` returns the image (C, H, W) and its labels (1, H', W'), or raises ValueError. ``cut`` gets them and
-    the record's position. With a batch size of 1 each image may have its own size. Raises SpecError for images that
+    the record's position. With a batch size of 1, images can have different sizes. Raises SpecError for images that
     cannot be read or differ in size.
     """
 

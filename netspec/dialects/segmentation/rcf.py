@@ -1,4 +1,4 @@
-"""RCF: edges are 1 where more than half of all people marked them; what fewer marked does not count.
+"""RCF: edges are 1 if more than half of the annotators marked them; those that fewer marked are ignored.
 
 HED and RCF each change the meaning of Caffe's SigmoidCrossEntropyLoss, without a field that shows it.
 """
@@ -13,12 +13,12 @@ from netspec.dialects.segmentation.edges import Balanced, EdgeMaps
 from netspec.dialects.segmentation.pairs import Array
 from netspec.layers import register
 
-DECLARATIONS = ""  # no field shows that a file is for this fork: the dialect must be named
+DECLARATIONS = ""  # no field determines this fork, so the dialect must be named
 
 
 @register("ImageLabelmapData", "image_data_param", "transform_param", "data_param.prefetch")
 class ImageLabelmapData(EdgeMaps):
-    """Read images and their edge maps, named in a list of lines ``image edges``, mirrored and cut alike.
+    """Read images and edge maps from a list with lines ``image edges``, mirrored and cropped in the same way.
 
     top[0]  transformed images (batch_size, 3 or 1, H, W)
     top[1]  edges (batch_size, 1, H, W): 1 for gray values from 128, else gray / 255
@@ -33,9 +33,10 @@ class ImageLabelmapData(EdgeMaps):
 
 @replace("SigmoidCrossEntropyLoss", "loss_param")
 class BalancedLoss(Balanced):
-    """The cross entropy of sigmoid(x) and edges, weighed in each image: an edge by the share of all else.
+    """The cross entropy of sigmoid(x) and edges, balanced in each image: an edge is weighted by the share of the rest.
 
-    All else weighs 1.1 times the share of edges. What is neither 1 nor 0 does not count. The sum is divided by N.
+    The rest is weighted by 1.1 times the share of edges. Labels other than 1 and 0 are ignored. The sum is divided by
+    N.
 
     bottom[0]  x (N, ...)
     bottom[1]  edges, as many

@@ -1,4 +1,4 @@
-"""SegNet and ENet: images with a label for each pixel, and a loss that weighs classes."""
+"""SegNet and ENet: images with a label for each pixel, and a loss with class weights."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ GROUP = "dense_image_data_param"
 
 @register("DenseImageData", GROUP, "transform_param", "data_param.prefetch")
 class DenseImageData(ReadingLayer):
-    """Read images and label images named in a list, both resized, mirrored and cut alike, at random in both phases.
+    """Read images and label images from a list, resized, mirrored and cropped in the same way, randomly in both phases.
 
-    Labels are resized without mixing, to a size smaller by label_divide_factor, and are not changed otherwise. A list
-    has lines ``image labels``.
+    Labels are resized by nearest neighbor, to a size smaller by label_divide_factor, and are not changed otherwise. A
+    list has lines ``image labels``.
 
     top[0]  transformed images (batch_size, 3 or 1, H, W)
     top[1]  labels (batch_size, 1, H, W); smaller by label_divide_factor
@@ -113,7 +113,7 @@ class DenseImageData(ReadingLayer):
         return source
 
     def known_shape(self) -> Shape | None:
-        """Return the shape where the prototxt gives height and width."""
+        """Return the shape if the prototxt gives height and width."""
         p = value(self.param, GROUP)
         height, width = (p.crop_height, p.crop_width) if p.crop_height else (p.new_height, p.new_width)
         return (self.batch_size, 3 if p.is_color else 1, height, width) if height else None
@@ -132,9 +132,9 @@ class DenseImageData(ReadingLayer):
     where=lambda param: value(param.loss_param, "weight_by_label_freqs"),
 )
 class SoftmaxWithLoss(losses.SoftmaxWithLoss):
-    """Caffe's SoftmaxWithLoss; with weight_by_label_freqs each prediction's loss counts class_weighting[label] times.
+    """Caffe's SoftmaxWithLoss; with weight_by_label_freqs, each prediction is weighted by class_weighting[label].
 
-    The sum is divided by the number of predictions that count, not by their weights.
+    The sum is divided by the number of predictions that are not ignored, not by their weights.
 
     bottom[0]  scores (N, C, ...), C at softmax_param.axis
     bottom[1]  labels, one per prediction
@@ -167,7 +167,7 @@ class SoftmaxWithLoss(losses.SoftmaxWithLoss):
 
 
 class _Dice(torch.autograd.Function):
-    """1 less the mean of r = (2 x.y + 1) / (x.x + y.y + 1); the gradient is that of the sum, as in the fork."""
+    """1 minus the mean of r = (2 x.y + 1) / (x.x + y.y + 1); the gradient is that of the sum, as in the fork."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
@@ -185,10 +185,10 @@ class _Dice(torch.autograd.Function):
 
 @register("DiceCoefLoss")
 class DiceCoefLoss(Loss):
-    """1 less the mean, over the items, of (2 x.y + 1) / (x.x + y.y + 1).
+    """1 minus the mean over the items of (2 x.y + 1) / (x.x + y.y + 1).
 
-    The gradient is not divided by the number of items. Other forks' have other numbers: over the whole batch, with
-    sums in place of squares, or with dice_coef_loss_param, which is not known here.
+    The gradient is not divided by the number of items. Other forks compute other values: over the whole batch, with
+    sums instead of squares, or with dice_coef_loss_param, which is not supported.
 
     bottom[0]  x (N, ...)
     bottom[1]  y, as many
@@ -200,7 +200,7 @@ class DiceCoefLoss(Loss):
     not_exported = "it is for training"
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape; the bottoms must have as many numbers."""
+        """Return the shape of the scalar top; the bottoms must have equal numbers of values."""
         x, y = (torch.Size(shape) for shape in bottom_shapes)
         if x[:1] != y[:1] or x.numel() != y.numel():
             raise self.error(

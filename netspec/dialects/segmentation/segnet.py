@@ -1,4 +1,4 @@
-"""Layers of nets that segment: PSPNet's and SegNet's BN, SegNet's Upsample."""
+"""Layers of segmentation nets: PSPNet's and SegNet's BN, SegNet's Upsample."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SEGNET_EPS = 1e-9  # added to the variance by SegNet's BN
 
 
 class _Unpool(torch.autograd.Function):
-    """Bring each value to the pixel that its mask names; the last one stays, every one gets the pixel's gradient."""
+    """Copy each value to the pixel in its mask; the last one wins, but every one gets the gradient of the pixel."""
 
     @staticmethod
     def forward(ctx: Any, values: torch.Tensor, mask: torch.Tensor, pixels: int) -> torch.Tensor:
@@ -40,15 +40,15 @@ class _Unpool(torch.autograd.Function):
 
 
 class Upsample(Layer):
-    """Enlarge maps: by a pooling's mask, each value to where it came from (SegNet), or by repeating each pixel (YOLO).
+    """Enlarge maps: by a pooling mask, which gives the pixel of each value (SegNet), or by repeating pixels (YOLO).
 
-    With a mask the new size is upsample_h and upsample_w, or ``scale`` times the map's (scale_h and scale_w, 2 unless
-    given), less 1 with pad_out_h and pad_out_w. Of several values for one pixel the last stays; the others' gradient is
-    the pixel's all the same.
+    With a mask, the new size is upsample_h and upsample_w, or ``scale`` times the map's (scale_h and scale_w, default
+    2), minus 1 with pad_out_h and pad_out_w. If several values have the same pixel, the last one wins, but all of them
+    get the gradient of the pixel.
 
     bottom[0]  (N, C, H, W)
     bottom[1]  optional: the mask, a Pooling layer's second top, of the same shape; gets no gradient
-    top[0]     (N, C, H', W'); without a mask H' = scale H (1 unless given)
+    top[0]     (N, C, H', W'); without a mask, H' = scale H (default 1)
     Fork: alexgkendall/caffe-segnet and eric612/MobileNet-YOLO, src/caffe/layers/upsample_layer.cpp
     """
 
@@ -128,21 +128,21 @@ class Upsample(Layer):
 
 
 class BN(NotLearned):
-    """Batch normalization and a learned slope and bias in one; PSPNet's, or SegNet's where its fields are given.
+    """Batch normalization with a learnable slope and bias, as in PSPNet, or as in SegNet if its fields are given.
 
-    PSPNet's subtracts the batch's mean and divides by sqrt(variance + eps) in training, and by moving averages in
-    testing or where ``frozen``; these move by 1 - momentum toward the batch's mean and biased variance. SegNet's
-    (scale_filler, shift_filler, bn_mode) does so by the batch in both phases; with bn_mode INFERENCE, for which its
+    PSPNet's subtracts the batch's mean and divides by sqrt(variance + eps) in training, and uses moving averages in
+    testing or if ``frozen``; these move by 1 - momentum toward the batch's mean and biased variance. SegNet's
+    (scale_filler, shift_filler, bn_mode) uses the batch in both phases. With bn_mode INFERENCE, for which its
     weights were changed, it has only slope and bias.
 
     bottom[0]  (N, C, H, W); up to four axes
     top[0]     the same shape
-    top[1]     optional, SegNet's only: the batch's mean (1, C, 1, 1); as top[2] it brings no gradient
+    top[1]     optional, SegNet's only: the batch's mean (1, C, 1, 1); the gradients of top[1] and top[2] are ignored
     top[2]     optional, SegNet's only: the batch's biased variance (1, C, 1, 1)
     blobs[0]   slopes (1, C, 1, 1), 0 unless a filler is given
     blobs[1]   biases (1, C, 1, 1)
     blobs[2]   moving mean     (1, C, 1, 1)                            PSPNet's only; not learned
-    blobs[3]   moving variance (1, C, 1, 1), in happynear's 1 / std    PSPNet's only; not learned
+    blobs[3]   moving variance (1, C, 1, 1), or 1 / std in happynear's    PSPNet's only; not learned
     Fork: hszhao/PSPNet, happynear/caffe-windows and alexgkendall/caffe-segnet, src/caffe/layers/bn_layer.cpp
     """
 
@@ -181,7 +181,7 @@ class BN(NotLearned):
         return [*as_before(self, bottom_shapes, self.channels), *shown]
 
     def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
-        """Return the normalized values, and what else is shown; in training also move the averages."""
+        """Return the normalized values and the other tops; in training, also update the averages."""
         slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (0, 1))
         if not self.by_batch and not self.moving:
             return data * slope + bias
@@ -237,6 +237,6 @@ class BN(NotLearned):
 
 
 def unpool(x, mask, size):
-    """Bring each value to the pixel of a larger map that the mask names; the others are 0."""
+    """Copy each value to the pixel of a larger map that the mask gives; the others are 0."""
     empty = x.new_zeros(*x.shape[:2], size[0] * size[1])
     return empty.scatter(2, mask.flatten(2).long(), x.flatten(2)).unflatten(2, size)

@@ -1,1 +1,1 @@
-"""SSD: detection by boxes over many maps (weiliu89/caffe, branch ssd)."""
+"""SSD, the single shot detector (weiliu89/caffe, branch ssd)."""

@@ -1,4 +1,4 @@
-"""SSD's AnnotatedData: images with boxes from a database of AnnotatedDatum, varied as its settings say.
+"""SSD's AnnotatedData: images with boxes from a database of AnnotatedDatum, with data augmentation.
 
 Fork: weiliu89/caffe (ssd), src/caffe/layers/annotated_data_layer.cpp
 """
@@ -24,17 +24,17 @@ from netspec.proto.schema import has, message, value
 
 Array = np.ndarray
 
-PERIOD = 10  # iterations from one draw of a resize_param to the next
-MOST_BOXES = 300  # of an image, with yolo_data_type: 1
+PERIOD = 10  # iterations between two random choices of a resize_param
+MOST_BOXES = 300  # maximum number of boxes in an image with yolo_data_type: 1
 
 
 class AnnotatedSource:
     """The records of a database of AnnotatedDatum, made into batches.
 
-    The variations of a record follow from ``draws`` and the record's position alone. Of several ``augments`` one is
-    drawn for each PERIOD iterations, by the prob of their resize_param. ``settings`` is the annotated_data_param: with
-    anno_type records count as having boxes, whatever they say; with yolo_data_type 1 each image's boxes are the rows of
-    YOLO instead, class from 0, x, y, width, height. Raises SpecError for a record that cannot be read.
+    The augmentation of a record depends only on ``draws`` and the record's position. One of several ``augments`` is
+    drawn for PERIOD iterations, with the prob of its resize_param. ``settings`` is the annotated_data_param. With
+    anno_type, all records are treated as having boxes; with yolo_data_type 1, each image's boxes are the rows of
+    YOLO: class from 0, x, y, width, height. Raises SpecError for a record that cannot be read.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class AnnotatedSource:
         return np.stack(images), (found if len(found) else nothing)[None, None]
 
     def _chosen(self, iteration: int) -> int:
-        """Return the number of the augmenter of an iteration."""
+        """Return the index of the augmenter for an iteration."""
         if len(self._augments) == 1:
             return 0
         draw = Random(derived(self._draws.seed, f"{self._draws.stream}/resize/{iteration // PERIOD}"))
@@ -144,16 +144,16 @@ class AnnotatedSource:
 class AnnotatedData(Data):
     """Read images with boxes from a database of AnnotatedDatum, in the order of its keys, over and over.
 
-    Each image is varied in this order: colors (distort_param), a larger canvas (expand_param), a window that one of the
-    batch samplers draws, a new size (resize_param), crop, mirror, mean, scale. Boxes are cut off at the window's sides;
-    emit_constraint says which stay.
+    Each image is augmented in this order: colors (distort_param), a larger canvas (expand_param), a window that one of
+    the batch samplers draws, a new size (resize_param), crop, mirror, mean, scale. Boxes are clipped to the window;
+    emit_constraint determines which are kept.
 
     top[0]  images (batch_size, C, H, W)
     top[1]  a row for each box (1, 1, n, 8): image, label, instance, xmin, ymin, xmax, ymax, difficult; corners in
-            parts of the image; one row of -1 where there is none. Records without a type give their labels
+            relative to the image; one row of -1 if there is none. Records without a type have labels instead
             (batch_size, 1, 1, 1). May be left out. With yolo_data_type: 1 (batch_size, 1, 300, 5): class from 0, x, y,
             width, height; zeros after the last box.
-    Fork: src/caffe/layers/annotated_data_layer.cpp; of several resize_param one is drawn by prob for 10 iterations
+    Fork: src/caffe/layers/annotated_data_layer.cpp; one of several resize_param is drawn by prob for 10 iterations
     each: eric612/MobileNet-YOLO
     """
 
@@ -172,7 +172,7 @@ class AnnotatedData(Data):
 
     @property
     def _jitter(self) -> float:
-        """How much of a side a window may leave out at most; in YOLO's manner unless it is given."""
+        """The maximum share of a side that a window may leave out; the default is YOLO's."""
         settings = value(self.param, "annotated_data_param")
         given = settings.HasField("yolo_data_jitter") or settings.yolo_data_type == 1
         return float(settings.yolo_data_jitter) if given else 0.0
@@ -201,13 +201,13 @@ class AnnotatedData(Data):
         return source
 
     def known_shape(self) -> Shape | None:
-        """Return the shape where the prototxt says size and channels."""
+        """Return the shape if the prototxt gives size and channels."""
         p = self.param.transform_param
         size = fixed_size(p)
         channels = 3 if p.force_color else 1 if p.force_gray else len(p.mean_value)
         return (self.batch_size, channels, *size) if size and (channels > 1 or p.force_gray) else None
 
     def second_shape(self, data: Shape) -> Shape:
-        """Return the shape of a single box, or of an image's boxes as YOLO has them."""
+        """Return the shape of a single box, or of an image's boxes in YOLO's format."""
         centered = value(self.param, "annotated_data_param").yolo_data_type == 1
         return (self.batch_size, 1, MOST_BOXES, 5) if centered else (1, 1, 1, COLUMNS + 1)

@@ -1,7 +1,7 @@
-"""How SSD's data layer varies an image and its boxes: colors, a larger canvas, a window, another size, a mirror.
+"""SSD's data augmentation of images and boxes: colors, a larger canvas, a window, another size, a mirror.
 
 Images are uint8 (H, W, C), blue first. Boxes are rows (label, instance, xmin, ymin, xmax, ymax, difficult), float32;
-the corners are in parts of the image. The fork makes a JPEG of the image after each step; here no step loses anything.
+the corners are relative to the image. The fork encodes the image as JPEG after each step; here all steps are lossless.
 Fork: weiliu89/caffe (ssd), src/caffe/data_transformer.cpp, src/caffe/util/sampler.cpp, im_transforms.cpp
 """
 
@@ -37,11 +37,11 @@ INTERPOLATION = {
     5: cv2.INTER_LANCZOS4,
 }
 CENTER = 0
-ABOUT = 0.01  # how far the probabilities of several resize_param may be from 1 together
+ABOUT = 0.01  # maximum difference from 1 of the sum of the probabilities of several resize_param
 
 
 def wrong_settings(transform: Any, samplers: Sequence[Any], at: Callable[..., Where]) -> Iterator[SpecError]:
-    """Yield what is wrong with a transform_param and with batch samplers, whatever the images are."""
+    """Yield the errors in a transform_param and in batch samplers that do not depend on the images."""
 
     def fault(message: str, *path: str | int) -> SpecError:
         return SpecError(message, at(*path))
@@ -77,7 +77,7 @@ def wrong_settings(transform: Any, samplers: Sequence[Any], at: Callable[..., Wh
 
 
 def fixed_size(transform: Any) -> tuple[int, int] | None:
-    """Return height and width of all images, where a transform_param alone says them."""
+    """Return the height and width of all images, if the transform_param determines them."""
     resizes, crop = value(transform, "resize_param"), (value(transform, "crop_h"), value(transform, "crop_w"))
     if transform.crop_size or all(crop):
         return (transform.crop_size,) * 2 if transform.crop_size else crop
@@ -89,7 +89,7 @@ def fixed_size(transform: Any) -> tuple[int, int] | None:
 class Augmenter:
     """Applies a ``transform_param`` with SSD's fields, after the batch samplers. ``at(*path)`` is a field's place.
 
-    ``resize`` is its resize_param, or one of them; None for none. With ``jitter`` one window is drawn without the
+    ``resize`` is its resize_param, or one of them, or None. With ``jitter``, one window is drawn without the
     samplers. Raises SpecError for a mean file that cannot be read.
     """
 
@@ -120,7 +120,7 @@ class Augmenter:
         self.resize, self._emit = resize, given("emit_constraint")
 
     def __call__(self, image: Array, boxes: Array, draw: Random) -> tuple[Array, Array]:
-        """Return an image as float32 (C, H', W') and the boxes that belong to it; all chance comes from ``draw``."""
+        """Return an image as float32 (C, H', W') and its boxes; all random numbers come from ``draw``."""
         if self._distort is not None:
             image = distorted(image, self._distort, draw)
         if self._expand is not None and draw.random() <= self._expand.prob:
@@ -131,7 +131,7 @@ class Augmenter:
         return self.transformed(image, boxes, draw)
 
     def size(self, image: Shape) -> tuple[int, int]:
-        """Return height and width that an image of a shape (H, W, ...) gets, before and without the samplers."""
+        """Return the height and width of an image of shape (H, W, ...) after resizing, without the samplers."""
         if all(self.crop):
             return self.crop
         return self._resized_to(*image[:2]) if self.resize is not None else (image[0], image[1])
@@ -142,7 +142,7 @@ class Augmenter:
     # Windows
 
     def _expanded(self, image: Array, boxes: Array, draw: Random) -> tuple[Array, Array]:
-        """Put the image somewhere on a larger canvas of the mean's color."""
+        """Put the image at a random position on a larger canvas with the color of the mean."""
         ratio = draw.uniform(1, self._expand.max_expand_ratio)
         height, width = image.shape[:2]
         tall, wide = int(height * ratio), int(width * ratio)
@@ -173,7 +173,7 @@ class Augmenter:
                     yield window
 
     def _jittered(self, draw: Random) -> Array:
-        """Return a window of YOLO's: the whole image, or in 8 of 10 cases sides shorter by up to half or all of jitter.
+        """Return YOLO's window: the whole image or, in 8 of 10 cases, sides shortened by up to jitter or half of it.
 
         Images that are padded to a size keep their proportions.
         """
@@ -192,7 +192,7 @@ class Augmenter:
         return image[y : y + rows, x : x + columns], self._projected(boxes, window)
 
     def _projected(self, boxes: Array, window: Array) -> Array:
-        """Return the boxes that belong to a window, relative to it and cut off at its sides."""
+        """Return the boxes of a window, relative to it and clipped to it."""
         corners = boxes[:, CORNERS]
         boxes = boxes[self._belong(corners, window)]
         origin, extent = np.tile(window[:2], 2), np.tile(window[2:] - window[:2], 2)
@@ -212,7 +212,7 @@ class Augmenter:
     # Size, window, mirror, mean, scale
 
     def transformed(self, image: Array, boxes: Array, draw: Random) -> tuple[Array, Array]:
-        """Do only the second half: size, window, mirror, mean and scale."""
+        """Apply only the second half: size, crop, mirror, mean and scale."""
         mirror = self._mirror and draw.randrange(2) == 1
         old = image.shape[:2]
         if self.resize is not None:
@@ -244,7 +244,7 @@ class Augmenter:
         return (pixels.astype(np.float32) - mean) * self._scale
 
     def _resized_to(self, height: int, width: int) -> tuple[int, int]:
-        """Return the size that an image of a size gets, padding included."""
+        """Return the size of an image after resizing, including padding."""
         if self.resize.resize_mode == FIT_SMALL_SIZE:
             return _fitted(height, width, self.resize, inside=False)
         return self.resize.height, self.resize.width
@@ -270,7 +270,7 @@ class Augmenter:
         return padded.reshape(param.height, param.width, channels)
 
     def _boxes_resized(self, boxes: Array, height: int, width: int) -> Array:
-        """Return the boxes of an image of an old size in parts of the new one."""
+        """Return the boxes of an image relative to its new size."""
         boxes, param = boxes.copy(), self.resize
         corners = boxes[:, CORNERS]
         corners[:, :2], corners[:, 2:] = corners[:, :2].clip(min=0), corners[:, 2:].clip(max=1)
@@ -284,7 +284,7 @@ class Augmenter:
         return boxes
 
     def _extrapolate(self, boxes: Array, old: tuple[int, int], window: Array) -> None:
-        """Count boxes of FIT_SMALL_SIZE in parts of ``width_scale`` and ``height_scale``, where these are given."""
+        """Make boxes of FIT_SMALL_SIZE relative to ``width_scale`` and ``height_scale``, if these are given."""
         param = self.resize
         if param.resize_mode == FIT_SMALL_SIZE and param.height_scale and param.width_scale:
             height, width = _fitted(*old, param, inside=False, whole=False)
@@ -294,7 +294,7 @@ class Augmenter:
 
 
 def _fitted(height: int, width: int, param: Any, inside: bool, whole: bool = True) -> Any:
-    """Return the size (rows, columns) of the same proportions that just fits into the given one, or around it."""
+    """Return the size (rows, columns) with the same proportions that fits into the given one, or around it."""
     aspect = width / height
     if (aspect > param.width / param.height) == inside:
         rows, columns = param.width / aspect, float(param.width)
@@ -304,7 +304,7 @@ def _fitted(height: int, width: int, param: Any, inside: bool, whole: bool = Tru
 
 
 def drawn_window(sampler: Any, draw: Random) -> Array:
-    """Return a random window (xmin, ymin, xmax, ymax) of the scales and aspect ratios of a Sampler."""
+    """Return a random window (xmin, ymin, xmax, ymax) with the scales and aspect ratios of a Sampler."""
     scale = draw.uniform(sampler.min_scale, sampler.max_scale)
     ratio = draw.uniform(sampler.min_aspect_ratio, sampler.max_aspect_ratio)
     ratio = min(max(ratio, scale**2), scale**-2)
@@ -316,7 +316,7 @@ def drawn_window(sampler: Any, draw: Random) -> Array:
 def suits(window: Array, boxes: Array, constraint: Any) -> bool:
     """Return whether a window meets a SampleConstraint with one of the boxes (n, 4).
 
-    Of several kinds of constraint the first counts, as in the fork.
+    If there are several kinds of constraints, only the first is used, as in the fork.
     """
     measures = {
         "jaccard_overlap": lambda: overlaps(window, boxes),
@@ -334,7 +334,7 @@ def suits(window: Array, boxes: Array, constraint: Any) -> bool:
 
 
 def distorted(image: Array, param: Any, draw: Random) -> Array:
-    """Return an image with other colors, as a DistortionParameter says."""
+    """Return an image with colors changed according to a DistortionParameter."""
     order = ("brightness", "contrast", "saturation", "hue")
     if draw.random() <= 0.5:
         order = ("brightness", "saturation", "hue", "contrast")
@@ -360,7 +360,7 @@ _COLORS: dict[str, Callable[[Array, float], Array]] = {
 
 
 def _in_hsv(image: Array, channel: int, factor: float, shift: float) -> Array:
-    """Return an image with one channel of its HSV form changed; gray images have none."""
+    """Return an image with one HSV channel changed; gray images have none."""
     if image.shape[2] != 3:
         return image
     hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)

@@ -1,4 +1,4 @@
-"""SSD's DetectionOutput: boxes and scores to detections, here and in exported nets."""
+"""SSD's DetectionOutput, which converts boxes and scores to detections, also in exported nets."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from netspec.proto.schema import value
 
 
 class DetectionOutput(Layer):
-    """Decode the predicted boxes, and of each class keep those of high confidence that overlap none of a higher one.
+    """Decode the predicted boxes, and apply non-maximum suppression to each class.
 
-    With five bottoms it is RefineDet's: the priors are refined first, and those that show no object with a confidence
-    of ``objectness_score`` are left out.
+    With five bottoms it is RefineDet's: the priors are first refined, and priors whose confidence of an object is below
+    ``objectness_score`` are left out.
 
-    bottom[0]  predicted boxes (N, 4 P) for P priors; (N, 4 P num_classes) where share_location is false
+    bottom[0]  predicted boxes (N, 4 P) for P priors; (N, 4 P num_classes) if share_location is false
     bottom[1]  confidences (N, P num_classes)
     bottom[2]  priors and variances (1, 2, 4 P)
-    bottom[3]  optional, not used: the images, which the fork draws the boxes into; RefineDet's: confidences (N, 2 P) of
-               no object and of one
-    bottom[4]  RefineDet's: the boxes (N, 4 P) that the priors are refined by
+    bottom[3]  optional: the images, in which the fork draws the boxes; not used. RefineDet's: confidences (N, 2 P) of
+               no object and of an object
+    bottom[4]  RefineDet's: the boxes (N, 4 P) that refine the priors
     top[0]     (1, 1, D, 7): image, label, confidence, xmin, ymin, xmax, ymax of D detections; D is 1 before the first
-               pass. Where nothing is found, a row (image, -1, -1, ...) for each image. Brings no gradient.
+               pass. If nothing is found, a row (image, -1, -1, ...) for each image. Its gradient is ignored.
     Fork: src/caffe/layers/detection_output_layer.cpp, also of sfzhang15/RefineDet
     """
 
@@ -64,7 +64,7 @@ class DetectionOutput(Layer):
         self.kinds = 1 if param.share_location else param.num_classes
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of one detection; the predictions must suit the priors."""
+        """Return the shape of one detection; the predictions must match the priors."""
         param = value(self.param, "detection_output_param")
         self.priors = check_predictions(self, bottom_shapes, self.kinds, param.num_classes)
         for i, each in ((3, 2), (4, 4)) if len(bottom_shapes) == 5 else ():
@@ -91,7 +91,7 @@ class DetectionOutput(Layer):
         return detections(rows, loc)
 
     def _detect(self, image: int, boxes: list[Array], scores: Array) -> Array:
-        """Return the detections of one image, by label, the most confident first: (d, 7)."""
+        """Return the detections of one image, by label and decreasing confidence: (d, 7)."""
         param = value(self.param, "detection_output_param")
         nms, rows = param.nms_param, [np.zeros((0, 7), np.float32)]
         for label in range(param.num_classes):
@@ -113,7 +113,7 @@ class DetectionOutput(Layer):
         return found
 
     def _exported(self, target: str, bottoms: Sequence[str]) -> Any:
-        """Return the parameters for an exported net; refuse what no target has."""
+        """Return the parameters for an exported net; raise SpecError for unsupported ones."""
         param = value(self.param, "detection_output_param")
         if param.nms_param.eta < 1:
             raise refusal(self, target, "its non-maximum suppression has a fixed threshold: eta must be 1")
@@ -137,7 +137,7 @@ class DetectionOutput(Layer):
         least = graph.constant([param.confidence_threshold]) if param.HasField("confidence_threshold") else lowest
         overlap = graph.constant([min(nms.nms_threshold, 1.0)])
         found = graph.node("NonMaxSuppression", boxes, candidates, every, overlap, least)
-        # One more row that is not a detection, so that there is always one: OpenCV 5.0 dies of empty tensors.
+        # Add a row that is not a detection, since OpenCV 5.0 crashes on empty tensors.
         found = graph.node("Concat", found, graph.constant([[0, 0, 0]]), axis=0)
         if param.keep_top_k > -1:
             found = self._onnx_best(graph, bottoms[0], scores, found, param.keep_top_k)
@@ -146,7 +146,7 @@ class DetectionOutput(Layer):
     def _onnx_boxes_and_scores(
         self, graph: OnnxGraph, bottoms: Sequence[str], classes: Sequence[int]
     ) -> tuple[str, str]:
-        """Write boxes (N, P, 4) and scores (N, classes, P); where each class has boxes of its own (N classes, 1, P)."""
+        """Write boxes (N, P, 4) and scores (N, classes, P), or (N classes, 1, P) if each class has its own boxes."""
         param = value(self.param, "detection_output_param")
         loc, conf, prior = bottoms[:3]
         codes = graph.node("Transpose", graph.reshape(loc, [0, -1, self.kinds, 4]), perm=[0, 2, 1, 3])
@@ -168,9 +168,9 @@ class DetectionOutput(Layer):
 
     @staticmethod
     def _onnx_best(graph: OnnxGraph, loc: str, scores: str, found: str, most: int) -> str:
-        """Write which of the detections (D + 1, 3) are among the ``most`` confident of their image, in their order.
+        """Write which of the detections (D + 1, 3) are among the ``most`` confident of their image, in order.
 
-        The last row stays whatever it is.
+        The last row is always kept.
         """
         shape = graph.shape_of(scores)
         lowest = graph.constant(float(np.finfo(np.float32).min))
@@ -196,7 +196,7 @@ class DetectionOutput(Layer):
     def _onnx_rows(
         self, graph: OnnxGraph, loc: str, boxes: str, scores: str, found: str, classes: Sequence[int]
     ) -> str:
-        """Write the top: a row for each detection (item, class, box) but the last; without any, one for each image."""
+        """Write the top: a row for each detection (item, class, box) except the last; without any, one per image."""
         thirds = graph.constant([1, 1, 1])
         item, column, box = graph.nodes("Split", found, thirds, outputs=3, axis=1)
         corners = graph.node("GatherND", boxes, graph.node("Concat", item, box, axis=1))
@@ -239,7 +239,7 @@ class DetectionOutput(Layer):
         return code.call(template, **options)
 
 
-# Functions that are copied into exported source, where each setting is written only if it is not the usual one.
+# These functions are copied into exported source code, in which only unusual settings are written.
 
 
 def decode_boxes(codes, priors, variances):

@@ -1,4 +1,4 @@
-"""SSD's DetectionEvaluate, and the mean average precision of what it finds.
+"""SSD's DetectionEvaluate, and the mean average precision of detections.
 
 Fork: weiliu89/caffe (ssd), src/caffe/layers/detection_evaluate_layer.cpp; Solver::TestDetection (src/caffe/solver.cpp),
 ComputeAP (src/caffe/util/bbox_util.cpp)
@@ -27,10 +27,10 @@ INTEGRAL = "Integral"
 
 
 class DetectionEvaluate(Layer):
-    """Say of each detection whether it is right: it overlaps a box of its label enough that no better one took.
+    """Judge each detection: it is right if it overlaps a box of its label enough that no better detection matches.
 
-    A detection on a difficult box counts neither as right nor as wrong, unless evaluate_difficult_gt is set. In a test
-    the rows of all batches together give the mean average precision: the one number that is shown for this top.
+    A detection on a difficult box is neither right nor wrong, unless evaluate_difficult_gt is set. In a test,
+    the rows of all batches together give the mean average precision, the only number shown for this top.
 
     bottom[0]  detections (1, 1, d, 7), DetectionOutput's
     bottom[1]  true boxes (1, 1, g, 8), AnnotatedData's
@@ -43,7 +43,7 @@ class DetectionEvaluate(Layer):
     label_bottoms = frozenset({0, 1})
     counted_axis = 2
     not_exported = "it compares with true boxes"
-    remembers = True  # which image comes next
+    remembers = True  # index of the next image
     solver_reads = frozenset({"eval_type", "ap_version", "show_per_class_result"})
 
     def setup(self) -> None:
@@ -60,7 +60,7 @@ class DetectionEvaluate(Layer):
         self._image = 0
 
     def _read_sizes(self, file: str) -> Array:
-        """Return width and height of each image (n, 2), from lines of name, height and width."""
+        """Return the width and height of each image (n, 2), from lines of name, height and width."""
         try:
             rows = [line.split() for line in Path(file).read_text().splitlines() if line.strip()]
         except (OSError, UnicodeDecodeError) as fault:
@@ -108,7 +108,7 @@ class DetectionEvaluate(Layer):
         return top
 
     def _judged(self, found: Array, true: Array, param: Any) -> Iterator[tuple[float, ...]]:
-        """Yield the rows of detections of one label in one image, the most confident first."""
+        """Yield the rows of detections of one label in one image, by decreasing confidence."""
         found = found[highest(found[:, CONFIDENCE], len(found))]
         table = self._overlaps(found[:, 3:7], true[:, 3:7])
         taken = set[int]()
@@ -123,7 +123,7 @@ class DetectionEvaluate(Layer):
             yield (row[IMAGE], row[LABEL], row[CONFIDENCE], right, wrong)
 
     def _overlaps(self, found: Array, true: Array) -> Array:
-        """Return the overlap of each detection with each true box: (d, g); in whole pixels where sizes are known."""
+        """Return the overlap of each detection with each true box: (d, g); in integer pixels if sizes are known."""
         if self._sizes is None:
             return overlaps(found[:, None], true[None])
         scale = np.tile(self._sizes[self._image % len(self._sizes)], 2)
@@ -131,7 +131,7 @@ class DetectionEvaluate(Layer):
         return overlaps(found.clip(0, 1)[:, None] * scale + pixel, true[None] * scale + pixel)
 
     def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
-        """Return the mean average precision over all batches; ``ap_version`` of the solver says which."""
+        """Return the mean average precision over all batches, in the version of the solver's ``ap_version``."""
         rows = np.concatenate([as_array(top).reshape(-1, 5) for top in tops])
         version = value(solver, "ap_version") if solver is not None else INTEGRAL
         counts, found = rows[rows[:, 0] == NO_IMAGE], rows[rows[:, 0] != NO_IMAGE]
@@ -159,14 +159,14 @@ def average_precision(found: Array, true: float, version: str = INTEGRAL) -> flo
         best = [precision[recall >= k / 10].max(initial=0) for k in range(11)]
         return _sum([share / np.float32(11) for share in reversed(best)])
     if version == "MaxIntegral":
-        # The fork begins at the end, and sums up in that order.
+        # The fork starts at the end, and sums in that order.
         precision, steps = np.maximum.accumulate(precision[::-1]), np.diff(recall, prepend=np.float32(0))[::-1]
         return _sum(steps * precision)
     return _sum(np.diff(recall, prepend=np.float32(0)) * precision)
 
 
 def _sum(terms: Iterable[np.float32]) -> float:
-    """Return the sum in float32, one term after the other, without the rounding beyond 1."""
+    """Return the sum in float32, one term after the other, limited to 1."""
     total = np.float32(0)
     for term in terms:
         total += term

@@ -1,4 +1,4 @@
-"""SSD's MultiBoxLoss: which prior boxes are trained, the matched ones and the hardest background, and on what.
+"""SSD's MultiBoxLoss: the prior boxes to train (matched ones and the hardest background), and their targets.
 
 n images have p priors each; boxes are predicted in k kinds, one for all classes or one per class.
 Fork: weiliu89/caffe (ssd), src/caffe/util/bbox_util.cpp: FindMatches, MineHardExamples, EncodeLocPrediction
@@ -52,7 +52,7 @@ class Truth:
 def read_truth(rows: Array, images: int, use_difficult: bool) -> list[Truth]:
     """Return the true boxes by image, from rows (image, label, instance, xmin, ymin, xmax, ymax, difficult)."""
     rows = rows if use_difficult else rows[rows[:, 7] == 0]
-    number = rows[:, 0].astype(int)  # -1: a row that holds the place of none
+    number = rows[:, 0].astype(int)  # -1: a placeholder row
     found = [rows[number == i] for i in range(images)]
     return [Truth(of_image[:, 3:7], of_image[:, 1].astype(int)) for of_image in found]
 
@@ -60,7 +60,7 @@ def read_truth(rows: Array, images: int, use_difficult: bool) -> list[Truth]:
 def find_matches(
     param: Any, truth: list[Truth], priors: Array, kinds: int, decoded: Callable[[int, int], Array]
 ) -> tuple[Array, Array]:
-    """Match the boxes of each image and kind with its true ones: as :func:`match`, but (n, k, p).
+    """Match the boxes of each image and kind with its true ones, like :func:`match`, but (n, k, p).
 
     The boxes are the priors (p, 4) or, unless use_prior_for_matching, the predictions: ``decoded(image, kind)``.
     """
@@ -92,12 +92,12 @@ def find_matches(
 def mine(
     param: Any, truth: list[Truth], found: Array, best: Array, losses: Array, boxes: Callable[[int], Array]
 ) -> tuple[Array, Array]:
-    """Return the matches (n, p) that are kept, and which priors (n, p) are trained as background.
+    """Return the matches (n, p) to keep, and which priors (n, p) to train as background.
 
-    MAX_NEGATIVE keeps all matches, and neg_pos_ratio times as many other priors, those of the greatest loss.
-    HARD_EXAMPLE keeps the sample_size priors of the greatest loss, matched or not. With an nms_param, priors are first
-    removed if their ``boxes(image)`` overlap one of greater loss; without its top_k none is left, as in the fork. An
-    image without a true box is not used.
+    MAX_NEGATIVE keeps all matches, and neg_pos_ratio times as many other priors, those with the largest loss.
+    HARD_EXAMPLE keeps the sample_size priors with the largest loss, matched or not. With an nms_param, priors are first
+    removed if their ``boxes(image)`` overlap one with a larger loss; without its top_k, none is left, as in the fork.
+    An image without a true box is not used.
     """
     kept, negative = found.copy(), np.zeros(found.shape, bool)
     for i in range(len(found)):
@@ -124,13 +124,13 @@ def mine(
 
 
 class MultiBoxLoss(Layer):
-    """The loss of predicted boxes and confidences: priors are matched with the true boxes, hard ones chosen.
+    """The loss of predicted boxes and confidences, with matching of priors and hard negative mining.
 
-    The sum over the matched priors of the boxes' loss (smooth L1 or L2 against the true box, encoded), times
+    The sum over the matched priors of the boxes' loss (smooth L1 or L2 to the encoded true box), times
     loc_weight, and over these and the chosen background of the confidences' loss (softmax or logistic); both divided by
-    the number of matches (loss_param; a part whose propagate_down is false is left out).
+    the number of matches (loss_param). A part whose propagate_down is false is left out.
 
-    bottom[0]  predicted boxes (N, 4 P) for P priors; (N, 4 P num_classes) where share_location is false
+    bottom[0]  predicted boxes (N, 4 P) for P priors; (N, 4 P num_classes) if share_location is false
     bottom[1]  confidences (N, P num_classes)
     bottom[2]  priors and variances (1, 2, 4 P)
     bottom[3]  true boxes, rows of 8: image in the batch (-1: none), label, instance, xmin, ymin, xmax, ymax, difficult
@@ -144,7 +144,7 @@ class MultiBoxLoss(Layer):
     label_bottoms = frozenset({2, 3})
 
     def setup(self) -> None:
-        """Check what the parameters say of each other."""
+        """Check that the parameters are consistent."""
         self.settings: Any = value(self.param, "multibox_loss_param")
         p, field = self.settings, "multibox_loss_param"
         if p.num_classes < 1:
@@ -167,14 +167,14 @@ class MultiBoxLoss(Layer):
         self.parts = list(self.param.propagate_down[:2]) or [True, True]
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape; the predictions must suit the priors."""
+        """Return the shape of the scalar top; the predictions must match the priors."""
         self.priors = check_predictions(self, bottom_shapes, self.kinds, self.settings.num_classes)
         if bottom_shapes[3][-1:] != (8,):
             raise self.error(f"found true boxes of shape {bottom_shapes[3]}, expected rows of 8 numbers", "bottom", 3)
         return [()]
 
     def forward(self, loc: torch.Tensor, conf: torch.Tensor, prior: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-        """Return the loss; raise SpecError for a true box that cannot be one."""
+        """Return the loss; raise SpecError for an invalid true box."""
         p, images = self.settings, loc.shape[0]
         codes = loc.reshape(images, self.priors, self.kinds, 4)
         scores = conf.reshape(images, self.priors, p.num_classes)
@@ -206,7 +206,7 @@ class MultiBoxLoss(Layer):
         return loss / max(1, count)
 
     def _scale(self, variances: Array) -> Array | None:
-        """Return the variances that are part of a box's code, if they are."""
+        """Return the variances that are part of a box's code, if any."""
         return None if self.settings.encode_variance_in_target else variances
 
     def _read_truth(self, rows: Array, images: int) -> list[Truth]:
@@ -230,9 +230,9 @@ class MultiBoxLoss(Layer):
     def _targets(self, found: Array, truth: list[Truth]) -> tuple[Array, Array]:
         """Return each prior's label (n, p), and 1 for each of its labels, else 0 (n, p, num_classes).
 
-        A prior without a match is the background; but where there is no mining, it has no label at all in the second.
-        There the fork also advances the second by p an image, not by p num_classes: the labels of all images but the
-        first stand at other priors (bbox_util.cpp, the end of EncodeConfPrediction).
+        A prior without a match is background; but without mining, it has no label in the second array.
+        In this case, the fork also advances the second array by p per image, not by p num_classes, so the labels of all
+        images except the first are at other priors (bbox_util.cpp, the end of EncodeConfPrediction).
         """
         p = self.settings
         labels = np.full((len(truth), self.priors), p.background_label_id)
@@ -261,7 +261,7 @@ class MultiBoxLoss(Layer):
         p = self.settings
         image, kind, prior = np.nonzero(found > NO_MATCH)
         predicted = codes[image, prior, kind]
-        first = np.cumsum([0, *(len(true.labels) for true in truth)])  # of each image's true boxes
+        first = np.cumsum([0, *(len(true.labels) for true in truth)])  # for the true boxes of each image
         boxes = np.concatenate([true.boxes for true in truth])[first[image] + found[image, kind, prior]]
         prior_boxes, prior_variances = priors[prior], variances[prior]
         scale = self._scale(prior_variances)

@@ -1,4 +1,4 @@
-"""SSD's PriorBox: boxes of several sizes around every pixel of a map."""
+"""SSD's PriorBox: boxes with several sizes around every pixel of a map."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from netspec.proto.schema import value
 
 
 class PriorBox(Layer):
-    """Lay boxes of some sizes and aspect ratios around the center of every pixel of a map.
+    """Compute boxes with several sizes and aspect ratios around the center of every pixel of a map.
 
-    For each min_size: a square of it; with max_sizes a square of sqrt(min_size max_size); then for each aspect_ratio
-    r, and 1 / r with ``flip``, min_size sqrt(r) by min_size / sqrt(r). Sizes are cut to whole pixels. Centers are at
-    (index + offset) step; where they are not given, the step is image / map and the image is bottom[1]. With
-    denser_prior_boxes (TextBoxes++) each box is followed by one with its center at (row + 1) step.
+    For each min_size: a square of this size; with max_sizes, a square of sqrt(min_size max_size); for each aspect_ratio
+    r, and 1 / r with ``flip``, min_size sqrt(r) by min_size / sqrt(r). Sizes are truncated to integers. Centers are at
+    (index + offset) step; by default, the step is image / map, and the image is bottom[1]. With
+    denser_prior_boxes (TextBoxes++), each box is followed by one with its center at (row + 1) step.
 
     bottom[0]  the map (N, C, H, W)
-    bottom[1]  the image (N, C', H', W'); not needed where img_size, or img_h and img_w, are given
-    top[0]     (1, 2, 4 H W K), K boxes a pixel: [0, 0] (xmin, ymin, xmax, ymax) in parts of the image, [0, 1] variances
+    bottom[1]  the image (N, C', H', W'); not needed if img_size, or img_h and img_w, are given
+    top[0]     (1, 2, 4 H W K), K boxes per pixel: [0, 0] relative (xmin, ymin, xmax, ymax), [0, 1] variances
     Fork: weiliu89/caffe (ssd), MhLiao/TextBoxes_plusplus, src/caffe/layers/prior_box_layer.cpp
     """
 
@@ -58,7 +58,7 @@ class PriorBox(Layer):
             raise self.error(message, "bottom")
 
     def _sizes(self, param: Any) -> Array:
-        """Return width and height of the boxes of one pixel (K, 2)."""
+        """Return the widths and heights of the boxes of one pixel (K, 2)."""
         ratios = [1.0]
         for ratio in param.aspect_ratio:
             if ratio <= 0:
@@ -74,7 +74,7 @@ class PriorBox(Layer):
         return np.array(sizes, np.float32)
 
     def _warn_of_cut_sizes(self, param: Any) -> None:
-        """Say which sizes are cut: other forks and OpenCV keep them, and nets trained there find other boxes here."""
+        """Warn about truncated sizes, since other forks and OpenCV do not truncate them."""
         for name in ("min_size", "max_size"):
             sizes = getattr(param, name)
             cut = [f"{rounded(size):g} to {self.pixels(size):g}" for size in sizes if self.pixels(size) != size]
@@ -84,11 +84,11 @@ class PriorBox(Layer):
                 log.logger.warning(f"{found}; OpenCV and some forks keep it, so a net trained there gives other boxes")
 
     def pixels(self, size: float) -> float:
-        """Return the size that a box gets for a given ``min_size`` or ``max_size``."""
+        """Return the size of a box for a ``min_size`` or ``max_size``."""
         return int(size)
 
     def _pair(self, param: Any, both: str, height: str, width: str) -> tuple[float, float] | None:
-        """Return (vertical, horizontal) of a setting given as one number or as two; None where it is not given."""
+        """Return (vertical, horizontal) of a setting given as one or two numbers, or None."""
         given = [name for name in (both, height, width) if param.HasField(name)]
         if not given:
             return None
@@ -98,7 +98,7 @@ class PriorBox(Layer):
         return getattr(param, given[0]), getattr(param, given[-1])
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape of the boxes; lay them."""
+        """Return the shape of the boxes, and compute them."""
         if any(len(shape) != 4 for shape in bottom_shapes):
             raise self.error(f"found bottoms of shapes {bottom_shapes}, expected 4 axes (N, C, H, W)", "bottom")
         height, width = bottom_shapes[0][2:]
@@ -179,7 +179,7 @@ class PriorBox(Layer):
 
 
 def prior_boxes(x, image, sizes, variances, step=None, offset=0.5, clip=False):
-    """Return boxes of some sizes (width, height) around the center of every pixel of x, in parts of the image.
+    """Return boxes with these sizes (width, height) around the center of every pixel of x, relative to the image.
 
     (1, 2, 4 H W K) for K sizes: the boxes (xmin, ymin, xmax, ymax) and their variances.
     """

@@ -1,6 +1,6 @@
 """SSD, the single shot detector: weiliu89/caffe, branch ssd.
 
-A database for its layer AnnotatedData is what the fork's convert_annoset writes: records of AnnotatedDatum.
+The databases for its layer AnnotatedData are written by the fork's convert_annoset, as records of AnnotatedDatum.
 """
 
 from __future__ import annotations
@@ -251,7 +251,7 @@ register("Normalize", "norm_param", "normalize_param")(Normalize)
 
 @register("Permute", "permute_param")
 class Permute(Reordered):
-    """Bring the axes into another order: axis i of the top is axis ``order``[i] of the bottom; the others follow.
+    """Permute the axes: axis i of the top is axis ``order``[i] of the bottom; the others follow.
 
     bottom[0]  any shape
     top[0]     its axes in the new order

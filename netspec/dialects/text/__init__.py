@@ -1,1 +1,1 @@
-"""Reading text: sequences of characters, CTC."""
+"""Text recognition: sequences of characters, CTC."""

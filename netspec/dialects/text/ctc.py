@@ -1,4 +1,4 @@
-"""Connectionist temporal classification for the dialect text: losses, and what is read off the scores of steps.
+"""Connectionist temporal classification for the dialect text: losses, and decoding.
 
 Graves et al., Connectionist Temporal Classification, ICML 2006.
 """
@@ -19,7 +19,7 @@ LOSS, DECODER = "ctc_loss_param", "ctc_decoder_param"
 
 
 def _collapsed(classes: Iterable[int], blank: int, merge: bool) -> list[int]:
-    """Return a path's labels: without blanks, and with ``merge`` one of each run of equal ones."""
+    """Return the labels of a path without blanks; with ``merge``, runs of equal labels count once."""
     before, found = -1, []
     for each in classes:
         if each != blank and not (merge and each == before):
@@ -29,7 +29,7 @@ def _collapsed(classes: Iterable[int], blank: int, merge: bool) -> list[int]:
 
 
 def edit_distance(first: Sequence[int], second: Sequence[int]) -> int:
-    """Return the fewest insertions, deletions and replacements that make one sequence of the other."""
+    """Return the minimum number of insertions, deletions and replacements between two sequences."""
     row = list(range(len(second) + 1))
     for i, a in enumerate(first, 1):
         above, row[0] = row[0], i
@@ -39,14 +39,14 @@ def edit_distance(first: Sequence[int], second: Sequence[int]) -> int:
 
 
 class CTCGreedyDecoder(Layer):
-    """Read off the most probable class of each step: without blanks, and one of each run of equal ones.
+    """Decode the most probable class of each step, without blanks; runs of equal classes count once.
 
-    With labels, say instead how well that agrees with them: 1 - edit distance / the longer length, as a mean, and how
-    many are right. Of equal probabilities the first class counts. blank_index: -1 is the last class.
+    With labels, compute the agreement instead: the mean of 1 - edit distance / the longer length, and the number of
+    correct sequences. If probabilities are equal, the first class counts. blank_index: -1 is the last class.
 
     bottom[0]  probabilities or scores (T, N, C)
-    bottom[1]  optional: labels (N, L), blanks among them not counted; they end at the first negative one
-    top[0]     classes (N, T, 1, 1), -1 after the last; with labels the agreement (1, 2, 1, 1)
+    bottom[1]  optional: labels (N, L) up to the first negative one; blanks among them are ignored
+    top[0]     classes (N, T, 1, 1), -1 after the last; with labels, the agreement (1, 2, 1, 1)
     Fork: senlinuc/caffe_ocr, src/caffe/layers/ctc_decoder_layer.cpp
     """
 
@@ -63,7 +63,7 @@ class CTCGreedyDecoder(Layer):
         return [(1, 2, 1, 1) if len(bottom_shapes) > 1 else (scores[1], scores[0], 1, 1)]
 
     def forward(self, scores: torch.Tensor, *labels: torch.Tensor) -> torch.Tensor:
-        """Return the classes, or how well they agree with the labels."""
+        """Return the classes, or their agreement with the labels."""
         param = value(self.param, DECODER)
         blank = param.blank_index if param.blank_index >= 0 else scores.shape[2] - 1
         paths = first_maxima(scores.flatten(2)).T.tolist()
@@ -90,11 +90,11 @@ def first_maxima(scores: torch.Tensor) -> torch.Tensor:
 
 
 class LabelsequenceAccuracy(Layer):
-    """Say how many sequences are read without a fault: the greedy decoding equals the labels without blanks.
+    """The share of correct sequences, whose greedy decoding equals the labels without blanks.
 
     bottom[0]  scores (N, T, C)
     bottom[1]  labels (N, L)
-    top[0]     the share of right ones, ()
+    top[0]     the share of correct sequences, ()
     Fork: xmfbit/warpctc-caffe, src/caffe/layers/labelsequence_accuracy_layer.cpp
     """
 
@@ -119,7 +119,7 @@ class LabelsequenceAccuracy(Layer):
 
 
 class _Ctc(torch.autograd.Function):
-    """The mean of the costs, 0 for a text that does not fit; the gradient is that of their sum, as warp-ctc's is."""
+    """The mean of the costs, 0 for a text that does not fit; the gradient is that of their sum, as in warp-ctc."""
 
     @staticmethod
     def forward(ctx: Any, scores: torch.Tensor, given: tuple[Any, ...], blank: int) -> torch.Tensor:
@@ -137,19 +137,19 @@ class _Ctc(torch.autograd.Function):
 
 
 class _CtcLoss(Layer):
-    """Base of the two CTC losses: what they share is computed by :class:`_Ctc`."""
+    """Base of the two CTC losses."""
 
     is_loss = True
     label_bottoms = frozenset({1, 2, 3})
     not_exported = "it is for training"
 
     def check_scores(self, scores: Shape) -> None:
-        """Refuse scores that are not (T, N, C)."""
+        """Raise SpecError for scores that are not (T, N, C)."""
         if len(scores) < 3 or any(size != 1 for size in scores[3:]):
             raise self.error(f"found scores of shape {scores}, expected (T, N, C)", "bottom", 0)
 
     def loss(self, scores: torch.Tensor, texts: Sequence[Sequence[int]], steps: Sequence[int], blank: int) -> Any:
-        """Return the loss of scores (T, N, C) for a text and a number of steps of each sequence."""
+        """Return the loss of scores (T, N, C) for the text and the number of steps of each sequence."""
         scores = scores.flatten(2)
         classes, labels = scores.shape[2], [label for text in texts for label in text]
         if wrong := [label for label in labels if not 0 <= label < classes]:
@@ -159,15 +159,16 @@ class _CtcLoss(Layer):
 
 
 class CTCLoss(_CtcLoss):
-    """-log of the probability of a text: the sum over all paths through the steps that collapse to it, as a mean.
+    """The mean of -log of the probability of each text, which is the sum over all paths that collapse to it.
 
-    The gradient is that of the sum, not of the mean, as in the forks. A text that does not fit its steps costs 0.
-    Two bottoms: all steps count, and labels equal to blank_index are left out. Three: as the fork's own data are.
+    The gradient is that of the sum, not of the mean, as in the forks. A text that is too long for its steps costs 0.
+    With two bottoms, all steps are used, and labels equal to blank_index are ignored. With three, the
+    format is that of the fork's data.
 
     bottom[0]  scores (T, N, C), before the softmax
-    bottom[1]  labels (N, L); with three bottoms: 0 where a sequence begins, 1 where it goes on (T, N); with four: steps
+    bottom[1]  labels (N, L); with three bottoms: 0 where a sequence begins, else 1 (T, N); with four: number of steps
                of each sequence (N,)
-    bottom[2]  with three: labels (T, N), negative after the last, counted from 0 without a blank where blank_index is
+    bottom[2]  with three: labels (T, N), negative after the last, counted from 0 without a blank if blank_index is
                0; with four: lengths of the texts (N,)
     bottom[3]  with four: labels (L, N)
     top[0]     the loss, ()
@@ -177,7 +178,7 @@ class CTCLoss(_CtcLoss):
     bottoms = (2, 4)
 
     def setup(self) -> None:
-        """Refuse what warp-ctc does not compute."""
+        """Raise SpecError for settings that warp-ctc does not support."""
         param = value(self.param, LOSS)
         if param.output_delay or param.preprocess_collapse_repeated or not param.ctc_merge_repeated:
             raise self.error(
@@ -186,7 +187,7 @@ class CTCLoss(_CtcLoss):
         self.blank: int = param.blank_index
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape; the bottoms must have as many sequences."""
+        """Return the shape of the scalar top; the bottoms must have equal numbers of sequences."""
         scores, *others = bottom_shapes
         self.check_scores(scores)
         items = scores[1]
@@ -217,22 +218,22 @@ class CTCLoss(_CtcLoss):
 
 
 class WarpCTCLoss(CTCLoss):
-    """CTCLoss by another name.
+    """Another name of CTCLoss.
 
     bottom[0]  scores (T, N, C), before the softmax
-    bottom[i]  as CTCLoss has them
+    bottom[i]  as for CTCLoss
     top[0]     the loss, ()
     Fork: senlinuc/caffe_ocr, src/caffe/layers/warp_ctc_loss_layer.cpp
     """
 
 
 class CtcLoss(_CtcLoss):
-    """The CTC loss of xmfbit/warpctc-caffe: -log of the probability of a text, as a mean; all of time_step steps count.
+    """The CTC loss of xmfbit/warpctc-caffe: the mean of -log of the probability of each text, over all time_step steps.
 
     The gradient is that of the sum, not of the mean, as in the fork.
 
     bottom[0]  scores (T, N, alphabet_size), before the softmax
-    bottom[1]  labels (N, L), those equal to blank_label left out
+    bottom[1]  labels (N, L); those equal to blank_label are ignored
     top[0]     the loss, ()
     Fork: xmfbit/warpctc-caffe, src/caffe/layers/ctc_loss_layer.cpp
     """

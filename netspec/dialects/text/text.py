@@ -1,4 +1,4 @@
-"""Reading text: connectionist temporal classification (CTC), sequences turned around, an LSTM with one bias.
+"""Text recognition: connectionist temporal classification (CTC), reversed sequences, an LSTM with one bias.
 
 Forks: ChWick/caffe and senlinuc/caffe_ocr; xmfbit/warpctc-caffe; junhyukoh/caffe-lstm (Lstm). Graves et al.,
 Connectionist Temporal Classification, ICML 2006.
@@ -76,9 +76,9 @@ extend LayerParameter {
 
 @register("ContinuationIndicator", "continuation_indicator_param")
 class ContinuationIndicator(Layer):
-    """Say where sequences go on, for a recurrent layer: 0 at the first step, 1 at all others.
+    """The continuation indicator for a recurrent layer: 0 at the first step, 1 at all others.
 
-    bottom[i]  optional, not read
+    bottom[i]  optional, not used
     top[0]     (time_step, batch_size)
     Fork: xmfbit/warpctc-caffe, src/caffe/layers/continuation_indicator_layer.cpp
     """
@@ -108,7 +108,7 @@ class ContinuationIndicator(Layer):
 
 @register("Reverse", "reverse_param")
 class Reverse(Layer):
-    """Turn an axis around: what was first is last. By default axis 0, the time.
+    """Reverse an axis, by default axis 0, the time.
 
     bottom[0]  any shape
     top[0]     the same shape
@@ -133,12 +133,12 @@ class Reverse(Layer):
 
 @register("ReverseTime", "reverse_time_param")
 class ReverseTime(Layer):
-    """Turn the first steps of each sequence around; what lies behind is copied with copy_remaining, else 0.
+    """Reverse the first steps of each sequence; with copy_remaining, the other steps are copied, else they are 0.
 
     bottom[0]  sequences (T, N, ...)
-    bottom[1]  how many steps each has (N,); gets no gradient
+    bottom[1]  the number of steps of each sequence (N,); gets no gradient
     top[0]     the shape of bottom[0]
-    Fork: senlinuc/caffe_ocr, src/caffe/layers/reverse_time_layer.cpp, which leaves what lies behind unwritten
+    Fork: senlinuc/caffe_ocr, src/caffe/layers/reverse_time_layer.cpp, which does not write the other steps
     """
 
     bottoms = (2, 2)
@@ -162,12 +162,12 @@ class ReverseTime(Layer):
 
 @register("Lstm", "lstm_param")
 class Lstm(Layer):
-    """An LSTM over all steps, from a state of zeros; its gates in the order input, forget, output, new.
+    """An LSTM over all steps with zero initial state; the order of the gates is input, forget, output, candidate.
 
-    With bottom[1] a sequence may go on from the last pass: where that is 0, a new one begins.
+    With bottom[1], a sequence can continue from the previous pass; a new one begins where bottom[1] is 0.
 
     bottom[0]  (T, N, C)
-    bottom[1]  optional: 0 where a sequence begins, 1 where it goes on (T, N); gets no gradient
+    bottom[1]  optional: 0 where a sequence begins, else 1 (T, N); gets no gradient
     top[0]     (T, N, num_output)
     blobs[0]   weights of the input (4 num_output, C)
     blobs[1]   weights of the state (4 num_output, num_output)
@@ -181,11 +181,11 @@ class Lstm(Layer):
 
     @property
     def remembers(self) -> bool:
-        """Whether it goes on from one pass to the next."""
+        """Whether the state continues in the next pass."""
         return len(self.bottom_shapes) > 1
 
     def setup(self) -> None:
-        """Make the blobs; the state begins at 0."""
+        """Add the blobs; the initial state is 0."""
         param, shape = value(self.param, "lstm_param"), self.bottom_shapes[0]
         if param.num_output < 1:
             raise self.error("num_output must be given and be at least 1", "lstm_param", "num_output")

@@ -1,7 +1,7 @@
-"""Volumes of video (N, C, L, H, W): convolutions and pooling over time, height and width.
+"""Video volumes (N, C, L, H, W): convolution and pooling over time, height and width.
 
 Forks: facebookarchive/C3D, version 1.1 (Convolution3D, Pooling3D); chuckcho/video-caffe (NdConvolution, NdPooling,
-which run on GPUs only, by cuDNN).
+which run only on GPUs, with cuDNN).
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ SHAPES = ("kernel_shape", "stride_shape", "pad_shape")
 
 
 def _in_caffes_words(layer: Layer) -> LayerParameter:
-    """Return a copy of the layer's parameters, in which Caffe's fields say what those of the fork do."""
+    """Return a copy of the layer's parameters with the fork's fields converted to Caffe's."""
     param = LayerParameter()
     param.CopyFrom(layer.param)
     return param
@@ -75,7 +75,7 @@ def _in_caffes_words(layer: Layer) -> LayerParameter:
 class Convolution3D(Convolution):
     """Caffe's Convolution over time, height and width.
 
-    filter_group is for memory and changes no number; the fork does not read ``group``.
+    filter_group only affects memory; the fork does not read ``group``.
 
     bottom[0]  (N, C, L, H, W)
     top[0]     (N, num_output, L', H', W'),  L' = (L + 2 temporal_pad - kernel_depth) // temporal_stride + 1
@@ -106,7 +106,7 @@ class Convolution3D(Convolution):
 
 @register("NdConvolution", "convolution_param", *(f"convolution_param.{name}" for name in SHAPES))
 class NdConvolution(Convolution):
-    """Caffe's Convolution, its kernel, stride and pad given as shapes: ``kernel_shape { dim: 3 dim: 3 dim: 3 }``.
+    """Caffe's Convolution, with kernel, stride and pad given as shapes: ``kernel_shape { dim: 3 dim: 3 dim: 3 }``.
 
     bottom[i]  (N, C, spatial axes: up to three)
     top[i]     (N, num_output, ...) as Convolution's
@@ -127,7 +127,7 @@ class NdConvolution(Convolution):
 
 
 def _shapes(layer: Layer, group: str) -> list[Shape]:
-    """Return the numbers of kernel_shape, stride_shape and pad_shape, () where one is not given."""
+    """Return kernel_shape, stride_shape and pad_shape, or () for one that is not given."""
     param, axes = getattr(layer.param, group), len(layer.bottom_shapes[0]) - 2
     found = []
     for name in SHAPES:
@@ -140,7 +140,7 @@ def _shapes(layer: Layer, group: str) -> list[Shape]:
 
 
 class _VolumePooling(Layer):
-    """Base of the poolings of volumes."""
+    """Base of pooling layers for volumes."""
 
     group: str
     kernel: Shape
@@ -151,7 +151,7 @@ class _VolumePooling(Layer):
     not_exported = "it pools volumes"
 
     def read(self) -> tuple[int, Shape, Shape, Shape]:
-        """Return the method, the kernel, the stride and the pad; () is a kernel as large as the map, or the default."""
+        """Return the method, kernel, stride and pad; () means a kernel as large as the map, or the default."""
         raise NotImplementedError
 
     def setup(self) -> None:
@@ -160,7 +160,7 @@ class _VolumePooling(Layer):
             raise self.error("there is no STOCHASTIC pooling of volumes, in the fork neither", self.group, "pool")
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the top's shape: rounded up, as Caffe's Pooling, but for its rule for padding."""
+        """Return the shape of the top, rounded up as in Caffe's Pooling except for its rule for padding."""
         shape, counts = bottom_shapes[0], []
         self.frame: list[int] = []  # in the order of F.pad
         lengths: list[torch.Tensor] = []
@@ -192,13 +192,13 @@ class _VolumePooling(Layer):
         return sums / self.areas.to(sums)
 
     def largest(self, volume: torch.Tensor) -> torch.Tensor:
-        """Return the maximum of each window of (N, C, L, H, W); the first of equal ones gets the gradient."""
+        """Return the maximum of each window of (N, C, L, H, W); the first of equal pixels gets the gradient."""
         kernel, stride = self.windows
         return F.max_pool3d(volume, kernel, stride)
 
 
 class _AllLargest(torch.autograd.Function):
-    """The maximum of each window. Every pixel equal to it gets the whole gradient, as in C3D: not only the first."""
+    """The maximum of each window. As in C3D, every pixel equal to it gets the whole gradient, not only the first."""
 
     @staticmethod
     def forward(ctx: Any, volume: torch.Tensor, kernel: Shape, stride: Shape) -> torch.Tensor:
@@ -223,8 +223,8 @@ class _AllLargest(torch.autograd.Function):
 class Pooling3D(_VolumePooling):
     """Reduce each window over time, height and width to its maximum or its average.
 
-    Each pixel equal to a window's maximum gets the gradient. Only AVE has padding; it counts as zeros, up to ``pad``
-    past the map.
+    Every pixel equal to a window's maximum gets the gradient. Only AVE has padding; it counts as zeros, up to ``pad``
+    beyond the map.
 
     bottom[0]  (N, C, L, H, W)
     top[0]     (N, C, L', H', W'),  L' = ceil((L - kernel_depth) / temporal_stride) + 1,
@@ -257,7 +257,7 @@ class Pooling3D(_VolumePooling):
 class NdPooling(_VolumePooling):
     """Reduce each window to its maximum or its average: ``kernel_shape { dim: 1 dim: 2 dim: 2 }``.
 
-    An average is divided by the kernel's volume, padding and what lies beyond it counting as zeros, as by cuDNN.
+    An average is divided by the volume of the kernel; padding and pixels beyond it count as zeros, as in cuDNN.
 
     bottom[0]  (N, C, spatial axes: up to three)
     top[0]     (N, C, ...), along each axis ceil((size + 2 pad - kernel) / stride) + 1; one less where it is padded and

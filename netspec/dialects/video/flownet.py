@@ -1,6 +1,6 @@
-"""FlowNet and FlowNet 2: maps of two images compared, resampled and warped. Fork: lmb-freiburg/flownet2.
+"""FlowNet and FlowNet 2: comparing, resampling and warping maps of two images. Fork: lmb-freiburg/flownet2.
 
-Its augmenting, reading and writing layers are not here.
+Its layers for augmentation, reading and writing are not supported.
 """
 
 from __future__ import annotations
@@ -85,10 +85,10 @@ class _OfMaps(Layer):
     """Base of layers that cannot be exported. All bottoms have four axes."""
 
     not_exported = "FlowNet's layers have no counterpart there"
-    same: ClassVar[slice]  # the axes in which both bottoms are alike
+    same: ClassVar[slice]  # the axes in which both bottoms are equal
 
     def check_maps(self, bottom_shapes: Sequence[Shape]) -> None:
-        """Refuse bottoms without four axes, or that differ in those of ``same``."""
+        """Raise SpecError for bottoms without four axes, or that differ in the axes ``same``."""
         first = bottom_shapes[0]
         for i, shape in enumerate(bottom_shapes):
             if len(shape) != 4 or shape[self.same] != first[self.same]:
@@ -97,14 +97,14 @@ class _OfMaps(Layer):
 
 @register("Correlation", "correlation_param")
 class Correlation(_OfMaps):
-    """Compare patches of one image's maps with those of the other's, moved by up to max_displacement pixels.
+    """Compare patches of one image's maps with patches of the other's, displaced by up to max_displacement pixels.
 
-    A patch of kernel_size pixels around each stride_1-th pixel; its mean product with (SUBTRACT: its mean absolute
-    difference from) the other's patch, moved by multiples of stride_2 pixels. pad zeros are around both.
+    For a patch of kernel_size pixels around each stride_1-th pixel, the mean product with (SUBTRACT: the mean absolute
+    difference from) the other's patch, displaced by multiples of stride_2 pixels. Both are padded with pad zeros.
 
     bottom[0]  (N, C, H, W)
     bottom[1]  the same shape
-    top[0]     (N, D D, H', W'),  D = 2 (max_displacement // stride_2) + 1, displacements row after row,
+    top[0]     (N, D D, H', W'),  D = 2 (max_displacement // stride_2) + 1, displacements in row-major order,
                H' = ceil((H + 2 pad - 2 max_displacement - kernel_size + 1) / stride_1)
     Paper: Fischer et al., FlowNet, ICCV 2015, section 3. Fork: src/caffe/layers/correlation_layer.cu
     """
@@ -148,13 +148,13 @@ class Correlation(_OfMaps):
 
 @register("Resample", "resample_param")
 class Resample(_OfMaps):
-    """Bring maps to another size. A pixel is the weighted mean of those near its place: LINEAR, CUBIC, or the NEAREST.
+    """Resize maps. A pixel is the weighted mean of the pixels near its position (LINEAR, CUBIC), or the NEAREST.
 
-    Where a side shrinks, the weights reach over as many more pixels, unless antialias is false. No gradient passes.
+    If a side shrinks, the weights cover proportionally more pixels, unless antialias is false. It has no gradient.
 
     bottom[0]  (N, C, H, W)
-    bottom[1]  optional: maps of the new size; their values do not count
-    top[0]     (N, C, H', W'), of height and width, or of bottom[1]
+    bottom[1]  optional: maps of the new size; their values are not used
+    top[0]     (N, C, H', W') with the given height and width, or those of bottom[1]
     Fork: src/caffe/layers/resample_layer.cu, which places columns by half a row's step and rows by half a column's
     """
 
@@ -180,7 +180,7 @@ class Resample(_OfMaps):
         return torch.einsum("yh,nchw,xw->ncyx", rows, maps, columns)
 
     def _weights(self, maps: torch.Tensor, axis: int, steps: Sequence[float]) -> torch.Tensor:
-        """Return the weights (new, old) of an axis; those of a pixel add up to 1, or are all 0."""
+        """Return the weights (new, old) of an axis; the sum for a pixel is 1 or 0."""
         old, new, p = maps.shape[2 + axis], self.top_shapes[0][2 + axis], self.settings
         places = torch.arange(new) * steps[axis] + steps[1 - axis] / 2 - 0.5
         if p.type == NEAREST:
@@ -193,18 +193,18 @@ class Resample(_OfMaps):
 
 
 def _cubic(x: torch.Tensor) -> torch.Tensor:
-    """Return the weight of a pixel that is ``x`` pixels away, Keys' with a = -1/2."""
+    """Return the weight of a pixel at distance ``x``: Keys' kernel with a = -1/2."""
     near, far = (1.5 * x - 2.5) * x * x + 1, ((2.5 - 0.5 * x) * x - 4) * x + 2
     return torch.where(x <= 1, near, torch.where(x < 2, far, 0))
 
 
 @register("FlowWarp", "flow_warp_param")
 class FlowWarp(_OfMaps):
-    """Move an image by a flow: each pixel is what lies, between four pixels of the image, where the flow points.
+    """Warp an image with a flow: each pixel is interpolated from four pixels at the position given by the flow.
 
     bottom[0]  the image (N, C, H, W)
     bottom[1]  the flow (N, 2, H, W): x, then y
-    top[0]     (N, C, H, W); 0, or with NOT_A_NUMBER that, where the flow points out of the image
+    top[0]     (N, C, H, W); 0, or NaN with NOT_A_NUMBER, where the flow points outside the image
     Fork: src/caffe/layers/flow_warp_layer.cpp
     """
 
@@ -240,7 +240,7 @@ class FlowWarp(_OfMaps):
 
 @register("ChannelNorm")
 class ChannelNorm(_OfMaps):
-    """The length of the vector of channels at each pixel.
+    """The L2 norm over the channels at each pixel.
 
     bottom[0]  (N, C, H, W)
     top[0]     (N, 1, H, W)
@@ -259,10 +259,10 @@ class ChannelNorm(_OfMaps):
 
 @register("Accum", "accum_param")
 class Accum(_OfMaps):
-    """Bring maps to one size, corner to corner, and put their channels after one another.
+    """Resize maps to a common size with aligned corners, and concatenate their channels.
 
-    The size is the largest of the bottoms; top_height x top_width, or the next multiple of size_divisible_by,
-    where both sides of it are larger; with have_reference that of the last bottom, which is not read otherwise.
+    The size is the largest of the bottoms, or top_height x top_width, or the next multiple of size_divisible_by,
+    if both of its sides are larger; with have_reference, that of the last bottom, which is otherwise not used.
 
     bottom[i]  (N, C_i, H_i, W_i)
     top[0]     (N, sum of C_i, H, W)
@@ -299,13 +299,13 @@ class Accum(_OfMaps):
 
 @register("Downsample", "downsample_param")
 class Downsample(_OfMaps):
-    """Bring maps to another size, corner to corner: the mean of the pixels near, weighed by their distance.
+    """Resize maps with aligned corners; a pixel is the mean of nearby pixels, weighted by their distance.
 
-    Pixels that are nan are left out; where they have more than half the weight of the others, the top is nan.
+    NaN pixels are ignored; if they have more than half the weight of the others, the top is NaN.
 
     bottom[0]  (N, C, H, W)
-    bottom[1]  optional: maps that have the new size, instead of top_height and top_width
-    top[0]     (N, C, top_height, top_width); brings no gradient, as in the fork
+    bottom[1]  optional: maps with the new size, instead of top_height and top_width
+    top[0]     (N, C, top_height, top_width); its gradient is ignored, as in the fork
     Fork: src/caffe/layers/downsample_layer.cu
     """
 
@@ -336,7 +336,7 @@ class Downsample(_OfMaps):
 
 
 def _near(side: int, to: int) -> torch.Tensor:
-    """Return how much each of ``side`` pixels counts for each of ``to``."""
+    """Return the weight of each of ``side`` pixels for each of ``to``."""
     step = (side - 1) / max(to - 1, 1)
     places = torch.arange(to).unsqueeze(1) * step
     return (1 - (torch.arange(side) - places).abs() / step).clamp(min=0) if step else torch.eye(to, side)
@@ -344,14 +344,14 @@ def _near(side: int, to: int) -> torch.Tensor:
 
 @register("L1Loss", "l1_loss_param")
 class L1Loss(Layer):
-    """Sum of the absolute differences, divided by the number of images; pixels that are nan do not count.
+    """Sum of the absolute differences, divided by the number of images; NaN pixels are ignored.
 
-    l2_per_location: sum over the pixels of sqrt(sum of squares over the channels + epsilon). plateau: less than this is
-    0. normalize_by_num_entries: divided by the number of those that are not nan, by channel. l2_prescale_by_channels:
-    the mean of squares in place of the sum. Where the difference is 0, the gradient is -1.
+    l2_per_location: sum over the pixels of sqrt(sum of squares over the channels + epsilon). plateau: smaller values
+    are 0. normalize_by_num_entries: divided by the number of values that are not NaN, by channel.
+    l2_prescale_by_channels: the mean of squares instead of the sum. If the difference is 0, the gradient is -1.
 
     bottom[0]  (N, C, H, W)
-    bottom[1]  optional: what is subtracted, the same shape
+    bottom[1]  optional: subtracted from bottom[0], the same shape
     top[0]     the loss, ()
     Fork: src/caffe/layers/l1loss_layer.cu
     """
@@ -382,7 +382,7 @@ class L1Loss(Layer):
 
 @register("NegReLU", "relu_param")
 class NegReLU(Layer):
-    """min(x, 0) + negative_slope max(x, 0); the gradient at 0 is the positive side's.
+    """min(x, 0) + negative_slope max(x, 0); the gradient at 0 is that of the positive side.
 
     bottom[0]  any shape
     top[0]     the same shape
@@ -398,10 +398,10 @@ class NegReLU(Layer):
 
 @register("Mean", "mean_param")
 class Mean(Layer):
-    """output_scale (input_scale x + mean_scale mean); with operation: SUBTRACT, less the mean.
+    """output_scale (input_scale x + mean_scale mean); with operation: SUBTRACT, minus the mean.
 
     bottom[i]  (N, C, H, W)
-    top[i]     the same shape; the mean is a value for each channel, in turn, or the numbers of ``file``
+    top[i]     the same shape; the mean is one value per channel, in turn, or the contents of ``file``
     Fork: src/caffe/layers/mean_layer.cpp
     """
 

@@ -1,4 +1,4 @@
-"""SSD's VideoData: the frames of a video or of a camera. `tsn` has another VideoData, which reads folders of frames.
+"""SSD's VideoData: the frames of a video or a camera. `tsn` has a different VideoData, for folders of frames.
 
 Fork: weiliu89/caffe (ssd)
 """
@@ -40,9 +40,9 @@ NO_BOXES = np.empty((0, COLUMNS), np.float32)
 
 
 class Frames:
-    """The frames of a video (a path), by number, or of a camera (its number), each the next. They are read in order.
+    """The frames of a video (a path), by index, or of a camera (its number). They are read in order.
 
-    Raises SpecError where it cannot be opened or has no frame.
+    Raises SpecError if it cannot be opened or has no frame.
     """
 
     def __init__(self, name: str | int, where: Where) -> None:
@@ -53,7 +53,7 @@ class Frames:
 
     def _open(self) -> None:
         level = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # it would print lines of its own
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # it would print its own messages
         self._capture, self._next = cv2.VideoCapture(self._name), 0
         cv2.utils.logging.setLogLevel(level)
         if not self._capture.isOpened():
@@ -76,7 +76,7 @@ class Frames:
 
 
 class VideoSource:
-    """Batches of frames, ``skip`` frames left out before each; random draws follow from a frame's position."""
+    """Batches of frames; ``skip`` frames are skipped before each. Random numbers depend on the frame's position."""
 
     def __init__(self, frames: Frames, cursor: Cursor, augment: Augmenter, skip: int, draws: Draws) -> None:
         self.cursor, self._frames, self._augment, self._step = cursor, frames, augment, skip + 1
@@ -85,7 +85,7 @@ class VideoSource:
         self.shapes: Sequence[Shape] = [(cursor.batch_size, 3, *size), (cursor.batch_size,)]
 
     def keys(self, iteration: int) -> list[str]:
-        """Return the names of the frames of an iteration, numbers from 1."""
+        """Return the names of the frames of an iteration, which are numbers from 1."""
         return [f"{self._frames.title} frame {number + 1}" for number in self._numbers(iteration)]
 
     def _numbers(self, iteration: int) -> list[int]:
@@ -110,10 +110,10 @@ class VideoSource:
     "transform_param.crop_w",
 )
 class VideoData(ReadingLayer):
-    """Read the frames of a video from its first, or of a camera. Before each frame skip_frames others are left out.
+    """Read the frames of a video or a camera. Before each frame, skip_frames others are skipped.
 
-    Frames are resized (resize_param), cropped, mirrored. The end of a video is an error; its message says so. The
-    last batch is dropped if it is not full.
+    Frames are resized (resize_param), cropped and mirrored. The end of a video is an error. The
+    last batch is dropped if it is incomplete.
 
     top[0]  transformed frames (batch_size of data_param, 3, H, W)
     top[1]  labels (batch_size,), all 0; may be left out
@@ -159,6 +159,6 @@ class VideoData(ReadingLayer):
         return super().num_records if value(self.param, GROUP).video_type == VIDEO else 0
 
     def known_shape(self) -> Shape | None:
-        """Return the shape where the prototxt says the size."""
+        """Return the shape if the prototxt gives the size."""
         size = fixed_size(self.param.transform_param)
         return (self.batch_size, 3, *size) if size else None

@@ -1,6 +1,6 @@
-"""Temporal segment networks: frames and flow of videos, windows of several sizes, databases read in random order.
+"""Temporal segment networks: frames and flow of videos, windows of several sizes, databases in random order.
 
-Fork: yjxiong/caffe (Wang et al., Temporal Segment Networks, ECCV 2016). The random draws are the net's own.
+Fork: yjxiong/caffe (Wang et al., Temporal Segment Networks, ECCV 2016). The random numbers are the net's own.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ Array = np.ndarray
 GROUP, RGB, FLOW = "video_data_param", 0, 1
 WINDOWS = ("fix_crop", "multi_scale", "scale_ratios", "max_distort", "is_flow", "more_fix_crop")
 TRANSFORM = ("transform_param", *(f"transform_param.{name}" for name in WINDOWS))
-RATIOS = (1.0, 0.875, 0.75, 0.66)  # of the windows' sides to the image's shorter one, unless scale_ratios are given
-NEAR = 3  # a side of a window that differs by less from crop_size becomes crop_size
-CORNERS = ((0, 0), (0, 4), (4, 0), (4, 4), (2, 2))  # where fix_crop puts a window, in quarters of the room around it
+RATIOS = (1.0, 0.875, 0.75, 0.66)  # default scale_ratios: a window's side divided by the image's shorter side
+NEAR = 3  # a side of a window that differs from crop_size by less becomes crop_size
+CORNERS = ((0, 0), (0, 4), (4, 0), (4, 4), (2, 2))  # positions of windows with fix_crop, in quarters of the free space
 MORE_CORNERS = ((0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3))
 
 
 class Windows(Transformer):
-    """Caffe's Transformer with windows of several sizes and places; mean values are repeated for all frames."""
+    """Caffe's Transformer with windows of several sizes and positions; mean values are repeated for all frames."""
 
     def __init__(self, param: Any, *arguments: Any) -> None:
         super().__init__(param, *arguments)
@@ -88,7 +88,7 @@ class Windows(Transformer):
             self._transform_one(image, cut, mirror, h_off, w_off)
 
     def _transform_one(self, image: Array, out: Array, mirror: int, h_off: int, w_off: int) -> None:
-        """Cut a window, in training of one of the sizes and at one of the places; bring it to crop_size."""
+        """Crop a window, in training with a random size and position, and resize it to crop_size."""
         p = self._param
         flipped = self.mirror and mirror % 2 == 1
         if self._random_crop and (value(p, "multi_scale") or value(p, "fix_crop")):
@@ -144,7 +144,7 @@ def _wrong_transform(layer: files.ReadingLayer) -> Iterator[SpecError]:
 
 
 class LaterShuffled(Cursor):
-    """A Cursor that reads the first epoch in order, and where it shuffles only the others."""
+    """A Cursor that reads the first epoch in order, and shuffles only the others."""
 
     @override
     def _record(self, position: int) -> int:
@@ -153,7 +153,7 @@ class LaterShuffled(Cursor):
 
 @replace("Data", "data_param", "data_param.shuffle", *TRANSFORM)
 class Data(files.Data):
-    """Caffe's Data; with shuffle each epoch after the first has a random order of its own.
+    """Caffe's Data; with shuffle, each epoch after the first has a different random order.
 
     top[0]  transformed images (batch_size, C, H, W)
     top[1]  labels (batch_size,); may be left out
@@ -178,7 +178,7 @@ class Data(files.Data):
 
 @dataclass(frozen=True)
 class Video:
-    """A line of the list: the folder of a video's frames, how many there are, its label, and the line's place."""
+    """A line of the list: the folder of a video's frames, their number, its label, and the place of the line."""
 
     folder: str
     frames: int
@@ -200,10 +200,10 @@ def read_videos(path: str, where: Where | None = None) -> list[Video]:
 
 
 class VideoSource:
-    """Batches of videos: of each ``num_segments`` parts of equal length some frames in a row, as channels.
+    """Batches of videos: consecutive frames from each of ``num_segments`` equal parts, as channels.
 
-    They begin anywhere in the part in training, in its middle in testing. Raises SpecError for a frame that cannot be
-    read, and for videos of another size.
+    They begin at a random position of the part in training, and at its center in testing. Raises SpecError for a frame
+    that cannot be read, and for videos of another size.
     """
 
     def __init__(
@@ -231,7 +231,7 @@ class VideoSource:
         return self._transform(frames, positions), labels.reshape(-1, 1, 1, 1)
 
     def _read(self, record: int, position: int) -> Array:
-        """Return the frames of a video, one behind the other: (C, H, W)."""
+        """Return the concatenated frames of a video: (C, H, W)."""
         video, p = self._videos[record], self._param
         length = video.frames // p.num_segments
         room, planes = length - p.new_length + 1, []
@@ -254,12 +254,12 @@ class VideoSource:
 
 @register("VideoData", GROUP, *TRANSFORM, "data_param.prefetch")
 class VideoData(files.ReadingLayer):
-    """Read frames or flow of videos, images in a folder each; a list has lines ``folder frames label``.
+    """Read frames or flow of videos, which are folders of images; a list has lines ``folder frames label``.
 
-    Of each of num_segments parts of a video new_length frames in a row are read. name_pattern is that of their files,
-    with their number from 1; of flow with a letter too, x or y, each a gray image.
+    From each of num_segments parts of a video, new_length consecutive frames are read. name_pattern is their file name,
+    with their number from 1; for flow also with a letter, x or y, for two gray images.
 
-    top[0]  (batch_size, 3 new_length num_segments, H, W); of flow 2 new_length num_segments: x, y, x, y, ...
+    top[0]  (batch_size, 3 new_length num_segments, H, W); for flow, 2 new_length num_segments: x, y, x, y, ...
     top[1]  labels (batch_size, 1, 1, 1)
     Fork: yjxiong/caffe, src/caffe/layers/video_data_layer.cpp
     """
@@ -295,7 +295,7 @@ class VideoData(files.ReadingLayer):
         return source
 
     def known_shape(self) -> Shape | None:
-        """Return the shape where the prototxt gives height and width."""
+        """Return the shape if the prototxt gives height and width."""
         p, crop = value(self.param, GROUP), self.param.transform_param.crop_size
         height, width = (crop, crop) if crop else (p.new_height, p.new_width)
         planes = 2 if p.modality == FLOW else 1 if p.grayscale else 3

@@ -1,4 +1,4 @@
-"""The losses of YOLO v2 and v3, as Darknet's region and yolo layers have them.
+"""The losses of YOLO v2 and v3, as in Darknet's region and yolo layers.
 
 Fork: eric612/MobileNet-YOLO, src/caffe/layers/region_loss_layer.cpp, yolov3_layer.cpp
 """
@@ -18,11 +18,11 @@ from netspec.layers.loss.base import Loss
 from netspec.proto.schema import value
 
 MSE = 2  # Yolov3Parameter.IOU_LOSS
-OBJECT, CLASSES = 4, 5  # where they begin among the numbers of a box; x, y, width and height are before them
+OBJECT, CLASSES = 4, 5  # their index in a box; x, y, width and height come before
 
 
 class _DarknetLoss(Loss):
-    """Base of the losses. ``_moves`` returns by how much each number of a map should change."""
+    """Base of the losses. ``_moves`` returns the desired change of each value of a map."""
 
     group: str
     not_exported = "it is for training"
@@ -34,7 +34,7 @@ class _DarknetLoss(Loss):
         self.anchors = np.array(param.biases, np.float32).reshape(-1, 2)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape; the map must have the channels of its boxes."""
+        """Return the shape of the scalar top; the map must have the channels of its boxes."""
         maps, truth = bottom_shapes
         channels = self.settings.num * (CLASSES + self.settings.num_class)
         if len(maps) != 4 or maps[1] != channels:
@@ -52,9 +52,9 @@ class _DarknetLoss(Loss):
         return _Moved.apply(maps, *(torch.from_numpy(a.reshape(maps.shape)).to(maps) for a in (moves, diff)))
 
     def _moves(self, cells: Array, truth: Array) -> Array:
-        """Return what the numbers (num, 5 + num_class, H, W) of an image are to be moved by, the other way round.
+        """Return the negative of the desired changes of the values (num, 5 + num_class, H, W) of an image.
 
-        Later true boxes replace what earlier ones said of the same anchor.
+        Later true boxes override earlier ones at the same anchor.
         """
         raise NotImplementedError
 
@@ -64,20 +64,20 @@ class _DarknetLoss(Loss):
 
 
 def _until(column: Array) -> int:
-    """Return how many numbers stand before the first 0."""
+    """Return the number of values before the first 0."""
     return int(np.argmin(np.append(column != 0, False)))
 
 
 class RegionLoss(_DarknetLoss):
-    """The sum of squares of what each number of YOLO's boxes is to be moved by, divided by N.
+    """The sum of squares of the desired changes of the values of YOLO's boxes, divided by N.
 
-    A box that overlaps a true one by more than ``thresh`` may have any objectness, others shall have 0. Of the anchors
-    (``biases``, in cells) in a true box's cell the one most like it in shape shall have its place, size and class, and
-    an objectness of 1, with ``rescore`` of its overlap. The moves, divided by N, are the gradient, as in Darknet: that
-    is half the derivative of the loss for some numbers, and for others another.
+    The objectness of a box that overlaps a true one by more than ``thresh`` is free; for others, it should be 0. Of the
+    anchors (``biases``, in cells) in a true box's cell, the one with the most similar shape should have its position,
+    size and class, and an objectness of 1, or of its overlap with ``rescore``. The changes, divided by N, are the
+    gradient, as in Darknet. For some values this is half the derivative of the loss, and for others it differs.
 
     bottom[0]  (N, num (5 + num_class), S, S): x, y, width, height, objectness, classes of each anchor
-    bottom[1]  true boxes (N, 1, n, 5): class from 0, x, y, width, height, parts of the image; zeros end them
+    bottom[1]  true boxes (N, 1, n, 5): class from 0, x, y, width, height, relative to the image; zeros end them
     top[0]     the loss, ()
     Fork: eric612/MobileNet-YOLO, src/caffe/layers/region_loss_layer.cpp
     """
@@ -95,7 +95,7 @@ class RegionLoss(_DarknetLoss):
             raise self.error("a tree or map of classes is not known here", self.group, "softmax_tree")
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the scalar top's shape; the map must be square."""
+        """Return the shape of the scalar top; the map must be square."""
         shapes = super().reshape(bottom_shapes)
         if bottom_shapes[0][2] != bottom_shapes[0][3]:
             raise self.error(f"found a map of shape {bottom_shapes[0]}, expected a square one", "bottom", 0)
@@ -137,17 +137,18 @@ class RegionLoss(_DarknetLoss):
 
 
 class Yolov3(_DarknetLoss):
-    """The sum of squares of what each number of YOLO v3's boxes is to be moved by, divided by N.
+    """The sum of squares of the desired changes of the values of YOLO v3's boxes, divided by N.
 
-    A box that overlaps a true one by more than ``thresh`` may have any objectness, others shall have 0. The anchor
-    (``biases``, in pixels of an image of anchors_scale times the map's size) most like a true box in shape shall have
-    its place, size and class, and an objectness of 1, if ``mask`` names it; so shall others of ``mask`` that are like
-    it by more than iou_thresh. The class shall have 1, others 0, each brought nearer to a half by label_smooth_eps.
-    The moves, divided by N, are the gradient; with use_logic_gradient times the derivative of the sigmoid. The fork
-    does not read noobject_scale, and object_scale with use_logic_gradient only. iou_loss other than MSE is not here.
+    The objectness of a box that overlaps a true one by more than ``thresh`` is free; for others, it should be 0. The
+    anchor (``biases``, in pixels of an image of anchors_scale times the map's size) with the shape most similar to a
+    true box should have its position, size and class, and an objectness of 1, if it is in ``mask``. So should other
+    anchors in ``mask`` that overlap its shape by more than iou_thresh. The target of the class is 1 and that of others
+    0, both moved toward 0.5 by label_smooth_eps. The changes, divided by N, are the gradient; with use_logic_gradient,
+    they are multiplied by the derivative of the sigmoid. As in the fork, noobject_scale is not used, and object_scale
+    only with use_logic_gradient. An iou_loss other than MSE is not supported.
 
     bottom[0]  (N, num (5 + num_class), H, W): x, y, width, height, objectness, classes of each anchor
-    bottom[1]  true boxes (N, 1, n, 5): class from 0, x, y, width, height, parts of the image; zeros end them
+    bottom[1]  true boxes (N, 1, n, 5): class from 0, x, y, width, height, relative to the image; zeros end them
     top[0]     the loss, ()
     Fork: eric612/MobileNet-YOLO, src/caffe/layers/yolov3_layer.cpp
     """
