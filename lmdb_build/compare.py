@@ -5,8 +5,9 @@ Files in the output folder, for each net:
     NAME.log, NAME.scores.json            its training (netspec train --scores)
     NAME.ITERATION.scores.json            a snapshot that the training did not test (netspec test --scores)
     NAME.train.npz, NAME.validation.npz   the descriptors of both databases' pairs (netspec extract)
+    NAME.test.npz                         those of the test pairs, if a database of them is given
 
-The table and the pictures are made from runs.json.
+The tables and the pictures are made from runs.json.
 """
 
 from __future__ import annotations
@@ -111,35 +112,59 @@ def read_entry(path: str) -> Entry:
     )
 
 
-def compare(
-    solvers: Sequence[str], out: Path, train: bool, gpu: str, say: Say, step: Step = lambda *_: None
-) -> tuple[str, list[Path]]:
-    """Train the nets of the solvers and evaluate the best snapshot of each; return the table and the report's files.
+@dataclass(frozen=True)
+class Choices:
+    """What ``compare`` does besides its default.
 
-    Without ``train`` the snapshots of earlier trainings are evaluated. ``gpu`` is netspec's ``--gpu``. ``say`` is
-    called with messages, ``step`` with the progress of each training. Raises SpecError or InputError for faults in the
-    files.
+    train   False: evaluate the snapshots of earlier trainings
+    resume  resume each training from its newest snapshot
+    test    databases of test pairs, one for each data layer of a net; () for none
+    gpu     netspec's ``--gpu``
+    """
+
+    train: bool = True
+    resume: bool = False
+    test: tuple[str, ...] = ()
+    gpu: str = ""
+
+
+def compare(
+    solvers: Sequence[str], out: Path, choices: Choices, say: Say, step: Step = lambda *_: None
+) -> tuple[str, list[Path]]:
+    """Train the nets of the solvers and evaluate the best snapshot of each; return the tables and the report's files.
+
+    ``say`` is called with messages, ``step`` with the progress of each training. Raises SpecError or InputError for
+    faults in the files.
     """
     entries = [read_entry(path) for path in solvers]
     for i, entry in enumerate(entries):
         if entry.stem in [other.stem for other in entries[:i]]:
             raise SpecError(f'found a second net named "{entry.name}"; give each net its own name', Where(entry.net))
+        layers = entry.sources["validation"]
+        if choices.test and len(choices.test) != len(layers):
+            found = f"{len(choices.test)} for a net with {len(layers)} data layers"
+            raise SpecError(f"databases of test pairs: {found}; give one for each layer", Where(entry.net))
     out.mkdir(parents=True, exist_ok=True)
     runs = []
     for entry in entries:
-        if train:
+        if choices.train:
             say(f"Training {entry.name} ({entry.solver})")
             words = ["train", "--solver", entry.solver, "--scores", str(out / f"{entry.stem}.scores.json")]
-            _netspec([*words, *_on(gpu)], out / f"{entry.stem}.log", say, step, entry.length)
-        runs.append(_judged(entry, out, gpu.replace("all", "0").partition(",")[0], say))
+            words += ["--resume"] if choices.resume else []
+            _netspec([*words, *_on(choices.gpu)], out / f"{entry.stem}.log", say, step, entry.length)
+        runs.append(_judged(entry, out, choices, say))
     file = out / "runs.json"
     write_whole(file, json.dumps(runs, indent=1))
     judged = read_runs(file)
-    return text_table(judged), write_report(judged, out)
+    tables = [text_table(judged)]
+    if choices.test:
+        tables.append(text_table(read_runs(file, "test"), "test"))
+    return "\n\n".join(tables), write_report(judged, out)
 
 
-def _judged(entry: Entry, out: Path, gpu: str, say: Say) -> dict[str, Any]:
+def _judged(entry: Entry, out: Path, choices: Choices, say: Say) -> dict[str, Any]:
     """Extract the descriptors of a net and return its entry of the run file."""
+    gpu = choices.gpu.replace("all", "0").partition(",")[0]
     saved, losses = _snapshots(entry, out)
     for iteration, path in saved.items():
         if iteration not in losses:
@@ -155,12 +180,15 @@ def _judged(entry: Entry, out: Path, gpu: str, say: Say) -> dict[str, Any]:
         "descriptors": entry.bottoms[:2],
         "label": entry.bottoms[2],
     }
-    for kind in PHASES:
+    databases = {kind: tuple(entry.sources[kind].values()) for kind in PHASES}
+    if choices.test:
+        databases["test"] = choices.test
+    for kind, sources in databases.items():
         say(f"Distances of the {kind} pairs: {entry.name}, iteration {best}")
         features = out / f"{entry.stem}.{kind}.npz"
         words = ["extract", "--model", entry.net, "--weights", str(saved[best]), "--phase", "TEST"]
         words += ["--blob", *entry.bottoms, "--out", str(features)]
-        for layer, database in zip(entry.sources["validation"], entry.sources[kind].values(), strict=True):
+        for layer, database in zip(entry.sources["validation"], sources, strict=True):
             words += ["--source", f"{layer}={database}"]
         _netspec([*words, *_on(gpu)], out / f"{entry.stem}.extract.log", say)
         run[kind] = str(features)

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from datetime import timedelta
 from pathlib import Path
 
 from tqdm import tqdm
@@ -229,31 +231,53 @@ def _add_compare(commands: Commands) -> None:
         metavar="FOLDER",
         help="folder for all files (default: out/compare)",
     )
+    parser.add_argument(
+        "--resume", action="store_true", help="resume each training from its newest snapshot, if there is one"
+    )
+    parser.add_argument(
+        "--test",
+        action="append",
+        default=[],
+        metavar="DATABASE",
+        help="also judge the nets on the pairs of this database; once for each data layer of the nets",
+    )
     parser.add_argument("--gpu", default="", metavar="N", help="the number of the GPU to use (default: the CPU)")
 
 
+def _left(first: Sequence[float], done: int, total: int) -> str:
+    """Return how long a training will still take, from the time since the first iteration that was shown."""
+    if done - first[0] < 50 or done >= total:  # too early to say
+        return ""
+    seconds = (time.monotonic() - first[1]) / (done - first[0]) * (total - done)
+    return f", about {timedelta(seconds=round(seconds))} left"
+
+
 def _compare(arguments: argparse.Namespace) -> None:
-    from lmdb_build.compare import compare  # which loads the plotting library
+    from lmdb_build.compare import Choices, compare  # which loads the plotting library
 
     shown: list[tqdm] = []  # the bar of the training, on a terminal
+    first = [0, 0.0]  # the first iteration that was shown, and the time then
 
     def say(line: str) -> None:
         tqdm.write(line, file=sys.stderr)
         sys.stderr.flush()
 
     def step(done: int, total: int, loss: str) -> None:
+        if not first[1] or done < first[0]:
+            first[:] = [done, time.monotonic()]
         if not sys.stderr.isatty():
-            say(f"Iteration {done} of {total}, loss = {loss}")
+            say(f"Iteration {done} of {total}, loss = {loss}{_left(first, done, total)}")
             return
-        if done == 0:
-            shown[:] = [tqdm(total=total, desc="train", unit="", leave=False)]
+        if done == first[0]:
+            shown[:] = [tqdm(total=total, initial=done, desc="train", unit="", leave=False)]
         for training in shown:
             training.set_postfix_str(f"loss {loss}", refresh=False)
             training.update(done - training.n)
             if done == total:
                 training.close()
 
-    table, files = compare(arguments.solver, arguments.out, arguments.train, arguments.gpu, say, step)
-    print(table)
+    choices = Choices(arguments.train, arguments.resume, tuple(arguments.test), arguments.gpu)
+    tables, files = compare(arguments.solver, arguments.out, choices, say, step)
+    print(tables)
     for path in files:
         say(f"wrote {path}")

@@ -58,8 +58,10 @@ class Run:
         return (self.name, *(f"{share:.3f}" for share in shares), *figures)
 
 
-def read_runs(path: Path) -> list[Run]:
+def read_runs(path: Path, judged: str = "validation") -> list[Run]:
     """Read a run file and judge its nets: thresholds from the training pairs, metrics from the validation pairs.
+
+    ``judged`` is "test" to judge them on the test pairs instead.
 
     Raises InputError if a file or an array is missing.
     """
@@ -67,12 +69,12 @@ def read_runs(path: Path) -> list[Run]:
         entries = json.loads(path.read_text())
     except (OSError, ValueError) as fault:
         raise InputError(f"cannot read this run file: {fault}", str(path)) from None
-    return [_judge(entry) for entry in entries]
+    return [_judge(entry, judged) for entry in entries]
 
 
-def _judge(entry: dict[str, Any]) -> Run:
+def _judge(entry: dict[str, Any], judged: str) -> Run:
     parts = []
-    for kind in ("train", "validation"):
+    for kind in ("train", judged):
         with _open(entry[kind]) as arrays:
             a, b, label = (_array(arrays, name, entry[kind]) for name in (*entry["descriptors"], entry["label"]))
             parts.append((pair_distances(a, b), label.reshape(-1) != 0))
@@ -103,10 +105,10 @@ def _array(arrays: Any, name: str, path: str) -> np.ndarray:
     return arrays[name]
 
 
-def text_table(runs: Sequence[Run]) -> str:
-    """Return the table as text, with the paper's precisions below it."""
+def text_table(runs: Sequence[Run], judged: str = "validation") -> str:
+    """Return the table as text, with the paper's precisions below it; ``judged`` as in ``read_runs``."""
     paper = ", ".join(f"{name} {100 * precision:.1f} %" for name, precision in PAPER)
-    pairs = f"{runs[0].metrics.pairs} validation pairs" if runs else "no runs"
+    pairs = f"{runs[0].metrics.pairs} {judged} pairs" if runs else "no runs"
     return "\n".join(
         [
             *in_columns([COLUMNS, *(run.cells() for run in runs)]),

@@ -116,6 +116,28 @@ def test_a_snapshot_that_no_test_met_is_tested_once_more(edited: Callable[..., N
     assert run["iteration"] in (4, 5)
 
 
+def test_test_pairs_have_a_table_of_their_own(edited: Callable[..., None], capfd: pytest.CaptureFixture[str]) -> None:
+    pairs = re.findall(r'source: "(.*?)"', Path("sgd_step/train_val.prototxt").read_text())
+    assert main(["compare", SOLVER, "--out", "out", "--test", pairs[-1]]) == 0
+    validation, test = capfd.readouterr().out.split("\n\nnet ")
+    assert re.search(r"Judged on \d+ validation pairs", validation)
+    assert re.search(r"Judged on \d+ test pairs", test)
+    row_of = {part.split()[0]: part.split()[1:6] for part in (*validation.splitlines(), *test.splitlines()) if part}
+    assert row_of["sgd_step"] == validation.splitlines()[1].split()[1:6]  # the same pairs: the same metrics
+    assert main(["compare", SOLVER, "--out", "out", "--no-train", "--test", pairs[-1], "--test", pairs[-1]]) == 1
+    assert "databases of test pairs: 2 for a net with 1 data layers" in capfd.readouterr().err
+
+
+def test_a_training_resumes(edited: Callable[..., None]) -> None:
+    assert main(["compare", SOLVER, "--out", "out"]) == 0
+    before = row("out")
+    for path in Path("sgd_step").glob("ref_iter_10*"):
+        path.unlink()
+    assert main(["compare", SOLVER, "--out", "out", "--resume"]) == 0
+    assert "Resuming from" in Path("out/sgd_step.log").read_text()
+    assert {**row("out"), "ms/image": ""} == {**before, "ms/image": ""}
+
+
 def test_without_training_it_scores_the_snapshots_that_there_are(folder: Path) -> None:
     for iteration, name in ((40, "ref_iter_40"), (60, "straight_iter_60")):
         model = (GOLDEN / "snapshot" / f"{name}.caffemodel").read_bytes()

@@ -1,0 +1,176 @@
+"""The paper's Table I on your own sequences: pairs, databases, trainings, and the table.
+
+python table_1.py --room desk_1 desk_2 --room kitchen --room hall_1 hall_2 --out table_1
+
+Each --room has the sequences of one room, in the layout of TUM RGB-D, with poses in one frame of reference. The nets
+are trained on parts of all rooms and judged on other parts. With --leave-one-out, each room is also left out of a
+training once, and the nets are judged on it. Each command is shown before it runs. To go on after an interruption,
+start the script again with the same options: what is complete stays, and an unfinished training resumes.
+
+The defaults suit a laptop. The paper's own size, on a GPU:
+    --size 224 --batch 256 --iterations 30000 --train 30000 --validation 6000 --gpu 0
+Run it in a clone, or where a copy of its folder prototxt is.
+"""
+
+import argparse
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from statistics import mean
+
+from loopclosure.report.table_one import read_runs
+
+NETS = ("siamese_8", "siamese_128", "siamese_resnet27_256", "siamese_resnet27_512")
+ALL = "all rooms"
+TEST_BATCH = 50
+
+
+def parse() -> argparse.Namespace:
+    """Return the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--room", nargs="+", action="append", required=True, type=Path, metavar="SEQUENCE")
+    parser.add_argument("--out", type=Path, default=Path("table_1"), help="folder for all files (default: table_1)")
+    parser.add_argument("--nets", nargs="+", choices=NETS, default=NETS, help="the nets to train (default: all four)")
+    parser.add_argument("--seeds", type=int, default=1, help="trainings of each net (default: 1)")
+    parser.add_argument("--leave-one-out", action="store_true", help="also train without each room in turn")
+    parser.add_argument("--size", type=int, default=64, help="side of the images in pixels (default: 64)")
+    parser.add_argument("--batch", type=int, default=32, help="pairs in an iteration (default: 32)")
+    parser.add_argument(
+        "--iter-size", type=int, default=1, help="parts that a batch is computed in, to save memory (default: 1)"
+    )
+    parser.add_argument("--iterations", type=int, default=3000, help="of each training (default: 3000)")
+    parser.add_argument("--train", type=int, default=6000, help="training pairs, at most (default: 6000)")
+    parser.add_argument(
+        "--validation", type=int, default=1200, help="validation pairs, at most, and as many test pairs (default: 1200)"
+    )
+    parser.add_argument("--min-gap", default="1", help="seconds between the images of a pair, at least (default: 1)")
+    parser.add_argument("--gpu", help="the number of the GPU (default: the CPU)")
+    return parser.parse_args()
+
+
+def run(*words: object) -> None:
+    """Show a command and run it; leave with its status if it fails."""
+    command = [str(word) for word in words]
+    print("$", shlex.join(command), flush=True)
+    status = subprocess.run([sys.executable, "-m", command[0].replace("-", "_"), *command[1:]], check=False).returncode
+    if status:
+        sys.exit(status)
+
+
+def make_pairs(arguments: argparse.Namespace, rooms: list[list[Path]], out: Path, counts: tuple[int, int, int]) -> None:
+    """Write the lists and the databases of training, validation and test pairs of some rooms.
+
+    A pair is positive if its poses are less than 2 m and 15 degrees apart, as in the paper. Each room is divided by
+    time: 0.6 for training, 0.2 for validation, 0.2 for testing; test pairs alone are from the whole room.
+    """
+    root = os.path.commonpath([sequence.resolve().parent for room in arguments.room for sequence in room])
+    frames = [("--same-frame", ",".join(sequence.name for sequence in room)) for room in rooms if len(room) > 1]
+    shares = "0.6,0.2,0.2" if counts[0] else "0,0,1"
+    names = ("train", "val", "test")
+    if not all((out / f"{name}.txt").exists() for name, count in zip(names, counts, strict=True) if count):
+        chosen = [word for name, count in zip(names, counts, strict=True) for word in (f"--{name}", count)]
+        run(
+            *("lmdb-build", "pairs", *(sequence for room in rooms for sequence in room), "--root", root),
+            *("--split", "time", "--shares", shares, "--min-gap", arguments.min_gap, "--different-scenes"),
+            "--at-most",
+            *(word for frame in frames for word in frame),
+            *(*chosen, "--out", out),
+        )
+    for name, count in zip(names, counts, strict=True):
+        if count and not (out / f"{name}_lmdb").exists():
+            size = ("-resize_width", arguments.size, "-resize_height", arguments.size)
+            run("lmdb-build", "convert", *size, f"{root}/", out / f"{name}.txt", out / f"{name}_lmdb")
+
+
+def write_net(arguments: argparse.Namespace, net: str, pairs: Path, folder: Path, seed: int) -> Path:
+    """Write one of the paper's nets and its solver for these pairs; return the solver.
+
+    Rate, momentum, decay and margin are the paper's. The rate is divided by 10 after each third of the iterations. The
+    running means of BatchNorm look back over the same share of the training as in the paper's 30,000 iterations.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    text = Path("prototxt", "normalized", net, "train_val.prototxt").read_text()
+    for old, new in {
+        '"data/pairs_train_lmdb"': f'"{pairs / "train_lmdb"}"',
+        '"data/pairs_val_lmdb"': f'"{pairs / "val_lmdb"}"',
+        "batch_size: 256": f"batch_size: {arguments.batch // arguments.iter_size}",
+        "batch_size: 250": f"batch_size: {TEST_BATCH}",
+        "fraction: 0.999": f"fraction: {max(0.9, 1 - 30 / arguments.iterations):.4g}",
+    }.items():
+        text = text.replace(old, new)
+    (folder / "train_val.prototxt").write_text(text)
+    text = Path("prototxt", "normalized", net, "solver.prototxt").read_text()
+    part = max(1, arguments.iterations // 12)
+    for name, value in {
+        "net": f'"{folder / "train_val.prototxt"}"',
+        "test_iter": -(-arguments.validation // TEST_BATCH),
+        "test_interval": part,
+        "stepsize": max(1, arguments.iterations // 3),
+        "max_iter": arguments.iterations,
+        "display": 10,
+        "average_loss": 10,
+        "snapshot": part,
+        "snapshot_prefix": f'"{folder / net}"',
+        "random_seed": seed,
+        "solver_mode": "CPU" if arguments.gpu is None else "GPU",
+    }.items():
+        text = re.sub(rf"^{name}: .*", f"{name}: {value}", text, flags=re.MULTILINE)
+    (folder / "solver.prototxt").write_text(f"{text}iter_size: {arguments.iter_size}\n")
+    return folder / "solver.prototxt"
+
+
+def train(arguments: argparse.Namespace, pairs: Path, test: Path, out: Path) -> None:
+    """Train each net with each seed on some pairs, and judge it on the validation pairs and the test pairs."""
+    for seed in range(1, arguments.seeds + 1):
+        for net in arguments.nets:
+            folder = out / net / f"seed_{seed}"
+            if not (folder / "runs.json").exists():
+                solver = write_net(arguments, net, pairs, folder, seed)
+                on = () if arguments.gpu is None else ("--gpu", arguments.gpu)
+                run("lmdb-build", "compare", solver, "--resume", "--test", test, *on, "--out", folder)
+
+
+def row(out: Path, net: str, trained_on: str) -> dict[str, object]:
+    """Return the table's row of a net: means over its seeds, and the range of more than one."""
+    files = sorted((out / trained_on.replace(" ", "_") / net).glob("seed_*/runs.json"))
+    cells: dict[str, object] = {"net": net, "trained on": trained_on, "seeds": len(files)}
+    for judged in ("validation", "test"):
+        metrics = [read_runs(file, judged)[0].metrics for file in files]
+        for name, field in {"precision": "precision", "recall": "recall", "ROC AUC": "roc_auc"}.items():
+            values = [getattr(metric, field) for metric in metrics]
+            spread = f" ({min(values):.3f} to {max(values):.3f})" if len(values) > 1 else ""
+            cells[f"{judged} {name}"] = f"{mean(values):.3f}{spread}"
+    return cells
+
+
+def main() -> None:
+    """Make the table."""
+    arguments = parse()
+    if not Path("prototxt", "normalized").is_dir():
+        sys.exit("no folder prototxt/normalized here; start this script in a clone, or copy its folder prototxt here")
+    counts = (arguments.train, arguments.validation, arguments.validation)
+    out: Path = arguments.out
+    pairs = out / "pairs"
+    make_pairs(arguments, arguments.room, pairs, counts)
+    train(arguments, pairs, pairs / "test_lmdb", out / ALL.replace(" ", "_"))
+    for left in arguments.room if arguments.leave_one_out else ():
+        others, name = [room for room in arguments.room if room is not left], f"without {left[0].name}"
+        folder = out / name.replace(" ", "_")
+        make_pairs(arguments, others, folder / "pairs", (*counts[:2], 0))
+        make_pairs(arguments, [left], folder / "test", (0, 0, counts[2]))
+        train(arguments, folder / "pairs", folder / "test" / "test_lmdb", folder)
+    trained = [ALL, *(f"without {room[0].name}" for room in arguments.room)]
+    rows = [
+        row(out, net, name) for name in trained for net in NETS if any((out / name.replace(" ", "_") / net).glob("*"))
+    ]
+    (out / "table.json").write_text(json.dumps(rows, indent=1))
+    for cells in ({name: name for name in rows[0]}, *rows):
+        print(*(f"{cell!s:<24}" for cell in cells.values()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""From sequences of two rooms to the paper's Table I and its Figure 5: examples/table_1.py and figure_5.py."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lmdb_build.walk.sequence import Walk, write_walk
+from paths import ROOT
+
+pytestmark = pytest.mark.slow
+
+ROOMS = ("--room", "hall", "hall_again", "--room", "kitchen")
+SMALL = ("--iterations", "24", "--batch", "8", "--iter-size", "2", "--train", "40", "--validation", "20")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the sequences of two rooms, the nets, and the table in table_1."""
+    folder = tmp_path_factory.mktemp("table_1")
+    for seed, name in enumerate(("hall", "kitchen")):
+        list(write_walk(folder / name, Walk(frames=120, width=64, height=48, seed=seed)))
+    shutil.copytree(folder / "hall", folder / "hall_again")
+    (folder / "prototxt").symlink_to(ROOT / "prototxt")
+    said = run(folder, "table_1.py", *ROOMS, *SMALL, "--nets", "siamese_8", "--leave-one-out")
+    assert said.count("$ lmdb-build compare") == 3
+    return folder
+
+
+def run(folder: Path, script: str, *words: str) -> str:
+    """Run an example in a folder; return what it prints."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(ROOT / "examples" / script), *words]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    return json.loads((folder / "table_1" / "table.json").read_text())
+
+
+def test_the_table_has_the_rooms_left_out(folder: Path) -> None:
+    found = table(folder)
+    assert [row["trained on"] for row in found] == ["all rooms", "without hall", "without kitchen"]
+    assert all(0 <= float(row[f"{judged} ROC AUC"]) <= 1 for row in found for judged in ("validation", "test"))
+    pairs = folder / "table_1" / "without_kitchen"
+    assert "kitchen/" not in (pairs / "pairs" / "train.txt").read_text().partition("seed:")[2]
+    assert "hall" not in (pairs / "test" / "test.txt").read_text().partition("seed:")[2]
+
+
+def test_the_solver_has_the_papers_proportions(folder: Path) -> None:
+    lines = (folder / "table_1/all_rooms/siamese_8/seed_1/solver.prototxt").read_text().splitlines()
+    assert {"base_lr: 0.01", "gamma: 0.1", "momentum: 0.9", "iter_size: 2"} < set(lines)
+    assert {"stepsize: 8", "max_iter: 24", "solver_mode: CPU"} < set(lines)
+    net = (folder / "table_1/all_rooms/siamese_8/seed_1/train_val.prototxt").read_text()
+    assert "batch_size: 4 " in net
+
+
+def test_what_is_complete_stays_and_an_unfinished_training_resumes(folder: Path) -> None:
+    before, seed = table(folder), folder / "table_1" / "all_rooms" / "siamese_8" / "seed_1"
+    (seed / "runs.json").unlink()
+    for file in seed.glob("siamese_8_iter_2[24]*"):
+        file.unlink()
+    said = run(folder, "table_1.py", *ROOMS, *SMALL, "--nets", "siamese_8", "--leave-one-out")
+    assert said.count("$") == 1
+    assert "Resuming from" in (seed / "siamese_8.log").read_text()
+    assert table(folder) == before
+
+
+def test_figure_5(folder: Path) -> None:
+    weights = "table_1/all_rooms/siamese_8/seed_1/siamese_8_iter_24.caffemodel"
+    words = ("hall", "hall_again", "--net", "siamese_8", "--weights", weights, "--vocabulary", "kitchen")
+    said = run(folder, "figure_5.py", *words)
+    assert "features" in said
+    assert "s for 240 images" in said
+    assert (folder / "figure_5" / "report" / "matrices.png").exists()
+    assert (folder / "figure_5" / "report" / "precision_recall.png").exists()
