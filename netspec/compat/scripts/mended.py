@@ -35,7 +35,21 @@ def _integer(value: Any) -> Any:
     if isinstance(value, (tuple, list)):
         return type(value)(map(_integer, value)) if type(value) in (tuple, list) else value
     value = _number(value)
-    return int(value) if isinstance(value, float) or getattr(value, "dtype", None) == "float32" else value
+    is_float32 = getattr(value, "dtype", None) == "float32" and value.ndim == 0
+    return int(value) if isinstance(value, float) or is_float32 else value
+
+
+def _resized(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Return function(...), named reshape or resize. Where it is one of a library, its sizes become integers."""
+    owner = type(getattr(function, "__self__", None)).__module__.partition(".")[0]
+    first = 0
+    if getattr(function, "__module__", None) == "numpy":  # np.reshape(array, sizes)
+        owner, first = "numpy", 1
+    if owner not in ("numpy", "PIL", "netspec"):
+        return function(*arguments, **named)
+    last = len(arguments) if function.__name__ == "reshape" else first + 1
+    sizes = map(_integer, arguments[first:last])
+    return function(*arguments[:first], *sizes, *arguments[last:], **named)
 
 
 def _percent(text: str, values: Any) -> str:
@@ -131,7 +145,7 @@ def _equality(compare: Callable[[Any, Any], Any], otherwise: bool) -> Callable[[
 
 BUILTINS: dict[str, Callable[..., Any]] = {
     **{"number": _number, "index": _integer, "percent": _percent, "format": _format, "bytes": _with_bytes},
-    **{"sort": _sort, "decode": _decode, "encode": _encode},
+    **{"sort": _sort, "decode": _decode, "encode": _encode, "resized": _resized},
     **{"eq": _equality(operator.eq, False), "noteq": _equality(operator.ne, True)},
     **{name: _comparing(getattr(operator, name)) for name in ("lt", "le", "gt", "ge")},
 }

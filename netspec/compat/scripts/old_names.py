@@ -317,23 +317,30 @@ def _skimage_color(color: Any) -> None:
 def _lmdb(lmdb: Any) -> None:
     """Allow keys to be text, and an environment to be opened twice in a process, as in Python 2."""
     whole, transaction = lmdb.open, lmdb.Transaction
-    opened: dict[str, Any] = {}
+    opened: dict[tuple[int, int], _Environment] = {}
 
     def open(path: Any, *arguments: Any, **named: Any) -> _Environment:
-        place = os.path.realpath(path)
-        try:
-            real = whole(path, *arguments, **named)
-        except lmdb.Error as fault:
-            if "already open" not in str(fault) or place not in opened:
-                raise
-            return opened[place].again()
-        opened[place] = _Environment(real)
-        return opened[place]
+        earlier = opened.get(_data_file(path))
+        if earlier is not None and earlier.users[0]:
+            return earlier.again()
+        environment = _Environment(whole(path, *arguments, **named))
+        opened[_data_file(path)] = environment
+        return environment
 
     def begin(env: Any, *arguments: Any, **named: Any) -> _Transaction:
         return _Transaction(transaction(getattr(env, "real", env), *arguments, **named))
 
     lmdb.open, lmdb.Environment, lmdb.Transaction = open, open, begin
+
+
+def _data_file(path: Any) -> tuple[int, int]:
+    """Return which file, by device and number, has the data of an environment; (0, 0) if there is none yet."""
+    file = os.path.join(path, "data.mdb") if os.path.isdir(path) else path
+    try:
+        found = os.stat(file)
+    except OSError:
+        return 0, 0
+    return found.st_dev, found.st_ino
 
 
 class _Proxy:

@@ -220,7 +220,7 @@ def _generated(data: bytes, path: str) -> CodeType:
 #: Functions of these modules, and methods of these names, take bytes.
 _TAKE_BYTES = ("base64", "binascii", "hashlib", "struct", "zlib")
 _METHODS_WITH_BYTES = ("FromString", "MergeFromString", "ParseFromString")
-_WITH_SIZES = ("empty", "ones", "reshape", "resize", "zeros")  # their first argument, or all, is a size
+_WITH_SIZES = ("empty", "ones", "zeros")  # their first argument is a size
 
 
 class _Mending(ast.NodeTransformer):
@@ -261,13 +261,13 @@ class _Mending(ast.NodeTransformer):
             return _calling("sort", function, *node.args, keywords=keywords)
         if of in _TAKE_BYTES or name in (_METHODS_WITH_BYTES if is_method else self.with_bytes):
             return _calling("bytes", function, *node.args, keywords=keywords)
-        if is_method and name in _WITH_SIZES:
-            starred = any(isinstance(argument, ast.Starred) for argument in node.args)
-            count = 0 if starred else len(node.args) if name == "reshape" else 1
-            node.args[:count] = [_calling("index", argument) for argument in node.args[:count]]
+        if is_method and name in _WITH_SIZES and node.args and not isinstance(node.args[0], ast.Starred):
+            node.args[0] = _calling("index", node.args[0])
         for keyword in keywords:
             if keyword.arg in ("shape", "size"):
                 keyword.value = _calling("index", keyword.value)
+        if is_method and name in ("reshape", "resize"):
+            return _calling("resized", function, *node.args, keywords=keywords)
         return node
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
