@@ -21,6 +21,7 @@ from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.places.frames import read_bgr
 from netspec.inspect.features.describer import Describer
 from netspec.proto.text import read_net, write_text
+from netspec.solver.precision import has_bfloat16
 
 RATE, WARM, SCALE, VIEWS = 8e-4, 30, 15, 128  # rate of learning, and iterations until it is reached; views of a batch
 OWN = 0.3  # weight of the original net as a teacher
@@ -58,7 +59,7 @@ for k in range(iterations):
     cut[:, 0, 0] *= rng.choice((-1, 1))
     x = torch.from_numpy(views[batch]).float()
     x = functional.grid_sample(x, functional.affine_grid(cut, list(x.shape), False), align_corners=False)
-    with torch.autocast("cpu", torch.bfloat16):
+    with torch.autocast("cpu", torch.bfloat16, enabled=bool(has_bfloat16())):  # without, it would be slower
         units = words(data=x)
     whole, parts = (SCALE * units[name].float() @ units[name].float().T for name in ("whole", "parts"))
     loss = torch.zeros(())
