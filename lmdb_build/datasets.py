@@ -16,7 +16,7 @@ from netspec import log
 from netspec.data.database import Writer
 from netspec.data.random_words import words
 from netspec.errors import SpecError, Where
-from netspec.files.kinds import pointer_fault
+from netspec.files.kinds import pointer_fault, unreadable
 from netspec.proto.schema import Datum
 
 IMAGES, LABELS = 2051, 2049  # magic numbers at the start of MNIST files
@@ -95,7 +95,7 @@ def _read(path: str) -> bytes:
     try:
         data = Path(path).read_bytes()
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror or fault}", Where(path)) from None
+        raise SpecError(unreadable(path, fault), Where(path)) from None
     if fault := pointer_fault(data):
         raise SpecError(fault, Where(path))
     return data

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_bgr
 from netspec.errors import SpecError
+from netspec.files.kinds import unreadable
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import write_whole
 
@@ -129,13 +130,13 @@ def join_lists(lists: Sequence[Path], out: Path, seed: int, root: Path | None = 
 
 
 def _read_lines(path: Path) -> list[str]:
-    expected = 'expected lines such as "a.png b.png 1"'
+    expected = 'lines such as "a.png b.png 1"'
     try:
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")  # names of files can be any bytes
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror}); {expected}", path) from error
+        raise InputError(unreadable(path, error, expected), path) from error
     if "\0" in text:
-        raise InputError(f"cannot be read (not a text file); {expected}", path)
+        raise InputError(f"is not a text file; expected {expected}", path)
     return text.splitlines()
 
 

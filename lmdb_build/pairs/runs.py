@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from loopclosure.errors import InputError
 from loopclosure.places.frames import image_paths
 from netspec.files.image_list import IMAGE_ENDINGS
+from netspec.files.kinds import unreadable
 
 Indices = NDArray[np.intp]
 
@@ -68,9 +69,10 @@ def read_table(path: Path, images: int) -> tuple[list[tuple[int, dict[str, str]]
         with path.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.DictReader(stream, restval="")
             rows = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a table"
-        raise InputError(f"cannot be read ({reason}); expected a CSV table with a header line", path) from error
+    except OSError as error:
+        raise InputError(unreadable(path, error, "a CSV table with a header line"), path) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError("is not a table; expected a CSV table with a header line", path) from error
     if not rows:
         raise InputError("has no row below its header line", path)
     columns = [name for name, text in rows[0][1].items() if str(text).lower().endswith(IMAGE_ENDINGS)]

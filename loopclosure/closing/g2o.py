@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from loopclosure.closing.graph import Edge, Solution, solve, squares_of
 from loopclosure.detector.export import EDGE, EDGE_2D, PLANE, VERTEX, VERTEX_2D, write_pose_graph
 from loopclosure.errors import InputError
+from netspec.files.kinds import unreadable
 from netspec.files.whole_file import write_csv
 
 Array = NDArray[np.float64]
@@ -75,7 +76,7 @@ def read_pose_graph(path: Path) -> PoseGraph:
                 else:
                     vertices[ids[0]] = pose
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror}); expected a pose graph (g2o)", path) from error
+        raise InputError(unreadable(path, error, "a pose graph (g2o)"), path) from error
     if len(tags) > 1:
         raise InputError("has vertices or edges of two and of three dimensions; expected one kind", path)
     if not edges:

@@ -37,7 +37,7 @@ COMMON_NAMES = ("images", "image", "rgb", "samples", "query", "ref", "reference"
 
 @dataclass(frozen=True)
 class DataSet:
-    """Frames and their truth.
+    """One or two sequences of frames, and the truth about them. Methods get the frames alone, as their ``Images``.
 
     queries         Q frames
     references      R frames, or None for one sequence that visits its own places again

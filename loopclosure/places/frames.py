@@ -15,7 +15,7 @@ import numpy as np
 
 from loopclosure.errors import InputError
 from netspec.files.image_list import list_images
-from netspec.files.kinds import is_cut_png
+from netspec.files.kinds import is_cut_png, nearest_existing, unreadable
 from netspec.files.opencv import cv2
 from netspec.process.environment import environment
 
@@ -80,7 +80,7 @@ def read_pixels(path: str | Path, mode: int) -> np.ndarray:
     try:
         data = Path(path).read_bytes()
     except OSError as error:
-        raise InputError(f"no such image ({error.strerror})", path) from None
+        raise InputError(unreadable(path, error), path) from None
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), mode) if data and not is_cut_png(data) else None
     except cv2.error:  # too large, for example
@@ -159,7 +159,7 @@ def _opened(path: str | Path) -> cv2.VideoCapture:
         if Path(path).is_dir():
             raise InputError("is a folder, and neither a video nor a ROS bag (which has a metadata.yaml)", path)
         if not Path(path).is_file():
-            raise InputError("no such video", path)
+            raise InputError(f"no such video{nearest_existing(path)}", path)
         raise InputError(f"cannot be decoded as a video{_advice(path)}", path)
     return capture
 

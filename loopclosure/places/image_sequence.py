@@ -1,4 +1,4 @@
-"""The type for frames that data sets, detectors, methods and lists of pairs use."""
+"""The one type for frames: data sets, detectors, methods and lists of pairs have them as such sequences."""
 
 from __future__ import annotations
 

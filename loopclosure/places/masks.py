@@ -16,11 +16,13 @@ from loopclosure.places.frames import read_pixels
 from loopclosure.places.mat_file import read_mat
 from netspec.errors import SpecError
 from netspec.files.arrays import read_npy
+from netspec.files.kinds import nearest_existing, unreadable
 from netspec.files.opencv import cv2
 
 # Names of the matrix: "truth" in the FAB-MAP sets, "GT" in files derived from them.
 TRUTH_KEYS = ("truth", "gt", "groundtruth", "ground_truth")
 COORDINATE_KEYS = ("gps", "coordinates", "xy")
+TABLE_OF_PLACES = "a table with columns place_id,query,ref"
 LOSSLESS_SUFFIXES = (".bmp", ".png", ".pgm", ".tif", ".tiff")
 
 
@@ -126,8 +128,10 @@ def read_place_pairs(path: str | Path) -> list[tuple[str, Path, Path]]:
                         raise InputError(f'no such {column} image "{row[column]}"', path, reader.line_num, 1)
                     images.append(image)
                 rows.append((row["place_id"], images[0], images[1]))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError("cannot be read; expected a table with columns place_id,query,ref", path) from error
+    except OSError as error:
+        raise InputError(unreadable(path, error, TABLE_OF_PLACES), path) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"is not a table; expected {TABLE_OF_PLACES}", path) from error
     if not rows:
         raise InputError("has no row", path)
     return rows
@@ -135,7 +139,7 @@ def read_place_pairs(path: str | Path) -> list[tuple[str, Path, Path]]:
 
 def _read_matrix(path: Path, keys: tuple[str, ...], what: str, last_columns: int | None = None) -> np.ndarray:
     if not path.is_file():
-        raise InputError(f"no such file; expected {what}", path)
+        raise InputError(f"no such file; expected {what}{nearest_existing(path)}", path)
     suffix = path.suffix.lower()
     if suffix == ".mat":
         return _read_mat(path, keys, what)

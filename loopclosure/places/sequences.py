@@ -22,6 +22,7 @@ from loopclosure.places.pose_files import PoseForm, matrix_fault, moved, read_po
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, content_lines, number
 from netspec.errors import SpecError
 from netspec.files.image_list import list_images
+from netspec.files.kinds import nearest_existing
 
 QUERIES = ("query", "queries", "Query", "Queries")
 REFERENCES = ("ref", "refs", "reference", "references", "database", "Ref", "Reference", "Database")
@@ -86,11 +87,12 @@ def benchmark_parts(folder: Path) -> tuple[Path, Path, Path]:
 
 
 def _tum(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
+    expected = "expected a TUM RGB-D sequence with rgb.txt and groundtruth.txt"
     if not folder.is_dir():
-        raise InputError("no such folder; expected a TUM RGB-D sequence with rgb.txt and groundtruth.txt", folder)
+        raise InputError(f"no such folder; {expected}{nearest_existing(folder)}", folder)
     listing = folder / "rgb.txt"
     if not listing.is_file():
-        raise InputError("no such file; expected a TUM RGB-D sequence with rgb.txt and groundtruth.txt", listing)
+        raise InputError(f"no such file; {expected}{nearest_existing(listing)}", listing)
     listed = list_images(folder)
     if listed.stamps is None:
         raise InputError('has lines without a time stamp; expected "timestamp filename" in each line', listing)
@@ -143,7 +145,8 @@ def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
     base = folder / "mav0" if (folder / "mav0").is_dir() else folder
     listing = base / "cam0" / "data.csv"
     if not listing.is_file():
-        raise InputError("no such file; expected an EuRoC sequence, a folder with mav0/cam0/data.csv", listing)
+        expected = "expected an EuRoC sequence, a folder with mav0/cam0/data.csv"
+        raise InputError(f"no such file; {expected}{nearest_existing(listing)}", listing)
     stamps, images = [], []
     for line_number, line in content_lines(listing, 'a list of images, "timestamp [ns],filename" per line'):
         row = next(csv.reader([line]))
@@ -212,7 +215,7 @@ def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
 
 def _video(source: Path, max_difference: float, own_poses: bool) -> ImageSequence:
     if not source.is_file():
-        raise InputError("no such video", source)
+        raise InputError(f"no such video{nearest_existing(source)}", source)
     count = video_length(source)
     if count is None:
         raise InputError("does not say how many frames it has; save its frames as images", source)

@@ -19,6 +19,7 @@ from loopclosure.places.sequences import PoseChoice
 from loopclosure.places.trajectory import Trajectory, write_rgb_list, write_trajectory
 from loopclosure.progress import Progress, silent
 from netspec.errors import did_you_mean
+from netspec.files.kinds import nearest_existing
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import whole_folder
 
@@ -142,7 +143,7 @@ def extract(
     Raises InputError if there is another folder of that name, or if the source cannot be read.
     """
     if not source.exists():
-        raise InputError("no such file", source)
+        raise InputError(f"no such file{nearest_existing(source)}", source)
     state = source.stat()
     made_from = f"{source.resolve()} {state.st_size} {state.st_mtime_ns} {topic} {pose_topic}".rstrip() + "\n"
     if folder.exists():

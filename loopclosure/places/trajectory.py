@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopclosure.errors import InputError
+from netspec.files.kinds import unreadable
 from netspec.files.whole_file import write_whole
 
 # TUM's associate.py allows 0.02 s; with 30 Hz images and 100 Hz motion capture, 0.03 s does no harm.
@@ -132,7 +133,7 @@ def content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror}); expected {expected}", path) from error
+        raise InputError(unreadable(path, error, expected), path) from error
     except UnicodeDecodeError as error:
         raise InputError(f"is not a text file; expected {expected}", path) from error
     for number, line in enumerate(text.splitlines(), start=1):

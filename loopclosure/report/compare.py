@@ -21,6 +21,7 @@ from loopclosure.report.page import rendered
 from loopclosure.report.plots import STYLE, draw_curve, frame_curves, legends_below
 from netspec.errors import printable
 from netspec.files.figures import COLORS, png
+from netspec.files.kinds import unreadable
 from netspec.files.whole_file import write_whole
 from netspec.terminal.output import in_columns
 
@@ -84,7 +85,7 @@ def _read(path: Path, label: str) -> Report:
     try:
         found = json.loads(path.read_text("utf-8"))
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror}); expected {EXPECTED}", path) from None
+        raise InputError(unreadable(path, error, EXPECTED), path) from None
     except (ValueError, RecursionError):
         raise InputError(f"is not JSON; expected {EXPECTED}", path) from None
     try:

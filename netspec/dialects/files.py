@@ -17,6 +17,7 @@ from pathlib import Path
 from netspec import log
 from netspec.dialects.registry import Dialect, activate, announce
 from netspec.errors import SpecError, Where, did_you_mean
+from netspec.files.kinds import unreadable
 
 GROUP = "netspec.dialects"  # entry points of other packages: the name of a dialect and its module
 
@@ -71,7 +72,7 @@ def read_dialect(file: DialectFile) -> Dialect:
         text = file.path.read_text("utf-8")
         tree = ast.parse(text)
     except (OSError, UnicodeDecodeError) as fault:
-        raise SpecError(f"cannot be read: {getattr(fault, 'strerror', None) or fault}", Where(str(file.path))) from None
+        raise SpecError(unreadable(file.path, fault), Where(str(file.path))) from None
     except SyntaxError as fault:
         place = Where(str(file.path), fault.lineno or 0, fault.offset or 0)
         raise SpecError(f"this is not valid Python: {fault.msg}", place) from None

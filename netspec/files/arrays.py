@@ -23,6 +23,7 @@ from typing import IO, Any, BinaryIO, TypeVar, cast
 import numpy as np
 
 from netspec.errors import InputError
+from netspec.files.kinds import nearest_existing
 from netspec.files.limits import ALWAYS, MOST_PACKED
 
 T = TypeVar("T")
@@ -140,7 +141,7 @@ def _read(stream: IO[bytes], size: int) -> np.ndarray:
 
 def _fault(error: BaseException, path: Path, expected: str) -> InputError:
     if not path.exists():
-        return InputError(f"no such file; expected {expected}", path)
+        return InputError(f"no such file; expected {expected}{nearest_existing(path)}", path)
     if isinstance(error, InputError):
         return error
     reason = " ".join(str(error).split())

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from netspec.errors import SpecError, Where
+from netspec.files.kinds import unreadable
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 SUBFOLDERS = ("rgb", "images", "Images")
-_EXPECTED = "expected a folder of images, or a text file that lists them"
+_EXPECTED = "a folder of images, or a text file that lists them"
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _LINE = re.compile(rf"(?:(?P<stamp>{_NUMBER})\s+)?(?P<name>.+?)(?:\s+[+-]?\d+)?")
 _COMMENT = re.compile(r"\s+#")
@@ -22,7 +23,10 @@ _COMMENT = re.compile(r"\s+#")
 
 @dataclass(frozen=True)
 class ImageList:
-    """Image files in order: ``paths``, their ``names``, and ``stamps`` (N,) [s] if all have one."""
+    """Image files in order: ``paths``, their ``names``, and ``stamps`` (N,) [s] if all have one.
+
+    This is all that networks need. ``loopclosure`` adds poses, a camera and videos (its ImageSequence).
+    """
 
     paths: tuple[Path, ...]
     names: tuple[str, ...]
@@ -68,13 +72,13 @@ def _in_time(images: ImageList) -> ImageList:
 
 def _read_list(path: Path) -> ImageList:
     if path.suffix.lower() in IMAGE_ENDINGS:
-        raise SpecError(f"is a single image; {_EXPECTED}", Where(str(path)))
+        raise SpecError(f"is a single image; expected {_EXPECTED}", Where(str(path)))
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except OSError as fault:
-        raise SpecError(f"cannot be read: {fault.strerror}; {_EXPECTED}", Where(str(path))) from None
+        raise SpecError(unreadable(path, fault, _EXPECTED), Where(str(path))) from None
     except UnicodeDecodeError:
-        raise SpecError(f"is not UTF-8 text; {_EXPECTED}", Where(str(path))) from None
+        raise SpecError(f"is not UTF-8 text; expected {_EXPECTED}", Where(str(path))) from None
     names, stamps = [], []
     for number, line in enumerate(lines, 1):
         text = line.strip()

@@ -60,12 +60,14 @@ def kind_of(data: bytes) -> str:
     return next((kind for magic, kind in _KINDS.items() if start.startswith(magic)), "")
 
 
-def unreadable(path: object, fault: OSError | ValueError) -> str:
-    """Return why a file cannot be read, and what to do where it is a web address or is not there."""
+def unreadable(path: object, fault: OSError | ValueError, expected: str = "") -> str:
+    """Return why a file cannot be read, what was ``expected``, and where to look if it is not there."""
     text = str(path)
     if "://" in text or text.startswith(("http:/", "https:/")):
         return "is a web address; download the file and give its path"
     reason = f"cannot be read: {getattr(fault, 'strerror', None) or fault}"
+    if expected:
+        reason = f"{reason}; expected {expected}"
     return f"{reason}{nearest_existing(text)}" if isinstance(fault, FileNotFoundError) else reason
 
 

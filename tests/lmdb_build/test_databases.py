@@ -260,7 +260,7 @@ def test_a_label_that_is_no_number_is_refused(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_a_missing_list_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    check_refused(tmp_path, capsys, convert_pairs_lmdb, [PNG, f"{tmp_path}/nix"], "cannot be read (No such file")
+    check_refused(tmp_path, capsys, convert_pairs_lmdb, [PNG, f"{tmp_path}/nix"], "cannot be read: No such file")
 
 
 def test_an_existing_database_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str], pair_list: str) -> None:

@@ -16,6 +16,7 @@ import torch
 from netspec import log
 from netspec.dialects.boxes import Array, as_array, highest, overlaps
 from netspec.errors import SpecError, Where
+from netspec.files.kinds import unreadable
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.reading import State
 from netspec.proto.schema import value
@@ -64,7 +65,7 @@ class DetectionEvaluate(Layer):
         try:
             rows = [line.split() for line in Path(file).read_text().splitlines() if line.strip()]
         except (OSError, UnicodeDecodeError) as fault:
-            message = f'name_size_file "{file}" cannot be read: {getattr(fault, "strerror", None) or fault}'
+            message = f'name_size_file "{file}" {unreadable(file, fault)}'
             raise self.error(message, "detection_evaluate_param", "name_size_file") from None
         for number, row in enumerate(rows, 1):
             if len(row) != 3 or not all(word.isdecimal() for word in row[1:]):

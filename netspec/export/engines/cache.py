@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
-import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -20,6 +18,8 @@ from typing import Any
 from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
+from netspec.files.own_folder import inside
+from netspec.files.whole_file import whole_folder
 from netspec.proto.forks import forks
 
 _EXPORTING = (
@@ -83,9 +83,9 @@ def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, b
     """Return the folder of a key, and whether it is new. A missing folder is created and filled by ``make``.
 
     An entry with damaged files is renamed, with a warning, and created again. Raises OSError if the folder
-    cannot be written.
+    cannot be written, and SpecError if the entry is a link.
     """
-    place = folder / key
+    place = inside(folder, key)
     if place.is_dir():
         if _is_whole(place):
             return place, False
@@ -94,21 +94,14 @@ def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, b
         with suppress(FileNotFoundError):  # another process moved it
             place.rename(aside)
     folder.mkdir(parents=True, exist_ok=True)
-    unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
     try:
-        make(unfinished)
-        digests = {path.name: _digest(path) for path in unfinished.iterdir()}
-        (unfinished / DIGESTS).write_text(json.dumps(digests))
-        for path in unfinished.iterdir():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
-        try:
-            unfinished.rename(place)
-        except OSError:
-            if not place.is_dir():  # another process may have made the same entry
-                raise
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)  # created by this call
+        with whole_folder(place) as unfinished:
+            make(unfinished)
+            digests = {path.name: _digest(path) for path in unfinished.iterdir()}
+            (unfinished / DIGESTS).write_text(json.dumps(digests))
+    except OSError:
+        if not place.is_dir():  # another process may have made the same entry
+            raise
     return place, True
 
 

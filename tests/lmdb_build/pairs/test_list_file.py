@@ -76,7 +76,7 @@ class TestFile:
         (tmp_path / "list.txt").write_text("# nothing\n")
         with pytest.raises(InputError, match="lists no pair"):
             read_pair_list(tmp_path / "list.txt")
-        with pytest.raises(InputError, match=r"none\.txt: cannot be read \(No such file"):
+        with pytest.raises(InputError, match=r"none\.txt: cannot be read: No such file"):
             read_pair_list(tmp_path / "none.txt")
 
     def test_a_name_with_blanks_is_quoted(self, tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ class TestWarp:
         source = singles_source(photos / "photos", photos)
         for path in (photos / "photos").iterdir():
             path.unlink()
-        with pytest.raises(InputError, match=r"photos/\d\.png: no such image"):
+        with pytest.raises(InputError, match=r"photos/\d\.png: cannot be read: No such file"):
             build_lists(source, Plan({"train": 4}, by="group", warp_share=1.0), photos, photos / "o")
 
 
@@ -255,7 +255,7 @@ class TestContactSheet:
 
     def test_a_missing_image_is_named_with_its_line(self, listed: Path) -> None:
         (listed.parent / "photos/1.png").unlink()
-        with pytest.raises(InputError, match=r"list\.txt:2:1: .*photos/1\.png no such image"):
+        with pytest.raises(InputError, match=r"list\.txt:2:1: .*photos/1\.png cannot be read: No such file"):
             contact_sheet(listed, listed.parent)
 
     def test_it_is_written_as_its_ending_says(self, listed: Path) -> None:

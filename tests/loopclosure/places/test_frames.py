@@ -84,7 +84,7 @@ def test_broken_sources(tmp_path):
         image_paths(tmp_path / "absent.txt")
     with pytest.raises(SpecError, match="single image"):
         image_paths(tmp_path / "a.png")
-    with pytest.raises(InputError, match="no such image"):
+    with pytest.raises(InputError, match="cannot be read: No such file"):
         read_bgr(tmp_path / "a.png")
     (tmp_path / "a.png").write_text("text")
     with pytest.raises(InputError, match="is not a readable image"):

@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from netspec.dialects import use_dialect
 from netspec.errors import SpecError
+from netspec.files.image_list import list_images
 from netspec.proto.binary import check_readable
 from netspec.proto.text import read_net, read_solver
 
@@ -31,3 +33,24 @@ def test_how_far_the_path_exists(read, path: str, says: str, tmp_path: Path, mon
     with pytest.raises(SpecError) as fault:
         read(str(tmp_path / "wide"))
     assert str(fault.value) == f"{tmp_path}/wide: cannot be read: No such file or directory"
+
+
+def test_what_was_expected_stands_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("photos").mkdir()
+    with pytest.raises(SpecError) as fault:
+        list_images("photo")
+    expected = "expected a folder of images, or a text file that lists them"
+    assert str(fault.value) == (
+        f"photo: cannot be read: No such file or directory; {expected}; "
+        f'did you mean "photos"?; relative paths start from {tmp_path}'
+    )
+
+
+def test_a_dialect_by_its_path(tmp_path: Path) -> None:
+    (tmp_path / "ours.py").touch()
+    with pytest.raises(SpecError) as fault:
+        use_dialect(str(tmp_path / "our.py"))
+    assert str(fault.value) == (
+        f'{tmp_path}/our.py: cannot be read: No such file or directory; did you mean "{tmp_path}/ours.py"?'
+    )

@@ -95,6 +95,16 @@ def test_a_damaged_entry_is_made_again(
     ]
 
 
+def test_no_entry_is_written_through_a_link(tmp_path: Path) -> None:
+    cache, elsewhere = tmp_path / "cache", tmp_path / "elsewhere"
+    cache.mkdir()
+    elsewhere.mkdir()
+    (cache / "key").symlink_to(elsewhere)
+    with pytest.raises(SpecError, match="key: is a link, and nothing is written through a link; move it away"):
+        entry(cache, "key", Maker())
+    assert list(elsewhere.iterdir()) == []
+
+
 def test_a_key_is_of_contents_and_options(tmp_path: Path) -> None:
     one, same, other = (tmp_path / name for name in ("one", "same", "other"))
     for path, text in ((one, "a"), (same, "a"), (other, "b")):
