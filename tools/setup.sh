@@ -11,7 +11,9 @@ if [ ! -x "$VENV/bin/netspec" ] || [ ! -e "$INSTALLED" ] || [ "$ROOT/pyproject.t
   quiet=--quiet
   if [ -t 2 ]; then quiet=; fi  # on a terminal pip shows how long a download takes
   # pip unpacks gigabytes into TMPDIR, and /tmp may be in memory.
-  install() { TMPDIR="$VENV/tmp" "$VENV/bin/python" -m pip install $quiet --disable-pip-version-check "$@" >&2; }
+  install() {
+    TMPDIR="$VENV/tmp" "$VENV/bin/python" -m pip install $quiet --no-compile --disable-pip-version-check "$@" >&2
+  }
   if ! "$VENV/bin/python" -m pip --version >/dev/null 2>&1; then
     if ! "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 10))'; then
       echo "$("$PYTHON" --version) is too old; name Python 3.10 or later: PYTHON=python3.12 $0" >&2
@@ -30,6 +32,8 @@ if [ ! -x "$VENV/bin/netspec" ] || [ ! -e "$INSTALLED" ] || [ "$ROOT/pyproject.t
   echo "Installing everything else" >&2
   install -e "$ROOT${NEEDS:+[$NEEDS]}"
   rm -r "$VENV/tmp"
+  # pip would compile on one core. Some packages have templates that are not Python: it says so by its status.
+  "$VENV/bin/python" -m compileall -q -j 0 "$VENV"/lib/python*/site-packages >"$VENV/compiled.log" || true
   touch "$VENV/installed" "$INSTALLED"
 fi
 "$PYTHON" "$ROOT/prototxt/variants.py"

@@ -25,7 +25,7 @@ BLOCK = 512  # rows of a matrix of scores that are looked at together: memory is
 
 @dataclass(frozen=True)
 class Images:
-    """The images that a method is given.
+    """The sequences that a method is given: those of a DataSet without its truth, and images to train on.
 
     queries     Q image files
     references  R image files; None for one sequence that visits its own places again: the queries are the references,

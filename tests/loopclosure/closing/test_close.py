@@ -1,7 +1,9 @@
 """``loopclosure close`` on the synthetic walk, which knows truth and depth; and one false loop put in by hand."""
 
 import csv
+import io
 import re
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -36,11 +38,19 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def close(walk: Path, out: Path, capsys: pytest.CaptureFixture[str], *more: str, loops: Path | None = None) -> str:
-    table = loops or walk.parent / "loops.csv"
-    line = ["close", str(walk), "--loops", str(table), "--drift", "2", "--seed", "3", *more, "--out", str(out)]
-    assert main(line) == 0, capsys.readouterr().err
-    return capsys.readouterr().out
+def close(folder: Path, loops: Path, out: Path) -> str:
+    """Close the loops of a sequence; return what the command prints."""
+    line = ["close", str(folder), "--loops", str(loops), "--drift", "2", "--seed", "3", "--out", str(out)]
+    with redirect_stdout(io.StringIO()) as printed:
+        assert main(line) == 0
+    return printed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def closed(walk: Path) -> tuple[str, Path]:
+    """What the command prints where it closes the walk, and the folder that it writes."""
+    out = walk.parent / "closed"
+    return close(walk, walk.parent / "loops.csv", out), out
 
 
 def errors(said: str) -> tuple[float, float]:
@@ -49,24 +59,22 @@ def errors(said: str) -> tuple[float, float]:
     return float(found[1]), float(found[2])
 
 
-def test_depth_mends_the_path(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = close(walk, tmp_path, capsys)
+def test_depth_mends_the_path(closed: tuple[str, Path]) -> None:
+    said, out = closed
     before, after = errors(said)
     assert before > 0.1
     assert after < 0.4 * before
     assert "loops measured in meters, from depth" in said
-    assert (tmp_path / "paths.png").stat().st_size > 10_000
-    assert len(read_poses(tmp_path / "closed.txt").poses) == FRAMES
+    assert (out / "paths.png").stat().st_size > 10_000
+    assert len(read_poses(out / "closed.txt").poses) == FRAMES
 
 
-def test_color_alone_mends_it_too_and_says_what_it_does_not_know(
-    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_color_alone_mends_it_too_and_says_what_it_does_not_know(walk: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare"
     bare.mkdir()
     for name in ("rgb", "rgb.txt", "groundtruth.txt", "calibration.txt"):
         (bare / name).symlink_to(walk / name)
-    said = close(bare, tmp_path / "out", capsys, loops=walk.parent / "loops.csv")
+    said = close(bare, walk.parent / "loops.csv", tmp_path / "out")
     before, after = errors(said)
     assert after < 0.6 * before
     assert "direction of the translation (up to scale)" in said
@@ -74,7 +82,7 @@ def test_color_alone_mends_it_too_and_says_what_it_does_not_know(
     assert "from depth" not in said
 
 
-def test_one_false_loop_is_survived(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_false_loop_is_survived(walk: Path, closed: tuple[str, Path], tmp_path: Path) -> None:
     """Frame 40 is said to show the place of frame 5, and its picture is put there, so that the images agree."""
     lying = tmp_path / "lying"
     lying.mkdir()
@@ -86,25 +94,24 @@ def test_one_false_loop_is_survived(walk: Path, tmp_path: Path, capsys: pytest.C
         (lying / name).symlink_to(walk / name)
     table = tmp_path / "loops.csv"
     table.write_text((walk.parent / "loops.csv").read_text() + "40,5\n")
-    _, clean = errors(close(walk, tmp_path / "clean", capsys))
-    said = close(lying, tmp_path / "out", capsys, loops=table)
-    _, after = errors(said)
+    _, clean = errors(closed[0])
+    _, after = errors(close(lying, table, tmp_path / "out"))
     assert after < 1.2 * clean + 0.005
     with (tmp_path / "out" / "loops.csv").open() as stream:
         used = {(row["query_id"], row["match_id"]): row["used"] for row in csv.DictReader(stream)}
     assert used[("40", "5")] == "no"
 
 
-def test_the_graph_says_what_was_measured(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    close(walk, tmp_path, capsys)
-    lines = [line.split() for line in (tmp_path / "closed.g2o").read_text().splitlines()]
+def test_the_graph_says_what_was_measured(walk: Path, closed: tuple[str, Path]) -> None:
+    _, out = closed
+    lines = [line.split() for line in (out / "closed.g2o").read_text().splitlines()]
     vertices = {int(words[1]): np.array(words[2:], float) for words in lines if words[0] == "VERTEX_SE3:QUAT"}
     edges = [
         (int(words[1]), int(words[2]), np.array(words[3:10], float)) for words in lines if words[0] != "VERTEX_SE3:QUAT"
     ]
     assert sorted(vertices) == list(range(FRAMES))
     assert all(len(words) == 31 for words in lines if words[0] == "EDGE_SE3:QUAT")
-    odometry = read_poses(tmp_path / "odometry.txt").poses
+    odometry = read_poses(out / "odometry.txt").poses
     for i, j, step in edges[: FRAMES - 1]:
         assert j == i + 1
         np.testing.assert_allclose(step, relative_pose(odometry[i], odometry[j]), atol=1e-4)
@@ -115,10 +122,11 @@ def test_the_graph_says_what_was_measured(walk: Path, tmp_path: Path, capsys: py
     assert np.median(off) < 0.06
 
 
-def test_odometry_from_a_file(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = close(walk, tmp_path / "a", capsys)
-    odometry = tmp_path / "a" / "odometry.txt"
-    line = ["close", str(walk), "--loops", str(walk.parent / "loops.csv"), "--odometry", str(odometry)]
+def test_odometry_from_a_file(
+    walk: Path, closed: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said, out = closed
+    line = ["close", str(walk), "--loops", str(walk.parent / "loops.csv"), "--odometry", str(out / "odometry.txt")]
     assert main([*line, "--out", str(tmp_path / "b")]) == 0
     again = capsys.readouterr().out
     assert errors(again) == pytest.approx(errors(said), abs=1e-3)
