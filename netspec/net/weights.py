@@ -21,7 +21,7 @@ from netspec import log
 from netspec.data import blobs
 from netspec.errors import Report, SpecError, Where, several
 from netspec.files.hdf5 import layer_groups, new_hdf5, open_hdf5
-from netspec.files.kinds import head_of, is_safetensors
+from netspec.files.kinds import head_of, is_safetensors, unreadable
 from netspec.files.whole_file import write_whole
 from netspec.layers.contract.base import Layer, shape_string
 from netspec.net.net import Net
@@ -111,9 +111,7 @@ def _read_into(blob: torch.Tensor, values: blobs.Elsewhere) -> None:
         for start, part in values.parts():
             flat[start : start + len(part)].copy_(torch.from_numpy(part))
     except (OSError, ValueError) as fault:
-        raise SpecError(
-            f"cannot be read: {getattr(fault, 'strerror', None) or fault}", Where(values.file.name)
-        ) from None
+        raise SpecError(unreadable(values.file.name, fault), Where(values.file.name)) from None
     if target is not blob:
         blob.copy_(target)
 
