@@ -30,11 +30,11 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGIN
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests of pages, site, wheel and examples take the longest and come first.
+    """Pyright takes the longest and comes first, then tests of pages, site, wheel and examples.
 
     In a parallel run, the last tests are then short, and the site is built only once.
     """
-    items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
+    items.sort(key=lambda item: (item.path.name != "test_types.py", item.path.parent != Path(__file__).parent))
 
 
 @pytest.hookimpl(wrapper=True)
