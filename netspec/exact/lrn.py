@@ -7,7 +7,7 @@ Caffe: src/caffe/layers/lrn_layer.cpp
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -18,11 +18,21 @@ from netspec.exact.pointwise import Pointwise
 from netspec.exact.sums import Product
 
 
-def within_channel(maps: torch.Tensor, size: int, alpha: float, beta: float) -> torch.Tensor:
+class Settings(NamedTuple):
+    """The numbers of a local response normalization."""
+
+    size: int
+    alpha: float
+    beta: float
+    k: float
+
+
+def within_channel(maps: torch.Tensor, settings: Settings) -> torch.Tensor:
     """Divide each value by a power of the squares around it in its map: (1 + alpha * their mean) ** beta.
 
     Caffe computes this with an internal net: Power, average Pooling, Power and a product.
     """
+    size, alpha, beta, _ = settings
     squares = Pointwise.apply(maps, lambda x: libm.power(x, 2), lambda x, _, diff: diff * (2 * x))
     means = F.avg_pool2d(squares, size, stride=1, padding=size // 2)
 
@@ -45,29 +55,27 @@ class AcrossChannels(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, maps: torch.Tensor, size: int, alpha: float, beta: float, k: float) -> torch.Tensor:
+    def forward(ctx: Any, maps: torch.Tensor, settings: Settings) -> torch.Tensor:
+        size, alpha, beta, k = settings
         base = _forward_sums(maps * maps, size, alpha / size, k)
         ctx.save_for_backward(maps, base)
-        ctx.settings = size, alpha, beta
+        ctx.settings = settings
         return libm.power(base, -beta) * maps
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[Any, ...]:
         maps, base = ctx.saved_tensors
-        size, alpha, beta = ctx.settings
+        size, alpha, beta, _ = ctx.settings
         roots = libm.power(base, -beta)
         sums = _backward_sums(diff * (roots * maps) / base, size)
-        return torch.add(diff * roots, maps * sums, alpha=-2 * alpha * beta / size), None, None, None, None
+        return torch.add(diff * roots, maps * sums, alpha=-2 * alpha * beta / size), None
 
 
 def across_channels_gradient(
-    maps: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, settings: tuple[int, float, float, float]
+    maps: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, settings: Settings
 ) -> torch.Tensor:
-    """Return the gradient of AcrossChannels, (N, C, H, W), from ``tops`` that may have been overwritten.
-
-    ``settings`` are its size, alpha, beta and k.
-    """
+    """Return the gradient of AcrossChannels, (N, C, H, W), from ``tops`` that may have been overwritten."""
     size, alpha, beta, k = settings
     base = _forward_sums(maps * maps, size, alpha / size, k)
     sums = _backward_sums(diff * tops / base, size)

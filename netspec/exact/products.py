@@ -34,6 +34,16 @@ class Filter:
     pad: Axes
     dilation: Axes
 
+    @property
+    def extent(self) -> Axes:
+        """The pixels that the dilated filter spans."""
+        return tuple(d * (k - 1) + 1 for k, d in zip(self.kernel, self.dilation, strict=True))
+
+    @property
+    def reads_padding_alone(self) -> bool:
+        """Whether it fits between the edge of the padding and the map: oneDNN may then read beyond the map."""
+        return any(p >= e for p, e in zip(self.pad, self.extent, strict=True))
+
     def fits(self, size: Axes) -> list[int]:
         """Return how often the filter fits along each axis of a map of this size."""
         axes = zip(size, self.kernel, self.stride, self.pad, self.dilation, strict=True)

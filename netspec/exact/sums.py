@@ -102,7 +102,7 @@ class Product(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, stable: bool, *bottoms: torch.Tensor) -> torch.Tensor:
         ctx.stable = stable
-        top = _product(bottoms)
+        top = product(bottoms)
         ctx.save_for_backward(top, *bottoms)
         return top
 
@@ -119,11 +119,12 @@ def product_gradient(
     stable: bool, bottoms: Sequence[torch.Tensor], i: int, top: torch.Tensor, diff: torch.Tensor
 ) -> torch.Tensor:
     """Return the gradient of factor ``i`` of a product, from ``top`` and ``diff``, the product's."""
-    others = _product([*bottoms[:i], *bottoms[i + 1 :]])
+    others = product([*bottoms[:i], *bottoms[i + 1 :]])
     return (others if stable else torch.where(bottoms[i] == 0, others, top / bottoms[i])) * diff
 
 
-def _product(factors: Any) -> torch.Tensor:
+def product(factors: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Return the product of tensors, multiplied one after the other."""
     first, *others = factors
     for other in others:
         first = first * other

@@ -146,7 +146,7 @@ class Prepared:
         layers = [fit or layer for fit, layer in zip(found, self._layers, strict=True)]
         changing = self._changing()
         probe = torch.empty(1, dtype=next((dtype for *_, dtype in given), torch.float32), device=self._device)
-        exact = [fit is not None and fit.is_exact(probe, fit.small) for fit in found]
+        exact = [fit is not None and fit.arithmetic(probe).is_caffes for fit in found]
         as_is = [fit is None or bool(changing & set(map(id, fit.blobs))) for fit in found]
         roles = roles_of(plan, layers)
         foldable = [not (e or a) for e, a in zip(exact, as_is, strict=True)]

@@ -14,8 +14,7 @@ import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.exact import libm
-from netspec.exact.channels import Slopes
-from netspec.exact.pointwise import Pointwise, tanh_gradient
+from netspec.exact.pointwise import tanh_gradient
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
@@ -32,7 +31,7 @@ class Rounded(Activation):
     """Base of activations that torch rounds differently from the C library, which Caffe calls."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return Pointwise.apply(x, self.as_caffe, self.caffes_gradient) if self.is_exact(x) else self.as_torch(x)
+        return self.arithmetic(x).function(x, self.as_torch, self.as_caffe, self.caffes_gradient)
 
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
         """Return the activated bottom, computed by torch's functions, with gradients by autograd."""
@@ -115,12 +114,7 @@ class PReLU(Activation):
         self.add_blob(() if p.channel_shared else shape[1:2], p.filler if p.HasField("filler") else None, 0.25)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        slopes = self.blob(0)
-        if self.is_exact(x):
-            return Slopes.apply(x.reshape(*x.shape[:2], -1), slopes, self.context.options.accumulate_in_place).reshape(
-                x.shape
-            )
-        return F.prelu(x, slopes.reshape(-1))
+        return self.arithmetic(x).sloped(x, self.blob(0))
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         slopes = math.prod(self.blob_shapes[0])

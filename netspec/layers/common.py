@@ -6,10 +6,8 @@ import math
 from collections.abc import Sequence
 
 import torch
-from torch.nn import functional as F
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.vectors import ChosenRows, SummedProducts, VectorProducts
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
@@ -53,12 +51,8 @@ class InnerProduct(Layer):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
-        transposed = self.param.inner_product_param.transpose
-        exact, in_place = self.is_exact(data, self.small), self.context.options.accumulate_in_place
-        if exact or (in_place and torch.is_grad_enabled()):
-            vectors, products = data.reshape(-1, self.inputs), VectorProducts if exact else SummedProducts
-            return products.apply(vectors, weight, bias, transposed, in_place).reshape(self.top_shapes[0])
-        return F.linear(data.flatten(self.axis), weight.t() if transposed else weight, bias)
+        vectors, transposed = data.flatten(self.axis), self.param.inner_product_param.transpose
+        return self.arithmetic(data).inner_product(vectors, weight, bias, transposed)
 
     @property
     def small(self) -> bool:
@@ -160,11 +154,7 @@ class Embed(Layer):
             message = f"found index {wrong[0]:g}, expected integers from 0 to {rows - 1} (input_dim - 1)"
             raise self.error(message, "bottom")
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
-        if self.is_exact(weight):
-            tops = ChosenRows.apply(index.flatten(), weight, bias, self.context.options.accumulate_in_place)
-            return tops.reshape(self.top_shapes[0])
-        top = F.embedding(index, weight)
-        return top if bias is None else top + bias
+        return self.arithmetic(weight).chosen_rows(index, weight, bias)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         top = graph.node("Gather", graph.blob(0), graph.cast(bottoms[0], "int64"), axis=0)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch.nn import functional as F
 
-from netspec.exact.channels import RowNormalization, row_normalization_gradient
-from netspec.exact.lrn import AcrossChannels, across_channels_gradient, within_channel
+from netspec.exact.lrn import Settings
 from netspec.layers.contract.base import MOST, Layer, Shape, is_in_place
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
@@ -48,39 +46,18 @@ class LRN(Layer):
         return bottom_shapes
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        param = self.param.lrn_param
-        size = param.local_size
-        if self.is_exact(data):
-            if param.norm_region == ACROSS_CHANNELS:
-                return AcrossChannels.apply(data, size, param.alpha, param.beta, param.k)
-            return within_channel(data, size, param.alpha, param.beta)
-        if param.norm_region == ACROSS_CHANNELS:
-            return data * self._base(data).pow(-param.beta)
-        base = 1 + param.alpha * F.avg_pool2d(data * data, size, stride=1, padding=size // 2)
-        return data * base.pow(-param.beta)
+        if self.param.lrn_param.norm_region == ACROSS_CHANNELS:
+            return self.arithmetic(data).across_channels(data, self.settings)
+        return self.arithmetic(data).within_channel(data, self.settings)
 
-    def _base(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the base of the divisor: k + alpha times the mean of the squares in the neighboring channels."""
+    @property
+    def settings(self) -> Settings:
+        """The numbers of the formula."""
         param = self.param.lrn_param
-        return param.k + param.alpha / param.local_size * self._window_sums(data * data)
-
-    def _window_sums(self, maps: torch.Tensor) -> torch.Tensor:
-        """Return the sums over the neighboring channels."""
-        size, channels = self.param.lrn_param.local_size, maps.shape[1]
-        framed = F.pad(maps, (0, 0, 0, 0, size // 2, size // 2))
-        total = framed[:, :channels]
-        for shift in range(1, size):
-            total = total + framed[:, shift : shift + channels]
-        return total
+        return Settings(param.local_size, param.alpha, param.beta, param.k)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        param = self.param.lrn_param
-        size, alpha, beta = param.local_size, param.alpha, param.beta
-        if self.is_exact(bottom):
-            return across_channels_gradient(bottom, top, diff, (size, alpha, beta, param.k))
-        base = self._base(bottom)
-        sums = self._window_sums(diff * top / base)
-        return diff * base.pow(-beta) - 2 * alpha * beta / size * bottom * sums
+        return self.arithmetic(bottom).across_channels_gradient(bottom, top, diff, self.settings)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         param = self.param.lrn_param
@@ -130,14 +107,9 @@ class MVN(Layer):
         return [(*shape, *(1,) * (4 - len(shape)))]
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        param, maps = self.param.mvn_param, self._maps(data)
-        if self.is_exact(data):
-            top: torch.Tensor = RowNormalization.apply(maps, param.eps if param.normalize_variance else None)
-        elif param.normalize_variance:
-            top = _Standardize.apply(maps, param.eps)
-        else:
-            top = maps - maps.mean(dim=1, keepdim=True)
-        return top.reshape(self.top_shapes[0])
+        param = self.param.mvn_param
+        eps = param.eps if param.normalize_variance else None
+        return self.arithmetic(data).standardized(self._maps(data), eps).reshape(self.top_shapes[0])
 
     def _maps(self, blob: torch.Tensor) -> torch.Tensor:
         """Return the maps of a bottom or top as rows."""
@@ -146,11 +118,8 @@ class MVN(Layer):
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         maps, tops, diffs = self._maps(bottom), self._maps(top), self._maps(diff)
-        eps = self.param.mvn_param.eps
-        if self.is_exact(bottom):
-            return row_normalization_gradient(maps, tops, diffs, eps).reshape(bottom.shape)
-        deviation = _deviation(maps - maps.mean(dim=1, keepdim=True), eps)
-        return _standardized_gradient(tops, deviation, diffs).reshape(bottom.shape)
+        found = self.arithmetic(bottom).standardized_gradient(maps, tops, diffs, self.param.mvn_param.eps)
+        return found.reshape(bottom.shape)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         param, (data,) = self.param.mvn_param, bottoms
@@ -174,35 +143,6 @@ class MVN(Layer):
         if not param.normalize_variance:
             return code.call(f"{function}({{x}}, {{axes}})", x=x, axes=axes)
         return code.call(f"{function}({{x}}, {{axes}}, eps={{eps}})", x=x, axes=axes, eps=rounded(param.eps))
-
-
-class _Standardize(torch.autograd.Function):
-    """Normalize rows to mean 0 and standard deviation 1, with Caffe's gradient.
-
-    Caffe differentiates without ``eps``, then divides by the deviation plus eps, so a constant row has a
-    finite gradient, while autograd's is NaN.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, rows: torch.Tensor, eps: float) -> torch.Tensor:
-        centered = rows - rows.mean(dim=1, keepdim=True)
-        deviation = _deviation(centered, eps)
-        top = centered / deviation
-        ctx.save_for_backward(top, deviation)
-        return top
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return _standardized_gradient(*ctx.saved_tensors, *grads), None
-
-
-def _deviation(centered: torch.Tensor, eps: float) -> torch.Tensor:
-    return centered.square().mean(dim=1, keepdim=True).sqrt() + eps
-
-
-def _standardized_gradient(top: torch.Tensor, deviation: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:
-    along = (grad * top).mean(dim=1, keepdim=True)
-    return (grad - grad.mean(dim=1, keepdim=True) - along * top) / deviation
 
 
 def spatial_response_norm(x, size, alpha, beta):

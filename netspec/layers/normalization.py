@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from typing_extensions import override
 
-from netspec.exact import SMALL_ITEM, libm
-from netspec.exact.channels import BatchNormalization
+from netspec.exact import SMALL_ITEM
+from netspec.exact.arithmetic import AsTorch, Function
 from netspec.layers.contract.base import Layer, Param, Shape
 from netspec.layers.contract.offers import offered
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import TEST
-
-MAX_OFFSET = 8  # the largest mean, in standard deviations, for which torch's CPU kernel is exact to 1e-6
 
 
 @register("BatchNorm", "batch_norm_param")
@@ -67,9 +64,12 @@ class BatchNorm(Layer):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the normalized values; in training also add the batch's statistics to the sums."""
+        arithmetic = self.arithmetic(data)
         if self.use_global_stats:
-            return self.by_past(self.is_exact(data, self.small))(data)
-        return self._by_batch(data)
+            return self.by_past(arithmetic)(data)
+        top, *statistics = arithmetic.normalized_batch(data, self.eps, *self.factors())
+        self.add(*statistics)
+        return top.relu_() if self.rectifies else top
 
     @property
     def eps(self) -> float:
@@ -81,23 +81,15 @@ class BatchNorm(Layer):
         with torch.no_grad():
             return means(*(self.blob(i) for i in range(3)))
 
-    def by_past(self, exact: bool) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return a function that normalizes a bottom of the current shape with the current stored statistics."""
-        mean, variance = self.past()
-        eps, axes = self.param.batch_norm_param.eps, (-1, *(1,) * (len(self.bottom_shapes[0]) - 2))
-        by_channel = mean.view(axes)
-        if exact:
-            deviation = libm.sqrt(variance + eps).view(axes)
-            return lambda data: (data - by_channel).div_(deviation)
-        far = _far_from_zero(mean, variance, eps)
-        arguments = (torch.zeros_like(mean) if far else mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
-        return lambda data: torch.batch_norm(data - by_channel if far else data, None, None, *arguments)
+    def by_past(self, arithmetic: AsTorch) -> Function:
+        """Return a function that normalizes a bottom by the present stored statistics."""
+        return arithmetic.normalizes(*self.past(), self.eps)
 
     def joined_with(self, after: Layer) -> Layer | None:
         """Return this layer joined with a Scale of its channels or a ReLU after it, for one kernel of torch."""
         kind = offered(after, "joins_as")
         fits = (kind == "scale" and not self.joined) or (kind == "relu" and not self.rectifies)
-        if not fits or self.use_global_stats or self.is_exact(self.blob(0), self.small):
+        if not fits or self.use_global_stats or self.arithmetic(self.blob(0)).is_caffes:
             return None
         made = copy.copy(self)
         made.joined, made.rectifies = (*self.joined, after), kind == "relu"
@@ -108,41 +100,9 @@ class BatchNorm(Layer):
         blobs = [layer.blob(j) for layer in self.joined for j in range(len(layer.blobs))]
         return blobs[0] if blobs else None, blobs[1] if len(blobs) > 1 else None
 
-    def _by_batch(self, data: torch.Tensor) -> torch.Tensor:
-        if self.is_exact(data, self.small):
-            values = data.numel() // self.channels
-            top, mean, variance = BatchNormalization.apply(data.reshape(*data.shape[:2], -1), self.eps)
-            self._add(mean, variance, values / (values - 1) if values > 1 else 1.0)
-            tops = (top.reshape(data.shape),)
-            for layer in self.joined:
-                tops = layer.run(*tops)
-            return tops[0]
-        top = self.normalized(data, torch.batch_norm, torch.backends.cudnn.enabled)[0]
-        return top.relu_() if self.rectifies else top
-
-    def normalized(self, data: torch.Tensor, normalize: Callable[..., Any], *options: Any) -> tuple[Any, torch.Tensor]:
-        """Normalize a batch with torch's ``normalize``; return the result and its input. Add to the statistics."""
-        made, mean, variance = self._by_torch(data, normalize, options)
-        if _far_from_zero(mean, variance, self.eps):
-            # Subtracting a constant from each channel changes only the rounding of the result and the gradient.
-            data = data - mean.view(-1, *(1,) * (data.dim() - 2))
-            made, _, variance = self._by_torch(data, normalize, options)
-        # Torch's unbiased variance of one value is 0 / 0, and Caffe's is 0.
-        self._add(mean, torch.zeros_like(variance) if data.numel() == self.channels else variance)
-        return made, data
-
-    def _by_torch(
-        self, data: torch.Tensor, normalize: Callable[..., Any], options: Sequence[Any]
-    ) -> tuple[Any, torch.Tensor, torch.Tensor]:
-        """Return the normalized batch, its mean and its unbiased variance."""
-        exact_enough = torch.promote_types(data.dtype, torch.float32)
-        mean, variance = data.new_zeros(2, self.channels, dtype=exact_enough).unbind()
-        made = normalize(data, *self.factors(), mean, variance, True, 1.0, self.eps, *options)
-        return made, mean, variance
-
     @torch.no_grad()
-    def _add(self, mean: torch.Tensor, variance: torch.Tensor, unbiased: float = 1.0) -> None:
-        """Add a batch's statistics to the sums."""
+    def add(self, mean: torch.Tensor, variance: torch.Tensor, unbiased: float = 1.0) -> None:
+        """Add a batch's statistics to the sums; ``unbiased`` is what makes the variance unbiased."""
         keep = self.param.batch_norm_param.moving_average_fraction
         self.blob(0).mul_(keep).add_(mean)
         self.blob(1).mul_(keep).add_(variance, alpha=unbiased)
@@ -206,15 +166,3 @@ def _onnx_channel_means(graph: OnnxGraph, data: str, axes: int) -> str:
     for part in ([0], list(range(2, axes))):
         data = graph.node("ReduceMean", data, graph.constant(part), keepdims=1) if part else data
     return data
-
-
-def _far_from_zero(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> bool:
-    """Return whether torch's kernel would lose precision, since on a CPU it computes x / std - mean / std.
-
-    Compiled by torch.compile, it subtracts the mean first.
-    """
-    return (
-        mean.device.type == "cpu"
-        and not torch.compiler.is_compiling()
-        and bool((mean.square() > MAX_OFFSET**2 * (variance + eps)).any())
-    )

@@ -14,9 +14,8 @@ import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.exact import libm
-from netspec.exact.pointwise import CellUpdate, Pointwise, tanh_gradient
-from netspec.exact.sums import Copies
-from netspec.exact.vectors import VectorProducts
+from netspec.exact.arithmetic import AsTorch
+from netspec.exact.pointwise import lstm_unit, tanh_gradient
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
@@ -61,13 +60,6 @@ def lstm(x, cont, w_x, bias, w_h, x_static, w_static, h, c):
     return torch.stack(outputs), h[None], c[None]
 
 
-def lstm_unit(cell, gates, cont):
-    """Return the next cell and hidden state; the gates are input, forget, output and candidate."""
-    i, f, o, g = gates.chunk(4, dim=-1)
-    cell = cont * torch.sigmoid(f) * cell + torch.sigmoid(i) * torch.tanh(g)
-    return cell, torch.sigmoid(o) * torch.tanh(cell)
-
-
 class Recurrent(Layer):
     """Base of RNN and LSTM.
 
@@ -85,6 +77,7 @@ class Recurrent(Layer):
     torch_function: Callable[..., Any]
     blob_names: ClassVar[tuple[str, ...]]
     remembers = True
+    how: AsTorch  # how this pass computes
     gates: ClassVar[int] = 1  # number of inputs of a hidden unit
 
     def setup(self) -> None:
@@ -137,12 +130,12 @@ class Recurrent(Layer):
     def forward(self, x: torch.Tensor, cont: torch.Tensor, *others: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the output of every time step and, if exposed, the last state."""
         steps, streams = x.shape[:2]
-        self.exact = self.is_exact(x)
+        self.how = self.arithmetic(x)
         inputs = self.multiply(x.reshape(steps * streams, -1), 0, bias=1).reshape(steps, streams, -1)
         statics: Sequence[torch.Tensor] = ()
         if self.has_static:
             static = self.multiply(others[0].reshape(streams, -1), 2)
-            statics = Copies.apply(static, steps) if self.exact else [static] * steps
+            statics = self.how.copies(static, steps)
         state = self._first_state(x, others[self.has_static :])
         goes_on = cont.detach().to(x.dtype).unsqueeze(2)
         outputs = []
@@ -185,9 +178,7 @@ class Recurrent(Layer):
     def multiply(self, vectors: torch.Tensor, weight: int, bias: int | None = None) -> torch.Tensor:
         """Return the products of vectors (M, K) with a matrix, given by the index of its blob, plus the bias."""
         matrix, added = self.blob(weight), None if bias is None else self.blob(bias)
-        if self.exact:
-            return VectorProducts.apply(vectors, matrix, added, False, self.context.options.accumulate_in_place)
-        return F.linear(vectors, matrix, added)
+        return self.how.product_of_step(vectors, matrix, added)
 
     def carry(self, hidden: torch.Tensor, keep: torch.Tensor, inputs: tuple[torch.Tensor, ...]) -> torch.Tensor:
         """Return the sum of the inputs and, unless a sequence begins, the product for the previous hidden state."""
@@ -294,7 +285,7 @@ class RNN(Recurrent):
         return self._tanh(self.multiply(h, last + 1, bias=last + 2)), (h,)
 
     def _tanh(self, x: torch.Tensor) -> torch.Tensor:
-        return Pointwise.apply(x, libm.tanh, tanh_gradient) if self.exact else torch.tanh(x)
+        return self.how.function(x, torch.tanh, libm.tanh, tanh_gradient)
 
     @override
     def onnx_step(self, graph: OnnxGraph, inputs: str, keep: str, state: Sequence[str]) -> tuple[str, list[str]]:
@@ -305,15 +296,8 @@ class RNN(Recurrent):
         return graph.node("Tanh", output), [h]
 
 
-def _lstm_unit(
-    cell: torch.Tensor, gate_input: torch.Tensor, keep: torch.Tensor, exact: bool
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the next cell and hidden state; the order of the gates is input, forget, output, candidate."""
-    return CellUpdate.apply(cell, gate_input, keep) if exact else lstm_unit(cell, gate_input, keep)
-
-
 def _onnx_unit(graph: OnnxGraph, cell: str, gate_input: str, keep: str, units: int) -> tuple[str, str]:
-    """Write what :func:`_lstm_unit` computes."""
+    """Write what :func:`netspec.exact.pointwise.lstm_unit` computes."""
     parts = graph.constant([units] * 4)
     i, f, o, g = graph.nodes("Split", gate_input, parts, outputs=4, axis=-1)
     i, f, o = (graph.node("Sigmoid", gate) for gate in (i, f, o))
@@ -350,7 +334,7 @@ class LSTM(Recurrent):
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
         """Compute one time step; see :meth:`Recurrent.step`."""
         h, c = state
-        c, h = _lstm_unit(c, self.carry(h, keep, inputs), keep, self.exact)
+        c, h = self.how.lstm_unit(c, self.carry(h, keep, inputs), keep)
         return h, (h, c)
 
     @override
@@ -393,7 +377,7 @@ class LSTMUnit(Layer):
         return [cell, cell]
 
     def forward(self, cell: torch.Tensor, gates: torch.Tensor, cont: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return _lstm_unit(cell, gates, cont.detach().to(cell.dtype).unsqueeze(2), self.is_exact(gates))
+        return self.arithmetic(gates).lstm_unit(cell, gates, cont.detach().to(cell.dtype).unsqueeze(2))
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         cell, gates, cont = bottoms

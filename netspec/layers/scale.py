@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 
 from netspec.data.blobs import Shape
 from netspec.exact import SMALL_ITEM
-from netspec.exact.channels import ChannelProducts
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
@@ -43,16 +42,6 @@ class _Affine(Layer):
                 message = f"an operand of shape {operand} does not match the bottom's axes from {axis} on, {shape}"
                 raise self.error(message, "bottom", len(shapes) - 1)
         return axis
-
-    def apply_exactly(
-        self, data: torch.Tensor, factors: torch.Tensor | None, bias: torch.Tensor | None, axis: int
-    ) -> torch.Tensor:
-        """Multiply and add in Caffe's order; the operands apply to the axes from ``axis`` on."""
-        operand = bias if factors is None else factors
-        assert operand is not None
-        values = data.reshape(math.prod(data.shape[:axis]), operand.numel(), -1)
-        tops = ChannelProducts.apply(values, factors, bias, self.context.options.accumulate_in_place)
-        return tops.reshape(data.shape)
 
     def onnx_operand(self, graph: OnnxGraph, bottoms: Sequence[str], blob: int, axis: int) -> str:
         """Return the second bottom or a learnable blob, broadcast over the first bottom's axes from ``axis`` on."""
@@ -103,13 +92,7 @@ class Scale(_Affine):
     def forward(self, data: torch.Tensor, factors: torch.Tensor | None = None) -> torch.Tensor:
         scale = self.blob(0) if factors is None else factors
         bias = self.blob(len(self.blobs) - 1) if self.param.scale_param.bias_term else None
-        by_channel = self.axis == 1 and scale.dim() == 1
-        if self.is_exact(data, self.small):
-            return self.apply_exactly(data, scale, bias, self.axis)
-        if by_channel:
-            return scaled_by_channel(scale, bias)(data)
-        top = data * _laid_over(scale, self.axis, data)
-        return top if bias is None else top + _laid_over(bias, self.axis, data)
+        return self.arithmetic(data).scaled(data, self.axis, scale, bias)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         top = graph.node("Mul", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
@@ -163,24 +146,10 @@ class Bias(_Affine):
         return [bottom_shapes[0]]
 
     def forward(self, data: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
-        operand = self.blob(0) if bias is None else bias
-        if self.is_exact(data):
-            return self.apply_exactly(data, None, operand, self.axis)
-        return data + _laid_over(operand, self.axis, data)
+        return self.arithmetic(data).scaled(data, self.axis, None, self.blob(0) if bias is None else bias)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Add", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         return code.call("{x} + {y}", x=bottoms[0], y=self.torch_operand(code, bottoms, 0, self.axis))
-
-
-def scaled_by_channel(scale: torch.Tensor, bias: torch.Tensor | None) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Scale each channel with torch's batch normalization (mean 0, variance 1), which is three times as fast."""
-    arguments = (scale, bias, torch.zeros_like(scale), torch.ones_like(scale), False, 0.0, 0.0)
-    return lambda data: torch.batch_norm(data, *arguments, torch.backends.cudnn.enabled)
-
-
-def _laid_over(values: torch.Tensor, axis: int, data: torch.Tensor) -> torch.Tensor:
-    """Reshape ``values`` for broadcasting over the axes of ``data`` from ``axis`` on."""
-    return values.reshape(*values.shape, *(1,) * (data.dim() - axis - values.dim()))

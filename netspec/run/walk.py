@@ -7,8 +7,7 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 
-from netspec.exact.sums import RowSums
-from netspec.exact.switch import applies
+from netspec.exact.arithmetic import arithmetic
 
 Values = dict[int, torch.Tensor]  # by value number of a Plan
 Result = tuple[torch.Tensor | None, Values]  # the weighted sum of the losses (None: no losses), and all values
@@ -77,6 +76,4 @@ def walk(steps: Iterable[Step], values: Values, exact: str, visit: Visit | None 
 
 def weighted_sum(top: torch.Tensor, weight: float, exact: str) -> torch.Tensor:
     """Return what a top contributes to the net's loss (Caffe: Layer::Forward)."""
-    if top.numel() > 1 and applies(exact, top):
-        return RowSums.apply(top.reshape(1, -1), weight)[0]
-    return top.sum() if weight == 1 else top.sum() * weight
+    return arithmetic(exact, top).sums(top, factor=weight)

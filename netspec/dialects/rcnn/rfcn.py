@@ -5,7 +5,7 @@ Fork: daijifeng001/caffe-rfcn; for the losses on a CPU, Intel's caffe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from typing_extensions import override
@@ -16,7 +16,6 @@ from netspec.dialects.rcnn.regions import RegionPooling, whole
 from netspec.dialects.rcnn.smooth import NORMALIZED, SmoothL1LossOHEM, divisor, four
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
-from netspec.layers.loss.base import total
 from netspec.layers.loss.scores import SoftmaxWithLoss
 from netspec.proto.schema import added_value, value
 
@@ -126,11 +125,13 @@ class SoftmaxWithLossOHEM(SoftmaxWithLoss):
         return (*tops, self._losses.reshape(labels.shape))[: self.num_tops]
 
     @override
-    def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, exact: bool) -> torch.Tensor:
+    def sum_up(
+        self, losses: torch.Tensor, valid: torch.Tensor | None, total: Callable[[torch.Tensor], torch.Tensor]
+    ) -> torch.Tensor:
         if valid is not None:
             losses = losses.where(valid, 0)
         self._losses = losses.detach()
-        return total(losses, exact) / divisor(self, self.outer, self.inner, valid)
+        return total(losses) / divisor(self, self.outer, self.inner, valid)
 
 
 replace(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -162,8 +162,10 @@ class SoftmaxWithLoss(losses.SoftmaxWithLoss):
         return super().forward(scores, labels)
 
     @override
-    def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, exact: bool) -> torch.Tensor:
-        return super().sum_up(losses * self._each, valid, exact)
+    def sum_up(
+        self, losses: torch.Tensor, valid: torch.Tensor | None, total: Callable[[torch.Tensor], torch.Tensor]
+    ) -> torch.Tensor:
+        return super().sum_up(losses * self._each, valid, total)
 
 
 class _Dice(torch.autograd.Function):

@@ -30,7 +30,7 @@ from netspec.dialects.boxes import (
     suppress_all,
 )
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.loss.base import BATCH_SIZE, FULL, VALID, Floor, normalization_mode
+from netspec.layers.loss.base import BATCH_SIZE, FULL, VALID, normalization_mode
 from netspec.layers.loss.scores import FLT_MIN
 from netspec.proto.schema import value
 
@@ -251,7 +251,7 @@ class MultiBoxLoss(Layer):
         """Return the loss of each prior's confidences (n, p)."""
         if self.settings.conf_loss_type == SOFTMAX:
             chosen = F.log_softmax(scores, 2).gather(2, torch.from_numpy(labels).to(scores.device)[..., None])
-            return -Floor.apply(chosen.squeeze(2), math.log(FLT_MIN))
+            return -self.arithmetic(chosen).floored(chosen.squeeze(2), math.log(FLT_MIN))
         return F.binary_cross_entropy_with_logits(scores, torch.from_numpy(hot).to(scores), reduction="none").sum(2)
 
     def _box_losses(

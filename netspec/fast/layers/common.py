@@ -23,7 +23,7 @@ def _inner_product(layer: InnerProduct, how: Inference) -> Kernel | None:
     transposed, top_shape = layer.param.inner_product_param.transpose, layer.top_shapes[0]
     rows = math.prod(top_shape[:-1])
     one_by_one = (rows, layer.inputs)
-    if layer.is_exact(weight, layer.small) and math.prod(layer.bottom_shapes[0]):
+    if layer.arithmetic(weight).is_caffes and math.prod(layer.bottom_shapes[0]):
         learned = at_rest(*copies(layer.values(), how))
         return overwriting(BoundVectors(layer.bottom_shapes[0], top_shape, transposed, learned), how)
     weight = weight.t() if transposed else weight
@@ -45,7 +45,7 @@ def _learn_inner_product(layer: InnerProduct, how: Learning) -> Kernels | None:
     top_shape, inputs, wanted = layer.top_shapes[0], layer.inputs, how.wanted[0]
     if math.prod(top_shape) == 0 or inputs == 0:
         return None
-    if layer.is_exact(weight, layer.small):
+    if layer.arithmetic(weight).is_caffes:
         bound = BoundVectors(layer.bottom_shapes[0], top_shape, transposed, Weights(weight, bias, *sums), wanted)
         return Kernels(bound.forward, bound.backward)
     tops = weight.new_empty(math.prod(top_shape[:-1]), top_shape[-1])

@@ -27,7 +27,7 @@ def _learn_softmax(layer: SoftmaxWithLoss, how: Learning) -> Kernels | None:
     shape, tops = layer.bottom_shapes[0], layer.num_tops
     split, flat = (layer.outer, layer.classes, layer.inner), (layer.outer, 1, layer.inner)
     divisor = float(normalizer(layer.normalization, layer.outer, layer.inner, None))
-    exact = layer.is_exact(torch.empty(1), small=math.prod(split[1:]) <= SMALL_ITEM)
+    exact = layer.arithmetic(torch.empty(1), small=math.prod(split[1:]) <= SMALL_ITEM).is_caffes
     label, diff = torch.empty(flat, dtype=torch.long), torch.empty(split)
     normalize = _bound_softmax(split) if exact else partial(F.softmax, dim=1)
     sum_up = _bound_cross_entropy(split, FLT_MIN, divisor) if exact else lambda p, _: _mean(p, label, divisor)

@@ -7,6 +7,7 @@ import math
 
 import torch
 
+from netspec.exact.by_torch import normalized_batch
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Affine, Folds, blob_in_double
 from netspec.fast.kernels import Inference, Kernel, Learning, Room, finished
@@ -28,11 +29,11 @@ def _folds(layer: BatchNorm) -> Folds:
 def _by_past(layer: BatchNorm, how: Inference) -> Kernel | None:
     if not layer.use_global_stats:
         return None
-    return finished(layer.by_past(layer.is_exact(layer.blob(0), layer.small)), how.finish)
+    return finished(layer.by_past(layer.arithmetic(layer.blob(0))), how.finish)
 
 
 def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
-    if layer.use_global_stats or math.prod(layer.top_shapes[0]) == 0 or layer.is_exact(layer.blob(0), layer.small):
+    if layer.use_global_stats or math.prod(layer.top_shapes[0]) == 0 or layer.arithmetic(layer.blob(0)).is_caffes:
         return None
     room, rectifies, sums = Room(), layer.rectifies, [*how.sums[3:], None, None][:2]
     asked = [how.wanted[0], *(total is not None for total in sums)]
@@ -41,7 +42,9 @@ def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
 
     def forward(data: torch.Tensor) -> torch.Tensor:
         nonlocal given, top, mean, deviation
-        (top, mean, deviation), given = layer.normalized(data, torch.native_batch_norm)
+        made, given, *statistics = normalized_batch(data, torch.native_batch_norm, layer.factors(), layer.eps)
+        layer.add(*statistics)
+        top, mean, deviation = made
         return top.relu_() if rectifies else top
 
     def backward(diff: torch.Tensor) -> torch.Tensor | None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import torch
 
+from netspec.exact.by_torch import scales_channels
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Absorbed, Affine, Folds, blob_in_double, copy_of
 from netspec.fast.kernels import Inference, Kernel, Learning, finished
-from netspec.layers.scale import Bias, Scale, scaled_by_channel
+from netspec.layers.scale import Bias, Scale
 from netspec.run.recorded import Kernels, recorded
 
 
@@ -15,8 +16,8 @@ def _scale(layer: Scale, how: Inference) -> Kernel | None:
     if not layer.by_channel:
         return None
     scale, bias = layer.blob(0), layer.blob(1) if len(layer.blobs) > 1 else None
-    if not layer.is_exact(scale, layer.small):
-        return finished(scaled_by_channel(scale, bias), how.finish)
+    if not layer.arithmetic(scale).is_caffes:
+        return finished(scales_channels(scale, bias), how.finish)
     axes = (-1, *(1,) * (len(layer.bottom_shapes[0]) - 2))
     factors, *shifts = (values.clone().view(axes) for values in layer.values())
     if not shifts:
@@ -27,7 +28,7 @@ def _scale(layer: Scale, how: Inference) -> Kernel | None:
 def _learn_scale(layer: Scale, how: Learning) -> Kernels | None:
     if not layer.by_channel:
         return None
-    adds = layer.is_exact(layer.blob(0), layer.small) and layer.context.options.accumulate_in_place  # as Caffe, itself
+    adds = layer.arithmetic(layer.blob(0)).is_caffes and layer.context.options.accumulate_in_place  # as Caffe, itself
     return recorded(layer.run, how.wanted, list(layer.blobs)) if adds and how.steady else None
 
 

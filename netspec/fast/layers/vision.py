@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 
 from netspec.exact import SMALL_PRODUCT
+from netspec.exact.layout import channels_side_by_side, map_by_map, of_one_channel
 from netspec.exact.products import Filter, laid_out_like
 from netspec.fast import fused
 from netspec.fast.bound import BoundColumns, Weights, at_rest
@@ -18,7 +19,6 @@ from netspec.fast.entry import Entry
 from netspec.fast.folding import Absorbed, Folds, blob_like, copy_of
 from netspec.fast.kernels import Inference, Kernel, Learning, copies, finished, overwriting, weight_and_bias
 from netspec.layers.vision.convolution import Convolution, Deconvolution
-from netspec.layers.vision.layout import channels_side_by_side, map_by_map, of_one_channel
 from netspec.layers.vision.pooling import AVE, STOCHASTIC, Pooling
 from netspec.layers.vision.windows import CEIL, LOWEST, Windows, max_pool
 from netspec.run.recorded import Kernels, recorded
@@ -38,9 +38,9 @@ def convolution(layer: Convolution, how: Inference) -> Kernel | None:
         return None
     shape, sliding = layer.bottom_shapes[0], Filter(layer.kernel, layer.stride, layer.pad, layer.dilation)
     weight, bias = layer.blob(0), layer.blob(1) if len(layer.blobs) > 1 else None
-    if layer.is_exact(weight, layer.small):
+    if layer.arithmetic(weight).is_caffes:
         return overwriting(BoundColumns(shape, sliding, layer.group, at_rest(*copies(layer.values(), how))), how)
-    if layer.reads_padding_alone:
+    if sliding.reads_padding_alone:
         return None
     if shape[0] * layer.work > SMALL_PRODUCT and how.pack and fused.suits(weight):
         return fused.convolution(shape, weight, bias, sliding, layer.group, how)
@@ -55,10 +55,10 @@ def learn_convolution(layer: Convolution, how: Learning) -> Kernels | None:
     shape, sliding = layer.bottom_shapes[0], Filter(layer.kernel, layer.stride, layer.pad, layer.dilation)
     (weight, bias), sums = weight_and_bias(layer, how)
     weights = Weights(weight, bias, *sums)
-    if layer.is_exact(weight, layer.small):
+    if layer.arithmetic(weight).is_caffes:
         bound = BoundColumns(shape, sliding, layer.group, weights, how.wanted[0], how.steady)
         return Kernels(bound.forward, bound.backward)
-    if layer.reads_padding_alone:
+    if sliding.reads_padding_alone:
         return None
     lay_out = channels_side_by_side if math.prod(shape) > 2 * weight.numel() else map_by_map
     return _convolutions(layer, sliding, weights, how.wanted[0], lay_out)
@@ -124,7 +124,7 @@ def _scaled_filters(layer: Convolution, scale: torch.Tensor) -> torch.Tensor:
 def _deconvolution(layer: Deconvolution, how: Inference) -> Kernel | None:
     weight, bias = layer.blob(0), layer.blob(1) if len(layer.blobs) > 1 else None
     usual = layer.channel_axis == 1 and layer.spatial_axes == 2 and len(layer.bottom_shapes) == 1
-    exact, large = layer.is_exact(weight, layer.small), layer.multiply_adds() > SMALL_PRODUCT
+    exact, large = layer.arithmetic(weight).is_caffes, layer.multiply_adds() > SMALL_PRODUCT
     if not (usual and not exact and large and how.pack and fused.suits(weight)):
         return None
     shape, sliding = layer.bottom_shapes[0], Filter(layer.kernel, layer.stride, layer.pad, layer.dilation)
@@ -153,7 +153,7 @@ def _pooling(layer: Pooling, how: Inference) -> Kernel | None:
     small = size <= (SLICED_BY_TWO if max(windows.kernel) <= 2 else math.inf)  # where channels lie side by side
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
-        if size > SLICED and not (small and not maps.is_contiguous()) and not layer.is_exact(maps):
+        if size > SLICED and not (small and not maps.is_contiguous()) and not layer.arithmetic(maps).is_caffes:
             values = largest(maps, windows)
         else:
             values = torch.max_pool2d(maps, *geometry, 1, ceil)

@@ -19,7 +19,8 @@ from typing_extensions import override
 
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError
-from netspec.exact import switch
+from netspec.exact import NONE
+from netspec.exact.arithmetic import AsTorch, arithmetic
 from netspec.files.limits import amount, is_out_of_memory, memory
 from netspec.graph.plan import Param
 from netspec.layers.contract import fillers
@@ -107,10 +108,14 @@ class Layer(torch.nn.Module):
         """
         return None
 
-    def is_exact(self, bottom: torch.Tensor, small: bool | None = False) -> bool:
-        """Return whether to compute in Caffe's order: :func:`netspec.exact.switch.applies`, for one type of numbers."""
-        applies = switch.applies(self.context.options.exact, bottom, bool(small))
-        return applies and all(blob.dtype == bottom.dtype for blob in self.blobs)
+    def arithmetic(self, bottom: torch.Tensor, small: bool | None = None) -> AsTorch:
+        """Return what to compute with: as torch, or, where the option ``exact`` says so, as Caffe to the last bit.
+
+        ``small`` is instead of the property ``small``. Bottoms of another type of numbers than the blobs are torch's.
+        """
+        options, small = self.context.options, self.small if small is None else small
+        exact = options.exact if all(blob.dtype == bottom.dtype for blob in self.blobs) else NONE
+        return arithmetic(exact, bottom, bool(small), options.accumulate_in_place)
 
     def close(self) -> None:
         """Close files and stop threads, if the layer has any."""

@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 
-from netspec.exact.sums import SumInOrder
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.targets import OnnxGraph
 
@@ -30,18 +29,6 @@ class Loss(Layer):
         if data[:1] != label[:1]:
             raise self.error(f"found bottoms of shapes {data} and {label}, expected the same number of items", "bottom")
         return [()]
-
-
-class Floor(torch.autograd.Function):
-    """max(x, floor), with a gradient that also passes below the floor, as in Caffe's losses."""
-
-    @staticmethod
-    def forward(ctx: Any, x: torch.Tensor, floor: float) -> torch.Tensor:
-        return x.clamp(min=floor)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return grads[0], None
 
 
 class Classified(Layer):
@@ -123,11 +110,6 @@ def normalization_mode(loss_param: Any, default: int) -> int:
     if loss_param.HasField("normalize"):
         return VALID if loss_param.normalize else BATCH_SIZE
     return default
-
-
-def total(losses: torch.Tensor, exact: bool) -> torch.Tensor:
-    """Return the sum of all losses, in Caffe's order if ``exact``."""
-    return SumInOrder.apply(losses.flatten(), 0) if exact else losses.sum()
 
 
 def normalizer(mode: int, outer: int, inner: int, valid: torch.Tensor | None) -> torch.Tensor | float:

@@ -10,9 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from netspec.exact import libm
-from netspec.exact.blas import dots, sum_in_order
-from netspec.exact.losses import SigmoidCrossEntropy
-from netspec.exact.sums import row_magnitudes, row_squares
+from netspec.exact.arithmetic import AsTorch
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
@@ -29,7 +27,6 @@ from netspec.layers.loss.base import (
     normalizer,
     onnx_items,
     onnx_normalized_sum,
-    total,
 )
 
 
@@ -52,10 +49,9 @@ class HingeLoss(ClassLoss):
         self.valid(label, None)
         sign = torch.ones_like(x).scatter(1, label.unsqueeze(1), -1)
         margins = F.relu(1 + sign * x)
+        arithmetic = self.arithmetic(margins)
         squared = self.param.hinge_loss_param.norm == self.L2
-        if self.is_exact(margins):
-            return (row_squares if squared else row_magnitudes)(margins.reshape(1, -1))[0] / self.outer
-        return (margins.square() if squared else margins).sum() / self.outer
+        return (arithmetic.sums_of_squares if squared else arithmetic.sums_of_magnitudes)(margins) / self.outer
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         x, labels = self.onnx_scores_and_labels(graph, *bottoms)
@@ -98,14 +94,11 @@ class SigmoidCrossEntropyLoss(Loss):
     def forward(self, x: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
         targets = targets.detach().reshape(x.shape)
         valid = None if self.ignore_label is None else targets.long() != self.ignore_label
-        exact = self.is_exact(x)
-        if exact:
-            losses = SigmoidCrossEntropy.apply(x, targets)
-        else:
-            losses = F.binary_cross_entropy_with_logits(x, targets, reduction="none")
+        arithmetic = self.arithmetic(x)
+        losses = arithmetic.sigmoid_cross_entropy(x, targets)
         if valid is not None:
             losses = losses.where(valid, 0)
-        return total(losses, exact) / normalizer(self.normalization, x.shape[0], math.prod(x.shape[1:]), valid)
+        return arithmetic.total(losses) / normalizer(self.normalization, x.shape[0], math.prod(x.shape[1:]), valid)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         x, targets = bottoms
@@ -154,9 +147,7 @@ class EuclideanLoss(Loss):
 
     def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         difference = a - b.reshape(a.shape)
-        exact = self.is_exact(difference)
-        squares = row_squares(difference.reshape(1, -1))[0] if exact else difference.square().sum()
-        return squares / (2 * a.shape[0])
+        return self.arithmetic(difference).sums_of_squares(difference) / (2 * a.shape[0])
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         a, b = (graph.node("Flatten", bottom, axis=1) for bottom in bottoms)
@@ -176,17 +167,22 @@ class _Contrastive(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, a: torch.Tensor, b: torch.Tensor, similar: torch.Tensor, margin: float, legacy: bool, exact: bool
+        ctx: Any,
+        a: torch.Tensor,
+        b: torch.Tensor,
+        similar: torch.Tensor,
+        margin: float,
+        legacy: bool,
+        arithmetic: AsTorch,
     ) -> torch.Tensor:
         difference = a - b
-        rows = difference.unsqueeze(2)
-        squared = dots(rows, rows).squeeze(1) if exact else difference.square().sum(1)
+        squared = arithmetic.sums_of_squares(difference, 1)
         distance = libm.sqrt(squared)
         dissimilar = (margin - squared).clamp(min=0) if legacy else (margin - distance).clamp(min=0).square()
         ctx.save_for_backward(difference, squared if legacy else distance, similar)
         ctx.margin, ctx.legacy = margin, legacy
         losses = torch.where(similar, squared, dissimilar)
-        return (sum_in_order(losses) if exact else losses.sum()) / len(a) / 2
+        return arithmetic.total(losses) / len(a) / 2
 
     @staticmethod
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
@@ -230,8 +226,8 @@ class ContrastiveLoss(Loss):
     def forward(self, a: torch.Tensor, b: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
         p = self.param.contrastive_loss_param
         similar = label.reshape(-1).long() != 0
-        exact = self.is_exact(a, small=True)
-        return _Contrastive.apply(a.flatten(1), b.flatten(1), similar, p.margin, p.legacy_version, exact)
+        arithmetic = self.arithmetic(a, small=True)
+        return _Contrastive.apply(a.flatten(1), b.flatten(1), similar, p.margin, p.legacy_version, arithmetic)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         p = self.param.contrastive_loss_param

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from google.protobuf.message import DecodeError
 
 from netspec.data.blobs import to_array
-from netspec.exact import SMALL_ITEM, libm
-from netspec.exact.losses import Infogain, logarithm, softmax
+from netspec.exact import SMALL_ITEM
+from netspec.exact.arithmetic import AsTorch
 from netspec.files.limits import read_bytes
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
@@ -25,13 +25,11 @@ from netspec.layers.loss.base import (
     VALID,
     Classified,
     ClassLoss,
-    Floor,
     Loss,
     ignore_label,
     normalization_mode,
     normalizer,
     onnx_normalized_sum,
-    total,
 )
 from netspec.proto.schema import BlobProto
 
@@ -51,24 +49,28 @@ class SoftmaxLoss(Loss, Classified):
         self.reshape_scores(bottom_shapes, axis, *path)
         return shapes[: self.num_tops]
 
-    def sum_up(self, losses: torch.Tensor, valid: torch.Tensor | None, exact: bool) -> torch.Tensor:
-        """Return the normalized sum of the losses (outer, inner) that are not ignored."""
+    def sum_up(
+        self, losses: torch.Tensor, valid: torch.Tensor | None, total: Callable[[torch.Tensor], torch.Tensor]
+    ) -> torch.Tensor:
+        """Return the normalized sum, by ``total``, of the losses (outer, inner) that count."""
         if valid is not None:
             losses = losses.where(valid, 0)
-        return total(losses, exact) / normalizer(self.normalization, self.outer, self.inner, valid)
+        return total(losses) / normalizer(self.normalization, self.outer, self.inner, valid)
 
 
 class _NegativeLogOfSoftmax(torch.autograd.Function):
     """-log(max(p, FLT_MIN)) of the labels' classes. p is the softmax."""
 
     @staticmethod
-    def forward(ctx: Any, scores: torch.Tensor, label: torch.Tensor, exact: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        ctx: Any, scores: torch.Tensor, label: torch.Tensor, arithmetic: AsTorch
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the losses (outer, inner) and p, for scores (outer, classes, inner) and labels (outer, inner)."""
-        p = softmax(scores) if exact else F.softmax(scores, 1)
+        p = arithmetic.softmax(scores, 1)
         ctx.save_for_backward(p, label)
         ctx.mark_non_differentiable(p)
         chosen = p.gather(1, label.unsqueeze(1)).squeeze(1).clamp(min=FLT_MIN)
-        return -(libm.log(chosen) if exact else chosen.log()), p
+        return -arithmetic.log(chosen), p
 
     @staticmethod
     def backward(ctx: Any, diff: torch.Tensor, *_: Any) -> tuple[torch.Tensor, None, None]:
@@ -104,9 +106,9 @@ class SoftmaxWithLoss(SoftmaxLoss):
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         x, label = self.scores_and_labels(scores, labels)
         valid = self.valid(label, self.ignore_label)
-        exact = self.is_exact(x, small=math.prod(x.shape[1:]) <= SMALL_ITEM)
-        losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid, exact)
-        return (self.sum_up(losses, valid, exact), p.reshape(scores.shape))[: self.num_tops]
+        arithmetic = self.arithmetic(x, small=math.prod(x.shape[1:]) <= SMALL_ITEM)
+        losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid, arithmetic)
+        return (self.sum_up(losses, valid, arithmetic.total), p.reshape(scores.shape))[: self.num_tops]
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         scores, labels = self.onnx_scores_and_labels(graph, *bottoms)
@@ -197,14 +199,9 @@ class InfogainLoss(SoftmaxLoss):
         assert matrix is not None, "setup reads the matrix unless it is a bottom"
         gain = matrix.detach().to(x.dtype).reshape(self.classes, self.classes)
         weights = gain[label if valid is None else label * valid]  # (outer, inner, classes)
-        if self.is_exact(x):
-            losses, p = Infogain.apply(x, weights, LOG_THRESHOLD)
-            counted = None if valid is None else valid.unsqueeze(2)
-            loss = self.sum_up(losses, counted, exact=True)
-        else:
-            log_p = F.log_softmax(x, 1)
-            losses = -(weights.movedim(2, 1) * Floor.apply(log_p, math.log(LOG_THRESHOLD))).sum(1)
-            loss, p = self.sum_up(losses, valid, exact=False), log_p.detach().exp()
+        arithmetic = self.arithmetic(x)
+        losses, p = arithmetic.infogain(x, weights, LOG_THRESHOLD)
+        loss = self.sum_up(losses, None if valid is None else valid.unsqueeze(2), arithmetic.total)
         return (loss, p.reshape(scores.shape))[: self.num_tops]
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
@@ -241,9 +238,9 @@ class MultinomialLogisticLoss(ClassLoss):
     def forward(self, probabilities: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         p, label = self.scores_and_labels(probabilities, labels)
         self.valid(label, None)
-        chosen = Floor.apply(p.gather(1, label.unsqueeze(1)), self.least)
-        exact = self.is_exact(chosen)
-        return -total(logarithm(chosen) if exact else chosen.log(), exact) / self.outer
+        arithmetic = self.arithmetic(p)
+        chosen = arithmetic.floored(p.gather(1, label.unsqueeze(1)), self.least)
+        return -arithmetic.total(arithmetic.log(chosen)) / self.outer
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         p, labels = self.onnx_scores_and_labels(graph, *bottoms)

@@ -6,11 +6,8 @@ import math
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 
-from netspec.exact.losses import softmax, softmax_gradient
-from netspec.exact.pointwise import Pointwise
-from netspec.exact.sums import Product, RowSums, product_gradient, row_magnitudes, row_squares
+from netspec.exact.sums import product_gradient
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
@@ -54,24 +51,14 @@ class Eltwise(Layer):
         return bottom_shapes[:1]
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
-        exact = self.is_exact(bottoms[0])
-        if exact and self.operation == self.PROD:
-            return Product.apply(self.param.eltwise_param.stable_prod_grad, *bottoms)
-        if exact and self.operation == self.SUM:
-            top = bottoms[0] * self.coeff[0]
-            for x, factor in zip(bottoms[1:], self.coeff[1:], strict=True):
-                top = torch.add(top, x, alpha=factor)  # rounds once, like BLAS's axpy
-            return top
+        if self.operation == self.PROD:
+            return self.arithmetic(bottoms[0]).product(bottoms, self.param.eltwise_param.stable_prod_grad)
         if self.operation == self.SUM:
-            bottoms = tuple(x if c == 1 else x * c for x, c in zip(bottoms, self.coeff, strict=True))
-        top, *others = bottoms
-        if self.operation == self.MAX:
-            top = torch.where(top > others[0], top, others[0])
-            for x in others[1:]:
-                top = torch.where(x > top, x, top)
-            return top
+            return self.arithmetic(bottoms[0]).weighted_sum(bottoms, self.coeff)
+        first, second, *others = bottoms
+        top = torch.where(first > second, first, second)
         for x in others:
-            top = top + x if self.operation == self.SUM else top * x
+            top = torch.where(x > top, x, top)
         return top
 
     def caffes_gradients(
@@ -124,21 +111,12 @@ class Reduction(Layer):
         return [shape[: self.axis]]
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        operation = self.param.reduction_param.operation
-        if self.is_exact(x):
-            return self._reduce_exactly(x.reshape(math.prod(self.top_shapes[0]), -1), operation) * self.coeff
+        operation, arithmetic = self.param.reduction_param.operation, self.arithmetic(x)
         if operation == self.ASUM:
-            x = x.abs()
-        elif operation == self.SUMSQ:
-            x = x.square()
-        return x.flatten(self.axis).sum(self.axis) * self.coeff
-
-    def _reduce_exactly(self, rows: torch.Tensor, operation: int) -> torch.Tensor:
-        if operation == self.ASUM:
-            sums = row_magnitudes(rows)
-        else:
-            sums = row_squares(rows) if operation == self.SUMSQ else RowSums.apply(rows, 1.0)
-        return sums.reshape(self.top_shapes[0])
+            return arithmetic.sums_of_magnitudes(x, self.axis) * self.coeff
+        if operation == self.SUMSQ:
+            return arithmetic.sums_of_squares(x, self.axis) * self.coeff
+        return arithmetic.sums(x, self.axis) * self.coeff
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         p, (data,) = self.param.reduction_param, bottoms
@@ -249,18 +227,10 @@ class Softmax(Layer):
         return bottom_shapes
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if self.is_exact(x):
-            return Pointwise.apply(x, lambda x: softmax(self._by_class(x)).reshape(x.shape), self.caffes_gradient)
-        return F.softmax(x, self.axis)
-
-    def _by_class(self, x: torch.Tensor) -> torch.Tensor:
-        """Return x as (outer, classes, inner)."""
-        return x.reshape(math.prod(x.shape[: self.axis]), x.shape[self.axis], -1)
+        return self.arithmetic(x).softmax(x, self.axis)
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        if self.is_exact(top):
-            return softmax_gradient(self._by_class(top), self._by_class(diff)).reshape(top.shape)
-        return (diff - (diff * top).sum(self.axis, keepdim=True)) * top
+        return self.arithmetic(top).softmax_gradient(top, diff, self.axis)
 
 
 @register("Silence")

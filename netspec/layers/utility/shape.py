@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import torch
 
-from netspec.exact.sums import Copies, tiles
 from netspec.layers.contract.base import Layer, Shape, refuse_in_place
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
@@ -113,9 +112,7 @@ class Split(Layer):
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return one tensor per top, so that each has its own gradient."""
-        if self.num_tops > 2 and self.is_exact(x):  # for two, the order does not matter
-            return Copies.apply(x, self.num_tops)
-        return tuple(x.view_as(x) for _ in range(self.num_tops))
+        return self.arithmetic(x).copies(x, self.num_tops)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         return bottoms * self.num_tops
@@ -144,10 +141,7 @@ class Tile(Layer):
         return [(*shape[:axis], shape[axis] * p.tiles, *shape[axis + 1 :])]
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if self.is_exact(x):
-            values = x.reshape(math.prod(x.shape[: self.axis]), -1)
-            return tiles(values, self.repeats[self.axis]).reshape(self.top_shapes[0])
-        return x.repeat(self.repeats)
+        return self.arithmetic(x).tiles(x, self.axis, self.param.tile_param.tiles)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Tile", *bottoms, graph.constant(self.repeats))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -12,19 +11,11 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.products import (
-    ColumnProducts,
-    Filter,
-    SpreadProducts,
-    SummedConvolutions,
-    convolution,
-)
-from netspec.exact.switch import is_recorded
+from netspec.exact.products import Filter
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
 from netspec.layers.contract.targets import OnnxGraph, TorchCode
-from netspec.layers.vision.layout import channels_side_by_side, map_by_map, of_one_channel
 from netspec.layers.vision.sliding import TORCH_USUAL, SlidingFilter
 
 
@@ -106,36 +97,7 @@ class Convolution(SlidingFilter):
         overhang = self.overhang(self.bottom_shapes[0])
         if any(overhang):
             maps = F.pad(maps, overhang)
-        if self.is_exact(maps, self.small):
-            return ColumnProducts.apply(
-                maps, weight, bias, sliding, self.group, self.context.options.accumulate_in_place
-            )
-        if self.reads_padding_alone:
-            maps = F.pad(maps, [p for p in reversed(sliding.pad) for _ in range(2)])
-            sliding = replace(sliding, pad=(0,) * len(sliding.pad))
-        if not torch.is_grad_enabled():  # with channels_last, each product would copy the weights
-            return convolution(of_one_channel(maps), weight, bias, sliding, self.group)
-        lay_out = channels_side_by_side if maps.numel() > 2 * weight.numel() else map_by_map
-        return self.convolved(maps, weight, bias, sliding, lay_out)
-
-    def convolved(
-        self,
-        maps: torch.Tensor,
-        weight: torch.Tensor,
-        bias: torch.Tensor | None,
-        sliding: Filter,
-        lay_out: Callable[[torch.Tensor], torch.Tensor],
-        transposed: bool = False,
-    ) -> torch.Tensor:
-        """Return the result of torch's kernel, with gradients, for maps in the layout that ``lay_out`` makes."""
-        if self.context.options.accumulate_in_place and not is_recorded():
-            return SummedConvolutions.apply(maps, weight, bias, (sliding, self.group, transposed), lay_out)
-        return convolution(lay_out(maps), weight, bias, sliding, self.group, transposed)
-
-    @property
-    def reads_padding_alone(self) -> bool:
-        """Whether a filter fits between the edge of the padding and the map: oneDNN may then read beyond the map."""
-        return any(p >= e for p, e in zip(self.pad, self.extent, strict=True))
+        return self.arithmetic(maps).convolution(maps, weight, bias, sliding, self.group)
 
     @property
     def small(self) -> bool:
@@ -227,13 +189,8 @@ class Deconvolution(Convolution):
         self, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter
     ) -> torch.Tensor:
         """Return the maps (N, C, spatial axes), with at least one spatial axis, spread by the filters."""
-        if self.is_exact(maps):
-            size = self.top_shapes[0][self.channel_axis + 1 :] or (1,)
-            in_place = self.context.options.accumulate_in_place
-            return SpreadProducts.apply(maps, weight, bias, (sliding, self.group), in_place, size)
-        if not torch.is_grad_enabled():
-            return convolution(maps, weight, bias, sliding, self.group, transposed=True)
-        return self.convolved(maps, weight, bias, sliding, lambda maps: maps, transposed=True)
+        size = self.top_shapes[0][self.channel_axis + 1 :] or (1,)
+        return self.arithmetic(maps).deconvolution(maps, weight, bias, (sliding, self.group), size)
 
     def multiply_adds(self) -> int:
         pixels = math.prod(self.bottom_shapes[0]) // self.channels

@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 
-from netspec.exact.sums import Copies
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
@@ -229,8 +228,7 @@ class SPP(_PoolingBase):
         return [(shape[0], shape[1] * sum(w.count[0] * w.count[1] for w in self.levels))]
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        several = len(self.levels) > 2 and self.is_exact(data)  # Caffe's SPP is a separate net with a Split
-        copies = Copies.apply(data, len(self.levels)) if several else [data] * len(self.levels)
+        copies = self.arithmetic(data).copies(data, len(self.levels))  # Caffe's SPP is a separate net with a Split
         method = self.param.spp_param.pool
         pooled = [self.pool(copy, windows, method)[0] for copy, windows in zip(copies, self.levels, strict=True)]
         return pooled[0] if len(pooled) == 1 else torch.cat([level.flatten(1) for level in pooled], dim=1)

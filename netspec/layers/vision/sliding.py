@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch.nn import functional as F
 
-from netspec.exact.products import Columns, Filter
+from netspec.exact.products import Filter
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
@@ -164,19 +164,10 @@ class Im2col(SlidingFilter):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         overhang = self.overhang(self.bottom_shapes[0])
-        if self.is_exact(data):
-            maps = F.pad(data, overhang).flatten(0, self.channel_axis - 1) if self.channel_axis else data[None]
-            sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
-            return Columns.apply(maps, sliding).reshape(self.top_shapes[0])
-        padding = chain.from_iterable((p, p) for p in reversed(self.pad))
-        windows = F.pad(data, [p + n for p, n in zip(padding, overhang, strict=True)])
-        first = self.channel_axis + 1
-        geometry = zip(self.extent, self.stride, self.dilation, strict=True)
-        for axis, (extent, stride, dilation) in enumerate(geometry, start=first):
-            windows = windows.unfold(axis, extent, stride)[..., ::dilation]  # the pixels of the filter as the last axis
-        last = first + self.spatial_axes
-        order = (*range(first), *range(last, windows.dim()), *range(first, last))
-        return windows.permute(order).reshape(self.top_shapes[0])
+        maps = F.pad(data, overhang) if any(overhang) else data
+        maps = maps.reshape(-1, *maps.shape[self.channel_axis :])
+        sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
+        return self.arithmetic(data).columns(maps, sliding).reshape(self.top_shapes[0])
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         if self.channel_axis != 1 or self.spatial_axes > 3 or any(self.overhang(self.bottom_shapes[0])):

@@ -1,0 +1,132 @@
+"""What torch's own kernels need around them, so that they compute what Caffe's layers compute."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch.nn import functional as F
+
+from netspec.exact.lrn import Settings
+
+MAX_OFFSET = 8  # the largest mean, in standard deviations, for which torch's CPU kernel is exact to 1e-6
+
+
+class Floor(torch.autograd.Function):
+    """max(x, floor), with a gradient that also passes below the floor, as in Caffe's losses."""
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor, floor: float) -> torch.Tensor:
+        return x.clamp(min=floor)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return grads[0], None
+
+
+class Standardization(torch.autograd.Function):
+    """Rows to mean 0 and deviation 1, with Caffe's gradient.
+
+    Caffe differentiates as if ``eps`` were not there, then divides by the deviation plus eps: a constant row has a
+    finite gradient, where autograd's is not a number.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, rows: torch.Tensor, eps: float) -> torch.Tensor:
+        centered = rows - rows.mean(dim=1, keepdim=True)
+        deviation = _deviation(centered, eps)
+        top = centered / deviation
+        ctx.save_for_backward(top, deviation)
+        return top
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return _standardized_gradient(*ctx.saved_tensors, *grads), None
+
+
+def standardized_gradient(rows: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, eps: float) -> torch.Tensor:
+    """Return the gradient of Standardization from its rows and ``tops``, which may have been overwritten."""
+    return _standardized_gradient(tops, _deviation(rows - rows.mean(dim=1, keepdim=True), eps), diff)
+
+
+def _deviation(centered: torch.Tensor, eps: float) -> torch.Tensor:
+    return centered.square().mean(dim=1, keepdim=True).sqrt() + eps
+
+
+def _standardized_gradient(top: torch.Tensor, deviation: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:
+    along = (grad * top).mean(dim=1, keepdim=True)
+    return (grad - grad.mean(dim=1, keepdim=True) - along * top) / deviation
+
+
+def response_base(maps: torch.Tensor, settings: Settings) -> torch.Tensor:
+    """Return what LRN divides by a power of: k + alpha times the mean of the squares in the channels around."""
+    return settings.k + settings.alpha / settings.size * window_sums(maps * maps, settings.size)
+
+
+def window_sums(maps: torch.Tensor, size: int) -> torch.Tensor:
+    """Return the sums over the ``size`` channels around each."""
+    channels = maps.shape[1]
+    framed = F.pad(maps, (0, 0, 0, 0, size // 2, size // 2))
+    total = framed[:, :channels]
+    for shift in range(1, size):
+        total = total + framed[:, shift : shift + channels]
+    return total
+
+
+def scales_channels(scale: torch.Tensor, bias: torch.Tensor | None) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return what scales each channel: batch normalization with mean 0 and variance 1, thrice as fast, backward too."""
+    arguments = (scale, bias, torch.zeros_like(scale), torch.ones_like(scale), False, 0.0, 0.0)
+    return lambda data: torch.batch_norm(data, *arguments, torch.backends.cudnn.enabled)
+
+
+def normalizes(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return a function that normalizes (N, C, ...) by a mean and a variance of each channel."""
+    far = _far_from_zero(mean, variance, eps)
+    arguments = (torch.zeros_like(mean) if far else mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
+    return lambda data: torch.batch_norm(data - _by_channel(mean, data) if far else data, None, None, *arguments)
+
+
+def normalized_batch(
+    data: torch.Tensor,
+    normalize: Callable[..., Any],
+    affine: tuple[torch.Tensor | None, torch.Tensor | None],
+    eps: float,
+    *options: Any,
+) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Normalize a batch (N, C, ...) by torch's function ``normalize``, with factors and biases ``affine``.
+
+    Returns its result, its input, the means (C,) and the unbiased variances (C,).
+    """
+    made, mean, variance = _normalized(data, normalize, affine, eps, options)
+    if _far_from_zero(mean, variance, eps):
+        # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
+        data = data - _by_channel(mean, data)
+        made, _, variance = _normalized(data, normalize, affine, eps, options)
+    # Torch's unbiased variance of one value is 0 / 0, Caffe's 0.
+    return made, data, mean, torch.zeros_like(variance) if data.numel() == len(mean) else variance
+
+
+def _normalized(
+    data: torch.Tensor, normalize: Callable[..., Any], affine: Any, eps: float, options: Any
+) -> tuple[Any, torch.Tensor, torch.Tensor]:
+    exact_enough = torch.promote_types(data.dtype, torch.float32)
+    mean, variance = data.new_zeros(2, data.shape[1], dtype=exact_enough).unbind()
+    made = normalize(data, *affine, mean, variance, True, 1.0, eps, *options)
+    return made, mean, variance
+
+
+def _by_channel(values: torch.Tensor, data: torch.Tensor) -> torch.Tensor:
+    return values.view(-1, *(1,) * (data.dim() - 2))
+
+
+def _far_from_zero(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> bool:
+    """Return whether torch's kernel would lose digits: on a CPU it computes x / std - mean / std.
+
+    Compiled by torch.compile, it subtracts the mean first.
+    """
+    return (
+        mean.device.type == "cpu"
+        and not torch.compiler.is_compiling()
+        and bool((mean.square() > MAX_OFFSET**2 * (variance + eps)).any())
+    )
