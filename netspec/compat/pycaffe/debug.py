@@ -19,7 +19,7 @@ def debug_info(runner: BlobRunner) -> Iterator[None]:
     ran_backward = False
 
     def forward(i: int) -> None:
-        for b in runner.top_ids[i]:
+        for b in runner.steps[i].top_ids:
             blob = runner.blobs[b]
             log_top(net.plan.nodes[i].name, runner.names[b], blob.data_memory.tensor(blob.shape))
         log_params(net.plan.nodes[i], net.layers[i])
@@ -29,7 +29,7 @@ def debug_info(runner: BlobRunner) -> Iterator[None]:
         ran_backward = True
         if not net.backward_plan.layers[i]:
             return
-        for b, wanted in zip(runner.bottom_ids[i], net.backward_plan.bottoms[i], strict=True):
+        for b, wanted in zip(runner.steps[i].bottom_ids, net.backward_plan.bottoms[i], strict=True):
             if wanted:
                 blob = runner.blobs[b]
                 log_bottom_diff(net.plan.nodes[i].name, runner.names[b], blob.diff_memory.tensor(blob.shape))

@@ -99,23 +99,24 @@ class Net:
         self._blob_names_index = {name: i for i, name in enumerate(runner.names)}
         self._blobs = list(runner.blobs)
         self._blobs_dict: Named[Blob] = Named("blob", zip(runner.names, runner.blobs, strict=True))
+        params = [step.params for step in runner.steps]
         self.layers: list[Any] = [
             getattr(layer, "code", None) or Layer(layer.type, blobs)
-            for layer, blobs in zip(net.layers, runner.params, strict=True)
+            for layer, blobs in zip(net.layers, params, strict=True)
         ]
         self._layer_dict: Named[Any] = Named("layer", zip(names, self.layers, strict=True))
         self._params_dict: Named[BlobVec] = Named(
-            "layer with parameters", ((name, blobs) for name, blobs in zip(names, runner.params, strict=True) if blobs)
+            "layer with parameters", ((name, blobs) for name, blobs in zip(names, params, strict=True) if blobs)
         )
-        self._top_names = self._names_of(runner.top_ids)
-        self._bottom_names = self._names_of(runner.bottom_ids)
+        self._top_names = self._names_of([step.top_ids for step in runner.steps])
+        self._bottom_names = self._names_of([step.bottom_ids for step in runner.steps])
         self._input_list, self._output_list = list(net.inputs), list(net.outputs)
         self._inputs = [self._blob_names.index(name) for name in net.inputs]
         self._outputs = [self._blob_names.index(name) for name in net.outputs]
         weights = {
             b: w
-            for ids, row in zip(runner.top_ids, net.loss_weights, strict=True)
-            for b, w in zip(ids, row, strict=True)
+            for step, row in zip(runner.steps, net.loss_weights, strict=True)
+            for b, w in zip(step.top_ids, row, strict=True)
         }
         self._blob_loss_weights = [weights[b] for b in range(len(self._blobs))]
 
@@ -166,10 +167,10 @@ class Net:
         return Named("blob", zip(self._blob_names, self._blob_loss_weights, strict=True))
 
     def _top_ids(self, layer: int) -> list[int]:
-        return list(self.runner.top_ids[layer])
+        return list(self.runner.steps[layer].top_ids)
 
     def _bottom_ids(self, layer: int) -> list[int]:
-        return list(self.runner.bottom_ids[layer])
+        return list(self.runner.steps[layer].bottom_ids)
 
     # Running
 

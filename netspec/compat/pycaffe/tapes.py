@@ -1,4 +1,4 @@
-"""The records that :class:`netspec.pycaffe.blob_runner.BlobRunner` keeps of layers, and the memory of tensors."""
+"""What :class:`netspec.compat.pycaffe.steps.LayerStep` keeps of the runs of its layer, and the memory of tensors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 
-from netspec.graph.plan import Node
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import Seen
 from netspec.layers.utility.live_blobs import Blob, BlobVec, BorrowedMemory
@@ -95,15 +94,3 @@ def gradient_of(parameter: torch.Tensor) -> torch.Tensor:
     if parameter.grad is None:
         parameter.grad = torch.zeros_like(parameter, memory_format=torch.contiguous_format)
     return parameter.grad
-
-
-def overwrites_shared(nodes: Sequence[Node], tops: Sequence[Sequence[Blob]]) -> bool:
-    """Return whether a layer computes in place on memory that another blob shares."""
-    sharing: dict[int, set[int]] = {}
-    for node, blobs in zip(nodes, tops, strict=True):
-        for top, in_place in zip(blobs, node.in_place, strict=False):
-            users = sharing.setdefault(id(top.data_memory), set())
-            users.add(id(top))
-            if in_place and len(users) > 1:
-                return True
-    return False

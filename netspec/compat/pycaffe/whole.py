@@ -11,9 +11,7 @@ from collections.abc import Iterator
 import torch
 
 from netspec.compat.pycaffe.blob_runner import BlobRunner
-from netspec.compat.pycaffe.tapes import overwrites_shared
 from netspec.graph.plan import AUTOMATIC
-from netspec.layers.contract.gradients import gradient_reads
 from netspec.layers.utility.live_blobs import Blob
 
 LARGE = 2**22  # numbers in all blobs: in a larger net, two sets of kernels take too much memory
@@ -40,9 +38,9 @@ class WholeRun:
         return not (
             net.random.has_drawn
             or AUTOMATIC in runner.names
-            or overwrites_shared(net.plan.nodes, runner.tops)
+            or runner.overwrites_shared()
             or any(len(part.members) > 1 for part in net.eager.parts())
-            or any("kept" in gradient_reads(layer) for layer in net.layers)
+            or any("kept" in step.reads for step in runner.steps)
         )
 
     def run(self) -> Passed | None:
@@ -67,14 +65,13 @@ class WholeRun:
 
     def _written(self) -> Iterator[tuple[int, Blob]]:
         """Yield pairs of a value and its blob, in the order of a forward pass."""
-        for node, layer, tops in zip(self._net.plan.nodes, self._net.layers, self._runner.tops, strict=True):
-            if "data" not in layer.shares:
-                yield from zip(node.tops, tops, strict=True)
+        for step in self._runner.steps:
+            if "data" not in step.layer.shares:
+                yield from zip(step.node.tops, step.tops, strict=True)
 
     def _reached(self) -> Iterator[tuple[int, Blob]]:
         """Yield pairs of a value and the blob of its gradient, in the order of a backward pass."""
-        plan, runner = self._net.backward_plan, self._runner
-        every = zip(self._net.plan.nodes, self._net.layers, runner.bottoms, plan.layers, plan.computed, strict=True)
-        for node, layer, bottoms, reached, wanted in reversed(list(every)):
-            if reached and "diff" not in layer.shares:
-                yield from ((v, b) for v, b, w in zip(node.bottoms, bottoms, wanted, strict=True) if w)
+        for step in reversed(self._runner.steps):
+            if step.reached and "diff" not in step.layer.shares:
+                bottoms = zip(step.node.bottoms, step.bottoms, step.wanted, strict=True)
+                yield from ((v, blob) for v, blob, wanted in bottoms if wanted)
