@@ -44,7 +44,27 @@ def of_one_channel(maps: torch.Tensor) -> torch.Tensor:
 
 def map_by_map(maps: torch.Tensor) -> torch.Tensor:
     """Return maps (N, C, H, W) in Caffe's layout."""
-    return of_one_channel(maps.contiguous())
+    if maps.dim() != 4 or maps.is_contiguous() or not maps.is_contiguous(memory_format=torch.channels_last):
+        return of_one_channel(maps.contiguous())
+    if not torch.is_grad_enabled() or is_recorded():
+        return maps.contiguous()
+    return _MapByMap.apply(maps)
+
+
+class _MapByMap(torch.autograd.Function):
+    """Return maps of channels_last in Caffe's layout. Their gradient is in channels_last, like the given maps."""
+
+    @staticmethod
+    def forward(maps: torch.Tensor) -> torch.Tensor:
+        return maps.contiguous()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[torch.Tensor], output: torch.Tensor) -> None:
+        """Save nothing for backward."""
+
+    @staticmethod
+    def backward(ctx: Any, *diffs: torch.Tensor) -> torch.Tensor:
+        return diffs[0].contiguous(memory_format=torch.channels_last)
 
 
 class _SideBySide(torch.autograd.Function):
