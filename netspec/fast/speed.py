@@ -5,12 +5,15 @@ Its methods import what they need: a command whose net an engine runs makes this
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from netspec.data.sources import AtOnce
     from netspec.fast.prepared import Prepared
     from netspec.fast.training import TrainingStep
     from netspec.layers.contract.base import Layer
@@ -38,6 +41,12 @@ class Fast:
             return why
         weighted = partial(weighted_sum, exact=eager.exact)
         return TrainingStep(eager.plan, parts, eager.loss_weights, eager.overwritten, weighted)
+
+    def reads_at_once(self, decode: Callable[[Any], np.ndarray]) -> AtOnce:
+        """Return what reads many raw Datums at once."""
+        from netspec.fast.stacked import Stacker
+
+        return Stacker(decode)
 
     def is_fresh(self, layer: Layer) -> bool:
         """Return whether the top of a prepared layer has memory of its own."""

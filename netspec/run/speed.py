@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 
+from netspec.data.sources import AtOnce
 from netspec.layers.contract.base import Layer
 from netspec.run.eager import Eager
 from netspec.run.recorded import Diff, Kernels
@@ -46,6 +48,10 @@ class Speed(Protocol):
 
         ``largest`` is the size, in numbers in all tops, of the nets that it trains; None for its own limit.
         """
+        ...
+
+    def reads_at_once(self, decode: Callable[[Any], np.ndarray]) -> AtOnce:
+        """Return what reads many raw Datums at once; ``decode`` returns the numbers (C, H, W) of one."""
         ...
 
     def is_fresh(self, layer: Layer) -> bool:

@@ -266,7 +266,9 @@ class Data(ReadingLayer):
             return None
         if p.force_encoded_color:
             transformer.color = True
-        source = DatabaseSource(reader, self.cursor(len(reader), p.rand_skip), transformer, self.place)
+        speed, cursor = self.context.options.speed, self.cursor(len(reader), p.rand_skip)
+        at_once = None if speed is None else speed.reads_at_once(transformer.decode)
+        source = DatabaseSource(reader, cursor, transformer, self.place, at_once)
         self.log_size(source, "data_layer.cpp:45")
         return source
 

@@ -10,9 +10,9 @@ from netspec.data.database import Writer, open_reader
 from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
 from netspec.data.random_words import permutation, words
 from netspec.data.sources import Cursor, DatabaseSource, Draws, batches, draw_skip
-from netspec.data.stacked import Stacker
 from netspec.data.transformer import Transformer
 from netspec.errors import SpecError, Where
+from netspec.fast.stacked import Stacker
 from netspec.proto.schema import Datum, TransformationParameter
 
 PLACE = Where("net.prototxt", 9, 5)
@@ -24,7 +24,7 @@ def source(path: Path, shapes: list[tuple[int, int, int]], batch_size: int, **tr
             writer.put(b"%08d" % i, array_to_datum(np.full(shape, i, np.uint8), i).SerializeToString())
     reader = open_reader(str(path))
     transformer = Transformer(TransformationParameter(**transform), 1, lambda *path: PLACE)
-    return DatabaseSource(reader, Cursor(len(reader), batch_size), transformer, PLACE)
+    return DatabaseSource(reader, Cursor(len(reader), batch_size), transformer, PLACE, Stacker(transformer.decode))
 
 
 def test_the_cursor_wraps_and_says_when() -> None:
@@ -94,7 +94,7 @@ def test_a_record_that_is_no_datum_is_named(tmp_path: Path) -> None:
         writer.put(b"second", b"\xff\xff\xff")
     reader = open_reader(str(tmp_path / "db"))
     transformer = Transformer(TransformationParameter(), 1, lambda *path: PLACE)
-    found = DatabaseSource(reader, Cursor(2, 1), transformer, PLACE)
+    found = DatabaseSource(reader, Cursor(2, 1), transformer, PLACE, Stacker(transformer.decode))
     with pytest.raises(SpecError, match=r'^net.prototxt:9:5: record "second" is not a Datum \(3 bytes\)$'):
         found.batch(1)
 
@@ -150,15 +150,17 @@ def test_small_records_are_read_at_once_as_one_by_one(
             writer.put(b"%08d" % i, record)
     reader = open_reader(str(tmp_path / "db"), backend)
     transformer = Transformer(TransformationParameter(mean_value=[2.5], scale=0.3, mirror=True), 0, lambda *path: PLACE)
-    read = DatabaseSource(reader, Cursor(len(reader), len(records) + 1), transformer, PLACE)  # which wraps
-    if len({datum_to_array(datum).shape for datum in one_by_one}) > 1:
-        with pytest.raises(SpecError, match="but the first record"):
-            read.batch(0)
-        return
-    arrays = [datum_to_array(datum) for datum in (*one_by_one, one_by_one[0])]
-    data, labels = read.batch(0)
-    assert (data == transformer(arrays, range(len(arrays)))).all()
-    assert labels.tolist() == [np.float32(datum.label) for datum in (*one_by_one, one_by_one[0])]
+    cursor = Cursor(len(reader), len(records) + 1)  # which wraps
+    for read_at_once in (Stacker(transformer.decode), None):
+        read = DatabaseSource(reader, cursor, transformer, PLACE, read_at_once)
+        if len({datum_to_array(datum).shape for datum in one_by_one}) > 1:
+            with pytest.raises(SpecError, match="but the first record"):
+                read.batch(0)
+            continue
+        arrays = [datum_to_array(datum) for datum in (*one_by_one, one_by_one[0])]
+        data, labels = read.batch(0)
+        assert (data == transformer(arrays, range(len(arrays)))).all()
+        assert labels.tolist() == [np.float32(datum.label) for datum in (*one_by_one, one_by_one[0])]
 
 
 def longer(record: bytes, count: int) -> bytes:
@@ -193,7 +195,8 @@ def test_of_records_longer_than_their_shape_the_first_numbers_are_read(
         for i, record in enumerate(records):
             writer.put(b"%08d" % i, record)
     transformer = Transformer(TransformationParameter(), 0, lambda *path: PLACE)
-    found = DatabaseSource(open_reader(str(tmp_path / "db")), Cursor(len(records), len(records)), transformer, PLACE)
+    reader, cursor = open_reader(str(tmp_path / "db")), Cursor(len(records), len(records))
+    found = DatabaseSource(reader, cursor, transformer, PLACE, Stacker(transformer.decode))
     assert (found.together(0, 1) is not None) == at_once
     data, _ = found.batch(0)
     stored = [
