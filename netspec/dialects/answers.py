@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +104,30 @@ class Dialects(Forks):
         from netspec.dialects.layers import class_of
 
         return class_of(param, options)
+
+    @override
+    def policies(self) -> tuple[str, ...]:
+        from netspec.dialects.blocks.settings import POLICIES
+
+        return POLICIES
+
+    @override
+    def rate_fields(self) -> frozenset[str]:
+        from netspec.dialects.blocks.settings import RATE_FIELDS
+
+        return RATE_FIELDS
+
+    @override
+    def policy_fault(self, param: Any) -> str:
+        from netspec.dialects.blocks.settings import policy_fault
+
+        return policy_fault(param)
+
+    @override
+    def learning_rate(self, param: Any, iteration: int, caffes: Callable[[float], Any]) -> Any:
+        from netspec.dialects.blocks.settings import learning_rate
+
+        return learning_rate(param, iteration, caffes)
 
     @override
     def dialects_of(self, net: Any) -> set[str]:

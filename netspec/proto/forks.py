@@ -75,6 +75,24 @@ class Forks:
         """Return the descriptor of caffe.proto with the additions of the active dialects; None if there are none."""
         return None
 
+    # The solver
+
+    def policies(self) -> "tuple[str, ...]":
+        """Return the values of lr_policy that forks add."""
+        return ()
+
+    def rate_fields(self) -> "frozenset[str]":
+        """Return the fields of SolverParameter that the rates of forks follow from."""
+        return frozenset()
+
+    def policy_fault(self, param: "Any") -> str:
+        """Return what a SolverParameter lacks for its lr_policy, one that forks add; "" where it lacks nothing."""
+        return ""
+
+    def learning_rate(self, param: "Any", iteration: int, caffes: "Callable[[float], Any]") -> "Any":
+        """Return the rate of an iteration; ``caffes`` computes the one of its lr_policy from a ``base_lr``."""
+        return caffes(param.base_lr)
+
     # The layers
 
     def register_type(self, layer_type: str) -> None:

@@ -21,6 +21,7 @@ from netspec.net.build import build_net, check_sources
 from netspec.net.net import Net
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_large
 from netspec.proto.binary import check_readable, split_paths
+from netspec.proto.forks import forks
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.proto.text import write_text
@@ -35,7 +36,6 @@ from netspec.solver.checks import (
     fields_without_effect,
 )
 from netspec.solver.debug import debug_info
-from netspec.solver.lr_policy import RATES_OF_FORKS
 from netspec.solver.options import TrainingOptions, choose_device
 from netspec.solver.precision import BF16, FP16, FP32, LossScale, computing, has_bfloat16
 from netspec.solver.processes import own_device
@@ -210,9 +210,8 @@ class Training:
 
     def _warn_of_settings(self) -> None:
         """Warn of fields without effect, and of settings that make the training slow or dependent on the machine."""
-        read = RATES_OF_FORKS.union(
-            *(layer.solver_reads for net in self.test_nets for layer in net.layers if isinstance(layer, Scores))
-        )
+        scores = [layer for net in self.test_nets for layer in net.layers if isinstance(layer, Scores)]
+        read = forks().rate_fields().union(*(layer.solver_reads for layer in scores))
         for line in fields_without_effect(self.param, self.node, read):
             log.warning("solver.cpp:45", line)
         if said := dependence(self.net, torch.get_num_threads()):

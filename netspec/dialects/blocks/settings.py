@@ -1,8 +1,16 @@
 """Settings of whole nets and solvers that forks added: Intel's, NVIDIA's and Yuanjun Xiong's Caffe.
 
-netspec/solver/lr_policy.py computes the rates. Settings of types and memory affect only how a fork computes. Here they
-have no effect, and a warning says so.
+Some of them change the learning rate. Settings of types and memory affect only how a fork computes. Here they have no
+effect, and a warning says so.
 """
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Callable
+from typing import Any
+
+from netspec.proto.schema import added_fields
 
 DECLARATIONS = """
 enum Type { DOUBLE = 0; FLOAT = 1; FLOAT16 = 2; INT = 3; UINT = 4; }
@@ -38,3 +46,40 @@ extend LayerParameter {
   optional Type backward_math = 10148 [default = FLOAT];
 }
 """
+
+#: The warm-up of Intel and NVIDIA: its length, initial rate and exponent
+RAMPS = (("warmup_iter", "warmup_start_lr", 1), ("rampup_interval", "rampup_lr", 2))
+POLICIES = ("multifixed",)
+RATE_FIELDS = frozenset({"stagelr", "stageiter", "min_lr", *(name for ramp in RAMPS for name in ramp[:2])})
+
+
+def policy_fault(param: Any) -> str:
+    """Return what lr_policy "multifixed" lacks, "" for nothing."""
+    rates, ends = (len(_given(param, name, ())) for name in ("stagelr", "stageiter"))
+    if param.lr_policy != "multifixed" or rates == ends > 0:
+        return ""
+    return f'lr_policy "multifixed" needs as many stagelr as stageiter, found {rates} and {ends}'
+
+
+def learning_rate(param: Any, iteration: int, caffes: Callable[[float], Any]) -> Any:
+    """Return the rate of an iteration: of a ramp, at the start, or of the policy, at least min_lr."""
+    least = _given(param, "min_lr")
+    return max(_above(param, iteration, least, caffes), least) if least else _above(param, iteration, 0.0, caffes)
+
+
+def _above(param: Any, iteration: int, least: float, caffes: Callable[[float], Any]) -> Any:
+    for length, start, power in RAMPS:
+        if iteration < _given(param, length):
+            first = _given(param, start)
+            return first + (param.base_lr - first) * (iteration / _given(param, length)) ** power
+    if param.lr_policy == "multifixed":
+        rates, ends = _given(param, "stagelr"), _given(param, "stageiter")
+        return rates[min(bisect.bisect_left(ends, iteration), len(ends) - 1)]
+    if param.lr_policy == "poly" and least:
+        return caffes(param.base_lr - least) + least
+    return caffes(param.base_lr)
+
+
+def _given(param: Any, name: str, otherwise: Any = 0) -> Any:
+    field = added_fields.get(param.DESCRIPTOR.full_name, {}).get(name)
+    return otherwise if field is None else field.get(param)
