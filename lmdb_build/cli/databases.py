@@ -25,9 +25,9 @@ from lmdb_build.databases import (
     write_databases,
 )
 from lmdb_build.datasets import convert_cifar, convert_mnist
+from lmdb_build.mean import channel_means, compute_mean, write_mean
 from netspec import log
 from netspec.data.database import BACKENDS, open_reader
-from netspec.data.mean import channel_means, compute_mean, write_mean
 from netspec.errors import Where
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar

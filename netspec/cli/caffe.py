@@ -140,7 +140,7 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
     """Train, and return the exit status."""
     from tqdm import tqdm
 
-    from netspec.solver.board import board, writer_class
+    from netspec.cli.board import board, writer_class
     from netspec.solver.processes import Lost
 
     if arguments.tensorboard and processes.is_root:

@@ -16,8 +16,8 @@ from netspec.terminal.output import bar
 from netspec.terminal.parser import QUIET, Commands
 
 if TYPE_CHECKING:
-    from netspec.data.records import Records
     from netspec.inspect.check.survey import Survey
+    from netspec.inspect.records import Records
 
 SHOW, STAT = "show", "stat"
 SHOWN_FAULTS = 4  # which come first
@@ -57,8 +57,8 @@ def _add_data(commands: Commands) -> None:
 
 
 def _data(arguments: argparse.Namespace) -> int:
-    from netspec.data.records import open_records, spread
     from netspec.inspect.check.survey import survey
+    from netspec.inspect.records import open_records, spread
 
     if arguments.what == SHOW:
         refuse(arguments, ("json",), "is for `data stat`")
@@ -91,9 +91,9 @@ def _print_survey(arguments: argparse.Namespace, found: Survey) -> int:
 
 
 def _show(arguments: argparse.Namespace, records: Records, found: Survey) -> None:
-    from netspec.data.records import spread
     from netspec.inspect.draw.sheet import sheet
     from netspec.inspect.draw.style import ending_of, write_figure
+    from netspec.inspect.records import spread
 
     ending_of(arguments.out, ("png", "svg"))
     if arguments.start is None:

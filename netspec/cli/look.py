@@ -41,9 +41,9 @@ def _add_filters(commands: Commands) -> None:
 
 
 def _filters(arguments: argparse.Namespace) -> None:
-    from netspec.data.stored_weights import stored_layers
     from netspec.inspect.draw.learned import filters_figure
     from netspec.inspect.draw.style import ending_of, write_figure
+    from netspec.inspect.stored_weights import stored_layers
 
     ending_of(arguments.out, PICTURES)
     layers = [layer for layer in stored_layers(arguments.weights) if layer.has_filters]

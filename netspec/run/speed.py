@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 
 from netspec.data.sources import AtOnce
@@ -50,7 +49,7 @@ class Speed(Protocol):
         """
         ...
 
-    def reads_at_once(self, decode: Callable[[Any], np.ndarray]) -> AtOnce:
+    def reads_at_once(self, decode: Callable[[Any], Any]) -> AtOnce:
         """Return what reads many raw Datums at once; ``decode`` returns the numbers (C, H, W) of one."""
         ...
 

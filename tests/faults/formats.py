@@ -21,6 +21,7 @@ import numpy as np
 import scipy.io
 
 from faults import recordings, written
+from lmdb_build.mean import write_mean
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.detector.detector import LoopDetector
@@ -35,7 +36,7 @@ from netspec.data.database import open_reader
 from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
 from netspec.data.hdf5 import Hdf5Source
 from netspec.data.images import read_image, read_image_list
-from netspec.data.mean import read_mean, read_mean_option, write_mean
+from netspec.data.mean import read_mean, read_mean_option
 from netspec.data.windows import read_window_file
 from netspec.errors import SpecError, raise_fault
 from netspec.files.image_list import list_images

@@ -19,10 +19,10 @@ import torch
 
 from netspec import log
 from netspec.compat.pycaffe.steps import LayerStep, PythonStep
-from netspec.compat.pycaffe.tapes import not_shared, storages
+from netspec.compat.pycaffe.tapes import BorrowedMemory, not_shared, storages
 from netspec.exact.blas import one_thread
 from netspec.graph.plan import AUTOMATIC
-from netspec.layers.utility.live_blobs import Blob, BorrowedMemory
+from netspec.layers.utility.live_blobs import Blob
 from netspec.layers.utility.python import Python
 from netspec.net.net import Net
 from netspec.run.walk import Step, walk

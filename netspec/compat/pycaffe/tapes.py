@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from typing_extensions import override
 
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import Seen
-from netspec.layers.utility.live_blobs import Blob, BlobVec, BorrowedMemory
+from netspec.layers.utility.live_blobs import Blob, BlobVec, Memory, Shape, write
 from netspec.run.recorded import Kernels
 
 
@@ -77,6 +80,53 @@ def not_shared(tensor: torch.Tensor, taken: set[int]) -> torch.Tensor:
     """Return the tensor, or a copy of it if its memory is in ``taken``."""
     aliased = tensor.device.type == "cpu" and tensor.untyped_storage().data_ptr() in taken
     return tensor.clone() if aliased else tensor
+
+
+class BorrowedMemory(Memory):
+    """The memory of a tensor that a net or a solver owns: a learnable blob's values, or their gradient.
+
+    ``find`` returns the tensor. On a GPU views show a copy, which :meth:`upload` copies back.
+    """
+
+    def __init__(self, find: Callable[[], torch.Tensor], capacity: int) -> None:
+        super().__init__()
+        self.capacity = capacity
+        self._find = find
+        self._copy: torch.Tensor | None = None
+        self._written = False
+
+    @override
+    def reserve(self, count: int) -> None:
+        """Refuse more numbers than there are."""
+        if count > self.capacity:
+            raise ValueError(f"this blob has {self.capacity} numbers and cannot be reshaped to {count}")
+
+    @override
+    def view(self, shape: Shape) -> np.ndarray:
+        tensor = self._find().detach()
+        if tensor.device.type != "cpu":
+            if self._copy is None:
+                self._copy = torch.empty(tensor.shape, dtype=tensor.dtype)
+            if not self._written:
+                self._copy.copy_(tensor)
+            tensor, self._written = self._copy, True
+        return tensor.view(-1).numpy()[: math.prod(shape)].reshape(shape)
+
+    @override
+    def tensor(self, shape: Shape) -> torch.Tensor:
+        return self._find().detach().view(-1)[: math.prod(shape)].view(shape)
+
+    @override
+    def put(self, tensor: torch.Tensor) -> None:
+        """Write to the tensor."""
+        write(self._find().detach().view(-1), tensor)
+
+    @torch.no_grad()
+    def upload(self) -> None:
+        """Copy to the GPU what was written to views."""
+        if self._written and self._copy is not None:
+            self._find().detach().copy_(self._copy)
+        self._written = False
 
 
 def parameters(layer: Layer) -> BlobVec:

@@ -10,11 +10,11 @@ from io import StringIO
 from pathlib import Path
 
 from netspec import log
-from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError, printable
 from netspec.exact.blas import kernels
 from netspec.files.limits import amount, memory
 from netspec.inspect.check.check import check_file
+from netspec.inspect.stored_weights import stored_layers
 from netspec.process.environment import environment
 from netspec.proto.binary import is_net_binary
 from netspec.terminal.commands import UNKNOWN, version

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError, Where
 from netspec.inspect.check.difference import Difference, Differences
+from netspec.inspect.stored_weights import stored_layers
 
 Weights = dict[str, tuple[np.ndarray, ...]]
 

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import torch
 
+from netspec.inspect.check.timed import timed
 from netspec.log import info, number
 from netspec.net.net import Net
-from netspec.run.timed import timed
 from netspec.solver.testing import Outputs, Tally, score_lines, scorers
 
 

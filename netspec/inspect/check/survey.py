@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from netspec.data.datum import times
-from netspec.data.records import Record, Records
 from netspec.files.limits import amount
+from netspec.inspect.records import Record, Records
 
 Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm: wraps an iterable
 _MOST_FAULTS = 100  # errors to keep with their keys; all are counted

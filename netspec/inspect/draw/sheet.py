@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from netspec.data.records import Record
 from netspec.files.figures import COLORS
 from netspec.inspect.check.survey import Survey, as_lines
 from netspec.inspect.draw.style import (
@@ -27,6 +26,7 @@ from netspec.inspect.draw.style import (
     text_at,
     what_is_shown,
 )
+from netspec.inspect.records import Record
 
 WIDTH, HEAD = 12.0, 2.1  # inches
 LONGER, CAPTION, GAP = 1.4, 0.44, 0.14  # inches: a tile's longer side, the two lines below it, between tiles

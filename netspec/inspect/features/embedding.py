@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from netspec.data.records import open_records
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.files.arrays import read_npz
 from netspec.files.image_list import list_images
 from netspec.files.opencv import cv2
 from netspec.inspect.features.images import read_pixels
+from netspec.inspect.records import open_records
 
 PCA, TSNE = "pca", "tsne"
 _BESIDE = ("stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms", "names", "keys")

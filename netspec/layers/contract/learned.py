@@ -107,7 +107,9 @@ def may_have_alias(blob: torch.Tensor) -> bool:
     return _uses is None or _uses(blob.untyped_storage()._cdata) > _uses_of_one()
 
 
-_uses = getattr(torch._C, "_storage_Use_Count", None)  # how many tensors and arrays share a storage
+# How many tensors and arrays share a storage. Torch has no public function for it; without this one, each blob that was
+# ever handed out is taken to have an alias still.
+_uses = getattr(torch._C, "_storage_Use_Count", None)
 
 
 @cache

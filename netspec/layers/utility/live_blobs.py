@@ -16,7 +16,6 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from typing_extensions import override
 
 Shape = tuple[int, ...]
 
@@ -86,7 +85,7 @@ class Memory:
         self._uploaded = None
         if self._flat is not None and self.is_watched():
             self._fresh = None
-            _write(self._flat, tensor)
+            write(self._flat, tensor)
         else:
             self._fresh = tensor.contiguous()
             if self._seen() is None:
@@ -116,7 +115,7 @@ class Memory:
                 return self._flat
             self._flat = torch.zeros(self.capacity, dtype=self.dtype)
         if fresh is not None:
-            _write(self._flat, fresh)
+            write(self._flat, fresh)
         return self._flat
 
     def _is_all(self, tensor: torch.Tensor) -> bool:
@@ -125,54 +124,7 @@ class Memory:
         return whole and tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
 
 
-class BorrowedMemory(Memory):
-    """The memory of a tensor that a net or a solver owns: a learnable blob's values, or their gradient.
-
-    ``find`` returns the tensor. On a GPU views show a copy, which :meth:`upload` copies back.
-    """
-
-    def __init__(self, find: Callable[[], torch.Tensor], capacity: int) -> None:
-        super().__init__()
-        self.capacity = capacity
-        self._find = find
-        self._copy: torch.Tensor | None = None
-        self._written = False
-
-    @override
-    def reserve(self, count: int) -> None:
-        """Refuse more numbers than there are."""
-        if count > self.capacity:
-            raise ValueError(f"this blob has {self.capacity} numbers and cannot be reshaped to {count}")
-
-    @override
-    def view(self, shape: Shape) -> np.ndarray:
-        tensor = self._find().detach()
-        if tensor.device.type != "cpu":
-            if self._copy is None:
-                self._copy = torch.empty(tensor.shape, dtype=tensor.dtype)
-            if not self._written:
-                self._copy.copy_(tensor)
-            tensor, self._written = self._copy, True
-        return tensor.view(-1).numpy()[: math.prod(shape)].reshape(shape)
-
-    @override
-    def tensor(self, shape: Shape) -> torch.Tensor:
-        return self._find().detach().view(-1)[: math.prod(shape)].view(shape)
-
-    @override
-    def put(self, tensor: torch.Tensor) -> None:
-        """Write to the tensor."""
-        _write(self._find().detach().view(-1), tensor)
-
-    @torch.no_grad()
-    def upload(self) -> None:
-        """Copy to the GPU what was written to views."""
-        if self._written and self._copy is not None:
-            self._find().detach().copy_(self._copy)
-        self._written = False
-
-
-def _write(flat: torch.Tensor, tensor: torch.Tensor) -> None:
+def write(flat: torch.Tensor, tensor: torch.Tensor) -> None:
     """Write a tensor to the front of memory. Tensors that autograd has saved change too, as in Caffe."""
     flat.data[: tensor.numel()].copy_(tensor.detach().reshape(-1))
 

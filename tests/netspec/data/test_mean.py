@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lmdb_build.mean import channel_means, compute_mean, write_mean
 from netspec.data.database import Writer, open_reader
 from netspec.data.datum import array_to_datum
-from netspec.data.mean import channel_means, compute_mean, read_mean, write_mean
+from netspec.data.mean import read_mean
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import BlobProto, BlobShape
 from paths import GOLDEN

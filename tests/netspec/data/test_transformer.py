@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from lmdb_build.mean import write_mean
 from netspec.data.datum import array_to_datum, encoded_datum
-from netspec.data.mean import write_mean
 from netspec.data.random_words import words
 from netspec.data.transformer import Transformer
 from netspec.errors import SpecError, Where

@@ -111,7 +111,7 @@ def test_the_padding_of_a_mirrored_window_is_mirrored(folder: Path) -> None:
 
 
 def test_the_mean_is_cropped_like_the_window(folder: Path) -> None:
-    from netspec.data.mean import write_mean
+    from lmdb_build.mean import write_mean
 
     mean = np.arange(3 * 12 * 12, dtype=np.float32).reshape(3, 12, 12)
     write_mean(str(folder / "mean"), mean)

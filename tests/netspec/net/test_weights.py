@@ -8,10 +8,10 @@ import pytest
 import torch
 
 import netspec
-from netspec.data.stored_weights import stored_layers
 from netspec.errors import SpecError
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
+from netspec.inspect.stored_weights import stored_layers
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, net_to_proto, save_weights

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lmdb_build.mean import write_mean
 from netspec.cli import main
-from netspec.data.mean import read_mean, read_mean_option, write_mean
+from netspec.data.mean import read_mean, read_mean_option
 from netspec.errors import SpecError
 from netspec.load import load_solver
 

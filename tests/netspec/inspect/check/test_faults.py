@@ -13,10 +13,10 @@ import pytest
 
 import netspec
 from case_files import read_cases
+from lmdb_build.mean import write_mean
 from netspec.data.blobs import from_array
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
-from netspec.data.mean import write_mean
 
 Run = Callable[..., Any]  # the fixture of conftest.py
 

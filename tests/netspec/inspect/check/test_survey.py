@@ -12,10 +12,10 @@ import pytest
 
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum, encoded_datum
-from netspec.data.records import open_records, spread
 from netspec.errors import SpecError
 from netspec.inspect.check.survey import Survey, survey
 from netspec.inspect.draw.style import as_picture, images_in, split
+from netspec.inspect.records import open_records, spread
 from paths import GOLDEN
 
 Run = Callable[..., Any]

@@ -11,12 +11,12 @@ import pytest
 from matplotlib.offsetbox import AnnotationBbox
 
 import netspec
-from netspec.data.stored_weights import stored_layers
 from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.learned import embedding_figure, filters_figure, maps_figure, saliency_figure
 from netspec.inspect.features.embedding import in_plane, read_features, thumbnails
 from netspec.inspect.features.images import ImageInput, ImageNet
 from netspec.inspect.features.saliency import of_distance, of_unit
+from netspec.inspect.stored_weights import stored_layers
 from paths import GOLDEN
 
 WEIGHTS = GOLDEN / "snapshot" / "ref_iter_40.caffemodel"

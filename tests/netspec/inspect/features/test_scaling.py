@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from netspec.data.mean import write_mean
+from lmdb_build.mean import write_mean
 from netspec.errors import SpecError
 from netspec.inspect.features.describer import Describer
 from netspec.inspect.features.scaling import Steps, scaling_of
