@@ -35,7 +35,7 @@ from netspec.exact.channels import (
     row_normalization_gradient,
 )
 from netspec.exact.layout import channels_side_by_side, map_by_map, of_one_channel
-from netspec.exact.pointwise import CellUpdate, Gradient, Pointwise, lstm_unit
+from netspec.exact.pointwise import CellUpdate, Gradient, lstm_unit, pointwise
 from netspec.exact.products import (
     Axes,
     ColumnProducts,
@@ -353,7 +353,7 @@ class AsCaffe(AsTorch):
 
     @override
     def softmax(self, x: torch.Tensor, axis: int) -> torch.Tensor:
-        return Pointwise.apply(
+        return pointwise(
             x,
             lambda x: losses.softmax(_by_class(x, axis)).reshape(x.shape),
             lambda bottom, top, diff: self.softmax_gradient(top, diff, axis),
@@ -365,7 +365,7 @@ class AsCaffe(AsTorch):
 
     @override
     def function(self, x: torch.Tensor, by_torch: Function, as_caffe: Function, gradient: Gradient) -> torch.Tensor:
-        return Pointwise.apply(x, as_caffe, gradient)
+        return pointwise(x, as_caffe, gradient)
 
     @override
     def log(self, x: torch.Tensor) -> torch.Tensor:
@@ -428,7 +428,14 @@ def arithmetic(exact: str, values: torch.Tensor, small: bool = False, in_place: 
 
     ``in_place``: gradients of parameters are added to ``grad`` at once (netspec/exact/accumulate.py).
     """
-    return (AsCaffe if applies(exact, values, small) else AsTorch)(in_place)
+    return _WAYS[applies(exact, values, small), in_place]
+
+
+_WAYS = {
+    (is_caffes, adds): (AsCaffe if is_caffes else AsTorch)(adds)
+    for is_caffes in (False, True)
+    for adds in (False, True)
+}
 
 
 def _by_rows(products: Any, vectors: torch.Tensor, weight: torch.Tensor, *how: Any) -> torch.Tensor:
@@ -445,6 +452,8 @@ def _of_rows(function: Function, x: torch.Tensor, axis: int | None) -> torch.Ten
 
 def _by_class(x: torch.Tensor, axis: int) -> torch.Tensor:
     """Return x as (outer, classes, inner)."""
+    if (x.dim(), axis) == (3, 1):
+        return x
     return x.reshape(math.prod(x.shape[:axis]), x.shape[axis], -1)
 
 

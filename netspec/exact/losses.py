@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from netspec.exact import libm
 from netspec.exact.blas import array, dots, one_thread, sum_in_order
 from netspec.exact.orders import class_sums
-from netspec.exact.pointwise import Pointwise
+from netspec.exact.pointwise import pointwise
 
 
 @one_thread()
@@ -30,7 +30,7 @@ def softmax_gradient(p: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
 
 def logarithm(values: torch.Tensor) -> torch.Tensor:
     """Return natural logarithms."""
-    return Pointwise.apply(values, libm.log, lambda values, logarithms, diff: diff / values)
+    return pointwise(values, libm.log, lambda values, logarithms, diff: diff / values)
 
 
 class SigmoidCrossEntropy(torch.autograd.Function):

@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from netspec.exact import libm
-from netspec.exact.pointwise import Pointwise
+from netspec.exact.pointwise import pointwise
 from netspec.exact.sums import Product
 
 
@@ -33,7 +33,7 @@ def within_channel(maps: torch.Tensor, settings: Settings) -> torch.Tensor:
     Caffe computes this with an internal net: Power, average Pooling, Power and a product.
     """
     size, alpha, beta, _ = settings
-    squares = Pointwise.apply(maps, lambda x: libm.power(x, 2), lambda x, _, diff: diff * (2 * x))
+    squares = pointwise(maps, lambda x: libm.power(x, 2), lambda x, _, diff: diff * (2 * x))
     means = F.avg_pool2d(squares, size, stride=1, padding=size // 2)
 
     def roots(x: torch.Tensor) -> torch.Tensor:
@@ -42,7 +42,7 @@ def within_channel(maps: torch.Tensor, settings: Settings) -> torch.Tensor:
     def gradient(x: torch.Tensor, root: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return diff * (root / (alpha * x + 1) * (-beta * alpha))
 
-    return Product.apply(True, maps, Pointwise.apply(means, roots, gradient))
+    return Product.apply(True, maps, pointwise(means, roots, gradient))
 
 
 class AcrossChannels(torch.autograd.Function):

@@ -33,6 +33,13 @@ class Pointwise(torch.autograd.Function):
         return ctx.gradient(*ctx.saved_tensors, diff), None, None
 
 
+def pointwise(
+    bottom: torch.Tensor, compute: Callable[[torch.Tensor], torch.Tensor], gradient: Gradient
+) -> torch.Tensor:
+    """Apply ``compute`` with Caffe's gradient, as :class:`Pointwise` does; without gradients that takes less time."""
+    return Pointwise.apply(bottom, compute, gradient) if torch.is_grad_enabled() else compute(bottom)
+
+
 def tanh_gradient(bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
     """Return the gradient of a hyperbolic tangent (src/caffe/layers/tanh_layer.cpp)."""
     return diff * (1 - top * top)

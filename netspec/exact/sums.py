@@ -11,7 +11,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from netspec.exact.blas import dots, one_thread, sum_in_order, sum_of_magnitudes
-from netspec.exact.pointwise import Pointwise
+from netspec.exact.pointwise import pointwise
 
 
 class SumInOrder(torch.autograd.Function):
@@ -50,7 +50,7 @@ def _row_squares(rows: torch.Tensor) -> torch.Tensor:
 
 def row_squares(rows: torch.Tensor) -> torch.Tensor:
     """Sum up the squares of each row (caffe_cpu_dot of it with itself): (M, K) to (M,)."""
-    return Pointwise.apply(rows, _row_squares, lambda rows, sums, diff: rows * (2 * diff).unsqueeze(1))
+    return pointwise(rows, _row_squares, lambda rows, sums, diff: rows * (2 * diff).unsqueeze(1))
 
 
 @one_thread()
@@ -60,7 +60,7 @@ def _row_magnitudes(rows: torch.Tensor) -> torch.Tensor:
 
 def row_magnitudes(rows: torch.Tensor) -> torch.Tensor:
     """Sum up the absolute values of each row (caffe_cpu_asum): (M, K) to (M,)."""
-    return Pointwise.apply(rows, _row_magnitudes, lambda rows, sums, diff: rows.sign() * diff.unsqueeze(1))
+    return pointwise(rows, _row_magnitudes, lambda rows, sums, diff: rows.sign() * diff.unsqueeze(1))
 
 
 class Copies(torch.autograd.Function):
@@ -86,7 +86,7 @@ def tiles(values: torch.Tensor, count: int) -> torch.Tensor:
 
     Caffe: src/caffe/layers/tile_layer.cpp
     """
-    return Pointwise.apply(
+    return pointwise(
         values, lambda values: values.unsqueeze(1).repeat(1, count, 1), lambda values, top, diff: sum_in_order(diff, 1)
     )
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 
-from netspec.data.blobs import Shape
 from netspec.graph.plan import Plan
-from netspec.layers.contract.base import Layer
+from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.reading import changes_itself
 
 

@@ -7,7 +7,6 @@ from typing import Any, Protocol
 
 import torch
 
-from netspec.data.sources import AtOnce
 from netspec.layers.contract.base import Layer
 from netspec.run.eager import Eager
 from netspec.run.recorded import Diff, Kernels
@@ -49,8 +48,11 @@ class Speed(Protocol):
         """
         ...
 
-    def reads_at_once(self, decode: Callable[[Any], Any]) -> AtOnce:
-        """Return what reads many raw Datums at once; ``decode`` returns the numbers (C, H, W) of one."""
+    def reads_at_once(self, decode: Callable[[Any], Any]) -> Callable[[Sequence[bytes]], Any]:
+        """Return what reads many raw Datums at once; ``decode`` returns the numbers (C, H, W) of one.
+
+        See :class:`netspec.data.sources.DatabaseSource`.
+        """
         ...
 
     def is_fresh(self, layer: Layer) -> bool:

@@ -114,8 +114,10 @@ class Layer(torch.nn.Module):
         ``small`` is instead of the property ``small``. Bottoms of another type of numbers than the blobs are torch's.
         """
         options, small = self.context.options, self.small if small is None else small
-        exact = options.exact if all(blob.dtype == bottom.dtype for blob in self.blobs) else NONE
-        return arithmetic(exact, bottom, bool(small), options.accumulate_in_place)
+        found = arithmetic(options.exact, bottom, bool(small), options.accumulate_in_place)
+        if found.is_caffes and any(blob.dtype != bottom.dtype for blob in self.blobs):
+            return arithmetic(NONE, bottom, in_place=options.accumulate_in_place)
+        return found
 
     def close(self) -> None:
         """Close files and stop threads, if the layer has any."""
