@@ -107,12 +107,12 @@ def test_the_option_chooses() -> None:
 
 def test_no_forward_asks_whose_arithmetic_it_is() -> None:
     """It is asked once, where a layer gets its arithmetic."""
-    asking = [
+    asking = {
         f"{path.name}:{function.name}"
         for path in sorted((ROOT / "netspec" / "layers").rglob("*.py"))
         for function in ast.walk(ast.parse(path.read_text()))
         if isinstance(function, ast.FunctionDef)
         for node in ast.walk(function)
         if isinstance(node, ast.Attribute) and node.attr in ("is_caffes", "exact")
-    ]
-    assert asking == ["base.py:arithmetic", "normalization.py:joined_with"]
+    }
+    assert asking == {"base.py:arithmetic", "normalization.py:joined_with"}
