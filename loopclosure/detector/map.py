@@ -25,6 +25,7 @@ from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import Describe, LoopDetector, fingerprint_of, refuse_another
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.frames import Points, points_of
+from loopclosure.detector.own_files import remove_own
 from loopclosure.detector.run import NAME, remember_all, run_detector, views_of
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
@@ -32,7 +33,7 @@ from loopclosure.index.index import INDEXES, open_index
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.progress import Progress, silent
 from netspec.files.arrays import Rows, check_array, read_npz, regular
-from netspec.files.own_folder import inside, remove_own
+from netspec.files.own_folder import inside
 from netspec.files.whole_file import only_one, whole_file, whole_folder, write_whole
 
 FORMAT = 2
