@@ -5,6 +5,7 @@ Caffe: include/caffe/layer.hpp, Net::ForwardFromTo, Net::BackwardFromTo (src/caf
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -177,7 +178,7 @@ class LayerStep:
             if any(self.wanted):
                 self._put_diffs((found,) if isinstance(found, torch.Tensor) else found, tape, storages(diffs))
 
-    def _put_diffs(self, found: list[torch.Tensor | None], tape: Tape, taken: set[int]) -> None:
+    def _put_diffs(self, found: Sequence[torch.Tensor | None], tape: Tape, taken: set[int]) -> None:
         for blob, leaf, diff, asked in zip(self.bottoms, tape.leaves, found, self.wanted, strict=True):
             if asked:
                 blob.diff_memory.put(not_shared(torch.zeros_like(leaf) if diff is None else diff, taken))
