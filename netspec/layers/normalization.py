@@ -67,8 +67,8 @@ class BatchNorm(Layer):
         arithmetic = self.arithmetic(data)
         if self.use_global_stats:
             return self.by_past(arithmetic)(data)
-        top, *statistics = arithmetic.normalized_batch(data, self.eps, *self.factors())
-        self.add(*statistics)
+        top, mean, variance, unbiased = arithmetic.normalized_batch(data, self.eps, *self.factors())
+        self.add(mean, variance, unbiased)
         return top.relu_() if self.rectifies else top
 
     @property

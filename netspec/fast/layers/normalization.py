@@ -42,8 +42,8 @@ def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
 
     def forward(data: torch.Tensor) -> torch.Tensor:
         nonlocal given, top, mean, deviation
-        made, given, *statistics = normalized_batch(data, torch.native_batch_norm, layer.factors(), layer.eps)
-        layer.add(*statistics)
+        made, given, *batch = normalized_batch(data, torch.native_batch_norm, layer.factors(), layer.eps)
+        layer.add(batch[0], batch[1])
         top, mean, deviation = made
         return top.relu_() if rectifies else top
 

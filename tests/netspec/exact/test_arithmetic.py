@@ -74,11 +74,12 @@ def computed(how: AsTorch, name: str) -> list[torch.Tensor]:
     if name == "infogain":
         found[0] = found[0].sum(2)  # of each class, or their sums
     if name == "normalized_batch":
+        assert isinstance(made, tuple)
         found[2] = found[2] * made[3]
-    loss = sum((x * torch.linspace(-1, 2, x.numel()).view(x.shape)).sum() for x in found if x.requires_grad)
+    terms = [(x * torch.linspace(-1, 2, x.numel()).view(x.shape)).sum() for x in found if x.requires_grad]
     learned = [x for x in tensors(CASES[name]) if x.requires_grad]
     if not name.endswith("gradient") and learned:
-        found += [x for x in torch.autograd.grad(loss, learned, allow_unused=True) if x is not None]
+        found += [x for x in torch.autograd.grad(torch.stack(terms).sum(), learned, allow_unused=True) if x is not None]
     return found
 
 
