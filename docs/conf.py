@@ -27,7 +27,7 @@ highlight_language = "commands"
 html_theme = "furo"
 html_title = f"netspec {version}"
 html_copy_source = html_use_index = False
-smartquotes_action = "qe"  # two hyphens begin an option; they are no dash
+smartquotes_action = "qe"  # two hyphens begin an option and must not become a dash
 html_show_copyright = False
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
@@ -41,11 +41,11 @@ html_theme_options = {
 }
 myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
-suppress_warnings = ["myst.header", "misc.highlighting_failure"]  # READMEs begin where they like; logs are no language
+suppress_warnings = ["myst.header", "misc.highlighting_failure"]  # READMEs start with any heading; logs lack a language
 
-# The README of each folder is a page too, and so are these files.
-ROOMS = {f"{name}/README.md": f"rooms/{name}.md" for name in ("loopclosure", "prototxt", "benchmarks")} | {
-    f"{name.upper()}.md": f"rooms/{name}.md" for name in ("changelog", "contributing", "architecture", "security")
+# The README of each folder and these files are pages, too.
+PROJECT_PAGES = {f"{name}/README.md": f"project/{name}.md" for name in ("loopclosure", "prototxt", "benchmarks")} | {
+    f"{name.upper()}.md": f"project/{name}.md" for name in ("changelog", "contributing", "architecture", "security")
 }
 LINK = re.compile(r"(?<!!)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]*)(#[^)]*)?\)")
 BLOCK = re.compile(r"^```([^\n`]*)\n.*?^```$", re.M | re.S)
@@ -80,7 +80,7 @@ class PrototxtLexer(RegexLexer):
 def rewrite(text: str, folder: Path) -> str:
     """Return the text of a file of ``folder`` as the site has it.
 
-    Links lead to pages; those without one are text. What a command does stands above it, where it fits on a phone.
+    Links lead to pages; links to other files become text. A comment on a command is moved above it, to fit on a phone.
     """
     text = BLOCK.sub(lambda block: block[0] if block[1] else COMMENTED.sub(r"\2\n\1", block[0]), text)
 
@@ -92,7 +92,7 @@ def rewrite(text: str, folder: Path) -> str:
         if not path.is_relative_to(ROOT):
             return found[0]
         name = path.relative_to(ROOT).as_posix()
-        destination = HERE / ROOMS[name] if name in ROOMS else path
+        destination = HERE / PROJECT_PAGES[name] if name in PROJECT_PAGES else path
         if name == "README.md":
             destination = HERE / "index.md"
         if destination.suffix != ".md" or not destination.is_relative_to(HERE):

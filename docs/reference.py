@@ -22,7 +22,7 @@ FIELD = re.compile(r"(optional|repeated|required) ([\w.]+) (\w+) = \d+(?: \[([^\
 
 
 class FromCode(SphinxDirective):
-    """A directive whose argument names what is shown, and whose text is Markdown that code writes."""
+    """A directive that inserts Markdown written by code; its argument names what to describe."""
 
     required_arguments = 1
 
@@ -31,7 +31,7 @@ class FromCode(SphinxDirective):
         raise NotImplementedError
 
     def run(self) -> list[nodes.Node]:
-        """Parse the text in place of the directive, at each build anew, since code may have changed."""
+        """Replace the directive by the parsed text, in every build, because the code may have changed."""
         self.env.note_reread()
         return self.parse_text_to_nodes(
             self.markdown(self.arguments[0] if self.arguments else ""), allow_section_headings=True
@@ -39,12 +39,12 @@ class FromCode(SphinxDirective):
 
 
 class CommandReference(FromCode):
-    """The commands of a program that stand under some headings of its help, or all, in the order of its help."""
+    """The commands of a program under some headings of its help, or all commands, in the order of its help."""
 
     final_argument_whitespace = True
 
     def markdown(self, name: str) -> str:
-        """Return a section for each command: what it is for, its usage, an example of a page, its options."""
+        """Return a section for each command: its purpose, its usage, an example from the pages, its options."""
         name, _, headings = name.partition(" ")
         parser = import_module(f"{name.replace('-', '_')}.cli").parser()
         groups = [part.partition(":\n") for part in (parser.epilog or "").split("\n\n")]
@@ -66,7 +66,7 @@ class CommandReference(FromCode):
 
 
 class LayerReference(FromCode):
-    """The layer types of the rooms of netspec.layers that are named."""
+    """The layer types in the named packages of netspec.layers."""
 
     final_argument_whitespace = True
 
@@ -129,7 +129,7 @@ def _signed(name: str, found: Any) -> list[str]:
 
 
 def _arguments(found: Any) -> str:
-    """Return the arguments of a function or class, without annotations; types stand in the docstrings."""
+    """Return the arguments of a function or class, without annotations; the docstrings describe the types."""
     parameters = [p.replace(annotation=inspect.Parameter.empty) for p in inspect.signature(found).parameters.values()]
     shown = [p.replace(default="...") if _is_long(p) else p for p in parameters if p.name != "self"]
     return re.sub(r"='\.\.\.'", "=...", str(inspect.Signature(shown)))
@@ -140,7 +140,7 @@ def _is_long(parameter: inspect.Parameter) -> bool:
 
 
 def docstring(found: Any) -> list[str]:
-    """Return a docstring as Markdown: examples are Python, lines of two columns a table, roles code."""
+    """Return a docstring as Markdown: examples become Python blocks, lines of two columns a table, roles code."""
     lines: list[str] = []
     rows: list[list[str]] = []
     for line in [*(inspect.getdoc(found) or "").splitlines(), ""]:
@@ -172,7 +172,7 @@ def _words(text: str) -> str:
 
 
 def _described(text: str) -> list[str]:
-    """Return a layer's docstring as Markdown: what comes before its blobs, a table of its blobs, what comes after."""
+    """Return a layer's docstring as Markdown: the text before its blobs, a table of its blobs, the text after."""
     lines, rows = [], []
     for line in text.splitlines():
         if found := BLOB.match(line):
@@ -192,7 +192,7 @@ def _described(text: str) -> list[str]:
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return a table as lines of Markdown, without the columns that are empty; no lines where there are no rows."""
+    """Return a table as lines of Markdown, without empty columns; no lines if there are no rows."""
     rows = list(rows)
     kept = [k for k in range(len(heads)) if any(row[k] for row in rows)]
     lines = [heads, ["---"] * len(heads), *rows] if rows else []
@@ -201,7 +201,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def _commands(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
-    """Yield all commands, those of commands too."""
+    """Yield all commands, including subcommands."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for command, made in action.choices.items():
@@ -211,7 +211,7 @@ def _commands(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.A
 
 @cache
 def _examples() -> list[str]:
-    """Return the commands that stand on the pages, where tests run them, each in one line."""
+    """Return the commands in the pages, each in one line; tests run them."""
     pages = [ROOT / "README.md", *ROOT.glob("*/README.md"), *sorted((ROOT / "docs").glob("*.md"))]
     text = "\n".join(block for page in pages for block in re.findall(r"^```\n(.*?)^```", page.read_text(), re.M | re.S))
     lines = re.sub(r"\s*\\\n\s*", " ", text).splitlines()
@@ -219,13 +219,13 @@ def _examples() -> list[str]:
 
 
 def _example(command: str) -> str:
-    """Return what a command of a page looks like: of those with options the shortest."""
+    """Return an example of a command: the shortest one in the pages that has options."""
     found = [line for line in _examples() if f"{line} ".startswith(f"{command} ") and "$" not in line]
     return min(found, key=lambda line: (" --" not in line, len(line)), default="")
 
 
 def _paragraphs(text: str) -> list[str]:
-    """Return a description as Markdown; a table in it, of lines with two columns, is a list."""
+    """Return a description as Markdown; lines with two columns become a list."""
     rows = re.sub(r"\n {6,}", " ", text)
     return [re.sub(r"^(--\S+(?: \S+)?)\s{2,}", r"- `\1`: ", _prose(line)) for line in rows.splitlines()]
 
@@ -234,13 +234,13 @@ SHARED = ("plugin", "limit", "verbose")  # options of every command, which come 
 
 
 def _arguments_of(parser: argparse.ArgumentParser) -> list[argparse.Action]:
-    """Return a command's arguments: its own in their order, then those that all commands have."""
+    """Return the arguments of a command: its own in order, then those of all commands."""
     shown = [a for a in parser._actions if not isinstance(a, argparse._HelpAction) and a.help is not argparse.SUPPRESS]
     return sorted(shown, key=lambda action: action.dest in SHARED)
 
 
 def _usage(parser: argparse.ArgumentParser) -> str:
-    """Return a command's positional arguments, and the options that it must have."""
+    """Return the positional arguments and the required options of a command."""
     words = {True: [], False: []}
     for action in (found := _arguments_of(parser)):
         if not action.option_strings:
@@ -252,7 +252,7 @@ def _usage(parser: argparse.ArgumentParser) -> str:
 
 
 def _value(action: argparse.Action) -> str:
-    """Return the word that stands for what an argument takes, or the words that it may be."""
+    """Return the placeholder of an argument's value, or its choices."""
     return str(action.metavar or (",".join(map(str, action.choices)) if action.choices else action.dest.upper()))
 
 

@@ -121,7 +121,7 @@ def _lines(kind: str) -> list[str]:
 
 
 class _Column:
-    """Blobs one below the other: each is drawn, and below it stand its name and its shape."""
+    """Blobs in a column: each with its name and its shape below it."""
 
     def __init__(self, blobs: Sequence[tuple[str, Shape]]) -> None:
         self._blobs = [(name, shape, _solid(shape)) for name, shape in blobs]

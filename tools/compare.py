@@ -6,6 +6,6 @@ tools/compare.py prototxt/small/siamese_8/solver.prototxt prototxt/small/siamese
 
 import sys
 
-from door import run
+from launch import run
 
 sys.exit(run("lmdb_build.cli", "compare"))

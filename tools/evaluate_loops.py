@@ -3,6 +3,6 @@
 
 import sys
 
-from door import run
+from launch import run
 
 sys.exit(run("loopclosure.cli", "evaluate"))

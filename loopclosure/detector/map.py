@@ -155,7 +155,7 @@ class Map:
         names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
         empty = names <= {"map.json", EXTRACTED, LOCK} and ("map.json" not in names or not cls(folder).sessions)
         if folder.exists() and not (folder.is_dir() and empty):
-            raise InputError("is there already; loopclosure map add adds to a map", folder)
+            raise InputError("exists already; loopclosure map add adds to a map", folder)
         folder.mkdir(parents=True, exist_ok=True)
         _write_head(folder, describer, 0, None)
         return cls(folder)
@@ -237,7 +237,7 @@ class Map:
         folder = inside(self.folder, f"{count:06d}")
         remove_own(folder, SESSION_FILES)  # of an add that was killed
         if folder.exists():
-            raise InputError("is in the way and no part of the map; move it away", folder)
+            raise InputError("is not part of the map; move it to another folder", folder)
         arrays: dict[str, Any] = detector.arrays_since(len(self))
         every = [*self.names, *(f"{folder.name}/{name}" for name in recording.names)]
         try:

@@ -1,1 +1,1 @@
-"""What `--method` can name."""
+"""The methods for ``--method``."""

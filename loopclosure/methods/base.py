@@ -1,7 +1,7 @@
 """The interface of a place-recognition method, and the names of the methods on the command line.
 
-A method gets the images of the queries and of the references and returns one matrix of scores, however it computes them
-(features of a net, words, sequences), so that all methods can be compared in one table.
+A method gets the images of the queries and of the references and returns one matrix of scores. So all methods can be
+compared in one table, whether they use features of a net, words or sequences.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from loopclosure.places.frames import read_gray
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.progress import Progress, timed
 
-BLOCK = 512  # rows of a matrix of scores that are looked at together: memory is that of the scores, and little more
+BLOCK = 512  # rows of a matrix of scores that are processed at a time, which limits the memory
 
 
 @dataclass(frozen=True)
 class Images:
-    """The sequences that a method is given: those of a DataSet without its truth, and images to train on.
+    """The sequences for a method: those of a DataSet without its truth, and training images.
 
     queries     Q image files
     references  R image files; None for one sequence that visits its own places again: the queries are the references,
-                and frame i may match the frames before it
-    train       for vocabularies and the like; may be empty: a method that needs them raises InputError
+                and frame i may match an earlier frame
+    train       training images, for example for vocabularies; if it is empty, a method that needs them raises
+                InputError
     """
 
     queries: ImageSequence
@@ -41,7 +42,7 @@ class Images:
     def of_files(
         cls, queries: Sequence[Path], references: Sequence[Path] | None = None, train: Sequence[Path] = ()
     ) -> Images:
-        """Return image files of which nothing else is known."""
+        """Make images from files only."""
         others = None if references is None else ImageSequence.of_files(references)
         return cls(ImageSequence.of_files(queries), others, list(train))
 
@@ -58,14 +59,14 @@ class Images:
 
 @dataclass
 class MethodResult:
-    """The answer of a method.
+    """The result of a method.
 
     scores           (Q, R) floats, higher = more similar; NaN if the method gives no score (the upper triangle of an
                      online one)
-    seconds          stage -> total seconds spent on it, in the order of the work
+    seconds          stage -> total seconds, in the order of the stages
     notes            sentences for the report: settings, sizes of vocabularies, what was left out
-    training_stages  the stages done once, on training images, rather than for each frame
-    answer           of a method that decides by itself what is a loop: what became of the queries
+    training_stages  the stages that run once, on training images, not for each frame
+    answer           the results for the queries, for a method that decides by itself what is a loop
     """
 
     scores: np.ndarray
@@ -80,7 +81,7 @@ class Method(Protocol):
 
     @property
     def name(self) -> str:
-        """What reports call it."""
+        """The name in reports."""
         ...
 
     def score(self, images: Images, progress: Progress) -> MethodResult:
@@ -92,10 +93,10 @@ class Method(Protocol):
 class MethodContext:
     """What a method may need to know about the evaluation.
 
-    exclude_frames   in one sequence, frames with |i - j| <= exclude_frames are not candidates (SeqSLAM must know this
-                     before it searches)
-    seed             of all random numbers
-    pairs            what verification has found, for all methods of a run
+    exclude_frames   in one sequence, frames with |i - j| <= exclude_frames are not candidates (SeqSLAM needs this
+                     before the search)
+    seed             the seed of all random numbers
+    pairs            verified pairs, shared by all methods of a run
     """
 
     exclude_frames: int = 0
@@ -109,7 +110,7 @@ def earlier(frames: int, exclude: int) -> np.ndarray:
 
 
 def refuse_overlap(train_images: Sequence[Path], test_images: Sequence[Path], model: str | Path = "") -> None:
-    """Raise InputError if an image is used for training and testing, which would give too good a result."""
+    """Raise InputError if an image is used for both training and testing, which would make the result too good."""
     trained = {Path(path).resolve() for path in train_images}
     shared = [path for path in test_images if Path(path).resolve() in trained]
     if shared:
@@ -123,7 +124,7 @@ def refuse_overlap(train_images: Sequence[Path], test_images: Sequence[Path], mo
 def describe_each(
     images: Images, stage: str, describe: Callable[[Path], np.ndarray], progress: Progress, seconds: dict[str, float]
 ) -> list[np.ndarray]:
-    """Return what ``describe`` makes of each tested image; its time is added to that of the ``stage``."""
+    """Return the result of ``describe`` for each tested image; the time is added to ``stage``."""
     found = []
     for path in progress(images.tested, stage, len(images.tested)):
         with timed(seconds, stage):
@@ -138,7 +139,7 @@ def compared(
     seconds: dict[str, float],
     views: int = 1,
 ) -> MethodResult:
-    """Compare the descriptors (D,) of the tested images, of so many views each; its time is added to ``seconds``."""
+    """Compare the descriptors (D,) of the tested images, each with ``views`` views; add the time to ``seconds``."""
     with timed(seconds, "similarity"):
         queries, references = np.split(np.array(rows), [len(images.queries)])
         scores = similarity_matrix(queries, None if images.references is None else references, metric, views)

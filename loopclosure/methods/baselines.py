@@ -1,7 +1,7 @@
 """The baselines as methods: ``fabmap``, ``bow`` and ``thumbnails`` on the command line.
 
-Their argument is a comma-separated list of ``setting=value``; the settings are the fields of the classes below and of
-the classes of these fields. ``fabmap:model=words.npz,scored=posterior`` writes its vocabulary to a file, and reads it
+The argument is a comma-separated list of ``setting=value``; the settings are the fields of the classes below and of
+the classes of these fields. ``fabmap:model=words.npz,scored=posterior`` writes its vocabulary to a file and reads it
 the next time.
 """
 
@@ -27,7 +27,7 @@ from loopclosure.words.word_model import TRAINING_STAGES, Training, WordModel, t
 
 @dataclass(frozen=True)
 class WordModelSource:
-    """Where the word model comes from: trained, or read from ``model`` (written there if it does not exist)."""
+    """The source of the word model: the file ``model``, or training, which then writes that file."""
 
     training: Training = field(default_factory=Training)
     model: str = ""
@@ -134,7 +134,7 @@ class ThumbnailMethod:
 
 
 def configure_words(argument: str, method: Any, training: Training, *parts: Any) -> list[Any]:
-    """Return a method whose ``source`` is a word model, and other parts, with the settings that ``argument`` gives."""
+    """Return a method with a word model as its ``source``, and other parts, with the settings in ``argument``."""
     method, source, training, extractor, *others = configure(
         method.name, argument, method, WordModelSource(), training, Extractor(), *parts
     )

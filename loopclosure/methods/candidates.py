@@ -1,6 +1,7 @@
-"""Step 1 of :mod:`loopclosure.methods.auto`: which pairs of frames can be loops at all.
+"""Step 1 of :mod:`loopclosure.methods.auto`: finds the pairs of frames that can be loops.
 
-Not those of one visit to a place, nor those that odometry puts far apart. Frames of a camera that stands count once.
+Pairs of one visit to a place, and pairs that are far apart by odometry, cannot. While the camera does not move, only
+one frame counts.
 """
 
 from __future__ import annotations
@@ -13,23 +14,24 @@ import numpy as np
 from loopclosure.methods.base import BLOCK, earlier
 from loopclosure.places.same_place import MAX_DISTANCE_M
 
-DRIFT = 0.1  # of the way: more than odometry is usually off
-FAR_M = 2 * MAX_DISTANCE_M  # from there on two frames show different places
+DRIFT = 0.1  # of the distance traveled: more than the usual error of odometry
+FAR_M = 2 * MAX_DISTANCE_M  # at this distance and beyond, two frames show different places
 AWAY = 2  # frames in a row
-STILL = 0.5  # of a usual step from frame to frame
+STILL = 0.5  # of the usual difference between consecutive frames
 STOP = 8  # steps
-MOVES = 0.9  # the quantile of steps at which the search for a usual one begins
+MOVES = 0.9  # the quantile of differences at which the search for the usual one begins
 
 
 @dataclass(frozen=True)
 class Compared:
-    """Frames that were compared, and what else is known of them.
+    """Compared frames, and other information about them.
 
-    scores   (Q, R), higher = more alike; queries and references are each in the order of time
+    scores   (Q, R), higher = more similar; queries and references are each in the order of time
     allowed  (Q, R) bool: pairs that may be loops
     two      two traverses; False: one drive, compared with itself
-    far      (Q, R) bool: pairs that odometry puts far apart; None without odometry
-    visit    of one drive: a reference is a candidate if it is more than so many frames older; None: found out
+    far      (Q, R) bool: pairs that are far apart by odometry; None without odometry
+    visit    for one drive: a reference is a candidate if it is more than this many frames older; None: found
+             automatically
     stamps   (Q,) seconds of the queries, NaN or None where not known
     """
 
@@ -43,15 +45,15 @@ class Compared:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Pairs (Q, R) that can be loops, of the frames in which the camera has moved.
+    """Pairs (Q, R) that can be loops, for the frames in which the camera has moved.
 
-    scores     higher = more alike
+    scores     higher = more similar
     allowed    which pairs are candidates
     two        two traverses, or one drive with itself
     queries, references  the numbers of these frames in the whole drive
-    stands     (N,) for each query of the whole drive, the row of the last of these frames that is not after it
-    far        pairs that odometry puts far apart; None without odometry
-    said       how long a visit to a place lasts, in a sentence; empty for two traverses
+    stands     (N,) for each query of the whole drive, the row of the last of these frames that is not later
+    far        pairs that are far apart by odometry; None without odometry
+    said       a sentence about how long a visit to a place lasts; empty for two traverses
     """
 
     scores: np.ndarray
@@ -64,17 +66,17 @@ class Candidates:
     said: str = ""
 
     def known(self, queries: slice | int = slice(None)) -> np.ndarray:
-        """Return the scores of the candidates of queries (n, R), or of one (R,), -inf elsewhere."""
+        """Return the scores of the candidates of queries (n, R), or of one query (R,), -inf for other pairs."""
         return np.where(self.allowed[queries], self.scores[queries], -np.inf)
 
     @cached_property
     def there(self) -> np.ndarray:
-        """Which queries (Q,) have a candidate."""
+        """Whether each query (Q,) has a candidate."""
         return np.any(self.allowed, axis=1)
 
     @cached_property
     def single(self) -> np.ndarray:
-        """The best candidate (Q,) of each query by its score alone; any where there is none."""
+        """The candidate (Q,) of each query with the best score; arbitrary if it has none."""
         blocks = (slice(first, first + BLOCK) for first in range(0, len(self.queries) or 1, BLOCK))
         return np.concatenate([self.known(block).argmax(axis=1) for block in blocks])
 
@@ -94,20 +96,21 @@ def candidates(compared: Compared) -> Candidates:
     if far is not None:
         far, allowed = allowed & far, allowed & ~far
     if compared.visit is not None:
-        said = f"one visit to a place lasts {compared.visit} frames, as was said"
+        said = f"one visit to a place lasts {compared.visit} frames, as given"
     elif not two:
         back, lasted = _returned(scores, allowed, queries)
         allowed &= back
-        said = f"one visit to a place lasts {np.median(lasted):.0f} frames as a rule, {lasted.max()} at most"
+        said = f"one visit to a place lasts {np.median(lasted):.0f} frames (median), {lasted.max()} at most"
     return Candidates(scores, allowed, two, queries, references, stands, far, said)
 
 
 def moved(scores: np.ndarray) -> np.ndarray:
     """Return the frames, rows of scores (N, M), in which the camera has moved.
 
-    Where a robot stands, for ``STOP`` steps or more that are on average less than ``STILL`` of a usual step, one frame
-    is taken while the others are within that of it: lines through all of them would lead past the place. The usual step
-    is one of a robot that moves, though it may stand for most of the time: the median of those that are no stop.
+    The robot has stopped if ``STOP`` or more differences between consecutive frames are on average less than ``STILL``
+    of the usual difference. Then one frame represents all frames that differ less than that from it; lines through all
+    of them would lead past the place. The usual difference is the median over frames in motion, because a robot may
+    stand still most of the time.
     """
 
     def step(a: int, b: int) -> float:
@@ -134,10 +137,11 @@ def moved(scores: np.ndarray) -> np.ndarray:
 
 
 def _returned(scores: np.ndarray, allowed: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which pairs (n, n) of ``frames`` (n,) have a leave-taking between them, and how long each visit lasts.
+    """Return for which pairs (n, n) of ``frames`` (n,) the place was left in between, and how long each visit lasts.
 
-    A visit to a frame's place ends with ``AWAY`` frames in a row that are as unlike it as different places are: the
-    median of all. A camera that stands, or a straight road, is like itself for long; that is no loop.
+    A visit to the place of a frame ends with ``AWAY`` consecutive frames that differ from it as much as different
+    places do, which is the median of all pairs. Frames of a standing camera or of a straight road stay similar for
+    a long time; that is not a loop.
     """
     count = len(scores)
     numbers = np.arange(count)
@@ -158,9 +162,9 @@ def _returned(scores: np.ndarray, allowed: np.ndarray, frames: np.ndarray) -> tu
 
 
 def far_apart(poses: np.ndarray) -> np.ndarray:
-    """Return which frames (N, N) bool odometry puts far apart.
+    """Return which frames (N, N) bool are far apart by odometry.
 
-    poses  (N, 7) of odometry in meters, in the order of time; NaN where it is not known
+    poses  (N, 7) of odometry in meters, in the order of time; NaN if not known
     """
     positions = poses[:, :3]
     known = np.all(np.isfinite(positions), axis=1)

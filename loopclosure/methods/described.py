@@ -1,4 +1,4 @@
-"""Descriptors by a function of the user's, a pre-trained net for example: ``describe`` on the command line."""
+"""Descriptors from the user's own function, for example a pre-trained net: ``describe`` on the command line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from loopclosure.progress import Progress, timed
 
 @dataclass
 class DescribedMethod:
-    """The descriptors of ``MODULE|FILE.py:FUNCTION``, an image (H, W, 3) BGR -> (D,), compared by one metric."""
+    """Descriptors by ``MODULE|FILE.py:FUNCTION``, which maps an image (H, W, 3) BGR to (D,), compared by one metric."""
 
     function: str
     metric: str = METRICS[0]

@@ -23,20 +23,20 @@ from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
 
-TOO_MANY = "are more than are compared at once"
+TOO_MANY = "are too many to compare at once"
 NOTHING = np.zeros((8, 8), np.uint8)
-MOST_PAIRS = 64_000_000  # of frames that are compared at once, in 0.8 GB
+MOST_PAIRS = 64_000_000  # pairs of frames that are compared at once, in 0.8 GB
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a decision on a whole drive.
+    """The settings of a decision on a whole drive.
 
-    precision  the share of the accepted loops that shall be right
+    precision  the share of the accepted loops that should be right
     visit      how many frames a visit to a place lasts, None: found from the scores
                (:func:`loopclosure.methods.auto.answer`)
-    seconds    how long it lasts at least
-    odometry   poses (frames, 7), NaN where not known; frames that they put far apart are no loop
+    seconds    the minimum duration of a visit
+    odometry   poses (frames, 7), NaN if not known; frames that are far apart by these are not a loop
     """
 
     precision: float = PRECISION
@@ -55,9 +55,9 @@ def whole_drive(
     request: Request = USUAL,
     progress: Progress = silent,
 ) -> Answer:
-    """Add every frame of a recording to a new detector, then decide with all of them in view which close loops.
+    """Add every frame of a recording to a new detector, then decide from all of them which ones close loops.
 
-    ``request.seconds`` is that of the detector's settings. The detector gets these loops.
+    ``request.seconds`` is set from the detector's settings. The loops are stored in the detector.
     """
     remember_all(detector, recording, features, progress)
     odometry = request.odometry
@@ -75,9 +75,9 @@ def whole_drive(
 
 
 def later_threshold(detector: LoopDetector, accepted: np.ndarray) -> float | None:
-    """Return a threshold for the frames that come after a drive that was decided as a whole.
+    """Return a threshold for the frames after a drive that was decided as a whole.
 
-    It is the least score, frame by frame, of an ``accepted`` frame (N,) that is above those of all frames that were not
+    It is the smallest score of an ``accepted`` frame (N,) that is higher than the scores of all frames that were not
     accepted; None if there is none.
     """
     settings, rows, stamps = detector.settings, detector.descriptors, detector.stamps
@@ -102,11 +102,12 @@ def last_session(
     request: Request = USUAL,
     progress: Progress = silent,
 ) -> Answer:
-    """Decide on the last session of a detector that verifies, with all of its frames in view.
+    """Decide on the last session of a detector with a geometric check, from all of its frames.
 
-    It is compared with each session before as two traverses and, if ``own``, with itself as one drive. Of more earlier
-    sessions than are compared at once, those are in which most frames have their best candidate; in the others each
-    frame is looked up by itself. ``results`` are what the frames found when they came; None: they were remembered.
+    It is compared with each earlier session as two traverses and, if ``own``, with itself as one drive. If there are
+    too many earlier sessions, it is compared with those that contain the best candidate of most frames; in the others,
+    each frame is looked up by itself. ``results`` are the results of the frames when they were added; None: they were
+    only remembered.
     """
     *earlier, (begin, count) = pairwise([*detector.sessions, len(detector)])
     together = detector.check is not None and bool(earlier or own)
@@ -131,7 +132,7 @@ def last_session(
         elsewhere = [any(first <= (result.accepted or 0) < end for first, end in left) for result in results]
         none = {"candidates": [], "accepted": None, "score": -np.inf, "inliers": None}
         found.append([r if r and kept else replace(r, **none) for r, kept in zip(results, elsewhere, strict=True)])
-        limits.append(f"{len(earlier)} sessions {TOO_MANY}: {len(left)} are looked at frame by frame")
+        limits.append(f"{len(earlier)} sessions {TOO_MANY}: {len(left)} are searched frame by frame")
     best = [max(each, key=lambda r: (bool(r), r.inliers or 0, r.score)) for each in zip(*found, strict=True)]
     return Answer(best or results or [], [*limits, *reasons], limits)
 
@@ -139,9 +140,10 @@ def last_session(
 def _among(
     detector: LoopDetector, span: tuple[int, int], between: Between, request: Request, progress: Progress
 ) -> Answer:
-    """Decide on the last session among the frames of a ``span``, another session or this one.
+    """Decide on the last session among the frames of a ``span``, which is another session or this one.
 
-    Where these are more than ``MOST_PAIRS``, every second or third frame is compared, and decides for those after it.
+    If there are more than ``MOST_PAIRS`` pairs, only every second or third frame is compared, and its result also
+    applies to the frames after it.
     """
     first, end = span
     begin, two = detector.sessions[-1], first != detector.sessions[-1]
@@ -168,19 +170,19 @@ def _among(
                 stamp=None if np.isnan(stamps[number]) else float(stamps[number]),
             )
         )
-    thinned = f"{count} frames {TOO_MANY}: one of {step} is, and decides for those after it"
+    thinned = f"{count} frames {TOO_MANY}: one of {step} is compared, and decides for the frames after it"
     return Answer(results, answered.reasons, [thinned] if step > 1 else [])
 
 
 def _compared(detector: LoopDetector, queries: range, references: range) -> np.ndarray:
-    """Return the scores (Q, R) of frames and others, or themselves."""
+    """Return the scores (Q, R) of frames with other frames, or with themselves."""
     rows, known = (detector.descriptors_of(of.start, of.stop)[:: of.step] for of in (queries, references))
     same, settings = queries == references, detector.settings
     return similarity_matrix(rows, None if same else known, settings.metric, settings.views)
 
 
 def _earlier(stamps: np.ndarray, seconds: float) -> np.ndarray:
-    """Return which pairs of frames are candidates: of each, those before that are old enough."""
+    """Return which pairs of frames are candidates: for each frame, the earlier ones that are old enough."""
     numbers = np.arange(len(stamps))
     allowed = np.tri(len(stamps), k=-1, dtype=bool)
     for rows in np.array_split(numbers, len(numbers) // BLOCK + 1) if seconds else ():
@@ -189,7 +191,7 @@ def _earlier(stamps: np.ndarray, seconds: float) -> np.ndarray:
 
 
 def _gray_image(recording: ImageSequence, number: int) -> np.ndarray:
-    """Return an image file as gray values; black where it cannot be read, since its features were there before."""
+    """Return an image file as gray values; black if it cannot be read, because its features are known already."""
     try:
         return read_gray(recording.paths[number])
     except InputError:

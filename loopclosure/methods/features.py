@@ -1,4 +1,4 @@
-"""Descriptors from files as a method, compared as they are or whitened: ``features`` on the command line."""
+"""Descriptors from files as a method, with or without whitening: ``features`` on the command line."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class WhitenBy:
 
 @dataclass(frozen=True)
 class FeatureMethod:
-    """Descriptors from files, compared by one metric; one file for queries and references, or one file for each."""
+    """Descriptors from files, compared by one metric; one file for both queries and references, or one for each."""
 
     query_file: Path
     reference_file: Path
@@ -55,7 +55,7 @@ class FeatureMethod:
 
     @property
     def name(self) -> str:
-        """The file's name, the metric, and whether it is whitened."""
+        """The name of the file, the metric, and whether descriptors are whitened."""
         return f"{self.query_file.stem} ({self.metric}{', whitened' if self.whitening.whiten else ''})"
 
     def score(self, images: Images, progress: Progress) -> MethodResult:

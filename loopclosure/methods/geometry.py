@@ -1,7 +1,7 @@
-"""Step 4 of :mod:`loopclosure.methods.auto`: which matches show the same points.
+"""Step 4 of :mod:`loopclosure.methods.auto`: finds the matches that show the same points.
 
-What chance explains is computed for the two images of each pair, by the number of their matches and their size
-(:mod:`loopclosure.detector.verification`). It does not depend on what other pairs of the same room share.
+The number of inliers that chance explains is computed for each pair from the number of matches and the image sizes
+(:mod:`loopclosure.detector.verification`). It does not depend on what other pairs of images have in common.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.lines import Lines
 from loopclosure.progress import Progress
 
-SAMPLE = 40  # pairs that show what is fixed in the images
+SAMPLE = 40  # pairs from which fixed parts of the images are found
 
 Agree = Callable[[int, int], Agreement]
 
 
 @dataclass
 class Matches:
-    """The match of each query: (Q,) arrays.
+    """The match of each query, as arrays (Q,).
 
     match     the best reference, -1 without one
-    score     of the match, that of a line where lines are used; -inf without one
+    score     of the match, or of its line if lines are used; -inf without a match
     line      whether its line makes it a loop
-    inliers   of the match, 0 if chance explains them, -1 where it was not verified
-    evidence  its inliers as a share of those that are needed
+    inliers   of the match, 0 if chance explains them, -1 if it was not verified
+    evidence  its inliers divided by the number needed
     few       whether it had too few points to be verified or rejected
     """
 
@@ -42,7 +42,7 @@ class Matches:
 
     @classmethod
     def of(cls, given: Candidates, lines: Lines | None, precision: float) -> Matches:
-        """Return the matches that the lines find, or else each query's best candidate."""
+        """Return the match of each query by its line, or else its best candidate."""
         count = len(given.queries)
         known = given.known().max(axis=1) if given.scores.size else np.full(count, -np.inf)
         match, score, line = np.where(np.isfinite(known), given.single, -1), known, np.zeros(count, bool)
@@ -54,7 +54,7 @@ class Matches:
 
     @property
     def there(self) -> np.ndarray:
-        """Which queries have a match."""
+        """Whether each query has a match."""
         return self.match >= 0
 
 
@@ -62,11 +62,11 @@ class Matches:
 class Geometry:
     """Verification of the frames of :class:`Candidates`, by row and column.
 
-    check   what is enough
-    agree   how many points of a query and a reference agree
-    common  the share of unlike pairs that agree: stripes of a curb repeat, and all images of a desk show it
-    tried   how many unlike pairs were looked at
-    hidden  the share of the images that is not looked at
+    check   the geometric check
+    agree   a function: how many points of a query and a reference agree
+    common  the share of dissimilar pairs that agree: the stripes of a curb repeat, and a desk is in all images of it
+    tried   the number of dissimilar pairs that were examined
+    hidden  the share of the images that is ignored
     """
 
     check: GeometricCheck
@@ -77,7 +77,7 @@ class Geometry:
 
     @classmethod
     def of(cls, given: Candidates, check: GeometricCheck, agree: Agree) -> Geometry:
-        """Look at unlike pairs, and leave out what is the same in many: a clock, the hood of the car."""
+        """Examine dissimilar pairs, and ignore parts that are the same in many images: a clock, the hood of the car."""
         unlike = _unlike(given)
         if isinstance(agree, Between) and unlike:
             pairs = unlike + _left(given)
@@ -91,30 +91,30 @@ class Geometry:
         return cls(check, of_rows, float(np.mean(same)) if same else 0.0, len(same), hidden)
 
     def evidence(self, agreement: Agreement) -> float:
-        """Return the inliers of an agreement as a share of what is needed, which unlike pairs that agree raise."""
+        """Return the inliers of an agreement divided by the number needed, which grows if dissimilar pairs agree."""
         return self.check.evidence(agreement) / (1 + self.common)
 
 
 def _sample(numbers: np.ndarray) -> np.ndarray:
-    """Return at most ``SAMPLE`` of some numbers, evenly spread."""
+    """Return at most ``SAMPLE`` of the numbers, evenly spread."""
     if not len(numbers):
         return numbers
     return numbers[np.unique(np.linspace(0, len(numbers) - 1, SAMPLE).round().astype(int))]
 
 
 def _unlike(given: Candidates) -> list[tuple[int, int]]:
-    """Return pairs that the scores call unlike."""
+    """Return pairs that are dissimilar by their scores."""
     known, pairs = given.known(), []
     for query in _sample(np.flatnonzero(np.count_nonzero(np.isfinite(known), axis=1) >= 8)):
         order = np.argsort(known[query], kind="stable")
         candidates = order[np.isfinite(known[query, order])]
-        # One of the least alike quarter, another quarter of them each time.
+        # A pair from the least similar quarter of the query, of another rank for each query.
         pairs.append((int(query), int(candidates[int(query) % max(1, len(candidates) // 4)])))
     return pairs
 
 
 def _left(given: Candidates) -> list[tuple[int, int]]:
-    """Return pairs of one drive whose second place was left just before: other places in the same light."""
+    """Return queries of one drive, each with its newest candidate: most likely another place in the same light."""
     if given.two:
         return []
     queries = _sample(np.flatnonzero(given.there))
@@ -122,10 +122,10 @@ def _left(given: Candidates) -> list[tuple[int, int]]:
 
 
 def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: Geometry, progress: Progress) -> None:
-    """Verify each query's match, or its best single image, which then becomes its match."""
+    """Verify the match of each query, or else its best single image, which then becomes its match."""
     there = np.flatnonzero(matches.there)
     for query in progress(there, "verification", len(there)):
-        # Lamps of a tunnel repeat: one image that is verified does not overrule a sequence that is accepted.
+        # The lamps of a tunnel repeat: one verified image does not overrule an accepted sequence.
         other = matches.match if matches.line[query] else given.single
         for reference in dict.fromkeys((int(matches.match[query]), int(other[query]))):
             agreement = geometry.agree(int(query), reference)

@@ -1,6 +1,6 @@
 """The methods by name. On the command line a method is written name[:argument].
 
-One that refines the scores of another is written name[:argument]+METHOD, where METHOD may refine a third one:
+A method that refines the scores of another is written name[:argument]+METHOD, where METHOD may refine a third one:
 verified:k=20+seqslam+features:siamese.npz:cosine.
 """
 
@@ -14,7 +14,7 @@ from loopclosure.methods import auto, baselines, described, features, online, re
 from loopclosure.methods.base import Method, MethodContext
 from netspec.errors import did_you_mean
 
-# The argument after the colon, the context, the inner method (None where it is no refiner).
+# The argument after the colon, the context, the inner method (None for a method that refines no other).
 Factory = Callable[[str, MethodContext, Method | None], Method]
 METHODS: dict[str, Factory] = {
     "fabmap": baselines.fabmap,
@@ -34,7 +34,7 @@ REFINERS = ("seqslam", "verified", "auto")
 
 
 def make_method(spec: str, context: MethodContext | None = None) -> Method:
-    """Build the method that a specification such as ``seqslam+features:siamese.npz`` names."""
+    """Build a method from a specification such as ``seqslam+features:siamese.npz``."""
     context = context or MethodContext()
     name = re.split("[:+]", spec, maxsplit=1)[0]
     if name not in METHODS:

@@ -1,7 +1,7 @@
-"""The online detector as it runs, as a method: ``detector`` on the command line.
+"""The online detector as a method: ``detector`` on the command line.
 
-It sees the frames in order, and decides with exclusion, threshold, consistency and geometric verification. Only the
-pairs that it accepts get a score.
+It gets the frames in order, and decides with exclusion, threshold, consistency and geometric verification. Only the
+accepted pairs get a score.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ SETTINGS_BEGIN = re.compile(r":(?=\w+=)")
 class OnlineMethod:
     """A :class:`LoopDetector` on descriptors from a file.
 
-    features            the file, of ``netspec extract --images``
-    threshold           least score of a loop; NaN: from the frames so far (:class:`DetectorSettings`)
+    features            a file that ``netspec extract --images`` wrote
+    threshold           smallest score of a loop; NaN: chosen from the frames so far (:class:`DetectorSettings`)
     verify              verify candidates by ``check``
     """
 
@@ -43,13 +43,13 @@ class OnlineMethod:
 
     @property
     def name(self) -> str:
-        """The file's name, and whether candidates are verified."""
+        """The name of the file, and whether candidates are verified."""
         return f"detector, {self.features.stem}{', verified' if self.verify else ''}"
 
     def score(self, images: Images, progress: Progress) -> MethodResult:
         """Score as :class:`loopclosure.methods.base.Method` says: the score of each accepted pair, else NaN."""
         if images.references is not None:
-            raise InputError("the detector finds loops in one sequence, and these are queries and references")
+            raise InputError("the detector finds loops in one sequence; separate references are not accepted")
         described = read_features(self.features)
         threshold = None if np.isnan(self.threshold) else self.threshold
         settings = replace(self.settings, threshold=threshold, views=described.views)

@@ -1,4 +1,4 @@
-"""Descriptors that need no net, beside the baselines: ``hog``, ``cohog`` and ``vlad`` on the command line."""
+"""More descriptors that need no net: ``hog``, ``cohog`` and ``vlad`` on the command line."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class HogMethod:
 class CoHogMethod:
     """Like CoHOG: the score is the mean, over the query's regions with texture, of the best cosine similarity.
 
-    least_entropy  of a region that is compared, as a share of the greatest
+    least_entropy  regions with less entropy are not compared; a share of the largest possible entropy
     """
 
     hog: Hog = field(default_factory=lambda: Hog(bins=8))

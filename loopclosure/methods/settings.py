@@ -8,15 +8,15 @@ from typing import Any
 from loopclosure.errors import InputError
 
 YES_NO = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
-# Not settable: the name is the method's, the seed is that of the whole evaluation.
+# Not settable: the name belongs to the method, the seed to the whole evaluation.
 FIXED = ("name", "seed")
 
 
 def configure(method: str, argument: str, *parts: Any) -> list[Any]:
-    """Return the dataclasses ``parts`` with the settings that ``argument`` gives.
+    """Return the dataclasses ``parts`` with the settings in ``argument``.
 
-    A setting goes to the first part that has a field of its name; the type of its default is the type of the value.
-    Raises InputError for a setting that no part has, and for a value of another type.
+    A setting goes to the first part that has a field of that name, and is parsed to the type of the field's default.
+    Raises InputError for an unknown setting, or a value of another type.
     """
     changes: list[dict[str, Any]] = [{} for _ in parts]
     known = {f.name: i for i, part in reversed(list(enumerate(parts))) for f in fields(part) if _settable(part, f.name)}

@@ -1,11 +1,11 @@
 """Geometric verification of another method's best matches: ``verified+METHOD`` on the command line.
 
-The best k references of each query are compared by local features and a fundamental matrix (an essential matrix, where
-the camera is known). What is verified comes before all that is not; within both the inner method's order stays. Where
-images are too small, too dark or too different to be verified, the inner method's answer is passed through. To come
-before a better score takes half as many inliers again as rule out chance: two views of other parts of one corridor have
-just enough. On top of SeqSLAM a sequence is verified, not a single image: a pair is verified if it is itself, or lies
-between two that are, on its trajectories.
+The best k references of each query are compared by local features and a fundamental matrix (an essential matrix if the
+camera is known). Verified pairs come before all others; within each group, the order of the inner method is kept. If
+images are too small, too dark or too different to be verified, the answer of the inner method is kept. To be placed
+before a better score, a pair needs 1.5 times the inliers that rule out chance, because two views of different parts of
+one corridor can have just enough. With SeqSLAM, sequences are verified, not single images: a pair also counts as
+verified if it lies between two verified pairs on one of its trajectories.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ ORDERS = ("score", "inliers")
 
 @dataclass
 class Verified:
-    """The best ``k`` references of each query by another method, verified by their geometry.
+    """The best ``k`` references of each query by another method, verified by geometry.
 
     inner           the method whose candidates are verified
-    check           how, with how many inliers
+    check           the check, and how many inliers it needs
     k               candidates per query
-    order           of what is verified: by the inner method's "score", or by the "inliers" of each pair, and then what
-                    is not verified gets no score. Inliers tell whether two views show the same things, but not from
-                    how near
+    order           the order of verified pairs: by the "score" of the inner method, or by the "inliers" of each pair;
+                    with "inliers", other pairs get no score. Inliers show that two views contain the same things, but
+                    not how near the cameras are
     exclude_frames  in one sequence, references within this many frames of the query are not candidates
-    pairs           where features and inliers are kept
+    pairs           the cache of features and inliers
     """
 
     inner: Method
@@ -55,7 +55,7 @@ class Verified:
 
     @property
     def name(self) -> str:
-        """The inner method's name after ``verified+``."""
+        """``verified+`` and the name of the inner method."""
         return f"verified+{self.inner.name}"
 
     def score(self, images: Images, progress: Progress) -> MethodResult:
@@ -79,12 +79,12 @@ class Verified:
             offsets, half = self.inner.settings.offsets(), self.inner.settings.length // 2
             before, after = range(half + 1), range(half, self.inner.settings.length + 1)
             verified = on_trajectories(verified, offsets, before) & on_trajectories(verified, offsets, after)
-            notes.append("a pair is verified if it lies between two that are, on its trajectories")
+            notes.append("a pair between two verified pairs on one trajectory counts as verified")
         if not verified.any():
-            notes.append("these images cannot be verified: the scores are those of the inner method")
+            notes.append("these images cannot be verified; the scores of the inner method are kept")
         known = ~np.isneginf(candidates)
         scores = np.where(known, candidates, np.nan).astype(np.float64)
-        if known.any():  # what is verified comes first
+        if known.any():  # verified pairs come first
             scores[verified & known] += np.ptp(scores[known]) + 1.0
         return MethodResult(scores, seconds, notes, found.training_stages)
 
@@ -109,9 +109,9 @@ class Verified:
 def on_trajectories(accepted: np.ndarray, offsets: np.ndarray, part: Iterable[int] | None = None) -> np.ndarray:
     """Return the pairs (Q, R) that have an accepted one on a trajectory through them.
 
-    offsets  (T, steps) the reference of each trajectory at each step, relative to that of the pair, which is at step
+    offsets  (T, steps) the reference of each trajectory at each step, relative to the reference of the pair at step
              (steps - 1) // 2
-    part     the steps that are looked at; all by default
+    part     the steps to examine; default: all
     """
     queries, references = accepted.shape
     steps = offsets.shape[1]
@@ -128,7 +128,7 @@ def on_trajectories(accepted: np.ndarray, offsets: np.ndarray, part: Iterable[in
 def verified(argument: str, context: MethodContext, inner: Method | None) -> Verified:
     """Build ``verified[:setting=value,...]+METHOD``."""
     if inner is None:
-        raise InputError("verified needs a method whose best matches it verifies; write verified+METHOD")
+        raise InputError("verified needs another method; write verified+METHOD")
     plain = Verified(inner, exclude_frames=context.exclude_frames, pairs=context.pairs)
     method, check = configure("verified", argument, plain, plain.check)
     method.check = check

@@ -274,7 +274,7 @@ def load_traverses(
     name = f"{_folder_name(queries)} in {_folder_name(references)}{_selection_text(selection)}"
     if truth_file is not None:
         if tolerance or soft_tolerance is not None:
-            raise InputError("a tolerance means nothing where a file says which frames show the same place", truth_file)
+            raise InputError("a tolerance cannot be used with a file of matching frames", truth_file)
         hard, soft = read_matches(truth_file, len(query_images), len(reference_images))
         taken = selection.numbers(len(query_images))
         truth = traverse_truth(hard[taken], f"same place: as {Path(truth_file).name} says", soft=soft[taken])

@@ -61,9 +61,7 @@ class FabMapSettings:
         if self.new_place not in ("sampled", "mean_field"):
             raise InputError(f'new_place is "sampled" or "mean_field", not "{self.new_place}"')
         if self.version == 2 and self.new_place == "mean_field":
-            raise InputError(
-                "FAB-MAP 2 knows likelihoods only up to a common factor, so it has no mean field; use sampled"
-            )
+            raise InputError("FAB-MAP 2 computes likelihoods only up to a common factor; mean_field needs version 1")
         if not 0.0 <= self.false_alarm < self.hit < 1.0:
             raise InputError(f"need 0 <= false_alarm < hit < 1, got {self.false_alarm:g} and {self.hit:g}")
         if self.samples < 0:

@@ -9,7 +9,7 @@ from netspec.layers.contract import exporting, gradients, joining, reading
 from netspec.layers.data.files import ReadingLayer
 from paths import ROOT
 
-ROOMS = [exporting, gradients, joining, reading]
+MODULES = [exporting, gradients, joining, reading]
 
 
 def members(cls: type) -> set[str]:
@@ -18,9 +18,9 @@ def members(cls: type) -> set[str]:
 
 OFFERED = {
     name
-    for room in ROOMS
-    for cls in vars(room).values()
-    if inspect.isclass(cls) and getattr(cls, "_is_protocol", False) and cls.__module__ == room.__name__
+    for module in MODULES
+    for cls in vars(module).values()
+    if inspect.isclass(cls) and getattr(cls, "_is_protocol", False) and cls.__module__ == module.__name__
     for name in members(cls)
 }
 HOOKS = members(Layer) | members(ReadingLayer)  # described there; what overrides them is not marked

@@ -92,7 +92,7 @@ def _files(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 MOST_PARAMETERS = 6  # without self, cls, and the ctx of a torch.autograd.Function
-ROOMS = ("netspec", "loopclosure", "lmdb_build", "benchmarks")
+PACKAGES = ("netspec", "loopclosure", "lmdb_build", "benchmarks")
 # Functions that may have more, and why.
 DOORS = {
     # Public, called with keywords.
@@ -124,7 +124,7 @@ def with_many_parameters(path: Path) -> Iterator[str]:
 
 
 def test_functions_have_few_parameters() -> None:
-    paths = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
+    paths = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
     found = {name for path in paths for name in with_many_parameters(path)}
     assert found == DOORS
 

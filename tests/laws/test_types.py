@@ -1,4 +1,4 @@
-"""Types: pyright finds nothing. It is a test so that it runs compared with the others."""
+"""Types: pyright finds nothing. As a test, it runs in parallel with the others."""
 
 import subprocess
 import sys

@@ -313,19 +313,19 @@ def test_the_mean_of_a_missing_database_is_refused(tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.slow
-def test_the_doors_work_from_anywhere_without_torch(tmp_path: Path, pair_list: str) -> None:
+def test_the_scripts_work_from_any_folder_without_torch(tmp_path: Path, pair_list: str) -> None:
     (tmp_path / "torch.py").write_text("raise ImportError('not needed here')")
 
-    def door(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    def script(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(ROOT / "tools" / name), *arguments]
         environment = os.environ | {"PYTHONPATH": str(tmp_path)}
         return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
 
-    done = door("convert_pairs_lmdb", PNG, pair_list, "pairs_lmdb")
+    done = script("convert_pairs_lmdb", PNG, pair_list, "pairs_lmdb")
     assert (done.returncode, done.stdout) == (0, "")
     assert "A total of 3 pairs." in done.stderr
-    assert door("convert_imageset", PNG, str(GOLDEN / "list.txt"), "images_lmdb").returncode == 0
-    assert "channel [2]: 122.765" in door("compute_image_mean", "images_lmdb").stderr
-    refused = door("convert_imageset", PNG, str(GOLDEN / "list.txt"), "images_lmdb")
+    assert script("convert_imageset", PNG, str(GOLDEN / "list.txt"), "images_lmdb").returncode == 0
+    assert "channel [2]: 122.765" in script("compute_image_mean", "images_lmdb").stderr
+    refused = script("convert_imageset", PNG, str(GOLDEN / "list.txt"), "images_lmdb")
     assert refused.returncode == 1
     assert "Traceback" not in refused.stderr

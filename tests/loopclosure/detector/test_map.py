@@ -99,7 +99,7 @@ def test_build_add_and_query(
     assert contents(tmp_path / "M") == before
     query = capsys.readouterr()
     assert "5 of 15 frames are in the map: found/loops.csv" in query.out
-    assert ("2 sessions are more than are compared at once: 1 are looked" in query.err) == (index != "p.db")
+    assert ("2 sessions are too many to compare at once: 1 are searched" in query.err) == (index != "p.db")
     found = loops(tmp_path / "found" / "loops.csv")
     assert [(query, match.partition("/")[2]) for query, match in found] == [
         (f"{i:03d}.png", f"{i + 5:03d}.png") for i in range(5)
@@ -274,7 +274,7 @@ def test_a_file_that_is_cut_while_it_is_open_is_a_fault(name: str, a_map: Map, d
 
 
 def test_faults_are_named(a_map: Map, drives: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is there already; loopclosure map add adds to a map"):
+    with pytest.raises(InputError, match="exists already; loopclosure map add adds to a map"):
         Map.create(tmp_path / "M", "default")
     with pytest.raises(InputError, match="is not a map"):
         Map(drives)

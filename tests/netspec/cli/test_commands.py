@@ -112,10 +112,10 @@ def test_quiet_is_no_log_and_every_warning(run: Run, edited: Edit) -> None:
     assert {line[0] for line in result.err.splitlines()} == {"W"}
 
 
-def test_the_door_tools_train(run: Run, edited: Edit) -> None:
+def test_tools_train(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, "max_iter: 60", "max_iter: 2")
-    door = [sys.executable, str(ROOT / "tools" / "train.py"), solver]
-    done = subprocess.run(door, capture_output=True, text=True, check=False, timeout=300)
+    script = [sys.executable, str(ROOT / "tools" / "train.py"), solver]
+    done = subprocess.run(script, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0
     assert done.stderr.splitlines()[-1].endswith("caffe.cpp:250] Optimization Done.")
 

@@ -181,7 +181,7 @@ def test_a_killed_process_ends_the_training_and_the_last_snapshot_is_whole() -> 
 
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
-def test_who_is_asked_to_end_does_not_wait_for_a_process_that_stands_still() -> None:
+def test_a_process_that_is_asked_to_end_does_not_wait_for_one_that_hangs() -> None:
     """Gloo can miss the death of a process: one that is stopped is as silent."""
     write(batch=2, iterations=10**7, after="false")
     started = start()

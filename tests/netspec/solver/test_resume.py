@@ -252,7 +252,7 @@ def test_what_changes_no_number_is_not_said(
     caplog.set_level(logging.INFO, "netspec")
     load_solver("solver.prototxt", snapshot=state)
     assert warnings() == []
-    assert "the training goes on as if it had never stopped" in caplog.text
+    assert "the training continues as if it had never stopped" in caplog.text
 
 
 COUNTED = """layer { name: "c" type: "Python" bottom: "data" top: "c"

@@ -37,7 +37,7 @@ def gradients() -> list[Tensors]:
 
 
 @pytest.mark.parametrize(
-    ("fields", "optimiser", "settings"),
+    ("fields", "torch_class", "settings"),
     [
         ({"type": "SGD", "momentum": 0.9}, torch.optim.SGD, {"momentum": 0.9}),
         ({"type": "SGD"}, torch.optim.SGD, {}),
@@ -48,11 +48,11 @@ def gradients() -> list[Tensors]:
         ({"type": "Adam", "momentum": 0.9, "delta": 0}, torch.optim.Adam, {"betas": (0.9, 0.999), "eps": 0}),
     ],
 )
-def test_while_the_rate_stands_still_a_rule_is_that_of_torch(fields, optimiser, settings, gradients):
+def test_at_a_constant_rate_a_rule_is_the_same_as_in_torch(fields, torch_class, settings, gradients):
     weights, _ = run(SolverParameter(**fields), gradients, [0.1] * len(gradients))
     theirs = [torch.nn.Parameter(torch.zeros(shape)) for shape in SHAPES]
     groups = [{"params": [theirs[0]], "lr": 0.1}, {"params": [theirs[1]], "lr": 0.2}]
-    optimizer = optimiser(groups, **settings)
+    optimizer = torch_class(groups, **settings)
     for diffs in gradients:
         for parameter, diff in zip(theirs, diffs, strict=True):
             parameter.grad = diff.clone()

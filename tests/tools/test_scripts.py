@@ -1,4 +1,4 @@
-"""The scripts in tools/ find a Python with the required packages, or say in one line what to run."""
+"""The scripts in tools/ find a Python with the required packages, or print the command to run in one line."""
 
 import os
 import shutil
@@ -13,7 +13,7 @@ from paths import GOLDEN, ROOT
 
 pytestmark = pytest.mark.slow
 
-DOORS = sorted(
+SCRIPTS = sorted(
     path.name
     for path in (ROOT / "tools").iterdir()
     if path.is_file() and "python" in path.read_text().partition("\n")[0]
@@ -38,37 +38,37 @@ def project(tmp_path: Path) -> Path:
     return folder
 
 
-def run(project: Path, python: Path, door: str, *words: str) -> subprocess.CompletedProcess[str]:
-    command = [str(python), str(project / "tools" / door), *words]
+def run(project: Path, python: Path, script: str, *words: str) -> subprocess.CompletedProcess[str]:
+    command = [str(python), str(project / "tools" / script), *words]
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     return subprocess.run(command, cwd=project.parent, env=environment, capture_output=True, text=True, check=False)
 
 
-def test_there_are_doors() -> None:
-    assert {"train.py", "convert_pairs_lmdb", "convert_imageset", "compute_image_mean", "compare.py"} < set(DOORS)
+def test_the_scripts_are_found() -> None:
+    assert {"train.py", "convert_pairs_lmdb", "convert_imageset", "compute_image_mean", "compare.py"} < set(SCRIPTS)
 
 
-@pytest.mark.parametrize("door", DOORS)
-def test_a_door_takes_the_python_of_the_virtual_environment_beside_it(
-    door: str, project: Path, bare_python: Path
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_script_uses_the_python_of_the_virtual_environment(
+    script: str, project: Path, bare_python: Path
 ) -> None:
     (project / ".venv").symlink_to(sys.prefix)
-    done = run(project, bare_python, door, "--help")
+    done = run(project, bare_python, script, "--help")
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("usage: ")
 
 
-@pytest.mark.parametrize("door", DOORS)
-def test_without_one_it_says_what_to_run_in_one_line(door: str, project: Path, bare_python: Path) -> None:
-    done = run(project, bare_python, door, "--help")
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_without_one_a_message_names_the_command_to_run(script: str, project: Path, bare_python: Path) -> None:
+    done = run(project, bare_python, script, "--help")
     assert (done.returncode, done.stdout) == (1, "")
     (line,) = done.stderr.splitlines()
-    assert line.startswith(f"{project}/tools/{door}: ")
+    assert line.startswith(f"{project}/tools/{script}: ")
     assert "No module named " in line
     assert line.endswith(f"bash {project}/tools/setup.sh")
 
 
-def test_a_virtual_environment_that_lacks_the_packages_too_is_not_tried_for_ever(
+def test_a_virtual_environment_without_the_packages_is_tried_only_once(
     project: Path, bare_python: Path
 ) -> None:
     (project / ".venv").symlink_to(bare_python.parents[1])
@@ -78,7 +78,7 @@ def test_a_virtual_environment_that_lacks_the_packages_too_is_not_tried_for_ever
         assert len(done.stderr.splitlines()) == 1
 
 
-def test_arguments_and_the_exit_status_go_through(project: Path, bare_python: Path) -> None:
+def test_arguments_and_the_exit_status_are_passed_on(project: Path, bare_python: Path) -> None:
     (project / ".venv").symlink_to(sys.prefix)
     words = ("-gray", f"{GOLDEN}/images/png/", f"{GOLDEN}/images/list.txt", "a db")
     assert run(project, bare_python, "convert_imageset", *words).returncode == 0
