@@ -1,4 +1,4 @@
-"""``lmdb-build convert``, ``imageset``, ``mean``, ``mnist``, ``cifar``, as Caffe's tools; and ``compare``.
+"""``lmdb-build convert``, ``imageset``, ``mean``, ``mnist`` and ``cifar``, like Caffe's tools, and ``compare``.
 
 Caffe: tools/convert_imageset.cpp, tools/compute_image_mean.cpp, examples/mnist, examples/siamese, examples/cifar10
 """
@@ -46,7 +46,7 @@ def add_commands(commands: Commands) -> None:
 
 def _add_backend(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--backend", default="lmdb", choices=BACKENDS, help="backend of the database (default: %(default)s)"
+        "--backend", default="lmdb", choices=BACKENDS, help="format of the database (default: %(default)s)"
     )
 
 
@@ -58,10 +58,18 @@ def _add_image_list(parser: argparse.ArgumentParser) -> None:
     )
     _add_backend(parser)
     parser.add_argument(
-        "--resize_width", type=int, default=0, metavar="N", help="resize images to this width (default: %(default)s)"
+        "--resize_width",
+        type=int,
+        default=0,
+        metavar="N",
+        help="resize images to this width; 0: do not resize (default: %(default)s)",
     )
     parser.add_argument(
-        "--resize_height", type=int, default=0, metavar="N", help="resize images to this height (default: %(default)s)"
+        "--resize_height",
+        type=int,
+        default=0,
+        metavar="N",
+        help="resize images to this height; 0: do not resize (default: %(default)s)",
     )
     parser.add_argument("--check_size", action="store_true", help="refuse images of different sizes")
     parser.add_argument("--encoded", action="store_true", help="store encoded images")
@@ -69,14 +77,14 @@ def _add_image_list(parser: argparse.ArgumentParser) -> None:
         "--encode_type",
         default="",
         metavar="NAME",
-        help="format to encode images in (png, jpg, ...); by default each file's own",
+        help="format of encoded images, such as png or jpg (default: each file's own)",
     )
     parser.add_argument(
         "--workers",
         type=int,
         default=0,
         metavar="N",
-        help="processes that read images; 0: one per core (default: %(default)s)",
+        help="number of processes that read images; 0: one per core (default: %(default)s)",
     )
     parser.add_argument("rootfolder", metavar="ROOTFOLDER", help="folder that the names in the list are relative to")
     parser.add_argument(
@@ -85,10 +93,10 @@ def _add_image_list(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("db_name", metavar="DB_NAME", help="the database to write; it must not exist")
 
 
-OF_PAIRS = """Write one Datum per pair of images, both stacked along the channels, into a database that Caffe reads.
-A line of LISTFILE is: a.png b.png 1. With -encoded the databases are DB_NAME_a and DB_NAME_b."""
-OF_IMAGES = """Write one Datum per image into a database that Caffe reads. A line of LISTFILE is: subfolder/file.png 7.
-Images that cannot be read are left out, and counted in the last line."""
+OF_PAIRS = """Write one Datum per pair into a database that Caffe reads; both images are stacked along the channels.
+A line of LISTFILE is, for example, "a.png b.png 1". With -encoded, the databases are DB_NAME_a and DB_NAME_b."""
+OF_IMAGES = """Write one Datum per image into a database that Caffe reads.
+A line of LISTFILE is, for example, "subfolder/file.png 7". Unreadable images are skipped; the last line counts them."""
 
 
 def _add_convert_pairs(commands: Commands) -> None:
@@ -135,7 +143,7 @@ def _convert(
         refuse(arguments, ("seed",), "is for --shuffle")
     width, height = arguments.resize_width, arguments.resize_height
     if (width > 0) != (height > 0) or min(width, height) < 0:
-        raise WrongUsage("-resize_width and -resize_height must both be given, and be above 0")
+        raise WrongUsage("-resize_width and -resize_height must both be given and be above 0")
     entries = read(arguments.listfile)
     if arguments.shuffle:
         log.info("convert_imageset.cpp:86", "Shuffling data")
@@ -178,14 +186,12 @@ def _mean(arguments: argparse.Namespace) -> None:
 
 
 def _add_mnist(commands: Commands) -> None:
-    parser = commands.add_parser("mnist", help="write the files of MNIST into a database (convert_mnist_data)")
+    parser = commands.add_parser("mnist", help="write the MNIST files into a database (convert_mnist_data)")
     parser.set_defaults(function=_mnist)
     _add_backend(parser)
-    parser.add_argument(
-        "--pairs", action="store_true", help="write pairs chosen at random (convert_mnist_siamese_data)"
-    )
-    parser.add_argument("images", metavar="IMAGES", help="the file of images, unpacked: train-images-idx3-ubyte")
-    parser.add_argument("labels", metavar="LABELS", help="the file of labels, unpacked: train-labels-idx1-ubyte")
+    parser.add_argument("--pairs", action="store_true", help="write randomly chosen pairs (convert_mnist_siamese_data)")
+    parser.add_argument("images", metavar="IMAGES", help="uncompressed file of images, such as train-images-idx3-ubyte")
+    parser.add_argument("labels", metavar="LABELS", help="uncompressed file of labels, such as train-labels-idx1-ubyte")
     parser.add_argument("db_name", metavar="DB_NAME", help="the database to write; it must not exist")
 
 
@@ -195,19 +201,19 @@ def _mnist(arguments: argparse.Namespace) -> None:
 
 
 def _add_cifar(commands: Commands) -> None:
-    parser = commands.add_parser("cifar", help="write the files of CIFAR-10 into two databases (convert_cifar_data)")
+    parser = commands.add_parser("cifar", help="write the CIFAR-10 files into two databases (convert_cifar_data)")
     parser.set_defaults(function=_cifar)
     parser.add_argument(
         "input_folder",
         metavar="INPUT_FOLDER",
-        help="the folder of data_batch_1.bin to data_batch_5.bin and test_batch.bin",
+        help="folder with data_batch_1.bin to data_batch_5.bin and test_batch.bin",
     )
     parser.add_argument(
         "output_folder",
         metavar="OUTPUT_FOLDER",
-        help="where cifar10_train_DB_TYPE and cifar10_test_DB_TYPE are written",
+        help="folder for cifar10_train_DB_TYPE and cifar10_test_DB_TYPE",
     )
-    parser.add_argument("db_type", choices=BACKENDS, help="the form of the databases")
+    parser.add_argument("db_type", choices=BACKENDS, help="format of the databases")
 
 
 def _cifar(arguments: argparse.Namespace) -> None:
@@ -215,21 +221,23 @@ def _cifar(arguments: argparse.Namespace) -> None:
 
 
 def _add_compare(commands: Commands) -> None:
-    parser = commands.add_parser("compare", help="train nets on the same pairs and print the table that compares them")
+    parser = commands.add_parser(
+        "compare", help="train Siamese nets on the same pairs and print a table of their results"
+    )
     parser.set_defaults(function=_compare)
-    parser.add_argument("solver", nargs="+", metavar="SOLVER", help="solver prototxt files of Siamese nets")
+    parser.add_argument("solver", nargs="+", metavar="SOLVER", help="solver prototxt of a Siamese net")
     parser.add_argument(
         "--train",
         action="store_true",
         default=True,
-        help="the default; --no-train evaluates the snapshots of an earlier training",
+        help="train the nets (the default); --no-train evaluates the snapshots of an earlier training",
     )
     parser.add_argument(
         "--out",
         type=Path,
         default=Path("out/compare"),
         metavar="FOLDER",
-        help="folder for all files (default: out/compare)",
+        help="folder for the results (default: out/compare)",
     )
     parser.add_argument(
         "--resume", action="store_true", help="resume each training from its newest snapshot, if there is one"
@@ -239,9 +247,9 @@ def _add_compare(commands: Commands) -> None:
         action="append",
         default=[],
         metavar="DATABASE",
-        help="also judge the nets on the pairs of this database; once for each data layer of the nets",
+        help="also evaluate the nets on the pairs of this database; give it once for each data layer of the nets",
     )
-    parser.add_argument("--gpu", default="", metavar="N", help="the number of the GPU to use (default: the CPU)")
+    parser.add_argument("--gpu", default="", metavar="N", help="number of the GPU to use (default: the CPU)")
 
 
 def _left(first: Sequence[float], done: int, total: int) -> str:
@@ -253,7 +261,7 @@ def _left(first: Sequence[float], done: int, total: int) -> str:
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-    from lmdb_build.compare import Choices, compare  # which loads the plotting library
+    from lmdb_build.compare import Choices, compare  # loads the plotting library
 
     shown: list[tqdm] = []  # the bar of the training, on a terminal
     first = [0, 0.0]  # the first iteration that was shown, and the time then

@@ -49,9 +49,7 @@ def test_the_scripts_are_found() -> None:
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_a_script_uses_the_python_of_the_virtual_environment(
-    script: str, project: Path, bare_python: Path
-) -> None:
+def test_a_script_uses_the_python_of_the_virtual_environment(script: str, project: Path, bare_python: Path) -> None:
     (project / ".venv").symlink_to(sys.prefix)
     done = run(project, bare_python, script, "--help")
     assert (done.returncode, done.stderr) == (0, "")
@@ -68,9 +66,7 @@ def test_without_one_a_message_names_the_command_to_run(script: str, project: Pa
     assert line.endswith(f"bash {project}/tools/setup.sh")
 
 
-def test_a_virtual_environment_without_the_packages_is_tried_only_once(
-    project: Path, bare_python: Path
-) -> None:
+def test_a_virtual_environment_without_the_packages_is_tried_only_once(project: Path, bare_python: Path) -> None:
     (project / ".venv").symlink_to(bare_python.parents[1])
     for python in (bare_python, project / ".venv" / "bin" / "python"):
         done = run(project, python, "convert_imageset", "--help")

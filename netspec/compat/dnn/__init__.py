@@ -1,4 +1,4 @@
-"""cv2.dnn's interface for Caffe's files, which OpenCV 5 no longer reads; all else of cv2.dnn is passed through.
+"""The interface of cv2.dnn for Caffe's files, which OpenCV 5 no longer reads; all other names come from cv2.dnn.
 
     from netspec import dnn  # in place of cv2.dnn
 
@@ -6,7 +6,7 @@
     net.setInput(dnn.blobFromImage(image, 1.0, (300, 300), (104, 117, 123)))
     detections = net.forward()
 
-Results, shapes, names and numbers are OpenCV 4's. What differs: docs/coming-from-opencv.md
+Results, shapes, names and numbers are those of OpenCV 4. Differences: docs/coming-from-opencv.md
 """
 
 from __future__ import annotations

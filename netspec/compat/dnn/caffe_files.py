@@ -1,4 +1,4 @@
-"""A prototxt and its weights, given as paths or as what is in the files, and the runnable nets made of them."""
+"""A prototxt and its weights, given as paths or as the contents of files, and the runnable nets made from them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PROTOTXT, WEIGHTS = "<prototxt>", "<caffeModel>"  # what errors call files that 
 
 @dataclass(frozen=True)
 class CaffeFiles:
-    """A net in phase TEST as its prototxt has it, and where its weights are (None: nowhere)."""
+    """A net in phase TEST as in its prototxt, and the source of its weights (None: no weights)."""
 
     net: NetParameter
     source: SourceMap
@@ -42,7 +42,7 @@ class CaffeFiles:
 
     @property
     def inputs(self) -> dict[str, Shape | None]:
-        """The input blobs and their shapes, None where the prototxt gives none."""
+        """The input blobs and their shapes, None if the prototxt gives none."""
         found: dict[str, Shape | None] = {}
         for layer in self.net.layer:
             if layer.type == "Input":
@@ -52,12 +52,12 @@ class CaffeFiles:
         return found
 
     def build(self, shapes: Mapping[str, Shape], device: str = "cpu") -> Net:
-        """Return the net for inputs of other shapes than the prototxt's; on "meta" with shapes only. Raises SpecError.
+        """Return the net for inputs of the given shapes; on "meta" only shapes are computed. Raises SpecError.
 
-        SSD's layers are OpenCV's (netspec/compat/dnn/opencv_layers.py).
+        SSD's layers are computed as in OpenCV (netspec/compat/dnn/opencv_layers.py).
         """
         options = BuildOptions(device, exact=NONE)
-        with log.silent():  # of what has no effect; OpenCV says nothing of it
+        with log.silent():  # warnings about fields without effect; OpenCV has none
             net = build_filtered(self._reshaped(shapes), self.source, options)
         for i, layer in enumerate(net.layers):
             if layer.type in ("PriorBox", "DetectionOutput"):
@@ -112,12 +112,12 @@ def read_files(prototxt: FileOrBytes, weights: FileOrBytes | None) -> CaffeFiles
 
 
 def _skip(fault: SpecError) -> None:
-    """Skip an unknown field, with a warning; raise the fault where OpenCV's importer fails too."""
+    """Skip an unknown field with a warning; raise the fault if OpenCV's importer fails, too."""
     if not isinstance(fault, ForkFault) or fault.owner in _NOT_SKIPPED:
         raise fault
     log.logger.warning(f"{fault.where}: skipped: {fault.message}")
 
 
 def bytes_of(data: Any) -> bytes:
-    """Return what is in a buffer, or in an array of bytes."""
+    """Return the bytes of a buffer or of an array."""
     return data.tobytes() if isinstance(data, np.ndarray) else bytes(data)

@@ -1,4 +1,4 @@
-"""What a layer costs, as OpenCV counts it: operations of one forward pass.
+"""The cost of a layer as OpenCV counts it: operations of one forward pass.
 
 OpenCV: getFLOPS of the classes in modules/dnn/src/layers (4.12); layers that it does not count cost 0.
 """
@@ -13,7 +13,7 @@ from netspec.layers.contract.base import Layer, Shape
 _MAX = 0  # caffe.proto: PoolingParameter.PoolMethod
 _WITHIN_CHANNEL = 1  # caffe.proto: LRNParameter.NormRegion
 
-#: Operations for each number of the (first) bottom.
+#: Operations per element of the first bottom.
 _FOR_EACH = {
     "AbsVal": 1,
     "BNLL": 5,
@@ -32,7 +32,7 @@ _FOR_EACH = {
 
 
 def operations(layer: Layer) -> int:
-    """Return the operations of a layer at its present shapes."""
+    """Return the number of operations of a layer at its current shapes."""
     count = _COUNTS.get(layer.type)
     if count is not None:
         return count(layer)
@@ -46,7 +46,7 @@ def _convolution(layer: Layer) -> int:
 
 
 def _deconvolution(layer: Layer) -> int:
-    channels, _, *kernel = layer.blob_shapes[0]  # OpenCV takes the bottom's channels for the top's
+    channels, _, *kernel = layer.blob_shapes[0]  # OpenCV uses the number of channels of the bottom instead of the top
     return sum(2 * channels * math.prod(kernel) * math.prod(bottom) for bottom in layer.bottom_shapes)
 
 

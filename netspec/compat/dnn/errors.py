@@ -1,4 +1,4 @@
-"""The error of this package. It is an error of OpenCV and of netspec, so that ``except cv2.error`` works."""
+"""The error of this package. It is an error of both OpenCV and netspec, so ``except cv2.error`` works."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ UNSPECIFIED, BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED = -2, -5, -204, -213
 
 
 class DnnError(cv2.error, SpecError):
-    """A fault of a user's file, or wrong use of this module.
+    """A fault in a user's file, or wrong use of this module.
 
-    It has the fields of cv2.error: ``code`` (a number of cv::Error), ``err`` and ``msg`` (the sentence), ``func``,
-    ``file`` and ``line`` (of the user's file, where one is at fault).
+    It has the fields of cv2.error: ``code`` (a number of cv::Error), ``err`` and ``msg`` (the message), ``func``,
+    ``file`` and ``line`` (of the user's file, if the fault is in one).
     """
 
     def __init__(self, message: str, where: Where | None = None, code: int = UNSPECIFIED, func: str = "") -> None:

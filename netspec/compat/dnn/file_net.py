@@ -1,4 +1,4 @@
-"""What is known of a net without running it: its layers, their shapes and costs.
+"""Describes a net without running it: its layers, their shapes and costs.
 
 OpenCV: modules/dnn/src/net_impl.cpp (4.12)
 """
@@ -26,9 +26,9 @@ Shapes = list[Shape]
 
 
 class FileNet:
-    """The net that a Net reads from Caffe's files: its layers by OpenCV's names and numbers, and built nets.
+    """A net read from Caffe's files: its layers by OpenCV's names and numbers, and the nets built from it.
 
-    Without files it has no layers. ``declared`` are the shapes of its inputs, ``shown`` their names, which
+    Without files it has no layers. ``declared`` has the shapes of its inputs, ``shown`` their names, which
     setInputsNames may change, and ``values`` the arrays that were set.
     """
 
@@ -45,13 +45,13 @@ class FileNet:
                 _ = self.net
 
     def asked(self, func: str, arguments: Sequence[Any], named: Mapping[str, Any]) -> tuple[CaffeNet, list[Entry]]:
-        """Return the net for the shapes among the arguments of a method, and the layer among them, or all layers."""
+        """Return the net for the shapes in the arguments of a method, and the layer in them, or all layers."""
         shapes = named.get("netInputShapes", named.get("netInputShape", arguments[-1] if arguments else None))
         layer = named.get("layerId", arguments[0] if len(arguments) > 1 else None)
         return self.shaped(shapes, func), self.table if layer is None else [self.entry(layer, func)]
 
     def shaped(self, given: Any, func: str) -> CaffeNet:
-        """Return the net built without values for inputs of these shapes: one shape, or one for each input."""
+        """Return the net, built without values, for inputs of these shapes: one shape, or one for each input."""
         self.check_not_empty(func)
         assert self.files is not None
         rows = [given] if len(given) and np.isscalar(given[0]) else given
@@ -78,7 +78,7 @@ class FileNet:
         return layer.bottom_shapes, layer.top_shapes
 
     def operations(self, net: CaffeNet, entry: Entry) -> int:
-        """Return the operations of a layer in a forward pass."""
+        """Return the number of operations of a layer in a forward pass."""
         if entry.name == INPUT or entry.top > 0:
             return 0
         layer = self.layer(net, entry)
@@ -90,7 +90,7 @@ class FileNet:
 
     @cached_property
     def net(self) -> CaffeNet:
-        """The net, built when it is first needed: inputs without a shape in the prototxt get theirs from setInput."""
+        """The net, built when it is first needed: inputs without a shape in the prototxt get one from setInput."""
         assert self.files is not None
         given = {key: value.shape for key, value in self.values.items() if self.declared[key] is None}
         return self.files.build(given)
@@ -106,11 +106,11 @@ class FileNet:
         return net.plan.nodes[self.nodes[entry.layer]]
 
     def layer(self, net: CaffeNet, entry: Entry) -> CaffeLayer:
-        """Return the layer of netspec behind one of OpenCV's."""
+        """Return netspec's layer for one of OpenCV's layers."""
         return net.layers[self.nodes[entry.layer]]
 
     def entry(self, layer: int | str, func: str) -> Entry:
-        """Return a layer by number or name. Raises DnnError where there is none."""
+        """Return a layer by number or name. Raises DnnError if there is none."""
         number = self.numbers.get(layer, -1) if isinstance(layer, str) else int(layer)
         if 0 <= number < len(self.table):
             return self.table[number]
@@ -129,5 +129,5 @@ class FileNet:
             raise DnnError("the net is empty", code=BAD_ARGUMENT, func=func)
 
     def where(self) -> Where | None:
-        """Return the place of the prototxt."""
+        """Return the location of the prototxt."""
         return Where(self.files.source.file) if self.files else None

@@ -19,10 +19,10 @@ Array = np.ndarray
 
 
 class Model:
-    """A net with the preparation of images: ``Model(net)``, or ``Model(weights, prototxt)`` in either order.
+    """A net with preprocessing of images: ``Model(net)``, or ``Model(weights, prototxt)`` in either order.
 
-    The image is resized to ``size`` (width, height), if it is set. The input is then (pixel - mean) scale. ``mean`` and
-    ``scale`` are by channel of the input, so R, G, B where swapRB is set.
+    The image is resized to ``size`` (width, height), if it is set. The input is then (pixel - mean) * scale. ``mean``
+    and ``scale`` are in the order of the input's channels: R, G, B if swapRB is set.
     """
 
     def __init__(self, model: Any, config: str | os.PathLike[str] = "") -> None:
@@ -40,22 +40,22 @@ class Model:
         return self
 
     def setInputMean(self, mean: Any) -> Model:
-        """Set what is subtracted, by channel."""
+        """Set the mean of each channel, which is subtracted."""
         self._mean = _scalar(mean)
         return self
 
     def setInputScale(self, scale: Any) -> Model:
-        """Set what the difference is multiplied by: one number, or one for each channel."""
+        """Set the factor for the difference: one number, or one for each channel."""
         self._scale = np.full(4, scale, float) if np.isscalar(scale) else np.array(_scalar(scale))
         return self
 
     def setInputCrop(self, crop: bool) -> Model:
-        """Set whether the image is cropped to the input's proportions, rather than stretched."""
+        """Set whether the image is cropped to the proportions of the input instead of stretched."""
         self._crop = bool(crop)
         return self
 
     def setInputSwapRB(self, swapRB: bool) -> Model:
-        """Set whether the first and the last channel change places."""
+        """Set whether the first and the last channel are swapped."""
         self._swap = bool(swapRB)
         return self
 
@@ -66,22 +66,22 @@ class Model:
         self.setInputScale(scale).setInputSize(size).setInputMean(mean).setInputSwapRB(swapRB).setInputCrop(crop)
 
     def setOutputNames(self, outNames: Sequence[str]) -> Model:
-        """Set the layers that :meth:`predict` returns the tops of. Default: those that no other layer reads."""
+        """Set the layers whose tops :meth:`predict` returns. Default: those that no other layer reads."""
         self._outputs = tuple(outNames)
         return self
 
     def setPreferableBackend(self, backendId: int) -> Model:
-        """Accept a backend."""
+        """Accept and ignore a backend."""
         self._net.setPreferableBackend(backendId)
         return self
 
     def setPreferableTarget(self, targetId: int) -> Model:
-        """Accept a target."""
+        """Accept and ignore a target."""
         self._net.setPreferableTarget(targetId)
         return self
 
     def enableWinograd(self, useWinograd: bool) -> Model:
-        """Accept the switch."""
+        """Accept and ignore the switch."""
         self._net.enableWinograd(useWinograd)
         return self
 
@@ -131,7 +131,7 @@ class SegmentationModel(Model):
     """A net with one output (1, classes, H, W): a score for each class and pixel."""
 
     def segment(self, frame: Array, mask: Any = None) -> Array:
-        """Return the class of the highest score of each pixel, the first of equals: (H, W) uint8."""
+        """Return the class of the highest score of each pixel, the first of equal ones: (H, W) uint8."""
         return self._predict_one(frame)[0].argmax(axis=0).astype(np.uint8)
 
 
@@ -143,7 +143,7 @@ class DetectionModel(Model):
         self._across = False
 
     def setNmsAcrossClasses(self, value: bool) -> DetectionModel:
-        """Accept whether boxes of other classes suppress one another; a DetectionOutput layer has decided that."""
+        """Accept and ignore whether boxes of different classes suppress each other: DetectionOutput decides this."""
         self._across = bool(value)
         return self
 
@@ -154,7 +154,7 @@ class DetectionModel(Model):
     def detect(self, frame: Array, confThreshold: float = 0.5, nmsThreshold: float = 0.0) -> tuple[Any, Any, Any]:
         """Return classes (n,), confidences (n,) and boxes (n, 4): x, y, width, height in pixels of the image.
 
-        Where nothing is found these are empty tuples. ``nmsThreshold`` is not used: the net has suppressed boxes.
+        If nothing is found, these are empty tuples. ``nmsThreshold`` is not used: the net has suppressed boxes already.
         """
         last = self._net.getLayer(self._net.getLayerNames()[-1])
         if last.type != "DetectionOutput":
@@ -172,7 +172,7 @@ class DetectionModel(Model):
 
 
 def _rectangle(corners: Array, width: int, height: int) -> tuple[int, int, int, int]:
-    """Return the box in pixels of an image; corners in parts of the image are those that span at most two pixels."""
+    """Return the box in pixels of an image; corners less than two pixels apart are fractions of the image."""
     left, top, right, bottom = (int(value) for value in corners)
     if right - left + 1 <= 2 or bottom - top + 1 <= 2:
         scaled = corners * np.array([width, height] * 2, np.float32)
@@ -183,6 +183,6 @@ def _rectangle(corners: Array, width: int, height: int) -> tuple[int, int, int, 
 
 
 def _scalar(values: Any) -> Sequence[float]:
-    """Return what OpenCV makes of a number or a sequence: four numbers, 0 where none is given."""
+    """Convert a number or a sequence to four numbers like OpenCV, with 0 for missing ones."""
     given = [values] if np.isscalar(values) else list(values)
     return [float(value) for value in [*given, 0, 0, 0, 0][:4]]

@@ -37,14 +37,14 @@ class Layer:
         self._tops = list(tops)
 
     def outputNameToIndex(self, outputName: str) -> int:
-        """Return the number of an input, for the input layer (-1: there is none of that name); 0 for other layers."""
+        """Return the index of an input, for the input layer (-1 if it has no such input); 0 for other layers."""
         if self.name != INPUT:
             return 0
         return self._tops.index(outputName) if outputName in self._tops else -1
 
 
 def _refused(func: str, message: str, code: int = NOT_IMPLEMENTED) -> Callable[..., NoReturn]:
-    """Return a method that refuses, whatever it gets."""
+    """Return a method that raises an error for any arguments."""
 
     def refuse(self: Net, *arguments: Any, **named: Any) -> NoReturn:
         raise DnnError(message.format(func), self._caffe.where(), code, func)
@@ -53,9 +53,9 @@ def _refused(func: str, message: str, code: int = NOT_IMPLEMENTED) -> Callable[.
 
 
 class Net:
-    """A net that was read from Caffe's files; without files, an empty one.
+    """A net read from Caffe's files; without files, an empty net.
 
-    Names and numbers of layers are OpenCV's (netspec/compat/dnn/table.py), arrays are float32 in Caffe's axes.
+    Names and numbers of layers are those of OpenCV (netspec/compat/dnn/table.py). Arrays are float32 with Caffe's axes.
     Faults raise :class:`netspec.dnn.DnnError`, which is a cv2.error.
     """
 
@@ -70,31 +70,31 @@ class Net:
         return len(self._caffe.table) < 2
 
     def getLayerNames(self) -> tuple[str, ...]:
-        """Return the names of all layers but the input layer."""
+        """Return the names of all layers except the input layer."""
         return tuple(entry.name for entry in self._caffe.table[1:])
 
     def getLayerId(self, layer: str) -> int:
-        """Return the number of a layer, -1 where there is none of that name."""
+        """Return the number of a layer, -1 if there is no layer of that name."""
         return self._caffe.numbers.get(layer, -1)
 
     def getLayerTypes(self) -> tuple[str, ...]:
-        """Return the types of its layers, each once, in alphabetical order."""
+        """Return the types of its layers, without duplicates, in alphabetical order."""
         return tuple(sorted({entry.type or "__NetInputLayer__" for entry in self._caffe.table}))
 
     def getLayersCount(self, layerType: str) -> int:
-        """Return how many layers are of a type."""
+        """Return the number of layers of a type."""
         return sum((entry.type or "__NetInputLayer__") == layerType for entry in self._caffe.table)
 
     def getUnconnectedOutLayers(self) -> Array:
-        """Return the numbers of the layers with no top that another layer reads: (n,) int32."""
+        """Return the numbers of the layers whose tops no other layer reads: (n,) int32."""
         return np.array(unconnected(self._caffe.files.net, self._caffe.table) if self._caffe.files else [], np.int32)
 
     def getUnconnectedOutLayersNames(self) -> tuple[str, ...]:
-        """Return the names of the layers with no top that another layer reads."""
+        """Return the names of the layers whose tops no other layer reads."""
         return tuple(self._caffe.table[number].name for number in self.getUnconnectedOutLayers())
 
     def dump(self) -> str:
-        """Return the layers, with the shapes of their tops, and what they read, in Graphviz's language."""
+        """Return the layers, the shapes of their tops, and their connections as a Graphviz graph."""
         self._caffe.check_not_empty("dump")
         assert self._caffe.files is not None
         given = {key: value.shape for key, value in self._caffe.values.items()}
@@ -130,7 +130,7 @@ class Net:
         return sum(self._caffe.operations(net, entry) for entry in entries)
 
     def getMemoryConsumption(self, *arguments: Any, **named: Any) -> tuple[int, int]:
-        """Return bytes of weights and of tops, of all layers or of one; arguments as :meth:`getFLOPS`."""
+        """Return the bytes of weights and of tops, of all layers or of one; arguments as for :meth:`getFLOPS`."""
         net, entries = self._caffe.asked("getMemoryConsumption", arguments, named)
         owners = [entry for entry in entries if entry.name != INPUT and entry.top <= 0]
         weights = sum(blob.numel() for entry in owners for blob in self._caffe.layer(net, entry).blobs)
@@ -154,7 +154,7 @@ class Net:
         return self._parameter(entry, numParam)
 
     def setParam(self, layer: int | str, numParam: int, blob: Array | Sequence[float]) -> None:
-        """Write a learnable blob of a layer; the array must have as many numbers."""
+        """Write a learnable blob of a layer; the array must have the same number of elements."""
         target = self._blob(self._caffe.entry(layer, "setParam"), numParam, "setParam")
         values = np.asarray(blob, np.float32)
         if values.size != target.numel():
@@ -179,7 +179,7 @@ class Net:
     # Settings
 
     def setInputsNames(self, inputBlobNames: Sequence[str]) -> None:
-        """Give the inputs other names, in their order."""
+        """Rename the inputs, in order."""
         self._caffe.shown = dict(zip(self._caffe.declared, inputBlobNames, strict=False))
 
     def setInputShape(self, inputName: str, shape: Sequence[int]) -> None:
@@ -189,9 +189,9 @@ class Net:
     # Running
 
     def setInput(self, blob: Any, name: str = "", scalefactor: float = 1.0, mean: Any = ()) -> None:
-        """Give an input, the first where it has no name: (blob - mean) scalefactor, ``mean`` one number a channel.
+        """Set an input, the first one if no name is given: (blob - mean) * scalefactor, with one ``mean`` per channel.
 
-        The shape may differ from the prototxt's wherever the layers can follow. None takes the input away.
+        The shape may differ from the prototxt if all layers allow it. None removes the input.
         """
         if self._caffe.files is None:
             return
@@ -208,9 +208,9 @@ class Net:
         self._caffe.values[key] = _normalized(values, float(scalefactor), np.atleast_1d(np.asarray(mean, np.float32)))
 
     def forward(self, outputName: Any = "", *more: Any, outputBlobs: Any = None, outBlobNames: Any = None) -> Any:
-        """Run the net; return the first top of a layer, by default the last one's, or of a list of layers: a tuple.
+        """Run the net; return the first top of a layer (default: the last one), or a tuple for a list of layers.
 
-        A layer is run only where it is needed. The top is what that layer gave, before others wrote over it in place.
+        Only layers that are needed run. The result is the top before other layers overwrite it in place.
         """
         asked = outBlobNames if outBlobNames is not None else outputName
         for word in more:  # forward(outputBlobs, outputName)
@@ -222,7 +222,7 @@ class Net:
         return self._forward([self._last()]) if isinstance(asked, list | tuple) else self._forward([self._last()])[0]
 
     def forwardAndRetrieve(self, outBlobNames: Sequence[str]) -> tuple[tuple[Array, ...], ...]:
-        """Run the net; return all tops of each of these layers."""
+        """Run the net; return all tops of each of the layers."""
         entries = [self._caffe.entry(name, "forwardAndRetrieve") for name in outBlobNames]
         net = self._caffe.net
         pins = [[(entry, top) for top in range(self._tops(net, entry))] for entry in entries]
@@ -230,7 +230,7 @@ class Net:
         return tuple(tuple(_array(next(found)) for _ in row) for row in pins)
 
     def getPerfProfile(self) -> tuple[int, Array]:
-        """Return ticks (cv2.getTickFrequency) in all and by layer, (n,): of one more run, on the inputs given last."""
+        """Run again on the last inputs; return the ticks (cv2.getTickFrequency) in total and by layer, (n,)."""
         ticks = np.zeros(len(self._caffe.table) - 1)
         self._check_inputs("getPerfProfile")
         with as_dnn_error("getPerfProfile"), torch.inference_mode():
@@ -243,12 +243,12 @@ class Net:
 
     @cached_property
     def _makers(self) -> dict[int, int]:
-        """The node that makes each value."""
+        """The node that computes each value."""
         return {v: i for i, node in enumerate(self._caffe.net.plan.nodes) for v in node.tops}
 
     @cached_property
     def _lasting(self) -> frozenset[int]:
-        """The values that no later one of the same name replaces."""
+        """The values that no later value of the same name replaces."""
         return frozenset({name: v for v, name in enumerate(self._caffe.net.plan.blobs)}.values())
 
     def _tops(self, net: CaffeNet, entry: Entry) -> int:
@@ -264,7 +264,7 @@ class Net:
         return tuple(map(_array, self._run([(entry, entry.top) for entry in entries], "forward")))
 
     def _run(self, pins: Sequence[tuple[Entry, int]], func: str) -> list[torch.Tensor]:
-        """Run what the tops need, and return them; each is given as a layer and the number of its top."""
+        """Run the layers that the tops need, and return the tops; each is given as a layer and an index."""
         self._check_inputs(func)
         with as_dnn_error(func), torch.inference_mode():
             net = self._caffe.net
@@ -284,7 +284,7 @@ class Net:
         return self._caffe.node(net, entry).tops[top]
 
     def _compute(self, net: CaffeNet, wanted: Sequence[int]) -> Mapping[int, torch.Tensor]:
-        """Return the values of these numbers: of the whole net, or layer by layer up to the last that is needed."""
+        """Return the values with these numbers, from the whole net, or layer by layer up to the last one needed."""
         if not wanted:
             return {}
         end, names, lasting = max(self._makers[v] for v in wanted), net.plan.blobs, self._lasting
@@ -295,7 +295,7 @@ class Net:
         return self._walk(end)
 
     def _walk(self, end: int, seconds: dict[int, float] | None = None) -> dict[int, torch.Tensor]:
-        """Run the nodes up to ``end`` one by one; return all values, and note in ``seconds`` what each takes."""
+        """Run the nodes up to ``end`` one by one; return all values, and store the time of each in ``seconds``."""
         net = self._caffe.net
         values = net.given(self._caffe.values)
 
@@ -309,10 +309,10 @@ class Net:
         walk([step for step in net.eager.one_by_one() if step.node <= end], values, net.options.exact, visit)
         return values
 
-    # What changes nothing, and what it refuses
+    # Settings without effect, and unsupported methods
 
     def _accept(self, *settings: Any, **named: Any) -> None:
-        """Accept a setting: there is one backend, torch, nets run on the CPU, and no switch changes a result."""
+        """Accept and ignore a setting: the backend is torch, nets run on the CPU, and no switch changes a result."""
 
     setPreferableBackend = setPreferableTarget = enableFusion = enableWinograd = setHalideScheduler = _accept
 
@@ -328,10 +328,10 @@ class Net:
     getInputDetails = _refused("getInputDetails", "the net is not quantized", UNSPECIFIED)
     getOutputDetails = _refused("getOutputDetails", "the net is not quantized", UNSPECIFIED)
 
-    # What can be wrong
+    # Errors
 
     def _input(self, name: str, func: str) -> str:
-        """Return the blob of an input that is called ``name``; "" is the first."""
+        """Return the blob of the input ``name``; "" is the first."""
         for blob, shown in self._caffe.shown.items():
             if name in ("", shown):
                 return blob
@@ -354,7 +354,7 @@ class Net:
             raise DnnError(message, self._caffe.where(), func=func)
 
     def _with_shapes(self, fault: ValueError, func: str) -> DnnError:
-        """Return a fault of a run with the shapes of the inputs that are not as the prototxt has them."""
+        """Return an error of a run, with the shapes of the inputs that differ from the prototxt."""
         caffe = self._caffe
         changed = [
             f'input "{caffe.shown[key]}" has shape {value.shape}, but the prototxt declares {caffe.declared[key]}'
@@ -366,13 +366,13 @@ class Net:
 
 
 def _learns(files: CaffeFiles) -> Iterable[bool]:
-    """Yield, for each layer with weights, whether they must come from a file, because the prototxt has none."""
+    """Yield for each layer with weights whether they must come from a file, because the prototxt has none."""
     learning = ("Convolution", "Deconvolution", "InnerProduct", "ConvolutionDepthwise", "DepthwiseConvolution")
     return (layer.type in learning and not layer.blobs for layer in files.net.layer)
 
 
 def _normalized(values: Array, scale: float, mean: Array) -> Array:
-    """Return (values - mean) scale; the mean is by channel, as far as it is given."""
+    """Return (values - mean) * scale; the mean has a number for each channel, or for the first channels."""
     if mean.any():
         by_channel = np.zeros(values.shape[1], np.float32)
         count = min(len(by_channel), len(mean))
@@ -384,7 +384,7 @@ def _normalized(values: Array, scale: float, mean: Array) -> Array:
 
 
 def _array(values: torch.Tensor) -> Array:
-    """Return a copy as OpenCV gives arrays: at least two axes, (n, 1) for a vector."""
+    """Return a copy in OpenCV's form: at least two axes, (n, 1) for a vector."""
     array = np.array(values.detach().numpy(), np.float32, order="C")
     return array if array.ndim > 1 else array.reshape(-1, 1)
 

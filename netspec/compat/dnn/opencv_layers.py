@@ -1,4 +1,4 @@
-"""Layers of SSD as OpenCV computes them: what it puts out differs from the fork's layers."""
+"""SSD's layers as OpenCV computes them; the outputs differ from those of the fork's layers."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from netspec.proto.schema import value
 
 
 class PriorBox(ssd.PriorBox):
-    """SSD's, but sizes that are no whole pixels stay as they are, and boxes are clipped unless ``clip`` is false.
+    """Like SSD's layer, but sizes are not rounded to pixels, and boxes are clipped unless ``clip`` is false.
 
-    With bottom[1] the image is always its size, whatever img_size, img_h and img_w say.
+    With bottom[1], the image size is always that of bottom[1]; img_size, img_h and img_w are ignored.
     OpenCV: modules/dnn/src/layers/prior_box_layer.cpp
     """
 
@@ -31,7 +31,7 @@ class PriorBox(ssd.PriorBox):
         return size
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Lay the boxes, and clip them where nothing is said."""
+        """Compute the boxes, and clip them by default."""
         shapes = super().reshape(bottom_shapes)
         if not value(self.param, "prior_box_param").HasField("clip"):
             self.boxes[0, 0] = self.boxes[0, 0].clip(0, 1)
@@ -39,22 +39,22 @@ class PriorBox(ssd.PriorBox):
 
 
 class DetectionOutput(ssd.DetectionOutput):
-    """SSD's, but each image's rows in the order of confidence, and always as many rows as may be kept.
+    """Like SSD's layer, but the rows of each image are in order of confidence, and the number of rows is fixed.
 
     top[0]     (1, 1, N keep_top_k, 7): the detections of all images, then rows of zeros
-    OpenCV: modules/dnn/src/layers/detection_output_layer.cpp. It refuses a net without keep_top_k; here the rows are
-    then those that are found, one of zeros where there are none.
+    OpenCV: modules/dnn/src/layers/detection_output_layer.cpp. OpenCV refuses a net without keep_top_k; here it gets
+    as many rows as are found, or one row of zeros.
     """
 
     type = "DetectionOutput"
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        """Return the shape with room for all detections that may be kept."""
+        """Return the shape for the largest number of detections."""
         super().reshape(bottom_shapes)
         return [(1, 1, max(bottom_shapes[0][0] * value(self.param, "detection_output_param").keep_top_k, 1), 7)]
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
-        """Return the detections, then rows of zeros."""
+        """Return the detections, followed by rows of zeros."""
         rows = super().forward(*bottoms)[0, 0]
         rows = rows[rows[:, 1] >= 0]  # without the fork's row (image, -1, ...) for none
         rows = rows[torch.argsort(rows[:, 2], descending=True, stable=True)]

@@ -1,4 +1,4 @@
-"""Reading nets, Caffe's files here and all others by cv2.dnn; and weights in half precision."""
+"""Reads nets: Caffe's files here, all others with cv2.dnn; and writes weights in half precision."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _CAFFE = (".prototxt", ".caffemodel", ".caffemodel.h5")
 def readNetFromCaffe(prototxt: FileOrBytes, caffeModel: FileOrBytes | None = None) -> Net:
     """Return the net of a prototxt with the weights of a .caffemodel (or .caffemodel.h5).
 
-    Either is a path, or what is in the file: bytes, a bytearray or an array of bytes. The dialects that the prototxt
-    needs are switched on. Raises DnnError.
+    Each is a path or the content of the file: bytes, a bytearray or an array of bytes. The dialects that the prototxt
+    needs are activated. Raises DnnError.
     """
     if isinstance(caffeModel, str) and not caffeModel:
         caffeModel = None
@@ -32,9 +32,9 @@ def readNetFromCaffe(prototxt: FileOrBytes, caffeModel: FileOrBytes | None = Non
 
 
 def readNet(model: Any, config: Any = "", framework: Any = "", **others: Any) -> Any:
-    """Return the net of two files in either order, by their names; what is not Caffe's is left to cv2.dnn.readNet.
+    """Return the net of two files in either order, recognized by name; cv2.dnn.readNet reads other formats.
 
-    ``readNet("caffe", weights, prototxt)`` takes what is in the files. Raises DnnError, and what cv2.dnn raises.
+    ``readNet("caffe", weights, prototxt)`` takes the contents of the files. Raises DnnError, or an error of cv2.dnn.
     """
     if not isinstance(config, str | os.PathLike):  # readNet(framework, bufferModel, bufferConfig)
         if str(model).lower() == "caffe":
@@ -53,7 +53,7 @@ def shrinkCaffeModel(
     dst: str | os.PathLike[str],
     layersTypes: Sequence[str] = ("Convolution", "InnerProduct"),
 ) -> None:
-    """Write a .caffemodel to ``dst`` with the blobs of layers of these types in half precision. Raises DnnError."""
+    """Write a .caffemodel to ``dst`` with the blobs of these types of layers in half precision. Raises DnnError."""
     with as_dnn_error("shrinkCaffeModel"):
         net, _ = parse_net_binary(os.fspath(src))
         for layer in net.layer:

@@ -1,7 +1,7 @@
-"""The layers of a net as OpenCV counts and names them.
+"""The layers of a net with OpenCV's numbers and names.
 
-Layer 0, "_input", stands for all inputs. A Convolution has the name of its top, and is one layer for each top. A name
-that occurs again gets a number at its end. An Axpy becomes two layers.
+Layer 0, "_input", represents all inputs. A Convolution has the name of its top, and is one layer for each top. A name
+that occurs again gets a number at the end. An Axpy becomes two layers.
 OpenCV: modules/dnn/src/caffe/caffe_importer.cpp (4.12)
 """
 
@@ -21,9 +21,9 @@ INPUT = "_input"
 
 @dataclass(frozen=True)
 class Entry:
-    """One of OpenCV's layers: its name and type, and its place in the filtered net: the layer, and the first top.
+    """One of OpenCV's layers: its name and type, and its position in the filtered net: the layer, and the first top.
 
-    ``top`` is -1 where it gives none: the input layer, a Silence, the first half of an Axpy.
+    ``top`` is -1 if it has none: the input layer, a Silence, the first half of an Axpy.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Entry:
 
 
 def make_table(net: NetParameter) -> list[Entry]:
-    """Return the layers of a filtered net; the place in the list is OpenCV's number."""
+    """Return the layers of a filtered net; the index in the list is OpenCV's number."""
     entries = [Entry(INPUT, "")]
     seen: Counter[str] = Counter()
     for i, layer in enumerate(net.layer):
@@ -79,13 +79,13 @@ def edges(net: NetParameter, table: Sequence[Entry]) -> list[tuple[int, int]]:
 
 
 def unconnected(net: NetParameter, table: Sequence[Entry]) -> list[int]:
-    """Return the numbers of the layers with no top that another layer reads."""
+    """Return the numbers of the layers whose tops no other layer reads."""
     read = {number for number, _ in edges(net, table)}
     return [number for number in range(len(table)) if number not in read]
 
 
 def graph_of(net: NetParameter, table: Sequence[Entry], tops: Sequence[Sequence[Shape]]) -> str:
-    """Return the layers and what they read in Graphviz's language; ``tops`` are the shapes of each layer's tops."""
+    """Return the layers and their connections as a Graphviz graph; ``tops`` has the shapes of each layer's tops."""
     lines = ["digraph G {"]
     for entry, shapes in zip(table, tops, strict=True):
         sizes = "".join(f"output: {' x '.join(map(str, shape))}\\l" for shape in shapes)
@@ -100,7 +100,7 @@ def _quoted(name: str) -> str:
 
 
 def nodes_of(plan: Plan, net: NetParameter) -> list[int]:
-    """Return, for each layer of the filtered net, its node in the plan, which has Split layers besides."""
+    """Return for each layer of the filtered net its node in the plan, which also has Split layers."""
     nodes: list[int] = []
     for i, node in enumerate(plan.nodes):
         layer = net.layer[len(nodes)] if len(nodes) < len(net.layer) else None

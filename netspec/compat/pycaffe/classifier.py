@@ -1,4 +1,4 @@
-"""A net that says what an image shows. Caffe: python/caffe/classifier.py."""
+"""A net that classifies images. Caffe: python/caffe/classifier.py."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from netspec.compat.pycaffe.proto import caffe_pb2
 class Classifier(Net):
     """A net with an image input, and a Transformer for it.
 
-    ``image_dims`` is the size (height, width) that images get before they are cropped to the net's own; by default that
-    of the net. ``mean``, ``input_scale``, ``raw_scale`` and ``channel_swap`` are the Transformer's.
+    ``image_dims`` is the size (height, width) to which images are resized before they are cropped to the net's input
+    size; default: the input size. ``mean``, ``input_scale``, ``raw_scale`` and ``channel_swap`` are settings of the
+    Transformer.
     """
 
     def __init__(
@@ -38,7 +39,7 @@ class Classifier(Net):
     def predict(self, inputs: Sequence[np.ndarray], oversample: bool = True) -> np.ndarray:
         """Return the first output (N, classes) for N images (H, W, K).
 
-        With ``oversample`` it is the mean over ten crops (corners, center, mirrored), else that of the center.
+        With ``oversample`` it is the mean over ten crops (corners, center, mirrored), otherwise that of the center.
         """
         height, width = self.image_dims
         images = np.zeros((len(inputs), height, width, inputs[0].shape[2]), np.float32)
@@ -58,7 +59,7 @@ class Classifier(Net):
 
 
 def transformer(net: Any, mean: Any, input_scale: Any, raw_scale: Any, channel_swap: Any) -> io.Transformer:
-    """Return the Transformer of a net's first input, with the settings that are given."""
+    """Return a Transformer for the net's first input, with the given settings."""
     in_ = net.inputs[0]
     made = io.Transformer({in_: net.blobs[in_].data.shape})
     made.set_transpose(in_, (2, 0, 1))

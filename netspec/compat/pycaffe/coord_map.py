@@ -1,7 +1,7 @@
-"""Where the pixels of one blob lie in another: how far to crop a map so that it fits the image it came from.
+"""Maps coordinates of one blob to another: how to crop a map so that it fits the image that it was computed from.
 
 A mapping is (axis, scale, shift), from a layer's bottom to its top: top coordinate = scale * bottom coordinate + shift,
-along the axes behind ``axis``; (None, 1, 0) leaves everything where it is. Blobs are Tops of a NetSpec.
+along the axes after ``axis``; (None, 1, 0) is the identity. Blobs are Tops of a NetSpec.
 Caffe: python/caffe/coord_map.py
 """
 
@@ -24,17 +24,17 @@ _TWO_DIMENSIONAL = frozenset(f"{what}_{axis}" for what in ("kernel", "stride", "
 
 
 class UndefinedMapException(Exception):
-    """The layer moves its bottom's pixels in no regular way."""
+    """The layer has no linear mapping of coordinates."""
 
 
 class AxisMismatchException(Exception):
-    """Two mappings are of different axes."""
+    """Two mappings have different axes."""
 
 
 def conv_params(fn: Function) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
-    """Return (axis, stride, extent of the dilated kernel, pad) of a layer with a kernel, an entry for each axis or one.
+    """Return (axis, stride, extent of the dilated kernel, pad) of a layer; each has one entry, or one for each axis.
 
-    Raises AssertionError for the fields of two dimensions (kernel_h and the like), which it does not know.
+    Raises AssertionError for fields such as kernel_h, which are not supported.
     """
     given = fn.params.get("convolution_param", fn.params)
     assert not _TWO_DIMENSIONAL & set(fn.params), "cropping does not support legacy _h/_w params"
@@ -50,12 +50,12 @@ def crop_params(fn: Function) -> tuple[int, np.ndarray]:
 
 
 def coord_map(fn: Function) -> Mapping:
-    """Return the mapping of a layer. Raises UndefinedMapException where it has none."""
+    """Return the mapping of a layer. Raises UndefinedMapException if it has none."""
     if fn.type_name in PASS_THROUGH_LAYERS:
         return IDENTITY
     if fn.type_name == "Crop":
         axis, offset = crop_params(fn)
-        return axis - 1, 1, -offset  # a mapping's axis is the last that it leaves alone, as a convolution's is
+        return axis - 1, 1, -offset  # the axis of a mapping is the last one that it does not change
     if fn.type_name in ("Convolution", "Pooling", "Im2col"):
         axis, stride, extent, pad = conv_params(fn)
         return axis, 1 / stride, (pad - (extent - 1) / 2) / stride
@@ -66,7 +66,7 @@ def coord_map(fn: Function) -> Mapping:
 
 
 def compose(base_map: Mapping, next_map: Mapping) -> Mapping:
-    """Return ``base_map`` after ``next_map``. Raises AxisMismatchException where their axes differ."""
+    """Return the composition: ``base_map`` after ``next_map``. Raises AxisMismatchException if their axes differ."""
     base_axis, base_scale, base_shift = base_map
     next_axis, next_scale, next_shift = next_map
     if None not in (base_axis, next_axis) and base_axis != next_axis:
@@ -84,9 +84,9 @@ def inverse(coord_map: Mapping) -> Mapping:
 
 
 def coord_map_from_to(top_from: Top, top_to: Top) -> Mapping:
-    """Return the mapping from one top to another, by way of a blob from which both are computed.
+    """Return the mapping from one top to another, through a blob from which both are computed.
 
-    Raises RuntimeError where layers with mappings connect them with no blob in common.
+    Raises RuntimeError if layers with mappings do not connect both to a common blob.
     """
     from_maps = _ancestors(top_from)
     for top, to_map in _ancestors(top_to).items():
@@ -98,7 +98,7 @@ def coord_map_from_to(top_from: Top, top_to: Top) -> Mapping:
 def crop(top_from: Top, top_to: Top) -> Top:
     """Return the top of a Crop layer that crops one top to the place and size of another.
 
-    Raises AssertionError where their scales differ, or the offset is negative or no whole number.
+    Raises AssertionError if their scales differ, or the offset is negative or not an integer.
     """
     axis, scale, shift = coord_map_from_to(top_from, top_to)
     assert np.all(scale == 1), f"scale mismatch on crop (a = {scale})"
@@ -111,7 +111,7 @@ def crop(top_from: Top, top_to: Top) -> Top:
 def _ancestors(top: Top) -> dict[Top, Mapping]:
     """Return the blobs that a top is computed from, itself first, each with the mapping from it to the top.
 
-    The second bottom of Crop gives a size only, so it is left out. Layers without a mapping end the walk.
+    The second bottom of Crop is ignored, because it only gives a size. The search ends at layers without a mapping.
     """
     maps = {top: IDENTITY}
     for reached in (pending := [top]):

@@ -18,10 +18,10 @@ Window = Sequence[int]
 
 
 class Detector(Net):
-    """A net with an image input that windows of images are warped to.
+    """A net with an image input, to which windows of images are warped.
 
-    ``context_pad`` is how many pixels at each border of the net's input show what is around a window; what lies outside
-    of the image is the mean. The other settings are the Transformer's.
+    ``context_pad`` is the number of pixels at each border of the input that show the surroundings of a window; pixels
+    outside the image are filled with the mean. The other settings are those of the Transformer.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Detector(Net):
         return self.detect_windows(zip(names, windows, strict=True))
 
     def crop(self, im: np.ndarray, window: np.ndarray) -> np.ndarray:
-        """Return the part of an image (H, W, K) that a window shows, with the context around it where that is set."""
+        """Return the part of an image (H, W, K) in a window, with the context around it if that is set."""
         top, left, bottom, right = (int(place) for place in window)
         cropped = im[top:bottom, left:right]
         if not self.context_pad:
@@ -88,7 +88,7 @@ class Detector(Net):
         return result
 
     def configure_crop(self, context_pad: int | None) -> None:
-        """Set the context, and as what lies outside an image the mean as an image has it; 0 where no mean is set."""
+        """Set the context, and the value of pixels outside an image: the mean, scaled like images, or 0."""
         self.context_pad = context_pad
         if not context_pad:
             return
@@ -97,6 +97,6 @@ class Detector(Net):
         if mean is None:
             self.crop_mean = np.zeros(self.blobs[in_].data.shape[1:], np.float32).transpose(1, 2, 0)
             return
-        # deprocess() adds the mean to what is 0 for the net.
+        # For an input of 0, deprocess() returns the mean.
         zero = np.zeros(self.blobs[in_].data.shape[1:], np.float32)
         self.crop_mean = self.transformer.deprocess(in_, zero)

@@ -1,6 +1,6 @@
 """Nets as pictures: a graph of layers and blobs, drawn by Graphviz.
 
-Needs pydot (the extra ``pycaffe``); PDF and other kinds need Graphviz' own program ``dot``.
+Needs pydot (the extra ``pycaffe``); PDF and some other formats need Graphviz' program ``dot``.
 Caffe: python/caffe/draw.py
 """
 
@@ -21,13 +21,13 @@ _COLORS = {
     "InnerProduct": "#CC33FF",
 }
 _LEARNED = ("Convolution", "Deconvolution", "InnerProduct")
-_TEXT_FORMATS = ("raw", "dot", "gv")  # which pydot writes by itself
+_TEXT_FORMATS = ("raw", "dot", "gv")  # formats that pydot writes by itself
 
 
 def draw_net_to_file(
     caffe_net: Any, filename: str, rankdir: str = "LR", phase: int | None = None, display_lrm: bool = False
 ) -> None:
-    """Draw a net into a file, in the format of its ending; ``.raw``, ``.dot`` and ``.gv`` are Graphviz' own text."""
+    """Draw a net into a file, in the format of its suffix; ``.raw``, ``.dot`` and ``.gv`` are Graphviz source."""
     extension = filename[filename.rfind(".") + 1 :]
     picture = draw_net(caffe_net, rankdir, extension, phase, display_lrm)
     write_whole(filename, picture)
@@ -36,8 +36,8 @@ def draw_net_to_file(
 def draw_net(
     caffe_net: Any, rankdir: str, ext: str = "png", phase: int | None = None, display_lrm: bool = False
 ) -> bytes:
-    """Return the picture of a net in a format of Graphviz. Raises SpecError for one that it does not have."""
-    from netspec.inspect.draw.graphviz import render  # here, so that pycaffe works without netspec/inspect
+    """Return the picture of a net in one of Graphviz' formats. Raises SpecError for an unknown format."""
+    from netspec.inspect.draw.graphviz import render  # imported here, so that pycaffe works without netspec/inspect
 
     graph = get_pydot_graph(caffe_net, rankdir, phase=phase, display_lrm=display_lrm)
     text = graph.to_string()
@@ -49,7 +49,7 @@ def get_pydot_graph(
 ) -> Any:
     """Return the pydot graph of a NetParameter; ``rankdir`` is LR, TB or BT.
 
-    With a phase only the layers that its rules include are there; ``display_lrm`` adds the learning rates' multipliers.
+    With a phase, only layers that are included in it are drawn; ``display_lrm`` adds the learning-rate multipliers.
     """
     pydot = errors.load("pydot", "pycaffe", "caffe.draw")
     graph = pydot.Dot(caffe_net.name or "Net", graph_type="digraph", rankdir=rankdir)
@@ -77,7 +77,7 @@ def get_pydot_graph(
 
 
 def get_layer_label(layer: Any, rankdir: str, display_lrm: bool = False) -> str:
-    """Return what stands in a layer's box: name, type, the window it slides, and the multipliers if asked for."""
+    """Return the text in a layer's box: name, type, kernel, and the multipliers if requested."""
     separator = " " if rankdir in ("TB", "BT") else r"\n"
     kind, window = layer.type, None
     if layer.type == "Pooling":
@@ -99,9 +99,9 @@ def get_layer_label(layer: Any, rankdir: str, display_lrm: bool = False) -> str:
 
 
 def get_layer_lr_mult(layer: Any) -> tuple[float, float]:
-    """Return the multipliers of the learning rate of weights and biases.
+    """Return the learning-rate multipliers of weights and biases.
 
-    Raises ValueError for a layer other than Convolution, Deconvolution and InnerProduct, or with more than two.
+    Raises ValueError if the layer is not a Convolution, Deconvolution or InnerProduct, or has more than two.
     """
     if layer.type not in _LEARNED:
         raise ValueError(f"{layer.type} layers do not have a learning rate multiplier")
@@ -112,7 +112,7 @@ def get_layer_lr_mult(layer: Any) -> tuple[float, float]:
 
 
 def get_edge_label(layer: Any) -> str:
-    """Return what stands at a layer's tops: the batch, or how many maps or numbers it gives."""
+    """Return the text at the tops of a layer: the batch size, or the number of channels or outputs."""
     if layer.type == "Data":
         return f"Batch {layer.data_param.batch_size}"
     if layer.type in ("Convolution", "Deconvolution"):
@@ -133,7 +133,7 @@ def get_pooling_types_dict() -> dict[int, str]:
 
 
 def _included(layer: Any, phase: int) -> bool:
-    """Say whether a layer's rules let it into a phase."""
+    """Return whether a layer is included in a phase."""
     if layer.include and layer.exclude:
         raise ValueError(f"layer {layer.name} has both include and exclude specified.")
     if layer.include:
@@ -142,5 +142,5 @@ def _included(layer: Any, phase: int) -> bool:
 
 
 def _quoted(text: str) -> str:
-    """Return a text in quotes: colons and slashes mean something to Graphviz."""
+    """Return a text in quotes, because colons and slashes are special to Graphviz."""
     return f'"{text}"'

@@ -1,4 +1,4 @@
-"""Images and arrays on their way into a net and out of it.
+"""Converts images and arrays to inputs of a net, and outputs back.
 
 Images are float arrays (H, W, K) with values from 0 to 1, K being 3 (RGB) or 1.
 Caffe: python/caffe/io.py
@@ -22,9 +22,9 @@ Extents = Sequence[int] | Array
 
 
 def blobproto_to_array(blob: Any, return_diff: bool = False) -> Array:
-    """Return the data, or the diff, of a BlobProto as float64, (num, channels, height, width) where it has these.
+    """Return the data, or the diff, of a BlobProto as float64, (num, channels, height, width) if it has these fields.
 
-    Raises ValueError where the shape does not suit the number of values.
+    Raises ValueError if the shape does not match the number of values.
     """
     values = np.array(blob.diff if return_diff else blob.data, np.float64)
     legacy = ("num", "channels", "height", "width")
@@ -34,7 +34,7 @@ def blobproto_to_array(blob: Any, return_diff: bool = False) -> Array:
 
 
 def array_to_blobproto(arr: Array, diff: Array | None = None) -> Any:
-    """Return an array, and its diff where one is given, as a BlobProto."""
+    """Return an array, and its diff if given, as a BlobProto."""
     blob = caffe_pb2.BlobProto()
     blob.shape.dim.extend(arr.shape)
     blob.data.extend(np.asarray(arr, np.float32).ravel())
@@ -44,22 +44,22 @@ def array_to_blobproto(arr: Array, diff: Array | None = None) -> Any:
 
 
 def arraylist_to_blobprotovector_str(arraylist: Sequence[Array]) -> bytes:
-    """Return arrays as the bytes of a BlobProtoVector."""
+    """Return arrays as a serialized BlobProtoVector."""
     return caffe_pb2.BlobProtoVector(blobs=[array_to_blobproto(arr) for arr in arraylist]).SerializeToString()
 
 
-arraylist_to_blobprotovecor_str = arraylist_to_blobprotovector_str  # as Caffe spells it
+arraylist_to_blobprotovecor_str = arraylist_to_blobprotovector_str  # Caffe's spelling
 
 
 def blobprotovector_str_to_arraylist(str: bytes) -> list[Array]:
-    """Return the arrays of the bytes of a BlobProtoVector."""
+    """Return the arrays in a serialized BlobProtoVector."""
     return [blobproto_to_array(blob) for blob in caffe_pb2.BlobProtoVector.FromString(str).blobs]
 
 
 def array_to_datum(arr: Array, label: int | np.integer | None = None) -> Any:
     """Return an array (C, H, W) as a Datum: uint8 as bytes, other numbers as floats.
 
-    Raises ValueError where it does not have three axes.
+    Raises ValueError if it does not have three axes.
     """
     if arr.ndim != 3:
         raise ValueError(f"Incorrect array shape: found {arr.shape}, expected (channels, height, width).")
@@ -86,9 +86,9 @@ def datum_to_array(datum: Any) -> Array:
 
 
 class Transformer:
-    """Makes an image into a net's input: resized, transposed, its channels in another order, scaled, without a mean.
+    """Converts an image to a net's input: resizes, transposes, reorders channels, scales, and subtracts a mean.
 
-    ``inputs`` has the shape of each input blob (N, C, H, W). What is not set is not done.
+    ``inputs`` has the shape of each input blob (N, C, H, W). Steps that are not set are skipped.
     """
 
     def __init__(self, inputs: Mapping[str, Sequence[int]]) -> None:
@@ -123,7 +123,7 @@ class Transformer:
         return values
 
     def deprocess(self, in_: str, data: Array) -> Array:
-        """Return what an input (K, H, W) was before ``preprocess``, but for its size."""
+        """Undo ``preprocess`` for an input (K, H, W), except for its size."""
         self._check_input(in_)
         values = data.copy().squeeze()
         if in_ in self.input_scale:
@@ -139,28 +139,28 @@ class Transformer:
         return values
 
     def set_transpose(self, in_: str, order: Sequence[int]) -> None:
-        """Set the order of an image's axes in the blob: (2, 0, 1) makes (H, W, K) into (K, H, W)."""
+        """Set the order of an image's axes in the blob: (2, 0, 1) turns (H, W, K) into (K, H, W)."""
         self._check_input(in_)
         if len(order) != len(self.inputs[in_]) - 1:
             raise Exception("Transpose order needs to have the same number of dimensions as the input.")
         self.transpose[in_] = order
 
     def set_channel_swap(self, in_: str, order: Sequence[int]) -> None:
-        """Set the order of the channels, after transposing: (2, 1, 0) makes RGB into BGR."""
+        """Set the order of the channels, after transposing: (2, 1, 0) turns RGB into BGR."""
         self._check_input(in_)
         if len(order) != self.inputs[in_][1]:
             raise Exception("Channel swap needs to have the same number of dimensions as the input channels.")
         self.channel_swap[in_] = order
 
     def set_raw_scale(self, in_: str, scale: float) -> None:
-        """Set what the image is multiplied by before the mean is subtracted: 255 for nets that know 0 to 255."""
+        """Set the factor of the image before the mean is subtracted: 255 for nets with inputs from 0 to 255."""
         self._check_input(in_)
         self.raw_scale[in_] = scale
 
     def set_mean(self, in_: str, mean: Array) -> None:
-        """Set what is subtracted: a value for each channel (K,), or an image (H, W) or (K, H, W).
+        """Set the mean to subtract: a value for each channel (K,), or an image (H, W) or (K, H, W).
 
-        An image of another size than the input's is resized, as Caffe does. Raises ValueError for another number of
+        A mean image of another size is resized to the input, as in Caffe. Raises ValueError for another number of
         channels or axes.
         """
         self._check_input(in_)
@@ -180,7 +180,7 @@ class Transformer:
         self.mean[in_] = mean
 
     def set_input_scale(self, in_: str, scale: float) -> None:
-        """Set what the input is multiplied by after the mean was subtracted."""
+        """Set the factor of the input after the mean is subtracted."""
         self._check_input(in_)
         self.input_scale[in_] = scale
 
@@ -207,9 +207,9 @@ def load_image(filename: Any, color: bool = True) -> Array:
 
 
 def resize_image(im: Array, new_dims: Extents, interp_order: int = 1) -> Array:
-    """Return an image (H, W, K) in another size (height, width), by splines of an order, without anti-aliasing.
+    """Return an image (H, W, K) resized to (height, width) by splines of the given order, without anti-aliasing.
 
-    As in Caffe, K of 1 or 3 goes through scikit-image (the extra ``pycaffe``), other K through SciPy's zoom.
+    As in Caffe, scikit-image (the extra ``pycaffe``) resizes images with K of 1 or 3, and SciPy's zoom all others.
     """
     height, width = (int(extent) for extent in new_dims)
     if im.shape[-1] not in (1, 3):
@@ -221,13 +221,13 @@ def resize_image(im: Array, new_dims: Extents, interp_order: int = 1) -> Array:
     if not high > low:
         return np.full((height, width, im.shape[-1]), low, np.float32)
     transform = errors.load("skimage.transform", "pycaffe", "caffe.io.resize_image")
-    unit = (im - low) / (high - low)  # scikit-image takes values from 0 to 1
+    unit = (im - low) / (high - low)  # scikit-image expects values from 0 to 1
     resized = transform.resize(unit, (height, width), order=interp_order, mode="constant", anti_aliasing=False)
     return (resized * (high - low) + low).astype(np.float32)
 
 
 def oversample(images: Sequence[Array] | Array, crop_dims: Extents) -> Array:
-    """Return ten crops (10 N, h, w, K) of each of N images of one size: corners, center, and the five mirrored."""
+    """Return ten crops of each of N images of one size, (10 N, h, w, K): corners, center, and these five mirrored."""
     height, width = (int(extent) for extent in crop_dims)
     rows, columns, channels = images[0].shape
     starts = [(top, left) for top in (0, rows - height) for left in (0, columns - width)]
@@ -242,7 +242,7 @@ def oversample(images: Sequence[Array] | Array, crop_dims: Extents) -> Array:
 
 
 def __getattr__(name: str) -> Any:
-    """Give what scripts take from Caffe's module because it imports it: ``resize``, ``zoom``, ``skimage``."""
+    """Return names that Caffe's module imports and that scripts use: ``resize``, ``zoom``, ``skimage``."""
     if name == "zoom":
         from scipy.ndimage import zoom
 

@@ -1,4 +1,4 @@
-"""Caffe's log on stderr, from the moment that pycaffe is imported, as glog writes it."""
+"""Writes Caffe's log to stderr in glog's format, from the import of pycaffe on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from netspec.terminal.commands import SEVERITIES, VARIABLE
 
 
 class _Stderr(logging.StreamHandler):
-    """Writes to what stderr is at the time."""
+    """Writes to the current stderr."""
 
     def __init__(self) -> None:
         logging.Handler.__init__(self)
@@ -27,7 +27,7 @@ _handler = _Stderr()
 
 
 def start() -> None:
-    """Show the log from the level on that the environment's GLOG_minloglevel says: 0 (INFO) to 3 (FATAL)."""
+    """Show the log from the level in the environment variable GLOG_minloglevel on: 0 (INFO) to 3 (FATAL)."""
     if _handler not in log.logger.handlers:
         log.logger.addHandler(_handler)
         log.logger.propagate = False
@@ -35,14 +35,14 @@ def start() -> None:
 
 
 def stop() -> None:
-    """Leave the log to the program's own handlers of the logger "netspec"."""
+    """Stop writing; the program's own handlers of the logger "netspec" still get the log."""
     log.logger.removeHandler(_handler)
     log.logger.propagate = True
     log.logger.setLevel(logging.NOTSET)
 
 
 def init_log(level: int | None = None, stderr: bool = True) -> None:
-    """Show the log from ``level`` on: 0 (INFO) to 3 (FATAL); it goes to stderr, whatever ``stderr`` says."""
+    """Show the log from ``level`` on: 0 (INFO) to 3 (FATAL). It always goes to stderr; ``stderr`` has no effect."""
     if level is not None:
         _set_level(level)
 

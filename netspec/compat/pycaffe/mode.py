@@ -24,7 +24,7 @@ class _Mode:
     device: int = 0
     warned: bool = False
     seed: int | None = None
-    nets: int = 0  # built since the seed was set
+    nets: int = 0  # nets built since the seed was set
     exact: str = SMALL
     multiprocess: bool = False
     solver_count: int = 1
@@ -36,12 +36,12 @@ _mode = _Mode()
 
 
 def set_mode_cpu() -> None:
-    """Use the CPU for nets that are built from now on."""
+    """Use the CPU for nets built from now on."""
     _mode.gpu = False
 
 
 def set_mode_gpu() -> None:
-    """Use the GPU for nets that are built from now on; without a GPU use the CPU, with one warning."""
+    """Use the GPU for nets built from now on; without a GPU, use the CPU, with one warning."""
     _mode.gpu = torch.cuda.is_available()
     if not _mode.gpu and not _mode.warned:
         _mode.warned = True
@@ -49,26 +49,26 @@ def set_mode_gpu() -> None:
 
 
 def set_device(device_id: int) -> None:
-    """Choose the GPU for nets that are built from now on, by its number."""
+    """Choose the GPU by its number, for nets built from now on."""
     if torch.cuda.is_available() and not 0 <= device_id < torch.cuda.device_count():
         raise ValueError(f"found device {device_id}, but torch finds {torch.cuda.device_count()} GPU(s) here")
     _mode.device = device_id
 
 
 def device() -> torch.device:
-    """Return where nets are built."""
+    """Return the device on which nets are built."""
     return torch.device("cuda", _mode.device) if _mode.gpu else torch.device("cpu")
 
 
 def set_random_seed(seed: int) -> None:
-    """Set the seed of random numbers: for fillers of later nets, and for Dropout and the like in present ones."""
+    """Set the seed of random numbers: for fillers of later nets, and for Dropout and the like in existing nets."""
     _mode.seed, _mode.nets = int(seed), 0
     for random in _mode.draws:
         random.restart(_mode.seed)
 
 
 def next_seed() -> int | None:
-    """Return the seed of the next net; None where none was set."""
+    """Return the seed of the next net; None if none was set."""
     if _mode.seed is None:
         return None
     _mode.nets += 1
@@ -87,16 +87,16 @@ def follow_seed(random: Random) -> None:
 
 
 def set_exact(choice: str) -> None:
-    """Set which sums equal Caffe's in every bit, in nets built from now on: "none", "small" or "all".
+    """Set which sums are bit-identical to Caffe's, in nets built from now on: "none", "small" or "all".
 
-    Not of Caffe; see netspec/exact/__init__.py.
+    Not in Caffe; see netspec/exact/__init__.py.
     """
     check_choice("exact", choice, CHOICES)
     _mode.exact = choice
 
 
 def exact() -> str:
-    """Return the choice of the last call of :func:`set_exact`."""
+    """Return the current setting of :func:`set_exact`."""
     return _mode.exact
 
 

@@ -1,4 +1,4 @@
-"""Ordered dictionaries by names of a prototxt, with the methods that scripts in Python 2 use."""
+"""Ordered dictionaries by name, with the methods that scripts in Python 2 use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Named(OrderedDict[str, T]):
-    """An OrderedDict that lists its names in the error for an unknown one."""
+    """An OrderedDict; the error for an unknown name lists the known ones."""
 
     def __init__(self, what: str = "name", items: Any = ()) -> None:
         self.what = what
@@ -27,7 +27,7 @@ class Named(OrderedDict[str, T]):
         return Named, (self.what, list(self.items()))
 
     def has_key(self, name: str) -> bool:
-        """Return whether there is such a name."""
+        """Return whether the name exists."""
         return name in self
 
     def iterkeys(self) -> Iterator[str]:
@@ -35,9 +35,9 @@ class Named(OrderedDict[str, T]):
         return iter(self.keys())
 
     def itervalues(self) -> Iterator[T]:
-        """Return an iterator over what is named."""
+        """Return an iterator over the values."""
         return iter(self.values())
 
     def iteritems(self) -> Iterator[tuple[str, T]]:
-        """Return an iterator over both."""
+        """Return an iterator over names and values."""
         return iter(self.items())

@@ -1,4 +1,4 @@
-"""Nets written in Python: each call of ``L.Convolution(bottom, num_output=20)`` is a layer, its results are its tops.
+"""Nets written in Python: a call such as ``L.Convolution(bottom, num_output=20)`` makes a layer and returns its tops.
 
     n = NetSpec()
     n.data = L.Input(shape=dict(dim=[1, 3, 224, 224]))
@@ -24,22 +24,22 @@ Name = Callable[["Top | Function"], str]
 
 
 class Top:
-    """One blob that a layer writes: the number ``n`` of the tops of ``fn``."""
+    """One blob that a layer writes: top number ``n`` of the layer ``fn``."""
 
     def __init__(self, fn: Function, n: int) -> None:
         self.fn = fn
         self.n = n
 
     def to_proto(self) -> Any:
-        """Return the net of all layers that this blob needs, with names made of the layers' types."""
+        """Return the net of all layers that this blob needs, named after their types."""
         return to_proto(self)
 
 
 class Function:
-    """A layer: its type, the tops it reads, and its parameters.
+    """A layer: its type, the tops that it reads, and its parameters.
 
-    ``ntop`` (1) is how many tops it writes; with ``in_place=True`` they are its bottoms. The other parameters are
-    fields of the message that its type has (``num_output`` of ``convolution_param``), or else of LayerParameter.
+    ``ntop`` (1) is the number of its tops; with ``in_place=True`` they are its bottoms. The other parameters are
+    fields of the message for its type (such as ``num_output`` in ``convolution_param``), or else of LayerParameter.
     Raises TypeError for an input that is not a Top.
     """
 
@@ -55,14 +55,14 @@ class Function:
         self.tops = tuple(Top(self, n) for n in range(self.ntop))
 
     def to_layer(self, bottoms: Iterable[str], name_of: Name) -> Any:
-        """Return the LayerParameter; ``name_of`` gives the names of tops and of a layer that has none."""
+        """Return the LayerParameter; ``name_of`` returns the names of tops, and of layers without a name."""
         layer = caffe_pb2.LayerParameter(type=self.type_name, bottom=bottoms)
         layer.top.extend(layer.bottom if self.in_place else [name_of(top) for top in self.tops])
         layer.name = name_of(self.tops[0] if self.tops else self)
         own = _own_message(layer, self.type_name)
         own_fields = layer.DESCRIPTOR.fields_by_name[own].message_type.fields_by_name if own else ()
         for name, value in self.params.items():
-            # As in Caffe, a field of both goes to the layer's own message, unless it is a message itself.
+            # As in Caffe, a field that exists in both goes to the layer's own message, unless it is a message itself.
             in_layer = name in layer.DESCRIPTOR.fields_by_name
             if name in own_fields and not (in_layer and name.endswith("param")):
                 assign_proto(getattr(layer, own), name, value)
@@ -87,12 +87,12 @@ class Function:
 
 
 def to_proto(*tops: Top) -> Any:
-    """Return the net of all layers that the tops need, with names made of the layers' types: ``Convolution1``."""
+    """Return the net of all layers that the tops need, named after their types: ``Convolution1``."""
     return _net(tops, {})
 
 
 class NetSpec:
-    """A net. Blobs and layers get the name of the attribute, or key, that they are assigned to."""
+    """A net. Blobs and layers are named after the attribute or key that they are assigned to."""
 
     tops: dict[str, Any]
 
@@ -103,7 +103,7 @@ class NetSpec:
         self.tops[name] = value
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # what copy and pickle ask an object for
+        if name.startswith("__"):  # attributes that copy and pickle look for
             raise AttributeError(name)
         if name not in self.tops:
             raise _NoSuchTop(f"the net has no top {name!r}{did_you_mean(name, list(self.tops))}")
@@ -117,15 +117,15 @@ class NetSpec:
     __delitem__ = __delattr__
 
     def keys(self) -> list[str]:
-        """Return the assigned names; as SSD has it."""
+        """Return the assigned names, as in SSD."""
         return list(self.tops)
 
     def vals(self) -> list[Any]:
-        """Return what was assigned; as SSD has it."""
+        """Return the assigned values, as in SSD."""
         return list(self.tops.values())
 
     def update(self, name: str, params: Mapping[str, Any]) -> None:
-        """Change parameters of the layer of a top; as SSD has it."""
+        """Change parameters of the layer of a top, as in SSD."""
         _function(self[name]).params.update(params)
 
     def to_proto(self) -> Any:
@@ -140,7 +140,7 @@ class _NoSuchTop(AttributeError, KeyError):
 
 
 def _net(wanted: Iterable[Top | Function], names: dict[Any, str]) -> Any:
-    """Return the net of the layers that some tops need, each layer behind those that it reads from."""
+    """Return the net of the layers that some tops need, each layer after those that it reads from."""
     autonames: Counter[str] = Counter()
     layers: dict[Function, Any] = {}
 
@@ -176,9 +176,9 @@ def _function(item: Any) -> Function:
 
 
 def assign_proto(proto: Any, name: str, value: Any) -> None:
-    """Set a field: a dict fills a message, a list a repeated field; a single value given to one becomes its only one.
+    """Set a field: a dict fills a message, a list a repeated field; a single value becomes a list of one.
 
-    Raises AttributeError for a field that the message does not have, TypeError or ValueError for a value that does not
+    Raises AttributeError for an unknown field, TypeError or ValueError for a value of the wrong type.
     suit it.
     """
     field = getattr(proto, name)
@@ -205,7 +205,7 @@ def _fill(message: Any, values: Mapping[str, Any]) -> None:
 
 
 def param_name_dict() -> dict[str, str]:
-    """Return the fields of LayerParameter that have a layer's parameters, by layer type: Convolution, convolution."""
+    """Return the fields of LayerParameter with a layer's parameters, without "_param", by layer type."""
     return _param_names(caffe_pb2.LayerParameter.DESCRIPTOR)
 
 
@@ -224,7 +224,7 @@ def _own_message(layer: Any, type_name: str) -> str:
 
 
 class Layers:
-    """``L``: ``L.Type(*bottoms, **params)`` gives the layer's top, a tuple of several, or without tops the layer."""
+    """``L``: ``L.Type(*bottoms, **params)`` returns the layer's top or tuple of tops, or the layer if it has none."""
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("__"):
@@ -238,7 +238,7 @@ class Layers:
 
 
 class Parameters:
-    """``P``: ``P.Pooling.MAX`` is the value MAX of the enums of PoolingParameter."""
+    """``P``: ``P.Pooling.MAX`` is the enum value MAX of PoolingParameter."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):

@@ -27,9 +27,9 @@ def has_nccl() -> bool:
 
 
 class NCCL:
-    """Joins the solvers of ``solver_count()`` processes that were given the same ``uid``.
+    """Connects the solvers of ``solver_count()`` processes with the same ``uid``.
 
-    Every process makes its own, having set its ``set_solver_rank``; the constructor waits for the others.
+    Every process calls ``set_solver_rank`` and then makes its own; the constructor waits for the others.
     """
 
     def __init__(self, solver: Solver, uid: bytes) -> None:
@@ -48,7 +48,7 @@ class NCCL:
         return f"netspec-{uuid.uuid4().hex}".encode()
 
     def bcast(self) -> None:
-        """Give every process the root's weights."""
+        """Copy the weights of the root to every process."""
         self._replicas.begin()
 
     def on_start(self) -> None:

@@ -1,4 +1,4 @@
-"""``caffe.SGDSolver`` and the others.
+"""``caffe.SGDSolver`` and the other solvers.
 
 Caffe: python/caffe/_caffe.cpp, src/caffe/solver.cpp
 """
@@ -44,7 +44,7 @@ class _Training(core_solver.Solver):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
-        self.net.largest_trained = math.inf  # blobs keep all tops in any case
+        self.net.largest_trained = math.inf  # blobs keep all tops anyway
         self._whole: WholeRun | None = None  # set after the first pass, if it is possible
         self.is_watched = bool(self.net.inputs) or any(
             isinstance(layer, Python)
@@ -111,7 +111,7 @@ class _Training(core_solver.Solver):
 
 
 class Solver:
-    """A training, from a solver's prototxt: ``get_solver(file)``, or ``SGDSolver(file)`` whatever type the file has.
+    """A training, from a solver's prototxt: ``get_solver(file)``, or ``SGDSolver(file)`` for any type in the file.
 
     The blobs of ``net`` and ``test_nets`` have the content of the last iteration; the diffs of parameters are the
     updates that it subtracted. Raises SpecError (a ValueError) for every fault of the files.
@@ -185,11 +185,11 @@ class Solver:
         self._training.snapshot()
 
     def share_weights(self, net: Net) -> None:
-        """Let a net use the training net's weights."""
+        """Make a net use the training net's weights."""
         net.share_with(self.net)
 
     def apply_update(self) -> None:
-        """Update the weights with the present gradients. Count an iteration if it is not counted yet."""
+        """Update the weights with the current gradients. Count an iteration if it is not counted yet."""
         self._training.apply_update()
         self._training.iteration -= self._counted
         self._counted = False
@@ -243,7 +243,7 @@ _SOLVERS = (SGDSolver, NesterovSolver, AdaGradSolver, RMSPropSolver, AdaDeltaSol
 
 
 def get_solver(solver_file: FilePath) -> Solver:
-    """Return the solver of the type that the file has."""
+    """Return a solver of the type in the file."""
     solver_file = os.fsdecode(solver_file)
     param, node = parse_solver(solver_file)
     for fault in rule_faults(param, node):

@@ -1,4 +1,4 @@
-"""Caffe's messages, where scripts look for them: ``from caffe.proto import caffe_pb2``."""
+"""Caffe's messages under the name that scripts import: ``from caffe.proto import caffe_pb2``."""
 
 from netspec.compat.pycaffe.proto import caffe_pb2
 

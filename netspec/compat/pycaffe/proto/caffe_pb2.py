@@ -1,7 +1,7 @@
-"""All messages and enums of Caffe's schema, and of the active dialects, under the names that protoc gives them.
+"""All messages and enums of Caffe's schema and of the active dialects, under the names that protoc generates.
 
-Nothing is generated and nothing is put into protobuf's default pool, so that another ``caffe_pb2`` in the process does
-not clash with this one. While no dialect is active, the classes are those of :mod:`netspec.proto.schema`.
+Nothing is generated, and nothing is added to protobuf's default pool, so another ``caffe_pb2`` in the process does
+not conflict with this one. If no dialect is active, the classes are those of :mod:`netspec.proto.schema`.
 Caffe: src/caffe/proto/caffe.proto
 """
 
@@ -42,7 +42,7 @@ def _file() -> Any:
 
 @cache
 def _names(file: Any) -> dict[str, Any]:
-    """Return what protoc would put into the module of a file, by name."""
+    """Return the names that protoc would generate for a file, with their values."""
     names: dict[str, Any] = {}
     for name, message in file.message_types_by_name.items():
         names[name] = message_factory.GetMessageClass(message)
