@@ -1,4 +1,4 @@
-"""Image files are classified by Transformer, mean and oversampling: drawn shapes that a net is trained on first."""
+"""Classify image files with a Transformer, a mean and oversampling; a net is first trained on drawn shapes."""
 
 import os
 import sys

@@ -1,8 +1,8 @@
-"""Train the words of siamese_words_256 in the net places further: by distillation, and with many negatives.
+"""Continue the training of the words of siamese_words_256 in the net places: by distillation, with many negatives.
 
 python distilled_words.py FOLDER ITERATIONS WEIGHTS LIST...: FOLDER has the files of trained_head.py, WEIGHTS are
-siamese_words_256.caffemodel, a LIST has batches of 64 pairs of views of 192x144 (docs/trained.md). It writes
-places.caffemodel again. The loss is that of trained_head.py, plus the difference between the cosines of a batch's views
+siamese_words_256.caffemodel, a LIST has batches of 64 pairs of views of 192x144 (docs/trained.md). It rewrites
+places.caffemodel. The loss is that of trained_head.py, plus the difference between the cosines of a batch's views
 and those of two teachers, the other words and the original net (Hinton, Vinyals, Dean: Distilling the Knowledge in a
 Neural Network).
 """
@@ -23,7 +23,7 @@ from netspec.inspect.features.describer import Describer
 from netspec.proto.text import read_net, write_text
 from netspec.solver.precision import has_bfloat16
 
-RATE, WARM, SCALE, VIEWS = 8e-4, 30, 15, 128  # rate of learning, and iterations until it is reached; views of a batch
+RATE, WARM, SCALE, VIEWS = 8e-4, 30, 15, 128  # learning rate, iterations until it is reached, and views per batch
 OWN = 0.3  # weight of the original net as a teacher
 folder, iterations, start, lists = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], [Path(n) for n in sys.argv[4:]]
 places = [folder / f"places.{kind}" for kind in ("prototxt", "caffemodel")]
@@ -53,7 +53,7 @@ others = (itself == 0).index_put((torch.arange(VIEWS), partner), torch.tensor(Fa
 for k in range(iterations):
     order = order or rng.permutation(len(views)).tolist()
     batch = order.pop()
-    cut = torch.zeros(VIEWS, 2, 3)  # a part of each view, in half of the batches seen in a mirror
+    cut = torch.zeros(VIEWS, 2, 3)  # a part of each view, mirrored in half of the batches
     cut[:, 0, 0] = cut[:, 1, 1] = torch.from_numpy(rng.uniform(0.8, 1, VIEWS))
     cut[:, :, 2] = torch.from_numpy(rng.uniform(-1, 1, (VIEWS, 2))) * (1 - cut[:, 0, :1])
     cut[:, 0, 0] *= rng.choice((-1, 1))
@@ -67,7 +67,7 @@ for k in range(iterations):
         loss = loss + functional.cross_entropy(cosines - itself, partner)
         learned = functional.log_softmax(cosines - itself, 1)
         loss = loss + functional.kl_div(learned, functional.softmax(like[batch] - itself, 1), reduction="batchmean")
-    for cosines in (whole, parts, (whole + parts) / 2):  # each pair against all others of the batch: first mistakes
+    for cosines in (whole, parts, (whole + parts) / 2):  # each pair against all others of the batch
         first = cosines[others].logsumexp(0) - cosines[torch.arange(VIEWS), partner]
         loss = loss + functional.softplus(first).mean() / 1.5
     optimizer.param_groups[0]["lr"] = RATE * min(1, (k + 1) / WARM) * (0.51 + 0.49 * np.cos(np.pi * k / iterations))

@@ -1,4 +1,4 @@
-"""A PyTorch model in Caffe's files: EfficientNet-Lite0 becomes a prototxt of BVLC's layers and a caffemodel."""
+"""Convert a PyTorch model to Caffe's files: EfficientNet-Lite0 as a prototxt with BVLC's layers and a caffemodel."""
 
 import sys
 from pathlib import Path
@@ -23,7 +23,7 @@ def conv(name, bottom, theirs, bn, halves=False, clip=True):
     """Append Convolution, BatchNorm, Scale and Clip, and note their weights: ``theirs`` and ``bn`` in PyTorch."""
     filters = weights[f"{theirs}.weight"][:, :: -1 if name == "stem" else 1]  # PyTorch's net takes RGB, Caffe's BGR
     shape = {"kernel_size": filters.shape[2] + halves, "pad": filters.shape[2] // 2, "stride": 1 + halves}
-    # To halve, TensorFlow pads one more below and right than above and left: a larger filter, first row and column 0.
+    # With stride 2, TensorFlow pads one more row below and column right: use a larger filter, first row and column 0.
     filters = np.pad(filters, ((0, 0), (0, 0), (halves, 0), (halves, 0)))
     group = len(filters) if filters.shape[1] == 1 else 1
     n[name] = L.Convolution(bottom, num_output=len(filters), group=group, bias_term=False, **shape)

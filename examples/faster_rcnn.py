@@ -1,7 +1,7 @@
-"""A small Faster R-CNN learns five images by heart, and finds the shapes in them: OUT/found.png.
+"""Train a small Faster R-CNN on five images until it finds the shapes in them: OUT/found.png.
 
 python faster_rcnn.py OUT [TRAIN TEST ITERATIONS]: the prototxts are faster_rcnn.prototxt, or those of py-faster-rcnn as
-they are, models/pascal_voc/ZF/faster_rcnn_end2end. These start from ImageNet's weights, here from random ones.
+they are, models/pascal_voc/ZF/faster_rcnn_end2end. Training starts from random weights, not from ImageNet's.
 """
 
 import os

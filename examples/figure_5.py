@@ -3,10 +3,10 @@
 python figure_5.py SEQUENCE_1 SEQUENCE_2 --weights table_1/.../siamese_resnet27_512_iter_3000.caffemodel
     --vocabulary OTHER_PLACE --out figure_5
 
-The sequences are of one place, in the layout of TUM RGB-D, with poses in one frame of reference; they become one walk.
+The sequences show one place, in the layout of TUM RGB-D, with poses in one frame of reference. They become one walk.
 FAB-MAP's vocabulary and tree are learned from images of another place. The report in OUT/report has the matrix of
-true loops, the matrix of each method, and precision against recall; the last lines say how long the methods take.
-Run it in a clone, or where a copy of its folder prototxt is.
+true loops, the matrix of each method, and precision against recall; the last lines have the times of the methods.
+Run it in a clone, or in a folder with a copy of the clone's folder prototxt.
 """
 
 import argparse
@@ -23,16 +23,16 @@ def parse() -> argparse.Namespace:
     """Return the arguments."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="+", type=Path)
-    parser.add_argument("--net", default="siamese_resnet27_512", help="a folder of prototxt/normalized (default: it)")
-    parser.add_argument("--weights", required=True, help="its trained weights")
+    parser.add_argument("--net", default="siamese_resnet27_512", help="folder in prototxt/normalized (%(default)s)")
+    parser.add_argument("--weights", required=True, help="trained weights of the net")
     parser.add_argument("--size", type=int, default=64, help="side of the images in pixels (default: 64)")
-    parser.add_argument("--vocabulary", required=True, help="images of another place: a folder or a sequence")
+    parser.add_argument("--vocabulary", required=True, help="folder or sequence with images of another place")
     parser.add_argument("--out", type=Path, default=Path("figure_5"), help="folder for all files (default: figure_5)")
     return parser.parse_args()
 
 
 def rows(path: Path) -> list[list[str]]:
-    """Return the rows of a file of TUM's: words, of which the first is a time."""
+    """Return the rows of a file in TUM's format, split into words; the first word is a time."""
     return [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
 
 
@@ -55,7 +55,7 @@ def join(sequences: list[Path], out: Path) -> None:
 
 
 def run(*words: object) -> None:
-    """Show a command and run it; leave with its status if it fails."""
+    """Print a command and run it; exit with its status if it fails."""
     command = [str(word) for word in words]
     print("$", shlex.join(command), flush=True)
     status = subprocess.run([sys.executable, "-m", *command], check=False).returncode

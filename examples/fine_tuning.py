@@ -1,4 +1,4 @@
-"""Fine-tuning: layers that keep their names start from trained weights, the renamed one learns other classes."""
+"""Fine-tuning: layers with the same name start from trained weights, and a renamed layer learns other classes."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""LeNet, written in Python and trained from Python: scikit-learn's digits through an LMDB, an update at a time."""
+"""LeNet, written and trained in Python, one update at a time, on scikit-learn's digits in an LMDB."""
 
 import os
 import sys

@@ -1,6 +1,6 @@
-"""A small MobileNet-SSD learns to find shapes: a database of boxes, a sampler, SSD's loss and average precision.
+"""Train a small MobileNet-SSD to find shapes: a database of boxes, a sampler, SSD's loss and average precision.
 
-python mobilenet_ssd.py OUT ITERATIONS: OUT/found.png shows what it finds in images that it never saw (400: a minute).
+python mobilenet_ssd.py OUT ITERATIONS: OUT/found.png shows the boxes found in new images (400 iterations: a minute).
 """
 
 import os

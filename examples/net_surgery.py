@@ -1,4 +1,4 @@
-"""Net surgery: a classifier of small images looks at each place of a large one; InnerProduct becomes Convolution."""
+"""Net surgery: turn InnerProduct into Convolution, so that a classifier of small images covers a large image."""
 
 import os
 import sys
@@ -36,7 +36,7 @@ small = caffe.Net("small.prototxt", caffe.TEST)
 small.params["fc2"][1].data[...] = np.linspace(-1, 1, 10)
 small.save("small.caffemodel")
 
-large = caffe.Net("large.prototxt", "small.caffemodel", caffe.TEST)  # conv1 comes along by its name
+large = caffe.Net("large.prototxt", "small.caffemodel", caffe.TEST)  # conv1 is copied by its name
 for fc, conv in zip(small.params["fc2"], large.params["fc2-conv"], strict=True):
     print(f"{fc.data.shape} -> {conv.data.shape}")
     conv.data.flat = fc.data.flat  # the weights lie in memory in the same order

@@ -1,4 +1,4 @@
-"""Layers in Python: one that reads data, and a loss with its gradient, in a net that learns a line."""
+"""Layers in Python: a data layer, and a loss with its gradient, in a net that learns a line."""
 
 import os
 import sys

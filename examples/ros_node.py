@@ -3,10 +3,10 @@
     python examples/ros_node.py image:=/camera/image_raw odom:=/odom _camera:=525,525,319.5,239.5
 
 in   image  sensor_msgs/Image (bgr8, rgb8, mono8);  odom  nav_msgs/Odometry
-out  loops  geometry_msgs/PoseWithCovarianceStamped: where a loop says that the robot is, on the corrected path
+out  loops  geometry_msgs/PoseWithCovarianceStamped: the position of the robot by a loop, on the corrected path
      path   nav_msgs/Path: all keyframes, corrected, after each loop
 parameters  ~camera FX,FY,CX,CY[,...];  ~describe (default);  ~mount x,y,z,qx,qy,qz,qw of the camera in the robot;
-            ~step, ~turn: a keyframe after so many meters, radians;  ~recent: not loops with the last so many seconds
+            ~step, ~turn: meters or radians between keyframes;  ~recent: no loops with the last so many seconds
 """
 
 import queue
@@ -27,8 +27,8 @@ from loopclosure.detector.export import LOOP_SIGMAS
 from loopclosure.detector.run import load_describe
 from loopclosure.places.intrinsics import from_text
 
-FORWARD = "0,0,0,-0.5,0.5,-0.5,0.5"  # a camera that looks forward: its z is the robot's x
-UNKNOWN = 1e6  # variance of what a loop does not measure
+FORWARD = "0,0,0,-0.5,0.5,-0.5,0.5"  # a camera that looks forward: its z axis is the robot's x axis
+UNKNOWN = 1e6  # variance of dimensions that a loop does not measure
 
 
 def after(pose, step):  # a pose (7,), tx ty tz qx qy qz qw, and one in its frame -> that in the world
@@ -76,7 +76,7 @@ class Node:
     def on_odometry(self, message):
         self.odometry = numbers(message.pose.pose)
 
-    def on_image(self, message):  # the newest image, and where the robot was; the work is the other thread's
+    def on_image(self, message):  # the newest image and the robot's position; another thread processes them
         if self.odometry is not None:
             with suppress(queue.Empty):
                 self.images.get_nowait()

@@ -1,6 +1,6 @@
-"""Images of shapes with their boxes, for mobilenet_ssd.py and faster_rcnn.py, and how well a net finds them.
+"""Draws images of shapes with their boxes for mobilenet_ssd.py and faster_rcnn.py, and judges what a net finds.
 
-A true box is a row of its kind (from 1) and x1, y1, x2, y2, parts of the image; a found one has its confidence second.
+A true box is a row: kind (from 1), x1, y1, x2, y2 as fractions of the image. A found box has its confidence second.
 """
 
 import cv2

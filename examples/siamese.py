@@ -1,4 +1,4 @@
-"""A Siamese net: two columns with the same weights learn where digits lie in the plane, and the picture shows it."""
+"""A Siamese net: two columns with shared weights learn to map digits to the plane, and a picture shows the result."""
 
 import os
 import sys
@@ -16,7 +16,7 @@ plt.switch_backend("Agg")
 
 
 def column(data, suffix):
-    def learned(name):  # both columns' parameters have these names, so they are the same
+    def learned(name):  # the parameters of both columns have these names, so they are shared
         return {"param": [{"name": f"{name}_w"}, {"name": f"{name}_b"}], "weight_filler": {"type": "xavier"}}
 
     hidden = L.InnerProduct(data, num_output=64, name=f"fc1{suffix}", **learned("fc1"))

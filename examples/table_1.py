@@ -4,12 +4,12 @@ python table_1.py --room desk_1 desk_2 --room kitchen --room hall_1 hall_2 --out
 
 Each --room has the sequences of one room, in the layout of TUM RGB-D, with poses in one frame of reference. The nets
 are trained on parts of all rooms and judged on other parts. With --leave-one-out, each room is also left out of a
-training once, and the nets are judged on it. Each command is shown before it runs. To go on after an interruption,
-start the script again with the same options: what is complete stays, and an unfinished training resumes.
+training once, and the nets are judged on it. Each command is printed before it runs. To continue after an interruption,
+start the script again with the same options: complete files are kept, and an unfinished training is resumed.
 
 The defaults suit a laptop. The paper's own size, on a GPU:
     --size 224 --batch 256 --iterations 30000 --train 30000 --validation 6000 --gpu 0
-Run it in a clone, or where a copy of its folder prototxt is.
+Run it in a clone, or in a folder with a copy of the clone's folder prototxt.
 """
 
 import argparse
@@ -35,25 +35,25 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--room", nargs="+", action="append", required=True, type=Path, metavar="SEQUENCE")
     parser.add_argument("--out", type=Path, default=Path("table_1"), help="folder for all files (default: table_1)")
     parser.add_argument("--nets", nargs="+", choices=NETS, default=NETS, help="the nets to train (default: all four)")
-    parser.add_argument("--seeds", type=int, default=1, help="trainings of each net (default: 1)")
+    parser.add_argument("--seeds", type=int, default=1, help="number of trainings of each net (default: 1)")
     parser.add_argument("--leave-one-out", action="store_true", help="also train without each room in turn")
     parser.add_argument("--size", type=int, default=64, help="side of the images in pixels (default: 64)")
-    parser.add_argument("--batch", type=int, default=32, help="pairs in an iteration (default: 32)")
+    parser.add_argument("--batch", type=int, default=32, help="pairs per iteration (default: 32)")
     parser.add_argument(
         "--iter-size", type=int, default=1, help="parts that a batch is computed in, to save memory (default: 1)"
     )
-    parser.add_argument("--iterations", type=int, default=3000, help="of each training (default: 3000)")
-    parser.add_argument("--train", type=int, default=6000, help="training pairs, at most (default: 6000)")
+    parser.add_argument("--iterations", type=int, default=3000, help="iterations of each training (default: 3000)")
+    parser.add_argument("--train", type=int, default=6000, help="largest number of training pairs (default: 6000)")
     parser.add_argument(
         "--validation", type=int, default=1200, help="validation pairs, at most, and as many test pairs (default: 1200)"
     )
-    parser.add_argument("--min-gap", default="1", help="seconds between the images of a pair, at least (default: 1)")
-    parser.add_argument("--gpu", help="the number of the GPU (default: the CPU)")
+    parser.add_argument("--min-gap", default="1", help="minimum seconds between the images of a pair (default: 1)")
+    parser.add_argument("--gpu", help="number of the GPU (default: the CPU)")
     return parser.parse_args()
 
 
 def run(*words: object) -> None:
-    """Show a command and run it; leave with its status if it fails."""
+    """Print a command and run it; exit with its status if it fails."""
     command = [str(word) for word in words]
     print("$", shlex.join(command), flush=True)
     status = subprocess.run([sys.executable, "-m", command[0].replace("-", "_"), *command[1:]], check=False).returncode
@@ -135,7 +135,7 @@ def train(arguments: argparse.Namespace, pairs: Path, test: Path, out: Path) -> 
 
 
 def row(out: Path, net: str, trained_on: str) -> dict[str, object]:
-    """Return the table's row of a net: means over its seeds, and the range of more than one."""
+    """Return the row of a net: means over its seeds, and their range if there are several."""
     files = sorted((out / trained_on.replace(" ", "_") / net).glob("seed_*/runs.json"))
     cells: dict[str, object] = {"net": net, "trained on": trained_on, "seeds": len(files)}
     for judged in ("validation", "test"):

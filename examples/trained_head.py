@@ -19,8 +19,8 @@ from loopclosure.places.frames import read_bgr
 from netspec.inspect.features.describer import Describer
 from netspec.proto.text import read_net, write_text
 
-RATE, WARM, SCALE, VIEWS = 2e-3, 30, 20, 128  # rate of learning, and iterations until it is reached; views of a batch
-LATE = 0.87  # from this share of the training on, each pair also competes with all other pairs of its batch
+RATE, WARM, SCALE, VIEWS = 2e-3, 30, 20, 128  # learning rate, iterations until it is reached, and views per batch
+LATE = 0.87  # after this share of the training, each pair also competes with all other pairs of its batch
 folder, iterations, lists = Path(sys.argv[1]), int(sys.argv[2]), [Path(name) for name in sys.argv[3:]]
 example = Path(__file__).with_suffix(".prototxt")
 many = Path(__file__).parents[1] / "prototxt" / "many_negatives" / "siamese_words_256"

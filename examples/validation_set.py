@@ -1,8 +1,8 @@
-"""The set on which descriptors are chosen: routes driven again in another season, and seen from other points.
+"""Makes the set on which descriptors are chosen: routes driven again in another season or from other viewpoints.
 
 python validation_set.py OUT SEQUENCES: SEQUENCES has a folder of images, in order, for each name below. Every second
 frame is a reference, the next one a query: OUT/outdoor and OUT/indoor have the queries in season/ and viewpoint/, and
-frame by frame the references in places/. docs/trained.md says what for.
+frame by frame the references in places/. docs/trained.md describes its use.
 """
 
 import sys
@@ -15,7 +15,7 @@ from lmdb_build.light import change_light
 from lmdb_build.views import cut_view
 
 FRAMES = 30  # references of each sequence, and as many queries
-# Public sequences, by the repositories they come from. None shows a place of another, and no net is trained on any.
+# Public sequences, by repository. None shows a place of another one, and no net is trained on any of them.
 SEQUENCES = {
     "outdoor": {
         "california_highway": "asensha08/Udacity-Project-4--Advanced-Lane-Finding",
@@ -49,7 +49,7 @@ for kind, names in SEQUENCES.items():
         for k, (reference, query) in enumerate(zip(images[::2], images[1::2], strict=False)):
             season, view = np.random.default_rng([*name.encode()]), np.random.default_rng([*name.encode(), k])
             about, size = view.uniform(0, 1, 2), query.shape[1::-1]
-            other = images[-1]  # a part of it may stand in front
+            other = images[-1]  # a part of it may cover the view
             views = {"places": reference, "season": change_light(query, lambda o=other: o, season)}
             views["viewpoint"] = cut_view(query, size, about, view)
             for part, image in views.items():

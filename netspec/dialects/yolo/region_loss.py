@@ -199,7 +199,7 @@ class Yolov3(_DarknetLoss):
         return first + [self.mask.index(n) for n in near if n in self.mask and n != left_out]
 
     def _move(self, moves: Array, cells: Array, shares: Array, n: int, label: int, place: Array) -> None:
-        """Say of anchor ``n`` of the mask, in the cell of a true box, what it shall be."""
+        """Set the desired values of anchor ``n`` of the mask in the cell of a true box."""
         p, map_size = self.settings, np.array(cells.shape[:1:-1], np.float32)
         column, row = (place[:2] * map_size).astype(int)
         at = (n, slice(None), row, column)
@@ -211,7 +211,7 @@ class Yolov3(_DarknetLoss):
         move[OBJECT] = -(1 - share[OBJECT]) * np.float32(p.object_scale if p.use_logic_gradient else 1)
         wanted, classes, eps = np.zeros(p.num_class, np.float32), share[CLASSES:], p.label_smooth_eps
         wanted[label] = 1
-        if move[CLASSES + label]:  # an earlier true box was for this anchor: its class is kept too
+        if move[CLASSES + label]:  # an earlier true box had this anchor: its class is kept, too
             step = p.class_scale * ((1 - eps) + eps / 2 - classes[label])
             move[CLASSES + label] = -step
         elif p.use_focal_loss:
@@ -232,7 +232,7 @@ class Yolov3(_DarknetLoss):
 
 
 class _Moved(torch.autograd.Function):
-    """The sum of the squares of moves / N; its gradient is given, as in the fork; it is not their derivative."""
+    """The sum of the squares of moves / N; its gradient is computed as in the fork, and is not the derivative."""
 
     @staticmethod
     def forward(ctx: Any, maps: torch.Tensor, moves: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:

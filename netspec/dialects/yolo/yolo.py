@@ -1,4 +1,4 @@
-"""YOLO in Caffe, versions 2 and 3: eric612/MobileNet-YOLO and its kin."""
+"""YOLO in Caffe, versions 2 and 3: eric612/MobileNet-YOLO and similar forks."""
 
 from __future__ import annotations
 
@@ -91,11 +91,11 @@ register("Yolov3", "yolov3_param")(Yolov3)
 
 
 class _YoloOutput(Layer):
-    """Base of the layers that turn YOLO's maps into detections, in the form of SSD's DetectionOutput.
+    """Base of the layers that turn YOLO's maps into detections, in the format of SSD's DetectionOutput.
 
-    A map has ``num_box`` boxes a cell, each of 5 + num_classes channels: x, y, width, height, object, classes. Boxes
-    overlapping a more confident one, of whatever label, by ``nms_threshold`` or more are dropped. The fork takes all
-    images of a batch for one; here each has its own detections.
+    A map has ``num_box`` boxes per cell, each with 5 + num_classes channels: x, y, width, height, object, classes. A
+    box that overlaps a more confident one of any label by ``nms_threshold`` or more is dropped. The fork treats all
+    images of a batch as one; here each image has its own detections.
     """
 
     group: str
@@ -131,7 +131,7 @@ class _YoloOutput(Layer):
         return as_array(maps).reshape(boxes, -1, *maps.shape[1:]).transpose(2, 3, 0, 1)
 
     def _detected(self, bottom: int, cells: Array) -> Array:
-        """Return the detections of a map: rows of label, confidence, x, y, width, height (d, 6), parts of the image."""
+        """Return the detections of a map (d, 6): label, confidence, x, y, width, height as fractions of the image."""
         raise NotImplementedError
 
     @staticmethod
@@ -165,12 +165,12 @@ def _anchors(param: Any, layer: Layer, group: str) -> Array:
 
 @register("YoloDetectionOutput", "yolo_detection_output_param")
 class YoloDetectionOutput(_YoloOutput):
-    """Turn YOLO v2's maps into detections: of each box its most probable class, times the probability of an object.
+    """Turn YOLO v2's maps into detections: the most probable class of each box, times the probability of an object.
 
-    Sizes are exp(w) and exp(h) of ``biases``, which count in cells.
+    Sizes are exp(w) and exp(h) times ``biases``, which are in cells.
 
     bottom[i]  (N, num_box (5 + num_classes), H, W)
-    top[0]     (1, 1, d, 7): image, label (from 1), confidence, xmin, ymin, xmax, ymax; (image, -1, ...) for none at all
+    top[0]     (1, 1, d, 7): image, label (from 1), confidence, xmin, ymin, xmax, ymax; (image, -1, ...) without any
     Fork: eric612/MobileNet-YOLO, src/caffe/layers/yolo_detection_output_layer.cpp
     """
 
@@ -200,11 +200,11 @@ class YoloDetectionOutput(_YoloOutput):
 class Yolov3DetectionOutput(_YoloOutput):
     """Turn YOLO v3's maps into detections: classes of boxes with a sufficient class times object probability.
 
-    Map i has the prior boxes that ``mask`` names in its i-th part; their ``biases`` count in pixels of an image of
+    Map i has the prior boxes in the i-th part of ``mask``; their ``biases`` are in pixels of an image of
     ``anchors_scale``[i] times the map's size.
 
     bottom[i]  (N, num_box (5 + num_classes), H, W)
-    top[0]     (1, 1, d, 7): image, label (from 1), confidence, xmin, ymin, xmax, ymax; (image, -1, ...) for none at all
+    top[0]     (1, 1, d, 7): image, label (from 1), confidence, xmin, ymin, xmax, ymax; (image, -1, ...) without any
     Fork: eric612/MobileNet-YOLO, src/caffe/layers/yolov3_detection_output_layer.cpp
     """
 
@@ -235,7 +235,7 @@ class Yolov3DetectionOutput(_YoloOutput):
 
 
 class _HardSigmoid(torch.autograd.Function):
-    """x / 5 + 1/2 between 0 and 1. The fork's gradient is 1/5 beyond them too: it looks at the top, not the bottom."""
+    """x / 5 + 1/2, clipped to 0..1. As in the fork, the gradient is 1/5 everywhere, because it tests the top."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
