@@ -1,4 +1,4 @@
-"""Each script of examples/ runs as it stands, and says what it is to show."""
+"""Each script of examples/ runs unmodified and prints the expected result."""
 
 import re
 import shutil

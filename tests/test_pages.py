@@ -1,4 +1,4 @@
-"""Every command and every Python snippet of the pages runs as it stands, in a copy of what playground.py makes.
+"""Every command and every Python snippet of the pages runs unmodified, in a copy of what playground.py makes.
 
 A block below ``<!-- not run: REASON -->`` is not run, nor are programs without a main() in ``PROGRAMS``: they install,
 measure for minutes or start these tests, and have tests of their own. tests/laws/test_documents.py parses all of them.

@@ -23,9 +23,9 @@ Main = Callable[[list[str]], int]
 
 @dataclass
 class Case:
-    """A command; its inputs are in the folder where it runs, its outputs in ``out`` there.
+    """A command; its inputs are in its working directory, its outputs in the folder ``out`` there.
 
-    ``check()`` reads the outputs and raises for what is broken; what it returns must always be the same, or None.
+    ``check()`` reads the outputs and raises for broken ones; its result must always be the same, or None.
     """
 
     main: Main
@@ -123,7 +123,7 @@ def walk_inputs() -> None:
 
 
 def check_report() -> object:
-    """Every file of the report is whole: pictures decode, the page ends, tables end with a line."""
+    """Every file of the report is complete: pictures decode, the page ends, tables end with a newline."""
     for path in sorted(Path("out").iterdir()):
         if path.suffix == ".png":
             assert cv2.imread(str(path)) is not None, f"{path} is no picture"

@@ -62,8 +62,8 @@ SOLVER = (Path(__file__).parent / "nets" / "solver.prototxt").read_text()
 class Format:
     """``write(path)`` writes a good file, ``read(path)`` reads it; ``path`` ends in ``suffix``.
 
-    Of a format whose file lies in a folder of its own, ``x``, ``inside`` is its name there. Where checksums would hide
-    most damage, ``open`` takes the file apart, and ``close`` makes one of damaged parts, whose checksums are right.
+    If the file of a format is in its own folder, ``x``, ``inside`` is its name there. If checksums would detect
+    most damage, ``open`` splits the file, and ``close`` makes a file with valid checksums from damaged parts.
     """
 
     suffix: str
@@ -74,7 +74,7 @@ class Format:
     close: Callable[[bytes], bytes] = bytes
 
     def good(self, folder: Path) -> bytes:
-        """Return the bytes of a good file, which is written to a folder."""
+        """Return the bytes of a good file after writing it to a folder."""
         path = folder / ("x" if self.inside else f"good{self.suffix}")
         if self.inside:
             shutil.rmtree(path, ignore_errors=True)
@@ -110,7 +110,7 @@ def unhashed(data: bytes) -> bytes:
 
 
 def hashed(data: bytes) -> bytes:
-    """Return the .extra file of damaged content, whose hash is right, if it is JSON at all."""
+    """Return an .extra file of damaged content with a valid hash, if the content is JSON."""
     try:
         return sealed(json.loads(data)).encode()
     except (ValueError, TypeError, RecursionError):
@@ -199,7 +199,7 @@ def all_rows(path: Path) -> None:
 
 
 def built(path: Path) -> None:
-    """Build a net without memory, data or files, and what it says."""
+    """Build a net without memory, data or files, and its messages."""
     message, source = parse_net_text(path.read_bytes().decode(errors="surrogateescape"), "net.prototxt")
     options = BuildOptions("meta", seed=0, open_data=False, write_files=False)
     repr(build_net(with_state(message, TEST, 0, ["x"]), source, options))
@@ -229,7 +229,7 @@ def members(data: bytes) -> bytes:
 
 
 def archive(parts: bytes) -> bytes:
-    """Return the zip archive of files that :func:`members` returned, whatever was done to them."""
+    """Return the zip archive of files as :func:`members` returns them, possibly damaged."""
     stream, made = io.BytesIO(parts), io.BytesIO()
     with zipfile.ZipFile(made, "w") as archive, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # two of one name

@@ -1,9 +1,9 @@
-"""Coverage-guided damage: libFuzzer, through atheris, looks for inputs that lead a reader to new places.
+"""Coverage-guided fuzzing: libFuzzer, through atheris, searches for inputs that reach new code in a reader.
 
     pip install -e ".[fuzz]"
     python tests/faults/fuzz.py FORMAT [libFuzzer's options, such as -runs=100000 or -max_total_time=60, and a corpus]
 
-What counts as a fault is said in mutate.py; its input is kept as ``crash-...`` in the working directory.
+mutate.py defines what counts as a fault; its input is written to ``crash-...`` in the working directory.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Commands that are killed again and again: is every file whole, is every process gone, and is all swept at the end?
+"""Kills commands again and again, and checks that files are complete, no process is left, and nothing else remains.
 
     python tests/faults/kill.py [--kills 200] [--seed 0] [COMMAND ...]
 
@@ -49,7 +49,7 @@ class Tally:
 
 
 def start(case: Case, slowly: bool = False) -> int:
-    """Fork a run of the command, quiet and in a session of its own, that may bring files to disk slowly."""
+    """Fork a run of the command, without output, in its own session; optionally, it writes files slowly."""
     child = os.fork()
     if child:
         return child
@@ -57,7 +57,7 @@ def start(case: Case, slowly: bool = False) -> int:
     null = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(null, stream)
-    netspec.files.whole_file._swept.clear()  # by this process: a new one knows nothing of that
+    netspec.files.whole_file._swept.clear()  # in this process, but not in new ones
     sync, status = os.fsync, 1
     if slowly:
         os.fsync = lambda descriptor: (time.sleep(0.01), sync(descriptor))[1]
@@ -90,7 +90,7 @@ def orphans(session: int, patience: float = 60.0) -> int:
 
 
 def kill_again_and_again(case: Case, kills: int, draw: random.Random) -> Tally:
-    """Run and kill the command in the working directory; tell what was lost."""
+    """Run and kill the command in the working directory; return what was lost."""
     Path("out").mkdir()
     case.prepare()
     began = time.monotonic()
@@ -103,7 +103,7 @@ def kill_again_and_again(case: Case, kills: int, draw: random.Random) -> Tally:
     Path("out").mkdir()
     tally, there = Tally(), False
     while tally.kills < kills:
-        remove_database()  # a database is never written over
+        remove_database()  # an existing database is never overwritten
         before = set(unfinished())
         wait = tally.kills % 2 == 1
         process = start(case, slowly=wait)
@@ -128,7 +128,7 @@ def kill_again_and_again(case: Case, kills: int, draw: random.Random) -> Tally:
             there = there and case.main is not lmdb_build.cli.main
             assert found == expected or (found is None and not there), "not what an undisturbed run writes"
             there = there or found is not None
-        except Exception as fault:  # whatever reading a broken file raises
+        except Exception as fault:  # any error from reading a broken file
             tally.broken.append(f"{type(fault).__name__}: {fault}")
     remove_database()
     os.waitpid(start(case), 0)

@@ -1,4 +1,4 @@
-"""Files that are damaged at random: does every reader end with one error of its own kind, soon, and with little memory?
+"""Damages files at random, and checks that every reader ends with its own error, soon, and with little memory.
 
     python tests/faults/mutate.py [--tries 1000] [--seed 0] [--keep FOLDER] [FORMAT ...]
 
@@ -66,7 +66,7 @@ def mutant(data: bytes, draw: random.Random) -> bytes:
 
 
 def ending(form: Format, folder: Path, data: bytes) -> str:
-    """Read the bytes; return "" or what went wrong."""
+    """Read the bytes; return "" or a description of the failure."""
     path = folder / f"x{form.suffix}"
     (path / form.inside if form.inside else path).write_bytes(data)
     try:
@@ -102,7 +102,7 @@ def run(form: Format, folder: Path, inputs: list[bytes]) -> dict[int, str]:
             _limit()
             for i in range(first, len(inputs)):
                 os.write(there, b"%d\n" % i)
-                signal.setitimer(signal.ITIMER_PROF, SECONDS)  # kills, whatever else the machine does
+                signal.setitimer(signal.ITIMER_PROF, SECONDS)  # kills the process even on a busy machine
                 signal.alarm(12 * SECONDS)
                 if said := ending(form, folder, inputs[i]):
                     os.write(there, f"{i} {said}\n".encode(errors="replace"))

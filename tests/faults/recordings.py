@@ -1,4 +1,4 @@
-"""Small sequences and bags, and what reads each to its end."""
+"""Small sequences and bags, and functions that read each to its end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""No room, or no leave, to write: one line, and the old file is whole."""
+"""A full disk, or no permission to write: one line of message, and the old file is unchanged."""
 
 import shutil
 import sys
@@ -26,7 +26,7 @@ MOST = 1500  # bytes of a file; all that the commands write is larger
 
 @contextmanager
 def full_disk() -> Iterator[None]:
-    """No file may become larger than a few bytes; the error is another one, its way is the same."""
+    """Limit files to a few bytes; the error differs from that of a full disk, but is handled in the same way."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (MOST, before[1]))
     try:
@@ -58,7 +58,7 @@ def test_a_full_disk(name: str, here: Path, capsys: pytest.CaptureFixture[str]) 
     with full_disk():
         assert case.main(case.words) == 1
     *_, line = capsys.readouterr().err.strip().splitlines()
-    assert "File too large" in line or "No space left on device" in line  # LMDB has words of its own
+    assert "File too large" in line or "No space left on device" in line  # LMDB has its own message
     assert contents() == before
 
 
@@ -130,7 +130,7 @@ layer { name: "o" type: "HDF5Output" bottom: "x" bottom: "y" hdf5_output_param {
 
 @pytest.fixture
 def output_net(here: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """``output_net(command)``: run it on a net with HDF5Output, where there is an older file."""
+    """``output_net(command)``: run it on a net with HDF5Output whose file exists already."""
     Path("net.prototxt").write_text(NET)
     Path("w.caffemodel").write_bytes(NetParameter(name="of no layer").SerializeToString())
     with h5py.File("out/o.h5", "w") as file:

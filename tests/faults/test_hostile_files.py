@@ -1,4 +1,4 @@
-"""Files that lie: about their size, about where their contents are, about what they are."""
+"""Files with false sizes, false offsets, or a false format."""
 
 import io
 import os
@@ -93,7 +93,7 @@ def test_an_hdf5_file_that_announces_too_much(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["link", "soft link", "stored", "virtual"])
 def test_an_hdf5_file_that_shows_what_lies_in_another(kind: str, tmp_path: Path) -> None:
-    """The other file is not read: its contents would come out of ``extract``, or of a snapshot."""
+    """The other file is not read; otherwise its contents would be in the output of ``extract`` or in a snapshot."""
     secret = tmp_path / "secret"
     with h5py.File(secret, "w") as file:
         file["data"] = np.arange(24.0).reshape(4, 6)
@@ -168,7 +168,7 @@ def test_a_name_that_no_file_has(name: str, tmp_path: Path, monkeypatch: pytest.
 
 
 def bomb(side: int) -> bytes:
-    """A black PNG of 1 bit per pixel, packed a thousand times; in color it has 24 times as many bytes."""
+    """A black PNG of 1 bit per pixel, compressed a thousand times; in color it has 24 times as many bytes."""
     header = b"IHDR" + side.to_bytes(4, "big") * 2 + b"\x01\x00\x00\x00\x00"
     body = b"IDAT" + zlib.compress(bytes(side * (side // 8 + 1)))
     parts = (header, body, b"IEND")
@@ -219,14 +219,14 @@ def test_a_cut_jpeg_is_accepted_by_nobody(tmp_path: Path) -> None:
 
 
 def part(name: bytes, body: bytes, size: int | None = None) -> bytes:
-    """A part of a PNG file, which may announce another size than it has."""
+    """A chunk of a PNG file, which may declare a false size."""
     length = len(body) if size is None else size
     return length.to_bytes(4, "big") + name + body + zlib.crc32(name + body).to_bytes(4, "big")
 
 
 @pytest.mark.parametrize("size", [5_000, (1 << 32) - 1])
 def test_a_png_part_that_announces_too_much(size: int, tmp_path: Path) -> None:
-    """OpenCV makes room for it first: 4 GiB."""
+    """OpenCV allocates memory for it first: 4 GiB."""
     header = part(b"IHDR", (24).to_bytes(4, "big") * 2 + b"\x08\x00\x00\x00\x00")
     body = part(b"IDAT", zlib.compress(bytes(24 * 25)), size)
     path = tmp_path / "x.png"
@@ -294,7 +294,7 @@ def test_hdf5_data_in_usual_packings(packing: dict[str, Any], tmp_path: Path) ->
 
 @pytest.mark.parametrize("seed", range(4))
 def test_any_lmdb_is_read_as_the_library_reads_it(seed: int, tmp_path: Path) -> None:
-    """Records of all sizes, written over, deleted, in several transactions."""
+    """Records of all sizes, overwritten and deleted in several transactions."""
     draw = np.random.default_rng(seed)
     with lmdb.open(str(tmp_path / "db"), map_size=1 << 26, lock=False) as env:
         for _ in range(6):
@@ -346,7 +346,7 @@ def test_a_database_that_is_changed_while_it_is_read(change: str, database: Path
 
 @pytest.mark.parametrize("backend", ["lmdb", "leveldb"])
 def test_a_database_that_was_written_to_is_opened_anew(backend: str, tmp_path: Path) -> None:
-    """A notebook goes on: only what was opened before is of yesterday."""
+    """A notebook continues: only databases that were opened earlier have old contents."""
     plyvel = pytest.importorskip("plyvel") if backend == "leveldb" else None
     path = str(tmp_path / "db")
     with Writer(path, backend) as writer:

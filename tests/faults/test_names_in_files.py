@@ -1,4 +1,4 @@
-"""Names from hell in everything that is written about a net: it parses, says the names, and nothing in it runs."""
+"""Hostile names in all files about a net: the files parse and contain the names, and no part of a name is executed."""
 
 import json
 import os
@@ -63,12 +63,12 @@ ENDINGS = {"onnx": "onnx", "torch": "py", "pt2": "pt2", "safetensors": "safetens
 
 
 def quoted(name: str) -> str:
-    """Return a name as a prototxt has it."""
+    """Return a name as it is written in a prototxt."""
     return '"' + "".join(f"\\{byte:03o}" for byte in name.encode()) + '"'
 
 
 def net(names: Iterator[str]) -> str:
-    """Return a net that has these names for itself, its blobs and its layers."""
+    """Return a net that uses these names for itself, its blobs and its layers."""
     own, data, other, label, conv, ip, loss, *layers = (quoted(next(names)) for _ in range(14))
     dims = "shape { dim: 2 dim: 3 dim: 6 dim: 6 }"
     return f"""name: {own}
@@ -85,7 +85,7 @@ layer {{ name: "split" type: "Slice" bottom: {ip} top: {quoted("tops" + "'" * 3)
 
 
 def nets() -> Iterator[str]:
-    """Yield nets in which each name stands in several places."""
+    """Yield nets that use each name in several places."""
     shuffled = random.Random(0)
     for start in range(0, len(NAMES), 9):
         names = NAMES[start:] + NAMES[:start]
@@ -94,7 +94,7 @@ def nets() -> Iterator[str]:
 
 
 class Page(HTMLParser):
-    """What of a page a browser would run, and its texts."""
+    """The texts of a page, and the parts that a browser would execute."""
 
     def __init__(self) -> None:
         super().__init__()

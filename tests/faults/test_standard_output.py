@@ -1,4 +1,4 @@
-"""What a command prints where nobody reads it, where there is no room, and names that are not in the encoding."""
+"""Standard output that nobody reads, that is full, or that cannot encode a name."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""The pages, and what a release says of itself: parsers take every command, links lead to files, versions agree."""
+"""The pages and the metadata of a release: parsers accept every command, links lead to files, versions agree."""
 
 import argparse
 import ast

@@ -1,4 +1,4 @@
-"""What every layer owes those who export: the same numbers elsewhere, or a reason why not."""
+"""Every layer can be exported with the same results, or gives a reason why not."""
 
 from pathlib import Path
 

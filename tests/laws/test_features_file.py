@@ -1,4 +1,4 @@
-"""features.npz is written by netspec and read by loopclosure, which know each other by docs/features.md alone."""
+"""features.npz, as netspec writes it and loopclosure reads it, agrees with docs/features.md."""
 
 import re
 from pathlib import Path

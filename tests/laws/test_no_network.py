@@ -1,4 +1,4 @@
-"""No command and no engine reaches for the network."""
+"""No command and no engine uses the network."""
 
 import os
 import socket

@@ -1,4 +1,4 @@
-"""What layers offer in addition to their forward pass is described once, by protocols; Layer itself has none of it."""
+"""Optional methods of layers are described once, by protocols; the class Layer has none of them."""
 
 import ast
 import inspect

@@ -1,4 +1,4 @@
-"""No option is ignored: each one of each command, given alone, is read, or refused by its name."""
+"""No option is ignored: every option of every command is read, or refused by name."""
 
 import argparse
 import ast

@@ -1,4 +1,4 @@
-"""Nets that train side by side read together what one reader reads: each record once, in order, equally transformed."""
+"""Parallel readers together read the records of a single reader: each once, in order, with the same transforms."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What every layer owes: a description, the shapes it declares, the gradient of what it computes, a word on misuse."""
+"""Every layer has a description, the declared shapes, a correct gradient, and a message for misuse."""
 
 import re
 from collections.abc import Iterator, Sequence

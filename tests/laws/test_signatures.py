@@ -1,6 +1,6 @@
-"""Public functions take one text where several are meant as one of them, and refuse a choice that there is not.
+"""Public functions accept a single text in place of a list of one, and refuse unknown choices.
 
-No function has more than six parameters, but the ones that are listed here with a reason.
+No function has more than six parameters, except those listed here with a reason.
 """
 
 import ast

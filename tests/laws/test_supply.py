@@ -1,4 +1,4 @@
-"""What comes with an installation: packages that fit together, with licenses that anyone may accept."""
+"""The packages of an installation: compatible versions and permissive licenses."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""A synthetic round trip that the tests of evaluation, report and detector share."""
+"""A synthetic round trip for the tests of evaluation, report and detector."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ PLACES = 20
 
 
 def blots(seed: int, height: int = 48, width: int = 64) -> np.ndarray:
-    """A picture that is unlike that of any other seed."""
+    """A picture that differs from that of any other seed."""
     rng = np.random.default_rng(seed)
     image = np.full((height, width, 3), 128, np.uint8)
     for _ in range(40):

@@ -1,4 +1,4 @@
-"""``loopclosure close`` on the synthetic walk, which knows truth and depth; and one false loop put in by hand."""
+"""``loopclosure close`` on the synthetic walk, with its true poses and depth, and with one false loop added."""
 
 import csv
 import io
@@ -83,7 +83,7 @@ def test_color_alone_mends_it_too_and_says_what_it_does_not_know(walk: Path, tmp
 
 
 def test_one_false_loop_is_survived(walk: Path, closed: tuple[str, Path], tmp_path: Path) -> None:
-    """Frame 40 is said to show the place of frame 5, and its picture is put there, so that the images agree."""
+    """The table has a loop of frames 40 and 5, and both have the same picture, so that the images agree."""
     lying = tmp_path / "lying"
     lying.mkdir()
     names = [line.split()[1] for line in (walk / "rgb.txt").read_text().splitlines()[3:]]
@@ -171,7 +171,7 @@ def test_without_a_camera_the_numbers_are_asked_for(two_laps: Path, tmp_path: Pa
 
 
 def test_fr1_rpy_where_the_camera_turns_gets_rotations_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From color alone; the camera's numbers are those of TUM, for images of half the size."""
+    """From color alone, with TUM's camera parameters for images of half the size."""
     folder = shared("data", "tum_fr1", "rgbd_dataset_freiburg1_rpy")
     (tmp_path / "loops.csv").write_text("query_id,match_id\n" + "".join(f"{i},{i - 90}\n" for i in range(120, 720, 40)))
     camera = "258.65,258.25,159.05,127.4,0.2624,-0.9531,-0.0054,0.0026,1.1633"
@@ -181,7 +181,7 @@ def test_fr1_rpy_where_the_camera_turns_gets_rotations_only(tmp_path: Path, caps
 
 
 def test_every_third_frame(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The table of ``detect WALK,stride=3`` counts the frames that were taken, and names them."""
+    """The table of ``detect WALK,stride=3`` numbers the selected frames, and has their names."""
     sequence = read_sequence(walk).with_poses()
     with (walk.parent / "loops.csv").open() as stream:
         ends = [(int(row["query_id"]) // 3, int(row["match_id"]) // 3) for row in csv.DictReader(stream)]

@@ -1,4 +1,4 @@
-"""``loopclosure close --graph``: anybody's pose graph, of thousands of poses, with false loops among the true ones."""
+"""``loopclosure close --graph``: pose graphs of thousands of poses, with true and false loops."""
 
 import csv
 import gzip
@@ -28,7 +28,7 @@ def entries(information: np.ndarray) -> str:
 
 
 def street(poses: int, seed: int = 0) -> np.ndarray:
-    """Poses (N, 7) of a drive of half a meter a pose through blocks of 20 m, back to where it was again and again."""
+    """Poses (N, 7) of a drive through blocks of 20 m, one every 0.5 m, which returns to earlier places many times."""
     rng = np.random.default_rng(seed)
     cell, heading, corners = np.zeros(2, int), 0, [np.zeros(2, int)]
     ways = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
@@ -50,7 +50,7 @@ def noisy(pose: np.ndarray, sigmas: tuple[float, float], rng: np.random.Generato
 
 
 def drive(poses: int, loops: int, false: int) -> tuple[np.ndarray, np.ndarray, list[Edge], list[Edge]]:
-    """The true path, that of the odometry, its steps, and loops of which the last ``false`` join any two places."""
+    """The true path, the odometry, its steps, and loops; the last ``false`` loops join random places."""
     rng = np.random.default_rng(1)
     truth = street(poses)
     steps = np.array([noisy(step, (0.02, 0.005), rng) for step in steps_between(truth)])
@@ -82,7 +82,7 @@ def test_a_drive_with_a_fifth_of_its_loops_false() -> None:
 
 @pytest.mark.slow
 def test_thousands_of_poses_take_few_steps_of_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """How long 20,000 take is in docs/closing.md; counted here is what does not depend on other programs."""
+    """docs/closing.md has the time for 20,000 poses; this test counts what does not depend on other load."""
     truth, path, odometry, loops = drive(5000, 500, 100)
     sizes = []
 
@@ -147,7 +147,7 @@ def test_comments_gaps_and_fixed_vertices(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_information_weighs_each_direction_of_each_edge(tmp_path: Path) -> None:
-    """Two edges disagree by 1 m along x and along y; each is trusted where its file says so."""
+    """Two edges differ by 1 m along x and along y; each has more information along one axis."""
     weights = [np.diag([9, 1, 1, 1, 1, 1.0]), np.diag([1, 9, 1, 1, 1, 1.0])]
     ends = ["1 0 0", "0 1 0"]
     lines = ["VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1", "VERTEX_SE3:QUAT 1 0 0 0 0 0 0 1"]
@@ -210,7 +210,7 @@ def test_no_other_option_belongs_to_a_graph(tmp_path: Path, capsys: pytest.Captu
 
 @pytest.mark.parametrize("flat", [False, True])
 def test_edges_alone_are_chained(tmp_path: Path, flat: bool) -> None:
-    """As SE-Sync's data sets are shipped: odometry in both directions, and a vertex that only a loop reaches."""
+    """As in SE-Sync's data sets: odometry in both directions, and a vertex that only a loop reaches."""
     truth = street(120)
     truth[:, 2] = 0
     truth[:, 3:] = Rotation.from_rotvec(0.1 * np.arange(120)[:, None] * [0, 0, 1]).as_quat()

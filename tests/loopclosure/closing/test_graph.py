@@ -1,4 +1,4 @@
-"""The pose graph: right derivatives, loops that mend drift, and false loops that do no harm."""
+"""The pose graph: correct derivatives, loops that correct drift, and false loops that do no harm."""
 
 import numpy as np
 import pytest
@@ -121,7 +121,7 @@ TURN = Rotation.from_euler("yx", [8, -3], degrees=True)
 
 
 def views(step: np.ndarray, depth: bool = False) -> tuple[View, View, np.ndarray]:
-    """Two views of points at 2 to 6 m; the second camera is turned and moved by ``step``. A quarter do not match."""
+    """Two views of points at 2 to 6 m; the second camera is moved by ``step``. A quarter does not match."""
     rng = np.random.default_rng(3)
     points = rng.uniform([-2, -1.5, 2], [2, 1.5, 6], (POINTS, 3))
     pixels, maps = [], []
@@ -196,7 +196,7 @@ def test_the_camera_of_smaller_images_and_of_text() -> None:
 
 @pytest.mark.parametrize(("ends", "spot"), [([(0, 40), (1, 39)], True), ([(0, 40), (15, 25)], False), ([], False)])
 def test_loops_in_one_spot_are_said_to_be(ends: list[tuple[int, int]], spot: bool) -> None:
-    """A way out of 20 m and back; loops at its beginning alone, or in the middle too."""
+    """A path of 20 m and back, with loops only at its beginning, or also in the middle."""
     poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (41, 1))
     poses[:, 0] = 20 - np.abs(np.arange(41) - 20)
     edges = [Edge(first, second, poses[0], np.eye(6)) for first, second in ends]

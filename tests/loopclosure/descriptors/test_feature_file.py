@@ -1,4 +1,4 @@
-"""features.npz: which descriptor is which image's, and what is said of files that do not fit."""
+"""features.npz: matching descriptors to images, and errors for files that do not match."""
 
 from pathlib import Path
 

@@ -28,7 +28,7 @@ LIGHT = 50 * np.random.default_rng(0).normal(size=(3, DIMENSIONS))
 
 
 def under_any_light(places: np.ndarray, seed: int) -> np.ndarray:
-    """The descriptors (N, D) of places, each seen in a light of its own."""
+    """The descriptors (N, D) of places, each in a different light."""
     rng = np.random.default_rng(seed)
     noise = 0.05 * rng.normal(size=places.shape)
     return (7 + places + rng.normal(size=(len(places), 3)) @ LIGHT + noise).astype(np.float32)
@@ -51,14 +51,14 @@ def laps() -> np.ndarray:
 
 @pytest.fixture
 def files(tmp_path: Path, training: np.ndarray, laps: np.ndarray) -> Path:
-    """A folder with laps.npz, named as the images of ``two_laps``, and other.npz, some of whose names are the same."""
+    """A folder with laps.npz, which has the image names of ``two_laps``, and other.npz, with some of them."""
     np.savez(tmp_path / "laps.npz", features=laps, names=np.array([f"rgb/{i}.png" for i in range(len(laps))]))
     np.savez(tmp_path / "other.npz", features=training, names=np.array([f"{i}.png" for i in range(len(training))]))
     return tmp_path
 
 
 def found(scores: np.ndarray) -> float:
-    """The share of the second lap's frames whose best frame of the first lap is the same place."""
+    """The share of frames of the second lap that match the same place in the first lap."""
     return float(np.mean(scores.argmax(axis=1) == np.arange(PLACES)))
 
 

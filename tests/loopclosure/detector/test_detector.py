@@ -1,4 +1,4 @@
-"""The detector: what it accepts, that it forgets nothing when saved, that growing it costs little."""
+"""The detector: what it accepts, that saving loses nothing, and that adding frames is cheap."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Loops as CSV and g2o: frames of reference, order of quaternions, and nothing invented."""
+"""Loops as CSV and g2o: frames of reference, order of quaternions, and no made-up poses."""
 
 import csv
 import os
@@ -94,7 +94,7 @@ def test_csv(tmp_path):
 
 
 def test_a_name_can_be_any_bytes(tmp_path):
-    """One that a spreadsheet would compute is written as a text, and read back."""
+    """A name that a spreadsheet would evaluate is written as text, and read back."""
     names = [os.fsdecode(name) for name in (b"=1+1.png", b"caf\xe9.png")]
     write_loops_csv(tmp_path / "loops.csv", [loop(1, 0)], names=names)
     assert b"caf\xe9.png,'=1+1.png" in (tmp_path / "loops.csv").read_bytes()

@@ -192,7 +192,7 @@ def test_one_adds_at_a_time_and_others_read(a_map: Map, drives: Path, tmp_path: 
 
 
 class Net(Thumbnailer):
-    """As a net, it says what describes."""
+    """Like a net, it has a fingerprint."""
 
     fingerprint = "a net"
 
@@ -248,7 +248,7 @@ def test_damage_is_one_line(damage, sentence: str, a_map: Map, tmp_path: Path) -
 
 
 def older(folder: Path) -> Path:
-    """Make it a map of format 1, and return where that has its projection."""
+    """Convert it to a map of format 1, and return the path of its projection."""
     (folder / "map.json").write_text('{"format": 1, "describer": "thumbnails"}')
     return folder / "projection.npz"
 
@@ -407,7 +407,7 @@ def test_a_projection_of_so_many_images_is_damaged(images: float, a_map: Map) ->
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_a_map_of_an_older_version_is_read_and_goes_on(a_map: Map, drives: Path) -> None:
-    """It named its sessions by their folders, and had the projection next to them."""
+    """It named sessions by their folders, and its projection was next to them."""
     a_map.add(read_sequence(drives / "b"), Thumbnailer())
     expected = Map(a_map.folder).detector(Thumbnailer()).descriptors
     (kept,) = a_map.folder.glob("projected-*")

@@ -1,4 +1,4 @@
-"""The detector over recordings: folders, sequences and videos, with any describe."""
+"""The detector on recordings: folders, sequences and videos, with any descriptor."""
 
 import sys
 
@@ -112,7 +112,7 @@ def test_describe_by_name(tmp_path, monkeypatch):
 
 
 def test_nothing_in_the_working_directory_runs_unnamed(tmp_path, monkeypatch):
-    """Not even a module of the name of one that an installed package imports."""
+    """Not even a module with the name of one that an installed package imports."""
     for name in ("my_describe", "wave", "sndhdr_of_mine"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('ran')")
     monkeypatch.chdir(tmp_path)
@@ -141,7 +141,7 @@ def test_a_video_that_is_shorter_than_it_says(tmp_path, monkeypatch):
 
 @pytest.fixture
 def installed(tmp_path, monkeypatch):
-    """A distribution that brings two describers, one of which cannot be imported."""
+    """A distribution with two describers; one of them cannot be imported."""
     info = tmp_path / "brings_describers-1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: brings-describers\nVersion: 1\n")

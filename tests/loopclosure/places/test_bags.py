@@ -41,7 +41,7 @@ def test_a_bag_becomes_a_sequence(name: str, ros: int, encoding: str, tmp_path: 
 
 @pytest.mark.slow
 def test_a_damaged_bag_is_one_line(tmp_path: Path) -> None:
-    """In the index, in a header, in a message, in the text beside it."""
+    """Damage in the index, in a header, in a message, in the text file next to it."""
     whole = Bag(tmp_path / "whole.bag", 1, "mono8", count=3).file.read_bytes()
     folder = Bag(tmp_path / "two", 2, "mono8", count=3).file
     text = (folder / "metadata.yaml").read_text()

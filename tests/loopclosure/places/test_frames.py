@@ -1,4 +1,4 @@
-"""Sources of frames: order, selection, and what is said of broken ones."""
+"""Sources of frames: order, selection, and errors for broken ones."""
 
 import os
 import subprocess
@@ -241,7 +241,7 @@ def test_a_video_that_cannot_be_decoded_says_so(begin: bytes, tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_of_a_video_that_cannot_be_decoded_nothing_else_is_printed(tmp_path: Path) -> None:
-    """FFmpeg prints lines of its own, unless it is told not to at the first video of a process."""
+    """FFmpeg prints its own messages unless they are disabled before the first video of a process."""
     (tmp_path / "drive.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42\x00\x00\x00\x00mp42isom" + bytes(range(256)) * 8)
     words = [sys.executable, "-m", "loopclosure", "detect", str(tmp_path / "drive.mp4"), "--out", str(tmp_path / "out")]
     done = subprocess.run(words, check=False, capture_output=True, text=True)

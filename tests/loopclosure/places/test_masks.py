@@ -1,4 +1,4 @@
-"""Masks and coordinates in every form they come in, and what is said of broken ones."""
+"""Masks and coordinates in every format, and errors for broken ones."""
 
 from pathlib import Path
 

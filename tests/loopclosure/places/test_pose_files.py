@@ -1,4 +1,4 @@
-"""Poses in the forms of TUM, KITTI and EuRoC: one path from each, and what is said where they look wrong."""
+"""Poses in the formats of TUM, KITTI and EuRoC give the same path, and a message if they look wrong."""
 
 from pathlib import Path
 

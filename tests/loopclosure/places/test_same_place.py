@@ -1,4 +1,4 @@
-"""The rule of the same place: its limits, and that one pair is judged as a whole matrix is."""
+"""The rule for the same place: its limits, and that a pair gives the same result as a matrix."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""TUM RGB-D files: what they hold, and what a broken line says."""
+"""TUM RGB-D files: their contents, and errors for broken lines."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The report: self-contained, the same in every form, and it says what it is judged by."""
+"""The report is self-contained, the same in every format, and states the rule of its truth."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""What --rerun writes is what Rerun itself calls whole."""
+"""Rerun accepts the files of --rerun as complete."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""The command ``check``: what a file builds, all that is wrong with it, and what is likely wrong."""
+"""The command ``check``: what a file builds, its errors, and likely mistakes."""
 
 import json
 from collections.abc import Callable
@@ -38,7 +38,7 @@ def test_check_prints_a_table(run: Run) -> None:
 
 @pytest.mark.slow
 def test_a_blob_that_many_layers_read(run: Run, tmp_path: Path) -> None:
-    """The widest line makes all lines wide: it lists no more blobs than people read."""
+    """The longest line determines the width, so it does not list all blobs."""
     net = tmp_path / "net.prototxt"
     net.write_text(
         'layer { name: "data" type: "Input" top: "b" input_param { shape { dim: 1 } } }\n'

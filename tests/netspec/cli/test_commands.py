@@ -1,4 +1,4 @@
-"""The commands, called as ``netspec`` calls them: what they do, say and end with."""
+"""The commands, called as ``netspec`` calls them: effects, messages and exit status."""
 
 import os
 import shutil
@@ -96,7 +96,7 @@ def test_missing_weights_are_reported_before_a_net_is_built(run: Run, words: lis
 
 @pytest.mark.slow
 def test_a_solver_without_max_iter_is_not_trained(run: Run, edited: Edit) -> None:
-    """Caffe trains nothing and ends well; load_solver and step(n) need none."""
+    """Caffe trains nothing and exits with 0; load_solver and step(n) need no max_iter."""
     solver = edited(SOLVER, "max_iter: 60", "")
     reported = "has no max_iter, so there is nothing to train; add max_iter: N, the number of iterations"
     assert run("train", solver).fault == f"{solver}: {reported}"

@@ -280,7 +280,7 @@ TRAINED = f"{INIT} was trained with transform_param {{ scale: 0.00390625 }}, but
 
 
 def conv1_of(run: Run, model: str, weights: str = INIT) -> tuple[np.ndarray, Any]:
-    """The blob "conv1" of the images, and what the command said."""
+    """The blob "conv1" of the images, and the messages of the command."""
     words = ["--model", model, "--weights", weights, "--blob", "conv1", "--images", "walk/rgb", "--out", "f.npz"]
     result = run("extract", *words)
     assert result.status == 0

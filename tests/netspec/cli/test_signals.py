@@ -1,4 +1,4 @@
-"""What a training does when a signal comes, and what it shows on a terminal."""
+"""Trainings react to signals and show their progress on a terminal."""
 
 import os
 import re
@@ -126,7 +126,7 @@ STARTS: dict[str, tuple[dict[str, Any], int]] = {
 
 @pytest.mark.parametrize("name", STARTS)
 def test_sigterm_stops_a_training_with_a_snapshot(name: str, endless) -> None:
-    """A scheduler takes 0 for the end of the work; under Caffe's names it is what Caffe's users expect."""
+    """For a scheduler, status 0 means that the work is done; under Caffe's names, its users expect 0."""
     program, status = STARTS[name]
     training = endless(*["--sigint_effect=none"] * (name == "netspec"), **program)
     training.wait_for("Iteration 10 ")
@@ -162,7 +162,7 @@ ENDLESS = (Path(__file__).parent / "programs" / "endless.py").read_text()
 
 
 def test_a_second_interrupt_ends_a_training_at_once(endless) -> None:
-    """The first would wait for the end of an iteration, which takes for ever here."""
+    """The first one waits for the end of the iteration, which never comes here."""
     Path("endless.py").write_text(ENDLESS)
     net = 'layer { name: "e" type: "Python" top: "e" python_param { module: "endless" layer: "Endless" } }'
     Path(SOLVER).write_text(f"net_param {{ {net} }} base_lr: 1 lr_policy: 'fixed' max_iter: 1 snapshot_prefix: 'x'")
@@ -212,7 +212,7 @@ WAYS = {
     ],
 )
 def test_a_training_ends_where_a_python_layer_has_a_process_of_its_own(way: str, layer: str, tmp_path: Path) -> None:
-    """A forked process has the handlers of the training, and is ended by SIGTERM all the same."""
+    """A forked process inherits the handlers of the training, but SIGTERM still ends it."""
     for name in ("prefetching.py", "train.py", "solver.prototxt"):
         text = (ROOT / "tests/netspec/cli/workers" / name).read_text()
         (tmp_path / name).write_text(text.replace("LAYER", layer))

@@ -106,7 +106,7 @@ def datums(*labels: int, shape: tuple[int, int, int] = (2, 3, 4), floats: bool =
 
 
 def packed(record: bytes) -> bytes:
-    """The same Datum with its floats packed, and a field that nobody knows in front."""
+    """The same Datum with its floats packed, after an unknown field."""
     datum = Datum.FromString(record)
     numbers = np.array(datum.float_data, "<f4").tobytes()
     datum.ClearField("float_data")

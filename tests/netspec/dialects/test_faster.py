@@ -40,7 +40,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def move(box: np.ndarray, delta: np.ndarray) -> np.ndarray:
-    """The box that a target describes: what the proposals do with what is learned."""
+    """The box that a target describes, as the proposals compute it from learned values."""
     sizes = box[2:] - box[:2] + 1
     center = box[:2] + sizes / 2 + delta[:2] * sizes
     half = np.exp(delta[2:]) * sizes / 2

@@ -1,4 +1,4 @@
-"""Dialects are found by name, by entry point and by path; what is wrong with one is said in one line."""
+"""Dialects are found by name, by entry point and by path; an error in one is reported in one line."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""The table of whose a layer is names what there is, and its warning is about the layers of this project only."""
+"""The table of forks and their layers names existing layers, and its warning is only about layers of this project."""
 
 from pathlib import Path
 

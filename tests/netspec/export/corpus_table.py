@@ -53,7 +53,7 @@ def difference(found: Arrays, expected: Arrays) -> str:
 
 
 def attempt(run: Callable[[], Arrays], expected: Arrays) -> str:
-    """Return the difference, or why there is none."""
+    """Return the difference, or the reason why there is none."""
     try:
         return difference(run(), expected)
     except Exception as fault:  # any error becomes a row of the table
@@ -67,7 +67,7 @@ def free_sizes(model: object) -> str:
 
 
 def row(net: Net) -> Mapping[str, str]:
-    """Return what became of a net, by target."""
+    """Return the result of a net for each target."""
     inputs = random_inputs(net)
     expected = here(calibrated(net, inputs), inputs)
     found: dict[str, str] = {}
@@ -87,7 +87,7 @@ def row(net: Net) -> Mapping[str, str]:
 
 
 def is_deploy(path: Path) -> bool:
-    """Say whether a file is a net that starts from inputs, and from nothing else."""
+    """Return whether a file is a net with inputs and without data layers."""
     try:
         types = [layer.type for layer in netspec.proto.text.read_net(path).layer]
     except netspec.SpecError:  # a solver
@@ -96,7 +96,7 @@ def is_deploy(path: Path) -> bool:
 
 
 def is_close(found: str) -> bool:
-    """Say whether a difference is below 1e-5."""
+    """Return whether a difference is below 1e-5."""
     return bool(re.fullmatch(r"\d\.\de[-+]\d\d", found)) and float(found) < 1e-5
 
 

@@ -1,4 +1,4 @@
-"""What is shipped: folded nets give the same numbers, with fewer layers, and other programs read them."""
+"""Folded nets give the same results with fewer layers, and other programs read them."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What is said of a file that is not there."""
+"""Messages about missing files."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The file that tells programs what a training's tests found and which snapshots it took."""
+"""The file with a training's test results and snapshots, for other programs."""
 
 from pathlib import Path
 

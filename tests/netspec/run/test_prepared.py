@@ -1,4 +1,4 @@
-"""Runs without gradients: prepared, folded and fused, they give what a layer-by-layer run gives, whoever writes."""
+"""Runs without gradients: prepared, folded and fused, they give the results of a layer-by-layer run after any write."""
 
 import copy
 import subprocess

@@ -1,4 +1,4 @@
-"""A training that is resumed goes on as if it had never stopped: same weights, same log, to the last bit."""
+"""A resumed training continues as if it had never stopped: same weights, same log, to the last bit."""
 
 import json
 import logging

@@ -319,7 +319,7 @@ layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "label" top: "lo
 
 @pytest.mark.parametrize("where", ["after the gradients", "between two updates"])
 def test_an_interrupt_comes_after_the_iteration(make, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
-    """Ctrl-C in Python leaves a training that goes on as if nothing had happened."""
+    """After Ctrl-C in Python, a training can continue as if nothing had happened."""
     with h5py.File("records.h5", "w") as file:
         file["data"] = np.random.default_rng(0).normal(size=(7, 3)).astype("f4")
         file["label"] = np.zeros((7, 2), "f4")

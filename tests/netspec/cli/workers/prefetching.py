@@ -1,4 +1,4 @@
-"""Python layers that read ahead in a process of their own, as those of the R-CNN generation do."""
+"""Python layers that prefetch in a separate process, like those of R-CNN."""
 
 import atexit
 import multiprocessing

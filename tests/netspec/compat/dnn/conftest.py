@@ -1,4 +1,4 @@
-"""The dialects that these nets switch on are off again after each file of tests."""
+"""Dialects that these nets activate are deactivated after each file of tests."""
 
 import sys
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What docs/coming-from-opencv.md says of the differences from OpenCV 4."""
+"""The differences from OpenCV 4 in docs/coming-from-opencv.md."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Net of netspec.dnn where it goes beyond OpenCV's, or answers wrong use."""
+"""Net of netspec.dnn: features that OpenCV does not have, and errors for wrong use."""
 
 from collections.abc import Callable
 from pathlib import Path

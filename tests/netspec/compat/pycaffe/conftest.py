@@ -1,4 +1,4 @@
-"""How tests of pycaffe make nets: from text, in a folder of their own, which is the working directory."""
+"""Makes nets for tests of pycaffe, from text, in a temporary working directory."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What BVLC Caffe computed, computed again through caffe.Net and the solvers: their passes are not netspec's own."""
+"""Results of BVLC Caffe, repeated with caffe.Net and its solvers, because their passes differ from netspec's own."""
 
 import json
 from collections.abc import Callable, Iterator

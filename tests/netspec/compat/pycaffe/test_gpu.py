@@ -1,4 +1,4 @@
-"""pycaffe on a GPU, a fake one: it shows tensors on the wrong device, and missing copies."""
+"""pycaffe on a fake GPU, which reveals tensors on the wrong device and missing copies."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -119,7 +119,7 @@ def test_in_place_layers_leave_the_last_writers_values(net_of: Callable[..., caf
 
 @pytest.mark.parametrize("held", [False, True])
 def test_in_place_layers_keep_what_their_gradient_needs(net_of: Callable[..., caffe.Net], held: bool) -> None:
-    """Scale's gradient reads what it has overwritten: Caffe keeps a copy, however scripts look at the blob."""
+    """The gradient of Scale reads what Scale has overwritten: Caffe keeps a copy, even if scripts view the blob."""
     text = INPUT + (
         'layer { name: "twice" type: "Power" bottom: "data" top: "x" power_param { scale: 2 } }'
         'layer { name: "scale" type: "Scale" bottom: "x" top: "x" scale_param { filler { value: 3 } } }'
@@ -204,7 +204,7 @@ READS = 'layer { name: "d" type: "HDF5Data" top: "x" hdf5_data_param { source: "
 )
 @pytest.mark.parametrize("alone", [False, True])
 def test_a_backward_pass_reads_draws_and_keeps_nothing(net_of: Callable[..., caffe.Net], net: str, alone: bool) -> None:
-    """Also where it comes before a forward pass, when autograd has not watched any."""
+    """Also before any forward pass, when autograd has recorded nothing."""
     with h5py.File("x.h5", "w") as file:
         file["x"] = np.arange(1, 9, dtype=np.float32).reshape(8, 1)
     Path("list").write_text("x.h5")
@@ -251,7 +251,7 @@ def test_split_copies_and_reshaped_blobs_lie_in_one_memory(net_of: Callable[...,
 
 
 def test_blobs_in_one_memory_may_be_maps_of_one_pixel(net_of: Callable[..., caffe.Net]) -> None:
-    """Torch gives such maps strides that its copies take for an overlap."""
+    """Torch's copies misinterpret the strides of such maps as an overlap."""
     net = net_of(
         """
         force_backward: true
@@ -287,7 +287,7 @@ def test_backward_belongs_to_the_last_forward(net_of: Callable[..., caffe.Net]) 
 
 
 def test_backward_reads_what_scripts_wrote_since(net_of: Callable[..., caffe.Net]) -> None:
-    """Caffe's backward reads data and weights where they lie: between the passes, scripts may change them."""
+    """Caffe's backward pass reads data and weights from memory: between the passes, scripts may change them."""
     text = INPUT + (
         'layer { name: "relu" type: "ReLU" bottom: "data" top: "relu" }'
         'layer { name: "fc" type: "InnerProduct" bottom: "relu" top: "fc" inner_product_param { num_output: 2 '
@@ -357,7 +357,7 @@ def test_deep_dream_climbs(net_of: Callable[..., caffe.Net]) -> None:
 
 
 def test_net_surgery(net_of: Callable[..., caffe.Net], write: Callable[..., str]) -> None:
-    """An InnerProduct's weights, poured into a convolution, give the same scores at each place."""
+    """The weights of an InnerProduct, copied to a Convolution, give the same scores at each position."""
     dense = net_of(
         INPUT + 'layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc" inner_product_param '
         '{ num_output: 5 weight_filler { type: "xavier" } bias_filler { type: "uniform" } } }'

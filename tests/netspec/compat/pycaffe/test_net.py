@@ -1,4 +1,4 @@
-"""caffe.Net: what Caffe's own test_net.py checks, in our words and on our nets."""
+"""caffe.Net: the checks of Caffe's test_net.py, on other nets."""
 
 from collections import OrderedDict
 from collections.abc import Callable

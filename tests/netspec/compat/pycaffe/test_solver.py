@@ -107,7 +107,7 @@ def test_blobs_show_each_iteration(solver: caffe.SGDSolver) -> None:
 
 @pytest.mark.parametrize("net", [SMALL, MEMORY], ids=["constant labels", "data in memory"])
 def test_steps_at_once_leave_what_single_steps_leave(net: str, write: Callable[..., str]) -> None:
-    """Within a call only its last pass fills the blobs, unless somebody can look at them, or has written to one."""
+    """Within a call only the last pass fills the blobs, unless code can read them, or has written to one."""
     write(net)
     rng = np.random.default_rng(0)
     data, labels = rng.random((12, 2, 6, 6), np.float32), rng.integers(5, size=12).astype(np.float32)
@@ -210,7 +210,7 @@ def test_debug_info_logs_what_netspecs_own_solver_logs(
 
 
 def shown(solver: caffe.Solver) -> dict[str, np.ndarray]:
-    """Copies of all that a script can see."""
+    """Copies of everything that a script can read."""
     seen = {
         f"{name}/{what}": getattr(blob, what) for name, blob in solver.net.blobs.items() for what in ("data", "diff")
     }
@@ -224,7 +224,7 @@ def shown(solver: caffe.Solver) -> dict[str, np.ndarray]:
 def test_single_steps_leave_in_the_blobs_what_passes_from_layer_to_layer_do(
     case: str, work_in: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bit by bit where all is computed in Caffe's order; otherwise kernels may round otherwise than autograd."""
+    """Bit by bit if everything is computed in Caffe's order; otherwise kernels may round differently than autograd."""
     monkeypatch.setattr("netspec.fast.training.LARGEST", 2**10)  # pycaffe has no limit
     monkeypatch.setattr(mode, "exact", lambda: "all")
     with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""How tests of ``netspec run`` start a Python in a folder of their own."""
+"""Starts Python in a temporary folder for tests of ``netspec run``."""
 
 import os
 import subprocess

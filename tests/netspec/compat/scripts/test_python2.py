@@ -112,7 +112,7 @@ HALF = "def half(n):\n    return n / 2\n"
 
 
 def test_modules_around_a_program_are_python_2_with_it(run: Run, tmp_path: Path) -> None:
-    """Numbers would be others in silence: nothing in these modules is of one language only."""
+    """Otherwise results would change silently, because these modules are valid in both languages."""
     places = ("bin/beside.py", "bin/pack/below.py", "lib/put.py", "lib/sub/deep.py", "given/elsewhere.py")
     names = ("beside", "pack.below", "put", "sub.deep", "three", "true", "elsewhere")
     program = f"import sys; sys.path.insert(0, 'lib')\nimport {', '.join(names)}\n"
@@ -140,7 +140,7 @@ def test_with_true_division_it_stays() -> None:
 
 
 def test_a_call_that_raised_is_not_made_again_and_its_line_is_named(run: Run) -> None:
-    """What it did before it raised would be done twice."""
+    """Otherwise, its effects before the exception would happen twice."""
     program = """import socket
 calls = []
 def faulty(data):

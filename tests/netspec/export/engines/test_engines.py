@@ -1,4 +1,4 @@
-"""Nets that an engine runs have torch's numbers; what it cannot do, torch does, and a line says so."""
+"""Nets run by an engine give torch's results; torch runs what the engine cannot, with a message."""
 
 import logging
 import shutil
@@ -376,7 +376,7 @@ def test_a_damaged_model_is_made_again(
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize("precision", choice.PRECISIONS)
 def test_signals_are_handled_after_nets_of_openvino_are_gone(precision: str) -> None:
-    """Each net's OpenVINO has a signal stack of its own; the first one's would stay where the second one goes last."""
+    """OpenVINO has a signal stack for each net; the first one must not remain after the second one is deleted."""
     pytest.importorskip("onnx")
     pytest.importorskip("openvino")
     done = subprocess.run([sys.executable, "-c", FIRST_GOES_FIRST, precision], capture_output=True, text=True)
