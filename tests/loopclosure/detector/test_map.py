@@ -322,7 +322,7 @@ def test_nothing_is_written_through_a_link(name: str, a_map: Map, drives: Path, 
         target.mkdir()
     (a_map.folder / name).symlink_to(target)
     before = contents(mine)
-    with pytest.raises(SpecError, match=f"M/{name}: is a link|M/{name}: is no lock"):
+    with pytest.raises(SpecError, match=f"M/{name}: is a symbolic link|M/{name}: is not a lock file"):
         a_map.add(read_sequence(drives / "b"), Thumbnailer())
     assert contents(mine) == before
     (a_map.folder / name).unlink()

@@ -173,7 +173,7 @@ def test_recent_images_have_log_odds_but_no_posterior() -> None:
     ("settings", "message"),
     [
         ({"version": 3}, "versions 1 and 2, not 3"),
-        ({"version": 2, "new_place": "mean_field"}, "no mean field"),
+        ({"version": 2, "new_place": "mean_field"}, "mean_field needs version 1"),
         ({"new_place": "sample"}, 'not "sample"'),
         ({"hit": 0.2, "false_alarm": 0.3}, "false_alarm < hit"),
         ({"samples": -1}, "samples is -1"),
