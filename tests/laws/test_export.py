@@ -22,7 +22,7 @@ from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text
 
 NOT_IN_ONNX = {"DummyData": "random", "HDF5Output": "writes a file", "Python": "code"}
-NOT_IN_TORCH = NOT_IN_ONNX | {"InfogainLoss": "matrix of weights", "Accuracy": "each class"}
+NOT_IN_TORCH = NOT_IN_ONNX | {"InfogainLoss": "infogain matrix", "Accuracy": "each class"}
 DATA = [name for name in TYPES if getattr(layer_class(name), "reads_data", False)]
 
 
