@@ -9,8 +9,10 @@ nothing, and a sequence without a verified pair is rejected.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.run import verdicts_said
@@ -18,7 +20,7 @@ from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
 from loopclosure.methods.candidates import Candidates, Compared, candidates, far_apart
-from loopclosure.methods.decision import decide
+from loopclosure.methods.decision import WINDOW, decide
 from loopclosure.methods.decoys import elsewhere
 from loopclosure.methods.geometry import Agree, Geometry, Matches, verify
 from loopclosure.methods.lines import Lines, best_lines, pool
@@ -28,6 +30,7 @@ from loopclosure.places.pose_files import read_poses
 from loopclosure.progress import Progress, silent, timed
 
 PRECISION = 0.99
+NEAR_A_STOP = 2  # frames, of those in which the camera moves
 TRIED = 10  # matches that a user who wants more may look at first
 
 
@@ -92,9 +95,8 @@ def _results(
     given: Candidates, matches: Matches, loops: np.ndarray, verdicts: list[str], stamps: np.ndarray | None
 ) -> list[LoopResult]:
     """Return the result of each query of the whole drive: that of the frame that stands for it."""
-    results = []
-    for query, row in enumerate(given.stands):
-        match = _match_between(given, matches, loops, query, row)
+    results, looked_at = [], given.references[matches.match]
+    for query, (row, match) in enumerate(zip(given.stands, places(given, matches, loops).tolist(), strict=True)):
         score, inliers, verdict = float(matches.score[row]), int(matches.inliers[row]), verdicts[row]
         stamp = np.nan if stamps is None else float(stamps[query])
         results.append(
@@ -104,23 +106,35 @@ def _results(
                 match if verdict == "accepted" else None,
                 verdict,
                 score,
-                inliers if inliers >= 0 and given.queries[row] == query else None,
+                inliers if inliers >= 0 and (query, match) == (given.queries[row], looked_at[row]) else None,
                 None if np.isnan(stamp) else stamp,
             )
         )
     return results
 
 
-def _match_between(given: Candidates, matches: Matches, loops: np.ndarray, query: int, row: int) -> int:
-    """Return the match of a frame of the whole drive, -1 without one: between those of the frames around it."""
-    if not matches.there[row]:
-        return -1
-    match, after = int(given.references[matches.match[row]]), row + 1
-    if query == given.queries[row] or after == len(loops) or not loops[[row, after]].all():
-        return match
-    following = int(given.references[matches.match[after]])
-    share = (query - given.queries[row]) / (given.queries[after] - given.queries[row])
-    return match + round(share * (following - match))
+def places(given: Candidates, matches: Matches, loops: np.ndarray) -> np.ndarray:
+    """Return the match (N,) of each query of the whole drive, -1 without one.
+
+    Where cameras stand, or drive through a tunnel in which all looks the same, one frame stands for many, and which
+    of them matches which is not known there and one frame further: they are spread between the matches on both sides.
+    """
+    frames, match = np.append(given.queries, len(given.stands)), given.references[matches.match]
+    unsure = _near_a_stop(given.queries) & _near_a_stop(given.references)[matches.match]
+    sure = loops & (~unsure | (matches.evidence >= 1))
+    places = np.where(matches.there, match, -1)[given.stands]
+    for first, last in pairwise(np.flatnonzero(sure).tolist()):
+        between = slice(first, last + 1)
+        line = np.interp(np.arange(first, last + 1), (first, last), matches.match[[first, last]])
+        if loops[between].all() and np.abs(matches.match[between] - line).max() <= WINDOW:
+            numbers = np.arange(frames[first], frames[last])
+            places[numbers] = np.rint(np.interp(numbers, frames[[first, last]], match[[first, last]]))
+    return places
+
+
+def _near_a_stop(frames: np.ndarray) -> np.ndarray:
+    """Return which of the frames (n,) in which a camera moved stand for several, or are near such a frame."""
+    return maximum_filter1d(np.diff(frames, append=frames[-1] + 1) > 1, 2 * NEAR_A_STOP + 1, mode="constant")
 
 
 def _verified_said(matches: Matches, geometry: Geometry) -> str:

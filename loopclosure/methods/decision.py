@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -12,6 +14,7 @@ from loopclosure.methods.lines import LEAST_ACCEPTED, Lines
 from loopclosure.methods.seqslam import SequenceSettings
 
 WINDOW = 5  # references to each side of a line, and at least so many queries along it, where a loop has neighbors
+MOST = 0.5  # of the matches between two loops are on one line with them, where it goes on between them
 UNLIKELY = 0.05  # that so many matches in a row are not verified, at the share that is
 
 
@@ -25,6 +28,7 @@ def decide(matches: Matches, lines: Lines | None) -> np.ndarray:
     seeds = matches.line & (many | (np.bincount(label, verified & matches.line)[label] > 0))
     by_line = grown(seeds, lines.above_decoys & (matches.match == lines.match), pairs)
     loops = by_line & ~contradicted(by_line, verified, pairs, lines.sequence.length)
+    loops |= between(loops, lines.match, lines.sequence) & (matches.match == lines.match)
     # From afar a place is seen before the camera is there: other queries fit it better.
     loops |= lines.near & (matches.evidence >= DOUBTLESS)
     return grown(loops, lines.near & verified, pairs)
@@ -65,6 +69,21 @@ def contradicted(loops: np.ndarray, verified: np.ndarray, pairs: np.ndarray, len
             if len(run) <= length and (1 - share) ** len(run) < UNLIKELY:
                 against[run] = True
     return against
+
+
+def between(loops: np.ndarray, match: np.ndarray, sequence: SequenceSettings) -> np.ndarray:
+    """Return the queries (Q,) between two loops of one line whose matches are on it, as at least half of them are.
+
+    Nothing leads a match there but the place itself, though its score is no greater than chance makes some.
+    """
+    filled = np.zeros_like(loops)
+    for first, last in pairwise(np.flatnonzero(loops).tolist()):
+        way, moved = last - first, match[last] - match[first]
+        if way > 1 and sequence.slowest * way - WINDOW <= moved <= sequence.fastest * way + WINDOW:
+            line = match[first] + moved * np.arange(1, way) / way
+            on = np.abs(match[first + 1 : last] - line) <= WINDOW
+            filled[first + 1 : last] = on & (np.mean(on) >= MOST)
+    return filled
 
 
 def stretches(loops: np.ndarray, pairs: np.ndarray) -> np.ndarray:

@@ -119,7 +119,7 @@ def _standardized(given: Candidates, which: np.ndarray) -> np.ndarray:
     distances = np.where(which, -given.scores, np.nan)
     if not given.two:
         distances = np.where(which.T, distances.T, distances)
-    return standardize(distances)
+    return standardize(distances, usual=True)
 
 
 def sequences(among: Pool, two: bool) -> Iterator[SequenceSettings]:
@@ -138,7 +138,7 @@ def search(given: Candidates, among: Pool, sequence: SequenceSettings) -> Lines:
     count, width = among.found.shape
     blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
     parts = [_search_rows(given, among, sequence, rows) for rows in blocks]
-    match, targets, alone, decoys, owner, middle, chance = (
+    match, targets, alone, decoys, owner, middle, chance, spread = (
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
     # A line that lies partly past the end of a loop has one wholly inside within half its length.
@@ -147,6 +147,9 @@ def search(given: Candidates, among: Pool, sequence: SequenceSettings) -> Lines:
     crossed = 2 * sequence.length + 1 if among.backwards else 0
     chances = np.maximum(0, among.decoys.sum(axis=1) - crossed).sum()
     odds = max(1.0, among.found.sum() / max(1, chances))
+    # Where chance lines differ more than usual, as of frames in one season, so much more is needed.
+    usual = np.median(spread[spread > 0]) if np.any(spread > 0) else 1.0
+    targets, alone, decoys = (scores / np.maximum(1.0, spread / usual) for scores in (targets, alone, decoys))
     targets = np.where(np.isfinite(decoys), targets, -np.inf)  # of what has no decoy nothing is known
     return Lines(sequence, np.where(np.isneginf(targets), -1, match), targets, alone, decoys, near, odds)
 
@@ -169,11 +172,13 @@ def _search_rows(given: Candidates, among: Pool, sequence: SequenceSettings, row
     chance = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in middle])
     if among.backwards:
         decoys = _scores(among.distances[:, ::-1], among.decoys[:, ::-1], sequence, rows)[:, ::-1]
-        decoys[np.abs(np.arange(decoys.shape[1]) - match[:, None]) <= reach] = -np.inf
     else:
         decoys = _scores(among.distances, among.decoys, sequence, rows)
+    spread = np.array([row[np.isfinite(row)].std() if np.isfinite(row).any() else 0.0 for row in decoys])
+    if among.backwards:
+        decoys[np.abs(np.arange(decoys.shape[1]) - match[:, None]) <= reach] = -np.inf
     alone = own[numbers, given.single[rows.start : rows.stop]]
-    return match, targets, alone, decoys.max(axis=1), owner, middle[numbers, match], chance
+    return match, targets, alone, decoys.max(axis=1), owner, middle[numbers, match], chance, spread
 
 
 def _scores(distances: np.ndarray, which: np.ndarray, sequence: SequenceSettings, rows: range) -> np.ndarray:

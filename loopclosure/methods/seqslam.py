@@ -110,25 +110,37 @@ def enhance_contrast(distances: np.ndarray, window: int = 10, valid: np.ndarray 
     return enhanced - np.nanmin(enhanced)
 
 
-def standardize(distances: np.ndarray) -> np.ndarray:
+def standardize(distances: np.ndarray, usual: bool = False) -> np.ndarray:
     """Give each row, then each column of distances (Q, R) mean 0 and deviation 1 over what is not NaN.
 
     A query that is unlike all references, and a reference that is like all queries, then count as any other: what
     another season does to descriptors. Memory is that of the result, in the precision of ``distances``.
+
+    usual  no deviation counts as less than the median of all rows, or columns: a frame without a loop, or a black one,
+           differs so little from all others that its small differences would look like loops
     """
     result = distances.copy()
     for along in (result, result.T):
-        for first in range(0, len(along), BLOCK):
-            rows = along[first : first + BLOCK]
-            known = np.isfinite(rows)
-            count = np.maximum(known.sum(axis=1, keepdims=True), 1)
-            mean = np.where(known, rows, 0).sum(axis=1, keepdims=True) / count
-            centered = np.where(known, rows - mean, 0)
-            deviation = np.sqrt(np.square(centered).sum(axis=1, keepdims=True) / count)
-            differ = deviation > 1e-12 * np.abs(mean)  # rounding, see enhance_contrast
-            scaled = np.divide(centered, deviation, out=np.zeros_like(centered), where=differ)
-            rows[:] = np.where(known, scaled, np.nan)
+        blocks = [along[first : first + BLOCK] for first in range(0, len(along), BLOCK)]
+        deviations = np.concatenate([_centered(rows) for rows in blocks])
+        if usual and np.isfinite(deviations).any():
+            deviations = np.maximum(deviations, np.nanmedian(deviations))
+        for first, rows in zip(range(0, len(along), BLOCK), blocks, strict=True):
+            deviation = deviations[first : first + BLOCK, None]
+            np.divide(rows, deviation, out=rows, where=deviation > 0)
     return result
+
+
+def _centered(rows: np.ndarray) -> np.ndarray:
+    """Subtract from rows (n, R) their means, in place, and return their deviations (n,), NaN where nothing is known."""
+    known = np.isfinite(rows)
+    count = known.sum(axis=1)
+    mean = np.where(known, rows, 0).sum(axis=1) / np.maximum(count, 1)
+    rows -= mean[:, None]
+    deviation = np.sqrt(np.square(np.where(known, rows, 0)).sum(axis=1) / np.maximum(count, 1))
+    rounding = deviation <= 1e-12 * np.abs(mean)  # see enhance_contrast
+    rows[rounding] = np.where(known[rounding], 0, np.nan)
+    return np.where(count > 0, np.where(rounding, 0.0, deviation), np.nan)
 
 
 def _neighbors(size: int, reach: int) -> Sequence[tuple[slice, slice]]:

@@ -124,7 +124,6 @@ def test_detect_chooses_by_itself(tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="the line through a loop is followed too far before its first frame", strict=True)
 def test_loops_of_a_drive_that_cannot_be_verified_are_right(tmp_path):
     line = ["detect", str(drive_that_comes_back(tmp_path)), "--describe", THUMBNAILS, "--out", str(tmp_path / "found")]
     assert main(line) == 0

@@ -266,6 +266,16 @@ def test_standardized_distances() -> None:
     np.testing.assert_allclose(scaled[:, 0].std(), 1)
 
 
+def test_a_deviation_that_is_less_than_usual_counts_as_usual() -> None:
+    """Rows of deviation 1, 3 and 9, then three columns that differ as much."""
+    rows = np.array([[-1.0, 1.0, 0.0], [-3.0, 0.0, 3.0], [0.0, 9.0, -9.0]]) * np.sqrt(1.5)
+    usual = rows / [[3], [3], [9]]
+    usual -= usual.mean(axis=0)
+    deviations = usual.std(axis=0)
+    expected = usual / np.maximum(deviations, np.median(deviations))
+    np.testing.assert_allclose(standardize(rows, usual=True), expected, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
