@@ -35,6 +35,14 @@ SMALL = (64, 32)
 NOISE = 4.0  # gray levels, camera noise between frames at one position
 SEASONS, SAME = (2, 3), 0
 WALKS = (41, 42)  # seeds
+# Rendered after the last constant was fixed, and judged once: seed, frames, laps and rooms of each walk.
+RENDERED = {
+    "two laps, the second in another light": (101, 200, 2, 4),
+    "there, and back in reverse": (102, 100, 1, 4),
+    "once through a large house": (103, 160, 1, 12),
+    "slow, two laps": (104, 300, 2, 4),
+    "fast, three laps": (105, 120, 3, 4),
+}
 GAP = 30  # frames nearer than this in one drive are not a loop
 # The families of the first half, by place; all others are the second. What is chosen on one is judged on the other.
 FIRST_HALF = (
@@ -65,7 +73,12 @@ class Drive:
 
 
 def drives(data: Path, work: Path, only: Sequence[str] = ()) -> Iterator[Drive]:
-    """Yield the drives of all or some families in the folder ``data``; images are written to ``work``."""
+    """Yield the drives of all or some families in the folder ``data``; images are written to ``work``.
+
+    Those of the family "rendered" are no part of all: they are asked for by name.
+    """
+    if "rendered" in only:
+        yield from _rendered(work)
     routes = {}
     with (data / "sequences" / "index.csv").open(encoding="utf-8") as table:
         for row in csv.DictReader(table):
@@ -113,7 +126,11 @@ def _room(folders: Sequence[Path]) -> DataSet:
     """Make one drive of sequences in one frame of reference, one after the other."""
     parts = [read_sequence(folder, "tum") for folder in folders]
     paths = [path for part in parts for path in part.paths]
-    poses = np.concatenate([part.poses for part in parts if part.poses is not None])
+    return _posed(paths, np.concatenate([part.poses for part in parts if part.poses is not None]))
+
+
+def _posed(paths: Sequence[Path], poses: np.ndarray) -> DataSet:
+    """Make one drive of images with poses (N, 7), NaN where not known: these images are left out."""
     known = np.flatnonzero(np.all(np.isfinite(poses), axis=1))
     posed = Poses(poses[known, :3], poses[known, 3:])
     hard, soft = (same_place_matrix(posed, posed, MAX_DISTANCE_M, angle) for angle in (MAX_ANGLE_DEG, SOFT_DEG))
@@ -190,13 +207,29 @@ def _of_walk(seed: int, size: tuple[int, int], work: Path) -> Iterator[Drive]:
         yield Drive(name, f"season {season}{end}", load_sequence(replace(first, paths=tuple(images)), references=first))
 
 
-def walked(work: Path, seed: int, size: tuple[int, int], frames: int = 300, laps: int = 2) -> Path:
-    """Return the folder of a synthetic walk in ``work``."""
+def walked(work: Path, seed: int, size: tuple[int, int], walk: Walk | None = None) -> Path:
+    """Return the folder of a synthetic walk in ``work``: two laps of 300 frames, or another."""
     folder = work / f"walk_{seed}_{size[0]}"
+    walk = walk or Walk(frames=300, width=size[0], height=size[1], laps=2, seed=seed)
     if not (folder / "rgb.txt").exists():
-        for _ in write_walk(folder, Walk(frames=frames, width=size[0], height=size[1], laps=laps, seed=seed)):
+        for _ in write_walk(folder, walk):
             pass
     return folder
+
+
+def _rendered(work: Path) -> Iterator[Drive]:
+    """Yield five walks through houses that no setting was chosen on."""
+    for kind, (seed, frames, laps, rooms) in RENDERED.items():
+        walk = read_sequence(walked(work, seed, (160, 120), Walk(frames, 160, 120, laps, rooms, seed)), "tum")
+        paths, poses = list(walk.paths), walk.poses
+        assert poses is not None
+        if "light" in kind:
+            lap = frames // laps
+            paths[lap:] = in_season(paths[lap:], work / f"walk_{seed}_160", SEASONS[0])
+        elif "reverse" in kind:
+            back = in_season(paths, work / f"walk_{seed}_160", SAME)
+            paths, poses = paths + back[::-1], np.concatenate([poses, poses[::-1]])
+        yield Drive("rendered", kind, _posed(paths, poses))
 
 
 def _traverses(queries: list[Path], there: np.ndarray, references: list[Path], here: np.ndarray) -> DataSet:

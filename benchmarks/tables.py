@@ -18,6 +18,7 @@ from benchmarks import results
 from benchmarks.drives import walked
 from benchmarks.pages import RESULTS
 from benchmarks.settings import Kept
+from lmdb_build.walk.sequence import Walk
 from loopclosure.evaluate import Outcome, judge
 from loopclosure.methods.base import MethodContext
 from loopclosure.methods.named import make_method
@@ -67,7 +68,7 @@ def data_set(name: str, data: Path, work: Path) -> DataSet:
     if name == "corridor_loop":
         return load_folder(data / name / "samples", data / name / "samples_GT.bmp")
     if name == "walk":
-        sequence = read_sequence(walked(work, WALK, (160, 120), frames=400, laps=3), "tum")
+        sequence = read_sequence(walked(work, WALK, (160, 120), Walk(400, 160, 120, laps=3, seed=WALK)), "tum")
         return load_sequence(sequence, exclusion=Exclusion(seconds=10.0))
     return load_place_pairs(data / "place_pairs" / {"SPED": "SPED_Test"}.get(name, name))
 

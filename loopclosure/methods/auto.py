@@ -85,7 +85,11 @@ def answer(
     rejected = np.where(matches.inliers >= 0, "not verified", "below threshold")
     verdicts = np.where(loops, "accepted", np.where(matches.there, rejected, "no candidate"))
     results = _results(given, matches, loops, verdicts.tolist(), compared.stamps)
-    reasons = [*filter(None, [given.said, age_said]), _sequences_said(lines, given.far), said]
+    reasons = [
+        *filter(None, [given.said, age_said]),
+        _sequences_said(lines if matches.line.any() else None, given.far),
+        said,
+    ]
     there = sum(bool(result.candidates) for result in results)
     reasons.append(_total_said(sum(map(bool, results)), there, given))
     return Answer(results, reasons)

@@ -23,12 +23,15 @@ def decide(matches: Matches, lines: Lines | None) -> np.ndarray:
     if lines is None:
         return matches.evidence >= SURE
     pairs, verified = neighbors(matches.match, lines.sequence), matches.evidence >= 1
+    if not matches.line.any():
+        return grown(matches.evidence >= SURE, verified, pairs)
     label = stretches(matches.line, pairs)
     many = np.bincount(label, matches.line)[label] >= LEAST_ACCEPTED
     seeds = matches.line & (many | (np.bincount(label, verified & matches.line)[label] > 0))
-    by_line = grown(seeds, lines.above_decoys & (matches.match == lines.match), pairs)
+    of_line = matches.match == lines.match
+    by_line = grown(seeds, lines.above_decoys & of_line, pairs)
     loops = by_line & ~contradicted(by_line, verified, pairs, lines.sequence.length)
-    loops |= between(loops, lines.match, lines.sequence) & (matches.match == lines.match)
+    loops |= between(loops, lines.match, lines.sequence) & of_line
     # From afar a place is seen before the camera is there: other queries fit it better.
     loops |= lines.near & (matches.evidence >= DOUBTLESS)
     return grown(loops, lines.near & verified, pairs)

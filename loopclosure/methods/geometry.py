@@ -42,14 +42,14 @@ class Matches:
 
     @classmethod
     def of(cls, given: Candidates, lines: Lines | None, precision: float) -> Matches:
-        """Return the match of each query by its line, or else its best candidate."""
+        """Return the match of each query by its line, or, where lines tell nothing, its best candidate."""
         count = len(given.queries)
         known = given.known().max(axis=1) if given.scores.size else np.full(count, -np.inf)
         match, score, line = np.where(np.isfinite(known), given.single, -1), known, np.zeros(count, bool)
-        if lines is not None:
+        if lines is not None and np.any(accepted := lines.accepted(precision)):
             there = lines.match >= 0
             match = np.where(there, lines.match, match)
-            score, line = np.where(there, lines.targets, -np.inf), lines.accepted(precision)
+            score, line = np.where(there, lines.targets, -np.inf), accepted
         return cls(match, score, line, np.full(count, -1), np.zeros(count), np.zeros(count, bool))
 
     @property
@@ -122,11 +122,12 @@ def _left(given: Candidates) -> list[tuple[int, int]]:
 
 
 def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: Geometry, progress: Progress) -> None:
-    """Verify the match of each query, or else its best single image, which then becomes its match."""
-    there = np.flatnonzero(matches.there)
+    """Verify the match of each query, or else its best single image or line, which then becomes its match."""
+    there, by_line = np.flatnonzero(matches.there), bool(matches.line.any())
+    instead = given.single if by_line or lines is None else np.where(lines.match >= 0, lines.match, given.single)
     for query in progress(there, "verification", len(there)):
         # The lamps of a tunnel repeat: one verified image does not overrule an accepted sequence.
-        other = matches.match if matches.line[query] else given.single
+        other = matches.match if matches.line[query] else instead
         for reference in dict.fromkeys((int(matches.match[query]), int(other[query]))):
             agreement = geometry.agree(int(query), reference)
             matches.inliers[query] = geometry.check.enough(agreement)
@@ -135,6 +136,6 @@ def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: G
             if matches.inliers[query]:
                 if reference != matches.match[query]:
                     matches.match[query] = reference
-                    if lines is not None:
-                        matches.score[query] = lines.alone[query]
+                    alone = lines.alone[query] if by_line and lines is not None else given.scores[query, reference]
+                    matches.score[query] = alone
                 break

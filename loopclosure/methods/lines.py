@@ -197,13 +197,16 @@ def _owner(column: np.ndarray, row: int, reach: int) -> int:
 
 
 def best_lines(given: Candidates, among: Pool, precision: float) -> Lines | None:
-    """Return the search that finds the most loops at this precision; None if none finds any."""
+    """Return the search that finds the most loops at this precision, the shortest lines if none finds any.
+
+    None if the drive is too short for lines.
+    """
     chosen, most = None, 0
     for sequence in sequences(among, given.two):
         if most and np.count_nonzero(given.there) * NEARLY <= most:
             break  # no other can find more
         found = search(given, among, sequence)
         count = np.count_nonzero(found.accepted(precision))
-        if count * NEARLY > most:
+        if chosen is None or count * NEARLY > most:
             chosen, most = found, count
     return chosen
