@@ -1,6 +1,6 @@
 """The paper's Figure 5 on your own sequences: a net, FAB-MAP 2.0 and thumbnails find the loops of one walk.
 
-python figure_5.py SEQUENCE_1 SEQUENCE_2 --weights table_1/.../siamese_resnet27_512_iter_3000.caffemodel
+python3 figure_5.py SEQUENCE_1 SEQUENCE_2 --weights table_1/.../siamese_resnet27_512_iter_3000.caffemodel
     --vocabulary OTHER_PLACE --out figure_5
 
 The sequences show one place, in the layout of TUM RGB-D, with poses in one frame of reference. They become one walk.

@@ -1,6 +1,6 @@
 """The paper's Table I on your own sequences: pairs, databases, trainings, and the table.
 
-python table_1.py --room desk_1 desk_2 --room kitchen --room hall_1 hall_2 --out table_1
+python3 table_1.py --room desk_1 desk_2 --room kitchen --room hall_1 hall_2 --out table_1
 
 Each --room has the sequences of one room, in the layout of TUM RGB-D, with poses in one frame of reference. The nets
 are trained on parts of all rooms and judged on other parts. With --leave-one-out, each room is also left out of a
