@@ -149,7 +149,7 @@ def search(given: Candidates, among: Pool, sequence: SequenceSettings) -> Lines:
     odds = max(1.0, among.found.sum() / max(1, chances))
     # Where chance lines differ more than usual, as of frames in one season, so much more is needed.
     usual = np.median(spread[spread > 0]) if np.any(spread > 0) else 1.0
-    targets, alone, decoys = (scores / np.maximum(1.0, spread / usual) for scores in (targets, alone, decoys))
+    targets, alone = (scores / np.maximum(1.0, spread / usual) for scores in (targets, alone))
     targets = np.where(np.isfinite(decoys), targets, -np.inf)  # of what has no decoy nothing is known
     return Lines(sequence, np.where(np.isneginf(targets), -1, match), targets, alone, decoys, near, odds)
 
