@@ -220,7 +220,7 @@ def test_flags_of_glog_and_of_caffes_other_commands_are_taken(run: Run, tmp_path
 def test_layers_prints_what_each_says_of_itself(run: Run) -> None:
     rows = [line.split(maxsplit=1) for line in run("layers").out.splitlines()]
     assert [row[0] for row in rows] == layer_types()
-    assert dict(rows)["Silence"] == "Use blobs that would otherwise be the net's outputs."
+    assert dict(rows)["Silence"] == "Consume blobs that would otherwise be outputs of the net."
     assert all(len(row) == 2 for row in rows)
 
 

@@ -32,11 +32,11 @@ FORKS = GOLDEN / "forks"
 CLOSE = 1e-4  # of the largest value
 # Faults of the forks, which netspec does not repeat.
 FAULTS = {
-    "happy__cosine": "happynear's Cosine leaves the top's gradient out",
-    "hed__sigmoid_loss_three": "labels that are neither 0 nor 1 bring no loss, but a gradient",
+    "happy__cosine": "happynear's Cosine omits the top's gradient",
+    "hed__sigmoid_loss_three": "labels other than 0 and 1 add no loss, but have a gradient",
     "intel__roi_pooling_2x5_outside": "a region with x2 < x1 gets a gradient",
-    "mscnn__roi_pooling_2x5_outside": "the backward pass clips regions that leave the image, the forward pass does not",
-    "mscnn__roi_pooling_pad_ratio": "the backward pass clips regions that leave the image",
+    "mscnn__roi_pooling_2x5_outside": "the backward pass clips regions to the image, but the forward pass does not",
+    "mscnn__roi_pooling_pad_ratio": "the backward pass clips regions to the image",
 }
 # Cases whose files do not show whose they are: the dialect that has to be named. Without it a warning asks for it.
 NAMED = {

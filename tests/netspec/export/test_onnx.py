@@ -65,7 +65,7 @@ def test_values_have_the_names_of_blobs(net_of: Callable[..., Net]) -> None:
     assert names_of(model) == ["conv_of_conv", "conv", "dropped", "a", "b"]  # and no splits
     assert [v.name for v in model.graph.output] == ["a", "b"]
     props = {each.key: each.value for each in model.metadata_props}
-    assert props["netspec.blobs"] == '{"conv_of_conv": "blob \\"conv\\" as layer \\"conv\\" leaves it"}'
+    assert props["netspec.blobs"] == '{"conv_of_conv": "blob \\"conv\\" after layer \\"conv\\""}'
 
 
 def test_an_input_that_is_changed_in_place_keeps_its_name(net_of: Callable[..., Net]) -> None:
@@ -249,7 +249,7 @@ def test_a_mean_that_does_not_suit_is_refused(steps: Preprocess, fault: str, net
 
 
 def test_cropping_needs_a_size(net_of: Callable[..., Net]) -> None:
-    with pytest.raises(SpecError, match="the height and width of data are free"):
+    with pytest.raises(SpecError, match="the height and width of data are dynamic"):
         onnx_model(net_of(IMAGE + CONV), preprocess=Preprocess(crop=True))
 
 

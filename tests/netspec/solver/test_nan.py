@@ -75,7 +75,7 @@ def test_a_training_goes_on_where_that_is_wanted(
     write(0.1, LOG, "log")
     assert main(["train", "solver.prototxt", "--nan", "warn"]) == 0
     said = capsys.readouterr().err
-    assert said.count("the training goes on") == 1
+    assert said.count("the training continues") == 1
     assert "Optimization Done." in said
 
 
