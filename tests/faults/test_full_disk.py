@@ -1,7 +1,6 @@
 """A full disk, or no permission to write: one line of message, and the old file is unchanged."""
 
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -176,7 +175,7 @@ def test_snapshots_over_2_gib_are_refused_at_the_start(
 ) -> None:
     case = CASES["train"]
     case.prepare()
-    monkeypatch.setattr(sys.modules["netspec.solver.training"], "MOST_BYTES", 1000)
+    monkeypatch.setattr("netspec.solver.training.MOST_BYTES", 1000)
     assert case.main(case.words) == 1
     assert "a binary file; set snapshot_format: HDF5" in capsys.readouterr().err.splitlines()[-1]
     with Path("solver.prototxt").open("a") as file:
