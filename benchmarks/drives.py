@@ -135,7 +135,7 @@ def _posed(paths: Sequence[Path], poses: np.ndarray) -> DataSet:
     posed = Poses(poses[known, :3], poses[known, 3:])
     hard, soft = (same_place_matrix(posed, posed, MAX_DISTANCE_M, angle) for angle in (MAX_ANGLE_DEG, SOFT_DEG))
     truth = sequence_truth(hard, Exclusion(GAP), "same place: less than 2 m and 15 degrees apart")
-    images = ImageSequence.of_files([paths[i] for i in known])
+    images = ImageSequence.of_files([paths[i] for i in known.tolist()])
     return DataSet("", images, None, truth, GAP, overlap=soft, overlap_rule=f"less than {SOFT_DEG:g} degrees apart")
 
 

@@ -131,7 +131,7 @@ def places(given: Candidates, matches: Matches, loops: np.ndarray) -> np.ndarray
         between = slice(first, last + 1)
         line = np.interp(np.arange(first, last + 1), (first, last), matches.match[[first, last]])
         if loops[between].all() and np.abs(matches.match[between] - line).max() <= WINDOW:
-            numbers = np.arange(frames[first], frames[last])
+            numbers = np.arange(int(frames[first]), int(frames[last]))
             places[numbers] = np.rint(np.interp(numbers, frames[[first, last]], match[[first, last]]))
     return places
 

@@ -101,7 +101,7 @@ def test_one_drive_that_comes_back_once():
 def test_frames_before_and_after_a_loop_in_another_light_are_no_loop(after, seed):
     """Their distances hardly differ. Standardized as those of a loop, they would look like lines."""
     steps, other = (np.random.default_rng(number).random((126, 768)) for number in (seed, seed + 50))
-    road, elsewhere = (sum(of[k : k + 120] for k in range(6)) for of in (steps, other))
+    road, elsewhere = (np.sum([of[k : k + 120] for k in range(6)], axis=0) for of in (steps, other))
     rows = np.concatenate([road, 0.8 * road[20:100], elsewhere[:after]])
     scores = -np.linalg.norm(rows[:, None] - rows, axis=2)
     found = answer(Compared(scores, np.tri(len(rows), k=-1, dtype=bool), False))
