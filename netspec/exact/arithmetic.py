@@ -34,7 +34,7 @@ from netspec.exact.channels import (
     Slopes,
     row_normalization_gradient,
 )
-from netspec.exact.layout import channels_side_by_side, map_by_map, of_one_channel
+from netspec.exact.layout import by_channel, channels_side_by_side, map_by_map, of_one_channel
 from netspec.exact.pointwise import CellUpdate, Gradient, lstm_unit, pointwise
 from netspec.exact.products import (
     Axes,
@@ -325,7 +325,7 @@ class AsCaffe(AsTorch):
     @override
     def normalizes(self, mean: torch.Tensor, variance: torch.Tensor, eps: float) -> Function:
         deviation = libm.sqrt(variance + eps)
-        return lambda data: (data - _by_channel(mean, data)).div_(_by_channel(deviation, data))
+        return lambda data: (data - by_channel(mean, data)).div_(by_channel(deviation, data))
 
     @override
     def standardized(self, rows: torch.Tensor, eps: float | None) -> torch.Tensor:
@@ -455,10 +455,6 @@ def _by_class(x: torch.Tensor, axis: int) -> torch.Tensor:
     if (x.dim(), axis) == (3, 1):
         return x
     return x.reshape(math.prod(x.shape[:axis]), x.shape[axis], -1)
-
-
-def _by_channel(values: torch.Tensor, data: torch.Tensor) -> torch.Tensor:
-    return values.view(-1, *(1,) * (data.dim() - 2))
 
 
 def _laid_over(values: torch.Tensor, axis: int, data: torch.Tensor) -> torch.Tensor:

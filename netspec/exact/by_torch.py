@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch.nn import functional as F
 
+from netspec.exact.layout import by_channel
 from netspec.exact.lrn import Settings
 
 MAX_OFFSET = 8  # the largest mean, in standard deviations, for which torch's CPU kernel is exact to 1e-6
@@ -84,7 +85,7 @@ def normalizes(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> Callab
     """Return a function that normalizes (N, C, ...) by a mean and a variance of each channel."""
     far = _far_from_zero(mean, variance, eps)
     arguments = (torch.zeros_like(mean) if far else mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
-    return lambda data: torch.batch_norm(data - _by_channel(mean, data) if far else data, None, None, *arguments)
+    return lambda data: torch.batch_norm(data - by_channel(mean, data) if far else data, None, None, *arguments)
 
 
 def normalized_batch(
@@ -101,7 +102,7 @@ def normalized_batch(
     made, mean, variance = _normalized(data, normalize, affine, eps, options)
     if _far_from_zero(mean, variance, eps):
         # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
-        data = data - _by_channel(mean, data)
+        data = data - by_channel(mean, data)
         made, _, variance = _normalized(data, normalize, affine, eps, options)
     # Torch's unbiased variance of one value is 0 / 0, Caffe's 0.
     return made, data, mean, torch.zeros_like(variance) if data.numel() == len(mean) else variance
@@ -114,10 +115,6 @@ def _normalized(
     mean, variance = data.new_zeros(2, data.shape[1], dtype=exact_enough).unbind()
     made = normalize(data, *affine, mean, variance, True, 1.0, eps, *options)
     return made, mean, variance
-
-
-def _by_channel(values: torch.Tensor, data: torch.Tensor) -> torch.Tensor:
-    return values.view(-1, *(1,) * (data.dim() - 2))
 
 
 def _far_from_zero(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> bool:

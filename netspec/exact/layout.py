@@ -81,3 +81,8 @@ class _SideBySide(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *diffs: torch.Tensor) -> torch.Tensor:
         return diffs[0].contiguous()
+
+
+def by_channel(values: torch.Tensor, maps: torch.Tensor) -> torch.Tensor:
+    """Return one value for each channel (C,) in a shape that meets maps (N, C, ...)."""
+    return values.view(-1, *(1,) * (maps.dim() - 2))

@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from netspec.exact.accumulate import ParameterSums
 from netspec.exact.blas import add_sums, gemm, one_thread
+from netspec.exact.layout import by_channel
 
 Axes = tuple[int, ...]
 COLUMNS = 2**20  # numbers (4 MB): the columns of several images, which fit into a CPU's cache
@@ -120,7 +121,7 @@ class ColumnProducts(ParameterSums):
         with one_thread():
             for some, top in zip(maps.split(ctx.at_once), tops.flatten(2).split(ctx.at_once), strict=True):
                 _gemm_by_group(filters, sliding.columns(some), top, group)
-        return tops if bias is None else tops.add_(_by_channel(bias, tops))
+        return tops if bias is None else tops.add_(by_channel(bias, tops))
 
     @staticmethod
     @once_differentiable
@@ -179,7 +180,7 @@ class SpreadProducts(ParameterSums):
             for some, top in zip(values.split(ctx.at_once), tops.split(ctx.at_once), strict=True):
                 _gemm_by_group(filters, some, columns[: len(some)], group, a_t=True)
                 top.copy_(sliding.spread(columns[: len(some)], size))
-        return tops if bias is None else tops.add_(_by_channel(bias, tops))
+        return tops if bias is None else tops.add_(by_channel(bias, tops))
 
     @staticmethod
     @once_differentiable
@@ -323,7 +324,3 @@ class Columns(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
         return ctx.sliding.spread(diff.contiguous(), ctx.size), None
-
-
-def _by_channel(bias: torch.Tensor, tops: torch.Tensor) -> torch.Tensor:
-    return bias.view(-1, *(1,) * (tops.dim() - 2))
