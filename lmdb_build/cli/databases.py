@@ -6,9 +6,10 @@ Caffe: tools/convert_imageset.cpp, tools/compute_image_mean.cpp, examples/mnist,
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
 
@@ -252,37 +253,38 @@ def _add_compare(commands: Commands) -> None:
     parser.add_argument("--gpu", default="", metavar="N", help="number of the GPU to use (default: the CPU)")
 
 
-def _left(first: Sequence[float], done: int, total: int) -> str:
-    """Return how long a training will still take, from the time since the first iteration that was shown."""
-    if done - first[0] < 50 or done >= total:  # too early to say
+def _left(done: int, to_do: int, seconds: float) -> str:
+    """Return how long a training will still take, if ``done`` iterations took so many seconds."""
+    if done < 50 or to_do <= 0:  # too early to say, or the end
         return ""
-    seconds = (time.monotonic() - first[1]) / (done - first[0]) * (total - done)
-    return f", about {timedelta(seconds=round(seconds))} left"
+    return f", about {timedelta(seconds=round(seconds / done * to_do))} left"
 
 
 def _compare(arguments: argparse.Namespace) -> None:
     from lmdb_build.compare import Choices, compare  # loads the plotting library
 
-    shown: list[tqdm] = []  # the bar of the training, on a terminal
-    first = [0, 0.0]  # the first iteration that was shown, and the time then
+    shown: tqdm | None = None  # the bar of the training, on a terminal
+    first, began, last = 0, 0.0, math.inf  # the training's first iteration, and the time then; the last one of any
 
     def say(line: str) -> None:
         tqdm.write(line, file=sys.stderr)
         sys.stderr.flush()
 
     def step(done: int, total: int, loss: str) -> None:
-        if not first[1] or done < first[0]:
-            first[:] = [done, time.monotonic()]
-        if not sys.stderr.isatty():
-            say(f"Iteration {done} of {total}, loss = {loss}{_left(first, done, total)}")
+        nonlocal shown, first, began, last
+        terminal = sys.stderr.isatty()
+        if done <= last:  # the next training
+            first, began = done, time.monotonic()
+            shown = tqdm(total=total, initial=done, desc="train", unit="", leave=False) if terminal else None
+        last = done
+        if shown is None:
+            left = _left(done - first, total - done, time.monotonic() - began)
+            say(f"Iteration {done} of {total}, loss = {loss}{left}")
             return
-        if done == first[0]:
-            shown[:] = [tqdm(total=total, initial=done, desc="train", unit="", leave=False)]
-        for training in shown:
-            training.set_postfix_str(f"loss {loss}", refresh=False)
-            training.update(done - training.n)
-            if done == total:
-                training.close()
+        shown.set_postfix_str(f"loss {loss}", refresh=False)
+        shown.update(done - shown.n)
+        if done == total:
+            shown.close()
 
     choices = Choices(arguments.train, arguments.resume, tuple(arguments.test), arguments.gpu)
     tables, files = compare(arguments.solver, arguments.out, choices, say, step)

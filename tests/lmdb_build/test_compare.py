@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -136,6 +137,26 @@ def test_a_training_resumes(edited: Callable[..., None]) -> None:
     assert main(["compare", SOLVER, "--out", "out", "--resume"]) == 0
     assert "Resuming from" in Path("out/sgd_step.log").read_text()
     assert {**row("out"), "ms/image": ""} == {**before, "ms/image": ""}
+
+
+def test_each_training_has_its_own_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = 1000.0
+
+    def trainings(solvers: object, out: object, choices: object, say: object, step: Callable[..., None]) -> Any:
+        nonlocal now
+        for first, seconds in ((0, 100.0), (0, 10.0), (50, 20.0)):  # the last one is resumed
+            for done in range(first, 201, 50):
+                step(done, 200, "0.1")
+                now += seconds
+        return "", []
+
+    monkeypatch.setattr("lmdb_build.compare.compare", trainings)
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    assert main(["compare", SOLVER]) == 0
+    left = re.findall(r"about (\S+) left", capsys.readouterr().err)
+    assert left == ["0:05:00", "0:03:20", "0:01:40", "0:00:30", "0:00:20", "0:00:10", "0:00:40", "0:00:20"]
 
 
 def test_without_training_it_scores_the_snapshots_that_there_are(folder: Path) -> None:
