@@ -87,7 +87,7 @@ def answer(
     results = _results(given, matches, loops, verdicts.tolist(), compared.stamps)
     reasons = [
         *filter(None, [given.said, age_said]),
-        _sequences_said(lines if matches.line.any() else None, given.far),
+        _sequences_said(lines if matches.by_lines else None, given.far),
         said,
     ]
     there = sum(bool(result.candidates) for result in results)

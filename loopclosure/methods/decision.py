@@ -23,7 +23,7 @@ def decide(matches: Matches, lines: Lines | None) -> np.ndarray:
     if lines is None:
         return matches.evidence >= SURE
     pairs, verified = neighbors(matches.match, lines.sequence), matches.evidence >= 1
-    if not matches.line.any():
+    if not matches.by_lines:
         return grown(matches.evidence >= SURE, verified, pairs)
     label = stretches(matches.line, pairs)
     many = np.bincount(label, matches.line)[label] >= LEAST_ACCEPTED

@@ -57,6 +57,11 @@ class Matches:
         """Whether each query has a match."""
         return self.match >= 0
 
+    @property
+    def by_lines(self) -> bool:
+        """Whether lines tell loops from other places in this drive, so that matches are theirs."""
+        return bool(self.line.any())
+
 
 @dataclass(frozen=True)
 class Geometry:
@@ -123,8 +128,9 @@ def _left(given: Candidates) -> list[tuple[int, int]]:
 
 def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: Geometry, progress: Progress) -> None:
     """Verify the match of each query, or else its best single image or line, which then becomes its match."""
-    there, by_line = np.flatnonzero(matches.there), bool(matches.line.any())
-    instead = given.single if by_line or lines is None else np.where(lines.match >= 0, lines.match, given.single)
+    there, instead = np.flatnonzero(matches.there), given.single
+    if lines is not None and not matches.by_lines:
+        instead = np.where(lines.match >= 0, lines.match, instead)
     for query in progress(there, "verification", len(there)):
         # The lamps of a tunnel repeat: one verified image does not overrule an accepted sequence.
         other = matches.match if matches.line[query] else instead
@@ -136,6 +142,6 @@ def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: G
             if matches.inliers[query]:
                 if reference != matches.match[query]:
                     matches.match[query] = reference
-                    alone = lines.alone[query] if by_line and lines is not None else given.scores[query, reference]
-                    matches.score[query] = alone
+                    by_line = lines is not None and matches.by_lines
+                    matches.score[query] = lines.alone[query] if by_line else given.scores[query, reference]
                 break
