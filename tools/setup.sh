@@ -33,7 +33,7 @@ if [ ! -x "$VENV/bin/netspec" ] || [ ! -e "$INSTALLED" ] || [ "$ROOT/pyproject.t
   install -e "$ROOT${NEEDS:+[$NEEDS]}"
   rm -r "$VENV/tmp"
   # pip would compile on one core. Some packages have templates that are not Python: it says so by its status.
-  "$VENV/bin/python" -m compileall -q -j 0 "$VENV"/lib/python*/site-packages >"$VENV/compiled.log" || true
+  "$VENV/bin/python" -m compileall -q -j 0 "$VENV"/lib/python*/site-packages >"$VENV/compiled.log" 2>&1 || true
   touch "$VENV/installed" "$INSTALLED"
 fi
 "$PYTHON" "$ROOT/prototxt/variants.py"
