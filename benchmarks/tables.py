@@ -68,7 +68,7 @@ def data_set(name: str, data: Path, work: Path) -> DataSet:
     if name == "corridor_loop":
         return load_folder(data / name / "samples", data / name / "samples_GT.bmp")
     if name == "walk":
-        sequence = read_sequence(walked(work, WALK, (160, 120), Walk(400, 160, 120, laps=3, seed=WALK)), "tum")
+        sequence = read_sequence(walked(work, Walk(400, 160, 120, laps=3, seed=WALK)), "tum")
         return load_sequence(sequence, exclusion=Exclusion(seconds=10.0))
     return load_place_pairs(data / "place_pairs" / {"SPED": "SPED_Test"}.get(name, name))
 
