@@ -11,10 +11,13 @@ Run it in a clone, or in a folder with a copy of the clone's folder prototxt.
 
 import argparse
 import csv
-import shlex
-import subprocess
-import sys
 from pathlib import Path
+
+import numpy as np
+from table_1 import run
+
+from loopclosure.places.sequences import read_sequence
+from loopclosure.places.trajectory import Trajectory, write_rgb_list, write_trajectory
 
 PAUSE_S = 60  # between two sequences of the walk
 
@@ -31,36 +34,25 @@ def parse() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def rows(path: Path) -> list[list[str]]:
-    """Return the rows of a file in TUM's format, split into words; the first word is a time."""
-    return [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
-
-
-def join(sequences: list[Path], out: Path) -> None:
+def join(folders: list[Path], out: Path) -> None:
     """Write one sequence in TUM's layout that has the images and poses of several, one after the other."""
-    images, poses, start = [], [], 0.0
-    for sequence in sequences:
-        found = rows(sequence / "rgb.txt")
-        first = float(found[0][0])
-        link = out / sequence.name
-        link.parent.mkdir(parents=True, exist_ok=True)
+    out.mkdir(parents=True, exist_ok=True)
+    names, stamps, poses, start = [], [], [], 0.0
+    for folder in folders:
+        link = out / folder.name
         link.unlink(missing_ok=True)
-        link.symlink_to(sequence.resolve())
-        for joined, each in ((images, found), (poses, rows(sequence / "groundtruth.txt"))):
-            joined += [[f"{float(row[0]) - first + start:.6f}", *row[1:]] for row in each]
-        images[-len(found) :] = [[row[0], f"{sequence.name}/{row[1]}"] for row in images[-len(found) :]]
-        start = float(images[-1][0]) + PAUSE_S
-    for name, joined in (("rgb.txt", images), ("groundtruth.txt", poses)):
-        (out / name).write_text("".join(" ".join(row) + "\n" for row in joined))
-
-
-def run(*words: object) -> None:
-    """Print a command and run it; exit with its status if it fails."""
-    command = [str(word) for word in words]
-    print("$", shlex.join(command), flush=True)
-    status = subprocess.run([sys.executable, "-m", *command], check=False).returncode
-    if status:
-        sys.exit(status)
+        link.symlink_to(folder.resolve())
+        sequence = read_sequence(folder, "tum")
+        assert sequence.stamps is not None
+        assert sequence.poses is not None
+        names += [f"{folder.name}/{name}" for name in sequence.names]
+        stamps.append(sequence.stamps - sequence.stamps[0] + start)
+        poses.append(sequence.poses)
+        start = stamps[-1][-1] + PAUSE_S
+    times, known = np.concatenate(stamps), np.concatenate(poses)
+    write_rgb_list(out / "rgb.txt", zip(times, names, strict=True))
+    there = np.isfinite(known).all(axis=1)
+    write_trajectory(out / "groundtruth.txt", Trajectory(times[there], known[there, :3], known[there, 3:]))
 
 
 def show_times(path: Path) -> None:

@@ -134,9 +134,8 @@ def train(arguments: argparse.Namespace, pairs: Path, test: Path, out: Path) -> 
                 run("lmdb-build", "compare", solver, "--resume", "--test", test, *on, "--out", folder)
 
 
-def row(out: Path, net: str, trained_on: str) -> dict[str, object]:
-    """Return the row of a net: means over its seeds, and their range if there are several."""
-    files = sorted((out / trained_on.replace(" ", "_") / net).glob("seed_*/runs.json"))
+def row(trained_on: str, net: str, files: list[Path]) -> dict[str, object]:
+    """Return the table's row of a net: means over the runs of its seeds, and the range of more than one."""
     cells: dict[str, object] = {"net": net, "trained on": trained_on, "seeds": len(files)}
     for judged in ("validation", "test"):
         metrics = [read_runs(file, judged)[0].metrics for file in files]
@@ -152,21 +151,21 @@ def main() -> None:
     arguments = parse()
     if not Path("prototxt", "normalized").is_dir():
         sys.exit("no folder prototxt/normalized here; start this script in a clone, or copy its folder prototxt here")
-    counts = (arguments.train, arguments.validation, arguments.validation)
-    out: Path = arguments.out
-    pairs = out / "pairs"
-    make_pairs(arguments, arguments.room, pairs, counts)
-    train(arguments, pairs, pairs / "test_lmdb", out / ALL.replace(" ", "_"))
+    counts, out = (arguments.train, arguments.validation, arguments.validation), arguments.out
+    names = (ALL, *(f"without {room[0].name}" for room in arguments.room))
+    folders = {name: out / name.replace(" ", "_") for name in names}
+    make_pairs(arguments, arguments.room, out / "pairs", counts)
+    train(arguments, out / "pairs", out / "pairs" / "test_lmdb", folders[ALL])
     for left in arguments.room if arguments.leave_one_out else ():
-        others, name = [room for room in arguments.room if room is not left], f"without {left[0].name}"
-        folder = out / name.replace(" ", "_")
-        make_pairs(arguments, others, folder / "pairs", (*counts[:2], 0))
+        folder = folders[f"without {left[0].name}"]
+        make_pairs(arguments, [room for room in arguments.room if room is not left], folder / "pairs", (*counts[:2], 0))
         make_pairs(arguments, [left], folder / "test", (0, 0, counts[2]))
         train(arguments, folder / "pairs", folder / "test" / "test_lmdb", folder)
-    trained = [ALL, *(f"without {room[0].name}" for room in arguments.room)]
-    rows = [
-        row(out, net, name) for name in trained for net in NETS if any((out / name.replace(" ", "_") / net).glob("*"))
-    ]
+    rows = []
+    for name, folder in folders.items():
+        for net in NETS:
+            if files := sorted((folder / net).glob("seed_*/runs.json")):
+                rows.append(row(name, net, files))
     (out / "table.json").write_text(json.dumps(rows, indent=1))
     for cells in ({name: name for name in rows[0]}, *rows):
         print(*(f"{cell!s:<24}" for cell in cells.values()))

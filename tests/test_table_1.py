@@ -15,7 +15,7 @@ from paths import ROOT
 pytestmark = pytest.mark.slow
 
 ROOMS = ("--room", "hall", "hall_again", "--room", "kitchen")
-SMALL = ("--iterations", "24", "--batch", "8", "--iter-size", "2", "--train", "40", "--validation", "20")
+SMALL = "--size 32 --iterations 24 --batch 8 --iter-size 2 --train 40 --validation 20".split()
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,8 @@ def test_what_is_complete_stays_and_an_unfinished_training_resumes(folder: Path)
 
 def test_figure_5(folder: Path) -> None:
     weights = "table_1/all_rooms/siamese_8/seed_1/siamese_8_iter_24.caffemodel"
-    words = ("hall", "hall_again", "--net", "siamese_8", "--weights", weights, "--vocabulary", "kitchen")
+    given = ("--weights", weights, "--vocabulary", "kitchen,stride=2")
+    words = ("hall", "hall_again", "--net", "siamese_8", "--size", "32", *given)
     said = run(folder, "figure_5.py", *words)
     assert "features" in said
     assert "s for 240 images" in said
