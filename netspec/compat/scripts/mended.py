@@ -14,6 +14,7 @@ import operator
 import re
 import string
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 from netspec.compat.scripts.as_python2 import Py2Bytes, py2_bytes, py2_text
@@ -39,17 +40,48 @@ def _integer(value: Any) -> Any:
     return int(value) if isinstance(value, float) or is_float32 else value
 
 
-def _resized(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Return function(...), named reshape or resize. Where it is one of a library, its sizes become integers."""
-    owner = type(getattr(function, "__self__", None)).__module__.partition(".")[0]
-    first = 0
-    if getattr(function, "__module__", None) == "numpy":  # np.reshape(array, sizes)
-        owner, first = "numpy", 1
-    if owner not in ("numpy", "PIL", "netspec"):
-        return function(*arguments, **named)
-    last = len(arguments) if function.__name__ == "reshape" else first + 1
-    sizes = map(_integer, arguments[first:last])
-    return function(*arguments[:first], *sizes, *arguments[last:], **named)
+def _sized(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Return function(...). In calls of NumPy and Pillow, and of reshape in pycaffe, sizes become integers."""
+    name, library = getattr(function, "__name__", ""), _library(function)
+    if library in ("numpy", "PIL"):
+        named = {key: _integer(value) if key in ("shape", "size") else value for key, value in named.items()}
+    first, last = 0, 0  # the arguments that are sizes
+    if name in ("reshape", "resize") and library in ("numpy", "PIL", "netspec"):
+        first = int(getattr(function, "__module__", None) == "numpy")  # np.reshape(array, sizes)
+        last = len(arguments) if name == "reshape" else first + 1
+    elif name in ("empty", "ones", "zeros") and library == "numpy":
+        last = 1
+    return function(*arguments[:first], *map(_integer, arguments[first:last]), *arguments[last:], **named)
+
+
+def _library(function: Any) -> str:
+    """Return the name of the package that a function is from, or the object that a method belongs to."""
+    owner = getattr(function, "__self__", None)
+    of = function if owner is None or isinstance(owner, ModuleType) else type(owner)
+    return str(getattr(of, "__module__", "")).partition(".")[0]
+
+
+class _Sliced:
+    """An object in ``object[a:b]``. If it is an array, floats are allowed as ``a`` and ``b``."""
+
+    def __init__(self, whole: Any) -> None:
+        self._whole = whole
+        is_array = any(base.__module__ == "numpy" for base in type(whole).__mro__)
+        self._bound = _integer if is_array else _number
+
+    def __getitem__(self, key: Any) -> Any:
+        return self._whole[self._mended(key)]
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        self._whole[self._mended(key)] = value
+
+    def __delitem__(self, key: Any) -> None:
+        del self._whole[self._mended(key)]
+
+    def _mended(self, key: Any) -> Any:
+        if isinstance(key, tuple):
+            return tuple(map(self._mended, key))
+        return slice(*map(self._bound, (key.start, key.stop, key.step))) if isinstance(key, slice) else key
 
 
 def _percent(text: str, values: Any) -> str:
@@ -144,8 +176,8 @@ def _equality(compare: Callable[[Any, Any], Any], otherwise: bool) -> Callable[[
 
 
 BUILTINS: dict[str, Callable[..., Any]] = {
-    **{"number": _number, "index": _integer, "percent": _percent, "format": _format, "bytes": _with_bytes},
-    **{"sort": _sort, "decode": _decode, "encode": _encode, "resized": _resized},
+    **{"number": _number, "sliced": _Sliced, "percent": _percent, "format": _format, "bytes": _with_bytes},
+    **{"sort": _sort, "decode": _decode, "encode": _encode, "sized": _sized},
     **{"eq": _equality(operator.eq, False), "noteq": _equality(operator.ne, True)},
     **{name: _comparing(getattr(operator, name)) for name in ("lt", "le", "gt", "ge")},
 }

@@ -220,7 +220,7 @@ def _generated(data: bytes, path: str) -> CodeType:
 #: Functions of these modules, and methods of these names, take bytes.
 _TAKE_BYTES = ("base64", "binascii", "hashlib", "struct", "zlib")
 _METHODS_WITH_BYTES = ("FromString", "MergeFromString", "ParseFromString")
-_WITH_SIZES = ("empty", "ones", "zeros")  # their first argument is a size
+_WITH_SIZES = ("empty", "ones", "reshape", "resize", "zeros")  # functions that take sizes by position
 
 
 class _Mending(ast.NodeTransformer):
@@ -261,13 +261,8 @@ class _Mending(ast.NodeTransformer):
             return _calling("sort", function, *node.args, keywords=keywords)
         if of in _TAKE_BYTES or name in (_METHODS_WITH_BYTES if is_method else self.with_bytes):
             return _calling("bytes", function, *node.args, keywords=keywords)
-        if is_method and name in _WITH_SIZES and node.args and not isinstance(node.args[0], ast.Starred):
-            node.args[0] = _calling("index", node.args[0])
-        for keyword in keywords:
-            if keyword.arg in ("shape", "size"):
-                keyword.value = _calling("index", keyword.value)
-        if is_method and name in ("reshape", "resize"):
-            return _calling("resized", function, *node.args, keywords=keywords)
+        if name in _WITH_SIZES or {"shape", "size"} & {keyword.arg for keyword in keywords}:
+            return _calling("sized", function, *node.args, keywords=keywords)
         return node
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
@@ -277,13 +272,13 @@ class _Mending(ast.NodeTransformer):
             return ast.copy_location(_calling("percent", node.left, node.right), node)
         return node
 
-    def visit_Slice(self, node: ast.Slice) -> ast.AST:
+    def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
         self.generic_visit(node)
-        if self.is_python2:
-            for name in ("lower", "upper", "step"):
-                bound = getattr(node, name)
-                if bound is not None and not isinstance(getattr(bound, "value", None), int):
-                    setattr(node, name, _calling("index", bound))
+        parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        slices = [part for part in parts if isinstance(part, ast.Slice)]
+        bounds = [bound for each in slices for bound in (each.lower, each.upper, each.step) if bound]
+        if self.is_python2 and not all(isinstance(getattr(bound, "value", None), int) for bound in bounds):
+            node.value = ast.copy_location(_calling("sliced", node.value), node.value)
         return node
 
     def visit_Compare(self, node: ast.Compare) -> ast.AST:
