@@ -136,11 +136,11 @@ def memory(task: Task) -> Run:
 def netspec_training(task: Task) -> Run:
     """Train as ``netspec train`` does: its data layer, its solver."""
     if not task.get("torch_first"):
-        import_module("netspec.process.programs").set_up()  # before torch: it sets how OpenMP's threads wait
+        import_module("netspec.terminal.process").set_up()  # before torch: it sets how OpenMP's threads wait
     import torch
 
     import netspec
-    from netspec.process.heap import keep_freed_memory
+    from netspec.terminal.process import keep_freed_memory
 
     keep_freed_memory()
     torch.set_num_threads(task["threads"])

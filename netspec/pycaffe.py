@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from netspec.process.alias import alias
+from netspec.compat.alias import alias
 
 if TYPE_CHECKING:
     from netspec.compat.pycaffe import *  # noqa: F403

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
+from netspec.files.environment import environment
 from netspec.files.image_list import list_images
 from netspec.files.kinds import is_cut_png, nearest_existing, unreadable
 from netspec.files.opencv import cv2
-from netspec.process.environment import environment
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 

@@ -186,10 +186,10 @@ def _as_caffe() -> bool:
 
 def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | None], processes: Processes) -> Solver:
     """Return the solver, resumed where that is asked for."""
-    from netspec.process.heap import keep_freed_memory
     from netspec.proto.text import parse_solver
     from netspec.solver.options import TrainingOptions
     from netspec.solver.solver import make_solver
+    from netspec.terminal.process import keep_freed_memory
 
     keep_freed_memory()
     param, node = parse_solver(path)

@@ -21,8 +21,8 @@ from netspec.cli.arguments import (
     options,
 )
 from netspec.errors import SpecError, printable
+from netspec.files.memory import no_collection
 from netspec.files.whole_file import write_whole
-from netspec.process.garbage import no_collection
 from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import PHASES, TEST, TRAIN
 from netspec.terminal.commands import DONE, FAULT, SOMETHING, UNREADABLE, WrongUsage, refuse

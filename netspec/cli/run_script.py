@@ -59,7 +59,7 @@ def _add_run(commands: Commands) -> None:
 def _run(arguments: argparse.Namespace) -> None:
     from netspec.compat.scripts.program import Options, run_module, run_script
     from netspec.compat.scripts.sources import write_translation
-    from netspec.process.heap import keep_freed_memory
+    from netspec.terminal.process import keep_freed_memory
 
     keep_freed_memory()  # most scripts train
 

@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 import torch
 
-from netspec.process.environment import environment
+from netspec.files.environment import environment
 
 with environment({"KMP_DUPLICATE_LIB_OK": "True"}):  # importing it sets this variable permanently
     from threadpoolctl import ThreadpoolController

@@ -28,12 +28,12 @@ from netspec.fast.folding import Absorbed, absorbing
 from netspec.fast.kernels import Inference, Kernel, finished
 from netspec.fast.steps import Schedule, schedule
 from netspec.fast.table import entry_of, folds_of, inference_kernel, is_fresh
+from netspec.files.memory import give_back_freed_memory
 from netspec.graph.options import PACK
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias
 from netspec.layers.contract.reading import changes_itself
-from netspec.process.heap import give_back_freed_memory
 from netspec.run.shapes import fitted
 from netspec.run.walk import Result, Step, Values, losses_of, walk
 

@@ -5,7 +5,7 @@ It reads the limit from the environment when it is loaded. Where something else 
 
 from __future__ import annotations
 
-from netspec.process.environment import environment
+from netspec.files.environment import environment
 
 MOST_PIXELS = 1 << 27
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from netspec import log
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where, did_you_mean
+from netspec.files.memory import no_collection
 from netspec.graph.filter import add_input, filter_net, is_input, shapes_of_input, with_state
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import make_plan
@@ -25,7 +26,6 @@ from netspec.layers import class_of, layer_class
 from netspec.layers.contract.reading import channels_read, reads_data, source_of, takes_shapes
 from netspec.net.net import Net
 from netspec.net.weights import copy_weights, load_weights
-from netspec.process.garbage import no_collection
 from netspec.proto.binary import parse_net_binary
 from netspec.proto.schema import TEST, LayerParameter, NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap

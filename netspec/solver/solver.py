@@ -18,11 +18,11 @@ import torch
 from netspec import log
 from netspec.errors import SpecError, several
 from netspec.graph.filter import with_train_state
-from netspec.process.signals import waiting_interrupts
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Place
 from netspec.solver import update
 from netspec.solver.extra import read_extra
+from netspec.solver.interrupts import waiting_interrupts
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.options import TrainingOptions
 from netspec.solver.precision import FP16

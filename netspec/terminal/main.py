@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
 
-from netspec.process.programs import set_up
-from netspec.process.signals import end_forked_processes_by_sigterm
+from netspec.terminal.process import end_forked_processes_by_sigterm, set_up
 
 
 def program(module: str, words: Sequence[str] | None = None) -> int:

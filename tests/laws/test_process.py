@@ -52,11 +52,9 @@ def compared(did):
         assert now == was, (did, name, was, now)
 
 {libraries}
-from netspec.process import heap
-heap.keep_freed_memory = None  # its effect cannot be seen
 before = settings()
 {work}
-assert "netspec.process.programs" not in sys.modules
+assert "netspec.terminal.process" not in sys.modules  # which also has settings whose effect cannot be seen
 """
 NET = """
 import numpy as np

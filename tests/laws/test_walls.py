@@ -36,7 +36,7 @@ def test_importing_needs_no_torch(module: str) -> None:
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
-BASE = {"errors", "log", "process", "files", "terminal"}
+BASE = {"errors", "log", "files", "terminal"}
 OURS = ("netspec", "loopclosure", "lmdb_build")
 STANDARD = {*sys.stdlib_module_names, "typing_extensions"} - {"argparse"}
 LIBRARIES = {"cv2": "OpenCV", "google": "protobuf", "sklearn": "scikit-learn", "PIL": "Pillow"}

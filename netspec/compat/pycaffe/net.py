@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from netspec import log
+from netspec.compat.alias import AliasFinder
 from netspec.compat.pycaffe import mode
 from netspec.compat.pycaffe.blob_runner import BlobRunner
 from netspec.compat.pycaffe.errors import caffes_errors
@@ -28,7 +29,8 @@ from netspec.net.weights import load_weights, write_binary, write_hdf5
 from netspec.proto.schema import PhaseValue
 from netspec.proto.text import parse_net
 
-pycaffe_shim.offer(__name__.rpartition(".")[0])  # Python layers may import all of it as caffe
+_PACKAGE = __name__.rpartition(".")[0]
+pycaffe_shim.offer(_PACKAGE, AliasFinder("caffe", _PACKAGE))  # Python layers may import all of it as caffe
 
 FilePath = str | bytes | Path
 Arrays = dict[str, np.ndarray]

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from netspec.process.alias import Alias
+from netspec.compat.alias import Alias
 
 NAME = "caffe"
 HOME = "netspec.compat.pycaffe"

@@ -12,10 +12,10 @@ from pathlib import Path
 from netspec import log
 from netspec.errors import SpecError, printable
 from netspec.exact.blas import kernels
+from netspec.files.environment import environment
 from netspec.files.limits import amount, memory
 from netspec.inspect.check.check import check_file
 from netspec.inspect.stored_weights import stored_layers
-from netspec.process.environment import environment
 from netspec.proto.binary import is_net_binary
 from netspec.terminal.commands import UNKNOWN, version
 

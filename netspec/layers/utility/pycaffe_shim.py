@@ -15,7 +15,6 @@ from functools import cache
 from typing import Any, NoReturn
 
 from netspec.layers.utility.live_blobs import Blob, BlobVec
-from netspec.process.alias import AliasFinder
 
 TRAIN, TEST = 0, 1
 
@@ -42,13 +41,14 @@ def __getattr__(name: str) -> NoReturn:
     raise AttributeError(f"netspec's module caffe for Python layers has no {name}; it has Layer, TRAIN and TEST")
 
 
-_home = __name__  # the attributes of this ``caffe``
+_home = __name__  # the module that Python layers import as ``caffe``
+_finders: tuple[Any, ...] = ()  # of modules inside it
 
 
-def offer(package: str) -> None:
-    """Let Python layers import a package as ``caffe`` instead of this module."""
-    global _home
-    _home = package
+def offer(package: str, finder: Any) -> None:
+    """Let Python layers import a package as ``caffe``, not this module; ``finder`` finds the modules inside it."""
+    global _home, _finders
+    _home, _finders = package, (finder,)
 
 
 @contextmanager
@@ -57,16 +57,17 @@ def importable() -> Iterator[None]:
     directory = os.getcwd()
     sys.path.insert(0, directory)
     stand_in = "caffe" not in sys.modules and not _is_installed(directory)
-    finder = AliasFinder("caffe", _home)
+    finders = _finders
     if stand_in:
         sys.modules["caffe"] = importlib.import_module(_home)
-        sys.meta_path.insert(0, finder)
+        sys.meta_path[:0] = finders
     try:
         yield
     finally:
         sys.path.remove(directory)
         if stand_in:
-            sys.meta_path.remove(finder)
+            for finder in finders:
+                sys.meta_path.remove(finder)
             for name in [name for name in sys.modules if name == "caffe" or name.startswith("caffe.")]:
                 del sys.modules[name]
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import pytest
 
 from netspec.errors import SpecError
+from netspec.files.memory import no_collection
 from netspec.net.net import Net
-from netspec.process.garbage import no_collection
 
 UNKNOWN = 'layer { name: "relu" type: "ReLU" bottom: "nothing" top: "relu" }'
 

@@ -1,7 +1,7 @@
-"""Environment variables that must stand while a library is loaded: set around that, and put back afterwards.
+"""Environment variables that a library reads when it is loaded.
 
-These are all: the most pixels of an image, for OpenCV (netspec/files/opencv.py), OpenBLAS's kernels, for SciPy, and
-what threadpoolctl (netspec/exact/blas.py) and torch's report (netspec/inspect/check/bug_report.py) set themselves.
+Used for OpenCV's limit on pixels (netspec/files/opencv.py) and the kernels of SciPy's OpenBLAS (netspec/exact/blas.py).
+threadpoolctl and torch's report (netspec/inspect/check/bug_report.py) set variables themselves.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables within the block, but for those that the user has set; then they are as before."""
+    """Set environment variables within the block, except those that are already set. Afterwards, restore them all."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update({name: value for name, value in variables.items() if before[name] is None})
     try:

@@ -1,1 +1,0 @@
-"""What concerns the whole process: how threads wait, memory that is kept, the garbage collector."""
