@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.targets import OnnxGraph
 
 Array = np.ndarray
 
@@ -238,22 +237,3 @@ def detections(rows: Sequence[Array], like: torch.Tensor) -> torch.Tensor:
         found = np.full((len(rows), 7), -1, np.float32)
         found[:, 0] = np.arange(len(rows))
     return torch.from_numpy(found[None, None]).to(like)
-
-
-def onnx_decode(graph: OnnxGraph, codes: str, priors: str, variances: str | None, code: int) -> str:
-    """Write :func:`decode` for codes (..., P, 4) and priors and variances (1, P, 4)."""
-    halves = graph.constant([2, 2])
-    low, high = graph.nodes("Split", priors, halves, outputs=2, axis=-1)
-    extent = graph.node("Sub", high, low)
-    if variances is not None:
-        codes = graph.node("Mul", codes, variances)
-    first, second = graph.nodes("Split", codes, halves, outputs=2, axis=-1)
-    if code == CENTER_SIZE:
-        half = graph.constant(0.5)
-        middle = graph.node("Mul", graph.node("Add", low, high), half)
-        center = graph.node("Add", graph.node("Mul", first, extent), middle)
-        reach = graph.node("Mul", graph.node("Mul", graph.node("Exp", second), extent), half)
-        return graph.node("Concat", graph.node("Sub", center, reach), graph.node("Add", center, reach), axis=-1)
-    if code == CORNER_SIZE:
-        first, second = graph.node("Mul", first, extent), graph.node("Mul", second, extent)
-    return graph.node("Concat", graph.node("Add", low, first), graph.node("Add", high, second), axis=-1)

@@ -45,8 +45,8 @@ def tanh_gradient(bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -
     return diff * (1 - top * top)
 
 
-def lstm_unit(cell, gates, cont):
-    """Return the next cell and hidden state; the gates are input, forget, output and candidate."""
+def lstm_unit(cell: torch.Tensor, gates: torch.Tensor, cont: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the next cell and hidden state (N, D); the gates (N, 4 D) are input, forget, output and candidate."""
     i, f, o, g = gates.chunk(4, dim=-1)
     cell = cont * torch.sigmoid(f) * cell + torch.sigmoid(i) * torch.tanh(g)
     return cell, torch.sigmoid(o) * torch.tanh(cell)

@@ -18,7 +18,7 @@ from netspec.fast.folding import Absorbed, Affine
 from netspec.fast.table import folds_of
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.exporting import passes_on
+from netspec.layers.contract.offers import passes_on
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ Caffe: the neuron layers, include/caffe/layers/neuron_layer.hpp
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,7 +16,6 @@ from netspec.exact import libm
 from netspec.exact.pointwise import tanh_gradient
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 class Activation(Layer):
@@ -49,21 +47,6 @@ class Rounded(Activation):
         raise NotImplementedError
 
 
-def scaled_and_shifted(graph: OnnxGraph, value: str, scale: float, shift: float) -> str:
-    """Return scale value + shift as nodes, without nodes that have no effect."""
-    if scale != 1:
-        value = graph.node("Mul", value, graph.constant(float(scale)))
-    return graph.node("Add", value, graph.constant(float(shift))) if shift else value
-
-
-def torch_scaled_and_shifted(code: TorchCode, value: str, scale: float, shift: float) -> str:
-    """Return the expression of scale value + shift, without parts that have no effect."""
-    template = ("{scale} * {x}" if scale != 1 else "{x}") + (
-        " + {shift}" if shift > 0 else " - {shift}" if shift else ""
-    )
-    return code.call(template, x=value, scale=float(scale), shift=abs(float(shift)))
-
-
 @register("ReLU", "relu_param")
 class ReLU(Activation):
     """max(x, 0) + negative_slope min(x, 0); the gradient at 0 is that of the negative side.
@@ -87,14 +70,6 @@ class ReLU(Activation):
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * self.slope)
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("LeakyRelu", *bottoms, alpha=self.slope) if self.slope else graph.node("Relu", *bottoms)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.slope:
-            return code.call("F.leaky_relu({x}, {slope})", x=bottoms[0], slope=self.slope)
-        return code.call("F.relu({x})", x=bottoms[0])
-
 
 @register("PReLU", "prelu_param")
 class PReLU(Activation):
@@ -116,16 +91,6 @@ class PReLU(Activation):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return self.arithmetic(x).sloped(x, self.blob(0))
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        slopes = math.prod(self.blob_shapes[0])
-        spatial = len(self.bottom_shapes[0]) - 2
-        return graph.node("PRelu", *bottoms, graph.blob(0, (slopes, *(1,) * (spatial if self.blob_shapes[0] else 0))))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        slopes = self.blob(0).reshape(-1)
-        slope = code.module("nn.PReLU({channels})", {"weight": slopes}, channels=len(slopes))
-        return code.call("{slope}({x})", slope=slope, x=bottoms[0])
-
 
 @register("ELU", "elu_param")
 class ELU(Rounded):
@@ -135,8 +100,6 @@ class ELU(Rounded):
     top[0]     the same shape
     Caffe: src/caffe/layers/elu_layer.cpp
     """
-
-    onnx_op, onnx_attributes = "Elu", ("alpha",)
 
     def setup(self) -> None:
         self.alpha: float = self.param.elu_param.alpha
@@ -150,11 +113,6 @@ class ELU(Rounded):
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * (self.alpha + top))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.alpha == 1:
-            return code.call("F.elu({x})", x=bottoms[0])
-        return code.call("F.elu({x}, alpha={alpha})", x=bottoms[0], alpha=self.alpha)
-
 
 @register("Sigmoid", "sigmoid_param")
 class Sigmoid(Rounded):
@@ -166,7 +124,6 @@ class Sigmoid(Rounded):
     """
 
     gradient_reads = frozenset({"top"})
-    onnx_op, torch_call = "Sigmoid", "torch.sigmoid({x})"
 
     @override
     def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:
@@ -186,7 +143,6 @@ class TanH(Rounded):
     """
 
     gradient_reads = frozenset({"top"})
-    onnx_op, torch_call = "Tanh", "torch.tanh({x})"
 
     @override
     def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:
@@ -206,7 +162,6 @@ class BNLL(Rounded):
     """
 
     gradient_reads = frozenset({"bottom"})
-    onnx_op, torch_call = "Softplus", "F.softplus({x})"
 
     @override
     def as_torch(self, x: torch.Tensor) -> torch.Tensor:
@@ -230,16 +185,11 @@ class Threshold(Activation):
     Caffe: src/caffe/layers/threshold_layer.cpp
     """
 
-    torch_call = "torch.gt({x}, {threshold}).to({x}.dtype)"
-
     def setup(self) -> None:
         self.threshold: float = self.param.threshold_param.threshold
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return (x > self.threshold).to(x.dtype)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.cast(graph.node("Greater", *bottoms, graph.constant(self.threshold)), "float32")
 
 
 @register("Clip", "clip_param")
@@ -267,13 +217,6 @@ class Clip(Activation):
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return diff * ((bottom >= self.low) & (bottom <= self.high))
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Clip", *bottoms, graph.constant(self.low), graph.constant(max(self.low, self.high)))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        high = max(self.low, self.high)
-        return code.call("torch.clamp({x}, {low}, {high})", x=bottoms[0], low=self.low, high=high)
-
 
 @register("Swish", "swish_param")
 class Swish(Rounded):
@@ -296,12 +239,3 @@ class Swish(Rounded):
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         inner, gate = self.beta * top, libm.sigmoid(self.beta * bottom)
         return (diff * (inner + gate * (1 - inner.double()))).to(diff.dtype)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        gate = graph.node("Sigmoid", scaled_and_shifted(graph, bottoms[0], self.beta, 0))
-        return graph.node("Mul", *bottoms, gate)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.beta == 1:
-            return code.call("F.silu({x})", x=bottoms[0])
-        return code.call("{x} * torch.sigmoid({beta} * {x})", x=bottoms[0], beta=self.beta)

@@ -9,9 +9,7 @@ import torch
 
 from netspec.exact import SMALL_PRODUCT
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import TRAIN
 
 
@@ -61,25 +59,6 @@ class InnerProduct(Layer):
     def multiply_adds(self) -> int:
         return math.prod(self.top_shapes[0]) * self.inputs
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        vectors = bottoms[0]
-        if (self.axis, len(self.bottom_shapes[0])) != (1, 2):
-            vectors = graph.node("Flatten", vectors, axis=self.axis)
-        bias = [graph.blob(1)] if len(self.blobs) > 1 else []
-        transposed = int(not self.param.inner_product_param.transpose)
-        top = graph.node("Gemm", vectors, graph.blob(0), *bias, transB=transposed)
-        return top if self.axis == 1 else graph.reshape_to_top(top)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        weight = self.blob(0).t() if self.param.inner_product_param.transpose else self.blob(0)
-        state = {"weight": weight, **({"bias": self.blob(1)} if len(self.blobs) > 1 else {})}
-        bias = "" if len(self.blobs) > 1 else ", bias=False"
-        template = f"nn.Linear({{in_channels}}, {{out_channels}}{bias})"
-        linear = code.module(template, state, in_channels=self.inputs, out_channels=weight.shape[0])
-        flat = len(self.bottom_shapes[0]) == self.axis + 1
-        vectors = bottoms[0] if flat else code.call(f"{{x}}.flatten({self.axis or ''})", x=bottoms[0])
-        return code.call("{linear}({x})", linear=linear, x=vectors)
-
 
 @register("Dropout", "dropout_param")
 class Dropout(Layer):
@@ -106,19 +85,10 @@ class Dropout(Layer):
         kept = torch.empty_like(data).bernoulli_(1 - self.ratio, generator=self.context.random.on(data.device))
         return data * kept.mul_(1 / (1 - self.ratio))
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        if self.phase == TRAIN:
-            raise refusal(self, "ONNX", "it draws random numbers in the training phase")
-        return graph.node("Identity", *bottoms)
-
     @property
     def passes_on(self) -> bool:
+        """Whether the top is the bottom, unchanged: in the test phase."""
         return self.phase != TRAIN
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.phase != TRAIN:
-            return bottoms[0]
-        return code.call("F.dropout({x}, {ratio}, self.training)", x=bottoms[0], ratio=self.ratio)
 
 
 @register("Embed", "embed_param")
@@ -155,14 +125,3 @@ class Embed(Layer):
             raise self.error(message, "bottom")
         weight, bias = self.blob(0), self.blob(1) if len(self.blobs) > 1 else None
         return self.arithmetic(weight).chosen_rows(index, weight, bias)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        top = graph.node("Gather", graph.blob(0), graph.cast(bottoms[0], "int64"), axis=0)
-        return graph.node("Add", top, graph.blob(1)) if len(self.blobs) > 1 else top
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        rows, width = self.blob_shapes[0]
-        template = "nn.Embedding({rows}, {out_channels})"
-        table = code.module(template, {"weight": self.blob(0)}, rows=rows, out_channels=width)
-        top = code.call("{table}({x}.long())", table=table, x=bottoms[0])
-        return code.call("{x} + {bias}", x=top, bias=code.parameter(1)) if len(self.blobs) > 1 else top

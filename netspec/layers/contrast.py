@@ -6,12 +6,10 @@ import math
 from collections.abc import Sequence
 
 import torch
-from torch.nn import functional as F
 
 from netspec.exact.lrn import Settings
 from netspec.layers.contract.base import MOST, Layer, Shape, is_in_place
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 
 ACROSS_CHANNELS = 0  # caffe.proto: enum LRNParameter.NormRegion
 
@@ -59,29 +57,6 @@ class LRN(Layer):
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return self.arithmetic(bottom).across_channels_gradient(bottom, top, diff, self.settings)
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        param = self.param.lrn_param
-        size, reach = param.local_size, param.local_size // 2
-        if param.norm_region == ACROSS_CHANNELS:
-            return graph.node("LRN", *bottoms, size=size, alpha=param.alpha, beta=param.beta, bias=param.k)
-        squares = graph.node("Mul", *bottoms, *bottoms)
-        window = {"kernel_shape": [size] * 2, "pads": [reach] * 4, "count_include_pad": 1}
-        mean = graph.node("Mul", graph.node("AveragePool", squares, **window), graph.constant(param.alpha))
-        base = graph.node("Add", mean, graph.constant(1.0))
-        return graph.node("Mul", *bottoms, graph.node("Pow", base, graph.constant(-param.beta)))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        param, (x,) = self.param.lrn_param, bottoms
-        alpha, beta = rounded(param.alpha), rounded(param.beta)
-        if param.norm_region == ACROSS_CHANNELS:
-            usual = {"alpha": 1e-4, "beta": 0.75, "k": 1.0}
-            given = {"alpha": alpha, "beta": beta, "k": rounded(param.k)}
-            given = {name: number for name, number in given.items() if number != usual[name]}
-            options = "".join(f", {name}={{{name}}}" for name in given)
-            return code.call(f"F.local_response_norm({{x}}, {{size}}{options})", x=x, size=param.local_size, **given)
-        template = f"{code.function(spatial_response_norm)}({{x}}, {{size}}, {{alpha}}, {{beta}})"
-        return code.call(template, x=x, size=param.local_size, alpha=alpha, beta=beta)
-
 
 @register("MVN", "mvn_param")
 class MVN(Layer):
@@ -120,43 +95,3 @@ class MVN(Layer):
         maps, tops, diffs = self._maps(bottom), self._maps(top), self._maps(diff)
         found = self.arithmetic(bottom).standardized_gradient(maps, tops, diffs, self.param.mvn_param.eps)
         return found.reshape(bottom.shape)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        param, (data,) = self.param.mvn_param, bottoms
-        missing = list(range(len(self.bottom_shapes[0]), 4))
-        if missing:
-            data = graph.node("Unsqueeze", data, graph.constant(missing))
-        axes = graph.constant(list(range(1 if param.across_channels else 2, 4)))
-        top = graph.node("Sub", data, graph.node("ReduceMean", data, axes, keepdims=1))
-        if not param.normalize_variance:
-            return top
-        variance = graph.node("ReduceMean", graph.node("Mul", top, top), axes, keepdims=1)
-        return graph.node("Div", top, graph.node("Add", graph.node("Sqrt", variance), graph.constant(param.eps)))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        param, x = self.param.mvn_param, bottoms[0]
-        missing = 4 - len(self.bottom_shapes[0])
-        if missing:
-            x = code.call(f"{{x}}[..., {', '.join(['None'] * missing)}]", x=x)
-        function = code.function(standardize if param.normalize_variance else center)
-        axes = (1, 2, 3) if param.across_channels else (2, 3)
-        if not param.normalize_variance:
-            return code.call(f"{function}({{x}}, {{axes}})", x=x, axes=axes)
-        return code.call(f"{function}({{x}}, {{axes}}, eps={{eps}})", x=x, axes=axes, eps=rounded(param.eps))
-
-
-def spatial_response_norm(x, size, alpha, beta):
-    """Divide by a power of 1 + alpha times the mean square of size x size pixels."""
-    mean = F.avg_pool2d(x * x, size, stride=1, padding=size // 2)
-    return x / (1 + alpha * mean).pow(beta)
-
-
-def center(x, axes):
-    """Subtract the mean over some axes."""
-    return x - x.mean(axes, keepdim=True)
-
-
-def standardize(x, axes, eps):
-    """Subtract the mean over some axes and divide by the standard deviation plus eps."""
-    variance, mean = torch.var_mean(x, axes, correction=0, keepdim=True)
-    return (x - mean) / (variance.sqrt() + eps)

@@ -8,10 +8,9 @@ import torch
 from typing_extensions import override
 
 from netspec.exact import libm
-from netspec.layers.activation import Activation, Rounded, scaled_and_shifted, torch_scaled_and_shifted
+from netspec.layers.activation import Activation, Rounded
 from netspec.layers.contract.base import refuse_in_place
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 @register("AbsVal")
@@ -22,8 +21,6 @@ class AbsVal(Activation):
     top[0]     the same shape
     Caffe: src/caffe/layers/absval_layer.cpp
     """
-
-    onnx_op, torch_call = "Abs", "torch.abs({x})"
 
     def setup(self) -> None:
         refuse_in_place(self)
@@ -91,18 +88,6 @@ class Power(Rounded):
             return top / self._inner(bottom) * slope
         return torch.where(bottom == 0, slope * bottom.pow(self.power - 1), top / bottom * self.power)
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        if self.power * self.scale == 0:
-            return graph.node("Expand", graph.constant(self.shift**self.power), graph.shape_of(bottoms[0]))
-        value = scaled_and_shifted(graph, bottoms[0], self.scale, self.shift)
-        return value if self.power == 1 else graph.node("Pow", value, graph.constant(self.power))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.power * self.scale == 0:
-            return code.call("torch.full_like({x}, {value})", x=bottoms[0], value=self.shift**self.power)
-        value = torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift)
-        return value if self.power == 1 else code.call("torch.pow({x}, {power})", x=value, power=self.power)
-
 
 def _log(base: float) -> float:
     """Return the logarithm of a base as a float, as in Caffe; -1 stands for e."""
@@ -145,12 +130,6 @@ class Exp(Rounded):
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return diff * top * self.scale
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Exp", scaled_and_shifted(graph, bottoms[0], self.scale, self.shift))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("torch.exp({x})", x=torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift))
-
 
 @register("Log", "log_param")
 class Log(Rounded):
@@ -183,11 +162,3 @@ class Log(Rounded):
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return over_its_diff(bottom, top, diff, libm.power(bottom * self.scale + self.shift, -1) * self.slope)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        logarithm = graph.node("Log", scaled_and_shifted(graph, bottoms[0], self.scale, self.shift))
-        return scaled_and_shifted(graph, logarithm, self.base_scale, 0)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        value = torch_scaled_and_shifted(code, bottoms[0], self.scale, self.shift)
-        return torch_scaled_and_shifted(code, code.call("torch.log({x})", x=value), self.base_scale, 0)

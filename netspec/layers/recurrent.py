@@ -6,58 +6,17 @@ Caffe: src/caffe/layers/recurrent_layer.cpp, which unrolls the time steps into a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
-import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.exact import libm
 from netspec.exact.arithmetic import AsTorch
-from netspec.exact.pointwise import lstm_unit, tanh_gradient
+from netspec.exact.pointwise import tanh_gradient
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
-
-# These functions are copied into exported source code.
-
-
-def rnn(x, cont, w_x, bias, w_h, w_o, bias_o, x_static, w_static, h):
-    """Return the outputs (T, N, D) and the last state of a recurrent net.
-
-    Where cont (T, N) is 0 a sequence begins.
-    """
-    inputs = F.linear(x, w_x, bias)
-    if x_static is not None:
-        inputs = inputs + F.linear(x_static, w_static)
-    h = inputs.new_zeros(x.shape[1], w_h.shape[1]) if h is None else h[0]
-    outputs = []
-    for t in range(x.shape[0]):
-        h = torch.tanh(inputs[t] + F.linear(cont[t, :, None] * h, w_h))
-        outputs.append(torch.tanh(F.linear(h, w_o, bias_o)))
-    return torch.stack(outputs), h[None]
-
-
-def lstm(x, cont, w_x, bias, w_h, x_static, w_static, h, c):
-    """Return the outputs (T, N, D) and the last states of an LSTM.
-
-    Where cont (T, N) is 0 a sequence begins. The gates are input, forget, output and
-    candidate.
-    """
-    inputs = F.linear(x, w_x, bias)
-    if x_static is not None:
-        inputs = inputs + F.linear(x_static, w_static)
-    zeros = inputs.new_zeros(x.shape[1], w_h.shape[1])
-    h, c = (zeros, zeros) if h is None else (h[0], c[0])
-    outputs = []
-    for t in range(x.shape[0]):
-        keep = cont[t, :, None]
-        i, f, o, g = (inputs[t] + F.linear(keep * h, w_h)).chunk(4, dim=1)
-        c = keep * torch.sigmoid(f) * c + torch.sigmoid(i) * torch.tanh(g)
-        h = torch.sigmoid(o) * torch.tanh(c)
-        outputs.append(h)
-    return torch.stack(outputs), h[None], c[None]
 
 
 class Recurrent(Layer):
@@ -74,8 +33,6 @@ class Recurrent(Layer):
     label_bottoms = frozenset({1})
     ignores = frozenset({"recurrent_param.debug_info"})
     state_names: ClassVar[tuple[str, ...]]
-    torch_function: Callable[..., Any]
-    blob_names: ClassVar[tuple[str, ...]]
     remembers = True
     how: AsTorch  # how this pass computes
     gates: ClassVar[int] = 1  # number of inputs of a hidden unit
@@ -195,59 +152,6 @@ class Recurrent(Layer):
             return tuple(s.to(x) for s in self.state)
         return (x.new_zeros(shape),) * len(self.state_names)
 
-    @property
-    def export_note(self) -> str:
-        """Return a note that the state is lost between runs; with expose_hidden, it is an input and an output."""
-        if self.exposed:
-            return ""
-        names = ", ".join(self.state_names)
-        return f"its state ({names}) starts at zero in every run; in Caffe it continues in the next run if cont is 1"
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        steps = graph.size(0, 0, "its time steps are unrolled")
-        streams = graph.size(0, 1, "its state has a row for each stream")
-        x, cont, *others = bottoms
-        rows = self.gates * self.hidden
-        vectors = graph.reshape(x, [steps * streams, math.prod(self.bottom_shapes[0][2:])])
-        inputs = graph.node("Gemm", vectors, graph.blob(0), graph.blob(1), transB=1)
-        inputs = graph.reshape(inputs, [steps, streams, rows])
-        if self.has_static:
-            static = graph.node("Flatten", others[0], axis=1)
-            inputs = graph.node("Add", inputs, graph.node("Gemm", static, graph.blob(2), transB=1))
-        keep = graph.reshape(cont, [steps, streams, 1])
-        state = list(others[self.has_static :])
-        if not self.exposed:
-            state = [graph.constant(torch.zeros(1, streams, self.hidden))] * len(self.state_names)
-        ones = graph.constant([1] * steps)
-        parts = [
-            [value] if steps == 1 else graph.nodes("Split", value, ones, outputs=steps, axis=0)
-            for value in (inputs, keep)
-        ]
-        outputs = []
-        for gate_input, goes_on in zip(*parts, strict=True):
-            output, state = self.onnx_step(graph, gate_input, goes_on, state)
-            outputs.append(output)
-        top = outputs[0] if steps == 1 else graph.node("Concat", *outputs, axis=0)
-        return (top, *state) if self.exposed else (top,)
-
-    def onnx_step(self, graph: OnnxGraph, inputs: str, keep: str, state: Sequence[str]) -> tuple[str, list[str]]:
-        """Write one time step like :meth:`step`, with an axis of size 1 before the streams."""
-        raise NotImplementedError
-
-    def onnx_product(self, graph: OnnxGraph, value: str, blob: int) -> str:
-        """Return the product with a learnable matrix."""
-        return graph.node("MatMul", value, graph.node("Transpose", graph.blob(blob), perm=[1, 0]))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
-        x, cont, *others = bottoms
-        names = [name for name in self.blob_names if self.has_static or name != "w_static"]
-        weights = [code.parameter(i, name=name) for i, name in enumerate(names)]
-        static = [code.call("{x}.flatten(1)", x=others[0]), weights.pop(2)] if self.has_static else ["None", "None"]
-        state = list(others[self.has_static :]) or ["None"] * len(self.state_names)
-        x = x if len(self.bottom_shapes[0]) == 3 else code.call("{x}.flatten(2)", x=x)
-        call = f"{code.function(self.torch_function)}({', '.join([x, cont, *weights, *static, *state])})"
-        return call if self.exposed else (f"{call}[0]",)
-
 
 @register("RNN", "recurrent_param")
 class RNN(Recurrent):
@@ -266,8 +170,6 @@ class RNN(Recurrent):
     bottoms = (2, 4)
     tops = (1, 2)
     state_names = ("h",)
-    torch_function = staticmethod(rnn)
-    blob_names = ("w_x", "bias", "w_static", "w_h", "w_o", "bias_o")
 
     def setup(self) -> None:
         super().setup()
@@ -286,24 +188,6 @@ class RNN(Recurrent):
 
     def _tanh(self, x: torch.Tensor) -> torch.Tensor:
         return self.how.function(x, torch.tanh, libm.tanh, tanh_gradient)
-
-    @override
-    def onnx_step(self, graph: OnnxGraph, inputs: str, keep: str, state: Sequence[str]) -> tuple[str, list[str]]:
-        hidden = 2 + self.has_static
-        kept = graph.node("Mul", keep, state[0])
-        h = graph.node("Tanh", graph.node("Add", inputs, self.onnx_product(graph, kept, hidden)))
-        output = graph.node("Add", self.onnx_product(graph, h, hidden + 1), graph.blob(hidden + 2))
-        return graph.node("Tanh", output), [h]
-
-
-def _onnx_unit(graph: OnnxGraph, cell: str, gate_input: str, keep: str, units: int) -> tuple[str, str]:
-    """Write what :func:`netspec.exact.pointwise.lstm_unit` computes."""
-    parts = graph.constant([units] * 4)
-    i, f, o, g = graph.nodes("Split", gate_input, parts, outputs=4, axis=-1)
-    i, f, o = (graph.node("Sigmoid", gate) for gate in (i, f, o))
-    kept = graph.node("Mul", graph.node("Mul", keep, f), cell)
-    cell = graph.node("Add", kept, graph.node("Mul", i, graph.node("Tanh", g)))
-    return cell, graph.node("Mul", o, graph.node("Tanh", cell))
 
 
 @register("LSTM", "recurrent_param")
@@ -325,8 +209,6 @@ class LSTM(Recurrent):
 
     state_names = ("h", "c")
     gates = 4
-    torch_function = staticmethod(lstm)
-    blob_names = ("w_x", "bias", "w_static", "w_h")
 
     @override
     def step(
@@ -336,13 +218,6 @@ class LSTM(Recurrent):
         h, c = state
         c, h = self.how.lstm_unit(c, self.carry(h, keep, inputs), keep)
         return h, (h, c)
-
-    @override
-    def onnx_step(self, graph: OnnxGraph, inputs: str, keep: str, state: Sequence[str]) -> tuple[str, list[str]]:
-        h, c = state
-        recurrent = self.onnx_product(graph, graph.node("Mul", keep, h), 2 + self.has_static)
-        c, h = _onnx_unit(graph, c, graph.node("Add", inputs, recurrent), keep, self.hidden)
-        return h, [h, c]
 
 
 @register("LSTMUnit")
@@ -378,11 +253,3 @@ class LSTMUnit(Layer):
 
     def forward(self, cell: torch.Tensor, gates: torch.Tensor, cont: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return self.arithmetic(gates).lstm_unit(cell, gates, cont.detach().to(cell.dtype).unsqueeze(2))
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        cell, gates, cont = bottoms
-        keep = graph.node("Unsqueeze", cont, graph.constant([2]))
-        return _onnx_unit(graph, cell, gates, keep, self.bottom_shapes[0][2])
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return f"{code.function(lstm_unit)}({', '.join(bottoms)}[..., None])"

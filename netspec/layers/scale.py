@@ -12,7 +12,6 @@ from netspec.data.blobs import Shape
 from netspec.exact import SMALL_ITEM
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 class _Affine(Layer):
@@ -42,27 +41,6 @@ class _Affine(Layer):
                 message = f"an operand of shape {operand} does not match the bottom's axes from {axis} on, {shape}"
                 raise self.error(message, "bottom", len(shapes) - 1)
         return axis
-
-    def onnx_operand(self, graph: OnnxGraph, bottoms: Sequence[str], blob: int, axis: int) -> str:
-        """Return the second bottom or a learnable blob, broadcast over the first bottom's axes from ``axis`` on."""
-        axes = len(self.bottom_shapes[0]) - axis
-        if len(bottoms) == 1:
-            shape = self.blob_shapes[blob]
-            return graph.blob(blob, (*shape, *(1,) * (axes - len(shape))))
-        given = len(self.bottom_shapes[1])
-        if given == axes:
-            return bottoms[1]
-        return graph.node("Unsqueeze", bottoms[1], graph.constant(list(range(given, axes))))
-
-    def torch_operand(self, code: TorchCode, bottoms: Sequence[str], blob: int, axis: int) -> str:
-        """Return the expression of the second bottom or a learnable blob, broadcast over axes from ``axis`` on."""
-        axes = len(self.bottom_shapes[0]) - axis
-        if len(bottoms) == 1:
-            shape = self.blob_shapes[blob]
-            name = "" if len(self.blobs) == 1 else ("scale", "bias")[blob]
-            return code.parameter(blob, (*shape, *(1,) * (axes - len(shape))), name)
-        missing = axes - len(self.bottom_shapes[1])
-        return code.call(f"{{x}}[..., {', '.join(['None'] * missing)}]", x=bottoms[1]) if missing else bottoms[1]
 
 
 @register("Scale", "scale_param")
@@ -94,12 +72,6 @@ class Scale(_Affine):
         bias = self.blob(len(self.blobs) - 1) if self.param.scale_param.bias_term else None
         return self.arithmetic(data).scaled(data, self.axis, scale, bias)
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        top = graph.node("Mul", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
-        if not self.param.scale_param.bias_term:
-            return top
-        return graph.node("Add", top, self.onnx_operand(graph, bottoms[:1], len(self.blobs) - 1, self.axis))
-
     @property
     def small(self) -> bool:
         shape, axes = self.bottom_shapes[0], len((*self.bottom_shapes[1:], *self.blob_shapes)[0])
@@ -113,16 +85,6 @@ class Scale(_Affine):
     @property
     def joins_as(self) -> str:
         return "scale" if self.by_channel else ""
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.by_channel:
-            scale = self.blob(0)
-            if code.affine(bottoms[0], scale, self.blob(1) if len(self.blobs) > 1 else torch.zeros_like(scale)):
-                return bottoms[0]
-        top = code.call("{x} * {y}", x=bottoms[0], y=self.torch_operand(code, bottoms, 0, self.axis))
-        if not self.param.scale_param.bias_term:
-            return top
-        return code.call("{x} + {y}", x=top, y=self.torch_operand(code, bottoms[:1], len(self.blobs) - 1, self.axis))
 
 
 @register("Bias", "bias_param")
@@ -147,9 +109,3 @@ class Bias(_Affine):
 
     def forward(self, data: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
         return self.arithmetic(data).scaled(data, self.axis, None, self.blob(0) if bias is None else bias)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Add", bottoms[0], self.onnx_operand(graph, bottoms, 0, self.axis))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call("{x} + {y}", x=bottoms[0], y=self.torch_operand(code, bottoms, 0, self.axis))

@@ -1,25 +1,32 @@
 """Every layer can be exported with the same results, or gives a reason why not."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from google.protobuf import text_format
+from typing_extensions import override
 
 from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, run_module, source_module
 from laws.examples import EXAMPLES
 from laws.test_registry import TYPES, folder  # noqa: F401
 from netspec.errors import SpecError
+from netspec.export.exporter import EXPORTERS
 from netspec.export.formats.deploy import with_inputs
 from netspec.export.formats.onnx import onnx_model
 from netspec.export.formats.pt2 import torch_module
+from netspec.export.table import exported, exporter_class, refusal
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
-from netspec.layers import layer_class
+from netspec.layers import Layer, layer_class
+from netspec.layers.contract.base import Shape
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.proto.schema import TEST
+from netspec.proto.schema import TEST, LayerParameter
 from netspec.proto.text import parse_net_text
+from paths import ROOT
 
 NOT_IN_ONNX = {"DummyData": "random", "HDF5Output": "writes a file", "Python": "code"}
 NOT_IN_TORCH = NOT_IN_ONNX | {"InfogainLoss": "infogain matrix", "Accuracy": "each class"}
@@ -40,13 +47,39 @@ def net_of_example(name: str, folder: Path) -> Net:  # noqa: F811
     return build_net(message, source, BuildOptions(seed=0, allow_python=True))
 
 
-def test_every_layer_says_how_it_is_exported_or_why_not() -> None:
+def test_every_layer_has_an_exporter_or_a_reason() -> None:
     for name in TYPES:
         cls = layer_class(name)
         assert cls is not None
-        own = [one for one in (("to_onnx", "onnx_op"), ("to_torch", "torch_call")) if any(hasattr(cls, n) for n in one)]
-        refused = "not_exported" in vars(cls) or name in DATA or name in NOT_IN_TORCH
+        exporter = exporter_class(cls)
+        pairs = (("to_onnx", "onnx_op"), ("to_torch", "torch_call"))
+        own = [pair for pair in pairs if any(hasattr(exporter, each) for each in pair)]
+        refused = hasattr(exporter, "not_exported") or name in DATA or name in NOT_IN_TORCH
         assert len(own) == 2 or refused, name
+
+
+def test_exporters_are_registered_for_existing_classes() -> None:
+    for path in EXPORTERS:
+        module, _, cls = path.rpartition(".")
+        assert f"class {cls}(" in (ROOT / module.replace(".", "/")).with_suffix(".py").read_text(), path
+
+
+def test_a_class_outside_netspec_defines_its_own_export() -> None:
+    class Doubled(Layer):
+        torch_call = "2 * {x}"
+
+        @override
+        def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
+            return bottom_shapes
+
+        @override
+        def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
+            return 2 * bottoms[0]
+
+    layer = Doubled(LayerParameter(name="it", bottom=["x"], top=["y"]), [(1, 2)])
+    assert exported(layer, "torch_call") == "2 * {x}"
+    assert exported(layer, "to_onnx") is exported(layer, "onnx_op") is None
+    assert str(refusal(layer, "ONNX")).endswith("cannot be exported to ONNX: its class does not support it")
 
 
 @pytest.mark.slow

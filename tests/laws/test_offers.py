@@ -5,11 +5,11 @@ import inspect
 from collections.abc import Iterator
 
 from netspec.layers import Layer
-from netspec.layers.contract import exporting, gradients, joining, reading
+from netspec.layers.contract import gradients, joining, reading
 from netspec.layers.data.files import ReadingLayer
 from paths import ROOT
 
-MODULES = [exporting, gradients, joining, reading]
+MODULES = [gradients, joining, reading]
 
 
 def members(cls: type) -> set[str]:

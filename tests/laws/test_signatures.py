@@ -104,10 +104,10 @@ DOORS = {
     "netspec/compat/pycaffe/classifier.py: Classifier.__init__",
     "netspec/compat/pycaffe/detector.py: Detector.__init__",
     # Copied into the source that `netspec export` writes, where a call shows a layer's blobs and fields one by one.
-    "netspec/layers/recurrent.py: rnn",
-    "netspec/layers/recurrent.py: lstm",
-    "netspec/dialects/ssd/detection.py: detection_output",
-    "netspec/dialects/ssd/priors.py: prior_boxes",
+    "netspec/export/layers/recurrent.py: rnn",
+    "netspec/export/layers/recurrent.py: lstm",
+    "netspec/export/dialects/ssd.py: detection_output",
+    "netspec/export/dialects/ssd.py: prior_boxes",
 }
 
 

@@ -15,7 +15,6 @@ from netspec.dialects.blocks.relu6 import Capped
 from netspec.dialects.segmentation.segnet import BN, Upsample
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.vision.convolution import Convolution
 from netspec.proto.schema import LayerParameter, value
 
@@ -107,20 +106,6 @@ class Axpy(Layer):
     def forward(self, a: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         return torch.addcmul(y, a.reshape(*a.shape[:2], *(1,) * (x.dim() - 2)), x)
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        a, x, y = bottoms
-        missing = list(range(len(self.bottom_shapes[0]), len(self.bottom_shapes[1])))
-        if missing:
-            a = graph.node("Unsqueeze", a, graph.constant(missing))
-        return graph.node("Add", graph.node("Mul", a, x), y)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        a, x, y = bottoms
-        missing = len(self.bottom_shapes[1]) - len(self.bottom_shapes[0])
-        if missing:
-            a = code.call(f"{{a}}[..., {', '.join(['None'] * missing)}]", a=a)
-        return code.call("{a} * {x} + {y}", a=a, x=x, y=y)
-
 
 @register("ReLU6", "relu6_param")
 class ReLU6(Capped):
@@ -196,8 +181,6 @@ class ShuffleChannel(Layer):
     Fork: farmingyard/ShuffleNet, shuffle_channel_layer.cpp
     """
 
-    torch_call = "F.channel_shuffle({x}, {group})"
-
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shape, self.group = bottom_shapes[0], value(self.param, "shuffle_channel_param").group
         if len(shape) < 2 or self.group < 1 or shape[1] % self.group:
@@ -207,11 +190,6 @@ class ShuffleChannel(Layer):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.unflatten(1, (self.group, -1)).transpose(1, 2).flatten(1, 2)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        channels = self.bottom_shapes[0][1]
-        dealt = graph.reshape(bottoms[0], [0, self.group, channels // self.group, -1])
-        return graph.reshape_to_top(graph.node("Transpose", dealt, perm=[0, 2, 1, 3]))
 
 
 @register("Interp", "interp_param")
@@ -269,37 +247,6 @@ class Interp(Layer):
         inner = F.pad(data, cut) if any(cut) else data
         return F.interpolate(inner, self.top_shapes[0][2:], mode="bilinear", align_corners=True)
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        param, (data, *like) = value(self.param, "interp_param"), bottoms
-        if param.pad_beg or param.pad_end:
-            start, end = graph.constant([-param.pad_beg] * 2), graph.constant([param.pad_end or 2**62] * 2)
-            data = graph.node("Slice", data, start, end, graph.constant([2, 3]))
-        if like:
-            size = graph.shape_of(like[0], 2, 4)
-        elif param.HasField("height"):
-            size = graph.constant([param.height, param.width])
-        else:
-            one, zoom = graph.constant([1, 1]), graph.constant([param.zoom_factor] * 2)
-            last = graph.node("Sub", graph.shape_of(data, 2, 4), one)
-            steps = graph.node("Mul", graph.node("Div", last, graph.constant([param.shrink_factor] * 2)), zoom)
-            size = graph.node("Add", steps, one)
-        sizes = graph.node("Concat", graph.shape_of(data, 0, 2), size, axis=0)
-        grid = {"mode": "linear", "coordinate_transformation_mode": "align_corners"}
-        return graph.node("Resize", data, "", "", sizes, **grid)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        param, (x, *like) = value(self.param, "interp_param"), bottoms
-        cut = (param.pad_beg, param.pad_end) * 2
-        if any(cut):
-            x = code.call("F.pad({x}, {cut})", x=x, cut=cut)
-        template = 'F.interpolate({x}, size={size}, mode="bilinear", align_corners=True)'
-        if like:
-            return code.call(template.replace("{size}", "{y}.shape[2:]"), x=x, y=like[0])
-        if None not in code.sizes(0)[2:] or param.HasField("height"):
-            return code.call(template, x=x, size=tuple(self.top_shapes[0][2:]))
-        size = "[(n - 1) // {shrink} * {zoom} + 1 for n in {x}.shape[2:]]"
-        return code.call(template.replace("{size}", size), x=x, shrink=param.shrink_factor, zoom=param.zoom_factor)
-
 
 @register("DeephiResize", "deephi_resize_param")
 class DeephiResize(Layer):
@@ -332,25 +279,6 @@ class DeephiResize(Layer):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return F.interpolate(data, self.top_shapes[0][2:], mode="nearest" if self.nearest else "bilinear")
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        p = self.settings
-        size = graph.constant([p.new_height, p.new_width])
-        if not p.new_height:
-            floats = graph.cast(graph.shape_of(bottoms[0], 2, 4), "float32")
-            size = graph.cast(graph.node("Mul", floats, graph.constant([p.scale_h, p.scale_w])), "int64")
-        sizes = graph.node("Concat", graph.shape_of(bottoms[0], 0, 2), size, axis=0)
-        grid = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
-        if self.nearest:
-            grid = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
-        return graph.node("Resize", bottoms[0], "", "", sizes, **grid)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        how = {"x": bottoms[0], "mode": repr("nearest" if self.nearest else "bilinear")}
-        if self.settings.new_height:
-            return code.call("F.interpolate({x}, {size}, mode={mode})", size=tuple(self.top_shapes[0][2:]), **how)
-        template = "F.interpolate({x}, scale_factor={scales}, mode={mode}, recompute_scale_factor=True)"
-        return code.call(template, scales=(self.settings.scale_h, self.settings.scale_w), **how)
 
 
 register("Upsample", "upsample_param")(Upsample)

@@ -6,9 +6,7 @@ R-CNN) or is random in testing (SegNet).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -18,8 +16,6 @@ from netspec.dialects.blocks.relu6 import Capped
 from netspec.dialects.layers import replace
 from netspec.layers import common
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.vision import convolution, pooling, windows
 from netspec.proto.schema import TRAIN, LayerParameter, added_value, has, value
 
@@ -108,23 +104,6 @@ class Convolution(convolution.Convolution):
             bottoms = tuple(F.pad(bottom, self.sides) for bottom in bottoms)
         return super().forward(*bottoms)
 
-    @override
-    def onnx_geometry(self) -> dict[str, Any]:
-        geometry = super().onnx_geometry()
-        left, right, top, bottom = self.sides
-        return geometry | {"pads": [top, left, bottom, right]} if any(self.sides) else geometry
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        if any(self.sides) and any(self.overhang(self.bottom_shapes[0])):
-            raise refusal(self, "ONNX", "its filter is longer than the map")
-        return super().to_onnx(graph, *bottoms)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        if any(self.sides):
-            sides = tuple(self.sides)
-            bottoms = tuple(code.call("F.pad({x}, {sides})", x=bottom, sides=sides) for bottom in bottoms)
-        return super().to_torch(code, *bottoms)
-
 
 POOLING = "pooling_param"
 
@@ -190,26 +169,11 @@ class Pooling(pooling.Pooling):
         if self.method == pooling.MAX:
             return F.max_pool2d(F.pad(data, self.frame, value=windows.LOWEST), self.kernel, self.stride)
         sums = F.avg_pool2d(F.pad(data, self.frame), self.kernel, self.stride, divisor_override=1)
-        return sums / self._areas().to(data)
+        return sums / self.areas().to(data)
 
-    def _areas(self) -> torch.Tensor:
+    def areas(self) -> torch.Tensor:
+        """Return the number of pixels that each window counts (down, across)."""
         return torch.outer(*(torch.tensor(lengths, dtype=torch.float64) for lengths in self.lengths))
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        for axis in (2, 3):
-            graph.size(0, axis, "its windows follow from the map's size")
-        left, right, up, down = self.frame
-        if min(self.frame) < 0:
-            raise refusal(self, "ONNX", "its windows leave out the map's end")
-        value = graph.constant(windows.LOWEST if self.method == pooling.MAX else 0.0)
-        framed = graph.node(
-            "Pad", *bottoms, graph.constant([0, 0, up, left, 0, 0, down, right]), value, mode="constant"
-        )
-        geometry = {"kernel_shape": list(self.kernel), "strides": list(self.stride)}
-        if self.method == pooling.MAX:
-            return graph.node("MaxPool", framed, **geometry)
-        shares = (self._areas() / math.prod(self.kernel)).float()
-        return graph.node("Div", graph.node("AveragePool", framed, **geometry), graph.constant(shares[None, None]))
 
 
 @replace(
@@ -255,19 +219,7 @@ class Dropout(common.Dropout):
         top = super().forward(data)
         return top if value(self.param.dropout_param, "scale_train") else top * (1 - self.ratio)
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        top = super().to_onnx(graph, *bottoms)
-        if value(self.param.dropout_param, "scale_train"):
-            return top
-        return graph.node("Mul", *bottoms, graph.constant(1 - self.ratio))
-
     @property
     def passes_on(self) -> bool:
+        """Whether the top is the bottom, unchanged."""
         return super().passes_on and value(self.param.dropout_param, "scale_train")
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if value(self.param.dropout_param, "scale_train"):
-            return super().to_torch(code, *bottoms)
-        if self.phase == TRAIN:
-            raise refusal(self, "PyTorch", "torch's dropout scales in training, this one in testing")
-        return code.call("{x} * {kept}", x=bottoms[0], kept=1 - self.ratio)

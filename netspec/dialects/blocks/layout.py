@@ -10,7 +10,6 @@ import torch
 from netspec.dialects.blocks.order import Reordered
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import value
 
 DECLARATIONS = """
@@ -162,15 +161,3 @@ class CropCenter(Layer):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data[self.window].clone()
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        cuts = [part.start for part in self.window]
-        axes = [axis for axis, cut in enumerate(cuts) if cut]
-        if not axes:
-            return graph.node("Identity", bottoms[0])
-        starts, ends = (graph.constant([sign * cuts[axis] for axis in axes]) for sign in (1, -1))
-        return graph.node("Slice", bottoms[0], starts, ends, graph.constant(axes))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        parts = [f"{part.start}:-{part.start}" if part.start else ":" for part in self.window]
-        return code.call(f"{{x}}[{', '.join(parts)}]", x=bottoms[0])

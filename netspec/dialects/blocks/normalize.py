@@ -10,7 +10,6 @@ import torch
 from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import given, value
 
 SSD, TSN, HAPPYNEAR = "ssd", "tsn", "happynear"
@@ -99,36 +98,6 @@ class Normalize(Layer):
         return (
             (data / size, lengths.reshape(self.top_shapes[-1]))[: self.num_tops] if self.num_tops > 1 else data / size
         )
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
-        axes = len(self.bottom_shapes[0])
-        over = graph.constant(list(range(1, axes)) if self.across else [1])
-        parts = graph.node("Mul", *bottoms, *bottoms) if self.squares else graph.node("Abs", *bottoms)
-        size = graph.node("Add", graph.node("ReduceSum", parts, over, keepdims=1), graph.constant(self.eps))
-        size = graph.node("Sqrt", size) if self.squares else size
-        top = graph.node("Div", *bottoms, size)
-        if self.blobs:
-            shape = (*self.blob_shapes[0], *(1,) * (axes - 2)) if self.blob_shapes[0] else ()
-            top = graph.node("Mul", top, graph.blob(0, shape))
-        return top if self.num_tops == 1 else [top, size]
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
-        axes = len(self.bottom_shapes[0])
-        over = tuple(range(1, axes)) if self.across else 1
-        given = {"x": bottoms[0], "over": over, "eps": rounded(self.eps)}
-        if self.blobs:
-            shape = (*self.blob_shapes[0], *(1,) * (axes - 2)) if self.blob_shapes[0] else ()
-            template = f"{code.function(normalize)}({{x}}, {{scale}}, {{over}}, eps={{eps}})"
-            return code.call(template, scale=code.parameter(0, shape), **given)
-        size = code.call(f"{code.function(length)}({{x}}, {{over}}, {{eps}}, {self.squares})", **given)
-        top = code.call("{x} / {size}", x=bottoms[0], size=size)
-        return top if self.num_tops == 1 else [top, size]
-
-
-def normalize(x, scale, axes, eps):
-    """Divide by the length over some axes, and multiply by learnable scales."""
-    length = (x.square().sum(axes, keepdim=True) + eps).sqrt()
-    return scale * x / length
 
 
 def length(x, axes, eps, squares):

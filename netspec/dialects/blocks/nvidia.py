@@ -7,7 +7,6 @@ import torch
 from netspec.dialects.layers import replace
 from netspec.dialects.not_learned import NotLearned
 from netspec.layers import normalization
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import has, value
 
 DECLARATIONS = """
@@ -55,18 +54,3 @@ class BatchNorm(NotLearned, normalization.BatchNorm):
             return top
         slope, bias = (self.blob(i).reshape(-1, *(1,) * (data.dim() - 2)) for i in (SLOPES, BIASES))
         return top * slope + bias
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        top = super().to_onnx(graph, *bottoms)
-        if not self.scales:
-            return top
-        shape = (self.channels, *(1,) * (len(self.bottom_shapes[0]) - 2))
-        return graph.node("Add", graph.node("Mul", top, graph.blob(SLOPES, shape)), graph.blob(BIASES, shape))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        top = super().to_torch(code, *bottoms)
-        if not self.scales:
-            return top
-        shape = (self.channels, *(1,) * (len(self.bottom_shapes[0]) - 2))
-        slope, bias = code.parameter(SLOPES, shape, "slope"), code.parameter(BIASES, shape, "bias")
-        return code.call("{x} * {slope} + {bias}", x=top, slope=slope, bias=bias)

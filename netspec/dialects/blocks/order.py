@@ -8,14 +8,12 @@ import torch
 
 from netspec.data.blobs import Shape
 from netspec.layers import Layer
-from netspec.layers.contract.targets import TorchCode
 
 
 class Reordered(Layer):
     """Base of layers that permute axes: axis i of the top is axis ``perm[i]`` of the bottom."""
 
     perm: list[int]
-    onnx_op, onnx_attributes = "Transpose", ("perm",)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         if len(bottom_shapes[0]) != len(self.perm):
@@ -25,6 +23,3 @@ class Reordered(Layer):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.permute(self.perm).contiguous()
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call(f"{{x}}.permute({', '.join(map(str, self.perm))})", x=bottoms[0])

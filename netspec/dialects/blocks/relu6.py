@@ -6,7 +6,6 @@ import torch
 import torch.nn.functional as F
 
 from netspec.layers.activation import Activation
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 class Capped(Activation):
@@ -23,14 +22,3 @@ class Capped(Activation):
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * self.slope).where(bottom < 6, 0)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        if self.slope == 0:
-            return graph.node("Clip", *bottoms, graph.constant(0.0), graph.constant(6.0))
-        leaky = graph.node("LeakyRelu", *bottoms, alpha=self.slope)
-        return graph.node("Min", leaky, graph.constant(6.0))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.slope == 0:
-            return code.call("F.relu6({x})", x=bottoms[0])
-        return code.call("F.leaky_relu({x}, {slope}).clamp(max=6)", x=bottoms[0], slope=self.slope)

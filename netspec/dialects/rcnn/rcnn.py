@@ -22,8 +22,6 @@ from netspec.dialects.rcnn.regions import RegionPooling, whole
 from netspec.dialects.rcnn.smooth import NORMALIZED, SmoothL1Loss
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.targets import OnnxGraph
 from netspec.proto.schema import TRAIN, value
 
 DECLARATIONS = """
@@ -119,12 +117,6 @@ class ROIPooling(RegionPooling):
         steps = torch.arange(count + 1, dtype=first.dtype, device=first.device) * (length / count)[:, None]
         ends = torch.stack([steps[:, :-1].floor(), steps[:, 1:].ceil()], dim=2) + first[:, None, None]
         return ends.clamp(0, size).long()
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        if self.pad_ratio:
-            raise refusal(self, "ONNX", "its regions grow by pad_ratio")
-        regions = graph.reshape(bottoms[1], [-1, 5])
-        return graph.node("MaxRoiPool", bottoms[0], regions, pooled_shape=self.bins, spatial_scale=self.scale)
 
 
 Table = tuple[torch.Tensor, torch.Tensor]  # values and their pixels

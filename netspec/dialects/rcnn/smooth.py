@@ -13,9 +13,7 @@ from typing_extensions import override
 from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
-from netspec.layers.loss.base import BATCH_SIZE, VALID, Loss, normalization_mode, normalizer, onnx_normalized_sum
+from netspec.layers.loss.base import VALID, Loss, normalization_mode, normalizer
 from netspec.proto.schema import added_value, value
 
 NORMALIZED = ("loss_param", "loss_param.normalization", "loss_param.pre_fixed_normalizer")
@@ -109,44 +107,6 @@ class SmoothL1Loss(Loss):
         loss = losses.sum() / divisor(self, items, math.prod(pixels), None)
         each = losses.detach().reshape(items, losses.shape[1], *pixels).sum(1, keepdim=True)
         return (loss, each) if self.num_tops > 1 else loss
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        if self.by_pixel:
-            raise refusal(self, "ONNX", "R-FCN's loss is for training")
-        predictions, *others = bottoms
-        shape = graph.shape_of(predictions)
-        aligned = [
-            bottom if self.bottom_shapes[i] == self.bottom_shapes[0] else graph.node("Reshape", bottom, shape)
-            for i, bottom in enumerate(others, 1)
-        ]
-        difference = graph.node("Sub", predictions, aligned[0])
-        if len(aligned) > 1:
-            difference = graph.node("Mul", difference, aligned[1])
-        length = graph.node("Abs", difference)
-        knee = graph.constant(self.knee)
-        square = graph.node("Mul", graph.node("Mul", difference, difference), graph.constant(0.5 / self.knee))
-        linear = graph.node("Sub", length, graph.constant(0.5 * self.knee))
-        losses = graph.node("Where", graph.node("Less", length, knee), square, linear)
-        if len(aligned) > 2:
-            losses = graph.node("Mul", losses, aligned[2])
-        return onnx_normalized_sum(graph, losses, "", BATCH_SIZE)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if len(set(self.bottom_shapes)) > 1 or self.by_pixel:
-            raise refusal(self, "PyTorch", "it is exported for bottoms of one shape, and not as R-FCN's")
-        knee = rounded(self.knee)
-        if len(bottoms) == 2:
-            template = 'F.smooth_l1_loss({x}, {y}, beta={knee}, reduction="sum") / {x}.shape[0]'
-            return code.call(template, x=bottoms[0], y=bottoms[1], knee=knee)
-        template = f"{code.function(weighted_smooth_l1_loss)}({', '.join(bottoms)}, beta={{knee}})"
-        return code.call(template, knee=knee)
-
-
-def weighted_smooth_l1_loss(predictions, targets, inside, outside=1.0, beta=1.0):
-    """Return the weighted sum of the smooth L1 losses of weighted differences, divided by N."""
-    x, y = inside * predictions, inside * targets
-    losses = F.smooth_l1_loss(x, y, beta=beta, reduction="none")
-    return (outside * losses).sum() / predictions.shape[0]
 
 
 class SmoothL1LossOHEM(SmoothL1Loss):

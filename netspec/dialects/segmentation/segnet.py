@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,9 +12,7 @@ from netspec.dialects.not_learned import NotLearned
 from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
-from netspec.layers.normalization import as_before, onnx_normalized, torch_batch_norm
+from netspec.layers.normalization import as_before
 from netspec.proto.schema import TRAIN, given, value
 
 INFERENCE = 1  # BNParameter.BNMode
@@ -96,36 +93,6 @@ class Upsample(Layer):
         top: torch.Tensor = _Unpool.apply(data.flatten(2), index.flatten(2), height * width)
         return top.reshape(self.top_shapes[0])
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        if len(bottoms) == 1:
-            scales = graph.constant([1.0, 1.0, float(self.scale_h), float(self.scale_w)])
-            grid = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
-            return graph.node("Resize", *bottoms, "", scales, **grid)
-        for axis in (2, 3):
-            graph.size(0, axis, "its mask counts the pixels of the enlarged map")
-        values = graph.reshape(bottoms[0], [0, 0, -1])
-        mask = graph.cast(graph.reshape(bottoms[1], [0, 0, -1]), "int64")
-        pixels = graph.constant([math.prod(self.top_shapes[0][2:])])
-        shape = graph.node("Concat", graph.shape_of(bottoms[0], 0, 2), pixels, axis=0)
-        empty = graph.node("Expand", graph.constant(0.0), shape)
-        return graph.reshape_to_top(graph.node("ScatterElements", empty, mask, values, axis=2))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        scale = (self.scale_h, self.scale_w)
-        if len(bottoms) == 1:
-            factor = self.scale_h if self.scale_h == self.scale_w else scale
-            return code.call("F.interpolate({x}, scale_factor={factor})", x=bottoms[0], factor=factor)
-        if None in code.sizes(0)[2:] and value(self.param, "upsample_param").HasField("upsample_h") is False:
-            cut = (value(self.param, "upsample_param").pad_out_h, value(self.param, "upsample_param").pad_out_w)
-            sides = [f"{{x}}.shape[{2 + k}] * {scale[k]}{' - 1' if cut[k] else ''}" for k in (0, 1)]
-            return code.call(
-                f"{code.function(unpool)}({{x}}, {{mask}}, ({', '.join(sides)}))", x=bottoms[0], mask=bottoms[1]
-            )
-        size = tuple(self.top_shapes[0][2:])
-        return code.call(
-            f"{code.function(unpool)}({{x}}, {{mask}}, {{size}})", x=bottoms[0], mask=bottoms[1], size=size
-        )
-
 
 class BN(NotLearned):
     """Batch normalization with a learnable slope and bias, as in PSPNet, or as in SegNet if its fields are given.
@@ -203,40 +170,3 @@ class BN(NotLearned):
         with torch.no_grad():
             for i, batch in ((2, mean), (3, (variance + self.eps).rsqrt() if self.inverse else variance)):
                 self.blob(i).mul_(momentum).add_(batch.reshape(self.blob_shapes[i]), alpha=1 - momentum)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        if self.num_tops > 1:
-            raise refusal(self, "ONNX", "it shows a batch's mean")
-        shape = (self.channels, *(1,) * (len(self.bottom_shapes[0]) - 2))
-        slope, bias = graph.blob(0, shape), graph.blob(1, shape)
-        if not self.by_batch and not self.moving:
-            return graph.node("Add", graph.node("Mul", *bottoms, slope), bias)
-        if not self.by_batch:
-            if self.inverse:
-                centered = graph.node("Sub", *bottoms, graph.blob(2, shape))
-                scaled = graph.node("Mul", centered, graph.node("Mul", graph.blob(3, shape), slope))
-                return graph.node("Add", scaled, bias)
-            blobs = [graph.blob(i, (self.channels,)) for i in range(4)]
-            return graph.node("BatchNormalization", *bottoms, *blobs, epsilon=self.eps)
-        normalized = onnx_normalized(graph, bottoms[0], len(self.bottom_shapes[0]), self.eps)
-        return graph.node("Add", graph.node("Mul", normalized, slope), bias)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.num_tops > 1:
-            raise refusal(self, "PyTorch", "it shows a batch's mean")
-        axes = len(self.bottom_shapes[0])
-        shape, eps = (self.channels, *(1,) * (axes - 2)), rounded(self.eps)
-        if self.by_batch or not self.moving:
-            template = "F.batch_norm({x}, None, None, training=True, eps={eps})" if self.by_batch else "{x}"
-            operands = {"y": code.parameter(0, shape, "slope"), "z": code.parameter(1, shape, "bias")}
-            return code.call(f"{template} * {{y}} + {{z}}", x=bottoms[0], eps=eps, **operands)
-        weight, bias, mean, variance = (self.blob(i).reshape(-1) for i in range(4))
-        variance = variance.pow(-2) - self.eps if self.inverse else variance
-        norm = torch_batch_norm(code, axes, mean, variance, eps, weight=weight, bias=bias)
-        return code.call("{norm}({x})", norm=norm, x=bottoms[0])
-
-
-def unpool(x, mask, size):
-    """Copy each value to the pixel of a larger map that the mask gives; the others are 0."""
-    empty = x.new_zeros(*x.shape[:2], size[0] * size[1])
-    return empty.scatter(2, mask.flatten(2).long(), x.flatten(2)).unflatten(2, size)

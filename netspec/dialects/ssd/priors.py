@@ -13,8 +13,6 @@ from netspec import log
 from netspec.dialects.boxes import Array
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.exporting import refusal
-from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import value
 
 
@@ -77,7 +75,7 @@ class PriorBox(Layer):
         """Warn about truncated sizes, since other forks and OpenCV do not truncate them."""
         for name in ("min_size", "max_size"):
             sizes = getattr(param, name)
-            cut = [f"{rounded(size):g} to {self.pixels(size):g}" for size in sizes if self.pixels(size) != size]
+            cut = [f"{size:g} to {self.pixels(size):g}" for size in sizes if self.pixels(size) != size]
             if cut:
                 place = self.context.at("prior_box_param", name, 0)
                 found = f"{place}: {name} is cut to whole pixels, as in SSD: {', '.join(cut)}"
@@ -122,76 +120,3 @@ class PriorBox(Layer):
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return torch.from_numpy(self.boxes).to(bottoms[0])
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        image_is_free = self.image is None and None in graph.sizes(1)[2:]
-        if None not in graph.sizes(0)[2:] and not image_is_free:
-            return graph.node("Identity", graph.constant(self.boxes))
-        if value(self.param, "prior_box_param").denser_prior_boxes:
-            raise refusal(self, "ONNX", "denser_prior_boxes is exported for maps of one size")
-        sides = []
-        for k in (0, 1):  # vertical, horizontal
-            count = graph.shape_of(bottoms[0], 2 + k, 3 + k)
-            if self.image:
-                extent = graph.constant([float(self.image[k])])
-            else:
-                extent = graph.cast(graph.shape_of(bottoms[1], 2 + k, 3 + k), "float32")
-            if self.step:
-                step = graph.constant([float(self.step[k])])
-            else:
-                step = graph.node("Div", extent, graph.cast(count, "float32"))
-            zero, one = graph.constant(0), graph.constant(1)
-            index = graph.cast(graph.node("Range", zero, graph.node("Squeeze", count), one), "float32")
-            offset = graph.constant(value(self.param, "prior_box_param").offset)
-            center = graph.node("Mul", graph.node("Add", index, offset), step)
-            center = graph.reshape(center, [-1, 1, 1] if k == 0 else [1, -1, 1])
-            half = graph.constant(self.sizes[:, 1 - k] / np.float32(2))
-            sides.append([graph.node("Div", graph.node(op, center, half), extent) for op in ("Sub", "Add")])
-        (top, bottom), (left, right) = sides
-        down, across = graph.shape_of(bottoms[0], 2, 3), graph.shape_of(bottoms[0], 3, 4)
-        shape = graph.node("Concat", down, across, graph.constant([len(self.sizes)]), axis=0)
-        last = graph.constant([3])
-        corners = [
-            graph.node("Unsqueeze", graph.node("Expand", side, shape), last) for side in (left, top, right, bottom)
-        ]
-        boxes = graph.node("Concat", *corners, axis=3)
-        if value(self.param, "prior_box_param").clip:
-            boxes = graph.node("Clip", boxes, graph.constant(0.0), graph.constant(1.0))
-        variances = graph.node("Expand", graph.constant(self.variances), graph.shape_of(boxes))
-        return graph.node("Concat", *(graph.reshape(part, [1, 1, -1]) for part in (boxes, variances)), axis=1)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        param = value(self.param, "prior_box_param")
-        if param.denser_prior_boxes:
-            raise refusal(self, "PyTorch", "it has denser_prior_boxes")
-        image = code.call("{image}", image=self.image) if self.image else code.call("{y}.shape[2:]", y=bottoms[1])
-        sizes = [(rounded(float(width)), rounded(float(height))) for width, height in self.sizes]
-        options = {
-            "sizes": sizes,
-            "variances": tuple(rounded(float(v)) for v in self.variances),
-            **({"step": self.step} if self.step else {}),
-            **({"offset": rounded(param.offset)} if param.offset != 0.5 else {}),
-            **({"clip": True} if param.clip else {}),
-        }
-        given = ", ".join(f"{name}={{{name}}}" for name in options)
-        template = f"{code.function(prior_boxes)}({{x}}, {{image}}, {given})"
-        return code.call(template, x=bottoms[0], image=image, **options)
-
-
-def prior_boxes(x, image, sizes, variances, step=None, offset=0.5, clip=False):
-    """Return boxes with these sizes (width, height) around the center of every pixel of x, relative to the image.
-
-    (1, 2, 4 H W K) for K sizes: the boxes (xmin, ymin, xmax, ymax) and their variances.
-    """
-    height, width = x.shape[2:]
-    down, across = step or (image[0] / height, image[1] / width)
-    options = {"dtype": torch.float64, "device": x.device}
-    y = (torch.arange(height, **options) + offset) * down
-    x = (torch.arange(width, **options) + offset) * across
-    center = torch.stack(torch.broadcast_tensors(x, y[:, None]), 2)[:, :, None]
-    half = torch.tensor(sizes, **options) / 2
-    boxes = torch.cat([center - half, center + half], 3)
-    boxes = (boxes / torch.tensor([image[1], image[0]] * 2, **options)).float()
-    boxes = boxes.clamp(0, 1) if clip else boxes
-    variance = torch.tensor(variances, device=boxes.device).expand_as(boxes)
-    return torch.stack([boxes.flatten(), variance.flatten()])[None]

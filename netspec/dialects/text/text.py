@@ -23,7 +23,6 @@ from netspec.dialects.text.ctc import (
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.reading import State
-from netspec.layers.contract.targets import OnnxGraph
 from netspec.proto.schema import has, value
 
 DECLARATIONS = """
@@ -85,7 +84,6 @@ class ContinuationIndicator(Layer):
 
     bottoms = (0, 1)
     label_bottoms = frozenset({0})
-    torch_call = "torch.ones({size}).index_fill(0, torch.tensor([0]), 0)"
 
     def setup(self) -> None:
         param = value(self.param, "continuation_indicator_param")
@@ -102,9 +100,6 @@ class ContinuationIndicator(Layer):
         top[0] = 0
         return top
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.constant(self.forward().cpu())
-
 
 @register("Reverse", "reverse_param")
 class Reverse(Layer):
@@ -115,8 +110,6 @@ class Reverse(Layer):
     Fork: senlinuc/caffe_ocr, src/caffe/layers/reverse_layer.cpp
     """
 
-    torch_call = "{x}.flip({axis})"
-
     def setup(self) -> None:
         self.axis = self.canonical_axis(value(self.param, "reverse_param").axis, self.bottom_shapes[0], "reverse_param")
 
@@ -125,10 +118,6 @@ class Reverse(Layer):
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.flip(self.axis)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        first, last, step = (graph.constant([n]) for n in (-1, -(2**31), -1))
-        return graph.node("Slice", bottoms[0], first, last, graph.constant([self.axis]), step)
 
 
 @register("ReverseTime", "reverse_time_param")

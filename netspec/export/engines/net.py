@@ -16,8 +16,8 @@ from netspec.export.engines.model import Model, Origin
 from netspec.export.engines.runners import Unable, warn_unable
 from netspec.export.formats.convert import Source
 from netspec.export.formats.onnx import export_onnx
+from netspec.export.table import layer_notes
 from netspec.graph.options import TORCH, BuildOptions
-from netspec.layers.contract.exporting import layer_notes
 from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias
 from netspec.layers.contract.reading import reads_data
 from netspec.net.net import Net

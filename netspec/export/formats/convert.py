@@ -18,7 +18,7 @@ from netspec.export.formats.torch import export_torch, write_tensors
 from netspec.files.kinds import unreadable
 from netspec.graph.filter import prune, with_state
 from netspec.graph.options import BuildOptions
-from netspec.layers.contract.exporting import passes_on
+from netspec.layers.contract.offers import passes_on
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights

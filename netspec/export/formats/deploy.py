@@ -19,7 +19,7 @@ from netspec.files.whole_file import whole_file
 from netspec.graph.filter import add_input, filter_net
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import origins
-from netspec.layers.contract.exporting import passes_on
+from netspec.layers.contract.offers import passes_on
 from netspec.layers.contract.reading import reads_data
 from netspec.net.build import build_net, not_to_be_given
 from netspec.net.net import Net

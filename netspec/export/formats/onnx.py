@@ -16,12 +16,11 @@ import torch
 from netspec.errors import SpecError
 from netspec.export.formats.preprocess import Preprocess
 from netspec.export.formats.shapes import Fixed, NetShapes, settled
+from netspec.export.table import exported, layer_notes, refusal
+from netspec.export.targets import OnnxGraph, Sizes
 from netspec.files.whole_file import whole_file, write_whole
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.exporting import layer_notes, refusal
 from netspec.layers.contract.learned import values_of
-from netspec.layers.contract.offers import offered
-from netspec.layers.contract.targets import OnnxGraph, Sizes
 from netspec.net.net import Net
 
 OPSET, IR_VERSION = 21, 10  # ONNX 1.16 (2024), which all current runtimes read
@@ -83,12 +82,13 @@ def _written(net: Net, preprocess: Preprocess | None) -> tuple[_Writer, list[str
 
 def _write_layer(layer: Layer, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
     """Write a layer into the graph; return the values of its tops. Raises SpecError if it cannot be exported."""
-    write, op = offered(layer, "to_onnx"), offered(layer, "onnx_op")
+    write, op = exported(layer, "to_onnx"), exported(layer, "onnx_op")
     if write is not None:
         return write(graph, *bottoms)
     if op is None:
         raise refusal(layer, "ONNX")
-    return graph.node(op, *bottoms, **{name: getattr(layer, name) for name in getattr(layer, "onnx_attributes", ())})
+    attributes = exported(layer, "onnx_attributes") or ()
+    return graph.node(op, *bottoms, **{name: getattr(layer, name) for name in attributes})
 
 
 class _DataFile:
@@ -249,7 +249,7 @@ def _value_info(name: str, dtype: Any, sizes: Sequence[int | str]) -> Any:
 
 
 class _Steps:
-    """Nodes and constants: the part of :class:`netspec.layers.contract.targets.OnnxGraph` that needs no layer."""
+    """Nodes and constants: the part of :class:`netspec.export.targets.OnnxGraph` that needs no layer."""
 
     def __init__(self, writer: _Writer, name: str) -> None:
         self.writer, self.name = writer, name
@@ -277,7 +277,7 @@ class _Steps:
 
 
 class _LayerGraph(_Steps):
-    """See :class:`netspec.layers.contract.targets.OnnxGraph`."""
+    """See :class:`netspec.export.targets.OnnxGraph`."""
 
     def __init__(self, writer: _Writer, index: int) -> None:
         self.layer: Layer = writer.net.layers[index]

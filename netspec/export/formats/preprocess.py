@@ -12,7 +12,7 @@ import numpy as np
 
 from netspec.data.mean import center
 from netspec.errors import SpecError
-from netspec.layers.contract.targets import Sizes
+from netspec.export.targets import Sizes
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from torch import nn
 from netspec.errors import SpecError, Where
 from netspec.export.formats.shapes import NetShapes, input_shapes, settled
 from netspec.export.formats.torch_code import MARK, Definition, check_shapes, legal, unique, write_definition
+from netspec.export.table import layer_notes
 from netspec.files.whole_file import whole_file
-from netspec.layers.contract.exporting import layer_notes
 from netspec.net.net import Net
 
 OPERATORS: dict[type, Callable[..., Any]] = {

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where
-from netspec.layers.contract.targets import Sizes
+from netspec.export.targets import Sizes
 from netspec.net.net import Net
 
 Shapes = tuple[Shape, ...]  # by value number of the Plan

@@ -31,8 +31,8 @@ from netspec.export.formats.torch_code import (
     unique,
     write_definition,
 )
+from netspec.export.table import layer_notes
 from netspec.files.whole_file import whole_file
-from netspec.layers.contract.exporting import layer_notes
 from netspec.net.net import Net
 
 

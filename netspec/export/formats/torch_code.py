@@ -17,11 +17,11 @@ import numpy as np
 import torch
 
 from netspec.export.formats.shapes import Fixed, NetShapes
+from netspec.export.table import exported, refusal
+from netspec.export.targets import Sizes, TorchCode
 from netspec.graph.plan import origins
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.exporting import passes_on, refusal
-from netspec.layers.contract.offers import offered
-from netspec.layers.contract.targets import Sizes, TorchCode
+from netspec.layers.contract.offers import passes_on
 from netspec.net.net import Net
 
 WIDTH = 88  # ruff's and black's line length where nothing else is configured
@@ -216,7 +216,7 @@ def write_definition(net: Net, shapes: NetShapes) -> Definition:
 
 def _write_layer(layer: Layer, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
     """Write a layer; return the expressions of its tops. Raises SpecError if it cannot be exported."""
-    write, template = offered(layer, "to_torch"), offered(layer, "torch_call")
+    write, template = exported(layer, "to_torch"), exported(layer, "torch_call")
     if write is not None:
         return write(code, *bottoms)
     if template is None:
@@ -260,7 +260,7 @@ class _Collector:
 
 
 class _LayerCode:
-    """See :class:`netspec.layers.contract.targets.TorchCode`."""
+    """See :class:`netspec.export.targets.TorchCode`."""
 
     def __init__(self, collector: _Collector, index: int) -> None:
         self.collector, self.made = collector, collector.made

@@ -1,6 +1,6 @@
 """What a layer may offer in addition to its forward pass, each by an attribute that its class defines.
 
-exporting.py  onnx_op, torch_call, or to_onnx, to_torch; passes_on: the layer in another form
+passes_on     whether every top is the bottom, unchanged
 gradients.py  caffes_gradient: the gradient from the content of memory
 joining.py    joined_with, joins_as: consecutive layers that one layer computes
 reading.py    running_state, restart, and the like: records, and state that is kept between passes
@@ -35,3 +35,8 @@ def call(layer: Layer, name: str, *arguments: Any) -> Any:
     """Call an offered method and return its result, or None if the class has none."""
     method = offered(layer, name)
     return None if method is None else method(*arguments)
+
+
+def passes_on(layer: Layer) -> bool:
+    """Return whether every top of a layer is its bottom, unchanged, at its present settings."""
+    return bool(offered(layer, "passes_on"))

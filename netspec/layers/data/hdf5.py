@@ -55,7 +55,6 @@ class HDF5Output(Layer):
 
     bottoms = (2, 2)
     tops = (0, 0)
-    not_exported = "it writes a file"
 
     def setup(self) -> None:
         name = self.param.hdf5_output_param.file_name

@@ -13,9 +13,7 @@ from netspec import log
 from netspec.errors import SpecError
 from netspec.layers.contract import fillers
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.proto.schema import FillerParameter
 
 T = TypeVar("T")
@@ -54,12 +52,6 @@ class Input(Layer):
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return tuple(torch.zeros(shape, device=self.context.device) for shape in self.shapes)
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        return [graph.input(i) for i in range(self.num_tops)]
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        return [code.input(i) for i in range(self.num_tops)]
-
 
 @register("DummyData", "dummy_data_param")
 class DummyData(Layer):
@@ -71,7 +63,6 @@ class DummyData(Layer):
 
     bottoms = (0, 0)
     tops = (1, None)
-    not_exported = "its values are random"
     OLD_AXES = ("num", "channels", "height", "width")
 
     def setup(self) -> None:
@@ -120,19 +111,6 @@ class DummyData(Layer):
             message = f"found {len(values)} {field}, expected 1 or one per top ({self.num_tops})"
             raise self.error(message, "dummy_data_param", field)
         return values * self.num_tops if len(values) == 1 else values
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        return [graph.node("Identity", graph.constant(values)) for values in self._fixed("ONNX")]
-
-    def _fixed(self, target: str) -> list[torch.Tensor]:
-        """Return the tops, which must be constant."""
-        fixed = [blob for blob in self._constants if blob is not None]
-        if len(fixed) < self.num_tops:
-            raise refusal(self, target)
-        return fixed
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        return [code.buffer(values) for values in self._fixed("PyTorch")]
 
 
 @register("MemoryData", "memory_data_param", "transform_param")

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.targets import OnnxGraph
 
 FULL, VALID, BATCH_SIZE, NONE = 0, 1, 2, 3  # caffe.proto: enum LossParameter.NormalizationMode
 
@@ -53,23 +52,6 @@ class Classified(Layer):
     def scores_and_labels(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return scores as (outer, classes, inner) and integer labels as (outer, inner)."""
         return scores.reshape(self.outer, self.classes, self.inner), labels.reshape(self.outer, self.inner).long()
-
-    def onnx_scores_and_labels(self, graph: OnnxGraph, scores: str, labels: str) -> tuple[str, str]:
-        """Write scores as (outer, classes, inner) and integer labels as (outer, 1, inner)."""
-        inner = self.inner if None not in graph.sizes(0)[1:] else -1
-        outer = -1 if inner > 0 else 0  # a free size after axis 0: then the classes are axis 1
-        scores = graph.reshape(scores, [outer, self.classes, inner])
-        shape = graph.node(
-            "Concat", graph.shape_of(scores, 0, 1), graph.constant([1]), graph.shape_of(scores, 2), axis=0
-        )
-        return scores, graph.cast(graph.node("Reshape", labels, shape), "int64")
-
-    def onnx_valid(self, graph: OnnxGraph, labels: str, ignore_label: int | None) -> tuple[str, str]:
-        """Write which labels count, as 0 or 1 (empty: all of them), and the labels with 0 for ignored ones."""
-        if ignore_label is None:
-            return "", labels
-        valid = graph.cast(graph.node("Not", graph.node("Equal", labels, graph.constant(ignore_label))), "int64")
-        return graph.cast(valid, "float32"), graph.node("Mul", labels, valid)
 
     def valid(self, labels: torch.Tensor, ignore_label: int | None) -> torch.Tensor | None:
         """Return which labels count (None: all of them). Raises SpecError for a label that is not a class."""
@@ -117,21 +99,3 @@ def normalizer(mode: int, outer: int, inner: int, valid: torch.Tensor | None) ->
     if mode == VALID and valid is not None:
         return valid.sum().clamp(min=1)
     return float(max(1, {FULL: outer * inner, VALID: outer * inner, BATCH_SIZE: outer, NONE: 1}[mode]))
-
-
-def onnx_normalized_sum(graph: OnnxGraph, losses: str, valid: str, mode: int) -> str:
-    """Write the sum of losses (outer, ...), divided as :func:`normalizer` says; an empty ``valid``: all count."""
-    if valid:
-        losses = graph.node("Mul", losses, valid)
-    if mode == VALID and valid:
-        counted = graph.node("Max", graph.node("ReduceSum", valid, keepdims=0), graph.constant(1.0))
-        return graph.node("Div", graph.node("ReduceSum", losses, keepdims=0), counted)
-    if mode in (FULL, VALID):
-        return graph.node("ReduceMean", losses, keepdims=0)
-    total = graph.node("ReduceSum", losses, keepdims=0)
-    return total if mode == NONE else graph.node("Div", total, onnx_items(graph, losses))
-
-
-def onnx_items(graph: OnnxGraph, value: str) -> str:
-    """Write the number of items, the size of axis 0, as a floating-point scalar."""
-    return graph.cast(graph.node("Squeeze", graph.shape_of(value, 0, 1)), "float32")

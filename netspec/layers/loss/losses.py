@@ -12,21 +12,14 @@ import torch.nn.functional as F
 from netspec.exact import libm
 from netspec.exact.arithmetic import AsTorch
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode, rounded
 from netspec.layers.loss.base import (
     BATCH_SIZE,
-    FULL,
-    NONE,
-    VALID,
     ClassLoss,
     Loss,
     ignore_label,
     normalization_mode,
     normalizer,
-    onnx_items,
-    onnx_normalized_sum,
 )
 
 
@@ -52,22 +45,6 @@ class HingeLoss(ClassLoss):
         arithmetic = self.arithmetic(margins)
         squared = self.param.hinge_loss_param.norm == self.L2
         return (arithmetic.sums_of_squares if squared else arithmetic.sums_of_magnitudes)(margins) / self.outer
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        x, labels = self.onnx_scores_and_labels(graph, *bottoms)
-        classes = graph.constant(torch.arange(self.classes).reshape(-1, 1))
-        of_label = graph.cast(graph.node("Equal", labels, classes), "float32")
-        sign = graph.node("Sub", graph.constant(1.0), graph.node("Mul", of_label, graph.constant(2.0)))
-        margins = graph.node("Relu", graph.node("Add", graph.constant(1.0), graph.node("Mul", sign, x)))
-        if self.param.hinge_loss_param.norm == self.L2:
-            margins = graph.node("Mul", margins, margins)
-        return onnx_normalized_sum(graph, margins, "", BATCH_SIZE)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        norm = 2 if self.param.hinge_loss_param.norm == self.L2 else 1
-        return code.call(
-            f"{code.function(hinge_loss)}({{x}}, {{y}}, norm={{norm}})", x=bottoms[0], y=bottoms[1], norm=norm
-        )
 
 
 @register("SigmoidCrossEntropyLoss", "loss_param", "sigmoid_param")
@@ -100,31 +77,6 @@ class SigmoidCrossEntropyLoss(Loss):
             losses = losses.where(valid, 0)
         return arithmetic.total(losses) / normalizer(self.normalization, x.shape[0], math.prod(x.shape[1:]), valid)
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        x, targets = bottoms
-        if self.bottom_shapes[0] != self.bottom_shapes[1]:
-            targets = graph.node("Reshape", targets, graph.shape_of(x))
-        softplus = graph.node("Softplus", graph.node("Neg", graph.node("Abs", x)))
-        linear = graph.node("Sub", graph.node("Relu", x), graph.node("Mul", x, targets))
-        valid = ""
-        if self.ignore_label is not None:
-            ignored = graph.node("Equal", graph.cast(targets, "int64"), graph.constant(self.ignore_label))
-            valid = graph.cast(graph.node("Not", ignored), "float32")
-        return onnx_normalized_sum(graph, graph.node("Add", linear, softplus), valid, self.normalization)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.ignore_label is not None:
-            raise refusal(self, "PyTorch", "torch's binary cross entropy cannot ignore a label")
-        x, y = bottoms
-        if self.bottom_shapes[0] != self.bottom_shapes[1]:
-            y = code.call("{y}.reshape({x}.shape)", x=x, y=y)
-        if self.normalization in (FULL, VALID):
-            return code.call("F.binary_cross_entropy_with_logits({x}, {y})", x=x, y=y)
-        total = 'F.binary_cross_entropy_with_logits({x}, {y}, reduction="sum")'
-        if self.normalization == NONE:
-            return code.call(total, x=x, y=y)
-        return code.call(f"{code.function(sigmoid_loss)}({{x}}, {{y}})", x=x, y=y)
-
 
 @register("EuclideanLoss")
 class EuclideanLoss(Loss):
@@ -148,18 +100,6 @@ class EuclideanLoss(Loss):
     def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         difference = a - b.reshape(a.shape)
         return self.arithmetic(difference).sums_of_squares(difference) / (2 * a.shape[0])
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        a, b = (graph.node("Flatten", bottom, axis=1) for bottom in bottoms)
-        difference = graph.node("Sub", a, b)
-        total = graph.node("ReduceSum", graph.node("Mul", difference, difference), keepdims=0)
-        return graph.node("Div", total, graph.node("Mul", onnx_items(graph, a), graph.constant(2.0)))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        x, y = bottoms
-        if self.bottom_shapes[0] != self.bottom_shapes[1]:
-            x, y = (code.call("{x}.flatten(1)", x=bottom) for bottom in bottoms)
-        return code.call("({x} - {y}).square().sum() / (2 * {x}.shape[0])", x=x, y=y)
 
 
 class _Contrastive(torch.autograd.Function):
@@ -228,52 +168,3 @@ class ContrastiveLoss(Loss):
         similar = label.reshape(-1).long() != 0
         arithmetic = self.arithmetic(a, small=True)
         return _Contrastive.apply(a.flatten(1), b.flatten(1), similar, p.margin, p.legacy_version, arithmetic)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        p = self.param.contrastive_loss_param
-        a, b = (graph.node("Flatten", bottom, axis=1) for bottom in bottoms[:2])
-        difference = graph.node("Sub", a, b)
-        squared = graph.node("ReduceSum", graph.node("Mul", difference, difference), graph.constant([1]), keepdims=0)
-        distance = squared if p.legacy_version else graph.node("Sqrt", squared)
-        dissimilar = graph.node("Relu", graph.node("Sub", graph.constant(p.margin), distance))
-        if not p.legacy_version:
-            dissimilar = graph.node("Mul", dissimilar, dissimilar)
-        label = graph.cast(graph.reshape(bottoms[2], [-1]), "int64")
-        losses = graph.node("Where", graph.node("Equal", label, graph.constant(0)), dissimilar, squared)
-        return graph.node("Mul", graph.node("ReduceMean", losses, keepdims=0), graph.constant(0.5))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        p = self.param.contrastive_loss_param
-        function = code.function(legacy_contrastive_loss if p.legacy_version else contrastive_loss)
-        template = f"{function}({', '.join(bottoms)}, margin={{margin}})"
-        return code.call(template, margin=rounded(p.margin))
-
-
-# Copied into exported PyTorch modules
-
-
-def sigmoid_loss(scores, targets):
-    """Return the cross entropy of sigmoid(scores), summed for each item and averaged over the items."""
-    total = F.binary_cross_entropy_with_logits(scores, targets, reduction="sum")
-    return total / scores.shape[0]
-
-
-def contrastive_loss(a, b, similar, margin):
-    """Return the mean over pairs of d**2 / 2 if similar, else max(margin - d, 0)**2 / 2."""
-    squared = (a - b).flatten(1).square().sum(1)
-    dissimilar = F.relu(margin - squared.sqrt()).square()
-    return torch.where(similar.flatten().long() != 0, squared, dissimilar).mean() / 2
-
-
-def legacy_contrastive_loss(a, b, similar, margin):
-    """Return the mean over pairs of d**2 / 2 if similar, else max(margin - d**2, 0) / 2."""
-    squared = (a - b).flatten(1).square().sum(1)
-    dissimilar = F.relu(margin - squared)
-    return torch.where(similar.flatten().long() != 0, squared, dissimilar).mean() / 2
-
-
-def hinge_loss(scores, labels, norm):
-    """Return the sum of max(0, 1 - s x)**norm / N, where s is 1 at the label, else -1."""
-    scores, labels = scores.flatten(1), labels.flatten().long()
-    sign = torch.ones_like(scores).scatter(1, labels[:, None], -1)
-    return F.relu(1 + sign * scores).pow(norm).sum() / scores.shape[0]

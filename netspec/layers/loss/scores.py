@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from google.protobuf.message import DecodeError
 
 from netspec.data.blobs import to_array
@@ -15,13 +14,8 @@ from netspec.exact import SMALL_ITEM
 from netspec.exact.arithmetic import AsTorch
 from netspec.files.limits import read_bytes
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.loss.base import (
-    BATCH_SIZE,
-    FULL,
-    NONE,
     VALID,
     Classified,
     ClassLoss,
@@ -29,7 +23,6 @@ from netspec.layers.loss.base import (
     ignore_label,
     normalization_mode,
     normalizer,
-    onnx_normalized_sum,
 )
 from netspec.proto.schema import BlobProto
 
@@ -110,29 +103,6 @@ class SoftmaxWithLoss(SoftmaxLoss):
         losses, p = _NegativeLogOfSoftmax.apply(x, label if valid is None else label * valid, arithmetic)
         return (self.sum_up(losses, valid, arithmetic.total), p.reshape(scores.shape))[: self.num_tops]
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        scores, labels = self.onnx_scores_and_labels(graph, *bottoms)
-        valid, labels = self.onnx_valid(graph, labels, self.ignore_label)
-        softmax = graph.node("Softmax", scores, axis=1)
-        chosen = graph.node("GatherElements", softmax, labels, axis=1)
-        losses = graph.node("Neg", graph.node("Log", graph.node("Max", chosen, graph.constant(FLT_MIN))))
-        loss = onnx_normalized_sum(graph, losses, valid, self.normalization)
-        return (loss,) if self.num_tops == 1 else (loss, graph.reshape_to_top(softmax, 1))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        scores, labels = self.bottom_shapes
-        y = bottoms[1] if labels == (scores[0], *scores[2:]) else code.call("{y}.squeeze(1)", y=bottoms[1])
-        if scores[1] != self.classes or labels not in ((scores[0], *scores[2:]), (scores[0], 1, *scores[2:])):
-            raise refusal(self, "PyTorch", "it is exported for scores (N, C, ...) and labels (N, ...) or (N, 1, ...)")
-        if self.ignore_label is None and self.normalization in (FULL, VALID):
-            loss = code.call("F.cross_entropy({x}, {y}.long())", x=bottoms[0], y=y)
-        else:
-            divisor = {FULL: "all", VALID: "counted", BATCH_SIZE: "items", NONE: "none"}[self.normalization]
-            options = {} if self.ignore_label is None else {"ignore": self.ignore_label}
-            given = ", ".join([f'divide_by="{divisor}"', *(f"{name}={{{name}}}" for name in options)])
-            loss = code.call(f"{code.function(softmax_loss)}({{x}}, {{y}}, {given})", x=bottoms[0], y=y, **options)
-        return (loss,) if self.num_tops == 1 else (loss, code.call("F.softmax({x}, dim=1)", x=bottoms[0]))
-
 
 @register("InfogainLoss", "infogain_loss_param", "loss_param")
 class InfogainLoss(SoftmaxLoss):
@@ -149,7 +119,6 @@ class InfogainLoss(SoftmaxLoss):
     """
 
     bottoms = (2, 3)
-    not_exported = "PyTorch has no loss with an infogain matrix"
     label_bottoms = frozenset({1, 2})
 
     def setup(self) -> None:
@@ -204,23 +173,6 @@ class InfogainLoss(SoftmaxLoss):
         loss = self.sum_up(losses, None if valid is None else valid.unsqueeze(2), arithmetic.total)
         return (loss, p.reshape(scores.shape))[: self.num_tops]
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        scores, labels = self.onnx_scores_and_labels(graph, *bottoms[:2])
-        valid, labels = self.onnx_valid(graph, labels, self.ignore_label)
-        if len(bottoms) == 3:
-            matrix = graph.reshape(bottoms[2], [self.classes, self.classes])
-        elif self.matrix is not None:
-            matrix = graph.constant(self.matrix.reshape(self.classes, self.classes))
-        else:
-            raise refusal(self, "ONNX", "the infogain matrix was not read")
-        log_p = graph.node("LogSoftmax", scores, axis=1)
-        floored = graph.node("Max", log_p, graph.constant(math.log(LOG_THRESHOLD)))
-        rows = graph.node("Gather", matrix, graph.node("Squeeze", labels, graph.constant([1])), axis=0)
-        weighted = graph.node("Mul", graph.node("Transpose", rows, perm=[0, 2, 1]), floored)
-        losses = graph.node("Neg", graph.node("ReduceSum", weighted, graph.constant([1]), keepdims=1))
-        loss = onnx_normalized_sum(graph, losses, valid, self.normalization)
-        return (loss,) if self.num_tops == 1 else (loss, graph.reshape_to_top(graph.node("Exp", log_p), 1))
-
 
 @register("MultinomialLogisticLoss")
 class MultinomialLogisticLoss(ClassLoss):
@@ -233,7 +185,6 @@ class MultinomialLogisticLoss(ClassLoss):
     """
 
     least = LOG_THRESHOLD
-    torch_call = "F.nll_loss(torch.log({x}.flatten(1).clamp(min={least})), {y}.flatten().long())"
 
     def forward(self, probabilities: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         p, label = self.scores_and_labels(probabilities, labels)
@@ -241,11 +192,6 @@ class MultinomialLogisticLoss(ClassLoss):
         arithmetic = self.arithmetic(p)
         chosen = arithmetic.floored(p.gather(1, label.unsqueeze(1)), self.least)
         return -arithmetic.total(arithmetic.log(chosen)) / self.outer
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        p, labels = self.onnx_scores_and_labels(graph, *bottoms)
-        chosen = graph.node("Max", graph.node("GatherElements", p, labels, axis=1), graph.constant(self.least))
-        return onnx_normalized_sum(graph, graph.node("Neg", graph.node("Log", chosen)), "", BATCH_SIZE)
 
 
 @register("Accuracy", "accuracy_param")
@@ -292,50 +238,3 @@ class Accuracy(Classified):
         hits = zeros.scatter_add(0, label.flatten(), right.flatten())
         occurrences = zeros.scatter_add(0, label.flatten(), valid.to(x.dtype).flatten())
         return accuracy, hits / occurrences.clamp(min=1)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        x, labels = self.onnx_scores_and_labels(graph, *bottoms)
-        counted, known = self.onnx_valid(graph, labels, self.ignore_label)
-        own = graph.node("GatherElements", x, known, axis=1)
-        as_good = graph.cast(graph.node("GreaterOrEqual", x, own), "float32")
-        rank = graph.node("ReduceSum", as_good, graph.constant([1]), keepdims=1)
-        right = graph.cast(graph.node("LessOrEqual", rank, graph.constant(float(self.top_k))), "float32")
-        accuracy = onnx_normalized_sum(graph, right, counted, VALID)
-        if self.num_tops == 1:
-            return (accuracy,)
-        classes = graph.constant(torch.arange(self.classes).reshape(-1, 1))
-        of_class = graph.cast(graph.node("Equal", labels, classes), "float32")  # an ignored label may also be a class
-        of_class = graph.node("Mul", of_class, counted) if counted else of_class
-        axes = graph.constant([0, 2])
-        occurrences = graph.node("ReduceSum", of_class, axes, keepdims=0)
-        hits = graph.node("ReduceSum", graph.node("Mul", of_class, right), axes, keepdims=0)
-        return accuracy, graph.node("Div", hits, graph.node("Max", occurrences, graph.constant(1.0)))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
-        if self.num_tops > 1 or self.inner != math.prod(self.bottom_shapes[0][2:]):
-            raise refusal(self, "PyTorch", "it is exported for scores (N, C, ...), without the accuracy of each class")
-        function = code.function(accuracy)
-        template = f"{function}({', '.join(bottoms)}, top_k={{top_k}}, ignore_label={{ignore}})"
-        return code.call(template, top_k=self.top_k, ignore=self.ignore_label)
-
-
-def softmax_loss(scores, labels, divide_by, ignore=-100):
-    """Return the sum of the cross entropy of softmax(scores), divided by the number of labels."""
-    labels = labels.long()
-    total = F.cross_entropy(scores, labels, ignore_index=ignore, reduction="sum")
-    counted = (labels != ignore).sum().clamp(min=1)
-    items = labels.shape[0]
-    counts = {"all": labels.numel(), "counted": counted, "items": items, "none": 1}
-    return total / counts[divide_by]
-
-
-def accuracy(scores, labels, top_k, ignore_label):
-    """Return the share of labels among the top_k scores; an equal score counts as higher."""
-    scores = scores.flatten(2) if scores.dim() > 2 else scores[:, :, None]
-    labels = labels.reshape(scores.shape[0], -1).long()
-    counted = torch.ones_like(labels)
-    if ignore_label is not None:
-        counted = (labels != ignore_label).long()
-    own = scores.gather(1, (labels * counted)[:, None])
-    right = ((scores >= own).sum(1) <= top_k) & (counted > 0)
-    return right.sum() / counted.sum().clamp(min=1)

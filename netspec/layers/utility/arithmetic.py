@@ -10,7 +10,6 @@ import torch
 from netspec.exact.sums import product_gradient
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 @register("Eltwise", "eltwise_param")
@@ -66,31 +65,6 @@ class Eltwise(Layer):
     ) -> tuple[torch.Tensor, ...]:
         return tuple(product_gradient(False, bottoms, i, top, diff) for i in range(len(bottoms)))
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        if self.operation == self.SUM:
-            scaled = zip(bottoms, self.coeff, strict=True)
-            bottoms = tuple(x if c == 1 else graph.node("Mul", x, graph.constant(c)) for x, c in scaled)
-        op = {self.SUM: "Add", self.PROD: "Mul", self.MAX: "Max"}[self.operation]
-        top, *others = bottoms
-        for bottom in others:
-            top = graph.node(op, top, bottom)
-        return top
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.operation == self.MAX:
-            top, *others = bottoms
-            for bottom in others:
-                top = code.call("torch.maximum({x}, {y})", x=top, y=bottom)
-            return top
-        if self.operation == self.PROD:
-            return " * ".join(bottoms)
-        top = ""
-        for bottom, coeff in zip(bottoms, self.coeff, strict=True):
-            sign = " - " if coeff < 0 else " + "
-            term = bottom if abs(coeff) == 1 else code.call("{coeff} * {x}", coeff=abs(coeff), x=bottom)
-            top = f"{top}{sign}{term}" if top else term if coeff > 0 else f"-{term}"
-        return top
-
 
 @register("Reduction", "reduction_param")
 class Reduction(Layer):
@@ -117,26 +91,6 @@ class Reduction(Layer):
         if operation == self.SUMSQ:
             return arithmetic.sums_of_squares(x, self.axis) * self.coeff
         return arithmetic.sums(x, self.axis) * self.coeff
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        p, (data,) = self.param.reduction_param, bottoms
-        if p.operation == self.ASUM:
-            data = graph.node("Abs", data)
-        elif p.operation == self.SUMSQ:
-            data = graph.node("Mul", data, data)
-        axes = graph.constant(list(range(self.axis, len(self.bottom_shapes[0]))))
-        op = "ReduceMean" if p.operation == self.MEAN else "ReduceSum"
-        top = graph.node(op, data, axes, keepdims=0)
-        return top if p.coeff == 1 else graph.node("Mul", top, graph.constant(p.coeff))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        p = self.param.reduction_param
-        form = {self.ASUM: "{x}.abs()", self.SUMSQ: "{x}.square()"}.get(p.operation, "{x}")
-        axes = list(range(self.axis, len(self.bottom_shapes[0])))
-        over = f"dim={axes[0] if len(axes) == 1 else tuple(axes)}" if self.axis else ""
-        operation = "mean" if p.operation == self.MEAN else "sum"
-        times = "" if p.coeff == 1 else "{coeff} * "
-        return code.call(f"{times}{form}.{operation}({over})", x=bottoms[0], coeff=p.coeff)
 
 
 @register("ArgMax", "argmax_param")
@@ -176,37 +130,6 @@ class ArgMax(Layer):
         top = torch.stack([indices, values], 1) if p.out_max_val else indices
         return top.reshape(self.top_shapes[0])
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
-        p, (data,) = self.param.argmax_param, bottoms
-        axis = 1 if self.axis is None else self.axis
-        if self.axis is None:
-            data = graph.node("Flatten", data, axis=1)
-        # For equal values, TopK returns the smaller index first; in the reversed axis, that is the larger one.
-        backwards = (graph.constant([-1]), graph.constant([-(2**62)]), graph.constant([axis]), graph.constant([-1]))
-        reverse = graph.node("Slice", data, *backwards)
-        values, order = graph.nodes("TopK", reverse, graph.constant([p.top_k]), outputs=2, axis=axis)
-        last = graph.node("Sub", graph.shape_of(data, axis, axis + 1), graph.constant([1]))
-        indices = graph.cast(graph.node("Sub", last, order), "float32")
-        if self.axis is not None:
-            return values if p.out_max_val else indices
-        columns = [indices, values] if p.out_max_val else [indices]
-        one = graph.constant([1])
-        top = graph.node("Concat", *(graph.node("Unsqueeze", column, one) for column in columns), axis=1)
-        ones = len(self.top_shapes[0]) - 3
-        return graph.node("Unsqueeze", top, graph.constant(list(range(3, 3 + ones)))) if ones > 0 else top
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        p, (x,) = self.param.argmax_param, bottoms
-        axis = 1 if self.axis is None else self.axis
-        if self.axis is None and len(self.bottom_shapes[0]) > 2:
-            x = code.call("{x}.flatten(1)", x=x)
-        found = code.call(f"{code.function(arg_max)}({{x}}, dim={axis}, top_k={{top_k}})", x=x, top_k=p.top_k)
-        if self.axis is not None:
-            return f"{found}[{1 if p.out_max_val else 0}]"
-        top = f"torch.stack({found}, 1)" if p.out_max_val else f"{found}[0][:, None]"
-        ones = max(0, len(self.top_shapes[0]) - 3)
-        return f"{top}[{', '.join(['...'] + ['None'] * ones)}]" if ones else top
-
 
 @register("Softmax", "softmax_param")
 class Softmax(Layer):
@@ -219,8 +142,6 @@ class Softmax(Layer):
 
     gradient_reads = frozenset({"top"})
     ignores_propagate_down = frozenset({0})
-    onnx_op, onnx_attributes = "Softmax", ("axis",)
-    torch_call = "F.softmax({x}, dim={axis})"
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         self.axis = self.canonical_axis(self.param.softmax_param.axis, bottom_shapes[0], "softmax_param", "axis")
@@ -251,12 +172,6 @@ class Silence(Layer):
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return ()
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        return ()
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        return ()
-
 
 @register("Parameter", "parameter_param")
 class Parameter(Layer):
@@ -279,16 +194,3 @@ class Parameter(Layer):
     def forward(self) -> torch.Tensor:
         blob = self.blob(0)
         return blob.view_as(blob)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Identity", graph.blob(0))
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        return (code.parameter(0),)
-
-
-def arg_max(x, dim, top_k):
-    """Return the indices (in x's type) and values of the largest; of equal ones, the last comes first."""
-    values, order = torch.sort(x.flip(dim), dim=dim, descending=True, stable=True)
-    indices = (x.shape[dim] - 1 - order).to(x.dtype)
-    return indices.narrow(dim, 0, top_k), values.narrow(dim, 0, top_k)

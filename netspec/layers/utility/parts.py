@@ -10,7 +10,6 @@ import torch
 
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:
@@ -33,7 +32,6 @@ class Concat(Layer):
     """
 
     bottoms = (1, None)
-    onnx_op, onnx_attributes = "Concat", ("axis",)
 
     def setup(self) -> None:
         if len(self.bottom_shapes) == 1:  # not copied
@@ -52,11 +50,6 @@ class Concat(Layer):
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return bottoms[0] if len(bottoms) == 1 else torch.cat(bottoms, self.axis)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if len(bottoms) == 1:
-            return bottoms[0]
-        return code.call(f"torch.cat([{', '.join(bottoms)}], dim={{axis}})", axis=self.axis)
 
 
 @register("Slice", "slice_param")
@@ -98,30 +91,6 @@ class Slice(Layer):
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return x.split(self.sizes, self.axis)
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        if self.num_tops == 1:
-            return [graph.node("Identity", *bottoms)]
-        points = list(self.param.slice_param.slice_point)
-        if graph.sizes(0)[self.axis] is not None:
-            return graph.nodes("Split", *bottoms, graph.constant(self.sizes), outputs=self.num_tops, axis=self.axis)
-        if not points:
-            return graph.nodes("Split", *bottoms, outputs=self.num_tops, axis=self.axis, num_outputs=self.num_tops)
-        axis = graph.constant([self.axis])
-        return [
-            graph.node("Slice", *bottoms, graph.constant([start]), graph.constant([end]), axis)
-            for start, end in zip([0, *points], [*points, 2**62], strict=True)
-        ]
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
-        if self.num_tops == 1:
-            return bottoms
-        if len(set(self.sizes)) == 1 and not self.param.slice_param.slice_point:
-            return code.call("{x}.chunk({count}, dim={axis})", x=bottoms[0], count=self.num_tops, axis=self.axis)
-        if code.sizes(0)[self.axis] is not None:
-            return code.call("{x}.split({sizes}, dim={axis})", x=bottoms[0], sizes=list(self.sizes), axis=self.axis)
-        points = list(self.param.slice_param.slice_point)
-        return code.call("{x}.tensor_split({points}, dim={axis})", x=bottoms[0], points=points, axis=self.axis)
-
 
 @register("Crop", "crop_param")
 class Crop(Layer):
@@ -159,25 +128,6 @@ class Crop(Layer):
     def forward(self, data: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
         return data[tuple(self.window)]
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        axis = next((i for i, part in enumerate(self.window) if part != slice(None)), 0)
-        starts = [part.start or 0 for part in self.window[axis:]]
-        wanted = graph.shape_of(bottoms[1], axis, len(self.window))
-        start = graph.constant(starts)
-        axes = graph.constant(list(range(axis, len(self.window))))
-        return graph.node("Slice", bottoms[0], start, graph.node("Add", wanted, start), axes)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        parts = []
-        for axis, part in enumerate(self.window):
-            if part == slice(None):
-                parts.append(":")
-            elif part.start == 0:
-                parts.append(f": {{y}}.shape[{axis}]")
-            else:
-                parts.append(f"{part.start} : {part.start} + {{y}}.shape[{axis}]")
-        return code.call(f"{{x}}[{', '.join(parts)}]", x=bottoms[0], y=bottoms[1])
-
 
 @register("BatchReindex")
 class BatchReindex(Layer):
@@ -191,7 +141,6 @@ class BatchReindex(Layer):
 
     bottoms = (2, 2)
     label_bottoms = frozenset({1})
-    torch_call = "{x}[{y}.long()]"
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         data, indices = bottom_shapes
@@ -205,9 +154,6 @@ class BatchReindex(Layer):
         if wrong.numel():
             raise self.error(f"found index {int(wrong[0])}, expected 0 to {x.shape[0] - 1}", "bottom", 1)
         return x.index_select(0, chosen)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Gather", bottoms[0], graph.cast(bottoms[1], "int64"), axis=0)
 
 
 @register("Filter")
@@ -244,13 +190,3 @@ class Filter(Layer):
         *data, selector = bottoms
         kept = selector.reshape(-1).nonzero().squeeze(1)
         return tuple(x.index_select(0, kept) for x in data)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        *data, selector = bottoms
-        dropped = graph.node("Equal", graph.reshape(selector, [-1]), graph.constant(0.0))
-        kept = graph.node("Squeeze", graph.node("NonZero", graph.node("Not", dropped)), graph.constant([0]))
-        return [graph.node("Gather", x, kept, axis=0) for x in data]
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        *data, selector = bottoms
-        return [code.call("{x}[{selector}.flatten() != 0]", x=x, selector=selector) for x in data]

@@ -63,7 +63,6 @@ class Python(Layer):
     """
 
     not_allowed = "a Python layer runs code named in the prototxt; pass --allow-python-layers if you trust it"
-    not_exported = "it runs Python code"
     bottoms = (0, None)
     tops = (0, None)
     takes_shapes = True  # if its code must not run

@@ -9,7 +9,6 @@ import torch
 
 from netspec.layers.contract.base import Layer, Shape, refuse_in_place
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 class _OtherShape(Layer):
@@ -23,12 +22,6 @@ class _OtherShape(Layer):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x.reshape(self.top_shapes[0])
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.reshape_to_top(bottoms[0])
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.reshape_to_top(bottoms[0])
 
 
 @register("Flatten", "flatten_param")
@@ -114,12 +107,6 @@ class Split(Layer):
         """Return one tensor per top, so that each has its own gradient."""
         return self.arithmetic(x).copies(x, self.num_tops)
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        return bottoms * self.num_tops
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        return bottoms * self.num_tops
-
 
 @register("Tile", "tile_param")
 class Tile(Layer):
@@ -129,8 +116,6 @@ class Tile(Layer):
     top[0]     that axis tiles times as long
     Caffe: src/caffe/layers/tile_layer.cpp
     """
-
-    torch_call = "{x}.repeat({repeats})"
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         p, shape = self.param.tile_param, bottom_shapes[0]
@@ -142,6 +127,3 @@ class Tile(Layer):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return self.arithmetic(x).tiles(x, self.axis, self.param.tile_param.tiles)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        return graph.node("Tile", *bottoms, graph.constant(self.repeats))

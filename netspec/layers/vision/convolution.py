@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch.nn import functional as F
@@ -13,10 +13,8 @@ from typing_extensions import override
 from netspec.exact import SMALL_PRODUCT
 from netspec.exact.products import Filter
 from netspec.layers.contract.base import Shape
-from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
-from netspec.layers.vision.sliding import TORCH_USUAL, SlidingFilter
+from netspec.layers.vision.sliding import SlidingFilter
 
 
 @register("Convolution", "convolution_param")
@@ -112,51 +110,6 @@ class Convolution(SlidingFilter):
         pixels = math.prod(self.top_shapes[0]) // self.num_output
         return len(self.top_shapes) * pixels * math.prod(self.blob_shapes[0])
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        weights = [graph.blob(0, (*self.blob_shapes[0], *(() if self.kernel else (1,))))]
-        if len(self.blobs) > 1:
-            weights.append(graph.blob(1))
-        geometry = self.onnx_geometry()
-        overhang = self.onnx_overhang(graph)
-        if any(overhang):
-            geometry["pads"] = [*self.pad, *(p + n for p, n in zip(self.pad, overhang, strict=True))]
-        tops = []
-        for i, bottom in enumerate(bottoms):
-            usual = self.channel_axis == 1 and self.spatial_axes
-            maps = bottom if usual else self._onnx_maps(graph, bottom)
-            top = self.onnx_convolved(graph, maps, weights, self.group, geometry)
-            tops.append(top if usual else graph.reshape_to_top(top, i))
-        return tops
-
-    def onnx_overhang(self, graph: OnnxGraph) -> Shape:
-        """Return the zeros to append along each spatial axis, where the filter is longer than the padded map."""
-        overhang = tuple(reversed(self.overhang(self.bottom_shapes[0])[1::2]))
-        for axis, zeros in enumerate(overhang, self.channel_axis + 1):
-            if zeros:
-                graph.size(0, axis, "its filter is larger than the map")
-        return overhang
-
-    def _onnx_maps(self, graph: OnnxGraph, bottom: str) -> str:
-        """Return a bottom as images, channels and at least one spatial axis."""
-        first = self.channel_axis + 1
-        why = "its channels are not axis 1"
-        spatial = [graph.size(0, axis, why) for axis in range(first, first + self.spatial_axes)] or [1]
-        return graph.reshape(bottom, [-1, self.channels, *spatial])
-
-    torch_module: ClassVar[str] = "Conv"
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        if self.channel_axis != 1 or not self.spatial_axes or any(self.overhang(self.bottom_shapes[0])):
-            raise refusal(self, "PyTorch", "it is exported for (N, C, spatial axes) and filters that fit")
-        numbers = {"in_channels": self.channels, "out_channels": self.num_output}
-        numbers |= {**self.torch_geometry(), "groups": self.group}
-        options = ", ".join(f"{name}={{{name}}}" for name in list(numbers)[2:])
-        bias = "" if len(self.blobs) > 1 else ", bias=False"
-        template = f"nn.{self.torch_module}{self.spatial_axes}d({{in_channels}}, {{out_channels}}, {options}{bias})"
-        state = {"weight": self.blob(0), **({"bias": self.blob(1)} if len(self.blobs) > 1 else {})}
-        conv = code.module(template, state, TORCH_USUAL, **numbers)
-        return [code.call("{conv}({x})", conv=conv, x=bottom) for bottom in bottoms]
-
 
 @register("Deconvolution", "convolution_param")
 class Deconvolution(Convolution):
@@ -168,9 +121,6 @@ class Deconvolution(Convolution):
     blobs[1]   bias    (num_output,)                                   unless bias_term: false
     Caffe: src/caffe/layers/base_conv_layer.cpp, deconv_layer.cpp
     """
-
-    onnx_filter = "ConvTranspose"
-    torch_module = "ConvTranspose"
 
     @override
     def filter_shape(self) -> Shape:

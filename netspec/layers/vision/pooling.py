@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 from netspec.layers.vision.windows import (
-    CEIL,
-    SMALLEST,
     Pair,
     Windows,
     average_pool,
@@ -47,79 +41,6 @@ class _PoolingBase(Layer):
         if self.phase == TRAIN:
             return sampled_pool(maps, windows, self.context.random.on(maps.device)), None
         return weighted_pool(maps, windows), None
-
-    def onnx_pool(
-        self, graph: OnnxGraph, data: str, windows: Windows, method: int, mask: bool = False
-    ) -> Sequence[str]:
-        """Return the pooled maps, and the mask if wanted."""
-        if any(r >= k for r, k in zip(windows.reach, windows.kernel, strict=True)):
-            raise refusal(
-                self,
-                "ONNX",
-                "windows with stride > kernel can lie outside the map; use round_mode: FLOOR",
-            )
-        pads = [*windows.pad, *windows.reach]
-        geometry = {"kernel_shape": list(windows.kernel), "strides": list(windows.stride), "pads": pads}
-        if method == MAX:
-            return self._onnx_max(graph, data, geometry, mask)
-        if method == AVE:
-            return [self._onnx_average(graph, data, windows, geometry)]
-        if self.phase == TRAIN:
-            raise refusal(self, "ONNX", "STOCHASTIC pooling draws random numbers in the training phase")
-        squares = graph.node("AveragePool", graph.node("Mul", data, data), count_include_pad=1, **geometry)
-        mean = graph.node("AveragePool", data, count_include_pad=1, **geometry)
-        least = graph.constant(SMALLEST / math.prod(windows.kernel))
-        return [graph.node("Div", squares, graph.node("Add", mean, least))]
-
-    def _onnx_max(self, graph: OnnxGraph, data: str, geometry: dict[str, Any], mask: bool) -> Sequence[str]:
-        if not mask:
-            return [graph.node("MaxPool", data, **geometry)]
-        top, indices = graph.nodes("MaxPool", data, outputs=2, **geometry)
-        pixels = graph.node("ReduceProd", graph.shape_of(data, 2, 4), keepdims=1)
-        return [top, graph.cast(graph.node("Mod", indices, pixels), "float32")]  # ONNX counts through all maps
-
-    def _onnx_average(self, graph: OnnxGraph, data: str, windows: Windows, geometry: dict[str, Any]) -> str:
-        means = graph.node("AveragePool", data, count_include_pad=1, **geometry)
-        beyond = [reach - pad for reach, pad in zip(windows.reach, windows.pad, strict=True)]
-        fixed = None not in graph.sizes(0)[2:]
-        areas = windows.areas(torch.zeros(())) / math.prod(windows.kernel)
-        if not any(beyond) or (fixed and bool((areas == 1).all())):
-            return means
-        # The last windows reach past the padded map. Pixels there do not count.
-        if fixed:
-            return graph.node("Div", means, graph.constant(areas[None, None]))
-        ones = graph.node("Expand", graph.constant(1.0), graph.shape_of(data))
-        frame = graph.constant([0, 0, *windows.pad, 0, 0, *windows.pad])
-        framed = graph.node("Pad", ones, frame, graph.constant(1.0), mode="constant")
-        counts = dict(geometry, pads=[0, 0, *beyond])
-        return graph.node("Div", means, graph.node("AveragePool", framed, count_include_pad=1, **counts))
-
-    def torch_pool(self, code: TorchCode, x: str, windows: Windows, method: int, mask: bool = False) -> str:
-        """Return the expression of the pooled maps; with ``mask``, of the maps and the mask."""
-        if self.phase == TRAIN and method == STOCHASTIC:
-            raise refusal(self, "PyTorch", "STOCHASTIC pooling draws random numbers in the training phase")
-        geometry = list(zip(windows.kernel, windows.stride, windows.pad, windows.reach, strict=True))
-        if any(r >= k for k, _, _, r in geometry) or (method != MAX and any(2 * p > k for k, _, p, _ in geometry)):
-            raise refusal(self, "PyTorch", "windows can lie outside the map; use round_mode: FLOOR, or less padding")
-        numbers: dict[str, Any] = {"kernel_size": windows.kernel, "stride": windows.stride, "padding": windows.pad}
-        options = ["{kernel_size}"]
-        if windows.stride != windows.kernel:
-            options.append("stride={stride}")
-        if any(2 * p > k for k, _, p, _ in geometry):
-            frame = (windows.pad[1], windows.reach[1], windows.pad[0], windows.reach[0])
-            x = code.call("F.pad({x}, {frame}, value=-torch.inf)", x=x, frame=frame)
-        else:
-            options += ["padding={padding}"] if any(windows.pad) else []
-            options += ["ceil_mode=True"] if windows.round_mode == CEIL and windows.stride != (1, 1) else []
-        options += ["return_indices=True"] if mask else []
-        numbers = {name: pair[0] if pair[0] == pair[1] else pair for name, pair in numbers.items()}
-        arguments = ", ".join(options)
-        if method == STOCHASTIC:
-            template = (
-                f"F.avg_pool2d({{x}}.square(), {arguments}) / F.avg_pool2d({{x}}, {arguments}).clamp(min={{least}})"
-            )
-            return code.call(template, x=x, least=SMALLEST, **numbers)
-        return code.call(f"F.{'max' if method == MAX else 'avg'}_pool2d({{x}}, {arguments})", x=x, **numbers)
 
 
 @register("Pooling", "pooling_param")
@@ -184,20 +105,6 @@ class Pooling(_PoolingBase):
         values, indices = self.pool(data, self.windows, self.method)
         return values if indices is None or self.num_tops == 1 else (values, indices.to(values.dtype))
 
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        if self.param.pooling_param.global_pooling and self.method != STOCHASTIC and self.num_tops == 1:
-            return [graph.node("GlobalMaxPool" if self.method == MAX else "GlobalAveragePool", *bottoms)]
-        if self.param.pooling_param.global_pooling:
-            for axis in (2, 3):
-                graph.size(0, axis, "its only window is the whole map")
-        return self.onnx_pool(graph, bottoms[0], self.windows, self.method, mask=self.num_tops > 1)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
-        mask = self.num_tops > 1
-        if not self.param.pooling_param.global_pooling or self.method == STOCHASTIC or mask:
-            return self.torch_pool(code, bottoms[0], self.windows, self.method, mask)
-        return code.call(f"F.adaptive_{'max' if self.method == MAX else 'avg'}_pool2d({{x}}, 1)", x=bottoms[0])
-
 
 @register("SPP", "spp_param")
 class SPP(_PoolingBase):
@@ -232,24 +139,6 @@ class SPP(_PoolingBase):
         method = self.param.spp_param.pool
         pooled = [self.pool(copy, windows, method)[0] for copy, windows in zip(copies, self.levels, strict=True)]
         return pooled[0] if len(pooled) == 1 else torch.cat([level.flatten(1) for level in pooled], dim=1)
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        for axis in (2, 3):
-            graph.size(0, axis, "the windows of its pyramid depend on the map's size")
-        method = self.param.spp_param.pool
-        levels = [self.onnx_pool(graph, bottoms[0], windows, method)[0] for windows in self.levels]
-        if len(levels) == 1:
-            return levels[0]
-        return graph.node("Concat", *(graph.node("Flatten", level, axis=1) for level in levels), axis=1)
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        for axis in (2, 3):
-            code.size(0, axis, "the windows of its pyramid depend on the map's size")
-        method = self.param.spp_param.pool
-        levels = [self.torch_pool(code, bottoms[0], windows, method) for windows in self.levels]
-        if len(levels) == 1:
-            return levels[0]
-        return f"torch.cat([{', '.join(f'{level}.flatten(1)' for level in levels)}], dim=1)"
 
 
 def _pyramid_level(bins: int, size: Pair) -> Windows:

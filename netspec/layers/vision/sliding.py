@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import chain
-from typing import Any, ClassVar
 
 import torch
 from torch.nn import functional as F
 
 from netspec.exact.products import Filter
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.exporting import refusal
 from netspec.layers.contract.registry import register
-from netspec.layers.contract.targets import OnnxGraph, TorchCode
 
 
 def _by(sizes: Shape) -> str:
@@ -103,38 +100,6 @@ class SlidingFilter(Layer):
         short = [max(0, e - size - 2 * p) for size, p, e in axes]
         return list(chain.from_iterable((0, n) for n in reversed(short)))
 
-    def onnx_geometry(self) -> dict[str, Any]:
-        """Return the attributes of ONNX's Conv and ConvTranspose."""
-        if not self.kernel:
-            return {"kernel_shape": [1]}
-        return {
-            "kernel_shape": list(self.kernel),
-            "strides": list(self.stride),
-            "dilations": list(self.dilation),
-            "pads": [*self.pad, *self.pad],
-        }
-
-    onnx_filter: ClassVar[str] = "Conv"
-
-    def onnx_convolved(
-        self, graph: OnnxGraph, maps: str, weights: Sequence[str], group: int, geometry: dict[str, Any]
-    ) -> str:
-        """Return the convolution. A filter of one pixel is padded by a separate node, for OpenCV 5.0."""
-        pads = geometry.get("pads", [])
-        if self.onnx_filter == "Conv" and set(self.kernel) == {1} and any(pads):
-            before, after = pads[: len(self.pad)], pads[len(self.pad) :]
-            maps = graph.node("Pad", maps, graph.constant([0, 0, *before, 0, 0, *after]))
-            geometry = {**geometry, "pads": [0] * len(pads)}
-        return graph.node(self.onnx_filter, maps, *weights, group=group, **geometry)
-
-    def torch_geometry(self) -> dict[str, Any]:
-        """Return kernel, stride, padding and dilation for torch: one number if all axes have the same."""
-        given = {"kernel_size": self.kernel, "stride": self.stride, "padding": self.pad, "dilation": self.dilation}
-        return {name: values[0] if len(set(values)) == 1 else values for name, values in given.items()}
-
-
-TORCH_USUAL = {"stride": 1, "padding": 0, "dilation": 1, "groups": 1}
-
 
 @register("Im2col", "convolution_param")
 class Im2col(SlidingFilter):
@@ -168,27 +133,3 @@ class Im2col(SlidingFilter):
         maps = maps.reshape(-1, *maps.shape[self.channel_axis :])
         sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
         return self.arithmetic(data).columns(maps, sliding).reshape(self.top_shapes[0])
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        if self.channel_axis != 1 or self.spatial_axes > 3 or any(self.overhang(self.bottom_shapes[0])):
-            raise refusal(self, "ONNX", "it is exported for (N, C, spatial axes) and filters that fit")
-        pixels = math.prod(self.kernel)
-        picks = (
-            torch.eye(pixels).reshape(pixels, 1, *self.kernel).repeat(self.channels, *(1,) * (1 + self.spatial_axes))
-        )
-        return self.onnx_convolved(graph, bottoms[0], [graph.constant(picks)], self.channels, self.onnx_geometry())
-
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.channel_axis != 1 or self.spatial_axes != 2 or any(self.overhang(self.bottom_shapes[0])):
-            raise refusal(self, "PyTorch", "it is exported for (N, C, H, W) and filters that fit")
-        numbers = self.torch_geometry()
-        options = ", ".join(f"{name}={{{name}}}" for name, value in numbers.items() if value != TORCH_USUAL.get(name))
-        rows = self.top_shapes[0][2]
-        code.size(0, 2, "the rows of windows are counted in advance")
-        template = f"{code.function(lay_out_windows)}({{x}}, {{rows}}, {options})"
-        return code.call(template, x=bottoms[0], rows=rows, **numbers)
-
-
-def lay_out_windows(x, rows, **geometry):
-    """Return the pixels under each position of a filter as channels (N, C K, H, W)."""
-    return F.unfold(x, **geometry).unflatten(2, (rows, -1))

@@ -14,13 +14,13 @@ from typing_extensions import override
 
 from exported import trained
 from netspec.exact.blas import one_thread
+from netspec.export.table import exported
 from netspec.fast import prepared as programs
 from netspec.fast.entry import Entry
 from netspec.fast.table import entry_of
 from netspec.graph.options import PASSES
 from netspec.layers.activation import Sigmoid
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.offers import offered
 from netspec.layers.vision.convolution import Convolution
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, write_binary
@@ -392,9 +392,9 @@ def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> No
         param.convolution_param.kernel_size.append(3)
         return cls(param, [(1, 2, 4, 4)])
 
-    assert offered(made(Halved), "to_onnx") is None
-    assert offered(made(Named), "to_onnx") is not None
-    assert [offered(made(Doubled), name) for name in ("onnx_op", "to_onnx", "torch_call", "to_torch")] == [None] * 4
+    assert exported(made(Halved), "to_onnx") is None
+    assert exported(made(Named), "to_onnx") is not None
+    assert [exported(made(Doubled), name) for name in ("onnx_op", "to_onnx", "torch_call", "to_torch")] == [None] * 4
     assert entry_of(made(Halved)) == entry_of(made(Named)) == Entry()  # entries are those of one class
 
 
