@@ -70,6 +70,7 @@ class Geometry:
     check   the geometric check
     agree   a function: how many points of a query and a reference agree
     common  the share of dissimilar pairs that agree: the stripes of a curb repeat, and a desk is in all images of it
+    points  the mean number of their points that agree, of those pairs that do not agree 0
     tried   the number of dissimilar pairs that were examined
     hidden  the share of the images that is ignored
     """
@@ -77,6 +78,7 @@ class Geometry:
     check: GeometricCheck
     agree: Agree
     common: float = 0.0
+    points: float = 0.0
     tried: int = 0
     hidden: float = 0.0
 
@@ -92,12 +94,13 @@ class Geometry:
             return agree(int(given.queries[query]), int(given.references[reference]))
 
         hidden = agree.hidden if isinstance(agree, Between) else 0.0
-        same = [check.enough(of_rows(query, reference)) > 0 for query, reference in unlike]
-        return cls(check, of_rows, float(np.mean(same)) if same else 0.0, len(same), hidden)
+        inliers = np.array([check.enough(of_rows(query, reference)) for query, reference in unlike])
+        common, points = (float(np.mean(inliers > 0)), float(np.mean(inliers))) if len(inliers) else (0.0, 0.0)
+        return cls(check, of_rows, common, points, len(inliers), hidden)
 
     def evidence(self, agreement: Agreement) -> float:
-        """Return the inliers of an agreement divided by the number needed, which grows if dissimilar pairs agree."""
-        return self.check.evidence(agreement) / (1 + self.common)
+        """Return the inliers of an agreement divided by the number needed: against chance and dissimilar pairs."""
+        return agreement.inliers / ((self.check.min_inliers or agreement.needed) + self.points)
 
 
 def _sample(numbers: np.ndarray) -> np.ndarray:
