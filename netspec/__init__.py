@@ -77,7 +77,7 @@ def __getattr__(name: str) -> "Any":
     import importlib.util
 
     if name == "__version__":
-        from netspec.terminal.commands import version
+        from netspec.files.version import version
 
         return version()
     if name in _HOMES:

@@ -11,20 +11,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netspec.errors import SpecError, several
-from netspec.exact import SMALL
 from netspec.graph.options import FP32, PASSES, TORCH, BuildOptions
 from netspec.proto.schema import phase_of
 
 if TYPE_CHECKING:
     import torch
 
+    from netspec.fast.speed import Fast
     from netspec.net.net import Net
-    from netspec.run.speed import Speed
     from netspec.solver.solver import Solver
 
 
-def speed() -> Speed | None:
-    """Return what makes nets faster, for :class:`~netspec.graph.options.BuildOptions`; None where it is not there."""
+def speed() -> Fast | None:
+    """Return netspec/fast for :class:`~netspec.graph.options.BuildOptions`, or None if it is not installed."""
     if find_spec("netspec.fast") is None:
         return None
     from netspec.fast.speed import Fast
@@ -41,7 +40,7 @@ def load_net(
     device: str | torch.device = "cpu",
     seed: int | None = None,
     allow_python: bool = False,
-    exact: str = SMALL,
+    exact: str = BuildOptions.exact,
     strict: bool = False,
     passes: str | Collection[str] = PASSES,
     engine: str = TORCH,
@@ -99,7 +98,7 @@ def load_solver(
     stages: str | Iterable[str] = (),
     allow_python: bool = False,
     action: Callable[[], str | None] = lambda: None,
-    exact: str = SMALL,
+    exact: str = BuildOptions.exact,
     strict: bool = False,
     precision: str = FP32,
     nan: str = "stop",
@@ -118,7 +117,6 @@ def load_solver(
         >>> solver.iteration
         2
     """
-    from netspec.layers.contract.context import device_of
     from netspec.proto.text import parse_solver
     from netspec.solver.options import TrainingOptions
     from netspec.solver.solver import make_solver
@@ -132,5 +130,5 @@ def load_solver(
         strict=strict,
         limit=limit,
     )
-    options = TrainingOptions(build, [device_of(each) for each in several(device)], nan, precision, action=action)
+    options = TrainingOptions(build, several(device), nan, precision, action=action)
     return make_solver(*parse_solver(path), options, weights, snapshot)

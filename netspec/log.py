@@ -18,6 +18,8 @@ from typing_extensions import override
 from netspec.errors import printable
 
 logger = logging.getLogger("netspec")
+SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)  # glog's 0 to 3
+VARIABLE = "GLOG_minloglevel"  # the environment variable with the lowest severity to log
 
 
 class _OneLine(logging.Filter):

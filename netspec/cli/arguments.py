@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from netspec import log
 from netspec.errors import SpecError
-from netspec.exact import CHOICES, SMALL
 from netspec.files.limits import read_amount
-from netspec.graph.options import BF16, ENGINES, FP32, OPENVINO, PASSES, PRECISIONS, TORCH, BuildOptions
+from netspec.graph.options import BF16, ENGINES, EXACT, FP32, OPENVINO, PASSES, PRECISIONS, TORCH, BuildOptions
 from netspec.load import speed
 from netspec.proto.binary import split_paths
 from netspec.proto.forks import use_dialect
@@ -172,8 +171,8 @@ def add_exact(parser: argparse.ArgumentParser) -> None:
     """Add ``--exact``."""
     parser.add_argument(
         "--exact",
-        default=SMALL,
-        choices=CHOICES,
+        default=BuildOptions.exact,
+        choices=EXACT,
         help="which sums are bit-identical to Caffe's on the CPU; all is slower (default: %(default)s)",
     )
 

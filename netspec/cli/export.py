@@ -263,9 +263,8 @@ def _add_export(commands: Commands) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from netspec.data.mean import read_mean_option
     from netspec.export.formats.convert import export_net
-    from netspec.export.formats.preprocess import Preprocess
+    from netspec.export.formats.preprocess import Preprocess, read_mean_option
 
     steps = Preprocess(
         arguments.input,

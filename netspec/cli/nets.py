@@ -284,9 +284,6 @@ def _add_layers(commands: Commands) -> None:
 
 
 def _layers(arguments: argparse.Namespace) -> None:
-    from netspec.layers import layer_class, layer_types
+    from netspec.inspect.layer_types import layer_lines
 
-    for name in layer_types():
-        cls = layer_class(name)
-        first = ((cls and cls.__doc__) or "").strip().splitlines()[0]
-        print(f"{name:28} {first}")
+    print("\n".join(layer_lines()))

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from netspec.cli.arguments import add_limit, add_plugin
-from netspec.terminal.commands import VARIABLE, WrongUsage, refuse
+from netspec.log import VARIABLE
+from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.parser import NO_LOG, Commands
 
 NAME = "run"

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from netspec.errors import check_choice, several
-from netspec.exact import CHOICES, SMALL
+from netspec.exact import CHOICES as EXACT
+from netspec.exact import SMALL
 
 TORCH, ONNXRUNTIME, OPENVINO = ENGINES = ("torch", "onnxruntime", "openvino")  # engines
 FP32, BF16 = PRECISIONS = ("fp32", "bf16")  # number formats
@@ -58,7 +59,7 @@ class BuildOptions:
     dialects: Collection[str] = ()
 
     def __post_init__(self) -> None:
-        check_choice("exact", self.exact, CHOICES)
+        check_choice("exact", self.exact, EXACT)
         for name in ("stages", "passes", "dialects"):
             object.__setattr__(self, name, several(getattr(self, name)))
         for name in self.passes:

@@ -36,7 +36,7 @@ class TrainingOptions:
     """
 
     build: BuildOptions = field(default_factory=BuildOptions)
-    devices: Sequence[torch.device] = ()
+    devices: Sequence[str | torch.device] = ()
     nan: str = "stop"
     precision: str = FP32
     processes: Processes = field(default_factory=Processes)

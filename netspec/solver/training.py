@@ -16,6 +16,7 @@ import torch
 
 from netspec import log
 from netspec.errors import SpecError, Where
+from netspec.layers.contract.context import device_of
 from netspec.layers.contract.reading import Scores
 from netspec.net.build import build_net, check_sources
 from netspec.net.net import Net
@@ -97,8 +98,8 @@ class Training:
             described = nets.solver_nets(param, self.node)
             for part in described if self.options.processes.is_root else described[:1]:
                 check_sources(part.net, part.source, self.options.build)
-        self.options = replace(self.options, devices=self._chosen_devices())
-        self.device = self.options.devices[0]
+        self.devices = self._chosen_devices()
+        self.device = self.devices[0]
         log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
         log.write(lines)
         self.seed = self._chosen_seed()
@@ -140,8 +141,9 @@ class Training:
 
     def _chosen_devices(self) -> Sequence[torch.device]:
         """Return the devices to train on, and log them as Caffe's tool does."""
-        devices = self.options.devices or [choose_device(self.param, self.node)]
-        if not self.options.devices and self.options.processes.count > 1 and devices[0].type == "cuda":
+        given = [device_of(each) for each in self.options.devices]
+        devices = given or [choose_device(self.param, self.node)]
+        if not given and self.options.processes.count > 1 and devices[0].type == "cuda":
             devices = [own_device()]
         if devices[0].type == "cpu":
             log.info("caffe.cpp:197", "Use CPU.")
@@ -157,7 +159,7 @@ class Training:
     def _build_nets(self, train: nets.SolverNet, *tests: nets.SolverNet) -> None:
         site, sentence = _CREATING[train.origin.split()[0]]
         log.info(site, sentence.format(train.origin))
-        processes, others = self.options.processes, self.options.devices[1:]
+        processes, others = self.options.processes, self.devices[1:]
         rank, ranks = processes.rank, processes.count * (1 + len(others))
         self.net = self.build(train, f"rank {rank}" if rank else train.label, self.device, rank, ranks)
         with log.silent():  # Caffe logs only the root

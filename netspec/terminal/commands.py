@@ -7,7 +7,6 @@ are known. Every error is one line.
 from __future__ import annotations
 
 import argparse
-import logging
 import os
 import shlex
 import signal
@@ -19,12 +18,11 @@ from contextlib import contextmanager, nullcontext
 
 from netspec.errors import SpecError, printable
 from netspec.files.limits import amount, is_out_of_memory, memory
+from netspec.log import SEVERITIES, VARIABLE
 from netspec.terminal.output import logging_to
 
 DONE, FAULT, WRONG_USAGE = 0, 1, 2  # exit statuses; a signal's is 128 + its number: 130, 143
 SOMETHING, UNREADABLE = 1, 2  # of commands that compare or advise: there is something to say; a file cannot be read
-SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)  # glog's 0 to 3
-VARIABLE = "GLOG_minloglevel"
 
 
 class WrongUsage(Exception):
@@ -150,17 +148,3 @@ def _level(arguments: argparse.Namespace) -> int:
         variable = os.environ.get(VARIABLE, "")
         minimum = int(variable) if variable.isdigit() else 0
     return max(arguments.log_level, SEVERITIES[min(minimum, len(SEVERITIES) - 1)])
-
-
-DISTRIBUTION = "netspec-caffe"
-UNKNOWN = "unknown"
-
-
-def version(distribution: str = DISTRIBUTION) -> str:
-    """Return the version of an installed distribution, "unknown" where it is not installed."""
-    from importlib import metadata  # which takes a while
-
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:  # the source is used without being installed
-        return UNKNOWN

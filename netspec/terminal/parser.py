@@ -17,7 +17,8 @@ from typing import Any
 
 from netspec import log
 from netspec.errors import did_you_mean
-from netspec.terminal.commands import FAULT, version
+from netspec.files.version import version
+from netspec.terminal.commands import FAULT
 
 TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
 

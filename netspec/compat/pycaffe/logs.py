@@ -8,7 +8,6 @@ import sys
 from typing import Any
 
 from netspec import log
-from netspec.terminal.commands import SEVERITIES, VARIABLE
 
 
 class _Stderr(logging.StreamHandler):
@@ -31,7 +30,7 @@ def start() -> None:
     if _handler not in log.logger.handlers:
         log.logger.addHandler(_handler)
         log.logger.propagate = False
-    _set_level(os.environ.get(VARIABLE, "0"))
+    _set_level(os.environ.get(log.VARIABLE, "0"))
 
 
 def stop() -> None:
@@ -57,6 +56,6 @@ def _set_level(level: int | str) -> None:
         number = int(level)
     except ValueError:
         number = 0
-    chosen = SEVERITIES[min(max(number, 0), 3)]
+    chosen = log.SEVERITIES[min(max(number, 0), 3)]
     _handler.setLevel(chosen)
     log.logger.setLevel(chosen)

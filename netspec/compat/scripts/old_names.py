@@ -23,7 +23,7 @@ from typing import Any
 
 from netspec.compat.scripts.as_python2 import py2_bytes
 from netspec.compat.scripts.mended import TRANSLATED
-from netspec.terminal.commands import VARIABLE
+from netspec.log import VARIABLE
 
 
 def install(also: Mapping[str, Callable[[Any], None]], quiet: bool = False) -> None:

@@ -16,6 +16,7 @@ from netspec.export.formats.preprocess import Preprocess
 from netspec.export.formats.pt2 import export_pt2
 from netspec.export.formats.torch import export_torch, write_tensors
 from netspec.files.kinds import unreadable
+from netspec.files.version import version
 from netspec.graph.filter import prune, with_state
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.offers import passes_on
@@ -24,7 +25,6 @@ from netspec.net.net import Net
 from netspec.net.weights import load_weights
 from netspec.proto.schema import PHASES
 from netspec.proto.text import parse_net
-from netspec.terminal.commands import version
 
 
 @dataclass(frozen=True)

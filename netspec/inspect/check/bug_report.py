@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, suppress
+from importlib import metadata
 from io import StringIO
 from pathlib import Path
 
@@ -17,7 +18,6 @@ from netspec.files.limits import amount, memory
 from netspec.inspect.check.check import check_file
 from netspec.inspect.stored_weights import stored_layers
 from netspec.proto.binary import is_net_binary
-from netspec.terminal.commands import UNKNOWN, version
 
 PACKAGES = ("netspec-caffe", "protobuf", "scipy", "lmdb", "opencv-python-headless", "h5py", "onnxruntime", "openvino")
 VARIABLES = re.compile(r"(OMP|GOMP|KMP|MKL|OPENBLAS|CUDA|GLOG|NETSPEC|OPENCV)_\w*")
@@ -37,7 +37,9 @@ def bug_report(paths: list[str]) -> str:
 def _machine() -> Iterator[str]:
     from torch.utils.collect_env import get_pretty_env_info
 
-    yield from (f"{name}: {version(name)}" for name in PACKAGES if version(name) != UNKNOWN)
+    for name in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            yield f"{name}: {metadata.version(name)}"
     yield f"BLAS kernels: {', '.join(sorted(kernels())) or 'another BLAS'}"
     yield f"Memory: {amount(memory())}"
     yield from (f"{name}: {os.environ[name]}" for name in sorted(os.environ) if VARIABLES.fullmatch(name))

@@ -14,12 +14,12 @@ from typing import Any
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
 
 from netspec import log
+from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Node, Plan, make_plan
-from netspec.layers import layer_class
-from netspec.layers.contract.base import Layer, Shape
+from netspec.layers import Layer, layer_class
 from netspec.net.build import build_filtered
 from netspec.proto.schema import PHASE_NAMES, NetParameter, PhaseValue, fields_of
 from netspec.proto.source_map import Place, SourceMap

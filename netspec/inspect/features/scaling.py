@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from netspec.data.blobs import Shape
-from netspec.data.mean import center, read_mean, read_mean_option
+from netspec.data.mean import center, read_mean
 from netspec.errors import SpecError, Where
+from netspec.export.formats.preprocess import read_mean_option
 from netspec.proto.schema import LayerParameter
 
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,6 @@ import pytest
 
 import netspec
 from netspec.inspect.check.bug_report import bug_report
-from netspec.terminal.commands import UNKNOWN, version
 from paths import GOLDEN
 
 WEIGHTS = GOLDEN / "snapshot" / "ref_iter_40.caffemodel"
@@ -24,7 +24,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_versions_and_the_machine() -> None:
     text = bug_report([])
-    for said in (f"netspec-caffe: {version('netspec-caffe')}", "BLAS kernels: ", "Memory: ", "PyTorch version: x"):
+    for said in (f"netspec-caffe: {netspec.__version__}", "BLAS kernels: ", "Memory: ", "PyTorch version: x"):
         assert f"\n{said}" in text
 
 
@@ -92,8 +92,12 @@ def test_the_command_prints_or_writes(run: Run) -> None:
     assert 'net: "sgd_step/train_val.prototxt"' in Path("report.md").read_text()
 
 
-def test_the_version(run: Run) -> None:
-    assert version() != UNKNOWN
-    assert netspec.__version__ == version()
-    assert version("no-such-distribution") == UNKNOWN
-    assert run("--version").out == f"netspec {version()}\n"
+def test_the_version(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(distribution: str) -> str:
+        raise metadata.PackageNotFoundError(distribution)
+
+    assert netspec.__version__ != "unknown"
+    assert netspec.__version__ == metadata.version("netspec-caffe")
+    assert run("--version").out == f"netspec {netspec.__version__}\n"
+    monkeypatch.setattr(metadata, "version", missing)
+    assert netspec.__version__ == "unknown"
