@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
 from netspec import log
 from netspec.errors import SpecError, several
-from netspec.graph import check_blobs
 from netspec.proto.schema import (
     PHASE_NAMES,
     LayerParameter,
@@ -104,57 +103,3 @@ def _meets(state: NetState, rule: NetStateRule, name: str) -> bool:
             log.info("net.cpp:342", f"The NetState contained a not_stage '{stage}' {ending}")
             return False
     return True
-
-
-INPUT = "Input"
-
-
-def is_input(layer: LayerParameter) -> bool:
-    """Return whether the tops of a layer are given by the caller."""
-    return layer.type == INPUT
-
-
-def add_input(net: NetParameter, name: str, shapes: Mapping[str, Sequence[int]]) -> None:
-    """Append an Input layer with tops of these shapes."""
-    entry = net.layer.add(name=name, type=INPUT, top=list(shapes))
-    for shape in shapes.values():
-        entry.input_param.shape.add().dim.extend(shape)
-
-
-def shapes_of_input(layer: LayerParameter) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the tops of an Input layer, as far as given. A single shape applies to all."""
-    shapes = [tuple(shape.dim) for shape in layer.input_param.shape]
-    return dict(zip(layer.top, shapes * len(layer.top) if len(shapes) == 1 else shapes, strict=False))
-
-
-def prune(
-    net: NetParameter, source: SourceMap, wanted: Sequence[str], given: Mapping[str, Sequence[int]]
-) -> tuple[NetParameter, SourceMap]:
-    """Return the filtered net with only the layers that are needed for the ``wanted`` blobs.
-
-    The layer that first writes a blob of ``given`` (name -> shape) is replaced by an Input layer of that shape; layers
-    that change it in place are kept. Raises SpecError for a blob that the net does not have.
-    """
-    check_blobs((*wanted, *given), (top for layer in net.layer for top in layer.top), source.file)
-    needed = set(wanted)
-    kept: list[int] = []
-    for i in reversed(range(len(net.layer))):
-        layer = net.layer[i]
-        made = {top for top in layer.top if top in needed}
-        if not made:
-            continue
-        fresh = {top for j, top in enumerate(layer.top) if j >= len(layer.bottom) or layer.bottom[j] != top}
-        if made & fresh and made <= set(given):
-            continue  # an Input layer replaces it
-        kept.append(i)
-        needed -= fresh - set(given)
-        needed.update(layer.bottom)
-    pruned = copy_without(net, {"layer"})
-    places = []
-    for name, shape in given.items():
-        add_input(pruned, name, {name: shape})
-        places.append(source.net)
-    for i in reversed(kept):
-        pruned.layer.add().CopyFrom(net.layer[i])
-        places.append(source.layers[i])
-    return pruned, source.with_layers(places)

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping
 
 from netspec.errors import SpecError, did_you_mean
-from netspec.proto.schema import LayerParameter, NetParameter
+from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.rewrite import copy_without
 
@@ -54,21 +54,6 @@ def insert_splits(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
 def is_split(name: str, kind: str) -> bool:
     """Return whether :func:`insert_splits` inserts a layer with this name and type."""
     return kind == "Split" and name.endswith("_split")
-
-
-def without_splits(net: NetParameter) -> list[LayerParameter]:
-    """Return the layers without Split layers; each reader of a copy reads the original blob."""
-    names: dict[str, str] = {}
-    layers = []
-    for layer in net.layer:
-        if layer.type == SPLIT:
-            names.update((top, names.get(layer.bottom[0], layer.bottom[0])) for top in layer.top)
-            continue
-        copy = LayerParameter()
-        copy.CopyFrom(layer)
-        copy.bottom[:] = [names.get(bottom, bottom) for bottom in layer.bottom]
-        layers.append(copy)
-    return layers
 
 
 def _last_names(blobs: Mapping[str, object]) -> str:

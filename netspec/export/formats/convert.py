@@ -11,13 +11,14 @@ import torch
 
 from netspec.errors import SpecError, Where
 from netspec.export.formats.deploy import fold, with_inputs, write_caffe
+from netspec.export.formats.inputs import prune
 from netspec.export.formats.onnx import export_onnx
 from netspec.export.formats.preprocess import Preprocess
 from netspec.export.formats.pt2 import export_pt2
 from netspec.export.formats.torch import export_torch, write_tensors
 from netspec.files.kinds import unreadable
 from netspec.files.version import version
-from netspec.graph.filter import prune, with_state
+from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.offers import passes_on
 from netspec.net.build import build_net

@@ -15,13 +15,14 @@ import torch
 
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
+from netspec.export.formats.inputs import add_input, not_to_be_given
 from netspec.files.whole_file import whole_file
-from netspec.graph.filter import add_input, filter_net
+from netspec.graph.filter import filter_net
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import origins
 from netspec.layers.contract.offers import passes_on
 from netspec.layers.contract.reading import reads_data
-from netspec.net.build import build_net, not_to_be_given
+from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import NetParameter, ParamSpec
 from netspec.proto.source_map import SourceMap

@@ -19,10 +19,11 @@ from netspec.errors import SpecError, Where
 from netspec.export.engines.choice import Choice
 from netspec.export.engines.model import Model, Origin
 from netspec.export.engines.runners import Unable, warn_unable
+from netspec.export.formats.inputs import is_input, prune, shapes_of_input
 from netspec.files.image_list import ImageList
 from netspec.files.kinds import unreadable
 from netspec.files.opencv import cv2
-from netspec.graph.filter import filter_net, is_input, prune, shapes_of_input, with_state
+from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import TORCH, BuildOptions
 from netspec.inspect.features.scaling import Steps, middle, scaling_of
 from netspec.load import speed
