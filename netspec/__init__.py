@@ -1,8 +1,8 @@
 """netspec, the living Caffe: runs Caffe's prototxt in PyTorch, unmodified, with Caffe's numbers.
 
-The public names are loaded when they are first used, so that ``import netspec.proto.text`` needs no torch. Nothing is
-imported here but a file that imports nothing: until this is done a program cannot answer signals
-(netspec/terminal/main.py), and ``python -m netspec`` still looks for modules in the working directory first
+The public names are loaded when they are first used, so that ``import netspec.proto.text`` does not import torch. This
+file imports only a module without imports of its own: until it has run, a program cannot handle signals
+(netspec/terminal/main.py), and ``python -m netspec`` still searches the working directory for modules first
 (netspec/__main__.py).
 """
 
@@ -46,7 +46,7 @@ __all__ = [
 
 
 def _find_forks() -> "_forks.Forks | None":
-    """Return who knows Caffe's forks; None where netspec/dialects is not there."""
+    """Return the object that knows Caffe's forks, or None if netspec/dialects is not installed."""
     import importlib.util
 
     if importlib.util.find_spec("netspec.dialects") is None:

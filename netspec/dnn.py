@@ -1,4 +1,4 @@
-"""OpenCV's ``cv2.dnn`` for Caffe's files: ``from netspec import dnn``. It lies in netspec/compat/dnn."""
+"""OpenCV's ``cv2.dnn`` for Caffe's files: ``from netspec import dnn``. The code is in netspec/compat/dnn."""
 
 from typing import TYPE_CHECKING, Any
 

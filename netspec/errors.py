@@ -1,4 +1,4 @@
-"""The one kind of error for all errors in a user's files, printed in the format of compilers."""
+"""The type of all errors in a user's files, printed in the format of compilers."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 
-@dataclass(frozen=True, slots=True)  # of a large net there are millions
+@dataclass(frozen=True, slots=True)  # a large net has millions
 class Where:
-    """A place in a file: ``file:line:column``, or the file alone where no line is known (line 0).
+    """A place in a file: ``file:line:column``, or only the file if no line is known (line 0).
 
     ``layer`` and ``type`` name the layer that the place belongs to, if any.
     """
@@ -32,7 +32,7 @@ class Where:
 def printable(text: str) -> str:
     """Return a text as one line, with control characters written as escapes.
 
-    Names come from files that somebody else wrote. Unescaped, they could forge lines of a log or control the terminal.
+    Names come from files of other people. Unescaped, they could forge lines of a log or control the terminal.
     Bytes of a file name that are not UTF-8 are escaped too, since they cannot be encoded.
     """
     return text.translate(_ESCAPES)
@@ -76,7 +76,7 @@ class InputError(SpecError):
         super().__init__(message, Where(os.fspath(file), line, column) if os.fspath(file) else None)
 
 
-Report = Callable[[SpecError], None]  # receives an error, and raises it, or collects it so that the work continues
+Report = Callable[[SpecError], None]  # receives an error, and raises or collects it
 
 
 def raise_fault(fault: SpecError) -> None:
@@ -119,14 +119,14 @@ def several(given: Any) -> tuple[Any, ...]:
     return tuple(given) if isinstance(given, Iterable) and not isinstance(given, (str, bytes)) else (given,)
 
 
-_ENDINGS = ("_param", "parameter", "loss", "data")  # what many names have in common says nothing
+_ENDINGS = ("_param", "parameter", "loss", "data")  # common endings do not make names similar
 
 
 def did_you_mean(word: str, known: Iterable[str], near: bool = False) -> str:
     """Return ``; did you mean "x"?`` for the closest known word, or an empty string.
 
-    ``near``: only for a slip of the pen. A layer type that has another first letter, or other digits, looks alike but
-    means something else; so does a name with an ending that many have.
+    With ``near``, only typing errors are corrected: the first letter and the digits must be equal, because layer types
+    that differ in them mean something else. The same holds for names with a common ending.
     """
     import difflib
 

@@ -1,6 +1,6 @@
-"""The public doors, :func:`load_net` and :func:`load_solver`: from files to a net, and to a solver.
+"""The public functions :func:`load_net` and :func:`load_solver`, which build a net or a solver from files.
 
-Here alone a net is given what is not in the core: speed (netspec/fast), and another engine (netspec/export/engines).
+Only this module connects a net with the optional packages netspec/fast and netspec/export/engines.
 """
 
 from __future__ import annotations
@@ -48,16 +48,18 @@ def load_net(
     cache: str | Path | bool | None = None,
     limit: int | None = None,
 ) -> Net:
-    """Build the net of a prototxt for a phase, level and stages; ``weights`` names one file of weights or several.
+    """Build the net of a prototxt for a phase, level and stages, with weights from one or several files.
 
-    It takes what a user may choose as keywords; from here on that is one BuildOptions (netspec/graph/options.py).
-    A warning names the layers that the weights lack; with ``strict`` that is an error.
-    ``passes`` are what may speed up a net of phase TEST that runs without gradients (netspec/fast/steps.py).
-    ``exact`` says which sums are Caffe's to the last bit: "none", "small" or "all" (see netspec/exact/__init__.py).
-    ``engine`` is "torch", "onnxruntime" or "openvino" (docs/engines.md), ``precision`` "fp32", or "bf16" where the
-    engine has it, ``cache`` the folder that keeps exported models (None: the user's cache folder, False: none).
-    ``limit`` is the memory, in bytes, that the net may need (None: what there is).
-    Raises SpecError for every fault of the files.
+    - ``passes``: the optimizations of a net of phase TEST that runs without gradients (netspec/fast/steps.py).
+    - ``exact``: which sums are bit-identical to Caffe's: "none", "small" or "all" (netspec/exact/__init__.py).
+    - ``strict``: layers without weights in the files are an error. By default there is a warning.
+    - ``engine``: "torch", "onnxruntime" or "openvino" (docs/engines.md).
+    - ``precision``: "fp32", or "bf16" if the engine supports it.
+    - ``cache``: the folder for exported models. None: the user's cache folder. False: no folder.
+    - ``limit``: the maximum memory of the net in bytes. None: the memory of its device.
+
+    The other keywords are those of :class:`~netspec.graph.options.BuildOptions`. Raises SpecError for errors in the
+    files and for unknown choices.
 
         >>> net = netspec.load_net("deploy.prototxt", weights="x.caffemodel")
         >>> net(images)["prob"].shape
@@ -106,11 +108,14 @@ def load_solver(
 ) -> Solver:
     """Build the solver of a prototxt and its nets, ready to run.
 
-    ``weights`` (one path, several separated by commas, or several) replaces the solver's own ``weights`` field; with
-    ``strict`` they must have every layer of each net. ``snapshot`` is a .solverstate to go on from; ``level`` and
-    ``stages`` go to the training net. Several devices train side by side, the first being the root. For the others see
-    :class:`~netspec.solver.options.TrainingOptions` and :class:`~netspec.graph.options.BuildOptions`, which all of this
-    is from here on. Raises SpecError for every fault of the files.
+    - ``weights``: one path, paths separated by commas, or several paths. They replace the solver's ``weights`` field.
+    - ``strict``: the weights must contain every layer of each net.
+    - ``snapshot``: a .solverstate from which to resume.
+    - ``device``: one device, or several that train in parallel. The first is the root.
+    - ``level``, ``stages``: the state of the training net.
+
+    The other keywords are those of :class:`~netspec.solver.options.TrainingOptions` and
+    :class:`~netspec.graph.options.BuildOptions`. Raises SpecError for errors in the files and for unknown choices.
 
         >>> solver = netspec.load_solver("solver.prototxt", weights="x.caffemodel")
         >>> solver.step(2)

@@ -1,4 +1,4 @@
-"""Caffe's Python interface: ``import netspec.pycaffe as caffe``. It lies in netspec/compat/pycaffe."""
+"""Caffe's Python interface: ``import netspec.pycaffe as caffe``. The code is in netspec/compat/pycaffe."""
 
 from typing import TYPE_CHECKING, Any
 

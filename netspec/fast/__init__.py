@@ -1,1 +1,1 @@
-"""Speed: what makes nets faster and changes nothing of what they compute. Without this folder they run all the same."""
+"""Faster code for nets, with the same results. It is optional: without this folder, nets run by ``forward``."""

@@ -1,4 +1,4 @@
-"""Runs of a net without gradients: each layer is prepared once for the shapes at hand.
+"""Runs of a net without gradients: each layer is prepared once for the current shapes.
 
 A program is the sequence of kernels for one set of input shapes and of blobs to keep. Programs keep copies of weights,
 folded or in the layout of a kernel. Before each run, a program checks whether a learned blob was written to, or could

@@ -1,6 +1,6 @@
-"""The object that a net is given to run faster.
+"""The implementation of :class:`netspec.run.speed.Speed`.
 
-Its methods import what they need: a command whose net an engine runs makes this object, and starts without torch.
+Its methods import what they need, because a command whose net is run by another engine does not load torch.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""What runs a net: one loop over steps, and the runners that make steps of a plan and its layers. None knows a Net."""
+"""Runs a net: a loop over steps, and runners that make these steps from a Plan and its layers, without a Net."""

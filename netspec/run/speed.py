@@ -1,4 +1,4 @@
-"""What a net may be given to run faster. It changes nothing of what is computed; netspec/fast is one."""
+"""The interface through which a net gets faster code. netspec/fast implements it. Results must not change."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from netspec.run.walk import Runner
 
 
 class Trainer(Protocol):
-    """Forward and backward passes of a net that trains, in one.
+    """Runs a net forward and backward.
 
-    Where it ``keeps``, ``passed`` has the values of the last pass and their gradients, by value number, until the next.
+    If ``keeps`` is set, ``passed`` contains the values of the last pass and their gradients, by value number.
     """
 
     keeps: bool
     passed: tuple[list[Any], list[Any]] | None
 
     def is_watched(self) -> bool:
-        """Return whether hooks wait for autograd's passes, so that it must make them."""
+        """Return whether a layer or blob has hooks, which only autograd calls."""
         ...
 
     def run(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Run the net forward and backward; return the weighted sum of its losses, and the outputs.
+        """Run the net forward and backward. Return the weighted sum of its losses, a scalar, and the output blobs.
 
         The gradients of the learnable blobs are added to ``grad``. The loss is valid until the next call.
         """
@@ -35,38 +35,38 @@ class Trainer(Protocol):
 
 
 class Speed(Protocol):
-    """Makes faster runners from the one that every net has."""
+    """Makes faster runners and kernels for a net."""
 
     def prepared(self, eager: Eager, passes: Collection[str]) -> Runner:
-        """Return a runner of passes without gradients; ``passes`` are what it may do (netspec/graph/options.py)."""
+        """Return a runner without gradients. ``passes`` are the allowed optimizations (netspec/graph/options.py)."""
         ...
 
     def trainer(self, eager: Eager, largest: float | None) -> Trainer | str:
-        """Return what trains the net, or the reason, in words, why it has nothing for it.
+        """Return a trainer for the net, or the reason why there is none.
 
-        ``largest`` is the size, in numbers in all tops, of the nets that it trains; None for its own limit.
+        ``largest`` is the largest number of elements in all tops of a net that is trained this way; None: a default.
         """
         ...
 
     def reads_at_once(self, decode: Callable[[Any], Any]) -> Callable[[Sequence[bytes]], Any]:
-        """Return what reads many raw Datums at once; ``decode`` returns the numbers (C, H, W) of one.
+        """Return a function that reads many raw Datums together. ``decode`` returns the array (C, H, W) of one Datum.
 
         See :class:`netspec.data.sources.DatabaseSource`.
         """
         ...
 
     def is_fresh(self, layer: Layer) -> bool:
-        """Return whether the top of a prepared layer is memory of its own, not a bottom's."""
+        """Return whether the top of a prepared layer has its own memory, not that of a bottom."""
         ...
 
     def learns(self, layer: Layer) -> bool:
-        """Return whether :meth:`kernels` has something for a layer at its present shapes."""
+        """Return whether :meth:`kernels` returns kernels for a layer with its current shapes."""
         ...
 
     def kernels(self, layer: Layer, wanted: Sequence[bool], sums: Sequence[Diff]) -> Kernels | None:
-        """Return what runs a layer forward and backward at its present shapes, for those who run layers one by one.
+        """Return the forward and backward kernels of a layer for its current shapes, or None.
 
-        ``wanted[i]`` says whether bottom i's gradient is asked for, that of learnable blob j is added to ``sums[j]``.
-        The backward kernel reads the bottoms again: they may have changed.
+        ``wanted[i]``: whether the gradient of bottom i is computed. ``sums[j]``: the tensor to which the gradient of
+        learnable blob j is added. Bottoms may change between the calls, so the backward kernel reads them again.
         """
         ...

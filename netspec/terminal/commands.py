@@ -1,7 +1,7 @@
 """How a command of any program runs: its log, its errors, its exit status, and signals.
 
 The log goes to stderr in glog's format; glog's own flags ``-minloglevel``, ``-logtostderr`` and ``-alsologtostderr``
-are known. Every error is one line.
+are accepted. Every error is one line.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from netspec.log import SEVERITIES, VARIABLE
 from netspec.terminal.output import logging_to
 
 DONE, FAULT, WRONG_USAGE = 0, 1, 2  # exit statuses; a signal's is 128 + its number: 130, 143
-SOMETHING, UNREADABLE = 1, 2  # of commands that compare or advise: there is something to say; a file cannot be read
+SOMETHING, UNREADABLE = 1, 2  # of commands that compare or advise: something was found; a file cannot be read
 
 
 class WrongUsage(Exception):
@@ -80,7 +80,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
 
 
 def _missing_part(fault: Exception) -> str:
-    """Return the folder of netspec that a command looked for in vain, "" for any other fault."""
+    """Return the folder of netspec that a command needs and that is missing; "" for any other error."""
     missing = (fault.name or "").split(".") if isinstance(fault, ModuleNotFoundError) else []
     return "/".join(missing[:2]) if missing[:1] == ["netspec"] and len(missing) > 1 else ""
 
@@ -115,12 +115,12 @@ def interruptible() -> Iterator[None]:
         return
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     before = {number: handler for number, handler in before.items() if _is_usual(handler)}
-    came: list[int] = []
+    received: list[int] = []
 
     def interrupt(number: int, _: object) -> None:
-        if came:
+        if received:
             os._exit(128 + number)
-        came.append(number)
+        received.append(number)
         raise Interrupted(number)
 
     try:
@@ -128,8 +128,8 @@ def interruptible() -> Iterator[None]:
             signal.signal(number, interrupt)
         yield
     except Exception:
-        if came:  # a module that was being imported may have turned the interrupt into another error
-            raise Interrupted(*came) from None
+        if received:  # a module that was being imported may have turned the interrupt into another error
+            raise Interrupted(*received) from None
         raise
     finally:
         for number, handler in before.items():
@@ -137,7 +137,7 @@ def interruptible() -> Iterator[None]:
 
 
 def _is_usual(handler: object) -> bool:
-    """Return whether a signal has the system's handler, Python's, or ``end_at_once`` of netspec/terminal/main.py."""
+    """Return whether a handler is the system's, Python's, or ``end_at_once`` of netspec/terminal/main.py."""
     return handler in (signal.SIG_DFL, signal.default_int_handler) or getattr(handler, "__name__", "") == "end_at_once"
 
 

@@ -67,7 +67,7 @@ def _flush_stdout(status: int) -> int:
     try:
         out.flush()
     except OSError as fault:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())  # it is written once more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())  # Python writes it again at exit
         if not isinstance(fault, BrokenPipeError):
             print(f"standard output: {fault.strerror}", file=sys.stderr)
         return status or 1

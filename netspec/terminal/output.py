@@ -1,4 +1,4 @@
-"""What a command shows: its log, bars while it works, doubts about the user's files, tables."""
+"""The output of a command: its log, progress bars, warnings about the user's files, and tables."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ Item = TypeVar("Item")
 
 
 def bar(items: Iterable[Item], stage: str, total: int | None = None, unit: str = "") -> Iterable[Item]:
-    """Return the items; on a terminal, a bar named ``stage`` shows how far the caller is in them."""
+    """Return the items; on a terminal, a progress bar named ``stage`` shows how many the caller has taken."""
     from tqdm import tqdm  # commands that show no bar do not load it
 
     return tqdm(items, desc=stage, total=total, disable=None, leave=False, unit=unit)
 
 
-def warn(doubt: str) -> None:
-    """Print a doubt about the user's files."""
-    print(printable(f"warning: {doubt}"), file=sys.stderr)
+def warn(message: str) -> None:
+    """Print a warning about the user's files."""
+    print(printable(f"warning: {message}"), file=sys.stderr)
 
 
 def in_columns(rows: Sequence[Sequence[str]], left: int = 1, spans: Sequence[tuple[str, int]] = ()) -> list[str]:
-    """Return rows of cells as lines; the first ``left`` columns begin at their left, the others end at their right.
+    """Return rows of cells as lines. The first ``left`` columns are left-aligned, and the others right-aligned.
 
-    ``spans``, where given, are headings above these others: a text, and over how many columns it stands.
+    ``spans`` are headings above the right-aligned columns: pairs of a text and the number of columns below it.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
@@ -80,7 +80,7 @@ def logging_to(level: int, form: logging.Formatter, folder: str | None) -> Itera
 
 
 class _WarnOnce(logging.Filter):
-    """Lets each warning through only the first time."""
+    """Passes each warning only once."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -129,7 +129,7 @@ class Solver:
             param.type = self.type_name
         with caffes_errors():
             build = BuildOptions(seed=mode.solver_seed(), allow_python=True, exact=mode.exact(), speed=speed())
-            # nan: training goes on, as in Caffe; a script may check the loss itself
+            # nan: the training continues, as in Caffe; a script may check the loss itself
             options = TrainingOptions(build, [mode.device()], nan="warn")
             self._training = _Training(param, node, options)
         self._callbacks: list[tuple[Callable[[], object], Callable[[], object]]] = []

@@ -148,5 +148,5 @@ class _Prepared:
 
 
 def _prepare_worker(reader: sources.Reader, shadow: bool) -> None:
-    reader.quiet = True  # the program's own process has said it
+    reader.quiet = True  # the program's own process has already printed it
     _make_ready(reader, shadow, quiet=True)
