@@ -175,6 +175,6 @@ def check_efficientnet_lite0(said: str, folder: Path) -> None:
     assert (folder / "efficientnet_lite0.caffemodel").stat().st_size < 20e6
 
 
-def test_it_runs(ran: tuple[str, str, Path]) -> None:
+def test_the_example_runs(ran: tuple[str, str, Path]) -> None:
     name, said, folder = ran
     globals()[f"check_{name}"](said, folder)

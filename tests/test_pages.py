@@ -63,7 +63,7 @@ def less(words: tuple[str, ...]) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_a_page_runs_as_it_stands(page: str, made: Path, tmp_path: Path) -> None:
+def test_commands_of_a_page_run(page: str, made: Path, tmp_path: Path) -> None:
     folder, log = shutil.copytree(made, tmp_path / "folder", symlinks=True), tmp_path / "log"
     for block in blocks(page):
         if block.file and block.language:
@@ -80,7 +80,7 @@ def test_a_page_runs_as_it_stands(page: str, made: Path, tmp_path: Path) -> None
                     assert status == FOUND.get(command.words[:2], 0), f"{line}\n{log.read_text()[-3000:]}"
 
 
-def test_a_command_and_a_snippet_that_fail_are_noticed(tmp_path: Path) -> None:
+def test_failing_commands_and_snippets_are_noticed(tmp_path: Path) -> None:
     log = tmp_path / "log"
     assert run(Command(("netspec", "chekc"), tmp_path), log) == 2
     assert "chekc" in log.read_text()

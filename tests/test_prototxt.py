@@ -53,7 +53,7 @@ def layers_of(path: Path) -> dict[str, LayerParameter]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: f"{path.parent.name}-{path.name}")
-def test_the_second_tower_is_the_first_under_other_names(folder: Path) -> None:
+def test_the_towers_differ_only_in_names(folder: Path) -> None:
     net = read_net(folder / "train_val.prototxt")
     second = [layer for layer in net.layer if layer.name.endswith("_p")]
     first = [layer for layer in net.layer if layer.type not in ("Data", "Slice", "ContrastiveLoss")][: len(second)]
@@ -83,7 +83,7 @@ def test_deploy_is_the_first_tower(folder: Path) -> None:
     assert deploy.layer[-1].top[0] == "feat"
 
 
-def test_the_nets_of_one_kind_differ_in_their_last_layer_alone() -> None:
+def test_nets_of_one_kind_differ_only_in_the_last_layer() -> None:
     for part in PARTS:
         for one, other in (("siamese_8", "siamese_128"), ("siamese_resnet27_256", "siamese_resnet27_512")):
             texts = [(ROOT / f"prototxt/{part}/{name}/train_val.prototxt").read_text() for name in (one, other)]
@@ -104,7 +104,7 @@ def test_the_residual_net_has_27_convolutions_and_7x7x512_reach_the_features() -
     assert checked.net.shapes[checked.net.plan.blobs[last.bottoms[0]]] == (1, 512, 7, 7)
 
 
-def test_the_papers_nets_are_what_the_paper_draws() -> None:
+def test_the_nets_have_the_papers_layers() -> None:
     """It names no normalization: the last InnerProducts go straight into the loss, and nothing else follows them."""
     for name in NETS:
         layers = layers_of(ROOT / f"prototxt/{name}/train_val.prototxt")
@@ -114,7 +114,7 @@ def test_the_papers_nets_are_what_the_paper_draws() -> None:
 
 
 @pytest.mark.parametrize("part", ["normalized", "small"])
-def test_what_keeps_trainings_from_diverging(part: str) -> None:
+def test_descriptors_are_normalized_against_divergence(part: str) -> None:
     """Distances of descriptors of length 1 stay below 2."""
     for name in NETS:
         layers = layers_of(ROOT / f"prototxt/{part}/{name}/train_val.prototxt")
@@ -123,7 +123,7 @@ def test_what_keeps_trainings_from_diverging(part: str) -> None:
 
 
 @pytest.mark.parametrize("name", NETS)
-def test_the_normalized_nets_are_the_papers_and_the_length(name: str) -> None:
+def test_normalized_nets_add_a_normalization_to_the_papers_nets(name: str) -> None:
     paper, longer = (layers_of(ROOT / f"prototxt/{part}/{name}/train_val.prototxt") for part in ("", "normalized"))
     added = {f"{layer}{side}" for layer in ("ip_feat", "feat_sumsq", "feat_inverse") for side in ("", "_p")}
     assert longer.keys() - paper.keys() == added
@@ -136,7 +136,7 @@ def test_the_normalized_nets_are_the_papers_and_the_length(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3])
 @pytest.mark.parametrize("name", ["siamese_128", "siamese_resnet27_256"])
-def test_it_trains_whatever_the_seed(name: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_works_for_any_seed(name: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Features that are all alike have a loss of 0.25; a training that diverges leaves it far behind."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
@@ -156,7 +156,7 @@ def test_it_trains_whatever_the_seed(name: str, seed: int, tmp_path: Path, monke
     assert max(losses) < 0.5
 
 
-def test_the_solvers_are_the_papers() -> None:
+def test_the_solvers_have_the_papers_settings() -> None:
     for part, name in itertools.product(("", "normalized"), NETS):
         solver = read_solver(ROOT / f"prototxt/{part}/{name}/solver.prototxt")
         assert Path(solver.net) == Path("prototxt") / part / name / "train_val.prototxt"
@@ -172,7 +172,7 @@ def test_the_solvers_are_the_papers() -> None:
 @pytest.mark.parametrize(
     "folder", [FOLDERS[k] for k in (0, 3, 8, 11)], ids=lambda path: f"{path.parent.name}-{path.name}"
 )
-def test_one_iteration_and_back_into_the_deploy_net(
+def test_weights_of_one_iteration_load_into_the_deploy_net(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -231,7 +231,7 @@ def test_the_words_loss_is_the_softmax_loss_of_a_batchs_cosines_both_ways(
         assert grad.abs().max() > 0, name
 
 
-def test_the_words_net_has_one_tower_twice_and_its_deploy_net_too() -> None:
+def test_the_words_net_and_its_deploy_net_have_two_equal_towers() -> None:
     train, deploy = (layers_of(WORDS / f"{name}.prototxt") for name in ("train_val", "deploy"))
     names = [name for name, layer in train.items() if layer.param and not name.endswith("_p")]
     assert len(names) == 3 * 9 + 2
@@ -246,7 +246,7 @@ def test_the_words_net_has_one_tower_twice_and_its_deploy_net_too() -> None:
     assert shapes == {"feat": (1, 256 + 25 * 64)}
 
 
-def test_places_contains_the_net_of_256_words_and_has_layers_of_caffe_alone() -> None:
+def test_places_contains_the_net_of_256_words_and_only_caffes_layers() -> None:
     small, large = (layers_of(folder / "deploy.prototxt") for folder in (WORDS, PLACES))
     for name in small.keys() - {"data", "input", "feat"}:
         assert large[name] == small[name]
@@ -263,7 +263,7 @@ def test_places_contains_the_net_of_256_words_and_has_layers_of_caffe_alone() ->
     sorted((ROOT / "prototxt").rglob("train_val*.prototxt")),
     ids=lambda path: f"{path.parent.parent.name}-{path.parent.name}-{path.stem}",
 )
-def test_every_net_checks_without_a_fault_or_advice(path: Path) -> None:
+def test_every_net_passes_check_and_lint(path: Path) -> None:
     """The advice would say, among other things, that towers do not share all parameters."""
     text = path.read_text()
     batch = int(re.findall(r"batch_size: (\d+)", text)[0])

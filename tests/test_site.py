@@ -45,7 +45,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_site_has_no_bad_link_and_loads_nothing_from_elsewhere(site: Path) -> None:
+def test_the_site_has_no_broken_links_and_no_external_resources(site: Path) -> None:
     pages = {page: Links(page) for page in site.rglob("*.html") if "_static" not in page.parts}
     assert len(pages) > 15
     for page, links in pages.items():
@@ -68,7 +68,7 @@ def text_of(site: Path, pages: str) -> str:
     return "".join(page.read_text() for page in (site / "reference").glob(f"{pages}.html"))
 
 
-def test_pages_that_newcomers_look_for_are_found_and_shown(site: Path) -> None:
+def test_search_words_lead_to_their_pages(site: Path) -> None:
     index = (site / "searchindex.js").read_text()
     texts = (site / "_static" / "texts.js").read_text()
     for words, page in (
@@ -130,7 +130,7 @@ def test_every_layer_is_drawn_with_its_shapes(site: Path) -> None:
             assert 10 < float(y) < height, f"{kind}: {text}"
 
 
-def test_what_a_command_does_stands_above_it(site: Path) -> None:
+def test_each_command_has_a_description_above_it(site: Path) -> None:
     shown = [
         re.sub(r"<[^>]+>", "", block) for page in site.rglob("*.html") for block in COMMANDS.findall(page.read_text())
     ]
@@ -139,7 +139,7 @@ def test_what_a_command_does_stands_above_it(site: Path) -> None:
     assert not [text for text in shown if re.search(r"^[^#\n]+ # ", text, re.M)]
 
 
-def test_no_word_of_code_in_a_sentence_is_wider_than_a_phone(site: Path) -> None:
+def test_inline_code_fits_a_phone(site: Path) -> None:
     for page in site.rglob("*.html"):
         sentences = re.sub(r"<table.*?</table>", "", page.read_text(), flags=re.S)
         for word in re.findall(r'<span class="pre">([^<]*)</span>', sentences):

@@ -44,7 +44,7 @@ def table(folder: Path) -> list[dict[str, str]]:
     return json.loads((folder / "table_1" / "table.json").read_text())
 
 
-def test_the_table_has_the_rooms_left_out(folder: Path) -> None:
+def test_the_table_lists_the_omitted_rooms(folder: Path) -> None:
     found = table(folder)
     assert [row["trained on"] for row in found] == ["all rooms", "without hall", "without kitchen"]
     assert all(0 <= float(row[f"{judged} ROC AUC"]) <= 1 for row in found for judged in ("validation", "test"))
@@ -61,7 +61,7 @@ def test_the_solver_has_the_papers_proportions(folder: Path) -> None:
     assert "batch_size: 4 " in net
 
 
-def test_what_is_complete_stays_and_an_unfinished_training_resumes(folder: Path) -> None:
+def test_complete_steps_are_kept_and_trainings_resume(folder: Path) -> None:
     before, seed = table(folder), folder / "table_1" / "all_rooms" / "siamese_8" / "seed_1"
     (seed / "runs.json").unlink()
     for file in seed.glob("siamese_8_iter_2[24]*"):

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("name", [shipped.SMALL, shipped.DEFAULT])
-def test_a_shipped_net_is_ahead_of_thumbnails_on_an_unseen_walk(tmp_path: Path, name: str) -> None:
+def test_a_shipped_net_beats_thumbnails_on_a_new_walk(tmp_path: Path, name: str) -> None:
     walk, features, out = tmp_path / "walk_1", tmp_path / "features.npz", tmp_path / "report"
     command = ["walk", str(tmp_path), "--frames", "120", "--laps", "2", "--size", "160x120", "--seed", "77"]
     assert lmdb_build(command) == 0

@@ -57,7 +57,7 @@ def commands(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "bin"
 
 
-def test_it_holds_every_file_of_the_packages_and_nothing_else(wheel: Path) -> None:
+def test_the_wheel_has_exactly_the_files_of_the_packages(wheel: Path) -> None:
     expected = {
         path.relative_to(ROOT).as_posix()
         for package in PACKAGES
@@ -73,7 +73,7 @@ def test_it_holds_every_file_of_the_packages_and_nothing_else(wheel: Path) -> No
     assert {"netspec/proto/caffe.desc", "netspec/py.typed", "netspec/inspect/features/shipped.py"} < found
 
 
-def test_it_says_what_it_is(wheel: Path) -> None:
+def test_the_wheel_has_its_metadata(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as file:
         (info,) = {name.partition("/")[0] for name in file.namelist() if ".dist-info/" in name}
         metadata = file.read(f"{info}/METADATA").decode()
@@ -89,7 +89,7 @@ def test_it_says_what_it_is(wheel: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["convert", "imageset", "mean", "compare"])
-def test_the_commands_of_lmdb_build_are_there(commands: Path, tmp_path: Path, command: str) -> None:
+def test_lmdb_builds_commands_are_installed(commands: Path, tmp_path: Path, command: str) -> None:
     said = run(commands / "lmdb-build", command, "--help", cwd=tmp_path).stdout
     assert said.startswith(f"usage: lmdb-build {command} ")
 
@@ -115,7 +115,7 @@ def test_the_other_commands_run_without_the_source(commands: Path, tmp_path: Pat
     assert where.is_relative_to(commands.parent)
 
 
-def test_loops_are_detected_with_no_option(commands: Path, tmp_path: Path) -> None:
+def test_detect_works_without_options(commands: Path, tmp_path: Path) -> None:
     """The net, its weights and the settings come with the wheel."""
     run(commands / "lmdb-build", "walk", "w", "--frames", "40", "--size", "80x60", "--laps", "2", cwd=tmp_path)
     run(commands / "loopclosure", "detect", "w/walk_1", "--out", "found", cwd=tmp_path)
@@ -126,7 +126,7 @@ def test_loops_are_detected_with_no_option(commands: Path, tmp_path: Path) -> No
     assert (paper / "train_val.prototxt").read_bytes() == (ROOT / "prototxt/siamese_8/train_val.prototxt").read_bytes()
 
 
-def test_an_editable_installation_has_the_nets_too(wheel: Path, tmp_path: Path) -> None:
+def test_an_editable_installation_has_the_nets(wheel: Path, tmp_path: Path) -> None:
     source, site = wheel.parent / "source", tmp_path / "site"
     venv.create(site, symlinks=True)
     editable = ("install", "--no-deps", "--no-index", "--no-build-isolation", "-e", source)

@@ -47,7 +47,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace | None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("where", SHELL)
-def test_every_command_is_one_that_its_parser_takes(where: str, tmp_path: Path) -> None:
+def test_every_command_is_accepted_by_its_parser(where: str, tmp_path: Path) -> None:
     found = commands(BLOCKS[where].text, tmp_path)
     assert found, "a block without a language is a list of commands"
     for command in found:
@@ -93,12 +93,12 @@ def test_commands_in_sentences_have_commands_and_options_that_exist(document: st
         ("lmdb-build walk walk --seed=1", []),
     ],
 )
-def test_wrong_words_in_sentences_would_be_found(line: str, unknown: list[str]) -> None:
+def test_wrong_words_in_sentences_are_found(line: str, unknown: list[str]) -> None:
     assert unknown_words(line) == unknown
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
-def test_every_block_says_what_it_is(document: str) -> None:
+def test_every_block_has_a_known_language(document: str) -> None:
     text = (ROOT / document).read_text()
     assert len(re.findall(r"^\s*(?:```|~~~)", text, re.M)) == 2 * len(blocks(document)), "a block begins a line: ```"
     for block in blocks(document):
@@ -109,12 +109,12 @@ def test_every_block_says_what_it_is(document: str) -> None:
 
 
 @pytest.mark.parametrize("words", [["netspec", "chekc"], ["loopclosure", "detect"], ["tools/bench", "--no-such-flag"]])
-def test_a_wrong_command_would_be_found(words: list[str]) -> None:
+def test_a_wrong_command_is_found(words: list[str]) -> None:
     with pytest.raises(SystemExit):
         parse(words)
 
 
-def test_shell_blocks_are_read_by_a_shell(tmp_path: Path) -> None:
+def test_shell_blocks_are_parsed_like_a_shell(tmp_path: Path) -> None:
     text = 'W=a/b\nE="netspec $W/c"  # why\nfor s in x y; do $E \\\n  --of ${s}_; done\n'
     text += 'source z && cd d\nloopclosure " e"\n'
     found = commands(text, tmp_path)
@@ -127,7 +127,7 @@ def test_shell_blocks_are_read_by_a_shell(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["netspec check $NOT_SET", "netspce check", "netspec check 'a"])
-def test_what_a_shell_does_not_take_is_found(text: str, tmp_path: Path) -> None:
+def test_invalid_shell_syntax_is_found(text: str, tmp_path: Path) -> None:
     with pytest.raises(AssertionError):
         commands(text, tmp_path)
 
@@ -140,25 +140,25 @@ def test_python_blocks_use_names_that_exist(where: str) -> None:
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
-def test_links_say_what_they_lead_to(document: str) -> None:
+def test_links_have_descriptive_texts(document: str) -> None:
     names = re.findall(r"(?<!!)\[([^\[\]]*\.(?:md|py|cff|toml))\]\(", (ROOT / document).read_text())
     assert names == []
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
-def test_links_lead_to_files(document: str) -> None:
+def test_links_lead_to_existing_files(document: str) -> None:
     path = ROOT / document
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text()):
         assert "://" in target or (path.parent / target).exists(), target
 
 
 @pytest.mark.parametrize("page", [path.relative_to(ROOT).as_posix() for path in benchmarks.pages.PAGES])
-def test_figures_are_those_of_their_files(page: str) -> None:
+def test_numbers_equal_their_result_files(page: str) -> None:
     text = (ROOT / page).read_text()
     assert benchmarks.pages.made(text) == text, "tools/bench pages writes them"
 
 
-def test_as_many_results_of_caffe_are_repeated_as_there_are() -> None:
+def test_the_counts_of_repeated_results_are_right() -> None:
     rows = json.loads((benchmarks.pages.RESULTS / "faithful.json").read_text())["rows"]
     folders = {"layers": "layers", "trainings": "train", "examples": "examples/runs"}
     counts = {what: len(list((GOLDEN / folder).iterdir())) for what, folder in folders.items()}
@@ -183,7 +183,7 @@ ROWS = [
         ("table: y", "there is no"),
     ],
 )
-def test_a_marker_becomes_figures_or_is_refused(marker: str, shown: str, tmp_path: Path) -> None:
+def test_markers_become_numbers_or_are_refused(marker: str, shown: str, tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text(json.dumps({"rows": ROWS}))
     try:
         text = benchmarks.pages.made(f"<!-- {marker} -->old<!-- end -->", tmp_path)
@@ -205,14 +205,14 @@ TESTS = {
 
 
 @pytest.mark.parametrize("row", DIFFERENCES, ids=lambda row: row.split("|")[1].strip()[:50])
-def test_each_difference_is_shown_by_a_test(row: str) -> None:
+def test_each_difference_has_a_test(row: str) -> None:
     assert len(re.findall(r"(?<!\\)\|", row)) == 4, "expected three columns"
     named = re.findall(r"\btest_\w+", row[row.index("<!--") :])
     assert named
     assert set(named) <= TESTS
 
 
-def test_the_readme_leads_to_the_page() -> None:
+def test_the_readme_links_to_the_page() -> None:
     assert "docs/coming-from-caffe.md" in (ROOT / "README.md").read_text()
 
 
@@ -220,7 +220,7 @@ def test_the_readme_leads_to_the_page() -> None:
 VERSION = re.search(r'^version = "(.+?)"', (ROOT / "pyproject.toml").read_text(), re.M)
 
 
-def test_changelog_and_citation_are_of_this_version() -> None:
+def test_changelog_and_citation_have_this_version() -> None:
     assert VERSION is not None
     changes = (ROOT / "CHANGELOG.md").read_text()
     citation = (ROOT / "CITATION.cff").read_text()
@@ -236,7 +236,7 @@ def test_the_paper_is_cited() -> None:
     assert re.findall(r"family-names: (\w+)", citation) == ["Qiu", "Ai", "Tian", "Wang", "Cao"]
 
 
-def test_the_form_for_faults_asks_for_what_is_needed() -> None:
+def test_the_issue_template_has_the_needed_fields() -> None:
     form = (ROOT / ".github" / "ISSUE_TEMPLATE" / "fault.yml").read_text()
     fields = re.findall(r"id: (\w+)\n(.*?)(?=\n  - type|\Z)", form, re.S)
     assert [name for name, _ in fields] == ["what", "prototxt", "command", "log", "report"]

@@ -85,7 +85,7 @@ def test_a_class_outside_netspec_defines_its_own_export() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TYPES)
 @pytest.mark.parametrize("target", ["ONNX", "PyTorch"])
-def test_layer_computes_the_same_elsewhere_or_says_why_it_cannot(
+def test_exported_layers_compute_the_same_or_give_a_reason(
     name: str,
     target: str,
     folder: Path,  # noqa: F811

@@ -44,7 +44,7 @@ def arrays(path: str) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.usefixtures("extract")
-def test_what_is_written_is_what_is_documented() -> None:
+def test_written_files_follow_the_documentation() -> None:
     images, records = arrays("images.npz"), arrays("records.npz")
     assert set(images) == {"features", "names", "stamps", "seconds_per_image", "zooms"}
     assert set(records) == {"feat", "keys", "seconds_per_record", "parameters"}
@@ -60,7 +60,7 @@ def test_what_is_written_is_what_is_documented() -> None:
 
 
 @pytest.mark.usefixtures("extract")
-def test_what_is_read_is_what_is_documented() -> None:
+def test_read_files_follow_the_documentation() -> None:
     assert {*NOT_FEATURES, "features"} == set(TABLE)
     images = read_features("images.npz")
     assert (len(images.features), images.views, images.names) == (IMAGES, VIEWS, [f"{k}.png" for k in range(IMAGES)])

@@ -115,7 +115,7 @@ def test_names_order_stamps_and_paths(here: Path, case: str) -> None:
 
 @pytest.mark.parametrize("case", REFUSED)
 @pytest.mark.usefixtures("here")
-def test_what_is_refused_and_how(case: str) -> None:
+def test_invalid_sources_are_refused_with_a_message(case: str) -> None:
     files, source, message = REFUSED[case]
     write(files)
     with pytest.raises(ValueError, match=r"\A[^\n]+\Z") as fault:
@@ -123,6 +123,6 @@ def test_what_is_refused_and_how(case: str) -> None:
     assert str(fault.value).startswith(message)
 
 
-def test_the_rule_is_written_down() -> None:
+def test_the_rule_is_documented() -> None:
     text = (ROOT / "docs" / "images.md").read_text()
     assert all(f"`{word}`" in text for word in (*IMAGE_ENDINGS, *SUBFOLDERS))

@@ -38,9 +38,9 @@ def undescribed() -> Iterator[str]:
                     yield f"{path.relative_to(ROOT)}:{method.lineno}: {method.name}"
 
 
-def test_what_no_protocol_describes_has_a_docstring_of_its_own() -> None:
+def test_methods_outside_of_protocols_have_docstrings() -> None:
     assert list(undescribed()) == []
 
 
-def test_the_layer_has_nothing_that_only_some_layers_offer() -> None:
+def test_layer_has_no_optional_methods() -> None:
     assert not OFFERED & set(vars(Layer))

@@ -225,7 +225,7 @@ def test_every_option_is_read_or_refused(
 
 
 @pytest.mark.parametrize("program", WAYS)
-def test_every_command_is_among_them(program: str) -> None:
+def test_every_command_is_tested(program: str) -> None:
     names = set(options(program)) - set(NOT_STARTED[program])
     assert {name for name in names if not any(f"{line} ".startswith(f"{name} ") for line in WAYS[program])} == set()
 
@@ -256,7 +256,7 @@ OF_OTHER_PROGRAMS = {"--nproc-per-node"}  # torchrun's
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
-def test_options_that_a_message_names_are_there() -> None:
+def test_options_in_messages_exist() -> None:
     """Each ``--word`` of a text in the programs, but those of docstrings, is an option of some command."""
     known = set(re.findall(r"--[a-z0-9_-]+", FROZEN.read_text())) | OTHERS | OF_GLOG | OF_OTHER_PROGRAMS
     found, gone = set(), []

@@ -96,7 +96,7 @@ def _faults(seed: int) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_random_nets_learn_alike_in_every_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_random_nets_learn_the_same_with_all_runners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     found = [reported for seed in range(SEED, SEED + COUNT) for reported in _faults(seed)]
     faults = [reported for reported in found if not reported.startswith("refused")]

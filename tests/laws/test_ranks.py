@@ -71,7 +71,7 @@ def interleaved(parts: list) -> list:
 @pytest.mark.parametrize("seed", [0, 7, 123456789])
 @pytest.mark.parametrize("ranks", [1, 2, 3, 4])
 @pytest.mark.parametrize("name", LAYERS)
-def test_ranks_read_together_what_one_reader_reads(name: str, ranks: int, seed: int) -> None:
+def test_ranks_together_read_the_records_of_one_reader(name: str, ranks: int, seed: int) -> None:
     alone = reader(name, BATCH * ranks, seed, 0, 1)
     together = [reader(name, BATCH, seed, rank, ranks) for rank in range(ranks)]
     for iteration in range(ITERATIONS):

@@ -79,7 +79,7 @@ def test_every_type_has_an_example() -> None:
 
 
 @every_type
-def test_docstring_says_what_goes_in_and_out_and_where_caffe_has_it(layer: Layer) -> None:
+def test_the_docstring_names_bottoms_tops_and_caffes_file(layer: Layer) -> None:
     lines = [line.strip() for line in (type(layer).__doc__ or "").splitlines()]
     assert lines[0].endswith((".", ":"))
     assert lines[1] == ""
@@ -115,7 +115,7 @@ IN_TORCHS_ORDER = [pytest.param((name, "none"), id=f"{name}-none", marks=pytest.
 
 
 @pytest.mark.parametrize("layer", [*IN_CAFFES_ORDER, *IN_TORCHS_ORDER], indirect=True)
-def test_gradient_is_that_of_what_it_computes(layer: Layer) -> None:
+def test_the_gradient_fits_the_result(layer: Layer) -> None:
     bottoms = EXAMPLES[layer.type].bottoms()
     for i, bottom in enumerate(bottoms):
         whole_numbers = bool((bottom == bottom.round()).all())
@@ -132,9 +132,7 @@ def test_gradient_is_that_of_what_it_computes(layer: Layer) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not POSSIBLE, reason="this torch cannot make a fake device")
 @pytest.mark.parametrize("name", [name for name in TYPES if name != "Python"])  # whose code sees numpy arrays
-def test_computes_on_the_gpu_what_it_computes_on_the_cpu(
-    name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gpu_and_cpu_compute_the_same(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     example = EXAMPLES[name]
     found = []

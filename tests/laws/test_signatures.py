@@ -135,13 +135,13 @@ def test_every_public_function_is_called_here() -> None:
 
 
 @pytest.mark.parametrize(("function", "name"), parameters("Iterable[str", "Collection[str", "Sequence[str"))
-def test_one_text_is_one_of_several(function: Callable[..., Any], name: str) -> None:
+def test_one_string_equals_a_list_of_one(function: Callable[..., Any], name: str) -> None:
     one = ONE_OF_SEVERAL[name]
     assert reported(CALLS[function](**{name: one})) == reported(CALLS[function](**{name: [one]}))
 
 
 @pytest.mark.parametrize(("function", "name"), parameters("str"))
-def test_a_choice_that_there_is_not_is_refused(function: Callable[..., Any], name: str) -> None:
+def test_an_unknown_choice_is_refused(function: Callable[..., Any], name: str) -> None:
     if name in CHOICES:
         with pytest.raises(ValueError, match="nonsense") as fault:
             CALLS[function](**{name: "nonsense"})
@@ -150,7 +150,7 @@ def test_a_choice_that_there_is_not_is_refused(function: Callable[..., Any], nam
         assert name in FREE | set(ONE_OF_SEVERAL), "say whether any text will do"
 
 
-def test_a_phase_is_a_number_that_there_is() -> None:
+def test_an_unknown_phase_number_is_refused() -> None:
     with pytest.raises(netspec.SpecError, match="found phase 7, expected TRAIN or TEST"):
         netspec.load_net("net.prototxt", phase=7)
 

@@ -45,9 +45,7 @@ def test_from_a_walk_to_lists_and_a_picture(walks: Path, tmp_path: Path, capsys:
 
 
 @pytest.mark.slow
-def test_what_it_says_of_its_lists_is_what_convert_needs(
-    walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_printed_commands_work_with_convert(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "a folder"
     assert main(pairs(walks, "--out", str(out), "--train", "20", "--val", "10", "--different-scenes")) == 0
     said = capsys.readouterr().out
@@ -66,7 +64,7 @@ def test_what_it_says_of_its_lists_is_what_convert_needs(
 @pytest.mark.parametrize(
     "words", ["--different-scenes", "-different-scenes=true", "-nodifferent-scenes -different-scenes"]
 )
-def test_flags_are_spelled_as_in_every_command(
+def test_flags_accept_gflags_spellings(
     walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str
 ) -> None:
     assert main(pairs(walks, "-out", str(tmp_path), "-train=20", "--val", "0", *words.split())) == 0
@@ -78,7 +76,7 @@ def test_two_houses_are_two_scenes(walks: Path) -> None:
     assert first != second
 
 
-def test_undeclared_scenes_are_warned_about(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_warning_for_undeclared_scenes(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(pairs(walks, "--out", str(tmp_path), "--train", "60", "--val", "0")) == 0
     assert "warning: train: " in capsys.readouterr().err
 
@@ -114,7 +112,7 @@ def test_warped_and_joined(walks: Path, tmp_path: Path) -> None:
         (["walk", "{0}/walk_1/rgb.txt"], "Not a directory"),
     ],
 )
-def test_a_fault_of_the_users_is_one_line_and_status_1(
+def test_an_error_of_the_user_is_one_line_with_status_1(
     walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
 ) -> None:
     assert main([argument.format(walks, tmp_path) for argument in arguments]) == 1
@@ -123,7 +121,9 @@ def test_a_fault_of_the_users_is_one_line_and_status_1(
     assert said.count("\n") == 1
 
 
-def test_a_broken_line_of_groundtruth_is_named(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_line_of_groundtruth_is_reported(
+    walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "s/rgb").mkdir(parents=True)
     (tmp_path / "s/rgb/1.png").touch()
     (tmp_path / "s/rgb.txt").write_text("1.0 rgb/1.png\n")
@@ -164,7 +164,7 @@ def lists(out: Path, line: str) -> list[tuple[str, str, int]]:
 
 
 @pytest.mark.slow
-def test_pairs_takes_the_data_sets_that_people_have(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pairs_accepts_all_kinds_of_data_sets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     poses = tmp_path / "poses.txt"
     poses.write_text(tum_rows(path()))
     euroc, kitti = write_euroc(tmp_path / "e"), write_kitti(tmp_path / "k")

@@ -75,7 +75,7 @@ def row(out: str) -> dict[str, str]:
     return found
 
 
-def test_it_trains_chooses_the_snapshot_that_validates_best_and_judges_it(
+def test_compare_trains_and_evaluates_the_best_validated_snapshot(
     edited: Callable[..., None], capfd: pytest.CaptureFixture[str]
 ) -> None:
     # better snapshots, but another training's; a path that begins with ./ is spelled in two ways
@@ -107,7 +107,7 @@ def test_it_trains_chooses_the_snapshot_that_validates_best_and_judges_it(
     assert main(["compare", SOLVER, "--out", "out", "--no-train"]) == 1
 
 
-def test_a_snapshot_that_no_test_met_is_tested_once_more(edited: Callable[..., None]) -> None:
+def test_a_snapshot_without_a_test_is_tested(edited: Callable[..., None]) -> None:
     edited("snapshot: 5", "snapshot: 4", "max_iter: 10", "max_iter: 5")
     assert main(["compare", SOLVER, "--out", "out"]) == 0
     (run,) = json.loads(Path("out/runs.json").read_text())
@@ -117,7 +117,7 @@ def test_a_snapshot_that_no_test_met_is_tested_once_more(edited: Callable[..., N
     assert run["iteration"] in (4, 5)
 
 
-def test_test_pairs_have_a_table_of_their_own(edited: Callable[..., None], capfd: pytest.CaptureFixture[str]) -> None:
+def test_test_pairs_have_their_own_table(edited: Callable[..., None], capfd: pytest.CaptureFixture[str]) -> None:
     pairs = re.findall(r'source: "(.*?)"', Path("sgd_step/train_val.prototxt").read_text())
     assert main(["compare", SOLVER, "--out", "out", "--test", pairs[-1]]) == 0
     validation, test = capfd.readouterr().out.split("\n\nnet ")
@@ -159,7 +159,7 @@ def test_each_training_has_its_own_time_left(
     assert left == ["0:05:00", "0:03:20", "0:01:40", "0:00:30", "0:00:20", "0:00:10", "0:00:40", "0:00:20"]
 
 
-def test_without_training_it_scores_the_snapshots_that_there_are(folder: Path) -> None:
+def test_without_training_existing_snapshots_are_scored(folder: Path) -> None:
     for iteration, name in ((40, "ref_iter_40"), (60, "straight_iter_60")):
         model = (GOLDEN / "snapshot" / f"{name}.caffemodel").read_bytes()
         (folder / "sgd_step" / f"ref_iter_{iteration}.caffemodel").write_bytes(model)
@@ -167,7 +167,7 @@ def test_without_training_it_scores_the_snapshots_that_there_are(folder: Path) -
     assert row("out/compare")["iteration"] in ("40", "60")
 
 
-def test_not_to_train_is_spelled_as_every_flag() -> None:
+def test_no_train_accepts_gflags_spellings() -> None:
     words = (["--no-train"], ["-notrain"], ["--train=false"], [], ["-train"])
     found = [parser().parse_args(["compare", "s", *more]).train for more in words]
     assert found == [False, False, False, True, True]
@@ -186,9 +186,7 @@ def fault(capfd: pytest.CaptureFixture[str], *words: str) -> str:
     return err.splitlines()[-1]
 
 
-def test_what_is_wrong_is_one_line(
-    folder: Path, edited: Callable[..., None], capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_errors_are_one_line(folder: Path, edited: Callable[..., None], capfd: pytest.CaptureFixture[str]) -> None:
     absent = "sgd_step/ref: no snapshot of this net; train it first (without --no-train)"
     assert fault(capfd, "--no-train") == absent
     twice = 'sgd_step/train_val.prototxt: found a second net named "sgd_step"; give each net its own name'
@@ -197,7 +195,7 @@ def test_what_is_wrong_is_one_line(
     assert 'SolverParameter has no field "base_rl"' in fault(capfd)
 
 
-def test_a_command_that_fails_ends_the_chain_with_its_line(
+def test_a_failed_command_ends_compare_with_its_message(
     edited: Callable[..., None], capfd: pytest.CaptureFixture[str]
 ) -> None:
     edited("sgd_step/init.caffemodel", "nowhere.caffemodel")
@@ -206,7 +204,7 @@ def test_a_command_that_fails_ends_the_chain_with_its_line(
     assert fault(capfd).startswith(f"{SOLVER}: none of the snapshots of its training was found")
 
 
-def test_a_net_that_is_not_siamese(folder: Path) -> None:
+def test_a_net_that_is_not_siamese_is_refused(folder: Path) -> None:
     net = Path("sgd_step/train_val.prototxt")
     text = net.read_text()
     net.write_text(text.replace('"ContrastiveLoss"', '"EuclideanLoss"'))
@@ -217,7 +215,7 @@ def test_a_net_that_is_not_siamese(folder: Path) -> None:
         read_entry(SOLVER)
 
 
-def test_pairs_of_the_training_are_no_validation_pairs(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_training_pairs_are_refused_for_validation(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     net = Path("sgd_step/train_val.prototxt")
     text = net.read_text()
     train, test = re.findall(r'source: "(.*?)"', text)
@@ -235,7 +233,7 @@ def test_pairs_of_the_training_are_no_validation_pairs(folder: Path, capfd: pyte
     assert "NetState" not in capfd.readouterr().err
 
 
-def test_an_interrupt_lets_the_training_end_with_a_snapshot(edited: Callable[..., None]) -> None:
+def test_an_interrupted_training_ends_with_a_snapshot(edited: Callable[..., None]) -> None:
     edited("max_iter: 10", "max_iter: 1000000", "snapshot: 5", "")
     command = [sys.executable, "-m", "lmdb_build", "compare", SOLVER, "--out", "out"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}

@@ -72,14 +72,14 @@ def pair_list(tmp_path: Path) -> str:
         (["-encoded"], "lmdb_encoded"),
     ],
 )
-def test_single_images_become_caffes_records_byte_for_byte(
+def test_records_of_single_images_are_byte_identical_to_caffes(
     tmp_path: Path, flags: list[str], database: str, workers: str
 ) -> None:
     assert convert_imageset([workers, *flags, PNG, str(GOLDEN / "list.txt"), str(tmp_path / "db")]) == 0
     assert records(tmp_path / "db") == records(GOLDEN / database)
 
 
-def test_the_log_is_caffes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_log_equals_caffes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     convert_imageset(["-shuffle", "-seed", "5", "-encode_type=png", PNG, str(GOLDEN / "list.txt"), f"{tmp_path}/db"])
     assert log_of(capsys.readouterr().err) == [
         "Shuffling data",
@@ -105,7 +105,7 @@ def test_every_thousand_records_are_logged(tmp_path: Path, capsys: pytest.Captur
 
 
 @pytest.mark.slow
-def test_shuffling_is_repeatable_and_numbers_the_new_order(tmp_path: Path) -> None:
+def test_shuffling_is_reproducible_and_keys_follow_the_new_order(tmp_path: Path) -> None:
     keys = []
     for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
         assert convert_imageset(["-shuffle", "-seed", seed, PNG, str(GOLDEN / "list.txt"), f"{tmp_path}/{name}"]) == 0
@@ -115,7 +115,7 @@ def test_shuffling_is_repeatable_and_numbers_the_new_order(tmp_path: Path) -> No
     assert sorted(key[9:] for key in keys[0]) == [b"%d.png" % i for i in range(6)]
 
 
-def test_names_may_hold_blanks(tmp_path: Path) -> None:
+def test_names_can_contain_spaces(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a place.png"), image("0.png"))
     (tmp_path / "list.txt").write_text("a place.png 4\n")
     assert convert_imageset([str(tmp_path), f"{tmp_path}/list.txt", f"{tmp_path}/db"]) == 0
@@ -142,7 +142,7 @@ def test_gray_pairs_have_two_channels_and_any_size(tmp_path: Path, pair_list: st
     assert (pairs_in(tmp_path / "db")[0][1] == np.stack(expected)).all()
 
 
-def test_encoded_pairs_become_twin_databases(tmp_path: Path, pair_list: str) -> None:
+def test_encoded_pairs_become_two_databases(tmp_path: Path, pair_list: str) -> None:
     assert convert_pairs_lmdb(["-encoded", "-shuffle", PNG, pair_list, f"{tmp_path}/db/"]) == 0
     assert convert_pairs_lmdb(["-shuffle", PNG, pair_list, f"{tmp_path}/raw"]) == 0
     assert sorted(os.listdir(tmp_path)) == ["db_a", "db_b", "pairs.txt", "raw"]
@@ -166,12 +166,12 @@ def test_gray_encoded_images_are_gray(tmp_path: Path) -> None:  # Caffe stores t
     assert [array.shape for _, array, _ in pairs_in(tmp_path / "db")] == [(1, 48, 64)] * 6
 
 
-def test_quoted_names_may_hold_blanks(tmp_path: Path) -> None:
+def test_quoted_names_can_contain_spaces(tmp_path: Path) -> None:
     (tmp_path / "l").write_text('"a place.png" b.png 1\nc.png "d e.png" 0\n')
     assert [entry.images for entry in read_pairs(f"{tmp_path}/l")] == [("a place.png", "b.png"), ("c.png", "d e.png")]
 
 
-def test_leveldb_is_written_too(tmp_path: Path, pair_list: str) -> None:
+def test_leveldb_can_be_written(tmp_path: Path, pair_list: str) -> None:
     pytest.importorskip("plyvel")
     assert convert_pairs_lmdb(["-backend=leveldb", PNG, pair_list, f"{tmp_path}/db"]) == 0
     assert (tmp_path / "db" / "CURRENT").exists()
@@ -192,7 +192,7 @@ def check_refused(
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])
-def test_a_missing_image_is_named_with_its_line(
+def test_a_missing_image_is_reported_with_its_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], workers: str
 ) -> None:
     (tmp_path / "l").write_text("# pairs\n0.png 1.png 1\n2.png nix.png 0\n")
@@ -219,7 +219,7 @@ def test_a_missing_image_is_named_with_its_line(
         ("# none", [], "lists no pair"),
     ],
 )
-def test_what_cannot_be_converted_is_refused(
+def test_images_that_cannot_be_converted_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, flags: list[str], message: str
 ) -> None:
     root = tmp_path / "images"
@@ -235,7 +235,7 @@ def test_what_cannot_be_converted_is_refused(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", ["1", "2"])
-def test_images_that_cannot_be_read_are_left_out_as_in_caffe(
+def test_unreadable_images_are_skipped_like_in_caffe(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], workers: str
 ) -> None:
     (tmp_path / "text.png").write_text("no image")
@@ -252,7 +252,7 @@ def test_images_that_cannot_be_read_are_left_out_as_in_caffe(
     check_refused(tmp_path, capsys, convert_imageset, [PNG, f"{tmp_path}/none"], 'none:1:1: image "')
 
 
-def test_a_label_that_is_no_number_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_label_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "l").write_text("0.png cat\n")
     check_refused(
         tmp_path, capsys, convert_imageset, [PNG, f"{tmp_path}/l"], 'l:1:1: found "0.png cat", expected an image'
@@ -277,7 +277,7 @@ def test_wrong_usage_is_status_2(tmp_path: Path, pair_list: str, flags: list[str
 
 
 @pytest.mark.parametrize(("read", "text"), [(read_pairs, "a.png b.png 2"), (read_single_list, "a.png cat")])
-def test_both_kinds_of_lists_raise_one_kind_of_error(tmp_path: Path, read: object, text: str) -> None:
+def test_both_kinds_of_lists_raise_the_same_type_of_error(tmp_path: Path, read: object, text: str) -> None:
     assert callable(read)
     (tmp_path / "l").write_text(f"# a comment\n{text}\n")
     with pytest.raises(SpecError, match=f"^{tmp_path}/l:2:") as fault:
@@ -291,7 +291,7 @@ def test_both_kinds_of_lists_raise_one_kind_of_error(tmp_path: Path, read: objec
 # compute_image_mean, and the scripts in tools/
 
 
-def test_the_mean_image_and_its_log_are_caffes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_mean_image_and_its_log_equal_caffes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert compute_image_mean([str(GOLDEN / "lmdb_plain"), f"{tmp_path}/mean.binaryproto"]) == 0
     assert (tmp_path / "mean.binaryproto").read_bytes() == (GOLDEN / "mean.binaryproto").read_bytes()
     found = [line.split(None, 3)[3] for line in capsys.readouterr().err.splitlines()]

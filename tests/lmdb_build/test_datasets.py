@@ -57,7 +57,7 @@ def test_pairs_of_mnist(tmp_path: Path) -> None:
     assert (len(found), len(firsts) > 30, 5 < sum(same) < 40) == (60, True, True)
 
 
-def test_mnist_is_what_caffe_writes(tmp_path: Path) -> None:
+def test_mnist_is_identical_to_caffes(tmp_path: Path) -> None:
     """Files of MNIST made from a database of Caffe's give that database again."""
     golden = shared("golden/examples/mnist/mnist_test_lmdb")
     expected = records(golden)[:500]
@@ -81,7 +81,7 @@ def test_cifar(tmp_path: Path) -> None:
         np.testing.assert_array_equal(datum_to_array(datum).ravel(), row[1:])
 
 
-def test_other_files_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_files_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     images = idx(tmp_path / "images", np.zeros((3, 2, 2), np.uint8))
     few = idx(tmp_path / "labels", np.zeros(2, np.uint8))
     (tmp_path / "packed").write_bytes(b"\x1f\x8b\x08\x00")

@@ -42,7 +42,7 @@ def test_the_second_image_is_the_first_or_near_it_in_its_run() -> None:
     assert 0.3 < np.mean(gaps > 0) < 0.5
 
 
-def test_a_batch_takes_a_run_from_one_part_of_it() -> None:
+def test_a_batch_uses_one_part_of_a_run() -> None:
     runs = runs_of(tracks=5, images=200)
     first, _ = choose_views(runs, Batches(count=40, size=12, window=30), np.random.default_rng(0))
     starts = []
@@ -75,7 +75,7 @@ def test_batches_that_cannot_be_made_are_refused(settings: dict, words: str) -> 
         choose_views(runs_of(), batches, np.random.default_rng(0))
 
 
-def test_two_views_about_one_point_overlap() -> None:
+def test_two_views_of_one_point_overlap() -> None:
     # Colors that say where a pixel was: blue its row, green its column.
     rows, columns = np.mgrid[0:120, 0:200]
     image = np.dstack([rows, columns, np.zeros_like(rows)]).astype(np.uint8)
@@ -89,7 +89,7 @@ def test_two_views_about_one_point_overlap() -> None:
     assert centers[1] > centers[0] + 20
 
 
-def test_the_points_of_view_of_a_place_differ_as_strongly_as_asked() -> None:
+def test_the_strength_of_a_view_is_adjustable() -> None:
     image = cv2.resize(np.random.default_rng(2).integers(0, 255, (12, 16, 3), np.uint8), (320, 240))
 
     def spread(viewpoint: float) -> float:
@@ -155,7 +155,7 @@ def test_the_command_writes_views_and_their_list(tmp_path: Path, capsys: pytest.
 
 
 @pytest.mark.parametrize("more", [[], ["folder", "index:x.csv"], ["index:x.csv,track=a"], ["folder", "--step", "0"]])
-def test_the_source_is_named_whole(more: list[str]) -> None:
+def test_the_source_has_its_full_name(more: list[str]) -> None:
     assert main(["views", "--out", "out", *more]) == 2
 
 
@@ -165,7 +165,7 @@ def view() -> np.ndarray:
     return cv2.resize(rng.integers(40, 216, (6, 8, 3), np.uint8), (64, 48), interpolation=cv2.INTER_CUBIC)
 
 
-def test_a_view_changes_with_the_generator_alone(view: np.ndarray) -> None:
+def test_a_view_depends_only_on_the_generator(view: np.ndarray) -> None:
     other, before = view[::-1].copy(), view.copy()
     found = [change_light(view, lambda: other, np.random.default_rng(seed)) for seed in range(40)]
     assert all(each.shape == view.shape and each.dtype == np.uint8 for each in found)
@@ -184,12 +184,12 @@ def test_most_views_can_still_be_recognized(view: np.ndarray) -> None:
     assert np.mean(np.array(like) < 0.95) > 0.3
 
 
-def test_a_small_picture_in_front_is_cut_to_its_size(view: np.ndarray) -> None:
+def test_a_small_image_in_front_is_cropped(view: np.ndarray) -> None:
     dark = np.zeros((5, 7, 3), np.uint8)
     assert any((change_light(view, lambda: dark, np.random.default_rng(seed)) == 0).any() for seed in range(40))
 
 
-def test_calm_views_keep_their_colors(view: np.ndarray) -> None:
+def test_weak_views_keep_their_colors(view: np.ndarray) -> None:
     gray = np.repeat(view[..., :1], 3, axis=2)
     other = np.dstack([np.full((48, 64), 255), np.zeros((48, 64)), np.zeros((48, 64))]).astype(np.uint8)
     for calm, most, least in ((1.0, 0, 0), (0.0, 200, 30)):

@@ -57,7 +57,7 @@ def test_evaluate_trains_on_other_images(two_laps, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_door(two_laps, two_laps_features, tmp_path):
+def test_tools_evaluate_loops_writes_a_report(two_laps, two_laps_features, tmp_path):
     line = [sys.executable, ROOT / "tools" / "evaluate_loops.py", two_laps, "--out", tmp_path]
     line += ["--method", f"features:{two_laps_features}"]
     done = subprocess.run(line, capture_output=True, text=True, cwd=tmp_path, check=False)
@@ -103,7 +103,7 @@ def drive_that_comes_back(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_detect_chooses_by_itself(tmp_path, capsys):
+def test_detect_chooses_the_threshold_automatically(tmp_path, capsys):
     drive = drive_that_comes_back(tmp_path)
     thumbnails = ["--describe", THUMBNAILS]
     line = ["detect", str(drive), *thumbnails, "--out", str(tmp_path / "found")]
@@ -132,7 +132,7 @@ def test_loops_of_a_drive_that_cannot_be_verified_are_right(tmp_path):
     assert all(abs(query - 100 - match) <= 5 for query, match in loops)
 
 
-def test_images_that_cannot_be_read_are_left_out(two_laps, tmp_path, capsys):
+def test_unreadable_images_are_skipped(two_laps, tmp_path, capsys):
     """Two of forty: loops, map and report have the others; a folder without one image is refused."""
     folder = tmp_path / "drive"
     folder.mkdir()
@@ -160,7 +160,7 @@ def loops_in(path):
 
 
 @pytest.mark.slow
-def test_each_door_gives_the_same_answer(tmp_path, capsys):
+def test_command_and_functions_give_the_same_result(tmp_path, capsys):
     """A camera passes a wall, and a part of it once more: a folder, a list, videos, two traverses, a map."""
     rng = np.random.default_rng(1)
     wall = np.full((128, 1600, 3), 128, np.uint8)
@@ -249,7 +249,7 @@ def expanded(line: str, **names: object) -> list[str]:
         ),
     ],
 )
-def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_features, tmp_path, capsys):
+def test_an_error_is_one_line_with_status_1(line, sentence, two_laps, two_laps_features, tmp_path, capsys):
     names = {"LAPS": two_laps, "OUT": tmp_path / "out", "FEATURES": two_laps_features}
     assert main(expanded(line, **names)) == 1
     (printed,) = capsys.readouterr().err.strip().splitlines()
@@ -282,7 +282,7 @@ def test_a_fault_is_one_line_and_status_1(line, sentence, two_laps, two_laps_fea
         ),
     ],
 )
-def test_options_that_do_not_go_together_are_one_line_and_status_2(
+def test_contradictory_options_are_one_line_with_status_2(
     line, sentence, two_laps, two_laps_features, tmp_path, capsys
 ):
     names = {"LAPS": two_laps, "OUT": tmp_path / "out", "FEATURES": two_laps_features}
@@ -326,13 +326,13 @@ def test_wrong_usage_is_status_2(line, capsys):
         ("argument --soft-angle: found 0, expected a number above 0", "evaluate --soft-angle 0"),
     ],
 )
-def test_numbers_that_mean_nothing_are_wrong_usage(words, said, capsys):
+def test_invalid_numbers_are_wrong_usage(words, said, capsys):
     assert main(words.split()) == 2
     assert said in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_control_c_is_one_line_and_status_130(tmp_path):
+def test_ctrl_c_is_one_line_with_status_130(tmp_path):
     """Interrupted while it reads: a pipe that nobody writes into."""
     os.mkfifo(tmp_path / "features.npz")
     code = """

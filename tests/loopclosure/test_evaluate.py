@@ -33,7 +33,7 @@ def test_perfect_features_find_every_loop(two_laps, two_laps_features):
     assert outcome.measures[ALL_PAIRS]["average precision"] == pytest.approx(1.0)
 
 
-def test_silence_is_said_and_costs_recall(two_laps):
+def test_queries_without_an_answer_reduce_recall(two_laps):
     data = load_sequence(read_sequence(two_laps, "tum"))
     scores = np.where(data.truth.hard, 1.0, 0.0)
     scores[30:] = np.nan
@@ -43,7 +43,7 @@ def test_silence_is_said_and_costs_recall(two_laps):
     assert outcome.notes[-1].startswith(f"no score for {silent} of ")
 
 
-def test_training_is_not_counted_a_frame(two_laps):
+def test_training_time_is_not_part_of_the_time_per_frame(two_laps):
     data = load_sequence(read_sequence(two_laps, "tum"))
     method = GivenScores(np.zeros((40, 40)), {"training": 2.0, "looking": 1.0}, [], ("training",))
     (outcome,) = evaluate(data, [("x", method)]).outcomes
@@ -76,7 +76,7 @@ def test_labels(text, name):
     assert named_method(text, MethodContext())[0] == name
 
 
-def test_methods_that_refine_another():
+def test_methods_can_refine_another():
     method = make_method("seqslam+features:a.npz:cosine", MethodContext(exclude_frames=7))
     assert isinstance(method, SeqSlam)
     assert method.name == "seqslam+a (cosine)"
@@ -84,7 +84,7 @@ def test_methods_that_refine_another():
     assert method.exclude_frames == 7
 
 
-def test_methods_that_refine_one_that_refines_another():
+def test_methods_can_refine_a_refining_method():
     outer = make_method("verified:k=7,min_inliers=9,ratio=0.7+seqslam:length=6+features:a.npz", MethodContext(3))
     assert isinstance(outer, Verified)
     assert (outer.k, outer.check.min_inliers, outer.check.ratio, outer.exclude_frames) == (7, 9, 0.7, 3)
@@ -129,7 +129,7 @@ def test_unknown_methods_list_the_known(spec):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_every_name_of_the_registry_is_there(name):
+def test_every_registered_name_exists(name):
     needed = {
         "features": ":a.npz",
         "describe": ":a.py:function",

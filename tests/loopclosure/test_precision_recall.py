@@ -31,7 +31,7 @@ def example_truth(soft=()):
     return traverse_truth(hard, "the worked example", soft=near)
 
 
-def test_all_pairs_of_the_worked_example():
+def test_the_example_over_all_pairs():
     found = JudgedScores(SCORES, example_truth()).all_pairs_curve()
     assert found.convention == ALL_PAIRS
     assert found.average_precision == pytest.approx(0.95)
@@ -44,7 +44,7 @@ def test_all_pairs_of_the_worked_example():
     assert (found.positives, found.samples) == (4, 20)
 
 
-def test_best_match_of_the_worked_example():
+def test_the_example_by_best_match():
     matches = JudgedScores(SCORES, example_truth()).best_matches
     assert list(matches.reference) == [0, 1, 3, 4]
     assert list(matches.right) == [True, True, False, False]
@@ -56,7 +56,7 @@ def test_best_match_of_the_worked_example():
     assert found.recall[-1] == pytest.approx(2 / 3)
 
 
-def test_recall_at_k_of_the_worked_example():
+def test_recall_at_k_of_the_example():
     found = JudgedScores(SCORES, example_truth()).recall_at((1, 2, 3, 99))
     assert found == {1: pytest.approx(2 / 3), 2: 1.0, 3: 1.0, 99: 1.0}
 
@@ -74,7 +74,7 @@ def test_curve_equals_scikit_learn(seed):
     assert found.average_precision == pytest.approx(average_precision_score(right, scores))
 
 
-def test_ties_are_one_point_whatever_their_order():
+def test_ties_are_one_point_in_any_order():
     found = curve(np.array([0.5, 0.5, 0.5]), np.array([True, False, True]))
     assert list(found.precision) == [pytest.approx(2 / 3)]
     assert found.recall_at_full_precision == 0.0
@@ -137,7 +137,7 @@ def test_best_f1():
     assert found.best_f1_threshold == 0.7
 
 
-def test_nothing_to_find_gives_nan_rather_than_a_figure():
+def test_without_loops_metrics_are_nan():
     found = curve(np.array([0.9, 0.1]), np.array([False, False]))
     assert np.isnan(found.average_precision)
     assert np.isnan(found.best_f1)

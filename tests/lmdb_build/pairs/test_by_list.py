@@ -70,7 +70,7 @@ class TestMask:
         right = MaskSource(run / "mask.png", run / "run", run, camera="right")
         assert right.names[:2] == ["run/2.png", "run/4.png"]
 
-    def test_what_is_not_compared_sets_no_gap(self, run: Path) -> None:
+    def test_pairs_that_are_not_compared_set_no_gap(self, run: Path) -> None:
         mask = cv2.imread(str(run / "mask.png"), cv2.IMREAD_GRAYSCALE)
         assert mask is not None
         mask[1, 0] = 255  # the left and the right image of one place
@@ -80,7 +80,7 @@ class TestMask:
         assert label(source, "run/1.png", "run/3.png") == LEFT_OUT  # nearer than any marked pair of one camera
         assert len(source.positives()) == 5
 
-    def test_a_mask_of_places_serves_the_images_of_one_camera(self, run: Path) -> None:
+    def test_a_mask_of_places_works_for_images_of_one_camera(self, run: Path) -> None:
         mask = np.zeros((6, 6), np.uint8)
         mask[4, 1] = 255
         cv2.imwrite(str(run / "six.png"), mask)
@@ -115,7 +115,7 @@ class TestFolders:
         images(tmp_path, *(f"night/{number}.jpg" for number in (1, 2, 3, 10, 99)))
         return folders_source(tmp_path / "day", tmp_path / "night", tmp_path)
 
-    def test_equal_names_are_the_same_place_whatever_their_ending(self, source: PlaceSource) -> None:
+    def test_equal_names_with_any_extension_are_the_same_place(self, source: PlaceSource) -> None:
         assert len(source.names) == 8
         assert label(source, "day/2.png", "night/2.jpg") == POSITIVE
         assert label(source, "day/2.png", "night/3.jpg") == NEGATIVE
@@ -124,13 +124,13 @@ class TestFolders:
     def test_pairs_join_the_two_folders_only(self, source: PlaceSource) -> None:
         assert label(source, "day/2.png", "day/3.png") == LEFT_OUT
 
-    def test_neighboring_places_can_be_left_out(self, source: PlaceSource, tmp_path: Path) -> None:
+    def test_neighboring_places_can_be_omitted(self, source: PlaceSource, tmp_path: Path) -> None:
         apart = folders_source(tmp_path / "day", tmp_path / "night", tmp_path, min_gap=2)
         assert label(apart, "day/3.png", "night/10.jpg") == LEFT_OUT
         assert label(apart, "day/1.png", "night/3.jpg") == NEGATIVE
         assert label(apart, "day/1.png", "night/1.jpg") == POSITIVE
 
-    def test_a_split_never_parts_the_two_images_of_a_place(self, source: PlaceSource) -> None:
+    def test_a_split_keeps_the_two_images_of_a_place_together(self, source: PlaceSource) -> None:
         shares = {"train": 0.5, "val": 0.5}
         for splits in (split_by_group(source, shares, 1), split_by_time(source, shares)):
             assert sum(len(part) for part in splits.values()) == 8
@@ -196,13 +196,13 @@ class TestTables:
             ("a,b\n1.jpg,2.jpg\n3.jpg,4.jpg\n", r'p\.csv:2:1: image "1\.jpg" is not in .*i\.csv'),
         ],
     )
-    def test_tables_that_say_nothing_are_refused(self, tmp_path: Path, text: str, words: str) -> None:
+    def test_tables_without_information_are_refused(self, tmp_path: Path, text: str, words: str) -> None:
         table = self.write(tmp_path / "p.csv", text)
         index = self.write(tmp_path / "i.csv", self.INDEX)
         with pytest.raises(InputError, match=words):
             table_source(table, tmp_path, "floor", index)
 
-    def test_a_column_that_is_not_there_and_a_second_that_is_no_number(self, tmp_path: Path) -> None:
+    def test_missing_columns_and_invalid_seconds_are_refused(self, tmp_path: Path) -> None:
         index = self.write(tmp_path / "i.csv", self.INDEX)
         with pytest.raises(InputError, match='has no column "storey"; there are: image, floor, clip, second'):
             index_source(index, tmp_path, "storey", "clip", "second", 1)
@@ -223,7 +223,7 @@ class TestTables:
         assert (len(places.names), len(places.positives())) == (400, 200)
 
 
-def test_single_images_are_places_that_only_a_warp_shows_twice(tmp_path: Path) -> None:
+def test_single_images_have_only_warped_positives(tmp_path: Path) -> None:
     images(tmp_path / "s", "1.png", "2.png", "3.png")
     source = singles_source(tmp_path / "s", tmp_path)
     assert label(source, "s/1.png", "s/2.png") == NEGATIVE

@@ -48,7 +48,7 @@ def test_the_papers_rule() -> None:
     assert [label(source, 0, other) for other in (6, 7)] == [NEGATIVE, NEGATIVE]
 
 
-def test_a_least_time_gap_leaves_neighbors_out_within_a_sequence_only() -> None:
+def test_a_minimum_time_gap_applies_within_a_sequence_only() -> None:
     source = two(PoseRule(min_gap_s=25.0))
     assert [label(source, 0, other) for other in (1, 2, 3)] == [LEFT_OUT, LEFT_OUT, NEGATIVE]
     close = two(PoseRule(min_gap_s=1e6))
@@ -59,13 +59,13 @@ def test_a_least_time_gap_leaves_neighbors_out_within_a_sequence_only() -> None:
     ("negatives", "expected"),
     [("same_sequence", [NEGATIVE, LEFT_OUT]), ("cross_sequence", [LEFT_OUT, NEGATIVE]), ("both", [NEGATIVE] * 2)],
 )
-def test_negatives_come_from_where_they_are_asked_for(negatives: str, expected: list[int]) -> None:
+def test_negatives_come_from_the_chosen_sequences(negatives: str, expected: list[int]) -> None:
     source = two(PoseRule(negatives=negatives))
     assert [label(source, 0, 5), label(source, 0, 7)] == expected
     assert label(source, 0, 2) == POSITIVE
 
 
-def test_sequences_of_one_scene_make_no_pair_across() -> None:
+def test_sequences_of_one_scene_give_no_pairs_across() -> None:
     source = two(scenes=Scenes(same_scene=(("a", "b"),)))
     assert [label(source, 0, 6), label(source, 0, 7)] == [LEFT_OUT, LEFT_OUT]
 
@@ -78,7 +78,7 @@ def test_sequences_that_share_a_frame_of_reference_are_judged_by_pose() -> None:
     assert [label(alone, 0, 6), label(alone, 0, 7)] == [POSITIVE, LEFT_OUT]
 
 
-def test_clear_negatives_leave_out_what_lies_between() -> None:
+def test_clear_negatives_omit_ambiguous_pairs() -> None:
     by_angle = two(PoseRule(clear_view_angle_deg=50))
     assert [label(by_angle, 0, other) for other in (2, 3, 4, 5)] == [POSITIVE, LEFT_OUT, NEGATIVE, LEFT_OUT]
     by_either = two(PoseRule(clear_view_angle_deg=50, clear_distance_m=5))
@@ -86,13 +86,13 @@ def test_clear_negatives_leave_out_what_lies_between() -> None:
     assert label(by_angle, 0, 7) == NEGATIVE  # another scene is clear enough
 
 
-def test_judging_does_not_depend_on_the_order() -> None:
+def test_labels_do_not_depend_on_the_order() -> None:
     source = two(PoseRule(min_gap_s=1.0, clear_view_angle_deg=30), Scenes(same_frame=(("a", "b"),)))
     first, second = np.triu_indices(8, 1)
     assert np.array_equal(source.judge(first, second), source.judge(second, first))
 
 
-def test_unknown_and_double_names_are_refused() -> None:
+def test_unknown_and_duplicate_names_are_refused() -> None:
     with pytest.raises(InputError, match='no sequence has the name "c"; there are: a, b'):
         two(scenes=Scenes(same_scene=(("a", "c"),)))
     with pytest.raises(InputError, match='two sequences have the name "a"'):
@@ -104,18 +104,18 @@ def warned(source: PoseSource, pairs: list[tuple[int, int]]) -> str:
     return "\n".join(source.warnings(first, second, source.judge(first, second)))
 
 
-def test_negatives_across_undeclared_sequences_are_warned_about() -> None:
+def test_a_warning_for_negatives_across_undeclared_sequences() -> None:
     pairs = [(0, 2), (0, 4), (0, 6)]
     assert "1 negatives are of different sequences that are not declared" in warned(two(), pairs)
     assert not warned(two(scenes=Scenes(all_others_differ=True)), pairs)
     assert not warned(two(scenes=Scenes(same_scene=(("a", "b"),))), pairs)
 
 
-def test_positives_that_are_neighbors_in_time_are_warned_about() -> None:
+def test_a_warning_for_positives_that_are_neighbors_in_time() -> None:
     assert "100% of the positives are images less than 3 s apart" in warned(two(), [(0, 1), (0, 4)])
     assert not warned(two(), [(0, 2), (0, 4)])
 
 
-def test_negatives_near_the_limits_are_warned_about() -> None:
+def test_a_warning_for_negatives_near_the_limits() -> None:
     assert "100% of the negatives judged by pose" in warned(two(), [(0, 2), (0, 3)])
     assert not warned(two(), [(0, 2), (0, 4)])

@@ -108,7 +108,7 @@ def test_the_list_is_shuffled(tmp_path: Path) -> None:
     assert labels != sorted(labels)
 
 
-def test_a_split_by_time_keeps_stretches_whole_and_a_gap_between_them() -> None:
+def test_a_split_by_time_keeps_ranges_with_a_gap_between_them() -> None:
     source = pose_source()
     splits = split_by_time(source, {"train": 0.5, "val": 0.25, "test": 0.25}, gap=1.0)
     for track in range(3):
@@ -147,7 +147,7 @@ def test_sequences_can_be_given_to_splits_by_name() -> None:
         ({"val": ["s1"], "test": ["s1"]}, 'sequence "s1" is named for two splits'),
     ],
 )
-def test_wrongly_named_sequences_are_refused(named: dict[str, list[str]], words: str) -> None:
+def test_unknown_sequence_names_are_refused(named: dict[str, list[str]], words: str) -> None:
     with pytest.raises(InputError, match=words):
         split_by_group(pose_source(), {"train": 0.5, "val": 0.25, "test": 0.25}, 1, named)
 
@@ -157,7 +157,7 @@ def test_fewer_sequences_than_splits_are_refused() -> None:
         split_by_group(pose_source((50,)), {"train": 0.5, "val": 0.5}, 1)
 
 
-def test_too_few_pairs_are_an_error_that_says_how_many_there_are(tmp_path: Path) -> None:
+def test_too_few_pairs_are_an_error_with_their_number(tmp_path: Path) -> None:
     source = pose_source((30,), PoseRule(negatives="same_sequence"))
     pairs = [(a, b) for a in range(30) for b in range(a + 1, 30)]
     labels = source.judge(*np.array(pairs).T)
@@ -190,13 +190,13 @@ def test_a_label_without_any_pair_is_an_error_even_with_at_most(tmp_path: Path) 
         (Plan({"train": 2, "val": 2}, shares={"train": 1.0, "val": 0.0, "test": 0.0}), "share of val is 0"),
     ],
 )
-def test_numbers_that_make_no_plan_are_refused(tmp_path: Path, plan: Plan, words: str) -> None:
+def test_invalid_numbers_are_refused(tmp_path: Path, plan: Plan, words: str) -> None:
     with pytest.raises(InputError, match=words):
         build(pose_source(), plan, tmp_path)
 
 
 @pytest.mark.slow
-def test_drawing_finds_what_looking_at_all_pairs_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sampling_finds_the_same_pairs_as_enumeration(monkeypatch: pytest.MonkeyPatch) -> None:
     source = pose_source()
     images = everything(source)
     everything_there = find_pairs(source, images, {POSITIVE: 10**6, NEGATIVE: 10**6}, np.random.default_rng(0))
@@ -235,7 +235,7 @@ def test_warped_pairs_replace_their_share_of_both_labels() -> None:
     assert np.array_equal(chosen.first == chosen.second, copies)
 
 
-def test_given_hard_negatives_are_all_taken_and_not_twice() -> None:
+def test_given_hard_negatives_are_all_used_once() -> None:
     source = pose_source()
     all_negatives = find_pairs(source, everything(source), {NEGATIVE: 40}, np.random.default_rng(9))[NEGATIVE]
     chosen = choose_pairs(
@@ -246,7 +246,7 @@ def test_given_hard_negatives_are_all_taken_and_not_twice() -> None:
     assert len(as_sets(negatives)) == 50
 
 
-def test_one_pose_more_or_less_far_apart_changes_the_label() -> None:
+def test_a_pose_across_the_limit_changes_the_label() -> None:
     """The choice asks the rule: a source with other limits labels otherwise."""
     source, wide = pose_source(), pose_source(rule=PoseRule(max_distance_m=4, max_angle_deg=40))
     first, second = np.triu_indices(len(source.names), 1)

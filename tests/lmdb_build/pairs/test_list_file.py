@@ -46,7 +46,7 @@ def ring(count: int = 30) -> PlaceSource:
 
 
 class TestFile:
-    def test_what_is_written_is_read_again(self, tmp_path: Path) -> None:
+    def test_written_lists_can_be_read(self, tmp_path: Path) -> None:
         path = tmp_path / "deep" / "list.txt"
         write_pair_list(path, [("a/1.png", "b.png", 1), ("c.png", "d.png", 0)], {"seed": "3", "rule": "2 m: 15 deg"})
         assert [(pair.first, pair.second, pair.label) for pair in read_pair_list(path)] == [
@@ -64,7 +64,7 @@ class TestFile:
             ("a.png b c.png 1", ":2:1: ", "expected two images and a label"),
         ],
     )
-    def test_a_broken_line_is_named(self, tmp_path: Path, line: str, place: str, words: str) -> None:
+    def test_an_invalid_line_is_reported(self, tmp_path: Path, line: str, place: str, words: str) -> None:
         path = tmp_path / "list.txt"
         path.write_text(f"# head\n{line}\n")
         with pytest.raises(InputError) as caught:
@@ -79,7 +79,7 @@ class TestFile:
         with pytest.raises(InputError, match=r"none\.txt: cannot be read: No such file"):
             read_pair_list(tmp_path / "none.txt")
 
-    def test_a_name_with_blanks_is_quoted(self, tmp_path: Path) -> None:
+    def test_a_name_with_spaces_is_quoted(self, tmp_path: Path) -> None:
         path = tmp_path / "list.txt"
         write_pair_list(path, [("my photo.png", "#b.png", 1)], {})
         (pair,) = read_pair_list(path)
@@ -91,19 +91,19 @@ class TestFile:
         assert b"caf\xe9.png b.png 1\n" in path.read_bytes()
         assert os.fsencode(read_pair_list(path)[0].first) == b"caf\xe9.png"
 
-    def test_a_file_that_is_no_text(self, tmp_path: Path) -> None:
+    def test_a_binary_file_is_refused(self, tmp_path: Path) -> None:
         path = tmp_path / "list.txt"
         path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0")
         with pytest.raises(InputError, match="not a text file"):
             read_pair_list(path)
 
-    def test_a_name_that_a_list_cannot_hold_is_refused(self, tmp_path: Path) -> None:
+    def test_a_name_that_a_list_cannot_contain_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(InputError, match="cannot list the image"):
             write_pair_list(tmp_path / "list.txt", [('my "photo".png', "b.png", 1)], {})
 
 
 class TestWarp:
-    def test_a_warp_keeps_the_size_and_shows_the_same_thing_otherwise(self) -> None:
+    def test_a_warp_keeps_the_size_and_changes_the_view(self) -> None:
         original = picture(1)
         warped = warp(original, np.random.default_rng(0))
         assert warped.shape == original.shape
@@ -118,7 +118,7 @@ class TestWarp:
             warped = warp(white, np.random.default_rng(seed)).reshape(-1, 3)
             assert (warped == warped[0]).all()
 
-    def test_warped_pairs_are_written_beside_the_list_again_with_the_same_bytes(self, photos: Path) -> None:
+    def test_warped_pairs_are_reproducible_next_to_the_list(self, photos: Path) -> None:
         source = singles_source(photos / "photos", photos)
         contents = []
         for name in ("one", "two"):
@@ -133,13 +133,13 @@ class TestWarp:
             contents.append([(photos / pair.second).read_bytes() for pair in pairs])
         assert contents[0] == contents[1]
 
-    def test_warped_images_must_lie_below_the_root(self, photos: Path) -> None:
+    def test_warped_images_must_be_below_the_root(self, photos: Path) -> None:
         source = singles_source(photos / "photos", photos / "photos")
         plan = Plan({"train": 4}, by="group", warp_share=1.0)
         with pytest.raises(InputError, match="warped images must be below the root folder"):
             build_lists(source, plan, photos / "photos", photos / "out")
 
-    def test_a_missing_image_is_named(self, photos: Path) -> None:
+    def test_a_missing_image_is_reported(self, photos: Path) -> None:
         source = singles_source(photos / "photos", photos)
         for path in (photos / "photos").iterdir():
             path.unlink()
@@ -148,7 +148,7 @@ class TestWarp:
 
 
 class TestHardNegatives:
-    def test_they_are_the_nearest_negatives(self) -> None:
+    def test_hard_negatives_are_the_nearest_negatives(self) -> None:
         source = ring()
         # On a line: places 2k and 2k + 1 lie close together, both photographs of a place closer still.
         line = np.array([2.0 * place - 0.8 * (place % 2) for place in range(30)])
@@ -160,7 +160,7 @@ class TestHardNegatives:
         assert (places[:, 1] - places[:, 0] == 1).all()
         assert (places[:, 0] % 2 == 0).all()
 
-    def test_they_spread_over_the_images(self) -> None:
+    def test_hard_negatives_are_spread_over_the_images(self) -> None:
         source = ring()
         rng = np.random.default_rng(0)
         features = rng.normal(size=(60, 4))
@@ -168,11 +168,11 @@ class TestHardNegatives:
         found = hard_negatives(source, np.arange(60), features, 40)
         assert len(np.unique(found)) > 40
 
-    def test_none_are_found_among_images_of_one_place(self) -> None:
+    def test_images_of_one_place_have_no_hard_negatives(self) -> None:
         source = PlaceSource([("a.png", "x"), ("b.png", "x")], [(0, 1)], {})
         assert len(hard_negatives(source, np.arange(2), np.eye(2), 5)) == 0
 
-    def test_their_share_of_a_list(self, tmp_path: Path) -> None:
+    def test_the_share_of_hard_negatives_in_a_list(self, tmp_path: Path) -> None:
         source = ring()
         line = np.concatenate([np.arange(30.0), np.arange(30.0)])
         features = Features(tmp_path / "f.npz", line[:, None].astype(np.float32), list(source.names))
@@ -248,17 +248,17 @@ class TestContactSheet:
         assert red[height // 2 :].sum() > 1000  # two negatives
         assert not green[height * 2 // 3 :].any()  # but one positive
 
-    def test_the_pictures_are_there(self, listed: Path) -> None:
+    def test_the_sheet_has_the_images_of_pairs(self, listed: Path) -> None:
         sheet = contact_sheet(listed, listed.parent, rows=1)
         shown = cv2.resize(sheet[50:230, 6:246], (80, 60), interpolation=cv2.INTER_AREA)
         assert np.abs(shown.astype(int) - picture(0)).mean() < 4
 
-    def test_a_missing_image_is_named_with_its_line(self, listed: Path) -> None:
+    def test_a_missing_image_is_reported_with_its_line(self, listed: Path) -> None:
         (listed.parent / "photos/1.png").unlink()
         with pytest.raises(InputError, match=r"list\.txt:2:1: .*photos/1\.png cannot be read: No such file"):
             contact_sheet(listed, listed.parent)
 
-    def test_it_is_written_as_its_ending_says(self, listed: Path) -> None:
+    def test_the_format_follows_from_the_file_name(self, listed: Path) -> None:
         write_contact_sheet(listed, listed.parent, listed.parent / "deep/sheet.png")
         assert cv2.imread(str(listed.parent / "deep/sheet.png")) is not None
         with pytest.raises(InputError, match="cannot be written as a picture"):

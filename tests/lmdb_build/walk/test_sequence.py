@@ -50,7 +50,7 @@ def facing_quad(distance: float, size: float, texture: np.ndarray) -> Quad:
     return Quad(origin, np.array([size, 0, 0.0]), np.array([0, size, 0.0]), texture, 0)
 
 
-def test_it_has_the_layout_of_tum_and_every_frame_a_pose(folder: Path, sequence: ImageSequence) -> None:
+def test_a_walk_has_tums_layout_and_a_pose_for_each_frame(folder: Path, sequence: ImageSequence) -> None:
     assert len(sequence) == SMALL.frames
     assert all(path.is_file() for path in sequence.paths)
     assert sequence.stamps is not None
@@ -67,7 +67,7 @@ def test_a_walk_of_few_frames_has_a_pose_for_each_of_them(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_house(folder: Path, tmp_path: Path) -> None:
+def test_the_seed_determines_the_bytes_of_a_walk(folder: Path, tmp_path: Path) -> None:
     short = replace(SMALL, frames=4, laps=1)
     for name, walk in (("a", short), ("b", short), ("c", replace(short, seed=8))):
         list(write_walk(tmp_path / name, walk))
@@ -78,7 +78,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_house(folde
     assert (tmp_path / "a/rgb/1000.000000.jpg").read_bytes() != (tmp_path / "c/rgb/1000.000000.jpg").read_bytes()
 
 
-def test_depth_is_written_in_the_form_of_tum_and_says_how_far_the_walls_are(tmp_path: Path) -> None:
+def test_depth_has_tums_format_and_the_distances_of_walls(tmp_path: Path) -> None:
     """A pixel of one frame, taken to where its depth says, is the same surface in the next frame."""
     walk = replace(SMALL, frames=100, laps=1, depth=True)
     list(write_walk(tmp_path / "w", walk))
@@ -100,7 +100,7 @@ def test_depth_is_written_in_the_form_of_tum_and_says_how_far_the_walls_are(tmp_
     assert np.mean(np.abs(there - seen[inside, 2]) < 0.1) > 0.75  # the others are hidden by something nearer
 
 
-def test_places_are_seen_again_on_every_lap(sequence: ImageSequence) -> None:
+def test_every_lap_revisits_the_same_places(sequence: ImageSequence) -> None:
     truth = same_place_matrix(sequence.known_poses(), sequence.known_poses())
     lap = np.arange(SMALL.frames) * SMALL.laps // SMALL.frames
     for later in (1, 2):
@@ -108,7 +108,7 @@ def test_places_are_seen_again_on_every_lap(sequence: ImageSequence) -> None:
         assert again.mean() > 0.9
 
 
-def test_the_same_place_looks_the_same_and_other_places_do_not(folder: Path, sequence: ImageSequence) -> None:
+def test_images_of_the_same_place_are_similar(folder: Path, sequence: ImageSequence) -> None:
     thumbnails = []
     for path in sequence.paths:
         picture = cv2.imread(str(path))
@@ -127,7 +127,7 @@ def test_the_same_place_looks_the_same_and_other_places_do_not(folder: Path, seq
     assert other < 0.2
 
 
-def test_a_lap_later_it_is_another_light_and_a_few_steps_aside(sequence: ImageSequence) -> None:
+def test_laps_differ_in_light_and_position(sequence: ImageSequence) -> None:
     poses = sequence.known_poses()
     truth = same_place_matrix(poses, poses)
     later = np.flatnonzero(np.arange(SMALL.frames) >= SMALL.frames // SMALL.laps)
@@ -140,7 +140,7 @@ def test_a_lap_later_it_is_another_light_and_a_few_steps_aside(sequence: ImageSe
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_painted_corner_appears_where_its_point_in_space_projects(seed: int) -> None:
+def test_corners_appear_at_their_projected_positions(seed: int) -> None:
     rng = np.random.default_rng(seed)
     texture = np.zeros((256, 256, 3), np.uint8)
     texture[:128, :128] = texture[128:, 128:] = 255
@@ -170,7 +170,7 @@ def test_texture_columns_run_to_the_right_and_rows_down() -> None:
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_the_nearer_surface_hides_the_other_whatever_their_order(order: tuple[int, int]) -> None:
+def test_nearer_surfaces_hide_others_in_any_order(order: tuple[int, int]) -> None:
     near = facing_quad(2.0, 0.5, np.full((32, 32, 3), 200, np.uint8))
     far = facing_quad(4.0, 8.0, np.full((32, 32, 3), 50, np.uint8))
     quads = [(near, far)[index] for index in order]
@@ -179,7 +179,7 @@ def test_the_nearer_surface_hides_the_other_whatever_their_order(order: tuple[in
     assert picture[10, 10, 0] == 50
 
 
-def test_a_surface_is_not_seen_from_behind() -> None:
+def test_surfaces_are_invisible_from_behind() -> None:
     quad = facing_quad(2.0, 1.0, np.full((32, 32, 3), 200, np.uint8))
     turned = replace(quad, origin=quad.origin + quad.right, right=-quad.right)
     assert not Renderer(flat_house(turned), CAMERA, plain_light()).draw(np.zeros(3), np.eye(3)).any()
@@ -200,7 +200,7 @@ def test_the_house_has_no_holes(seed: int) -> None:
 
 
 @pytest.mark.parametrize("rooms", [4, 6, 8])
-def test_the_way_leads_through_every_room_and_never_into_furniture(rooms: int) -> None:
+def test_the_path_visits_every_room_and_avoids_furniture(rooms: int) -> None:
     for seed in range(4):
         house = build_house(seed, rooms)
         for room in house.rooms:
@@ -212,7 +212,7 @@ def test_the_way_leads_through_every_room_and_never_into_furniture(rooms: int) -
                 assert np.linalg.norm(gap, axis=1).min() >= 0.5
 
 
-def test_the_camera_is_carried_upright(sequence: ImageSequence) -> None:
+def test_the_camera_is_upright(sequence: ImageSequence) -> None:
     axes = Rotation.from_quat(sequence.known_poses().quaternions).as_matrix()
     assert (axes[:, 2, 1] < -0.98).all()  # y points down
     assert (np.abs(axes[:, 2, 0]) < 0.05).all()  # x is level
@@ -229,11 +229,11 @@ def test_the_camera_is_carried_upright(sequence: ImageSequence) -> None:
         ({"seed": -1}, "seed must be 0 or more"),
     ],
 )
-def test_numbers_that_make_no_walk_are_refused(tmp_path: Path, change: dict[str, int], words: str) -> None:
+def test_invalid_settings_of_a_walk_are_refused(tmp_path: Path, change: dict[str, int], words: str) -> None:
     with pytest.raises(InputError, match=words):
         list(write_walk(tmp_path / "w", replace(SMALL, **change)))
 
 
-def test_a_folder_with_a_sequence_is_not_written_over(folder: Path) -> None:
+def test_a_folder_with_a_sequence_is_not_overwritten(folder: Path) -> None:
     with pytest.raises(InputError, match="holds a sequence already"):
         list(write_walk(folder, SMALL))

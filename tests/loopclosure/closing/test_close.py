@@ -59,7 +59,7 @@ def errors(said: str) -> tuple[float, float]:
     return float(found[1]), float(found[2])
 
 
-def test_depth_mends_the_path(closed: tuple[str, Path]) -> None:
+def test_depth_corrects_the_path(closed: tuple[str, Path]) -> None:
     said, out = closed
     before, after = errors(said)
     assert before > 0.1
@@ -69,7 +69,7 @@ def test_depth_mends_the_path(closed: tuple[str, Path]) -> None:
     assert len(read_poses(out / "closed.txt").poses) == FRAMES
 
 
-def test_color_alone_mends_it_too_and_says_what_it_does_not_know(walk: Path, tmp_path: Path) -> None:
+def test_color_corrects_the_path_up_to_scale(walk: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare"
     bare.mkdir()
     for name in ("rgb", "rgb.txt", "groundtruth.txt", "calibration.txt"):
@@ -82,7 +82,7 @@ def test_color_alone_mends_it_too_and_says_what_it_does_not_know(walk: Path, tmp
     assert "from depth" not in said
 
 
-def test_one_false_loop_is_survived(walk: Path, closed: tuple[str, Path], tmp_path: Path) -> None:
+def test_one_false_loop_is_tolerated(walk: Path, closed: tuple[str, Path], tmp_path: Path) -> None:
     """The table has a loop of frames 40 and 5, and both have the same picture, so that the images agree."""
     lying = tmp_path / "lying"
     lying.mkdir()
@@ -102,7 +102,7 @@ def test_one_false_loop_is_survived(walk: Path, closed: tuple[str, Path], tmp_pa
     assert used[("40", "5")] == "no"
 
 
-def test_the_graph_says_what_was_measured(walk: Path, closed: tuple[str, Path]) -> None:
+def test_the_graph_contains_the_measurements(walk: Path, closed: tuple[str, Path]) -> None:
     _, out = closed
     lines = [line.split() for line in (out / "closed.g2o").read_text().splitlines()]
     vertices = {int(words[1]): np.array(words[2:], float) for words in lines if words[0] == "VERTEX_SE3:QUAT"}
@@ -146,7 +146,7 @@ def test_odometry_from_a_file(
         ("--loops LOOPS", 2, "one of the arguments --odometry --drift is required"),
     ],
 )
-def test_faults_are_one_line(
+def test_errors_are_reported_in_one_line(
     line: str, status: int, words: str, walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "far.csv").write_text("query_id,match_id\n900,1\n")
@@ -163,7 +163,7 @@ def test_faults_are_one_line(
     assert words in capsys.readouterr().err
 
 
-def test_without_a_camera_the_numbers_are_asked_for(two_laps: Path, tmp_path: Path, capsys) -> None:
+def test_without_a_camera_its_parameters_are_required(two_laps: Path, tmp_path: Path, capsys) -> None:
     (tmp_path / "loops.csv").write_text("query_id,match_id\n25,5\n")
     line = f"close {two_laps} --loops {tmp_path / 'loops.csv'} --drift 1 --out {tmp_path / 'out'}"
     assert main(line.split()) == 1
@@ -197,7 +197,7 @@ def test_every_third_frame(walk: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert len(read_poses(tmp_path / "out" / "closed.txt").poses) == FRAMES // 3
 
 
-def test_loops_that_are_not_there_are_named_as_far_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_loops_are_reported_with_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
     expected = "out/lops.csv: no such file; expected the loops.csv that loopclosure detect writes"

@@ -99,7 +99,7 @@ def test_thousands_of_poses_take_few_steps_of_little_memory(monkeypatch: pytest.
     assert ate_rmse_m(found.poses, truth) < 0.5 * ate_rmse_m(path, truth)
 
 
-def test_gtsam_takes_the_same_steps() -> None:
+def test_gtsam_computes_the_same_steps() -> None:
     pytest.importorskip("gtsam")
     _, path, odometry, loops = drive(600, 60, 12)
     graph_of = graph._Graph(len(path), [*odometry, *loops])
@@ -157,7 +157,7 @@ def test_information_weighs_each_direction_of_each_edge(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.poses[1, :3], [0.9, 0.9, 0], atol=1e-6)
 
 
-def test_parts_that_no_edge_joins_stay_where_they_are(tmp_path: Path) -> None:
+def test_unconnected_parts_are_unchanged(tmp_path: Path) -> None:
     lines = [f"VERTEX_SE3:QUAT {i} {3 * i} 0 0 0 0 0 1" for i in range(4)]
     lines += [f"EDGE_SE3:QUAT {i} {i + 1} 1 0 0 0 0 0 1 {entries(np.eye(6))}" for i in (0, 2)]
     (tmp_path / "parts.g2o").write_text("\n".join(lines))
@@ -193,14 +193,14 @@ def test_two_dimensions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         ((entries(2 * np.eye(6)), entries(-np.eye(6))), ":7:1: the information matrix has a negative eigenvalue, -1"),
     ],
 )
-def test_faults_of_the_file(tmp_path: Path, change: tuple[str, str], said: str) -> None:
+def test_errors_of_the_file_are_reported(tmp_path: Path, change: tuple[str, str], said: str) -> None:
     path = tmp_path / "in.g2o"
     path.write_text(GRAPH.replace(*change))
     with pytest.raises(InputError, match=re.escape(said)):
         read_pose_graph(path)
 
 
-def test_no_other_option_belongs_to_a_graph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_options_are_refused_for_a_graph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = ["close", "--graph", "in.g2o", "--out", str(tmp_path)]
     assert main([*line, "--loops", "l.csv"]) == 2
     assert "--loops cannot be used with --graph" in capsys.readouterr().err

@@ -43,7 +43,7 @@ def loop_edges(truth: np.ndarray, every: int = 5) -> list[Edge]:
     return [Edge(i, j, relative_pose(truth[i], truth[j]), LOOP_SIGMAS.information()) for i, j in pairs]
 
 
-def test_derivatives_are_those_of_the_errors() -> None:
+def test_derivatives_equal_numerical_ones() -> None:
     rng = np.random.default_rng(0)
     poses = np.hstack([rng.normal(size=(5, 3)), Rotation.random(5, rng).as_quat()])
     measured = np.hstack([rng.normal(size=(3, 3)), Rotation.random(3, rng).as_quat()])
@@ -59,7 +59,7 @@ def test_derivatives_are_those_of_the_errors() -> None:
     np.testing.assert_allclose(graph.derivatives(state).toarray(), numeric, atol=1e-7)
 
 
-def test_loops_mend_the_drift() -> None:
+def test_loops_correct_the_drift() -> None:
     truth = laps()
     path = drifted(truth, 2, seed=1)
     solution = solve(path, odometry_edges(path), loop_edges(truth))
@@ -70,7 +70,7 @@ def test_loops_mend_the_drift() -> None:
 
 
 @pytest.mark.parametrize("false", [1, 8])
-def test_false_loops_do_no_harm(false: int) -> None:
+def test_false_loops_do_not_distort_the_path(false: int) -> None:
     truth = laps()
     path = drifted(truth, 2, seed=1)
     right = loop_edges(truth)
@@ -81,7 +81,7 @@ def test_false_loops_do_no_harm(false: int) -> None:
     np.testing.assert_allclose(solution.poses[:, :3], clean.poses[:, :3], atol=0.01)
 
 
-def test_without_loops_the_path_stays() -> None:
+def test_without_loops_the_path_is_unchanged() -> None:
     path = drifted(laps(), 2, seed=1)
     solution = solve(path, odometry_edges(path), [])
     np.testing.assert_allclose(solution.poses[:, :3], path[:, :3], atol=1e-12)
@@ -174,7 +174,7 @@ def test_a_camera_that_only_turned_gives_a_rotation_only() -> None:
     assert degrees_off(found.pose) < 0.2
 
 
-def test_points_that_do_not_agree_give_nothing() -> None:
+def test_inconsistent_points_give_no_motion() -> None:
     first, second, matches = views(np.array([0.4, 0, 0]))
     assert relative_view(first, second, matches[:19]) is None
     scrambled = np.stack([matches[:, 0], np.random.default_rng(1).permutation(POINTS)], axis=1)
@@ -195,7 +195,7 @@ def test_the_camera_of_smaller_images_and_of_text() -> None:
 
 
 @pytest.mark.parametrize(("ends", "spot"), [([(0, 40), (1, 39)], True), ([(0, 40), (15, 25)], False), ([], False)])
-def test_loops_in_one_spot_are_said_to_be(ends: list[tuple[int, int]], spot: bool) -> None:
+def test_loops_at_one_position_are_reported(ends: list[tuple[int, int]], spot: bool) -> None:
     """A path of 20 m and back, with loops only at its beginning, or also in the middle."""
     poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (41, 1))
     poses[:, 0] = 20 - np.abs(np.arange(41) - 20)

@@ -75,13 +75,13 @@ def test_an_array_named_after_its_blob(tmp_path):
         ({"features": ROWS, "zooms": np.ones(3)}, "2 numbers per image, which cannot be 3 views"),
     ],
 )
-def test_odd_files_are_refused(tmp_path, arrays, sentence):
+def test_invalid_files_are_refused(tmp_path, arrays, sentence):
     np.savez(tmp_path / "f.npz", **arrays)
     with pytest.raises(InputError, match=sentence):
         read_features(tmp_path / "f.npz")
 
 
-def test_missing_and_broken_files(tmp_path):
+def test_missing_and_damaged_files_are_reported(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_features(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("no archive")
@@ -92,7 +92,7 @@ def test_missing_and_broken_files(tmp_path):
         read_features(tmp_path / "one.npy")
 
 
-def test_method_scores_and_carries_the_seconds_of_the_net(tmp_path):
+def test_the_method_includes_the_time_of_the_net(tmp_path):
     path = save(tmp_path / "f.npz", ["1.png", "2.png", "3.png", "4.png"], seconds_per_image=np.array(0.25))
     images = [Path("1.png"), Path("2.png"), Path("3.png")]
     found = make_method(f"features:{path}").score(Images.of_files(images), silent)
@@ -118,7 +118,7 @@ def test_queries_and_references_of_two_files(tmp_path):
     np.testing.assert_allclose(scores, [[-np.sqrt(2), -np.sqrt(18)]], rtol=1e-5)
 
 
-def test_descriptors_that_are_not_finite_are_refused(tmp_path):
+def test_nonfinite_descriptors_are_refused(tmp_path):
     rows = ROWS.astype(np.float32).copy()
     rows[1:3, 0] = np.nan, np.inf
     np.savez(tmp_path / "f.npz", features=rows)

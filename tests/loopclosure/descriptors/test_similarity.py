@@ -34,7 +34,7 @@ def test_matrix(features, metric):
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "cosine"])
-def test_of_several_views_the_two_most_alike_count(features, metric):
+def test_the_most_similar_two_views_decide(features, metric):
     queries, references = features[:20].reshape(10, -1), features[20:].reshape(10, -1)
     expected = [
         brute_force(queries[:, 7 * u : 7 * u + 7], references[:, 7 * v : 7 * v + 7], metric)
@@ -44,7 +44,7 @@ def test_of_several_views_the_two_most_alike_count(features, metric):
     np.testing.assert_allclose(similarity_matrix(queries, references, metric, views=2), np.max(expected, axis=0))
 
 
-def test_blocks_are_the_matrix(features):
+def test_blocks_equal_the_matrix(features):
     blocks = list(similarity_blocks(features, rows=16))
     assert [start for start, _ in blocks] == [0, 16, 32]
     np.testing.assert_allclose(np.concatenate([block for _, block in blocks]), similarity_matrix(features), atol=1e-12)
@@ -73,14 +73,14 @@ def test_top_k_against_other_references(features):
 
 
 @pytest.mark.parametrize("columns", [16384, 3])
-def test_equal_scores_come_in_the_order_of_the_references(columns, monkeypatch):
+def test_equal_scores_keep_the_order_of_the_references(columns, monkeypatch):
     monkeypatch.setattr(similarity, "BLOCK_COLUMNS", columns)
     same = np.ones((9, 2), np.float32)
     np.testing.assert_array_equal(top_k(same, same, k=3).indices, np.tile([0, 1, 2], (9, 1)))
 
 
 @pytest.mark.slow
-def test_memory_is_that_of_blocks(monkeypatch):
+def test_memory_is_limited_to_blocks(monkeypatch):
     """20,000 frames: the whole matrix would be 1.6 GB of float32."""
     import tracemalloc
 
@@ -94,12 +94,12 @@ def test_memory_is_that_of_blocks(monkeypatch):
     assert peak < 50e6
 
 
-def test_a_feature_of_zeros_is_alike_to_nothing_by_cosine():
+def test_a_zero_feature_has_cosine_similarity_zero():
     scores = similarity_matrix(np.array([[0.0, 0.0], [1.0, 0.0]]), metric="cosine")
     np.testing.assert_array_equal(scores, [[0.0, 0.0], [0.0, 1.0]])
 
 
-def test_fewer_references_than_asked_for():
+def test_fewer_references_than_requested():
     assert top_k(np.eye(3), np.eye(3)[:2], k=10).indices.shape == (3, 2)
     found = top_k(np.eye(3), k=2)
     np.testing.assert_array_equal(found.indices[0], [-1, -1])
@@ -118,7 +118,7 @@ def test_fewer_references_than_asked_for():
         (lambda: Exclusion(frames=-1), "cannot exclude -1"),
     ],
 )
-def test_faults_are_named(call, sentence):
+def test_errors_are_reported(call, sentence):
     with pytest.raises(InputError, match=sentence):
         call()
 
@@ -156,7 +156,7 @@ def test_thumbnails_ignore_brightness_and_contrast_by_default() -> None:
     assert plain(brighter).mean() == pytest.approx(2 * plain(image).mean() + 40, abs=1)
 
 
-def test_shrinking_averages_and_color_is_taken_as_gray() -> None:
+def test_shrinking_averages_and_color_becomes_gray() -> None:
     image = np.kron([[0, 255], [255, 0]], np.ones((12, 16))).astype(np.uint8)
     image[::2, ::2] = 128
     shrunk = Thumbnailer(width=2, height=2, normalize="none")
@@ -179,6 +179,6 @@ def test_differences_are_means_over_the_pixels() -> None:
         ({"width": 0}, "has no pixels"),
     ],
 )
-def test_impossible_thumbnails(settings: dict, message: str) -> None:
+def test_impossible_thumbnails_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Thumbnailer(**settings)

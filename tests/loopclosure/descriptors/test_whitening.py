@@ -72,7 +72,7 @@ def test_training_descriptors_come_out_with_unit_covariance(training):
     np.testing.assert_allclose(np.linalg.norm(whitening(training), axis=1), 1, rtol=1e-5)
 
 
-def test_the_power_goes_from_the_variances_as_they_are_to_equal_ones(training):
+def test_the_power_interpolates_between_original_and_equal_variances(training):
     turned = np.cov(learn_whitening(training, power=0.0).project(training).T)
     variances = np.sort(np.linalg.eigvalsh(np.cov(training.T)))[::-1]
     np.testing.assert_allclose(np.diag(turned), variances, rtol=1e-3)
@@ -85,7 +85,7 @@ def test_without_division_all_components_keep_the_distances(training, laps):
     np.testing.assert_allclose(pdist(rows), pdist(laps), rtol=1e-4)
 
 
-def test_fewer_components_are_the_strongest(training, laps):
+def test_the_strongest_components_are_kept(training, laps):
     everything, few = learn_whitening(training), learn_whitening(training, components=5)
     np.testing.assert_array_equal(few.projection, everything.projection[:, :5])
     assert few(laps).shape == (2 * PLACES, 5)
@@ -101,7 +101,7 @@ def test_order_and_rotation_of_the_dimensions_do_not_matter(training, laps):
         np.testing.assert_allclose(scores, expected, atol=2e-3)
 
 
-def test_dimensions_without_variance_stay_out(training, laps):
+def test_dimensions_without_variance_are_omitted(training, laps):
     def widened(rows):
         constant = np.full((len(rows), 1), 1000.1, np.float32)
         return np.hstack([rows, constant, rows[:, :1], np.zeros_like(constant)])
@@ -122,7 +122,7 @@ def test_a_descriptor_at_the_mean_stays_zero(training):
     np.testing.assert_array_equal(whitening(whitening.mean[None]), np.zeros((1, DIMENSIONS)))
 
 
-def test_it_finds_the_pairs_that_common_variation_hides(training, laps):
+def test_whitening_finds_pairs_hidden_by_common_variation(training, laps):
     first, second = laps[:PLACES], laps[PLACES:]
     assert found(similarity_matrix(second, first)) < 0.3
     assert found(similarity_matrix(second, first, "cosine")) < 0.3
@@ -140,7 +140,7 @@ def test_it_finds_the_pairs_that_common_variation_hides(training, laps):
         (np.eye(3), {"power": 1.5}, "power is 1.5; expected 0"),
     ],
 )
-def test_what_cannot_be_learned_from(descriptors, settings, sentence):
+def test_unusable_training_images_are_refused(descriptors, settings, sentence):
     with pytest.raises(InputError, match=sentence):
         learn_whitening(descriptors.astype(np.float32), source="other.npz", **settings)
 
@@ -166,7 +166,7 @@ def test_specifications():
         ("whiten=t.npz,components=many", 'components is a whole number, not "many"'),
     ],
 )
-def test_odd_specifications(settings, sentence):
+def test_invalid_specifications_are_refused(settings, sentence):
     with pytest.raises(InputError, match=sentence):
         make_method(f"features:a.npz:{settings}")
 
@@ -228,7 +228,7 @@ def test_detect_finds_loops_through_the_views(two_laps, tmp_path):
         assert [int(row["match_id"]) for row in csv.DictReader(stream)] == list(range(PLACES))
 
 
-def test_tested_images_are_not_learned_from(files, training, laps):
+def test_tested_images_are_refused_for_training(files, training, laps):
     images = [Path(f"/data/two_laps/rgb/{i}.png") for i in range(len(laps))]
     nearly = laps[5] * np.float32(1.0001)
     np.savez(files / "overlap.npz", features=np.vstack([training, nearly]), names=np.array(["x"] * 400 + ["a/5.png"]))
@@ -271,7 +271,7 @@ def test_evaluate(two_laps, files, tmp_path, capsys):
     assert min(averages[1]) > 0.99
 
 
-def test_evaluate_says_what_is_wrong_in_one_line(two_laps, files, capsys):
+def test_evaluate_reports_errors_in_one_line(two_laps, files, capsys):
     method = f"features:{files}/laps.npz:whiten={files}/laps.npz"
     assert main(["evaluate", str(two_laps), "--out", str(files / "report"), "--method", method]) == 1
     (line,) = capsys.readouterr().err.strip().splitlines()

@@ -26,7 +26,7 @@ def run(detector, descriptors, **more):
     return [detector.add_descriptor(row, **more) for row in descriptors]
 
 
-def test_second_lap_closes_its_loops_and_the_first_none():
+def test_only_the_second_lap_closes_loops():
     detector = LoopDetector(exclude_recent=10, threshold=-0.5)
     results = run(detector, two_laps())
     assert [r.accepted for r in results] == [None] * 60 + list(range(60))
@@ -50,7 +50,7 @@ def test_candidates_are_those_of_the_search_by_blocks(metric):
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "cosine"])
-def test_of_several_views_the_two_most_alike_count(metric, tmp_path):
+def test_the_most_similar_two_views_decide(metric, tmp_path):
     descriptors = np.random.default_rng(1).normal(2.0, 1.0, (60, 24)).astype(np.float32)
     expected = similarity_matrix(descriptors, None, metric, views=3)
     detector = LoopDetector(metric=metric, views=3, exclude_recent=7, top_k=4)
@@ -65,7 +65,7 @@ def test_of_several_views_the_two_most_alike_count(metric, tmp_path):
         LoopDetector(views=3).add_descriptor(np.ones(25))
 
 
-def test_seconds_exclude_too():
+def test_frames_can_be_excluded_by_time():
     detector = LoopDetector(exclude_recent=0, exclude_seconds=2.0, top_k=9)
     for stamp in (0.0, 1.0, 1.5, 3.0, 3.5):
         result = detector.add_descriptor(np.ones(3), stamp)
@@ -76,7 +76,7 @@ def test_seconds_exclude_too():
         detector.add_descriptor(np.ones(3), 1.0)
 
 
-def test_consistency_wants_the_frames_before_to_agree():
+def test_consistency_requires_earlier_frames_to_agree():
     descriptors = two_laps()
     lonely = descriptors[:60].copy()
     lonely[50] = descriptors[3]  # one frame looks like an old one, its neighbors do not
@@ -114,7 +114,7 @@ def test_without_a_threshold_a_loop_is_as_similar_as_consecutive_frames(tmp_path
         assert all(abs(angles[r.accepted] - angles[r.query_id]) < 0.06 for r in one.loops)
 
 
-def test_saved_and_loaded_it_goes_on_as_if_nothing_had_happened(tmp_path):
+def test_a_loaded_detector_continues_identically(tmp_path):
     descriptors = two_laps(places=300)
     settings = DetectorSettings(exclude_recent=20, threshold=-0.4, consistency=2, top_k=3)
     whole = LoopDetector(settings=settings)
@@ -142,7 +142,7 @@ def test_an_empty_detector_can_be_saved(tmp_path):
     assert len(detector) == 1
 
 
-def test_files_that_are_no_detector(tmp_path):
+def test_other_files_than_detectors_are_refused(tmp_path):
     np.savez(tmp_path / "other.npz", rows=np.zeros(3))
     (tmp_path / "text.npz").write_text("text")
     for name in ("other.npz", "text.npz", "none.npz"):
@@ -163,7 +163,7 @@ def test_memory_grows_by_doubling():
     assert len(arrays) <= 3
 
 
-def test_describe_gets_the_image():
+def test_describe_is_called_with_the_image():
     seen = []
 
     def describe(image):
@@ -187,7 +187,7 @@ def test_describe_gets_the_image():
         (lambda d: LoopDetector(metric="l1"), "unknown metric"),
     ],
 )
-def test_faults_are_named(call, sentence):
+def test_errors_are_reported(call, sentence):
     detector = LoopDetector()
     detector.add_descriptor([1.0, 2.0])
     with pytest.raises(InputError, match=sentence):
@@ -195,7 +195,7 @@ def test_faults_are_named(call, sentence):
     assert len(detector) == 1
 
 
-def test_a_misspelt_setting_is_a_programmers_fault():
+def test_a_misspelled_setting_is_a_type_error():
     with pytest.raises(TypeError, match="has no setting treshold"):
         LoopDetector(treshold=1.0)
 
@@ -222,7 +222,7 @@ def filled(**settings: Any) -> LoopDetector:
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_a_visitor_finds_every_frame_and_adds_none(views: int, tmp_path) -> None:
+def test_a_visitor_searches_all_frames_and_adds_none(views: int, tmp_path) -> None:
     detector = filled(exclude_recent=30, views=views)
     detector.save(tmp_path / "before.npz")
     visitors = [Visitor(detector), Visitor(detector)]
@@ -235,7 +235,7 @@ def test_a_visitor_finds_every_frame_and_adds_none(views: int, tmp_path) -> None
     assert (tmp_path / "after.npz").read_bytes() == (tmp_path / "before.npz").read_bytes()
 
 
-def test_consistency_is_that_of_each_visitor() -> None:
+def test_each_visitor_has_its_own_consistency() -> None:
     detector = filled(exclude_recent=5, consistency=2)
     one, other = Visitor(detector), Visitor(detector)
     verdicts = [one.add_descriptor(row).verdict for row in near(LAP[:4], 1)]
@@ -289,7 +289,7 @@ def test_sessions_of_a_damaged_file(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("stamp", [np.inf, -np.inf, np.nan])
-def test_a_stamp_that_is_not_finite_is_refused_and_the_next_frame_is_taken(stamp: float) -> None:
+def test_a_nonfinite_stamp_is_refused_and_the_next_frame_is_accepted(stamp: float) -> None:
     detector = LoopDetector()
     detector.add_descriptor(np.ones(4), 1.0)
     with pytest.raises(InputError, match=r"frame 1 has stamp .*; expected seconds"):

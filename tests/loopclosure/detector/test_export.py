@@ -57,14 +57,14 @@ def test_g2o_edges_chain_the_vertices(tmp_path, poses):
         np.testing.assert_allclose(matrix(vertices[a]) @ matrix(step), matrix(vertices[b]), atol=1e-6)
 
 
-def test_information_is_of_the_sigmas():
+def test_information_is_the_inverse_of_squared_sigmas():
     values = [float(v) for v in Sigmas(0.1, 0.5).information()[np.triu_indices(6)]]
     full = np.zeros((6, 6))
     full[np.triu_indices(6)] = values
     np.testing.assert_allclose(full, np.diag([100, 100, 100, 4, 4, 4]))
 
 
-def test_frames_without_a_pose_are_no_vertices(tmp_path, poses):
+def test_frames_without_a_pose_have_no_vertex(tmp_path, poses):
     poses[1] = np.nan
     left_out = write_g2o(tmp_path / "g.g2o", poses, [loop(3, 1)], lambda q, m: np.array([0, 0, 0, 0, 0, 0, 1.0]))
     lines = (tmp_path / "g.g2o").read_text().splitlines()
@@ -102,7 +102,7 @@ def test_a_name_can_be_any_bytes(tmp_path):
     assert (found.query, found.match) == (1, 0)
 
 
-def test_control_characters_of_a_name_are_escaped_and_found_again(tmp_path: Path) -> None:
+def test_control_characters_of_names_are_escaped_and_restored(tmp_path: Path) -> None:
     names = ["a\x1b[2J\x9b.png", "b.png"]
     write_loops_csv(tmp_path / "loops.csv", [LoopResult(1, [(0, 0.5)], 0, "accepted", 0.5)], None, names)
     assert not set(b"\x1b\x9b") & set((tmp_path / "loops.csv").read_bytes())

@@ -124,7 +124,7 @@ def test_long_descriptors_are_projected(drives: Path, tmp_path: Path, monkeypatc
 
 
 @pytest.mark.slow
-def test_what_is_projected_is_kept(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_projected_descriptors_are_kept(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(maps, "LEARNED_FROM", 9)
     monkeypatch.setattr(maps, "COMPONENTS", 8)
     opened, folder = Map.create(tmp_path / "M", "thumbnails"), tmp_path / "M"
@@ -143,9 +143,7 @@ def test_what_is_projected_is_kept(drives: Path, tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.slow
-def test_of_what_was_projected_before_only_a_maps_own_files_go(
-    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_maps_own_old_files_are_removed(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(maps, "LEARNED_FROM", 9)
     monkeypatch.setattr(maps, "COMPONENTS", 8)
     opened, folder = Map.create(tmp_path / "M", "thumbnails"), tmp_path / "M"
@@ -166,7 +164,7 @@ DYING = (Path(__file__).parent / "programs" / "dying.py").read_text()
 
 
 @pytest.mark.slow
-def test_a_run_that_is_killed_leaves_the_map_as_it_was(a_map: Map, drives: Path, tmp_path: Path) -> None:
+def test_a_killed_command_does_not_change_the_map(a_map: Map, drives: Path, tmp_path: Path) -> None:
     before = contents(tmp_path / "M")
     words = [sys.executable, "-c", DYING, str(tmp_path / "M"), str(drives / "b")]
     assert subprocess.run(words, check=False).returncode == -signal.SIGKILL
@@ -180,7 +178,7 @@ def test_a_run_that_is_killed_leaves_the_map_as_it_was(a_map: Map, drives: Path,
 
 
 @pytest.mark.slow
-def test_one_adds_at_a_time_and_others_read(a_map: Map, drives: Path, tmp_path: Path) -> None:
+def test_one_process_writes_while_others_read(a_map: Map, drives: Path, tmp_path: Path) -> None:
     other = Map(tmp_path / "M")
     with only_one(tmp_path / "M" / ".lock", ""):
         with pytest.raises(SpecError, match="locked by another process"):
@@ -198,7 +196,7 @@ class Net(Thumbnailer):
 
 
 @pytest.mark.parametrize(("older", "described"), [(False, "a net"), (True, "63cb899e0703cb96")])
-def test_a_map_that_another_net_described_is_refused(
+def test_a_map_of_another_net_is_refused(
     older: bool, described: str, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Map.create(tmp_path / "M", "default").add(read_sequence(drives / "a"), Net())
@@ -241,7 +239,7 @@ def test_a_map_that_another_net_described_is_refused(
         (lambda m: shutil.rmtree(m / "000000"), "000000/frames.npz: no such file; expected a session of a map"),
     ],
 )
-def test_damage_is_one_line(damage, sentence: str, a_map: Map, tmp_path: Path) -> None:
+def test_damage_is_reported_in_one_line(damage, sentence: str, a_map: Map, tmp_path: Path) -> None:
     damage(tmp_path / "M")
     with pytest.raises(InputError, match=sentence):
         Map(tmp_path / "M").detector(Thumbnailer())
@@ -265,7 +263,7 @@ def pipe(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["rows", "points", "descriptors"])
-def test_a_file_that_is_cut_while_it_is_open_is_a_fault(name: str, a_map: Map, drives: Path) -> None:
+def test_a_file_truncated_while_open_is_an_error(name: str, a_map: Map, drives: Path) -> None:
     """A mapped one would end the process (SIGBUS)."""
     before = a_map.detector(Thumbnailer())
     os.truncate(a_map.folder / "000000" / f"{name}.npy", 200)
@@ -273,7 +271,7 @@ def test_a_file_that_is_cut_while_it_is_open_is_a_fault(name: str, a_map: Map, d
         a_map.detector(Thumbnailer()) if name == "rows" else run_detector(before, read_sequence(drives / "b"))
 
 
-def test_faults_are_named(a_map: Map, drives: Path, tmp_path: Path) -> None:
+def test_errors_are_reported(a_map: Map, drives: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="exists already; loopclosure map add adds to a map"):
         Map.create(tmp_path / "M", "default")
     with pytest.raises(InputError, match="is not a map"):
@@ -297,7 +295,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
-def test_nothing_is_removed_behind_a_link(a_map: Map, drives: Path, tmp_path: Path) -> None:
+def test_links_are_not_followed_for_removal(a_map: Map, drives: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "000000.npy").write_text("of the user")
@@ -311,7 +309,7 @@ def test_nothing_is_removed_behind_a_link(a_map: Map, drives: Path, tmp_path: Pa
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("name", ["projected-20", "map.json", "000001", ".lock"])
-def test_nothing_is_written_through_a_link(name: str, a_map: Map, drives: Path, tmp_path: Path) -> None:
+def test_links_are_not_followed_for_writing(name: str, a_map: Map, drives: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     mine.mkdir()
     target = mine / name
@@ -335,9 +333,7 @@ def test_nothing_is_written_through_a_link(name: str, a_map: Map, drives: Path, 
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("failing", ["map.json", "projection.npz", "000001.npy", "loops.csv"])
-def test_an_add_that_fails_adds_nothing(
-    failing: str, a_map: Map, drives: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_add_changes_nothing(failing: str, a_map: Map, drives: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The disk may be full at any file; tried again, the drive is there once."""
     open_ = Path.open
 
@@ -371,7 +367,7 @@ def test_a_drive_without_frames_is_not_added(a_map: Map) -> None:
     assert len(Map(a_map.folder)) == PLACES
 
 
-def test_a_source_that_is_not_there_leaves_no_map(drives: Path, tmp_path: Path) -> None:
+def test_a_missing_source_creates_no_map(drives: Path, tmp_path: Path) -> None:
     folder = tmp_path / "N"
     assert main(["map", "build", str(folder), str(drives / "a"), str(drives / "typo")]) == 1
     assert not folder.exists()
@@ -381,7 +377,7 @@ def test_a_source_that_is_not_there_leaves_no_map(drives: Path, tmp_path: Path) 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
-def test_who_reads_while_a_projection_is_learned_again_reads_on(a_map: Map, drives: Path) -> None:
+def test_readers_continue_while_a_projection_is_replaced(a_map: Map, drives: Path) -> None:
     a_map.add(read_sequence(drives / "b"), Thumbnailer())
     reader = Map(a_map.folder)
     expected = reader.detector(Thumbnailer()).descriptors
@@ -394,7 +390,7 @@ def test_who_reads_while_a_projection_is_learned_again_reads_on(a_map: Map, driv
 
 
 @pytest.mark.parametrize("images", [np.inf, np.nan, 1e300])
-def test_a_projection_of_so_many_images_is_damaged(images: float, a_map: Map) -> None:
+def test_a_projection_with_a_wrong_count_is_damaged(images: float, a_map: Map) -> None:
     arrays = {"mean": np.zeros(768), "projection": np.zeros((768, 256)), "images": np.array(images)}
     about = json.loads((a_map.folder / "map.json").read_text())
     (a_map.folder / "projected-5").mkdir()
@@ -406,7 +402,7 @@ def test_a_projection_of_so_many_images_is_damaged(images: float, a_map: Map) ->
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
-def test_a_map_of_an_older_version_is_read_and_goes_on(a_map: Map, drives: Path) -> None:
+def test_a_map_of_an_older_version_can_be_extended(a_map: Map, drives: Path) -> None:
     """It named sessions by their folders, and its projection was next to them."""
     a_map.add(read_sequence(drives / "b"), Thumbnailer())
     expected = Map(a_map.folder).detector(Thumbnailer()).descriptors

@@ -38,7 +38,7 @@ def test_sequence_with_poses(two_laps):
     np.testing.assert_allclose(relative, [0, 0, 0, 0, 0, 0, 1], atol=1e-6)
 
 
-def test_features_take_the_place_of_describe(two_laps, two_laps_features):
+def test_features_replace_describe(two_laps, two_laps_features):
     detector = LoopDetector(exclude_recent=5, threshold=-0.2)
     results = run_detector(
         detector, read_sequence(two_laps).taken(Selection(stride=2)), read_features(two_laps_features)
@@ -111,7 +111,7 @@ def test_describe_by_name(tmp_path, monkeypatch):
             load_describe(specification, options)
 
 
-def test_nothing_in_the_working_directory_runs_unnamed(tmp_path, monkeypatch):
+def test_no_code_of_the_working_directory_runs_unrequested(tmp_path, monkeypatch):
     """Not even a module with the name of one that an installed package imports."""
     for name in ("my_describe", "wave", "sndhdr_of_mine"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('ran')")
@@ -125,7 +125,7 @@ def test_nothing_in_the_working_directory_runs_unnamed(tmp_path, monkeypatch):
         load_describe("sndhdr_of_mine:flat", {})
 
 
-def test_a_video_that_is_shorter_than_it_says(tmp_path, monkeypatch):
+def test_a_video_shorter_than_its_header_is_accepted(tmp_path, monkeypatch):
     image = np.zeros((8, 8, 3), np.uint8)
     recording = ImageSequence.of_video(tmp_path / "v.avi", 100).at([0, 5, 99])
     monkeypatch.setattr(

@@ -30,14 +30,14 @@ def check():
     return GeometricCheck()
 
 
-def test_the_same_wall_has_many_inliers_and_another_few(check):
+def test_only_the_same_wall_has_many_inliers(check):
     here, there, other = (check.describe(image) for image in (wall(0), seen_from_the_side(wall(0)), wall(1)))
     assert check.inliers(here, there) > 60
     assert check.inliers(here, other) == 0
     assert check.inliers(here, there) == check.inliers(here, there)
 
 
-def test_matches_join_what_is_the_same_point(check):
+def test_matches_connect_equal_points(check):
     image = wall(0)
     shifted = np.roll(image, (10, 20), axis=(0, 1))
     a, b = check.describe(image), check.describe(shifted)
@@ -61,7 +61,7 @@ def test_matches_are_those_of_the_plain_ratio_test(check):
     assert len(expected) > 50
 
 
-def test_an_image_without_a_point_is_no_crash(check):
+def test_an_image_without_points_is_accepted(check):
     blank = check.describe(np.full((60, 80, 3), 200, np.uint8))
     assert blank.points.shape == (0, 2)
     assert check.inliers(blank, check.describe(wall(0))) == 0
@@ -73,12 +73,12 @@ def test_gray_images_and_the_limit_of_points():
     assert len(few.describe(cv2.cvtColor(wall(0), cv2.COLOR_BGR2GRAY)).points) == 30
 
 
-def test_settings_that_cannot_work():
+def test_invalid_settings_are_refused():
     with pytest.raises(InputError, match="expected at least 8"):
         GeometricCheck(min_inliers=3)
 
 
-def test_the_detector_asks_for_geometry_last(tmp_path, check):
+def test_geometry_is_checked_last(tmp_path, check):
     """Descriptors that call all walls alike: only the true pair survives, also after saving and loading."""
     detector = LoopDetector(lambda image: np.ones(2), exclude_recent=0, threshold=-1.0, check=check)
     assert detector.add(wall(0)).verdict == "no candidate"
@@ -117,7 +117,7 @@ def test_eight_points_on_a_line_do_not_agree(check):
 
 
 @pytest.mark.slow
-def test_as_many_must_agree_as_rule_out_chance():
+def test_the_required_number_of_inliers_excludes_chance():
     """Moisan and Stival's count: of eight matches all in an image of this size, of many a small share."""
     check = GeometricCheck()
     asked = [check.agreement(noise(count, 0), noise(count, 1)).needed for count in (12, 30, 100, 400)]
@@ -163,7 +163,7 @@ def test_large_images_are_reduced_and_points_stay_in_their_own_pixels():
     assert check.inliers(a, b) > 100
 
 
-def test_images_and_pairs_are_looked_at_once(monkeypatch):
+def test_images_and_pairs_are_processed_once(monkeypatch):
     images = {0: wall(0), 1: seen_from_the_side(wall(0))}
     read = []
     pairs = Pairs(lambda key: read.append(key) or images[key])
@@ -179,7 +179,7 @@ def with_patch(image, patch, corner):
     return seen
 
 
-def test_a_printed_code_in_two_places_is_no_evidence(check):
+def test_repeated_printed_codes_are_ignored(check):
     """A code of 60 pixels has more inliers than rule out chance; a poster of half the image is a place."""
     code = np.random.default_rng(5).integers(0, 2, (20, 20)).repeat(3, 0).repeat(3, 1)[..., None].repeat(3, 2) * 255
     here, there = with_patch(wall(0), code, (40, 50)), with_patch(wall(1), code, (190, 120))
@@ -190,7 +190,7 @@ def test_a_printed_code_in_two_places_is_no_evidence(check):
     assert check.inliers(check.describe(here), check.describe(there)) > 30
 
 
-def test_what_is_fixed_in_all_images_is_left_out(check):
+def test_points_fixed_in_all_images_are_ignored(check):
     """A frame around each image, as a dashboard has it; each place is seen twice, the second time from elsewhere."""
     frame = wall(9)
 

@@ -63,7 +63,7 @@ def test_a_detector_finds_the_same_loops(name: str, tmp_path: Path, monkeypatch:
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("faiss") is None, reason="not installed: faiss")
 @pytest.mark.parametrize("metric", ["cosine", "euclidean"])
-def test_signs_leave_out_no_match(metric: str) -> None:
+def test_the_index_of_signs_misses_no_match(metric: str) -> None:
     """Of 20,000 rows that vary in 20 directions of 300, seen again with some noise, 1,000 are examined."""
     rng = np.random.default_rng(0)
     ways = rng.standard_normal((20, 300))
@@ -83,7 +83,7 @@ def test_signs_leave_out_no_match(metric: str) -> None:
 
 
 @pytest.mark.skipif(find_spec("milvus_lite") is None, reason="not installed: milvus_lite")
-def test_a_database_stays(tmp_path: Path) -> None:
+def test_a_database_is_kept(tmp_path: Path) -> None:
     name = str(tmp_path / "places.db")
     open_index(name, "cosine").add(directions(20))
     again = open_index(name, "cosine")
@@ -92,12 +92,12 @@ def test_a_database_stays(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(find_spec("pymilvus") is None, reason="not installed: pymilvus")
-def test_a_server_that_is_not_there_is_one_line() -> None:
+def test_a_missing_server_is_reported_in_one_line() -> None:
     with pytest.raises(InputError, match=r"^http://127.0.0.1:9: Milvus: .*server unavailable"):
         open_index("http://127.0.0.1:9", "cosine")
 
 
-def test_what_is_not_known_or_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_and_missing_indexes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=r'no index "hnsw"; expected exact, faiss, or Milvus: FILE.db'):
         open_index("hnsw", "cosine")
     monkeypatch.setattr("loopclosure.index.index.find_spec", lambda name: None)

@@ -67,7 +67,7 @@ def test_two_traverses_of_one_road_are_matched(seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
-def test_roads_that_share_no_place_have_no_loop(seed):
+def test_roads_without_common_places_have_no_loops(seed):
     scores = alike(drive(150, seed), drive(120, seed + 100))
     found = answer(Compared(scores, everything(scores), True))
     assert not found.accepted.any()
@@ -84,7 +84,7 @@ def test_a_drive_against_keyframes():
 
 
 @pytest.mark.slow
-def test_one_drive_that_comes_back_once():
+def test_one_drive_with_one_revisit():
     road = drive(400, 3)
     rows = np.concatenate([road, again(road[100:180], 1.0, 4), drive(100, 5)])
     scores = alike(rows, rows)
@@ -98,7 +98,7 @@ def test_one_drive_that_comes_back_once():
 
 
 @pytest.mark.parametrize(("after", "seed"), [(0, 1), (40, 0)])
-def test_frames_before_and_after_a_loop_in_another_light_are_no_loop(after, seed):
+def test_frames_around_a_loop_are_not_part_of_it(after, seed):
     """Their distances hardly differ. Standardized as those of a loop, they would look like lines."""
     steps, other = (np.random.default_rng(number).random((126, 768)) for number in (seed, seed + 50))
     road, elsewhere = (np.sum([of[k : k + 120] for k in range(6)], axis=0) for of in (steps, other))
@@ -112,13 +112,13 @@ def test_frames_before_and_after_a_loop_in_another_light_are_no_loop(after, seed
 
 
 @pytest.mark.parametrize("frames", [1, 2, 12])
-def test_too_few_frames_tell_nothing(frames):
+def test_too_few_frames_give_no_decision(frames):
     scores = alike(drive(frames, 1), drive(frames, 1))
     assert not answer(Compared(scores, everything(scores), True)).accepted.any()
 
 
 @pytest.mark.parametrize("kind", ["none", "half", "all"])
-def test_a_long_sequence_counts_whatever_part_of_it_is_verified(kind):
+def test_a_long_sequence_counts_if_any_part_is_verified(kind):
     """Half of it may be in another light; in each of 40 unlike pairs something may be the same."""
     road = drive(150, 6)
     scores = alike(again(road, 1.0, 7), road)
@@ -195,7 +195,7 @@ def test_stops_of_both_traverses_are_matched_frame_by_frame():
     assert places(given, matches, loops)[11] == 30
 
 
-def test_a_query_like_which_chance_differs_more_needs_a_better_line():
+def test_queries_with_more_variable_chance_scores_need_better_lines():
     """Half of the queries are like some references and unlike others, without an order."""
     rng, road = np.random.default_rng(0), drive(160, 1)
     scores = alike(again(road, 1.0, 2), road)
@@ -206,7 +206,7 @@ def test_a_query_like_which_chance_differs_more_needs_a_better_line():
     assert found.targets[:80].max() < found.targets[90:].min()
 
 
-def test_a_sequence_is_not_overruled_by_one_image_that_repeats():
+def test_one_repeated_image_does_not_override_a_sequence():
     """The lamps of a tunnel: each third image is verified with the next lamp, which it looks like most."""
     road = drive(150, 6)
     scores = alike(again(road, 1.0, 7), road)
@@ -223,7 +223,7 @@ def test_a_sequence_is_not_overruled_by_one_image_that_repeats():
 
 
 @pytest.mark.parametrize("inliers", [20, 28])
-def test_a_facade_whose_windows_repeat_is_no_loop(inliers):
+def test_a_repetitive_facade_is_not_a_loop(inliers):
     scores = alike(drive(150, 1), drive(120, 101))
     found = answer(
         Compared(scores, everything(scores), True), GeometricCheck(), lambda q, r: Agreement(40, inliers * (q % 2), 20)
@@ -231,7 +231,7 @@ def test_a_facade_whose_windows_repeat_is_no_loop(inliers):
     assert not found.accepted.any()
 
 
-def test_a_desk_of_which_all_images_show_something():
+def test_loops_on_a_desk_need_three_times_the_points_of_unlike_pairs():
     """Unlike pairs are verified as well; what has three times the points is a loop."""
     rng = np.random.default_rng(3)
     rows = again(drive(5, 9)[rng.integers(0, 5, 200)], 0.3, 10)
@@ -247,7 +247,7 @@ def test_a_desk_of_which_all_images_show_something():
 
 
 @pytest.mark.slow
-def test_what_is_fixed_in_one_pass_alone_is_left_out():
+def test_points_fixed_in_one_traverse_are_ignored():
     """A hood that the sun lights in the second pass; the least alike frames of it are those of the first."""
     rng, passes = np.random.default_rng(4), np.arange(80) // 40
     images = [cv2.resize(rng.integers(0, 256, (15, 20)).astype(np.uint8), (160, 120)) for _ in passes]
@@ -272,7 +272,7 @@ def test_a_camera_that_moves_slowly_closes_no_loop():
 
 
 @pytest.mark.slow
-def test_a_second_pass_from_beside_is_found_though_only_consecutive_frames_are_verified():
+def test_a_second_pass_with_an_offset_is_found_from_consecutive_frames():
     road = drive(400, 3)
     rows = np.concatenate([road, again(road[100:180], 1.0, 4), drive(100, 5)])
     points = Agreement(80, 60, 20), Agreement(80, 9, 20)
@@ -285,7 +285,7 @@ def test_a_second_pass_from_beside_is_found_though_only_consecutive_frames_are_v
 
 
 @pytest.mark.parametrize("length", [4, 12, 40])
-def test_a_visit_to_a_place_has_an_end(length):
+def test_a_visit_of_a_place_ends(length):
     """A room in which a camera turns: everything is seen again and again, and is alike."""
     visits = np.arange(480) // length
     views = again(np.tile(drive(1, 1), (8, 1)), 0.8, 2)[visits % 8]
@@ -302,7 +302,7 @@ def test_a_visit_to_a_place_has_an_end(length):
 
 @pytest.mark.parametrize("stands", ["query", "reference"])
 @pytest.mark.parametrize(("times", "noise"), [(40, 0.03), (150, 0.1)])
-def test_a_robot_that_stands_adds_no_frames_to_a_sequence(stands, times, noise):
+def test_a_stopped_robot_adds_no_frames_to_a_sequence(stands, times, noise):
     road = drive(150, 6)
     places = np.repeat(np.arange(150), np.where(np.isin(np.arange(150), (30, 90)), times, 1))
     still, moving = again(again(road, 0.8, 7)[places], noise, 8), np.arange(150)
@@ -313,7 +313,7 @@ def test_a_robot_that_stands_adds_no_frames_to_a_sequence(stands, times, noise):
     assert np.all(np.abs(here[found.match] - there)[found.accepted] <= 1)
 
 
-def test_a_robot_that_moves_slowly_for_a_while_does_not_stand():
+def test_a_slow_robot_is_not_stopped():
     road = drive(200, 6)
     places = np.cumsum(np.where(np.isin(np.arange(200) // 40, (1, 3)), 0.4, 1))
     left, part = np.floor(places).astype(int), (places % 1)[:, None]
@@ -321,7 +321,7 @@ def test_a_robot_that_moves_slowly_for_a_while_does_not_stand():
     assert np.array_equal(moved(scores), np.arange(200))
 
 
-def test_a_loop_does_not_go_on_past_a_seam():
+def test_a_loop_does_not_cross_a_cut():
     """The second pass begins where the first one did, and not where it ended."""
     road = drive(150, 6)
     rows = np.concatenate([road, again(road, 0.8, 7)])
@@ -340,7 +340,7 @@ def round_and_round(frames, radius=20.0):
     return poses
 
 
-def test_odometry_tells_different_places():
+def test_odometry_distinguishes_places():
     far = far_apart(round_and_round(300))
     lag = np.abs(np.subtract.outer(np.arange(300), np.arange(300)))
     assert not far[lag % 100 <= 2].any()
@@ -349,7 +349,7 @@ def test_odometry_tells_different_places():
 
 
 @pytest.mark.slow
-def test_with_odometry_single_images_are_told_from_chance():
+def test_with_odometry_single_images_are_distinguished_from_chance():
     """The camera looks where it likes, so that no sequence comes back; a twin of each place is across the road."""
     rng = np.random.default_rng(2)
     places = drive(100, 1)[rng.permutation(100)]
@@ -364,7 +364,7 @@ def test_with_odometry_single_images_are_told_from_chance():
     assert not (found.accepted & wrong).any()
 
 
-def test_single_images_are_verified_where_sequences_tell_nothing():
+def test_single_images_are_verified_if_sequences_are_inconclusive():
     """A camera that looks at five things in random order."""
     rng = np.random.default_rng(8)
     seen = rng.integers(0, 5, 200)
@@ -433,7 +433,7 @@ def test_as_a_method(tmp_path, monkeypatch):
     ("spec", "message"),
     [("auto", r"write auto\+METHOD"), ("auto:length=3+thumbnails", 'auto has no setting "length=3"')],
 )
-def test_settings_that_make_no_sense(spec, message):
+def test_invalid_settings_are_refused(spec, message):
     with pytest.raises(InputError, match=message):
         make_method(spec)
 
@@ -443,7 +443,7 @@ def test_a_precision_that_makes_no_sense():
         answer(Compared(np.eye(3), np.ones((3, 3), bool), True), precision=2.0)
 
 
-def test_blocks_of_queries_change_nothing(monkeypatch):
+def test_results_do_not_depend_on_blocks_of_queries(monkeypatch):
     road = drive(120, 5)
     scores = alike(again(road, 1.0, 6), road)
     at_once = answer(Compared(scores, everything(scores), True))
@@ -452,7 +452,7 @@ def test_blocks_of_queries_change_nothing(monkeypatch):
     assert np.count_nonzero(at_once.accepted) > 100
 
 
-def test_of_a_longer_drive_than_is_compared_at_once_every_second_frame_decides(monkeypatch):
+def test_every_second_frame_of_a_very_long_drive_decides(monkeypatch):
     road = drive(160, 7)
     rows = np.concatenate([road, again(drive(60, 8), 0, 9), again(road, 0.3, 10)])
     monkeypatch.setattr(whole, "MOST_PAIRS", len(rows) ** 2 // 2)
@@ -467,7 +467,7 @@ def test_of_a_longer_drive_than_is_compared_at_once_every_second_frame_decides(m
     assert [result.query_id for result in found.results] == list(range(len(rows)))
 
 
-def test_a_remembered_drive_is_decided_once_and_has_a_threshold_for_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stored_drive_is_decided_once_and_gives_a_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is decided when a frame comes; the threshold is that of a detector that looks up frame by frame."""
     road = drive(80, 7)
     rows = np.concatenate([road, drive(60, 8), again(road, 0.3, 10)]).astype(np.float32)
@@ -483,7 +483,7 @@ def test_a_remembered_drive_is_decided_once_and_has_a_threshold_for_later(monkey
     assert later == pytest.approx(single[found.accepted & (single > others)].min(), rel=1e-4)
 
 
-def test_the_advice_is_a_threshold_that_the_parser_takes() -> None:
+def test_the_advised_threshold_is_accepted_by_the_parser() -> None:
     """Where fewer frames have a candidate than are advised to be looked at, the threshold is one of theirs."""
     scores = np.random.default_rng(0).normal(size=(30, 30)) - 5
     allowed = np.zeros((30, 30), bool)

@@ -62,7 +62,7 @@ def test_one_sequence(spec: str, images: dict[str, list[Path]]) -> None:
     np.testing.assert_array_equal(np.argmax(earlier[PLACES:], axis=1), np.arange(PLACES))
 
 
-def test_every_stage_is_shown_and_timed(images: dict[str, list[Path]]) -> None:
+def test_every_stage_has_progress_and_time(images: dict[str, list[Path]]) -> None:
     shown: dict[str, int | None] = {}
 
     def progress(items, stage, total=None):
@@ -78,7 +78,7 @@ def test_every_stage_is_shown_and_timed(images: dict[str, list[Path]]) -> None:
     ]  # fmt: skip
 
 
-def test_a_vocabulary_is_kept_and_used_again(tmp_path: Path, images: dict[str, list[Path]]) -> None:
+def test_a_vocabulary_is_saved_and_reused(tmp_path: Path, images: dict[str, list[Path]]) -> None:
     path = tmp_path / "words.npz"
     first = make_method(f"fabmap:model={path},{WORDS}").score(
         Images.of_files(images["again"], images["first"], images["train"]), silent
@@ -93,14 +93,14 @@ def test_a_vocabulary_is_kept_and_used_again(tmp_path: Path, images: dict[str, l
 
 
 @pytest.mark.parametrize("spec", ["fabmap", "bow"])
-def test_training_images_are_needed_and_are_not_tested(spec: str, images: dict[str, list[Path]]) -> None:
+def test_training_images_are_required_and_not_tested(spec: str, images: dict[str, list[Path]]) -> None:
     with pytest.raises(InputError, match="needs training images"):
         make_method(spec).score(Images.of_files(images["again"], images["first"]), silent)
     with pytest.raises(InputError, match=r"8 of 16 test images are training images too"):
         make_method(spec).score(Images.of_files(images["again"], images["first"], images["first"]), silent)
 
 
-def test_settings_reach_the_part_they_belong_to() -> None:
+def test_settings_are_passed_to_their_part() -> None:
     fabmap = make_method(
         "fabmap:words=77, kind=orb,version=1,samples=9,motion=yes,scored=posterior",
         MethodContext(exclude_frames=6, seed=4),
@@ -146,7 +146,7 @@ def test_settings_reach_the_part_they_belong_to() -> None:
         (r"bow\+thumbnails: bow works on images", "bow+thumbnails"),
     ],
 )
-def test_a_method_or_setting_that_makes_no_sense_is_refused(spec: str, message: str) -> None:
+def test_invalid_methods_and_settings_are_refused(spec: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         make_method(spec.strip())
 

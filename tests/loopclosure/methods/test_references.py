@@ -27,7 +27,7 @@ def stripes(turn_deg: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("turn_deg", "bin_"), [(10, 0), (90, 4), (170, 8)])
-def test_gradients_fall_into_the_bin_of_their_direction(turn_deg, bin_):
+def test_gradients_are_counted_in_the_bin_of_their_direction(turn_deg, bin_):
     blocks = Hog(side=128).blocks(stripes(turn_deg))
     assert blocks.shape == (7, 7, 36)
     assert np.argmax(blocks.reshape(49, 4, 9).sum(axis=(0, 1))) == bin_
@@ -61,7 +61,7 @@ def test_vlad_sums_differences_to_the_nearest_word():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("spec", ["hog", "cohog:side=128", "vlad:words=8"])
-def test_they_find_the_second_lap(spec, two_laps, tmp_path):
+def test_references_find_the_second_lap(spec, two_laps, tmp_path):
     data = load_sequence(read_sequence(two_laps, "tum"))
     train = []
     for i in range(10):
@@ -128,7 +128,7 @@ def test_a_function_must_be_named(spec):
 
 
 # The online detector judged as a method
-def test_it_scores_only_what_it_accepts(two_laps, two_laps_features):
+def test_only_accepted_matches_have_scores(two_laps, two_laps_features):
     data = load_sequence(read_sequence(two_laps, "tum"))
     context = MethodContext(data.exclude_frames)
     spec = f"detector:{two_laps_features}:threshold=-0.3,consistency=2"

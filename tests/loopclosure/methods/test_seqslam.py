@@ -51,7 +51,7 @@ def frames(count: int) -> list[Path]:
     return [Path(f"{i}.png") for i in range(count)]
 
 
-def test_contrast_of_the_oracle() -> None:
+def test_contrast_equals_the_reference() -> None:
     enhanced = enhance_contrast(planted(), 10)
     assert enhanced.sum() == pytest.approx(1803.062152404, abs=1e-8)
     np.testing.assert_allclose(
@@ -60,7 +60,7 @@ def test_contrast_of_the_oracle() -> None:
     assert enhanced.min() == 0.0
 
 
-def test_matches_of_the_oracle() -> None:
+def test_matches_equal_the_reference() -> None:
     match, ratio = least_cost_matches(trajectory_costs(enhance_contrast(planted(), 10), OPEN_SEQSLAM), window=10)
     expected = """5:7:.970799 6:8:.974159 7:19:.970108 8:7:.908976 9:7:.853456 10:8:.955933 11:5:.943301 12:5:.441713
         13:5:.403547 14:6:.295662 15:7:.290555 16:8:.303895 17:9:.226682 18:10:.160210 19:11:.242648 20:12:.279916"""
@@ -73,11 +73,11 @@ def test_matches_of_the_oracle() -> None:
     np.testing.assert_array_equal(judged[ratio[judged] < 0.45], np.arange(12, 21))
 
 
-def test_contrast_where_all_references_look_alike_is_zero_not_nan() -> None:
+def test_contrast_of_equal_references_is_zero() -> None:
     np.testing.assert_array_equal(enhance_contrast(np.full((4, 9), 0.1), 4), 0.0)
 
 
-def test_contrast_looks_at_valid_pairs_only() -> None:
+def test_contrast_uses_valid_pairs_only() -> None:
     distances = np.random.default_rng(0).random((12, 12))
     valid = earlier(12, 2)
     changed = np.where(valid, distances, 1e6)
@@ -89,14 +89,14 @@ def test_contrast_without_any_valid_pair() -> None:
     assert np.isnan(enhance_contrast(np.ones((3, 3)), 4, np.zeros((3, 3), bool))).all()
 
 
-def test_contrast_takes_a_query_of_many_like_places_down() -> None:
+def test_contrast_normalizes_a_query_that_differs_from_all_places() -> None:
     distances = noise_with_path(20, 20, [(i, i) for i in range(20)])
     distances[7] += 5.0  # a query that is unlike everything, say at night
     enhanced = enhance_contrast(distances, 10)
     assert enhanced[7].mean() == pytest.approx(enhanced[6].mean(), abs=0.5)
 
 
-def test_costs_are_means_along_the_path() -> None:
+def test_costs_are_means_along_a_trajectory() -> None:
     distances = np.random.default_rng(1).random((9, 9))
     settings = SequenceSettings(length=4, slowest=1.0, fastest=1.0, edges="drop")
     costs = trajectory_costs(distances, settings)
@@ -104,7 +104,7 @@ def test_costs_are_means_along_the_path() -> None:
     np.testing.assert_array_equal(np.isfinite(costs), np.pad(np.ones((5, 5), bool), 2))
 
 
-def test_parts_of_trajectories_are_shared_and_no_mean_changes() -> None:
+def test_shared_parts_of_trajectories_keep_the_means() -> None:
     random = np.random.default_rng(3)
     distances = np.where(random.random((150, 600)) < 0.02, np.nan, random.random((150, 600)))
     settings = SequenceSettings(length=21, slowest=0.5, fastest=2.0, velocity_step=0.25)
@@ -137,7 +137,7 @@ def test_a_drive_at_another_speed_is_found(velocity: float, anchor: str) -> None
     assert off.max() <= (1 if anchor == "center" else 2)
 
 
-def test_a_drive_the_other_way_needs_both_directions() -> None:
+def test_a_reverse_drive_needs_both_directions() -> None:
     distances = noise_with_path(30, 30, [(q, 29 - q) for q in range(30)])
     for directions, found in (("forward", False), ("both", True)):
         settings = SequenceSettings(directions=directions, edges="drop")
@@ -145,7 +145,7 @@ def test_a_drive_the_other_way_needs_both_directions() -> None:
         assert np.all(match[5:25] == 29 - np.arange(5, 25)) == found
 
 
-def test_nan_is_outside() -> None:
+def test_trajectories_through_nan_have_no_cost() -> None:
     distances = np.random.default_rng(2).random((15, 15))
     distances[7, 7] = np.nan
     settings = SequenceSettings(length=4, slowest=1.0, fastest=1.0, edges="drop")
@@ -208,7 +208,7 @@ def test_uniqueness_as_the_score() -> None:
     assert result.scores[query[second], reference[second]].min() > 0.3
 
 
-def test_uniqueness_of_scores_that_may_be_of_either_sign() -> None:
+def test_uniqueness_of_scores_with_either_sign() -> None:
     log_odds = 40.0 * (two_laps() + 1.0)
     settings = SequenceSettings(contrast=0)
     result = SeqSlam(Fixed(log_odds), settings, scored="uniqueness", exclude_frames=5).score(
@@ -249,7 +249,7 @@ def right(scores: np.ndarray) -> float:
     return float(np.mean(np.argmax(np.nan_to_num(scores, nan=-np.inf), axis=1) == np.arange(len(scores))))
 
 
-def test_what_resembles_everything_says_nothing() -> None:
+def test_standardization_reduces_references_similar_to_all_queries() -> None:
     pictures = Images.of_files(frames(30), frames(30))
     plain = SeqSlam(Fixed(another_season()), SequenceSettings(contrast=0))
     scaled = SeqSlam(Fixed(another_season()), SequenceSettings(contrast=0), standardize="traverses")
@@ -266,7 +266,7 @@ def test_standardized_distances() -> None:
     np.testing.assert_allclose(scaled[:, 0].std(), 1)
 
 
-def test_a_deviation_that_is_less_than_usual_counts_as_usual() -> None:
+def test_small_deviations_are_raised_to_the_usual_one() -> None:
     """Rows of deviation 1, 3 and 9, then three columns that differ as much."""
     rows = np.array([[-1.0, 1.0, 0.0], [-3.0, 0.0, 3.0], [0.0, 9.0, -9.0]]) * np.sqrt(1.5)
     usual = rows / [[3], [3], [9]]
@@ -287,7 +287,7 @@ def test_a_deviation_that_is_less_than_usual_counts_as_usual() -> None:
         ({"slowest": 2.0}, "slowest <= fastest"),
     ],
 )
-def test_settings_that_make_no_sense(settings: dict, message: str) -> None:
+def test_invalid_settings_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         SequenceSettings(**settings)
 

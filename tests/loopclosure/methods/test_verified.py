@@ -57,7 +57,7 @@ def first(scores, given):
 
 
 @pytest.mark.slow
-def test_the_same_walls_come_first_and_the_rest_keeps_its_order(walls):
+def test_verified_matches_come_first_and_others_keep_their_order(walls):
     rng = np.random.default_rng(0)
     given = rng.normal(size=(12, 12))
     result = Verified(Fixed(given), k=12).score(Images.of_files(walls), silent)
@@ -85,7 +85,7 @@ def test_only_the_best_k_of_each_query_are_examined(walls):
     assert first(result.scores, scores) == [(i, i) for i in range(1, 5)]
 
 
-def test_images_that_cannot_be_verified_pass_through(walls):
+def test_images_that_cannot_be_verified_keep_their_scores(walls):
     blank = walls[0].parent / "gray.png"
     cv2.imwrite(str(blank), np.full((240, 320, 3), 90, np.uint8))
     given = np.random.default_rng(0).normal(size=(6, 6))
@@ -95,7 +95,7 @@ def test_images_that_cannot_be_verified_pass_through(walls):
 
 
 @pytest.mark.parametrize(("inliers", "best"), [(17, 0), (26, 1)])
-def test_just_more_inliers_than_chance_do_not_overrule_a_score(walls, inliers, best):
+def test_few_inliers_do_not_override_a_score(walls, inliers, best):
     given = np.array([[0.9, 0.5, 0.1]])
     method = Verified(Fixed(given), k=3)
     images = Images.of_files(walls[:1], walls[1:4])
@@ -105,7 +105,7 @@ def test_just_more_inliers_than_chance_do_not_overrule_a_score(walls, inliers, b
 
 
 @pytest.mark.slow
-def test_another_method_of_the_run_finds_nothing_again(walls, monkeypatch):
+def test_results_of_another_method_are_reused(walls, monkeypatch):
     context = MethodContext()
     images = Images.of_files(walls[WALLS:], walls[:WALLS])
     scores = make_method("verified:k=6+thumbnails", context).score(images, silent).scores
@@ -131,7 +131,7 @@ def test_on_top_of_seqslam_a_sequence_is_verified(walls):
     assert (11, 5) not in first(sequences.score(Images.of_files(ended), silent).scores, given)
 
 
-def test_trajectories_support_what_is_on_them():
+def test_trajectories_support_their_matches():
     seen = np.zeros((9, 9), bool)
     seen[4, 3] = True
     offsets = SequenceSettings(length=4, slowest=1.0, fastest=1.0).offsets()
@@ -141,7 +141,7 @@ def test_trajectories_support_what_is_on_them():
 
 
 @pytest.mark.slow
-def test_excluded_frames_are_no_candidates(walls):
+def test_excluded_frames_are_not_candidates(walls):
     method = Verified(Fixed(np.zeros((12, 12))), exclude_frames=WALLS)
     assert [i - j for i, j in accepted(method.score(Images.of_files(walls), silent).scores) if i - j <= WALLS] == []
 

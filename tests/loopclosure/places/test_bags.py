@@ -40,7 +40,7 @@ def test_a_bag_becomes_a_sequence(name: str, ros: int, encoding: str, tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_damaged_bag_is_one_line(tmp_path: Path) -> None:
+def test_a_damaged_bag_is_reported_in_one_line(tmp_path: Path) -> None:
     """Damage in the index, in a header, in a message, in the text file next to it."""
     whole = Bag(tmp_path / "whole.bag", 1, "mono8", count=3).file.read_bytes()
     folder = Bag(tmp_path / "two", 2, "mono8", count=3).file
@@ -68,14 +68,14 @@ def is_refused(file: Path) -> bool:
     return False
 
 
-def test_what_uses_a_bag_keeps_its_own_errors(tmp_path: Path) -> None:
+def test_errors_of_the_caller_of_a_bag_are_passed_on(tmp_path: Path) -> None:
     bag = Bag(tmp_path / "a.bag", 1, count=1).file
     with pytest.raises(ZeroDivisionError), open_bag(bag):
         raise ZeroDivisionError
 
 
 @pytest.mark.slow
-def test_a_topic_must_be_chosen_where_there_are_several(tmp_path: Path) -> None:
+def test_one_of_several_topics_must_be_chosen(tmp_path: Path) -> None:
     bag = Bag(tmp_path / "two.bag", 1, second_camera=True).file
     with pytest.raises(
         InputError, match="several topics with images: /cam/image, /other/image; choose one with topic="
@@ -87,7 +87,7 @@ def test_a_topic_must_be_chosen_where_there_are_several(tmp_path: Path) -> None:
     assert "48 frames of /other/image" in extract(bag, tmp_path / "frames", "/other/image")[1]
 
 
-def test_what_is_no_bag_is_one_line(tmp_path: Path) -> None:
+def test_other_files_than_bags_are_reported_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "no.bag").write_bytes(b"nothing")
     (tmp_path / "no").mkdir()
     (tmp_path / "no" / "metadata.yaml").write_text("a: [")
@@ -100,7 +100,7 @@ def test_what_is_no_bag_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_commands_take_bags(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_commands_accept_bags(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = Bag(tmp_path / "drive.bag", 1).file
     line = f"evaluate {bag} --method thumbnails --out {tmp_path / 'report'}"
     assert main(line.split()) == 0

@@ -48,7 +48,7 @@ def test_selection(selection, expected):
         (Selection(limit=0), "limit of 0"),
     ],
 )
-def test_selections_of_nothing(selection, sentence):
+def test_empty_selections_are_refused(selection, sentence):
     with pytest.raises(InputError, match=sentence):
         selection.numbers(10)
 
@@ -73,7 +73,7 @@ def test_folders_lists_and_sequences(tmp_path):
     assert [p.name for p in image_paths(tmp_path / "tum")] == ["2.png", "1.png"]
 
 
-def test_broken_sources(tmp_path):
+def test_invalid_sources_are_refused(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(SpecError, match="contains no images"):
         image_paths(tmp_path / "empty")
@@ -157,7 +157,7 @@ def camera(monkeypatch: pytest.MonkeyPatch):
     return install
 
 
-def test_of_a_camera_the_newest_image_is_taken(camera) -> None:
+def test_the_newest_image_of_a_camera_is_used(camera) -> None:
     made = camera(40, 0.01)
     seen = []
     for stamp, image in live_frames("0"):
@@ -171,7 +171,7 @@ def test_of_a_camera_the_newest_image_is_taken(camera) -> None:
     assert made.released
 
 
-def test_a_caller_that_stops_frees_the_camera(camera) -> None:
+def test_the_camera_is_released(camera) -> None:
     made = camera(10**9, 0.001)
     frames = live_frames("0")
     next(frames)
@@ -188,7 +188,7 @@ def test_a_caller_that_stops_frees_the_camera(camera) -> None:
         ("none.avi", "no such video"),
     ],
 )
-def test_what_cannot_be_opened(source: str, sentence: str, camera) -> None:
+def test_unreadable_sources_are_reported(source: str, sentence: str, camera) -> None:
     if source != "none.avi":
         camera(0)
     with pytest.raises(InputError, match=sentence):
@@ -213,7 +213,7 @@ def test_detect_watches_a_video(tmp_path, capsys) -> None:
     assert "expected the frames, or --video" in capsys.readouterr().err
 
 
-def test_ctrl_c_ends_a_stream_and_keeps_what_was_found(camera, tmp_path, monkeypatch) -> None:
+def test_ctrl_c_ends_a_stream_and_keeps_results(camera, tmp_path, monkeypatch) -> None:
     camera(10**9)
     seen = []
 
@@ -231,7 +231,7 @@ def test_ctrl_c_ends_a_stream_and_keeps_what_was_found(camera, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("begin", [b"", b"\x00\x00\x00\x18ftypmp42\x00\x00\x00\x00mp42isom"])
-def test_a_video_that_cannot_be_decoded_says_so(begin: bytes, tmp_path: Path) -> None:
+def test_a_video_that_cannot_be_decoded_is_reported(begin: bytes, tmp_path: Path) -> None:
     path = tmp_path / "drive.mp4"
     path.write_bytes(begin + bytes(range(256)) * 8)
     for read in (video_length, lambda path: list(video_frames(path))):
@@ -240,7 +240,7 @@ def test_a_video_that_cannot_be_decoded_says_so(begin: bytes, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_of_a_video_that_cannot_be_decoded_nothing_else_is_printed(tmp_path: Path) -> None:
+def test_a_video_that_cannot_be_decoded_prints_one_line(tmp_path: Path) -> None:
     """FFmpeg prints its own messages unless they are disabled before the first video of a process."""
     (tmp_path / "drive.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42\x00\x00\x00\x00mp42isom" + bytes(range(256)) * 8)
     words = [sys.executable, "-m", "loopclosure", "detect", str(tmp_path / "drive.mp4"), "--out", str(tmp_path / "out")]

@@ -68,7 +68,7 @@ def test_sparse_and_bool_masks(tmp_path):
         ("x.png", "no image", "is not a readable image"),
     ],
 )
-def test_broken_masks(tmp_path, name, content, sentence):
+def test_invalid_masks_are_refused(tmp_path, name, content, sentence):
     (tmp_path / name).write_text(content)
     with pytest.raises(InputError, match=sentence):
         read_truth_matrix(tmp_path / name)
@@ -151,7 +151,7 @@ def test_a_mask_of_places_fits_where_places_are_pairs_of_images() -> None:
         mask_of_places("left", np.zeros((8, 8), bool), 4, Path("mask.png"))
 
 
-def test_only_of_both_cameras_some_pairs_are_not_compared() -> None:
+def test_for_both_cameras_only_images_of_the_same_camera_are_compared() -> None:
     both = comparable("both", images_of_places("both", 4))
     assert both.tolist() == [[(i + j) % 2 == 0 for j in range(4)] for i in range(4)]
     for camera in ("all", "left", "right", "joined"):

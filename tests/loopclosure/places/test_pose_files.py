@@ -35,7 +35,7 @@ def test_one_path_in_each_form(rows, tmp_path: Path) -> None:
         np.testing.assert_allclose(np.diff(read.stamps), 1)
 
 
-def test_the_world_may_come_first_and_so_may_w(tmp_path: Path) -> None:
+def test_direction_and_order_of_poses_can_be_set(tmp_path: Path) -> None:
     inverted = np.linalg.inv(path())
     read = read_poses(write(tmp_path / "a.txt", kitti_rows(inverted)), PoseForm(direction="world-to-camera"))
     same_poses(read.poses, path())
@@ -74,7 +74,7 @@ def test_a_jump_is_noticed(tmp_path: Path) -> None:
         ("0 1 2 3 0.9 0.9 0 0\n", "a.txt:1:9: qx qy qz qw have length 1.273, a rotation has length 1"),
     ],
 )
-def test_a_broken_row_is_one_line(text: str, message: str, tmp_path: Path) -> None:
+def test_an_invalid_row_is_one_line(text: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         read_poses(write(tmp_path / "a.txt", text))
     assert str(caught.value).startswith(f"{tmp_path}/{message}")
@@ -101,5 +101,5 @@ def test_poses_without_a_time_are_those_of_the_images_in_order(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", ["xyz", "rpy"])
-def test_the_real_paths_of_tum_raise_no_doubt(name: str) -> None:
+def test_real_paths_of_tum_give_no_warning(name: str) -> None:
     assert read_sequence(shared("data", "tum_fr1", f"rgbd_dataset_freiburg1_{name}"), "tum").doubts == ()

@@ -48,7 +48,7 @@ def test_distance_and_angle_must_both_be_small() -> None:
     assert same_place(ORIGIN, pose(2.5, 20.0), max_distance_m=3, max_angle_deg=30)
 
 
-def test_the_angle_is_of_the_whole_rotation_and_the_view_angle_is_blind_to_roll() -> None:
+def test_the_view_angle_ignores_roll() -> None:
     np.testing.assert_allclose(angles_deg(ORIGIN, pose(turn_deg=70, axis="z")), 70)
     np.testing.assert_allclose(view_angles_deg(ORIGIN, pose(turn_deg=70, axis="z")), 0, atol=1e-6)
     np.testing.assert_allclose(view_angles_deg(ORIGIN, pose(turn_deg=70, axis="x")), 70)
@@ -62,7 +62,7 @@ def test_a_quaternion_and_its_negative_are_the_same_rotation() -> None:
     np.testing.assert_allclose(angles_deg(ORIGIN, flipped), 30)
 
 
-def test_a_matrix_is_what_its_pairs_are() -> None:
+def test_a_matrix_equals_its_single_pairs() -> None:
     a, b = random_poses(37), random_poses(23, seed=1)
     truth = same_place_matrix(a, b)
     one_by_one = [[bool(same_place(a[i], b[j])) for j in range(23)] for i in range(37)]
@@ -71,7 +71,7 @@ def test_a_matrix_is_what_its_pairs_are() -> None:
     np.testing.assert_allclose(distances_m(a[3], b), np.linalg.norm(a.positions[3] - b.positions, axis=1))
 
 
-def test_blocks_of_any_height_make_the_same_matrix() -> None:
+def test_the_matrix_does_not_depend_on_the_block_size() -> None:
     a, b = random_poses(37), random_poses(23, seed=1)
     for pairs_at_once in (1, 23 * 5, 10_000):
         blocks = list(same_place_blocks(a, b, pairs_at_once=pairs_at_once))
@@ -128,14 +128,14 @@ def test_views_of_one_camera(other, same):
     assert overlapping(camera(), other) == overlapping(other, camera()) == same
 
 
-def test_a_wider_camera_sees_more():
+def test_a_wider_field_of_view_overlaps_more():
     turned = camera(turn_deg=50)
     assert overlapping(camera(), turned, fov_deg=100)
     assert overlapping(camera(), turned, least=0.05)
     assert not overlapping(camera(), camera(turn_deg=30), least=0.6)
 
 
-def test_measured_depth_tells_a_far_wall_from_a_near_one(tmp_path):
+def test_depth_distinguishes_near_and_far_walls(tmp_path):
     far, near = tmp_path / "far.png", tmp_path / "near.png"
     cv2.imwrite(str(far), np.full((48, 64), 5000 * 12, np.uint16))
     cv2.imwrite(str(near), np.full((48, 64), 5000 * 1, np.uint16))
@@ -149,7 +149,7 @@ def test_measured_depth_tells_a_far_wall_from_a_near_one(tmp_path):
     assert not none.measured.any()
 
 
-def test_what_is_no_depth_image(tmp_path):
+def test_an_invalid_depth_image_is_refused(tmp_path):
     color = tmp_path / "color.png"
     cv2.imwrite(str(color), np.zeros((48, 64, 3), np.uint8))
     with pytest.raises(InputError, match="is not a depth image"):
@@ -157,12 +157,12 @@ def test_what_is_no_depth_image(tmp_path):
 
 
 @pytest.mark.parametrize("settings", [{"fov_deg": 0.0}, {"fov_deg": 180.0}, {"least": 0.0}, {"least": 1.1}])
-def test_settings_that_make_no_sense(settings):
+def test_invalid_settings_are_refused(settings):
     with pytest.raises(InputError, match=r"expected 0\.\.180"):
         ViewOverlap(**settings)
 
 
-def test_a_sequence_with_depth_says_so(two_laps, tmp_path):
+def test_depth_of_a_sequence_determines_its_overlap_rule(two_laps, tmp_path):
     folder = tmp_path / "with_depth"
     folder.mkdir()
     (folder / "rgb").symlink_to(two_laps / "rgb")
@@ -178,7 +178,7 @@ def test_a_sequence_with_depth_says_so(two_laps, tmp_path):
     assert (data.soft_truth.soft | ~data.truth.hard).all()
 
 
-def test_the_field_of_view_is_the_cameras_where_it_is_known():
+def test_the_field_of_view_comes_from_the_camera_if_known():
     wide = Intrinsics(40, 40, 32, 24, size=(64, 48))
     assert ViewOverlap().of_camera(wide).fov == pytest.approx(77.32, abs=0.01)
     assert ViewOverlap(50).of_camera(wide).fov == 50

@@ -64,7 +64,7 @@ def test_euroc_without_its_truth_or_with_a_missing_image(tmp_path: Path) -> None
             read_sequence(folder)
 
 
-def test_a_distortion_that_is_not_known_is_refused(tmp_path: Path) -> None:
+def test_an_unknown_distortion_is_refused(tmp_path: Path) -> None:
     folder = write_euroc(tmp_path)
     sensor = folder / "mav0/cam0/sensor.yaml"
     sensor.write_text(sensor.read_text().replace("radial-tangential", "equidistant"))
@@ -73,7 +73,7 @@ def test_a_distortion_that_is_not_known_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", ["99999999999999999999", "1e999", "nan", "0.5"])
-def test_a_mount_that_is_no_rotation_is_refused(value: str, tmp_path: Path) -> None:
+def test_an_invalid_mount_is_refused(value: str, tmp_path: Path) -> None:
     folder = write_euroc(tmp_path)
     sensor = folder / "mav0/cam0/sensor.yaml"
     sensor.write_text(sensor.read_text().replace("data: [0,", f"data: [{value},"))
@@ -82,14 +82,14 @@ def test_a_mount_that_is_no_rotation_is_refused(value: str, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("row", ["30 0 15.5 0 30 0 15.5 0 0 0 1 0", "30 0 15.5 0 0 30 11.5 0 0 0 1 inf"])
-def test_a_projection_that_is_none_is_refused(row: str, tmp_path: Path) -> None:
+def test_an_invalid_projection_is_refused(row: str, tmp_path: Path) -> None:
     folder = write_kitti(tmp_path)
     (folder / "calib.txt").write_text(f"P0: {row}\n")
     with pytest.raises(InputError, match=r'calib\.txt: expected "P0:" and the twelve numbers of a projection'):
         read_sequence(folder)
 
 
-def test_names_that_no_file_has(tmp_path: Path) -> None:
+def test_missing_files_of_a_sequence_are_reported(tmp_path: Path) -> None:
     folder = write_euroc(tmp_path)
     for name in ("x" * 5000, "a\0b"):
         (folder / "mav0/cam0/data.csv").write_text(f"7,{name}\n")
@@ -123,7 +123,7 @@ def test_kitti_with_too_few_poses_or_no_images(tmp_path: Path) -> None:
         read_sequence(tmp_path, "kitti")
 
 
-def test_a_file_of_poses_takes_the_place_of_the_sequences_own(tmp_path: Path) -> None:
+def test_a_file_of_poses_replaces_the_sequences_poses(tmp_path: Path) -> None:
     folder = write_kitti(tmp_path)
     poses = tmp_path / "slam.txt"
     poses.write_text(tum_rows(path()[:30]))
@@ -132,7 +132,7 @@ def test_a_file_of_poses_takes_the_place_of_the_sequences_own(tmp_path: Path) ->
     assert sequence.with_poses().names[29] == "image_0/000029.png"
 
 
-def test_a_video_becomes_a_folder_and_stays_one(tmp_path: Path) -> None:
+def test_a_video_is_extracted_once(tmp_path: Path) -> None:
     video = write_video(tmp_path / "drive.avi")
     folder, said = extract(video, tmp_path / "frames")
     assert said == f"{video}: 48 frames: {folder}"
@@ -160,7 +160,7 @@ def test_a_benchmark_with_its_lists_of_matches(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_matches(tmp_path / "mask.npy", 12, 14)[0], data.truth.hard)
 
 
-def test_a_benchmarks_faults_are_named(tmp_path: Path) -> None:
+def test_errors_of_a_benchmark_are_reported(tmp_path: Path) -> None:
     folder = write_benchmark(tmp_path / "a", references=12)
     with pytest.raises(InputError, match="names query 10 and reference 12; there are 12 queries and 12 references"):
         load_traverses(folder / "query", folder / "ref", truth_file=folder / "ground_truth.json")
@@ -178,7 +178,7 @@ class Harmful:
         return (Path.touch, (Path("harmed"),))
 
 
-def test_lists_of_matches_run_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lists_of_matches_execute_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     rows = np.empty(2, dtype=object)
     rows[:] = [Harmful(), [1]]
@@ -218,14 +218,14 @@ def test_images_with_both_a_mask_and_poses_are_wrong_usage(tmp_path: Path, capsy
     assert "pose-form needs poses" in capsys.readouterr().err
 
 
-def test_detect_takes_euroc_with_its_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_detect_accepts_euroc_with_its_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_euroc(tmp_path)
     line = ["detect", str(folder), "--threshold", "-0.001", "--exclude-recent", "10", "--out", str(tmp_path / "found")]
     assert main([*line, "--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]) == 0
     assert "24 of 24 loops are the same place by their poses" in capsys.readouterr().out
 
 
-def test_a_selection_counts_frames_without_a_pose_too(two_laps, tmp_path):
+def test_a_selection_counts_frames_without_a_pose(two_laps, tmp_path):
     shutil.copytree(two_laps, tmp_path / "laps")
     truth = (tmp_path / "laps" / "groundtruth.txt").read_text().splitlines()
     (tmp_path / "laps" / "groundtruth.txt").write_text("\n".join(line for line in truth if line[:2] != "4.") + "\n")

@@ -56,7 +56,7 @@ def test_groundtruth_is_sorted_and_its_quaternions_are_normalized(tmp_path: Path
         ("1.5 0.1 0.2 0.3 90 0 0 1", 17, "length 90"),
     ],
 )
-def test_a_broken_line_of_groundtruth_is_named_with_its_column(
+def test_an_invalid_line_of_groundtruth_is_reported_with_its_column(
     tmp_path: Path, line: str, column: int, words: str
 ) -> None:
     path = write(tmp_path / "groundtruth.txt", f"# head\n{GOOD_POSE}\n{line}\n")
@@ -67,7 +67,7 @@ def test_a_broken_line_of_groundtruth_is_named_with_its_column(
     assert "\n" not in str(caught.value)
 
 
-def test_a_broken_line_of_rgb_txt_is_named(tmp_path: Path) -> None:
+def test_an_invalid_line_of_rgb_txt_is_reported(tmp_path: Path) -> None:
     pictures(tmp_path, "a.png", "b.png")
     path = write(tmp_path / "rgb.txt", "1.0 rgb/a.png\n2.0 rgb/gone.png\n")
     with pytest.raises(SpecError, match=r"rgb\.txt:2:5: no such image \"rgb/gone.png\""):
@@ -77,7 +77,7 @@ def test_a_broken_line_of_rgb_txt_is_named(tmp_path: Path) -> None:
         read_sequence(tmp_path, "tum")
 
 
-def test_depth_that_is_listed_and_gone_is_a_warning(tmp_path: Path) -> None:
+def test_missing_depth_images_are_a_warning(tmp_path: Path) -> None:
     pictures(tmp_path, "a.png")
     write(tmp_path / "rgb.txt", "1.0 rgb/a.png\n")
     write(tmp_path / "depth.txt", "1.0 depth/a.png\n")
@@ -105,14 +105,14 @@ def test_missing_empty_and_binary_files_are_one_line(tmp_path: Path) -> None:
         read_sequence(tmp_path, "tum").with_poses()
 
 
-def test_associate_takes_the_nearest_pose_within_the_limit() -> None:
+def test_associate_chooses_the_nearest_pose_within_the_limit() -> None:
     trajectory = trajectory_at(1.0, 2.0, 3.0)
     frames = np.array([0.5, 0.98, 1.02, 1.51, 2.49, 3.0, 3.03, 3.2])
     assert associate(frames, trajectory, 0.05).tolist() == [-1, 0, 0, -1, -1, 2, 2, -1]
     assert associate(frames, trajectory, 1.0).tolist() == [0, 0, 0, 1, 1, 2, 2, 2]
 
 
-def test_frames_without_a_pose_are_counted_and_left_out(tmp_path: Path) -> None:
+def test_frames_without_a_pose_are_counted_and_omitted(tmp_path: Path) -> None:
     frames = [(stamp, f"rgb/{stamp:g}.png") for stamp in (1.0, 1.01, 5.0, 2.0)]
     pictures(tmp_path, *(Path(name).name for _, name in frames))
     write_rgb_list(tmp_path / "rgb.txt", frames)
@@ -127,7 +127,7 @@ def test_frames_without_a_pose_are_counted_and_left_out(tmp_path: Path) -> None:
     assert len(sequence.known_poses()[np.array([0, 2])]) == 2
 
 
-def test_no_frame_with_a_pose_at_all_says_both_time_spans(tmp_path: Path) -> None:
+def test_an_error_without_poses_has_both_time_spans(tmp_path: Path) -> None:
     pictures(tmp_path, "a.png")
     write_rgb_list(tmp_path / "rgb.txt", [(100.0, "rgb/a.png")])
     write_trajectory(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
@@ -135,7 +135,7 @@ def test_no_frame_with_a_pose_at_all_says_both_time_spans(tmp_path: Path) -> Non
         read_sequence(tmp_path, "tum").with_poses()
 
 
-def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+def test_written_lists_can_be_read(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     quaternions = rng.normal(size=(20, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)

@@ -63,7 +63,7 @@ def test_figures_are_those_of_the_reports(reports):
     assert warnings([old, new]) == []
 
 
-def test_what_does_not_compare_is_said(reports, tmp_path):
+def test_reports_that_cannot_be_compared_are_reported(reports, tmp_path):
     found = json.loads(reports[1].read_text())
     found["truth_and_exclusion"] = "other limits"
     for method in found["methods"]:
@@ -84,7 +84,7 @@ def test_other_files_are_refused(reports, tmp_path, content, message):
         read_reports([reports[0], tmp_path / "x.json"])
 
 
-def test_faults_of_usage(reports, tmp_path, capsys):
+def test_wrong_options_are_refused(reports, tmp_path, capsys):
     assert main(["compare", str(reports[0]), str(tmp_path / "none.json")]) == 1
     assert "none.json: cannot be read" in capsys.readouterr().err
     assert main(["compare", str(reports[0]), str(reports[0])]) == 1

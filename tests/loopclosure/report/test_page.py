@@ -64,7 +64,7 @@ def rows(path):
         return list(csv.DictReader(stream))
 
 
-def test_the_page_stands_alone_and_says_what_it_judges_by(evaluation, folder):
+def test_the_page_is_self_contained_and_names_its_rule(evaluation, folder):
     page = (folder / "report.html").read_text()
     assert set(re.findall(r'(?:src|href)="([^:]*:)', page)) == {"data:"}
     assert "http" not in page
@@ -75,7 +75,7 @@ def test_the_page_stands_alone_and_says_what_it_judges_by(evaluation, folder):
     assert "loopclosure evaluate --x" in page
 
 
-def test_what_is_named_maliciously_is_text(two_laps, tmp_path):
+def test_malicious_names_are_escaped(two_laps, tmp_path):
     evil = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7 * 7 }}{% raw %}$\\frac{"
     data = load_sequence(read_sequence(two_laps, "tum"))
     data = replace(data, name=evil, notes=[evil], truth=replace(data.truth, description=evil))
@@ -92,7 +92,7 @@ def test_what_is_named_maliciously_is_text(two_laps, tmp_path):
     assert reader.texts.count(evil) >= 8  # title, heading, training, note of the data, name of the method, stage, note
 
 
-def test_pictures_are_written_and_in_the_page(folder):
+def test_plots_are_written_and_embedded(folder):
     page = (folder / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
     for name in ("precision_recall", "matrices", "matches", "map"):
@@ -134,14 +134,14 @@ def test_figures_are_the_same_in_csv_json_and_text(evaluation, folder):
     assert summary["queries_with_a_loop"] == 20
 
 
-def test_times_leave_training_out_of_a_frame(folder):
+def test_times_per_frame_exclude_training(folder):
     table = {(row["method"], row["stage"]): row for row in rows(folder / "times.csv")}
     assert table["<noise>", "vocabulary"]["milliseconds a frame"] == ""
     assert float(table["<noise>", "looking"]["milliseconds a frame"]) == pytest.approx(10.0)
     assert float(table["A net & more", "features"]["milliseconds a frame"]) == pytest.approx(4.0)
 
 
-def test_curves_hold_all_that_average_precision_needs(evaluation, folder):
+def test_curves_are_sufficient_for_average_precision(evaluation, folder):
     for slug, outcome in (("a_net_more", evaluation.outcomes[0]), ("noise", evaluation.outcomes[1])):
         table = rows(folder / f"curve_{slug}.csv")
         for curve in (outcome.pairs, outcome.best):
@@ -194,7 +194,7 @@ def test_two_traverses_without_positions(tmp_path):
     assert "10 pairs that nearly show the same place are ignored when found" in page
 
 
-def test_large_matrices_are_drawn_without_losing_loops():
+def test_large_matrices_are_reduced_without_losing_loops():
     from loopclosure.report.plots import _greatest_of_blocks
 
     values = np.zeros((1001, 900))

@@ -19,29 +19,29 @@ def test_distances_flatten_blobs_of_four_axes():
     np.testing.assert_allclose(pair_distances(a, np.zeros_like(a)), np.linalg.norm(a.reshape(2, 6), axis=1))
 
 
-def test_threshold_lies_between_the_two_kinds():
+def test_the_threshold_separates_both_classes():
     assert best_threshold(np.array([0.1, 0.3, 0.7, 0.9]), np.array([1, 1, 0, 0])) == pytest.approx(0.5)
 
 
-def test_of_equally_good_thresholds_the_smallest():
+def test_the_smallest_of_equally_good_thresholds_is_chosen():
     # calling one pair the same or three is right three times of four
     assert best_threshold(np.array([0.1, 0.2, 0.3, 0.4]), np.array([1, 0, 1, 0])) == pytest.approx(0.15)
 
 
-def test_equal_distances_are_never_cut_apart():
+def test_equal_distances_are_never_separated():
     distances = np.array([0.5, 0.5, 0.5, 0.9])
     threshold = best_threshold(distances, np.array([1, 1, 0, 0]))
     assert metrics_at(threshold, distances, np.array([1, 1, 0, 0])).true_positives == 2
     assert threshold == pytest.approx(0.7)
 
 
-def test_all_or_none_can_be_best():
+def test_all_or_no_pairs_can_be_positive():
     distances = np.array([0.2, 0.4])
     assert metrics_at(best_threshold(distances, np.array([1, 1])), distances, np.array([1, 1])).recall == 1.0
     assert metrics_at(best_threshold(distances, np.array([0, 0])), distances, np.array([0, 0])).true_negatives == 2
 
 
-def test_neighboring_floats_are_still_distinguished():
+def test_neighboring_floats_are_distinguished():
     low = 1.0
     high = np.nextafter(low, 2.0)
     distances, labels = np.array([low, high]), np.array([1, 0])
@@ -49,7 +49,7 @@ def test_neighboring_floats_are_still_distinguished():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_threshold_is_as_good_as_trying_them_all(seed):
+def test_the_threshold_is_optimal(seed):
     rng = np.random.default_rng(seed)
     labels = rng.integers(0, 2, 60)
     distances = np.round(rng.normal(1.0 - 0.5 * labels, 0.4), 1)  # rounding makes ties
@@ -88,7 +88,7 @@ def test_shares_without_a_denominator_are_nan():
         ([], [], "no pairs to judge"),
     ],
 )
-def test_faults_are_named(distances, labels, sentence):
+def test_errors_are_reported(distances, labels, sentence):
     with pytest.raises(InputError, match=sentence):
         best_threshold(np.array(distances), np.array(labels))
 

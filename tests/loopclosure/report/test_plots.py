@@ -42,7 +42,7 @@ def legend_of(axis: Axes) -> Legend:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3, 10, 20])
-def test_legends_of_curves_hide_nothing(count):
+def test_legends_do_not_cover_curves(count):
     figure = curves(evaluation_of([LONG_NAME, *(f"method {i}" for i in range(1, count))]))
     figure.draw_without_rendering()
     axes = [axis.get_window_extent() for axis in figure.axes]
@@ -69,7 +69,7 @@ def test_every_curve_of_twenty_looks_different():
 
 
 @pytest.mark.slow
-def test_a_dollar_sign_in_a_name_is_no_formula():
+def test_a_dollar_sign_in_a_name_is_text():
     evaluation = evaluation_of([r"$\nonsense{$", "_hidden"])
     for draw in (curves, matrices, matches):
         draw(evaluation).draw_without_rendering()
@@ -78,7 +78,7 @@ def test_a_dollar_sign_in_a_name_is_no_formula():
 
 
 @pytest.mark.slow
-def test_the_callers_backend_is_untouched(two_laps, tmp_path):
+def test_the_backend_of_the_caller_is_kept(two_laps, tmp_path):
     code = f"""
 import sys, matplotlib
 matplotlib.use("svg")

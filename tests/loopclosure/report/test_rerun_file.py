@@ -47,7 +47,7 @@ def test_recordings_of_detect_and_close(folder: Path) -> None:
 
 
 @pytest.mark.skipif(not WITHOUT, reason="installed: rerun")
-def test_without_rerun_nothing_begins(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_rerun_the_command_stops_early(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["detect", "laps", *KNOWN, "--rerun", "found.rrd"]) == 1
     assert capsys.readouterr().err == "rerun is not installed; pip install netspec-caffe[rerun]\n"
     assert not (folder / "found").exists()

@@ -52,7 +52,7 @@ def test_information_of_example_b(one: int, other: int, nats: float) -> None:
     assert information(EXAMPLE_B)[other, one] == information(EXAMPLE_B)[one, other]
 
 
-def test_the_tree_is_the_strongest_one() -> None:
+def test_the_tree_has_maximal_information() -> None:
     words = (np.random.default_rng(3).random((60, 40)) < 0.3).astype(int)
     words[:, 20:] |= words[:, :20] & (np.random.default_rng(4).random((60, 20)) < 0.8)
     tree = learn_tree(words, lower_bound=0.0)
@@ -70,12 +70,12 @@ def test_the_tree_is_the_strongest_one() -> None:
     assert tree.root == min(edge)
 
 
-def test_counts_are_presence_and_the_order_of_images_is_nothing() -> None:
+def test_only_the_presence_of_words_matters() -> None:
     shuffled = EXAMPLE_B[np.random.default_rng(0).permutation(len(EXAMPLE_B))] * 3
     np.testing.assert_array_equal(learn_tree(shuffled).parent, learn_tree(EXAMPLE_B).parent)
 
 
-def test_a_word_that_no_or_every_image_has() -> None:
+def test_words_of_no_or_all_images() -> None:
     words = np.concatenate([EXAMPLE_B, np.zeros((16, 1), int), np.ones((16, 1), int)], axis=1)
     tree = learn_tree(words)
     assert tree.marginal[6] == pytest.approx(0.01)
@@ -86,7 +86,7 @@ def test_a_word_that_no_or_every_image_has() -> None:
         assert np.all((p >= 0.01 - 1e-12) & (p <= 0.99 + 1e-12))
 
 
-def test_words_too_loosely_tied_are_refused() -> None:
+def test_words_with_too_little_information_are_refused() -> None:
     with pytest.raises(InputError, match=r"4 of 6 words.*share less than 0.03 nat.*lower bound"):
         learn_tree(EXAMPLE_B, lower_bound=0.03)
 

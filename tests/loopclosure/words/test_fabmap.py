@@ -107,7 +107,7 @@ def test_two_traverses_are_located_on_a_finished_map(motion: bool) -> None:
     assert np.mean(np.argmax(scores.log_odds, axis=1) == np.arange(30)) > 0.9
 
 
-def test_sampling_approaches_the_mean_of_all_and_follows_the_seed() -> None:
+def test_sampling_approximates_the_mean_and_depends_on_the_seed() -> None:
     tree, training, walk = synthetic_walk()
     model = {seed: FabMapModel(tree, training, FabMapSettings(version=1, seed=seed)) for seed in (0, 1)}
     drawn = [model[seed].new_place(walk) for seed in (0, 0, 1)]
@@ -127,7 +127,7 @@ def test_a_place_seen_again_unchanged_wins_among_places_with_as_many_words() -> 
     np.testing.assert_array_equal(np.argmax(model.likelihoods(places, places), axis=1), np.arange(40))
 
 
-def test_a_word_of_every_image_says_less_than_a_rare_one() -> None:
+def test_frequent_words_weigh_less_than_rare_ones() -> None:
     rng = np.random.default_rng(6)
     training = rng.random((100, 30)) < 0.2
     training[:, 10] = True
@@ -145,7 +145,7 @@ def test_a_word_of_every_image_says_less_than_a_rare_one() -> None:
     assert abs(common) < 0.2 < rare
 
 
-def test_images_without_words_are_places_too() -> None:
+def test_images_without_words_are_places() -> None:
     tree, training, _ = synthetic_walk()
     walk = np.zeros((4, len(tree)), bool)
     walk[[1, 3]] = training[0]
@@ -180,7 +180,7 @@ def test_recent_images_have_log_odds_but_no_posterior() -> None:
         ({"recent": -1}, "recent is -1"),
     ],
 )
-def test_settings_that_make_no_sense(settings: dict, message: str) -> None:
+def test_invalid_settings_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         FabMapSettings(**settings)
 

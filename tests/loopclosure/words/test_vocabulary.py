@@ -50,7 +50,7 @@ def test_a_blank_image_has_no_features_and_no_words(kind: str) -> None:
     np.testing.assert_array_equal(vocabulary.count(blank), [0, 0, 0])
 
 
-def test_no_more_features_than_asked_for_and_color_is_taken_as_gray() -> None:
+def test_the_number_of_features_is_limited_and_color_becomes_gray() -> None:
     extractor = Extractor(max_features=15)
     assert len(extractor(texture(1))) == 15
     np.testing.assert_array_equal(extractor(cv2.cvtColor(texture(1), cv2.COLOR_GRAY2BGR)), extractor(texture(1)))
@@ -59,7 +59,7 @@ def test_no_more_features_than_asked_for_and_color_is_taken_as_gray() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"), [({"kind": "surf"}, '"surf"; known: sift, orb'), ({"max_features": 0}, "is 0")]
 )
-def test_impossible_extractors(settings: dict, message: str) -> None:
+def test_impossible_extractors_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Extractor(**settings)
 
@@ -103,12 +103,12 @@ def founders_one_by_one(descriptors: np.ndarray, radius: float) -> list[int]:
 
 
 @pytest.mark.slow
-def test_founders_are_those_of_the_plain_loop() -> None:
+def test_cluster_seeds_equal_those_of_a_plain_loop() -> None:
     descriptors = unit_vectors(600)
     np.testing.assert_array_equal(founders(descriptors, 0.6), founders_one_by_one(descriptors, 0.6))
 
 
-def test_founders_lie_apart_and_cover_all_across_blocks() -> None:
+def test_cluster_seeds_are_distant_and_cover_all_descriptors() -> None:
     descriptors, radius = unit_vectors(10_000, seed=3), 0.7
     centers = descriptors[founders(descriptors, radius)]
     apart = cdist(centers, centers)
@@ -167,7 +167,7 @@ def test_l1_by_hand() -> None:
 
 
 @pytest.mark.parametrize("metric", METRICS)
-def test_similarity_lies_between_nothing_and_the_same(metric: str) -> None:
+def test_similarity_is_between_0_and_1(metric: str) -> None:
     words = np.random.default_rng(0).poisson(0.5, (30, 50))
     bag = BagOfWords.learn(words, metric)
     similarity = bag.similarity(words, words)
@@ -179,7 +179,7 @@ def test_similarity_lies_between_nothing_and_the_same(metric: str) -> None:
 
 
 @pytest.mark.parametrize("metric", METRICS)
-def test_an_image_without_words_is_like_nothing_not_even_another_one(metric: str) -> None:
+def test_an_image_without_words_has_similarity_0(metric: str) -> None:
     words = np.array([[0, 0, 0, 0], [0, 2, 0, 1], [5, 0, 0, 0]])  # the last has only a word that all images have
     similarity = BagOfWords.learn(TRAINING, metric).similarity(words, words)
     np.testing.assert_allclose(similarity, [[0, 0, 0], [0, 1, 0], [0, 0, 0]], atol=1e-12)

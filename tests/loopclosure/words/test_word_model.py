@@ -61,7 +61,7 @@ def test_clustering_by_radius(training_images: list[Path]) -> None:
     assert "of 55 descriptors" in fewer.vocabulary.made  # 5 of each image but the blank one
 
 
-def test_what_is_saved_is_loaded(tmp_path: Path, training_images: list[Path], model: WordModel) -> None:
+def test_a_saved_model_can_be_loaded(tmp_path: Path, training_images: list[Path], model: WordModel) -> None:
     path = tmp_path / "words.npz"
     model.save(path)
     loaded = WordModel.load(path)
@@ -80,7 +80,7 @@ def test_orb_words_keep_their_extractor(tmp_path: Path, training_images: list[Pa
     assert WordModel.load(tmp_path / "orb.npz").vocabulary.extractor == extractor
 
 
-def test_files_without_a_model(tmp_path: Path) -> None:
+def test_files_without_a_model_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none.npz: no such file; expected a word model"):
         WordModel.load(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("words")
@@ -94,14 +94,14 @@ def test_files_without_a_model(tmp_path: Path) -> None:
         WordModel.load(tmp_path / "newer.npz")
 
 
-def test_training_needs_images_that_are_there(tmp_path: Path) -> None:
+def test_training_needs_existing_images(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needs training images"):
         train([])
     with pytest.raises(InputError, match=r"gone.png: cannot be read: No such file"):
         train([tmp_path / "gone.png"])
 
 
-def test_images_trained_on_are_not_tested(tmp_path: Path, training_images: list[Path]) -> None:
+def test_training_images_are_not_tested(tmp_path: Path, training_images: list[Path]) -> None:
     others = write_textures(tmp_path / "others", 3, first_seed=50)
     refuse_overlap(training_images, others)
     link = tmp_path / "link.png"

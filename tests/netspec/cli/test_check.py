@@ -37,7 +37,7 @@ def test_check_prints_a_table(run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_a_blob_that_many_layers_read(run: Run, tmp_path: Path) -> None:
+def test_check_shortens_the_list_of_readers_of_a_blob(run: Run, tmp_path: Path) -> None:
     """The longest line determines the width, so it does not list all blobs."""
     net = tmp_path / "net.prototxt"
     net.write_text(
@@ -53,7 +53,7 @@ def test_a_blob_that_many_layers_read(run: Run, tmp_path: Path) -> None:
     assert len(result.out) < 1_000_000
 
 
-def test_check_shows_caffes_log_when_asked(run: Run) -> None:
+def test_check_can_show_caffes_log(run: Run) -> None:
     quiet, loud = (run("check", NET, *PAIR_SHAPE, *words) for words in ([], ["-v"]))
     assert quiet.err == ""
     assert "Network initialization done." in loud.messages
@@ -75,7 +75,7 @@ def test_check_opens_no_data(run: Run) -> None:
     assert run("check", NET).fault == wanted + "give --shape pair_data=50,C,H,W, or --data"
 
 
-def test_check_gives_shapes_to_data_layers_and_inputs_only(run: Run) -> None:
+def test_check_accepts_shapes_for_data_layers_and_inputs_only(run: Run) -> None:
     expected = f'{NET}: --shape: no data layer has a top "pair"; did you mean "pair_data"? their tops: pair_data, sim'
     assert run("check", NET, *PAIR_SHAPE, "--shape", "pair=1,2,28,28").fault == expected
     fault = run("check", SOLVER, *PAIR_SHAPE, "--shape", "conv1=1,6,24,24").fault
@@ -102,7 +102,7 @@ def test_check_filters_by_phase_level_and_stage(run: Run) -> None:
     assert left("--stage", "b,a", "--level", "3") == ["b1", "b2", "b3"]
 
 
-def test_check_reports_every_fault_of_a_net_at_once(run: Run, edited: Edit) -> None:
+def test_check_reports_all_errors_of_a_net(run: Run, edited: Edit) -> None:
     net = edited(
         NET,
         'bottom: "pool1"', 'bottom: "pol1"',
@@ -124,7 +124,7 @@ def test_check_reports_every_fault_of_a_net_at_once(run: Run, edited: Edit) -> N
         assert all(number.isdigit() for number in line.split(":")[1:3])
 
 
-def test_check_reports_faults_of_a_solver_and_of_its_nets_at_once(run: Run, edited: Edit) -> None:
+def test_check_reports_all_errors_of_a_solver_and_its_nets(run: Run, edited: Edit) -> None:
     Path("net.prototxt").write_text(Path(edited(NET, 'type: "ReLU"', 'type: "Relu"')).read_text())
     solver = edited(
         SOLVER, NET, "net.prototxt", 'lr_policy: "step"', 'lr_policy: "stepp"', "momentum: 0.9", "iter_size: 0"

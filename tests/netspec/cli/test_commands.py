@@ -44,7 +44,7 @@ Edit = Callable[..., str]
     ],
     ids=lambda words: words[0] + "-images" * ("--images" in words),
 )
-def test_every_net_is_built_as_exact_as_asked_for(
+def test_every_command_passes_exact_to_its_nets(
     run: Run, edited: Edit, words: list[Any], exact: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     edited(SOLVER, "max_iter: 60", "max_iter: 1")
@@ -78,7 +78,7 @@ def test_every_net_is_built_as_exact_as_asked_for(
     ],
     ids=["two dashes", "one dash", "two dashes =", "one dash =", "position"],
 )
-def test_train_takes_its_arguments_in_each_spelling(run: Run, edited: Edit, words: list[str]) -> None:
+def test_train_accepts_all_spellings(run: Run, edited: Edit, words: list[str]) -> None:
     solver = edited(SOLVER, "max_iter: 60", "max_iter: 1", "snapshot_after_train: false", "")
     result = run("train", *[word.replace(SOLVER, solver) for word in words])
     assert result.status == 0
@@ -102,7 +102,7 @@ def test_a_solver_without_max_iter_is_not_trained(run: Run, edited: Edit) -> Non
     assert run("train", solver).fault == f"{solver}: {reported}"
 
 
-def test_quiet_is_no_log_and_every_warning(run: Run, edited: Edit) -> None:
+def test_quiet_shows_only_warnings(run: Run, edited: Edit) -> None:
     """Weights that fit no layer, and another batch size at a resume."""
     Path("other.prototxt").write_text(Path(NET).read_text().replace('name: "', 'name: "other_'))
     solver = edited(SOLVER, NET, "other.prototxt", "max_iter: 60", "max_iter: 1")
@@ -120,7 +120,7 @@ def test_tools_train(run: Run, edited: Edit) -> None:
     assert done.stderr.splitlines()[-1].endswith("caffe.cpp:250] Optimization Done.")
 
 
-def test_train_goes_on_from_a_snapshot(run: Run, edited: Edit) -> None:
+def test_train_resumes_from_a_snapshot(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, "max_iter: 60", "max_iter: 62", "snapshot_after_train: false", "")
     result = run("train", "--solver", solver, "--snapshot", "sgd_step/ref_iter_60.solverstate")
     assert result.status == 0
@@ -129,7 +129,7 @@ def test_train_goes_on_from_a_snapshot(run: Run, edited: Edit) -> None:
 
 
 @pytest.mark.slow
-def test_train_gives_level_and_stages_to_the_training_net_only(run: Run, edited: Edit) -> None:
+def test_train_applies_level_and_stages_to_the_training_net_only(run: Run, edited: Edit) -> None:
     stage = (
         'layer { name: "extra" type: "Power" bottom: "data" top: "extra" include { stage: "a" min_level: 2 } }\nlayer {'
     )
@@ -143,7 +143,7 @@ def test_train_gives_level_and_stages_to_the_training_net_only(run: Run, edited:
     assert [len(lines) for lines in created] == [0, 0, 1]
 
 
-def test_train_leaves_the_handlers_of_signals_as_they_were(run: Run) -> None:
+def test_train_restores_signal_handlers(run: Run) -> None:
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGHUP)
     assert run("train", "nowhere.prototxt").fault.startswith(
         "nowhere.prototxt: cannot be read: No such file or directory; "
@@ -166,7 +166,7 @@ def test_test_scores_a_net_on_its_test_data(run: Run) -> None:
     assert result.messages[-2].startswith(f"Loss: {mean}")
 
 
-def test_test_loads_several_weights_the_last_one_winning(run: Run) -> None:
+def test_test_loads_several_weights_and_the_last_has_priority(run: Run) -> None:
     one = run("test", "--model", NET, "--weights", "sgd_step/ref_iter_60.caffemodel", "--iterations", 1)
     two = run("test", "--model", NET, "--weights", f"{INIT},sgd_step/ref_iter_60.caffemodel", "--iterations", 1)
     assert one.messages[-1] == two.messages[-1]
@@ -205,7 +205,7 @@ def test_upgrades_write_the_current_format(run: Run) -> None:
     )
 
 
-def test_flags_of_glog_and_of_caffes_other_commands_are_taken(run: Run, tmp_path: Path) -> None:
+def test_flags_of_glog_and_of_caffes_other_commands_are_accepted(run: Run, tmp_path: Path) -> None:
     flags = tmp_path / "flags"
     flags.write_text("# all of them\n-iterations=1\n--stderrthreshold=2\n-colorlogtostderr\n")
     words = ["time", "-model", NET, f"-flagfile={flags}", "-weights", "w", "-v=1", "-log_prefix=false"]
@@ -217,7 +217,7 @@ def test_flags_of_glog_and_of_caffes_other_commands_are_taken(run: Run, tmp_path
     assert wrong.status == 2
 
 
-def test_layers_prints_what_each_says_of_itself(run: Run) -> None:
+def test_layers_prints_the_first_line_of_each_docstring(run: Run) -> None:
     rows = [line.split(maxsplit=1) for line in run("layers").out.splitlines()]
     assert [row[0] for row in rows] == layer_types()
     assert dict(rows)["Silence"] == "Consume blobs that would otherwise be outputs of the net."
@@ -225,7 +225,7 @@ def test_layers_prints_what_each_says_of_itself(run: Run) -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without a GPU")
-def test_without_a_gpu_the_cpu_is_used_and_a_wish_for_a_gpu_refused(run: Run, edited: Edit) -> None:
+def test_without_a_gpu_the_cpu_is_used_and_gpu_is_refused(run: Run, edited: Edit) -> None:
     asked = run("device_query")
     assert (asked.status, asked.messages[-1]) == (0, "No GPU: torch finds none on this machine")
     refused = "torch finds no GPU(s) on this machine; omit --gpu to use the CPU"
@@ -240,14 +240,14 @@ def test_without_a_gpu_the_cpu_is_used_and_a_wish_for_a_gpu_refused(run: Run, ed
 # What is wrong, in one line
 
 
-def test_gpus_that_are_not_numbers_or_not_there(run: Run) -> None:
+def test_invalid_and_missing_gpus_are_refused(run: Run) -> None:
     fault = "--gpu first: expected a GPU's number, several numbers separated by commas, or all"
     assert run("train", SOLVER, "--gpu=first").fault == fault
     count = torch.cuda.device_count()
     assert f"torch finds {count or 'no'} GPU(s)" in run("train", SOLVER, "--gpu", f"0,{count + 1}").fault
 
 
-def test_a_typo_in_a_field_a_type_or_a_blob(run: Run, edited: Edit) -> None:
+def test_typos_are_reported_with_suggestions(run: Run, edited: Edit) -> None:
     def fault(*changes: str) -> str:
         Path("net.prototxt").write_text(Path(edited(NET, *changes)).read_text())
         return run("train", edited(SOLVER, NET, "net.prototxt")).fault
@@ -266,7 +266,7 @@ def test_a_typo_in_a_field_a_type_or_a_blob(run: Run, edited: Edit) -> None:
     )
 
 
-def test_a_database_that_is_missing_empty_or_of_another_shape(run: Run, edited: Edit) -> None:
+def test_invalid_databases_are_reported(run: Run, edited: Edit) -> None:
     lmdb.open("empty_lmdb").close()
     Path("hollow_lmdb").mkdir()
     Path("net.prototxt").write_text(Path(NET).read_text())
@@ -295,7 +295,7 @@ def test_a_database_that_is_missing_empty_or_of_another_shape(run: Run, edited: 
     ],
     ids=["database", "images", "hdf5"],
 )
-def test_a_source_that_is_missing_is_said_before_the_log(run: Run, kind: str, says: str) -> None:
+def test_a_missing_source_is_reported_before_the_log(run: Run, kind: str, says: str) -> None:
     """Even if it is the last one, of the net that tests."""
     Path("net.prototxt").write_text(
         'layer { name: "a" type: "DummyData" top: "a" dummy_data_param { shape { dim: 1 dim: 2 } } }\n'
@@ -314,7 +314,7 @@ def test_a_source_that_is_missing_is_said_before_the_log(run: Run, kind: str, sa
     assert "\n" not in line
 
 
-def test_a_solver_that_names_no_net(run: Run, edited: Edit) -> None:
+def test_a_solver_without_a_net_is_refused(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, f'net: "{NET}"', "")
     assert run("train", solver).fault.startswith(
         "edited.prototxt: the solver has no net to train, expected exactly one"
@@ -327,7 +327,7 @@ def test_a_solver_that_names_no_net(run: Run, edited: Edit) -> None:
     )
 
 
-def test_a_prefix_that_cannot_be_written_to(run: Run, edited: Edit) -> None:
+def test_an_unwritable_prefix_is_refused(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, "sgd_step/ref", "nowhere/ref", "display: 10", "display: 10 snapshot: 5")
     fault = run("train", solver).fault
     assert fault.startswith(
@@ -336,7 +336,7 @@ def test_a_prefix_that_cannot_be_written_to(run: Run, edited: Edit) -> None:
     assert fault.endswith(f"; relative paths start from {Path.cwd()}")
 
 
-def test_weights_that_are_missing_or_no_weights(run: Run) -> None:
+def test_missing_and_invalid_weights_are_refused(run: Run) -> None:
     missing = f"nowhere.caffemodel: cannot be read: No such file or directory; relative paths start from {os.getcwd()}"
     assert run("train", SOLVER, "--weights", "nowhere.caffemodel").fault == missing
     assert run("test", "--model", NET, "--weights", "nowhere.caffemodel").fault == missing
@@ -348,14 +348,14 @@ def test_weights_that_are_missing_or_no_weights(run: Run) -> None:
     assert run("train", SOLVER, "--snapshot", INIT).fault.startswith(f"{INIT}: ")
 
 
-def test_a_file_that_is_no_prototxt(run: Run) -> None:
+def test_an_invalid_prototxt_is_refused(run: Run) -> None:
     assert run("test", "--model", INIT, "--weights", INIT).fault.startswith(f"{INIT}:2:1: unexpected character 0x08")
     assert run("check", "nowhere.prototxt").fault.startswith(
         "nowhere.prototxt: cannot be read: No such file or directory; "
     )
 
 
-def test_a_net_that_waits_for_inputs(run: Run, edited: Edit) -> None:
+def test_a_net_with_inputs_cannot_be_trained(run: Run, edited: Edit) -> None:
     deploy = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 dim: 3 } } }'
     Path("net.prototxt").write_text(deploy)
     expected = "net.prototxt: no value for input 'x'; this net's inputs: x"
@@ -398,14 +398,14 @@ def test_wrong_usage_ends_with_status_2(run: Run, words: str, said: str) -> None
     assert "Traceback" not in result.err
 
 
-def test_help_is_no_fault(run: Run) -> None:
+def test_help_ends_with_status_0(run: Run) -> None:
     assert "caffe train" in run("--help").out
     result = run("train", "--help")
     assert result.status == 0
     assert "--sighup_effect" in result.out
 
 
-def test_weights_of_which_no_layer_fits_are_refused(run: Run) -> None:
+def test_weights_that_fit_no_layer_are_refused(run: Run) -> None:
     other = NetParameter.FromString(Path(INIT).read_bytes())
     for layer in other.layer:
         layer.name += "_b"
@@ -421,7 +421,7 @@ def test_weights_of_which_no_layer_fits_are_refused(run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_weights_that_lack_a_layer_get_one_warning_and_with_strict_a_fault(run: Run, edited: Edit) -> None:
+def test_missing_layers_are_a_warning_or_with_strict_an_error(run: Run, edited: Edit) -> None:
     solver = edited(SOLVER, "max_iter: 60", "max_iter: 1")
     part = NetParameter.FromString(Path(INIT).read_bytes())
     for layer in part.layer:

@@ -50,7 +50,7 @@ def test_shells_complete_commands_options_and_files(script: Path, shell: str, tm
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("script", "shell"), [(shell, shell) for shell in SHELLS], indirect=["script"])
-def test_scripts_have_every_command_and_no_fault(script: Path, shell: str) -> None:
+def test_scripts_have_every_command_and_valid_syntax(script: Path, shell: str) -> None:
     commands = parser()._subparsers._group_actions[0].choices  # type: ignore[union-attr]
     assert commands
     text = script.read_text()
@@ -59,7 +59,7 @@ def test_scripts_have_every_command_and_no_fault(script: Path, shell: str) -> No
         subprocess.run([program, "-n", script], check=True)
 
 
-def test_without_the_package_one_line_says_what_to_install(
+def test_without_the_package_one_line_gives_advice(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "shtab", None)

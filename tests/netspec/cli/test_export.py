@@ -88,7 +88,7 @@ def test_safetensors(net: Net, run: Run) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["onnx", "torch", "safetensors"])
-def test_the_same_bytes_are_written_twice(form: str, net: Net, run: Run) -> None:
+def test_exports_are_reproducible(form: str, net: Net, run: Run) -> None:
     """Twelve hash tables have the order of their metadata by chance only; a file that is read back has all of it."""
     if form == "onnx":
         pytest.importorskip("onnx", reason=ONNX_EXTRA)
@@ -139,7 +139,7 @@ def test_part_of_a_net(onnx: Any, net: Net, run: Run) -> None:
     assert 'no blob "conf" in this net; did you mean "conv"?' in run(*words, "conf").fault
 
 
-def test_images_steps(onnx: Any, net: Net, run: Run) -> None:
+def test_preprocessing_is_exported(onnx: Any, net: Net, run: Run) -> None:
     words = ("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "net.onnx", "--mean", "1,2,3", "--swap")
     assert run(*words, "--scale", "0.5").status == 0
     inputs = random_inputs(net)
@@ -158,12 +158,12 @@ def test_images_steps(onnx: Any, net: Net, run: Run) -> None:
         ('no input "x" in this net; it has: data', "--to onnx --out n.onnx --swap --input x"),
     ],
 )
-def test_faults_are_one_line(words: str, fault: str, onnx: Any, net: Net, run: Run) -> None:
+def test_errors_are_reported_in_one_line(words: str, fault: str, onnx: Any, net: Net, run: Run) -> None:
     assert fault in run("export", MODEL, "--weights", WEIGHTS, *words.split()).fault
     assert not list(Path().glob("n.onnx"))
 
 
-def test_weights_that_are_not_there(onnx: Any, net: Net, run: Run) -> None:
+def test_missing_weights_are_reported(onnx: Any, net: Net, run: Run) -> None:
     words = ("export", MODEL, "--to", "onnx", "--out", "n.onnx")
     assert "no.caffemodel: cannot be read: No such file or directory" in run(*words, "--weights", "no.caffemodel").fault
     assert run(*words).err == "warning: no --weights given: the weights are random\n"
@@ -179,9 +179,7 @@ def test_the_onnx_library_is_an_extra(net: Net, run: Run, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("target", "out"), [("torch", "n.py"), ("pt2", "n.pt2"), ("safetensors", "n.safetensors"), ("fold", "n")]
 )
-def test_a_fault_leaves_old_files_as_they_were(
-    target: str, out: str, net: Net, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_keeps_old_files(target: str, out: str, net: Net, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ("fold", MODEL) if target == "fold" else ("export", MODEL, "--to", target)
     words = (*words, "--weights", WEIGHTS, "--out", out)
     assert run(*words).status == 0

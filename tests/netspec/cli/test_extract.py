@@ -41,7 +41,7 @@ def test_extract_writes_blobs_and_keys_over_all_records(run: Run) -> None:
     np.testing.assert_array_equal(found["sim"][:50, 0], first["sim"])
 
 
-def test_the_same_bytes_are_written_twice_where_no_time_is_wanted(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_output_without_times_is_reproducible(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
     for name in ("a.npz", "b.npz"):
         words = ["--model", NET, "--weights", INIT, "--blob", "feat", "--iterations", "1", "--out", name]
@@ -51,7 +51,7 @@ def test_the_same_bytes_are_written_twice_where_no_time_is_wanted(run: Run, monk
 
 
 @pytest.mark.slow
-def test_extract_reads_another_database_and_as_many_batches_as_asked(run: Run) -> None:
+def test_extract_reads_a_given_database_and_number_of_batches(run: Run) -> None:
     words = f"--model {NET} --weights {INIT} --blob sim --out f.npz --source pair_data=pairs/train_lmdb".split()
     assert run("extract", *words, "--iterations", "13").status == 0
     found = np.load("f.npz")
@@ -60,7 +60,7 @@ def test_extract_reads_another_database_and_as_many_batches_as_asked(run: Run) -
     assert found["keys"].tolist()[638:642] == ["00000638", "00000639", "00000000", "00000001"]
 
 
-def test_extract_without_weights_warns_of_random_ones(run: Run) -> None:
+def test_extract_without_weights_warns(run: Run) -> None:
     result = run("extract", "--model", NET, "--blob", "feat", "--out", "f.npz", "--iterations", 1)
     assert result.status == 0
     assert result.err == "warning: no --weights given: the weights are random\n"
@@ -96,7 +96,7 @@ def features_of(path: Path) -> np.ndarray:
 IMAGES = ("--model", NET, "--weights", INIT, "--blob", "feat", "--out", "f.npz")
 
 
-def test_extract_runs_a_training_nets_tower_over_a_folder_of_images(run: Run, images: Path) -> None:
+def test_extract_runs_a_tower_of_a_training_net_on_images(run: Run, images: Path) -> None:
     assert run("extract", *IMAGES, "--images", images / "rgb").status == 0
     found = np.load("f.npz")
     assert found["names"].tolist() == ["1.png", "2.png", "10.png"]
@@ -106,7 +106,7 @@ def test_extract_runs_a_training_nets_tower_over_a_folder_of_images(run: Run, im
         np.testing.assert_allclose(row, features_of(images / "rgb" / str(name)), rtol=1e-4, atol=1e-6)
 
 
-def test_extract_describes_the_middle_of_each_image_too(run: Run, images: Path) -> None:
+def test_extract_can_add_the_center_of_each_image(run: Run, images: Path) -> None:
     whole = images / "rgb" / "1.png"
     image = cv2.imread(str(whole))
     assert image is not None
@@ -128,7 +128,7 @@ def test_extract_keeps_the_order_and_the_stamps_of_a_tum_list(run: Run, images: 
     np.testing.assert_allclose(found["features"][1], features_of(images / "rgb" / "1.png"), rtol=1e-4, atol=1e-6)
 
 
-def test_extract_reads_a_list_of_caffes_with_labels(run: Run, images: Path) -> None:
+def test_extract_reads_caffes_lists_with_labels(run: Run, images: Path) -> None:
     (images / "rgb" / "list.txt").write_text("2.png 1\n10.png 0\n")
     assert run("extract", *IMAGES, "--images", images / "rgb" / "list.txt").status == 0
     assert np.load("f.npz")["names"].tolist() == ["2.png", "10.png"]
@@ -141,7 +141,7 @@ def test_extract_can_feed_the_other_tower(run: Run, images: Path) -> None:
     np.testing.assert_allclose(np.load("g.npz")["features"], np.load("f.npz")["features"], rtol=1e-5)
 
 
-def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run, images: Path) -> None:
+def test_extract_from_images_needs_no_database_if_the_shape_is_given(run: Run, images: Path) -> None:
     Path("pairs").unlink()
     words = [*IMAGES, "--images", images / "rgb"]
     assert 'database "pairs/test_lmdb" does not exist' in run("extract", *words).fault
@@ -171,7 +171,7 @@ def test_extract_from_images_needs_no_database_where_the_shape_is_said(run: Run,
         ("nowhere.caffemodel: cannot be read: No such file or directory", "--weights nowhere.caffemodel"),
     ],
 )
-def test_extract_says_in_one_line_what_is_wrong(run: Run, images: Path, words: str, fault: str) -> None:
+def test_extract_reports_errors_in_one_line(run: Run, images: Path, words: str, fault: str) -> None:
     Path("empty").mkdir()
     Path("list.txt").write_text("walk/rgb/1.png\nb.png\n")
     assert fault in run("extract", *IMAGES, *words.split()).fault
@@ -199,14 +199,14 @@ def test_extract_says_in_one_line_what_is_wrong(run: Run, images: Path, words: s
         ),
     ],
 )
-def test_extract_refuses_words_that_do_not_go_together(run: Run, images: Path, words: str, fault: str) -> None:
+def test_extract_refuses_contradictory_options(run: Run, images: Path, words: str, fault: str) -> None:
     result = run("extract", *IMAGES, *words.split())
     assert result.status == 2
     assert fault in result.err.splitlines()[-1]
     assert not Path("f.npz").exists()
 
 
-def test_extract_knows_no_such_blob(run: Run) -> None:
+def test_extract_refuses_unknown_blobs(run: Run) -> None:
     words = ["--model", NET, "--blob", "feet", "--out", "f.npz", "--weights", INIT]
     expected = f'{NET}: no blob "feet" in this net; did you mean "feat"? it has: pair_data, sim, data, '
     assert run("extract", *words).fault.startswith(expected)
@@ -217,7 +217,7 @@ def test_extract_knows_no_such_blob(run: Run) -> None:
 # What extract says
 
 
-def test_extract_says_in_three_lines_what_it_did(run: Run, images: Path) -> None:
+def test_extract_prints_a_summary_of_three_lines(run: Run, images: Path) -> None:
     result = run("extract", *IMAGES, "--images", images / "rgb", "--zooms", "1,0.5")
     assert (result.status, result.err) == (0, "")
     what, pixels, wrote = result.out.splitlines()
@@ -236,7 +236,7 @@ def test_extract_says_in_three_lines_what_it_did(run: Run, images: Path) -> None
         ("mirror: true", ""),
     ],
 )
-def test_extract_says_what_it_does_to_the_pixels(run: Run, images: Path, param: str, reported: str) -> None:
+def test_extract_prints_the_preprocessing(run: Run, images: Path, param: str, reported: str) -> None:
     Path("net.prototxt").write_text(
         'layer { name: "in" type: "DummyData" top: "data" dummy_data_param { shape { dim: 1 dim: 3 dim: 9 dim: 9 } } '
         f"transform_param {{ {param} }} }}"
@@ -246,7 +246,7 @@ def test_extract_says_what_it_does_to_the_pixels(run: Run, images: Path, param: 
     assert pixels == f'data (3 x 9 x 9): BGR, 0 to 255{reported} (transform_param of layer "in")'
 
 
-def test_extract_says_how_many_records_it_read(run: Run) -> None:
+def test_extract_prints_the_number_of_records(run: Run) -> None:
     result = run("extract", "--model", NET, "--weights", INIT, "--blob", "feat", "sim", "--out", "f.npz")
     assert (result.status, result.err) == (0, "")
     what, wrote = result.out.splitlines()
@@ -255,7 +255,7 @@ def test_extract_says_how_many_records_it_read(run: Run) -> None:
     assert wrote.endswith(" ms per record")
 
 
-def test_extract_shows_caffes_log_when_asked(run: Run, images: Path) -> None:
+def test_extract_can_show_caffes_log(run: Run, images: Path) -> None:
     words = [*IMAGES, "--images", images / "rgb"]
     quiet = run("extract", *words)
     for option in ("-v", "--verbose"):
@@ -303,7 +303,7 @@ def test_a_deploy_file_that_scales_by_itself_gets_no_warning(run: Run, images: P
     np.testing.assert_allclose(found, conv1_of(run, NET)[0], rtol=1e-4, atol=1e-5)
 
 
-def test_weights_that_tell_of_no_transform_get_no_warning(run: Run, images: Path) -> None:
+def test_weights_without_a_transform_get_no_warning(run: Run, images: Path) -> None:
     Path("deploy.prototxt").write_text(INPUT + CONV)
     net = netspec.load_net("deploy.prototxt")
     for weights in ("deploy.caffemodel", "deploy.caffemodel.h5"):
@@ -312,7 +312,7 @@ def test_weights_that_tell_of_no_transform_get_no_warning(run: Run, images: Path
 
 
 @pytest.mark.slow
-def test_the_net_that_the_project_brings_gets_no_warning(run: Run, images: Path) -> None:
+def test_the_shipped_net_gets_no_warning(run: Run, images: Path) -> None:
     words = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
     _, result = conv1_of(run, str(words / "deploy.prototxt"), str(words / "siamese_words_256.caffemodel"))
     assert result.err == ""
@@ -322,7 +322,7 @@ def test_the_net_that_the_project_brings_gets_no_warning(run: Run, images: Path)
 # extract_features
 
 
-def test_extract_features_writes_what_caffes_did(run: Run) -> None:
+def test_extract_features_equals_caffes(run: Run) -> None:
     result = run("extract_features", INIT, NET, "feat,sim", "feat_lmdb,sim_lmdb", 4, "lmdb", "CPU")
     assert result.status == 0
     golden = (GOLDEN / "log" / "extract_features.log").read_text().splitlines()
@@ -337,7 +337,7 @@ def test_extract_features_writes_what_caffes_did(run: Run) -> None:
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_extract_features_says_in_one_line_what_is_wrong(run: Run) -> None:
+def test_extract_features_reports_errors_in_one_line(run: Run) -> None:
     def fault(*words: str) -> str:
         return run("extract_features", INIT, NET, *words).fault
 
@@ -347,7 +347,7 @@ def test_extract_features_says_in_one_line_what_is_wrong(run: Run) -> None:
     assert fault("feat", "db", "1", "lmdb").startswith("db: already exists; ")
 
 
-def test_extract_warns_of_descriptors_that_are_not_finite(run: Run) -> None:
+def test_extract_warns_of_nonfinite_descriptors(run: Run) -> None:
     Path("dark").mkdir()
     for name, value in (("a.png", 9), ("b.png", 0)):
         cv2.imwrite(f"dark/{name}", np.full((8, 8, 3), value, np.uint8))

@@ -13,7 +13,7 @@ DEPLOY = ROOT / "prototxt" / "small" / "siamese_resnet27_256" / "deploy.prototxt
 
 
 @pytest.mark.slow
-def test_the_plan_names_what_runs_together(run: Callable[..., Any]) -> None:
+def test_the_plan_shows_joined_layers(run: Callable[..., Any]) -> None:
     lines = run("check", DEPLOY, "--plan").out.splitlines()
     (first,) = (line for line in lines if line.startswith("  ") and line.split()[1] == "conv1a")
     assert first.split(maxsplit=1)[1] == "conv1a + bn_conv1a + scale_conv1a + relu_conv1a"
@@ -41,7 +41,7 @@ def test_a_training_net_has_no_passes(run: Callable[..., Any]) -> None:
 
 
 @pytest.mark.slow
-def test_says_how_a_net_is_trained(run: Callable[..., Any]) -> None:
+def test_the_plan_shows_how_a_net_is_trained(run: Callable[..., Any]) -> None:
     folder = DEPLOY.parents[1]
     shape = ("--shape", "pair_data=2,6,64,64")
     for name, said in (("siamese_8", "by kernels prepared once"), ("siamese_resnet27_256", "by kernels prepared once")):
@@ -51,7 +51,7 @@ def test_says_how_a_net_is_trained(run: Callable[..., Any]) -> None:
     assert "more than 4,194,304" in run("check", net, "--plan", "--phase", "TRAIN", *large).out
 
 
-def test_extract_takes_passes(run: Callable[..., Any]) -> None:
+def test_extract_accepts_passes(run: Callable[..., Any]) -> None:
     files = "--model sgd_step/train_val.prototxt --weights sgd_step/init.caffemodel"
     words = f"extract {files} --blob feat --iterations 1".split()
     found = []

@@ -47,7 +47,7 @@ def test_a_training_writes_each_test_and_each_snapshot(run: Run, short: Callable
     assert [test["outputs"]["loss"][0] for test in found["tests"]] == pytest.approx(logged, rel=1e-5)
 
 
-def test_a_training_that_goes_on_keeps_what_it_found_before(run: Run, short: Callable[[int], str]) -> None:
+def test_a_resumed_training_keeps_earlier_scores(run: Run, short: Callable[[int], str]) -> None:
     assert run("train", short(4), "--weights", INIT, "--scores", "scores.json").status == 0
     before = scores()
     assert [test["iteration"] for test in before["tests"]] == [0, 2, 4]
@@ -59,7 +59,7 @@ def test_a_training_that_goes_on_keeps_what_it_found_before(run: Run, short: Cal
     assert [snapshot["iteration"] for snapshot in after["snapshots"]] == [3, 6]
 
 
-def test_a_new_training_begins_a_new_file(run: Run, short: Callable[[int], str]) -> None:
+def test_a_new_training_starts_a_new_file(run: Run, short: Callable[[int], str]) -> None:
     Path("scores.json").write_text("anything")
     assert run("train", short(1), "--weights", INIT, "--scores", "scores.json").status == 0
     assert [test["iteration"] for test in scores()["tests"]] == [0]
@@ -74,7 +74,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_training(run: Run, shor
     assert Path("scores.json").read_text() == "anything"
 
 
-def test_test_writes_its_means_in_the_same_form(run: Run) -> None:
+def test_test_writes_scores_in_the_same_format(run: Run) -> None:
     result = run("test", "--model", NET, "--weights", INIT, "--iterations", "2", "--scores", "scores.json")
     assert result.status == 0
     (test,) = scores()["tests"]

@@ -95,7 +95,7 @@ def test_an_interrupt_stops_a_training_and_takes_a_snapshot(endless) -> None:
     assert state.removesuffix(".solverstate") in last_messages(3)[0]
 
 
-def test_a_hangup_takes_a_snapshot_and_training_goes_on(endless) -> None:
+def test_a_hangup_takes_a_snapshot_and_training_continues(endless) -> None:
     training = endless()
     training.wait_for("Iteration 10 ")
     training.send(signal.SIGHUP)
@@ -106,7 +106,7 @@ def test_a_hangup_takes_a_snapshot_and_training_goes_on(endless) -> None:
     assert len(snapshots()) == 1
 
 
-def test_what_signals_do_can_be_changed(endless) -> None:
+def test_effects_of_signals_can_be_changed(endless) -> None:
     training = endless("--sigint_effect=none", "-sighup_effect", "stop")
     training.wait_for("Iteration 10 ")
     training.send(signal.SIGINT)
@@ -142,14 +142,14 @@ def test_sigterm_stops_a_training_with_a_snapshot(name: str, endless) -> None:
     assert len(snapshots()) == 1
 
 
-def test_the_status_goes_by_the_name_of_the_program(endless) -> None:
+def test_the_status_depends_on_the_name_of_the_program(endless) -> None:
     training = endless(name="caffe")
     training.wait_for("Iteration 10 ")
     training.send(signal.SIGINT)
     assert training.status() == 0
 
 
-def test_a_training_whose_standard_error_is_closed(work_in: Callable[..., Path]) -> None:
+def test_a_training_works_with_closed_stderr(work_in: Callable[..., Path]) -> None:
     work_in("train/sgd_step")
     Path(SOLVER).write_text(Path(SOLVER).read_text().replace("snapshot_after_train: false", ""))
     words = ["sh", "-c", 'exec "$@" 2>&-', "sh", sys.executable, "-m", "netspec", "train", SOLVER]
@@ -161,7 +161,7 @@ def test_a_training_whose_standard_error_is_closed(work_in: Callable[..., Path])
 ENDLESS = (Path(__file__).parent / "programs" / "endless.py").read_text()
 
 
-def test_a_second_interrupt_ends_a_training_at_once(endless) -> None:
+def test_a_second_interrupt_ends_a_training_immediately(endless) -> None:
     """The first one waits for the end of the iteration, which never comes here."""
     Path("endless.py").write_text(ENDLESS)
     net = 'layer { name: "e" type: "Python" top: "e" python_param { module: "endless" layer: "Endless" } }'
@@ -175,7 +175,7 @@ def test_a_second_interrupt_ends_a_training_at_once(endless) -> None:
     assert training.status() == 130
 
 
-def test_on_a_terminal_a_line_says_how_far_it_is(work_in: Callable[..., Path]) -> None:
+def test_on_a_terminal_a_line_shows_the_progress(work_in: Callable[..., Path]) -> None:
     work_in("train/sgd_step")
     pty, fcntl, termios = map(pytest.importorskip, ("pty", "fcntl", "termios"))  # Windows has none of them
     terminal, given = pty.openpty()
@@ -211,7 +211,7 @@ WAYS = {
         ("python", "Joined"),
     ],
 )
-def test_a_training_ends_where_a_python_layer_has_a_process_of_its_own(way: str, layer: str, tmp_path: Path) -> None:
+def test_a_training_with_a_process_of_a_python_layer_ends(way: str, layer: str, tmp_path: Path) -> None:
     """A forked process inherits the handlers of the training, but SIGTERM still ends it."""
     for name in ("prefetching.py", "train.py", "solver.prototxt"):
         text = (ROOT / "tests/netspec/cli/workers" / name).read_text()

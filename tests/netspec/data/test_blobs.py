@@ -5,7 +5,7 @@ from netspec.data import blobs
 from netspec.proto.schema import BlobProto, BlobShape
 
 
-def test_values_and_gradient_survive_the_round_trip():
+def test_values_and_gradients_can_be_written_and_read():
     values = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
     proto = BlobProto.FromString(blobs.from_array(values, diff=-values).SerializeToString())
     assert list(proto.shape.dim) == [2, 3, 4]
@@ -15,7 +15,7 @@ def test_values_and_gradient_survive_the_round_trip():
     assert blobs.to_array(proto).dtype == np.float32
 
 
-def test_doubles_stay_doubles():
+def test_doubles_are_kept():
     values = np.array([[np.pi], [np.e]])
     proto = blobs.from_array(values, diff=values)
     assert list(proto.double_data) == [np.pi, np.e]
@@ -24,13 +24,13 @@ def test_doubles_stay_doubles():
     np.testing.assert_array_equal(blobs.diff_to_array(proto), values)
 
 
-def test_what_protobuf_itself_writes_is_read():
+def test_messages_written_by_protobuf_are_read():
     proto = BlobProto(shape=BlobShape(dim=[3]), data=[1.5, -2.5, 1e-30])
     np.testing.assert_array_equal(blobs.to_array(proto), np.array([1.5, -2.5, 1e-30], np.float32))
     assert blobs.diff_to_array(proto) is None
 
 
-def test_a_transposed_array_is_written_in_its_own_order():
+def test_a_transposed_array_is_written_in_row_major_order():
     values = np.arange(6, dtype=np.float32).reshape(2, 3).T
     np.testing.assert_array_equal(blobs.to_array(blobs.from_array(values)), values)
 
@@ -52,12 +52,12 @@ def test_the_four_old_fields_give_the_shape():
         ((1, 1, 1, 500), (1, 1, 1, 1, 500), False),
     ],
 )
-def test_an_old_shape_fits_one_with_fewer_axes(old: tuple[int, ...], shape: tuple[int, ...], fitting: bool):
+def test_an_old_shape_fits_a_shape_with_fewer_axes(old: tuple[int, ...], shape: tuple[int, ...], fitting: bool):
     proto = BlobProto(num=old[0], channels=old[1], height=old[2], width=old[3])
     assert blobs.fits(proto, shape) is fitting
 
 
-def test_a_new_shape_fits_itself_only():
+def test_a_new_shape_fits_only_itself():
     proto = BlobProto(shape=BlobShape(dim=[1, 500]))
     assert blobs.fits(proto, (1, 500))
     assert not blobs.fits(proto, (500,))
@@ -99,13 +99,13 @@ def test_numbers_of_raw_data_are_read(kind: int | None, dtype: str, found: type)
     assert blobs.diff_to_array(proto) is None
 
 
-def test_half_precision_keeps_its_fractions_and_signs():
+def test_half_precision_is_read_exactly():
     values = np.array([-0.1, 65504, 6e-8, -0.0], "<f2")
     proto = with_raw(BlobProto(num=1, channels=1, height=1, width=4), 2, values.tobytes())
     np.testing.assert_array_equal(blobs.to_array(proto)[0, 0, 0], values.astype(np.float32))
 
 
-def test_data_wins_over_what_another_fork_keeps_under_the_numbers_of_raw_data():
+def test_data_has_priority_over_fields_numbered_like_raw_data():
     data = BlobProto(shape=BlobShape(dim=[2]), data=[1, 2])
     np.testing.assert_array_equal(blobs.to_array(with_raw(data, 1, np.array([7, 8], "<f4").tobytes())), [1, 2])
     number_12_is_a_varint = data.SerializeToString() + bytes([10 << 3 | 2, 1, 65, 12 << 3, 9])

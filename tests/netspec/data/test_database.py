@@ -28,13 +28,13 @@ def write(path: Path, records: dict[bytes, bytes], backend: str = "lmdb") -> Non
             writer.put(key, value)
 
 
-def test_records_come_in_the_order_of_their_keys(tmp_path: Path) -> None:
+def test_records_are_in_the_order_of_their_keys(tmp_path: Path) -> None:
     write(tmp_path / "db", {b"b": b"2", b"a": b"1", b"c": b"3"})
     reader = open_reader(str(tmp_path / "db"))
     assert [(reader.key(i), reader.record(i)) for i in range(len(reader))] == [(b"a", b"1"), (b"b", b"2"), (b"c", b"3")]
 
 
-def test_any_record_is_found_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_record_can_be_read_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(database, "_SCAN", 10)  # keys are listed in several goes
     reader = open_reader(str(GOLDEN / "pairs" / "train_lmdb"))
     for i in (639, 5, 300):
@@ -42,7 +42,7 @@ def test_any_record_is_found_first(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(reader.record(i)) == 1579
 
 
-def test_caffes_own_database_is_read_without_leaving_a_lock_beside_it() -> None:
+def test_reading_caffes_database_leaves_no_lock_file() -> None:
     assert len(open_reader(str(GOLDEN / "features" / "feat_lmdb"))) == 200
     assert os.listdir(GOLDEN / "features" / "feat_lmdb") == ["data.mdb"]
 
@@ -74,14 +74,14 @@ def test_a_reader_works_in_a_forked_worker() -> None:
     assert os.waitpid(child, 0)[1] == 0
 
 
-def test_two_layers_may_read_one_database() -> None:
+def test_two_layers_can_read_one_database() -> None:
     path = str(GOLDEN / "pairs" / "test_lmdb")
     first, second = open_reader(path), open_reader(path)
     assert first.record(0) == second.record(0)
 
 
 @pytest.mark.slow
-def test_readers_come_and_go_in_threads() -> None:  # liblmdb must not open what is still being closed
+def test_readers_can_be_opened_and_closed_in_threads() -> None:  # liblmdb must not open what is still being closed
     faults: list[Exception] = []
 
     def come_and_go() -> None:
@@ -99,7 +99,7 @@ def test_readers_come_and_go_in_threads() -> None:  # liblmdb must not open what
     assert not faults
 
 
-def test_a_database_that_other_code_holds_open_is_read() -> None:
+def test_a_database_that_is_open_elsewhere_can_be_read() -> None:
     source = str(GOLDEN / "images" / "lmdb_gray")
     with lmdb.open(source, readonly=True, lock=False) as env, env.begin() as transaction:
         reader = open_reader(source)
@@ -107,7 +107,7 @@ def test_a_database_that_other_code_holds_open_is_read() -> None:
         assert read == list(transaction.cursor())
 
 
-def test_a_database_made_anew_at_the_same_path_is_read_anew(tmp_path: Path) -> None:
+def test_a_replaced_database_is_read_again(tmp_path: Path) -> None:
     write(tmp_path / "db", {b"a": b"old"})
     old = open_reader(str(tmp_path / "db"))
     (tmp_path / "db").rename(tmp_path / "before")
@@ -167,7 +167,7 @@ def make_leveldb(path: Path) -> None:
         (make_leveldb, "has backend LEVELDB, not LMDB; set backend: LEVELDB"),
     ],
 )
-def test_a_bad_source_is_refused_in_one_line(tmp_path: Path, make: object, message: str) -> None:
+def test_an_invalid_source_is_refused_in_one_line(tmp_path: Path, make: object, message: str) -> None:
     assert callable(make)
     make(tmp_path / "db")
     with pytest.raises(SpecError) as fault:
@@ -177,7 +177,7 @@ def test_a_bad_source_is_refused_in_one_line(tmp_path: Path, make: object, messa
     assert "\n" not in str(fault.value)
 
 
-def test_an_lmdb_taken_for_a_leveldb_says_what_to_write() -> None:
+def test_an_lmdb_with_backend_leveldb_gets_advice() -> None:
     with pytest.raises(SpecError, match=r"LEVELDB is Caffe's default\); set backend: LMDB"):
         open_reader(str(GOLDEN / "pairs" / "test_lmdb"), "leveldb", PLACE)
 
@@ -188,7 +188,7 @@ def test_an_lmdb_taken_for_a_leveldb_says_what_to_write() -> None:
 @pytest.mark.parametrize(
     "folder", ["images/lmdb_plain", "images/lmdb_resized", "images/lmdb_encoded", "features/feat_lmdb"]
 )
-def test_the_file_is_caffes_byte_for_byte(tmp_path: Path, folder: str) -> None:
+def test_the_file_is_byte_identical_to_caffes(tmp_path: Path, folder: str) -> None:
     caffes = GOLDEN / folder
     reader = open_reader(str(caffes))
     write(tmp_path / "db", {reader.key(i): reader.record(i) for i in range(len(reader))})
@@ -196,7 +196,7 @@ def test_the_file_is_caffes_byte_for_byte(tmp_path: Path, folder: str) -> None:
 
 
 @pytest.mark.parametrize("batch", [1, 7, 1000])
-def test_a_batch_that_overflows_the_map_is_written_once_more_and_whole(
+def test_a_batch_that_overflows_the_map_is_written_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch: int
 ) -> None:
     monkeypatch.setattr(database, "_FIRST_MAP_SIZE", 1 << 16)
@@ -222,7 +222,7 @@ def test_the_map_grows_with_the_data(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert {reader.key(i): reader.record(i) for i in range(len(reader))} == records
 
 
-def test_records_may_come_in_any_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_records_can_be_written_in_any_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(database, "_FIRST_MAP_SIZE", 1 << 20)
     rng = np.random.default_rng(0)
     records = {b"%08d" % i: rng.bytes(3000) for i in rng.permutation(2500)}
@@ -232,7 +232,7 @@ def test_records_may_come_in_any_order(tmp_path: Path, monkeypatch: pytest.Monke
     assert all(reader.record(i) == records[reader.key(i)] for i in range(0, 2500, 7))
 
 
-def test_the_file_is_one_that_plain_liblmdb_opens(tmp_path: Path) -> None:
+def test_liblmdb_can_open_the_file(tmp_path: Path) -> None:
     write(tmp_path / "db", {b"a": b"1"})
     assert os.listdir(tmp_path / "db") == ["data.mdb"]
     with lmdb.open(str(tmp_path / "db"), map_size=1 << 40) as env, env.begin() as transaction:  # Caffe's map size
@@ -246,7 +246,7 @@ def test_an_existing_path_is_refused_and_kept(tmp_path: Path) -> None:
     assert open_reader(str(tmp_path / "db")).record(0) == b"1"
 
 
-def test_the_database_appears_only_when_it_is_whole(tmp_path: Path) -> None:
+def test_the_database_appears_only_when_complete(tmp_path: Path) -> None:
     with Writer(str(tmp_path / "db")) as writer:
         writer.put(b"a", b"1")
         writer.commit()
@@ -254,7 +254,7 @@ def test_the_database_appears_only_when_it_is_whole(tmp_path: Path) -> None:
     assert (tmp_path / "db").exists()
 
 
-def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_failure_leaves_no_files(tmp_path: Path) -> None:
     def put_and_fail(writer: Writer) -> None:
         writer.put(b"a", b"1")
         raise RuntimeError("image 2")
@@ -264,13 +264,13 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_a_key_that_lmdb_cannot_hold_is_named(tmp_path: Path) -> None:
+def test_a_key_that_is_too_long_is_reported(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match=r'cannot write record "xxx'), Writer(str(tmp_path / "db")) as writer:
         writer.put(b"x" * 600, b"1")
     assert os.listdir(tmp_path) == []
 
 
-def test_a_missing_folder_is_made_and_one_that_cannot_be_is_named(tmp_path: Path) -> None:
+def test_missing_folders_are_created_or_reported(tmp_path: Path) -> None:
     write(tmp_path / "new" / "folder" / "db", {})
     assert os.listdir(tmp_path / "new" / "folder") == ["db"]
     (tmp_path / "file").touch()
@@ -278,7 +278,7 @@ def test_a_missing_folder_is_made_and_one_that_cannot_be_is_named(tmp_path: Path
         write(tmp_path / "file" / "db", {})
 
 
-def test_an_unknown_backend_is_named(tmp_path: Path) -> None:
+def test_an_unknown_backend_is_reported(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match='unknown backend "sqlite"; expected one of: lmdb, leveldb'):
         write(tmp_path / "db", {}, "sqlite")
 
@@ -286,7 +286,7 @@ def test_an_unknown_backend_is_named(tmp_path: Path) -> None:
 # LevelDB
 
 
-def test_leveldb_goes_there_and_back(tmp_path: Path) -> None:
+def test_leveldb_can_be_written_and_read(tmp_path: Path) -> None:
     pytest.importorskip("plyvel")
     records = {b"%08d" % i: bytes([i % 256]) * i for i in range(2500)}
     write(tmp_path / "db", records, "leveldb")
@@ -345,7 +345,7 @@ def test_a_damaged_leveldb_is_refused(tmp_path: Path, kind: str, damage: Callabl
         open_reader(str(tmp_path / "db"), "leveldb")
 
 
-def test_records_of_a_leveldb_that_is_damaged_later(tmp_path: Path) -> None:
+def test_a_leveldb_that_is_damaged_after_opening_is_reported(tmp_path: Path) -> None:
     """What was not read when it was opened is checked when it is read."""
     plyvel = pytest.importorskip("plyvel")
     write(tmp_path / "db", {b"%08d" % i: random.Random(i).randbytes(10_000) for i in range(200)}, "leveldb")
@@ -362,7 +362,7 @@ def test_records_of_a_leveldb_that_is_damaged_later(tmp_path: Path) -> None:
         reader.record(3)
 
 
-def test_without_plyvel_leveldb_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_plyvel_a_message_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "plyvel", None)
     make_leveldb(tmp_path / "db")
     with pytest.raises(SpecError, match=r"pip install 'netspec-caffe\[leveldb\]'"):
@@ -372,7 +372,7 @@ def test_without_plyvel_leveldb_says_what_to_install(tmp_path: Path, monkeypatch
     assert os.listdir(tmp_path) == ["db"]
 
 
-def test_a_full_disk_is_called_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """LMDB itself says "Input/output error"."""
     with Writer(str(tmp_path / "db"), "LMDB") as writer:
         monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=0))

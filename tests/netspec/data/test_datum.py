@@ -14,7 +14,7 @@ def png(image: np.ndarray) -> bytes:
     return cv2.imencode(".png", image.transpose(1, 2, 0))[1].tobytes()
 
 
-def test_uint8_goes_through_data() -> None:
+def test_uint8_is_stored_in_data() -> None:
     datum = parse_datum(array_to_datum(COLORS, 3).SerializeToString())
     assert (datum.channels, datum.height, datum.width, datum.label) == (3, 5, 7, 3)
     assert not datum.float_data
@@ -23,7 +23,7 @@ def test_uint8_goes_through_data() -> None:
     assert (found == COLORS).all()
 
 
-def test_floats_go_through_float_data() -> None:
+def test_floats_are_stored_in_float_data() -> None:
     values = np.linspace(-2, 2, 24, dtype=np.float64).reshape(2, 3, 4)
     datum = array_to_datum(values)
     assert not datum.HasField("data")
@@ -33,13 +33,13 @@ def test_floats_go_through_float_data() -> None:
     assert (found == values.astype(np.float32)).all()
 
 
-def test_data_is_preferred_where_both_are_given() -> None:  # data_transformer.cpp:53
+def test_data_has_priority_over_float_data() -> None:  # data_transformer.cpp:53
     datum = Datum(channels=1, height=1, width=2, data=b"\x05\xff", float_data=[1.5, 2.5])
     assert datum_to_array(datum).tolist() == [[[5, 255]]]
 
 
 @pytest.mark.parametrize(("color", "channels"), [(None, 3), (True, 3), (False, 1)])
-def test_encoded_images_are_decoded_as_asked(color: bool | None, channels: int) -> None:
+def test_encoded_images_are_decoded_in_color_or_gray(color: bool | None, channels: int) -> None:
     found = datum_to_array(encoded_datum(png(COLORS), 1), color)
     assert found.shape == (channels, 5, 7)
     if channels == 3:
@@ -52,7 +52,7 @@ def test_a_gray_file_stays_gray_unless_color_is_forced() -> None:
     assert (datum_to_array(datum, color=True) == COLORS[[0, 0, 0]]).all()
 
 
-def test_planar_takes_gray_and_color() -> None:
+def test_planar_accepts_gray_and_color() -> None:
     assert planar(np.zeros((4, 5), np.uint8)).shape == (1, 4, 5)
     assert planar(np.zeros((4, 5, 3), np.uint8)).shape == (3, 4, 5)
 
@@ -68,12 +68,12 @@ def test_planar_takes_gray_and_color() -> None:
         (encoded_datum(cv2.imencode(".png", np.zeros((2, 2), np.uint16))[1].tobytes()), "uint16 .* only 8 bits"),
     ],
 )
-def test_contradictions_are_named(datum: Datum, message: str) -> None:
+def test_contradictions_are_reported(datum: Datum, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         datum_to_array(datum)
 
 
-def test_what_is_no_datum_is_refused() -> None:
+def test_an_invalid_datum_is_refused() -> None:
     with pytest.raises(ValueError, match="is not a Datum"):
         parse_datum(b"\xff\xff\xff")
 

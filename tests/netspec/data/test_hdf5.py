@@ -32,7 +32,7 @@ def listed(tmp_path: Path) -> str:
     return str(tmp_path / "list.txt")
 
 
-def test_batches_straddle_files_and_wrap(listed: str) -> None:
+def test_batches_span_files_and_wrap(listed: str) -> None:
     source = Hdf5Source(listed, ["data", "label"], 7, where=PLACE)
     assert list(source.shapes) == [(7, 2, 3), (7,)]
     labels = [source.batch(i)[1].tolist() for i in range(2)]
@@ -61,7 +61,7 @@ def refuse(tmp_path: Path, names: str, message: str) -> None:
         Hdf5Source(str(tmp_path / "bad.txt"), ["data", "label"], 2, where=PLACE)
 
 
-def test_bad_files_are_named_with_their_line(tmp_path: Path, listed: str) -> None:
+def test_invalid_files_are_reported_with_their_line(tmp_path: Path, listed: str) -> None:
     refuse(
         tmp_path,
         f"{tmp_path}/a.h5\n{tmp_path}/nix.h5\n",
@@ -99,7 +99,7 @@ def test_results_are_appended_in_caffes_four_axes(tmp_path: Path) -> None:
     assert label.shape == (3, 1, 1, 1)
 
 
-def test_results_of_another_shape_or_place_are_refused(tmp_path: Path) -> None:
+def test_results_with_another_shape_or_invalid_path_are_refused(tmp_path: Path) -> None:
     sink = Hdf5Sink(str(tmp_path / "out.h5"), PLACE)
     sink.append(np.zeros((2, 3)), np.zeros(2))
     with pytest.raises(SpecError, match=r'rows of "data" had shape \(3, 1, 1\) in earlier batches, found \(4, 1, 1\)'):

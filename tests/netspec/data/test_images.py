@@ -38,7 +38,7 @@ def test_a_gray_image_has_one_channel_also_when_resized() -> None:
     assert read_image(str(PNG / "0.png"), color=False, size=(5, 6)).shape == (1, 5, 6)
 
 
-def test_a_missing_and_a_broken_image_are_distinguished(tmp_path: Path) -> None:
+def test_missing_and_damaged_images_are_distinguished(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r'image ".*nix.png" cannot be read: No such file'):
         read_image(str(tmp_path / "nix.png"))
     (tmp_path / "text.png").write_text("hello")
@@ -46,7 +46,7 @@ def test_a_missing_and_a_broken_image_are_distinguished(tmp_path: Path) -> None:
         read_image(str(tmp_path / "text.png"))
 
 
-def test_lists_are_split_at_the_last_blank(tmp_path: Path) -> None:
+def test_list_lines_are_split_at_the_last_space(tmp_path: Path) -> None:
     (tmp_path / "l").write_text("# what this is\n\na b.png 3\n  c.png -1  \r\nd.png\t7\n")
     images = read_image_list(str(tmp_path / "l"))
     assert [(image.name, image.label, image.where.line) for image in images] == [
@@ -57,7 +57,7 @@ def test_lists_are_split_at_the_last_blank(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("line", ["a.png", "a.png x", "a.png 1.5", "3"])
-def test_a_line_without_a_label_is_named(tmp_path: Path, line: str) -> None:
+def test_a_line_without_a_label_is_reported(tmp_path: Path, line: str) -> None:
     (tmp_path / "l").write_text(f"ok.png 1\n{line}\n")
     with pytest.raises(SpecError, match=f'l:2:1: found "{line}", expected an image name'):
         read_image_list(str(tmp_path / "l"))

@@ -18,14 +18,14 @@ PLACE = Where("db")
 
 
 @pytest.mark.parametrize("database", ["lmdb_plain", "lmdb_encoded"])  # the same images
-def test_the_mean_is_caffes_byte_for_byte(tmp_path: Path, database: str) -> None:
+def test_the_mean_is_byte_identical_to_caffes(tmp_path: Path, database: str) -> None:
     mean = compute_mean(open_reader(str(GOLDEN / "images" / database)), PLACE)
     write_mean(str(tmp_path / "mean.binaryproto"), mean)
     assert (tmp_path / "mean.binaryproto").read_bytes() == (GOLDEN / "images" / "mean.binaryproto").read_bytes()
     assert (read_mean(str(tmp_path / "mean.binaryproto")) == mean).all()
 
 
-def test_float_records_count_too() -> None:
+def test_float_records_are_included() -> None:
     reader = open_reader(str(GOLDEN / "features" / "feat_lmdb"))
     assert compute_mean(reader, PLACE).shape == (8, 1, 1)
 
@@ -42,7 +42,7 @@ def test_channel_means_are_summed_as_caffe_sums_them(caplog: pytest.LogCaptureFi
     assert channel_means(plane.reshape(1, 15, 20)) == [float(total / np.float32(300))]
 
 
-def test_an_image_of_another_size_is_named(tmp_path: Path) -> None:
+def test_an_image_of_another_size_is_reported(tmp_path: Path) -> None:
     with Writer(str(tmp_path / "db")) as writer:
         for i, width in enumerate((4, 4, 5)):
             writer.put(b"%08d" % i, array_to_datum(np.zeros((1, 3, width), np.uint8)).SerializeToString())
@@ -66,7 +66,7 @@ def test_means_with_a_new_shape_field_are_read(tmp_path: Path) -> None:
         (BlobProto(shape=BlobShape(dim=[2]), data=[1, 2]).SerializeToString(), r"contains a blob of shape \(2,\)"),
     ],
 )
-def test_what_is_no_mean_image_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
+def test_an_invalid_mean_image_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "m").write_bytes(content)
     with pytest.raises(SpecError, match=message):
         read_mean(str(tmp_path / "m"), Where("net.prototxt", 2, 5))

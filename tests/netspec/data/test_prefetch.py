@@ -26,7 +26,7 @@ def slow_square(i: int) -> int:
 @pytest.mark.parametrize(
     ("ahead", "workers", "at_once"), [(0, 1, 1), (1, 1, 1), (4, 3, 1), (4, 2, 3), (1, 2, 8), (0, 1, 8)]
 )
-def test_batches_come_in_order_however_many_threads_make_them(ahead: int, workers: int, at_once: int) -> None:
+def test_batches_are_in_order_for_any_number_of_threads(ahead: int, workers: int, at_once: int) -> None:
     feed = Feed(slow_square, ahead, workers, at_once)
     assert [feed.next() for _ in range(20)] == [i * i for i in range(20)]
     assert feed.position == 20
@@ -34,14 +34,14 @@ def test_batches_come_in_order_however_many_threads_make_them(ahead: int, worker
 
 
 @pytest.mark.parametrize("ahead", [0, 2])
-def test_a_feed_counts_the_time_for_which_it_was_waited_for(ahead: int) -> None:
+def test_a_feed_measures_the_waiting_time(ahead: int) -> None:
     feed = Feed(each(lambda i: time.sleep(0.05)), ahead, workers=1)
     feed.next()
     assert feed.waited >= 0.05
     feed.close()
 
 
-def test_batches_are_made_ahead_but_not_far() -> None:
+def test_batches_are_read_ahead_within_a_limit() -> None:
     made: list[int] = []
     feed = Feed(each(made.append), ahead=3, workers=1)
     feed.next()
@@ -65,7 +65,7 @@ def test_no_thread_runs_before_the_first_batch_or_after_close() -> None:
     feed.close()
 
 
-def test_a_feed_that_nobody_needs_any_more_ends_its_threads() -> None:
+def test_an_unused_feed_ends_its_threads() -> None:
     before = set(threading.enumerate())
     feed = Feed(slow_square, 2, 2)
     feed.next()
@@ -77,7 +77,7 @@ def test_a_feed_that_nobody_needs_any_more_ends_its_threads() -> None:
 
 
 @pytest.mark.parametrize("at_once", [1, 4])
-def test_restart_goes_anywhere(at_once: int) -> None:
+def test_restart_can_go_to_any_iteration(at_once: int) -> None:
     feed = Feed(slow_square, 3, 2, at_once)
     feed.next()
     feed.restart()
@@ -88,7 +88,7 @@ def test_restart_goes_anywhere(at_once: int) -> None:
 
 
 @pytest.mark.parametrize(("ahead", "at_once"), [(0, 1), (3, 1), (3, 4)])
-def test_a_fault_surfaces_in_its_own_turn(ahead: int, at_once: int) -> None:
+def test_an_error_is_raised_at_its_batch(ahead: int, at_once: int) -> None:
     @each
     def make(i: int) -> int:
         if i == 2:
@@ -103,7 +103,7 @@ def test_a_fault_surfaces_in_its_own_turn(ahead: int, at_once: int) -> None:
     feed.close()
 
 
-def test_the_interpreter_ends_though_nobody_closed_the_feed() -> None:
+def test_the_interpreter_exits_with_an_open_feed() -> None:
     feed = "Feed(lambda i, n: [time.sleep(0.05)], 4, 4)"
     code = f"import time; from netspec.data.prefetch import Feed; {feed}.next(); print('end')"
     done = subprocess.run(

@@ -27,24 +27,24 @@ def source(path: Path, shapes: list[tuple[int, int, int]], batch_size: int, **tr
     return DatabaseSource(reader, Cursor(len(reader), batch_size), transformer, PLACE, Stacker(transformer.decode))
 
 
-def test_the_cursor_wraps_and_says_when() -> None:
+def test_the_cursor_wraps_and_logs_it() -> None:
     cursor = Cursor(count=5, batch_size=2)
     assert [cursor.records(i) for i in range(4)] == [[0, 1], [2, 3], [4, 0], [1, 2]]
     assert [cursor.wraps(i) for i in range(5)] == [0, 0, 1, 0, 1]  # the last record is read in batches 2 and 4
 
 
-def test_a_batch_may_be_larger_than_the_database() -> None:
+def test_a_batch_can_be_larger_than_the_database() -> None:
     cursor = Cursor(count=3, batch_size=7)
     assert cursor.records(0) == [0, 1, 2, 0, 1, 2, 0]
     assert [cursor.wraps(i) for i in range(3)] == [2, 2, 3]
 
 
-def test_records_are_skipped_at_the_very_start_only() -> None:
+def test_records_are_skipped_only_at_the_start() -> None:
     cursor = Cursor(count=5, batch_size=4, skip=3)
     assert [cursor.records(0), cursor.records(1)] == [[3, 4, 0, 1], [2, 3, 4, 0]]
 
 
-def test_each_epoch_has_an_order_of_its_own() -> None:
+def test_each_epoch_has_its_own_order() -> None:
     cursor = Cursor(count=50, batch_size=10, shuffle=True, draws=Draws(1, "x"))
     epochs = [[record for i in range(5 * e, 5 * e + 5) for record in cursor.records(i)] for e in range(3)]
     assert all(sorted(epoch) == list(range(50)) for epoch in epochs)
@@ -53,7 +53,7 @@ def test_each_epoch_has_an_order_of_its_own() -> None:
     assert again.records(12) == cursor.records(12)
 
 
-def test_rand_skip_is_one_draw_below_its_limit() -> None:
+def test_rand_skip_is_random_below_its_limit() -> None:
     skips = {draw_skip(10, seed, "data/TRAIN") for seed in range(100)}
     assert skips == set(range(10))
     assert draw_skip(0, 1, "data/TRAIN") == 0
@@ -68,7 +68,7 @@ def test_batches_have_images_labels_and_keys(tmp_path: Path) -> None:
     assert found.keys(2) == ["00000004", "00000000"]
 
 
-def test_a_record_of_another_size_is_named(tmp_path: Path) -> None:
+def test_a_record_of_another_size_is_reported(tmp_path: Path) -> None:
     found = source(tmp_path / "db", [(3, 4, 4)] * 3 + [(1, 4, 4)], 2)
     found.batch(0)
     with pytest.raises(SpecError) as fault:
@@ -78,17 +78,17 @@ def test_a_record_of_another_size_is_named(tmp_path: Path) -> None:
     )
 
 
-def test_a_batch_of_one_takes_any_size(tmp_path: Path) -> None:  # Caffe: the first datum of a batch sets its shape
+def test_a_batch_of_one_accepts_any_size(tmp_path: Path) -> None:  # Caffe: the first datum of a batch sets its shape
     found = source(tmp_path / "db", [(3, 4, 4), (3, 6, 5)], 1)
     assert [found.batch(i)[0].shape for i in range(2)] == [(1, 3, 4, 4), (1, 3, 6, 5)]
 
 
-def test_a_crop_brings_sizes_together(tmp_path: Path) -> None:
+def test_a_crop_makes_sizes_equal(tmp_path: Path) -> None:
     found = source(tmp_path / "db", [(3, 4, 4), (3, 6, 5)], 2, crop_size=3)
     assert found.batch(0)[0].shape == (2, 3, 3, 3)
 
 
-def test_a_record_that_is_no_datum_is_named(tmp_path: Path) -> None:
+def test_an_invalid_record_is_reported(tmp_path: Path) -> None:
     with Writer(str(tmp_path / "db")) as writer:
         writer.put(b"first", array_to_datum(np.zeros((1, 1, 1), np.uint8)).SerializeToString())
         writer.put(b"second", b"\xff\xff\xff")
@@ -132,7 +132,7 @@ def packed(record: bytes) -> bytes:
     ],
 )
 @pytest.mark.parametrize("backend", ["lmdb", "leveldb"])
-def test_small_records_are_read_at_once_as_one_by_one(
+def test_small_records_read_together_equal_single_reads(
     tmp_path: Path, records: list[bytes], at_once: bool, backend: str
 ) -> None:
     if backend == "leveldb":
@@ -188,7 +188,7 @@ LONG_FLOATS = [longer(record, 3) for record in datums(1, 2, floats=True)]
         pytest.param(datums(1, 2), True, id="none of them"),
     ],
 )
-def test_of_records_longer_than_their_shape_the_first_numbers_are_read(
+def test_surplus_numbers_of_a_record_are_ignored(
     tmp_path: Path, records: list[bytes], at_once: bool, caplog: pytest.LogCaptureFixture
 ) -> None:  # as data_transformer.cpp does; nets are trained from such databases
     with Writer(str(tmp_path / "db")) as writer:
@@ -210,7 +210,7 @@ def test_of_records_longer_than_their_shape_the_first_numbers_are_read(
 
 @pytest.mark.parametrize("ranks", [1, 3])
 @pytest.mark.parametrize("shapes", [[(2, 3, 4)] * 7, [(2, 3, 4), (3, 6, 5), (3, 6, 5)]])
-def test_several_iterations_at_once_are_those_one_by_one(
+def test_several_iterations_together_equal_single_iterations(
     tmp_path: Path, ranks: int, shapes: list[tuple[int, int, int]]
 ) -> None:
     alike = len(set(shapes)) == 1
@@ -220,7 +220,7 @@ def test_several_iterations_at_once_are_those_one_by_one(
         assert all((a == b).all() for a, b in zip(one, at_once, strict=True))
 
 
-def test_records_of_another_form_than_those_before_are_read_too() -> None:
+def test_records_of_changing_forms_are_read() -> None:
     read = Stacker()
     for shape in ((2, 3, 4), (2, 4, 3), (24, 1, 1)):  # of one size
         found = read(datums(1, 2, shape=shape))
@@ -231,13 +231,13 @@ def test_records_of_another_form_than_those_before_are_read_too() -> None:
     assert read([b""]) is None
 
 
-def test_a_record_draws_the_same_in_any_batch() -> None:
+def test_random_numbers_of_a_record_do_not_depend_on_its_batch() -> None:
     whole = words(7, "data/TRAIN", 0, 100)
     parts = np.concatenate([words(7, "data/TRAIN", first, 20) for first in range(0, 100, 20)])
     assert (whole == parts).all()
 
 
-def test_the_draws_are_what_they_have_always_been() -> None:
+def test_random_numbers_never_change() -> None:
     # A resumed run must draw what the first one would have drawn, whatever the versions of numpy.
     assert words(1, "a", 0, 1).tolist() == [
         [16125938745833911740, 11915995768183236433, 13288515000938474924, 528424593193280505]
@@ -245,16 +245,16 @@ def test_the_draws_are_what_they_have_always_been() -> None:
     assert permutation(1, "a", 9).tolist() == [3, 5, 6, 1, 7, 2, 0, 4, 8]
 
 
-def test_seed_and_stream_matter() -> None:
+def test_seed_and_stream_change_random_numbers() -> None:
     drawn = [words(seed, stream, 0, 4).tolist() for seed in (0, 1) for stream in ("data/TRAIN", "data/TEST")]
     assert all(drawn[i] != drawn[j] for i in range(4) for j in range(i))
 
 
-def test_draws_are_spread_evenly() -> None:
+def test_random_numbers_are_uniform() -> None:
     quarters = np.bincount((words(0, "x", 0, 25_000).ravel() % 4).astype(int))
     assert np.abs(quarters / 25_000 - 1).max() < 0.03
 
 
-def test_a_permutation_holds_each_number_once() -> None:
+def test_a_permutation_has_each_number_once() -> None:
     assert sorted(permutation(3, "x", 1001)) == list(range(1001))
     assert permutation(3, "x", 0).tolist() == []

@@ -59,7 +59,7 @@ def test_the_crop_is_central_and_floored_in_test() -> None:
 
 
 @pytest.mark.parametrize("floats", [False, True])
-def test_training_does_what_caffes_loops_do_with_the_same_draws(tmp_path: Path, floats: bool) -> None:
+def test_training_transforms_like_caffe_for_equal_random_numbers(tmp_path: Path, floats: bool) -> None:
     mean = np.random.default_rng(1).uniform(90, 140, (3, 9, 12)).astype(np.float32)
     write_mean(str(tmp_path / "mean.binaryproto"), mean)
     settings = {"crop_size": 6, "mirror": True, "scale": 0.0039, "mean_file": str(tmp_path / "mean.binaryproto")}
@@ -72,13 +72,13 @@ def test_training_does_what_caffes_loops_do_with_the_same_draws(tmp_path: Path, 
         assert (top == caffe(image, mean, 0.0039, 6, h % 4, w % 7, m % 2 == 1)).all()
 
 
-def test_mirroring_happens_in_test_too() -> None:  # as in Caffe: only the crop knows the phase
+def test_images_are_also_mirrored_in_phase_test() -> None:  # as in Caffe: only the crop knows the phase
     found = transformer(TEST, mirror=True)(list(IMAGES), range(40))
     mirrored = [(top == image[:, :, ::-1]).all() for top, image in zip(found, IMAGES, strict=True)]
     assert mirrored == [m % 2 == 1 for m in words(5, "data", 0, 40)[:, 0].tolist()]
 
 
-def test_records_are_transformed_alike_in_any_batch() -> None:
+def test_the_transform_of_a_record_does_not_depend_on_its_batch() -> None:
     train = transformer(TRAIN, crop_size=4, mirror=True)
     whole = train(list(IMAGES), range(40))
     parts = np.concatenate([train(list(IMAGES[i : i + 8]), range(i, i + 8)) for i in range(0, 40, 8)])
@@ -111,7 +111,7 @@ def test_force_color_and_force_gray_are_for_encoded_images(caplog: pytest.LogCap
         ),
     ],
 )
-def test_settings_that_cannot_be_are_refused_where_they_stand(fields: dict, place: str, message: str) -> None:
+def test_contradictory_settings_are_refused_with_their_location(fields: dict, place: str, message: str) -> None:
     with pytest.raises(SpecError) as fault:
         transformer(**fields).output_shape((3, 9, 12))
     assert str(fault.value).startswith(f'net.prototxt:3:1: layer "data transform_param.{place}" (Data): {message}')

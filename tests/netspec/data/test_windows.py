@@ -61,7 +61,7 @@ def test_windows_are_sorted_by_their_overlap(folder: Path) -> None:
     assert [(w.label, w.x1) for w in found.background] == [(0, 10)]  # 0.4 is neither
 
 
-def test_background_comes_first_and_foreground_by_its_share(folder: Path) -> None:
+def test_background_comes_before_the_share_of_foreground(folder: Path) -> None:
     found = source(folder, bg_threshold=0.3, fg_fraction=0.3)
     labels = np.array([found.batch(i)[1] for i in range(20)])
     assert (labels[:, :6] == 0).all()  # 8 * 0.3 = 2.4 windows are foreground
@@ -84,7 +84,7 @@ def test_mirror_mean_and_scale(folder: Path) -> None:
     assert not labels.any()
 
 
-def test_context_is_added_around_and_is_zero_beyond_the_image(folder: Path) -> None:
+def test_context_is_zero_outside_the_image(folder: Path) -> None:
     # Two pixels of context in a crop of 8: the box of 10 x 10 grows by 8 / 4 to 20 x 20, from -5 to 15: 21 pixels.
     # Five of them lie beyond the image: round(5 * 8 / 21) = 2 pixels of the crop, and round(16 * 8 / 21) = 6 remain.
     data, labels = source(folder, bg_threshold=0.3, fg_fraction=1.0, context_pad=2).batch(0)
@@ -95,7 +95,7 @@ def test_context_is_added_around_and_is_zero_beyond_the_image(folder: Path) -> N
     assert (top[:, 2:, 2:] == inside).all()
 
 
-def test_a_square_keeps_the_proportions(folder: Path) -> None:
+def test_a_square_crop_keeps_the_aspect_ratio(folder: Path) -> None:
     # The box of 16 x 12 around (12, 12) becomes one of 16 x 16, from 4 to 20 both ways.
     data, labels = source(folder, bg_threshold=0.3, fg_fraction=1.0, crop_mode="square").batch(0)
     assert (data[list(labels).index(5)] == warped(4, 4, 20, 20)).all()
@@ -119,7 +119,7 @@ def test_the_mean_is_cropped_like_the_window(folder: Path) -> None:
     assert (data[0] == warped(10, 12, 25, 27) - mean[:, 2:10, 2:10]).all()
 
 
-def test_images_may_be_kept_in_memory(folder: Path) -> None:
+def test_images_can_be_cached(folder: Path) -> None:
     cached = source(folder, bg_threshold=0.3, cache_images=True)
     before = cached.batch(0)[0]
     (folder / "0.png").unlink()
@@ -144,14 +144,14 @@ def test_images_may_be_kept_in_memory(folder: Path) -> None:
         ("3 0.1", "3 0.45", "has no background windows"),
     ],
 )
-def test_a_bad_window_file_is_named_with_its_line(folder: Path, old: str, new: str, message: str) -> None:
+def test_an_invalid_window_file_is_reported_with_its_line(folder: Path, old: str, new: str, message: str) -> None:
     text = FILE.replace(old, new).format(folder=folder)
     (folder / "windows.txt").write_text(text)
     with pytest.raises(SpecError, match=message):
         source(folder, bg_threshold=0.3)
 
 
-def test_a_window_beyond_the_image_is_named(folder: Path) -> None:
+def test_a_window_outside_the_image_is_reported(folder: Path) -> None:
     (folder / "windows.txt").write_text(FILE.format(folder=folder).replace("10 12 25 27", "10 12 25 30"))
     with pytest.raises(SpecError, match="is not inside image"):
         source(folder, bg_threshold=0.3, fg_fraction=0.0).batch(0)

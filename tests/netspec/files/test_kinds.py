@@ -96,7 +96,7 @@ layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc"
         ("x.caffemodel.gz", b"\x1f\x8bxx", "packed by gzip|cannot be read"),
     ],
 )
-def test_other_files_are_named(name: str, data: bytes, said: str, tmp_path: Path) -> None:
+def test_wrong_files_are_reported(name: str, data: bytes, said: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(data)
     with pytest.raises(SpecError, match=said) as caught:
         load_weights(EMPTY, tmp_path / name)

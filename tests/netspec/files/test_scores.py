@@ -13,7 +13,7 @@ SCORES = Scores(
 )
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_written_files_can_be_read(tmp_path: Path) -> None:
     SCORES.write(tmp_path / "scores.json")
     assert read_scores(tmp_path / "scores.json") == SCORES
     assert [path.name for path in tmp_path.iterdir()] == ["scores.json"]

@@ -73,7 +73,7 @@ def test_a_blob_used_twice_is_split_under_caffes_names() -> None:
     ]
 
 
-def test_the_users_of_an_in_place_result_share_the_last_writers_split() -> None:
+def test_readers_of_an_in_place_result_share_one_split() -> None:
     text = """
     layer { name: "data" type: "Input" top: "x" }
     layer { name: "relu" type: "ReLU" bottom: "x" top: "x" }
@@ -83,7 +83,7 @@ def test_the_users_of_an_in_place_result_share_the_last_writers_split() -> None:
     assert _split(text)[2] == "x_relu_0_split: x -> x_relu_0_split_0,x_relu_0_split_1"
 
 
-def test_a_loss_weight_is_a_use_and_moves_to_the_first_copy() -> None:
+def test_a_loss_weight_counts_as_a_use_and_moves_to_the_first_copy() -> None:
     text = """
     layer { name: "data" type: "Input" top: "x" }
     layer { name: "sum" type: "Reduction" bottom: "x" top: "s" loss_weight: 0.5 }

@@ -35,7 +35,7 @@ def test_outputs_are_in_alphabetical_order() -> None:
     ]
 
 
-def test_the_first_of_a_name_owns_and_multipliers_may_be_given_once() -> None:
+def test_the_first_layer_owns_a_shared_parameter() -> None:
     made = plan(
         """
         layer { name: "d" type: "Input" top: "x" top: "y" }
@@ -53,12 +53,12 @@ FAULTS = read_cases("netspec/graph/cases/faults.txt")
 
 
 @pytest.mark.parametrize("case", FAULTS.values(), ids=FAULTS)
-def test_faults_name_their_place(case: dict[str, str]) -> None:
+def test_errors_name_their_location(case: dict[str, str]) -> None:
     with pytest.raises(SpecError, match=case["message"]):
         plan(case["net"])
 
 
-def test_faults_can_all_be_collected() -> None:
+def test_all_errors_can_be_collected() -> None:
     faults: list[SpecError] = []
     net, source = parse_net_text(
         'layer { name: "a" type: "ReLU" bottom: "no" top: "x" }\n'
@@ -90,11 +90,11 @@ def _needs(propagate: str, force: str = "") -> tuple[tuple[bool, ...], tuple[tup
     return tuple(by_name[name] for name in ("low", "high", "loss", "aside")), backward.bottoms
 
 
-def test_only_what_is_under_a_loss_needs_backward() -> None:
+def test_only_layers_below_a_loss_need_backward() -> None:
     assert _needs("")[0] == (True, True, True, False)
 
 
-def test_propagate_down_false_ends_the_way_down() -> None:
+def test_propagate_down_false_stops_backward() -> None:
     assert _needs("propagate_down: false")[0] == (False, True, True, False)
 
 

@@ -19,13 +19,13 @@ def test_a_net_is_built_without_collections(net_of: Callable[..., Net]) -> None:
     assert gc.isenabled()
 
 
-def test_a_net_that_cannot_be_built_leaves_the_collector_on(net_of: Callable[..., Net]) -> None:
+def test_the_collector_is_enabled_again_after_an_error(net_of: Callable[..., Net]) -> None:
     with pytest.raises(SpecError, match="nothing"):
         net_of(UNKNOWN)
     assert gc.isenabled()
 
 
-def test_who_paused_the_collector_goes_on_without_it(net_of: Callable[..., Net]) -> None:
+def test_a_collector_that_was_disabled_stays_disabled(net_of: Callable[..., Net]) -> None:
     with no_collection():
         net_of('layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } }')
         assert not gc.isenabled()

@@ -84,12 +84,12 @@ def test_the_same_field_of_many_layers_is_named_once(net_of, warnings) -> None:
         layer("Scale", "scale_param { filler { value: 2 } bias_term: true bias_filler { value: 2 } }"),
     ],
 )
-def test_what_changes_no_result_is_not_worth_a_word(net_of, warnings, text: str) -> None:
+def test_fields_that_change_no_result_are_not_reported(net_of, warnings, text: str) -> None:
     net_of(INPUT + text)
     assert warnings() == []
 
 
-def test_the_old_places_of_a_transform_mean_nothing_to_a_current_data_layer(net_of, warnings) -> None:
+def test_old_transform_fields_have_no_effect_in_a_current_data_layer(net_of, warnings) -> None:
     net_of(
         'layer { name: "d" type: "Data" top: "d" data_param { source: "no" batch_size: 2 scale: 0.5 mirror: true } }'
         'layer { name: "i" type: "ImageData" top: "i" top: "l" image_data_param { source: "no" crop_size: 4 } '

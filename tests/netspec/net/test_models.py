@@ -23,7 +23,7 @@ MODELS = {
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_a_trained_model_gives_what_its_own_program_gives(name: str):
+def test_a_trained_model_gives_the_results_of_its_own_program(name: str):
     for dialect in MODELS[name]:
         netspec.use_dialect(dialect)
     folder = shared("golden", "models", name)

@@ -59,7 +59,7 @@ def test_an_unknown_name(net: Net, find, says: str) -> None:
         (["a", "b"], "found values of type <U1 for an input; expected an array of numbers or a tensor"),
     ],
 )
-def test_what_is_no_array(net: Net, value: object, says: str) -> None:
+def test_an_input_that_is_not_an_array_is_refused(net: Net, value: object, says: str) -> None:
     with pytest.raises(SpecError) as fault:
         net(value)
     assert str(fault.value).startswith("net.prototxt: ")

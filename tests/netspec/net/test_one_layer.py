@@ -37,7 +37,7 @@ def test_several_tops_are_a_tuple() -> None:
     assert netspec.layer('type: "Silence"')(np.ones(2)) == ()
 
 
-def test_blobs_are_there_at_once_where_the_shapes_are_given() -> None:
+def test_blobs_exist_immediately_if_shapes_are_given() -> None:
     text = 'type: "InnerProduct" inner_product_param { num_output: 2 weight_filler { type: "xavier" } }'
     product = netspec.layer(text, (1, 3))
     assert product.layer is not None
@@ -57,7 +57,7 @@ def test_a_layer_without_bottoms_a_loss_and_the_training_phase() -> None:
     assert set(dropped.tolist()) == {0, 2}
 
 
-def test_exact_says_whose_sums_are_made() -> None:
+def test_exact_selects_the_arithmetic() -> None:
     x = torch.randn(2, 3, requires_grad=True)
 
     assert netspec.layer('type: "Sigmoid"', exact="all")(x).grad_fn.name() == "PointwiseBackward"  # the C library's
@@ -76,7 +76,7 @@ def test_exact_says_whose_sums_are_made() -> None:
         ('type: "Concat"', r"found 0 bottom blob\(s\), expected at least 1"),
     ],
 )
-def test_what_is_wrong_is_said_with_its_place(text: str, message: str) -> None:
+def test_errors_contain_their_location(text: str, message: str) -> None:
     with pytest.raises(netspec.SpecError, match=message):
         netspec.layer(text)(*[] if "Concat" in text else [np.ones((1, 1, 4, 4))])
 
@@ -105,7 +105,7 @@ def test_a_net_is_copied_before_and_after_a_pass(net_of: Callable[..., Net], cop
             assert torch.equal(copied(net)(data=torch.ones(2, 3))["ip"], net(data=torch.ones(2, 3))["ip"])
 
 
-def test_what_reads_open_files_or_trains_is_not_copied(work_in: Callable[..., Path]) -> None:
+def test_nets_with_open_files_and_solvers_cannot_be_copied(work_in: Callable[..., Path]) -> None:
     work_in("train/sgd_step")
     solver = load_solver("sgd_step/solver.prototxt")
     net = load_net("sgd_step/train_val.prototxt", "TRAIN")

@@ -67,7 +67,7 @@ def made(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> Callabl
 
 
 @pytest.mark.parametrize("gradients", [False, True])
-def test_a_top_of_another_shape_than_promised_is_refused(made: Callable[..., Net], gradients: bool) -> None:
+def test_a_top_with_an_undeclared_shape_is_refused(made: Callable[..., Net], gradients: bool) -> None:
     net, whole = made(Odd), made(Whole)
     with torch.set_grad_enabled(gradients):
         for _ in range(2):
@@ -88,13 +88,13 @@ def test_a_top_of_another_shape_than_promised_is_refused(made: Callable[..., Net
         (Many, "reshape returned 2 shape(s), expected 1, one for each top"),
     ],
 )
-def test_a_class_that_promises_nothing_is_refused(made: Callable[..., Net], cls: type[Layer], message: str) -> None:
+def test_a_class_without_top_shapes_is_refused(made: Callable[..., Net], cls: type[Layer], message: str) -> None:
     with pytest.raises(SpecError) as found:
         made(cls)
     assert found.value.message == message
 
 
-def test_a_class_that_computes_nothing_is_refused(made: Callable[..., Net]) -> None:
+def test_a_class_without_forward_is_refused(made: Callable[..., Net]) -> None:
     net = made(Idle)
     for gradients in (False, True):
         with torch.set_grad_enabled(gradients), pytest.raises(SpecError, match="Idle does not define forward"):

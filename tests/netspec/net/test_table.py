@@ -49,7 +49,7 @@ def test_a_table_fits_a_width(net_of: Callable[..., Net]) -> None:
         assert {word.strip(",") for word in shown.partition(" columns: ")[2].split()} == missing
 
 
-def test_long_names_lose_their_middle_in_a_narrow_table(net_of: Callable[..., Net]) -> None:
+def test_long_names_are_shortened_in_the_middle_in_a_narrow_table(net_of: Callable[..., Net]) -> None:
     net = net_of(NET.replace("left", "inception_5b_" + 30 * "x" + "_reduce"))
     lines = table(net.plan, list(net.layers), 80).splitlines()
     assert max(map(len, lines)) <= 80

@@ -32,7 +32,7 @@ def in_threads(run: Callable[[int], None]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gradients", [False, True])
-def test_threads_that_share_a_net_get_their_own_numbers(net_of: Callable[..., Net], gradients: bool) -> None:
+def test_threads_that_share_a_net_get_their_own_results(net_of: Callable[..., Net], gradients: bool) -> None:
     net = net_of(TEXT)
     net.keep = "conv"
     with torch.no_grad():
@@ -47,7 +47,7 @@ def test_threads_that_share_a_net_get_their_own_numbers(net_of: Callable[..., Ne
     in_threads(run)
 
 
-def test_threads_that_share_a_net_of_pycaffe_get_their_own_numbers(tmp_path) -> None:
+def test_threads_that_share_a_pycaffe_net_get_their_own_results(tmp_path) -> None:
     (tmp_path / "net.prototxt").write_text(TEXT)
     net = caffe.Net(str(tmp_path / "net.prototxt"), caffe.TEST)
     images = [inputs(3 * k + 1) for k in range(COUNT)]

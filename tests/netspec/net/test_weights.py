@@ -64,7 +64,7 @@ def golden_net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_weights_of_caffes_are_written_again_byte_for_byte(case: str, golden_net, tmp_path: Path):
+def test_rewriting_caffes_weights_gives_identical_bytes(case: str, golden_net, tmp_path: Path):
     """Layer list, splits, phases, parameters, shapes, and shared blobs repeated by each sharer are Caffe's."""
     net = golden_net(f"train/{case}")
     load_weights(net, GOLDEN / "train" / case / "init.caffemodel")
@@ -74,7 +74,7 @@ def test_weights_of_caffes_are_written_again_byte_for_byte(case: str, golden_net
 
 
 @pytest.mark.parametrize(("name", "ending", "warned"), [("a/b", ".h5", 1), ("a/b", "", 0), ("a", ".h5", 0)])
-def test_hdf5_weights_that_caffe_would_not_load_are_warned_of(
+def test_a_warning_for_hdf5_weights_that_caffe_cannot_load(
     name: str, ending: str, warned: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     net = net_of(
@@ -108,7 +108,7 @@ def test_the_hdf5_form_has_caffes_structure(golden_net, tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", ["w.caffemodel", "w.caffemodel.h5"])
-def test_what_is_written_is_read(name: str, tmp_path: Path):
+def test_written_files_can_be_read(name: str, tmp_path: Path):
     net = net_of(TOWERS)
     fill(net)
     save_weights(net, tmp_path / name)
@@ -130,7 +130,7 @@ def test_the_file_lists_the_layers_as_they_run():
     assert not any(len(blob.diff) for layer in proto.layer for blob in layer.blobs)
 
 
-def test_gradients_are_written_where_asked_for(tmp_path: Path):
+def test_gradients_are_written_on_request(tmp_path: Path):
     net = net_of(TOWERS)
     fill(net)
     assert list(net_to_proto(net, diff=True).layer[3].blobs[1].diff) == [0.5] * 4
@@ -144,7 +144,7 @@ def test_gradients_are_written_where_asked_for(tmp_path: Path):
         assert diff[()].tolist() == [[0.5] * 3] * 4
 
 
-def test_a_sharer_of_another_shape_is_written_in_its_own(tmp_path: Path):
+def test_a_shared_blob_is_written_in_the_shape_of_each_layer(tmp_path: Path):
     net = net_of(
         """
         layer { name: "in" type: "Input" top: "a" top: "b"
@@ -171,7 +171,7 @@ def written(tmp_path: Path, proto: NetParameter) -> Path:
     return path
 
 
-def test_layers_that_only_the_file_has_are_ignored_and_named(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_layers_missing_in_the_net_are_ignored_and_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     proto = net_to_proto(net_of(TOWERS))
     proto.layer[1].name = "other"
     with caplog.at_level(logging.INFO, "netspec"):
@@ -180,7 +180,7 @@ def test_layers_that_only_the_file_has_are_ignored_and_named(tmp_path: Path, cap
     assert "Ignoring source layer ip" not in caplog.text
 
 
-def test_layers_that_only_the_net_has_stay(tmp_path: Path):
+def test_layers_missing_in_the_file_are_unchanged(tmp_path: Path):
     proto = net_to_proto(net_of(TOWERS))
     del proto.layer[1:]
     net = net_of(TOWERS)
@@ -273,7 +273,7 @@ def field(number: int, contents: bytes) -> bytes:
     "kind", ["current", "V1", "V0", "floats with tags", "two runs", "numbers before the shape", "the field of a place"]
 )
 @pytest.mark.parametrize("turned", [False, True])
-def test_numbers_are_read_where_they_lie_in_a_file(kind: str, turned: bool, tmp_path: Path) -> None:
+def test_numbers_are_read_directly_from_the_file(kind: str, turned: bool, tmp_path: Path) -> None:
     (tmp_path / "w.caffemodel").write_bytes(wide(kind))
     with net_beside_numbers(tmp_path / "w.caffemodel") as (message, file):
         left = file is not None and not message.layer[0].blobs[0].data
@@ -291,7 +291,7 @@ def test_numbers_are_read_where_they_lie_in_a_file(kind: str, turned: bool, tmp_
     assert [blob.ravel().tolist() for blob in stored.blobs] == [list(range(1200)), list(range(40))]
 
 
-def test_what_is_cut_or_has_too_few_numbers_is_refused(tmp_path: Path) -> None:
+def test_truncated_and_incomplete_files_are_refused(tmp_path: Path) -> None:
     whole = wide("current")
     net = net_of(WIDE)
     before = blobs_of(net)["ip"][0]
@@ -306,7 +306,7 @@ def test_what_is_cut_or_has_too_few_numbers_is_refused(tmp_path: Path) -> None:
     assert (blobs_of(net)["ip"][0] == before).all()
 
 
-def test_another_shape_is_refused_and_nothing_changes(tmp_path: Path):
+def test_a_wrong_shape_is_refused_and_changes_nothing(tmp_path: Path):
     proto = net_to_proto(net_of(TOWERS))
     proto.layer[3].blobs[1].shape.dim[:] = [2, 2]
     net = net_of(TOWERS)
@@ -322,14 +322,14 @@ def test_another_shape_is_refused_and_nothing_changes(tmp_path: Path):
     np.testing.assert_array_equal(blobs_of(net)["ip"][0], before)
 
 
-def test_another_number_of_blobs_is_refused(tmp_path: Path):
+def test_a_wrong_number_of_blobs_is_refused(tmp_path: Path):
     proto = net_to_proto(net_of(TOWERS))
     del proto.layer[1].blobs[1:]
     with pytest.raises(SpecError, match="incompatible number of blobs for layer 'ip': 1 in the file, 2 in the net"):
         load_weights(net_of(TOWERS), written(tmp_path, proto))
 
 
-def test_in_hdf5_only_the_blobs_of_an_owner_may_not_lack(tmp_path: Path):
+def test_hdf5_files_may_omit_shared_blobs_only(tmp_path: Path):
     path = tmp_path / "w.caffemodel.h5"
     net = net_of(TOWERS)
     save_weights(net, path)
@@ -350,14 +350,14 @@ def test_in_hdf5_only_the_blobs_of_an_owner_may_not_lack(tmp_path: Path):
         load_weights(net, path)
 
 
-def test_the_form_is_known_by_the_content_not_by_the_name(tmp_path: Path):
+def test_the_format_is_detected_from_the_content(tmp_path: Path):
     net = net_of(TOWERS)
     save_weights(net, tmp_path / "w.h5")
     shutil.move(tmp_path / "w.h5", tmp_path / "w.caffemodel")
     load_weights(net, tmp_path / "w.caffemodel")
 
 
-def test_files_that_are_no_weights(tmp_path: Path):
+def test_files_without_weights_are_refused(tmp_path: Path):
     net = net_of(TOWERS)
     with pytest.raises(SpecError, match=r"nowhere\.caffemodel: cannot be read: No such file"):
         load_weights(net, tmp_path / "nowhere.caffemodel")
@@ -374,7 +374,7 @@ def test_files_that_are_no_weights(tmp_path: Path):
         load_weights(net, written(tmp_path, torn))
 
 
-def test_a_folder_that_is_not_there(tmp_path: Path):
+def test_a_missing_folder_is_reported(tmp_path: Path):
     with pytest.raises(SpecError, match=r"gone/w\.caffemodel: cannot be written: No such file or directory"):
         save_weights(net_of(TOWERS), tmp_path / "gone" / "w.caffemodel")
     with pytest.raises(SpecError, match=r"gone/w\.h5: cannot be written: No such file or directory$"):
@@ -393,7 +393,7 @@ def holding(tmp_path: Path, *layers: str, name: str = "w.caffemodel") -> Path:
 
 
 @pytest.mark.parametrize("ending", ["", ".h5"])
-def test_one_warning_names_the_layers_that_the_weights_lack(tmp_path: Path, warnings, ending: str):
+def test_one_warning_names_all_layers_without_weights(tmp_path: Path, warnings, ending: str):
     path = holding(tmp_path, "one")
     if ending:
         save_weights(net_of(TWO), path)
@@ -412,7 +412,7 @@ def test_one_warning_names_the_layers_that_the_weights_lack(tmp_path: Path, warn
         load_weights(net, path, strict=True)
 
 
-def test_a_warning_where_nothing_fits_and_an_error_where_something_must(tmp_path: Path, warnings):
+def test_weights_that_fit_no_layer_are_a_warning_or_an_error(tmp_path: Path, warnings):
     path = holding(tmp_path, "in")
     load_weights(net_of(TWO), path)
     (line,) = warnings()
@@ -422,20 +422,20 @@ def test_a_warning_where_nothing_fits_and_an_error_where_something_must(tmp_path
     load_weights(net_of(TWO), holding(tmp_path, "two"), some=True)
 
 
-def test_several_files_together_may_have_every_layer(tmp_path: Path, warnings):
+def test_several_files_can_together_have_all_layers(tmp_path: Path, warnings):
     paths = [holding(tmp_path, "one", name="1.caffemodel"), holding(tmp_path, "two", name="2.caffemodel")]
     load_weights(net_of(TWO), paths, strict=True)
     assert warnings() == []
 
 
-def test_a_layer_that_shares_the_blobs_of_a_loaded_one_is_not_missed(tmp_path: Path, warnings):
+def test_a_layer_that_shares_loaded_blobs_is_not_missing(tmp_path: Path, warnings):
     proto = net_to_proto(net_of(TOWERS))
     del proto.layer[3:]  # "ip/p" and what follows
     load_weights(net_of(TOWERS), written(tmp_path, proto), strict=True)
     assert warnings() == []
 
 
-def test_layers_without_blobs_and_weights_in_the_prototxt_are_not_missed(tmp_path: Path, warnings):
+def test_layers_without_blobs_or_with_weights_in_the_prototxt_are_not_missing(tmp_path: Path, warnings):
     text = TWO.replace('name: "two"', 'name: "two" blobs { shape { dim: 4 dim: 4 } %s } blobs { shape { dim: 4 } %s }')
     text %= ("data: [" + ", ".join("1" * 16) + "]", "data: [1, 2, 3, 4]")
     net = net_of(text + 'layer { name: "relu" type: "ReLU" bottom: "y" top: "y" }')
@@ -444,7 +444,7 @@ def test_layers_without_blobs_and_weights_in_the_prototxt_are_not_missed(tmp_pat
     assert blobs_of(net)["two"][1].tolist() == [1, 2, 3, 4]
 
 
-def test_load_net_takes_several_files_of_weights(tmp_path: Path) -> None:
+def test_load_net_accepts_several_weights_files(tmp_path: Path) -> None:
     (tmp_path / "net.prototxt").write_text(TOWERS)
     files = [tmp_path / f"{seed}.caffemodel" for seed in (2, 3)]
     for seed, file in zip((2, 3), files, strict=True):
@@ -462,7 +462,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("case", SHAPES)
-def test_equal_weights_make_equal_bytes(case: str, tmp_path: Path) -> None:
+def test_equal_weights_give_equal_bytes(case: str, tmp_path: Path) -> None:
     """Caffe notes a rate of 0 for BatchNorm's blobs, and no shape for blobs of no axes."""
     folder = GOLDEN / "caffemodel" / case
     param, source = parse_net(folder / "net.prototxt")
@@ -473,7 +473,7 @@ def test_equal_weights_make_equal_bytes(case: str, tmp_path: Path) -> None:
     assert (tmp_path / "ours.caffemodel").read_bytes() == (folder / "caffe.caffemodel").read_bytes()
 
 
-def test_weights_of_another_net_are_called_so(tmp_path: Path):
+def test_weights_of_another_net_are_reported(tmp_path: Path):
     text = """name: "NAME"
         layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 } } }
         layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip" inner_product_param { num_output: SIZE } }"""

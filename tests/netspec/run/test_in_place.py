@@ -45,7 +45,7 @@ def batch_norm_gradient(inner: np.ndarray, top: np.ndarray, diff: np.ndarray) ->
     return (diff - diff.mean(0) - top * (diff * top).mean(0)) / deviation
 
 
-def test_relu_before_batch_norm_passes_what_is_above_the_mean() -> None:
+def test_relu_before_batch_norm_passes_gradients_of_values_above_the_mean() -> None:
     x, y, diff, gradient = run(chain('type: "ReLU"', 'type: "BatchNorm"'))
     expected = batch_norm_gradient(x.clip(0), y, diff) * (y > 0)
     np.testing.assert_allclose(gradient, expected, rtol=1e-6, atol=1e-9)
@@ -61,7 +61,7 @@ def test_sigmoid_before_dropout_reads_the_dropped_and_scaled_values() -> None:
     np.testing.assert_allclose(gradient, diff * kept / 0.75 * y * (1 - y), rtol=1e-6)
 
 
-def test_relu_before_dropout_is_as_if_memory_were_not_shared() -> None:
+def test_relu_before_dropout_has_the_gradient_of_unshared_memory() -> None:
     x, y, diff, gradient = run(chain('type: "ReLU"', 'type: "Dropout"'))
     np.testing.assert_allclose(gradient, diff * 2 * (y > 0))
     assert not (y[x <= 0]).any()
@@ -78,7 +78,7 @@ def test_relu_before_dropout_is_as_if_memory_were_not_shared() -> None:
         ('type: "BNLL"', lambda x, y: sigmoid(y)),
     ],
 )
-def test_layer_reads_what_a_negative_scale_left(layer: str, derivative: Callable[..., np.ndarray]) -> None:
+def test_a_layer_reads_the_result_of_a_negative_scale(layer: str, derivative: Callable[..., np.ndarray]) -> None:
     net = chain(layer, 'type: "Scale" scale_param { filler { value: -3 } }')
     x, y, diff, gradient = run(net)
     np.testing.assert_allclose(gradient, -3 * diff * derivative(x, y), rtol=1e-6)
@@ -98,7 +98,7 @@ def test_a_fold_loses_the_bottoms_sign(layer: str, derivative: Callable[..., np.
 
 
 @pytest.mark.parametrize("layer", ['type: "ReLU"', 'type: "ELU"', 'type: "Sigmoid"', 'type: "TanH"', 'type: "Exp"'])
-def test_the_last_layer_of_a_chain_is_left_to_torch(layer: str) -> None:
+def test_the_last_layer_of_a_chain_has_torchs_gradient(layer: str) -> None:
     y = chain('type: "BatchNorm"', layer)(x=torch.ones(SHAPE, requires_grad=True))["y"]
     assert y.grad_fn is not None
     assert "Overwritten" not in y.grad_fn.name()

@@ -43,7 +43,7 @@ def passed(net: Net, data: torch.Tensor) -> list[torch.Tensor]:
         NET.replace('"Scale" bottom: "c" top: "c"', '"Scale" bottom: "c" top: "c" propagate_down: false'),
     ],
 )
-def test_together_they_compute_what_each_computes(net_of, text: str) -> None:
+def test_joined_layers_compute_the_same_as_separate_layers(net_of, text: str) -> None:
     data = torch.randn(4, 3, 40, 40, generator=torch.Generator().manual_seed(1))
     together, alone = net_of(text, phase=0, exact="none"), net_of(text, phase=0, exact="none")
     alone.eager._runs_alone = [True] * len(alone.layers)
@@ -62,7 +62,7 @@ def test_together_they_compute_what_each_computes(net_of, text: str) -> None:
         (NET, (), True, ["scale", "relu"]),
     ],
 )
-def test_they_run_together_unless_somebody_looks(net_of, text: str, keep, hooked: bool, expected: list[str]) -> None:
+def test_layers_are_joined_unless_they_have_hooks(net_of, text: str, keep, hooked: bool, expected: list[str]) -> None:
     net = net_of(text, phase=0)
     net.keep = keep
     if hooked:

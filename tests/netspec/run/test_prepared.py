@@ -85,7 +85,7 @@ def test_norms_fold_into_the_convolution_and_the_activation_fuses(net_of: Callab
     assert program.kinds == ["packed"]
 
 
-def test_what_only_hands_on_is_not_run_and_sums_are_made_in_place(net_of: Callable[..., Net]) -> None:
+def test_identity_layers_are_skipped_and_sums_are_computed_in_place(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED))
     assert_same(quickly(net, data=images()), slowly(net, data=images()))
     steps = last_line(net).schedule.steps
@@ -94,7 +94,7 @@ def test_what_only_hands_on_is_not_run_and_sums_are_made_in_place(net_of: Callab
 
 
 @pytest.mark.parametrize("how", ["num_output: 12", "num_output: 8 group: 8", "num_output: 8 group: 8 dilation: 2"])
-def test_deconvolutions_are_laid_out_too(how: str, net_of: Callable[..., Net]) -> None:
+def test_weights_of_deconvolutions_are_packed(how: str, net_of: Callable[..., Net]) -> None:
     layer = f'type: "Deconvolution" convolution_param {{ kernel_size: 4 stride: 2 pad: 1 {how} {FILLERS} }}'
     text = INPUT + f'layer {{ name: "conv" bottom: "data" top: "conv" {layer} }}' + NORM
     net = trained(net_of(text.replace('type: "ReLU"', 'type: "ReLU" relu_param { negative_slope: 0.1 }')))
@@ -104,14 +104,14 @@ def test_deconvolutions_are_laid_out_too(how: str, net_of: Callable[..., Net]) -
 
 
 @pytest.mark.parametrize("passes", [(), *((name,) for name in PASSES), PASSES], ids="-".join)
-def test_each_pass_can_be_switched(passes: tuple[str, ...], net_of: Callable[..., Net]) -> None:
+def test_each_pass_can_be_switched_off(passes: tuple[str, ...], net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED, passes=passes))
     assert_same(quickly(net, data=images()), slowly(net, data=images()))
     assert (net.prepared is None) == (not passes)
 
 
 @pytest.mark.parametrize("keep", ["all", ["conv"], ["bn", "left"]], ids=str)
-def test_blobs_that_are_asked_for_are_there(keep: str | list[str], net_of: Callable[..., Net]) -> None:
+def test_requested_blobs_are_kept(keep: str | list[str], net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED))
     net.keep = keep
     slowly(net, data=images())
@@ -172,7 +172,7 @@ def load_other_weights(net: Net) -> None:
 @pytest.mark.parametrize(
     "write", [write_in_place, write_to_data, write_by_numpy, give_other_data, replace_the_parameter, load_other_weights]
 )
-def test_what_is_written_to_parameters_counts_in_the_next_run(
+def test_changed_parameters_are_used_in_the_next_run(
     write: Callable[[Net], None], net_of: Callable[..., Net], tmp_path: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(str(tmp_path))
@@ -188,7 +188,7 @@ def test_what_is_written_to_parameters_counts_in_the_next_run(
         assert last_line(net).kinds == ["packed"]
 
 
-def test_memory_that_somebody_holds_may_be_written_to_at_any_time(net_of: Callable[..., Net]) -> None:
+def test_writes_through_an_alias_are_noticed(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK))
     quickly(net, data=images())
     held = net.params["conv"][0].detach().numpy()[1:]
@@ -211,7 +211,7 @@ def test_shapes_may_change_from_run_to_run(net_of: Callable[..., Net]) -> None:
 
 
 @pytest.mark.parametrize("exact", ["none", "small"])
-def test_what_was_prepared_for_a_shape_is_there_when_it_comes_again(exact: str, net_of: Callable[..., Net]) -> None:
+def test_programs_are_kept_for_earlier_shapes(exact: str, net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED, exact=exact))
     sizes = (5, 40, 7)
     for size in sizes:
@@ -224,7 +224,7 @@ def test_what_was_prepared_for_a_shape_is_there_when_it_comes_again(exact: str, 
     assert "as is" not in {kind for program in before for kind in program.kinds}
 
 
-def test_programs_of_a_net_are_bounded(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_programs_is_limited(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(programs, "PROGRAMS", 2)
     net = trained(net_of(BLOCK))
     for size in (7, 8, 9, 7):
@@ -234,7 +234,7 @@ def test_programs_of_a_net_are_bounded(net_of: Callable[..., Net], monkeypatch: 
 
 
 @pytest.mark.parametrize(("runs", "fewest", "most"), [(programs.RUNS, 2, 16), (0, 1, 1)])
-def test_what_programs_keep_is_bounded_by_what_runs_need(
+def test_the_memory_of_programs_is_limited(
     runs: int, fewest: int, most: int, net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(programs, "RUNS", runs)
@@ -251,7 +251,7 @@ def test_what_programs_keep_is_bounded_by_what_runs_need(
     assert_same(quickly(net, data=images(1, 8, 8, 9)), slowly(net, data=images(1, 8, 8, 9)))
 
 
-def test_exact_programs_share_copies_of_blobs_and_count_what_they_keep(net_of: Callable[..., Net]) -> None:
+def test_exact_programs_share_copies_of_blobs_and_count_their_memory(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK, exact="all"))
     assert net.prepared is not None
     for size in range(8, 40):
@@ -265,7 +265,7 @@ def test_exact_programs_share_copies_of_blobs_and_count_what_they_keep(net_of: C
 
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_runs_of_many_sizes_take_little_more_memory_than_one(tmp_path: Path) -> None:
+def test_runs_of_many_sizes_need_little_more_memory_than_one(tmp_path: Path) -> None:
     """Six small convolutions, 24 batch sizes: the process grows by a few runs of the largest."""
     text = 'layer { name: "c0" type: "Input" top: "c0" input_param { shape { dim: 1 dim: 32 dim: 40 dim: 40 } } }'
     for k in range(6):
@@ -305,7 +305,7 @@ def test_inputs_and_earlier_outputs_are_never_overwritten(net_of: Callable[..., 
 
 @pytest.mark.parametrize("keep", [(), "conv", "all"])
 @pytest.mark.parametrize("exact", ["small", "all"])
-def test_products_lend_memory_only_where_nobody_looks_afterwards(
+def test_products_reuse_memory_only_for_values_inside_the_net(
     exact: str, keep: str | tuple[str, ...], net_of: Callable[..., Net]
 ) -> None:
     net = net_of(NETS["shared_memory"], exact=exact)
@@ -319,14 +319,14 @@ def test_products_lend_memory_only_where_nobody_looks_afterwards(
             assert torch.equal({**kept, **outputs}[name], blob), name
 
 
-def test_what_follows_on_a_count_of_items_is_run_by_its_values(net_of: Callable[..., Net]) -> None:
+def test_layers_after_a_top_of_unknown_shape_run_by_value(net_of: Callable[..., Net]) -> None:
     net, x = trained(net_of(NETS["count_of_items"])), images(4, 8, 40, 40)
     for which in ([1, 0, 1, 1], [0, 1, 0, 0], [1, 1, 1, 1]):
         inputs = {"data": x, "which": torch.tensor(which, dtype=torch.float32)}
         assert_same(quickly(net, **inputs), slowly(net, **inputs))
 
 
-def test_not_a_number_never_wins_a_maximum(net_of: Callable[..., Net]) -> None:
+def test_nan_is_never_the_maximum(net_of: Callable[..., Net]) -> None:
     pool = (
         'layer { name: "pool" type: "Pooling" bottom: "data" top: "pool" pooling_param { kernel_size: 2 stride: 2 } }'
     )
@@ -335,7 +335,7 @@ def test_not_a_number_never_wins_a_maximum(net_of: Callable[..., Net]) -> None:
     assert torch.equal(quickly(net, data=x)["pool"], slowly(net, data=x)["pool"])
 
 
-def test_copies_other_precisions_and_threads(net_of: Callable[..., Net]) -> None:
+def test_copies_precisions_and_threads(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED))
     expected = quickly(net, data=images())
     other = copy.deepcopy(net)
@@ -350,7 +350,7 @@ def test_copies_other_precisions_and_threads(net_of: Callable[..., Net]) -> None
     assert_same(quickly(net, data=images().double()), slowly(net, data=images().double()))
 
 
-def test_inference_mode_and_no_grad_may_take_turns(net_of: Callable[..., Net]) -> None:
+def test_inference_mode_and_no_grad_can_alternate(net_of: Callable[..., Net]) -> None:
     lrn = 'layer { name: "lrn" type: "LRN" bottom: "scale" top: "lrn" }'
     net = trained(net_of(BLOCK + lrn))
     expected = slowly(net, data=images())
@@ -359,7 +359,7 @@ def test_inference_mode_and_no_grad_may_take_turns(net_of: Callable[..., Net]) -
             assert_same(net(data=images()), expected)
 
 
-def test_layers_that_share_weights_each_lay_them_out_for_themselves(net_of: Callable[..., Net]) -> None:
+def test_layers_that_share_weights_pack_them_separately(net_of: Callable[..., Net]) -> None:
     text = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 8 dim: 300 } } }'
     for name, bottom, transposed in (("in", "data", "false"), ("out", "in", "true"), ("again", "out", "false")):
         text += f"""
@@ -372,7 +372,7 @@ layer {{ name: "{name}" type: "InnerProduct" bottom: "{bottom}" top: "{name}" pa
     assert last_line(net).kinds == ["packed"] * 3
 
 
-def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> None:
+def test_a_subclass_with_its_own_forward_inherits_no_kernels() -> None:
     class Halved(Convolution):
         @override
         def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -399,7 +399,7 @@ def test_a_layer_with_another_forward_pass_inherits_nothing_of_the_first() -> No
 
 
 @pytest.mark.parametrize(("low", "high", "steps"), [(0, 6, 1), (-1, 0.5, 1), (2, 1, 2)])
-def test_clip_is_done_by_the_layer_before_it(net_of, low: float, high: float, steps: int) -> None:
+def test_clip_is_fused_into_the_layer_before_it(net_of, low: float, high: float, steps: int) -> None:
     text = f"""
 layer {{ name: "data" type: "Input" top: "data" input_param {{ shape {{ dim: 2 dim: 8 dim: 20 dim: 20 }} }} }}
 layer {{ name: "c" type: "Convolution" bottom: "data" top: "c"

@@ -43,9 +43,7 @@ def gradient(net: Net) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("layer", "passes"), CASES, ids=[*IGNORE_IT, *HEED_IT])
-def test_a_gradient_passes_where_caffes_layer_does_not_ask(
-    layer: str, passes: bool, net_of: Callable[..., Net]
-) -> None:
+def test_gradients_pass_layers_that_ignore_propagate_down(layer: str, passes: bool, net_of: Callable[..., Net]) -> None:
     text = TWO_READERS.format(layer=layer)
     found = gradient(net_of(text, TRAIN))
     everywhere = gradient(
@@ -55,7 +53,7 @@ def test_a_gradient_passes_where_caffes_layer_does_not_ask(
     assert not torch.equal(everywhere, torch.ones_like(found))
 
 
-def test_nothing_passes_to_a_layer_that_caffe_skips(net_of: Callable[..., Net]) -> None:
+def test_no_gradient_reaches_a_layer_that_caffe_skips(net_of: Callable[..., Net]) -> None:
     """The only reader of its top has ``propagate_down: false``: Caffe does not run its backward pass."""
     text = TWO_READERS.format(layer=IGNORE_IT["Flatten"]).replace(
         'bottom: "low" top: "other"', 'bottom: "cont" top: "other"'

@@ -30,7 +30,7 @@ def is_prepared(solver: Solver) -> bool:
 @pytest.mark.parametrize("more", ["momentum: 0.9", 'type: "Adam" iter_size: 2', 'type: "AdaGrad" clip_gradients: 0.1'])
 @pytest.mark.parametrize("exact", ["none", "small", "all"])
 @pytest.mark.parametrize("net", NETS)
-def test_trains_as_autograd_does(tmp_path: Path, net: str, exact: str, more: str) -> None:
+def test_training_kernels_equal_autograd(tmp_path: Path, net: str, exact: str, more: str) -> None:
     results = []
     for prepares in (False, True):
         solver = made(tmp_path, NETS[net], exact, more)
@@ -61,7 +61,7 @@ def test_trains_as_autograd_does(tmp_path: Path, net: str, exact: str, more: str
             assert a is None or torch.equal(a, b)
 
 
-def test_who_looks_at_a_pass_sees_autograds(tmp_path: Path) -> None:
+def test_hooks_get_the_values_of_autograd(tmp_path: Path) -> None:
     """Hooks, blobs to keep, and debug_info; afterward the kernels go on."""
     plain, watched = made(tmp_path, NETS["typical"]), made(tmp_path, NETS["typical"])
     seen = []
@@ -80,7 +80,7 @@ def test_who_looks_at_a_pass_sees_autograds(tmp_path: Path) -> None:
         assert torch.equal(mine.parameter, theirs.parameter)
 
 
-def test_follows_what_is_done_to_the_weights(tmp_path: Path) -> None:
+def test_changes_of_the_weights_are_noticed(tmp_path: Path) -> None:
     """Values that are written, memory that is replaced, gradients that are dropped, blobs that are frozen."""
     results = []
     for prepares in (False, True):
@@ -102,7 +102,7 @@ def test_follows_what_is_done_to_the_weights(tmp_path: Path) -> None:
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
-def test_says_why_it_is_not_prepared(tmp_path: Path) -> None:
+def test_the_reason_for_not_being_prepared_is_given(tmp_path: Path) -> None:
     rows = "".join(
         f'layer {{ name: "b{i}" type: "Bias" bottom: "x" top: "x" param {{ name: "w" }} }}\n' for i in (0, 1)
     )

@@ -44,7 +44,7 @@ def test_losses_rates_and_tests_are_written(run: Run, solver: Callable[[int], st
     assert [step for step, _ in found["test/loss"]] == [3, 6]
 
 
-def test_a_training_that_goes_on_hides_what_it_repeats(run: Run, solver: Callable[[int], str]) -> None:
+def test_a_resumed_training_replaces_repeated_iterations(run: Run, solver: Callable[[int], str]) -> None:
     assert run("train", solver(5), *INIT, "--tensorboard", "board").status == 0
     snapshot = ("--snapshot", "sgd_step/ref_iter_3.solverstate")
     assert run("train", solver(7), *snapshot, "--tensorboard", "board").status == 0

@@ -30,7 +30,7 @@ def start(run: str, meta: dict) -> Solver:
 
 
 @pytest.mark.parametrize("run", RUNS)
-def test_follows_caffe(run: str, folder: Path, caffes_bits: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_follows_caffe(run: str, folder: Path, caffes_bits: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """The outputs of 120 iterations, the weights after them and what the test nets then put out, to the last bit.
 
     On other CPUs than Caffe's to a twentieth.
@@ -52,7 +52,7 @@ def test_follows_caffe(run: str, folder: Path, caffes_bits: bool, monkeypatch: p
 
 @pytest.mark.slow
 @pytest.mark.parametrize("run", RUNS)
-def test_begins_as_caffe_does_on_every_cpu(run: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_starts_like_caffe_on_every_cpu(run: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The weights after the first iteration, to 1e-4 of what was subtracted from them."""
     monkeypatch.chdir(folder)
     solver = start(run, json.loads(Path(f"examples/runs/{run}/meta.json").read_text()))

@@ -22,7 +22,7 @@ CASES = sorted(folder.name for folder in (GOLDEN / "train").iterdir())
 
 
 @pytest.mark.parametrize(("case", "exact"), [(case, promised(GOLDEN / "train" / case)[0]) for case in CASES])
-def test_follows_caffe(case: str, exact: str, work_in: Callable[..., Path], caffes_bits: bool) -> None:
+def test_training_follows_caffe(case: str, exact: str, work_in: Callable[..., Path], caffes_bits: bool) -> None:
     """Its losses, weights, history and test losses, to the last bit.
 
     On other CPUs than Caffe's to 1e-2; to a quarter where ties in max poolings decide, which fall as the CPU rounds.
@@ -52,7 +52,7 @@ def test_follows_caffe(case: str, exact: str, work_in: Callable[..., Path], caff
 
 @pytest.mark.parametrize("exact", ["small", "all"])
 @pytest.mark.parametrize("case", CASES)
-def test_begins_as_caffe_does_on_every_cpu(case: str, exact: str, work_in: Callable[..., Path]) -> None:
+def test_training_starts_like_caffe_on_every_cpu(case: str, exact: str, work_in: Callable[..., Path]) -> None:
     """The weights after five iterations, to 1e-4.
 
     ``after_5.npz`` is of this project, from runs whose every loss and last weight were Caffe's, bit for bit.
@@ -67,7 +67,7 @@ def test_begins_as_caffe_does_on_every_cpu(case: str, exact: str, work_in: Calla
 
 @pytest.mark.parametrize("case", STEPS)
 @pytest.mark.parametrize("choice", CHOICES)
-def test_each_step_is_caffes(
+def test_each_step_equals_caffes(
     case: str, choice: str, work_in: Callable[..., Path], caffes_bits: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Outputs and weights after each of three iterations to 1e-3; ``all`` to the last bit on a CPU as Caffe's."""
@@ -87,7 +87,9 @@ def test_each_step_is_caffes(
     assert_arrays(found, golden, 0 if caffes_bits and choice == "all" else 1e-3)
 
 
-def test_the_rates_of_sigmoid_have_caffes_bits(work_in: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_rates_of_sigmoid_are_bit_identical_to_caffes(
+    work_in: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The gradient of the bias is 0.6 in each iteration, whatever the CPU: its steps show the rate."""
     monkeypatch.chdir(work_in("steps/sigmoid"))
     param, _ = parse_solver(Path("solver.prototxt"))

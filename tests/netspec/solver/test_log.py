@@ -40,7 +40,7 @@ def test_the_speed_comes_from_the_clock_and_is_0_at_first(work_in: Callable[...,
     assert paces == ["0 iter/s, 0.5s/10 iters", "5 iter/s, 2s/10 iters"]
 
 
-def test_the_share_of_the_time_spent_waiting_for_data_is_there(
+def test_the_share_of_time_spent_waiting_for_data_is_logged(
     work_in: Callable[..., Path], lines: Callable[[], list[str]], monkeypatch: pytest.MonkeyPatch
 ):
     work_in("train/sgd_step")
@@ -53,7 +53,7 @@ def test_the_share_of_the_time_spent_waiting_for_data_is_there(
     assert re.findall(r"Waiting for data: (\S+) % of the time", "\n".join(lines())) == ["50.0", "2.5"]
 
 
-def test_clipping_and_multistep_say_so(work_in: Callable[..., Path], lines: Callable[[], list[str]]):
+def test_clipping_and_multistep_are_logged(work_in: Callable[..., Path], lines: Callable[[], list[str]]):
     work_in("train/sgd_step")
     Path("solver.prototxt").write_text(
         'net: "sgd_step/train_val.prototxt" base_lr: 0.05 lr_policy: "multistep" gamma: 0.5 stepvalue: 1 max_iter: 2\n'
@@ -101,12 +101,12 @@ def test_a_tally_is_the_mean_of_each_element_over_the_batches():
     assert tally.scores == {"loss": [1.5], "acc": [2.0, 2.0]}
 
 
-def test_scores_are_printed_with_their_part_of_the_loss():
+def test_scores_are_printed_with_their_contribution_to_the_loss():
     lines = score_lines({"acc": [0.5, 1 / 3], "loss": [2.0]}, {"acc": 0.0, "loss": 0.3})
     assert list(lines) == ["acc = 0.5", "acc = 0.333333", "loss = 2 (* 0.3 = 0.6 loss)"]
 
 
-def test_a_loss_without_a_top_gets_caffes(tmp_path: Path, lines: Callable[[], list[str]]):
+def test_a_loss_without_a_top_gets_caffes_name(tmp_path: Path, lines: Callable[[], list[str]]):
     path = tmp_path / "net.prototxt"
     path.write_text(
         'input: "a" input_shape { dim: 2 } input: "b" input_shape { dim: 2 }\n'

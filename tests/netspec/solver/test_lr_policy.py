@@ -98,13 +98,13 @@ def test_the_rate_is_rounded_to_float32():
     assert learning_rate(param, 0, 0) != 0.1
 
 
-def test_a_rate_that_grows_beyond_all_bounds_is_refused():
+def test_an_infinite_rate_is_refused():
     param = SolverParameter(lr_policy="exp", base_lr=1, gamma=10)
     with pytest.raises(SpecError, match='lr_policy "exp" gives the learning rate inf at iteration 500'):
         learning_rate(param, 500, 0)
 
 
-def test_poly_has_no_rate_beyond_max_iter():
+def test_poly_is_undefined_after_max_iter():
     param = SolverParameter(lr_policy="poly", base_lr=1, power=0.5, max_iter=10)
     with pytest.raises(SpecError, match=r"nan at iteration 11 \(max_iter 10\)"):
         learning_rate(param, 11, 0)
@@ -124,10 +124,10 @@ def test_poly_has_no_rate_beyond_max_iter():
         ({"lr_policy": "multifixed"}, "needs as many stagelr as stageiter, found 0 and 0"),
     ],
 )
-def test_what_is_refused_before_the_first_iteration(fields: dict, message: str):
+def test_invalid_policies_are_refused_before_the_first_iteration(fields: dict, message: str):
     (fault,) = policy_faults(SolverParameter(**fields), NODE)
     assert re.search(message, str(fault))
 
 
-def test_a_gamma_of_0_is_legal():
+def test_a_gamma_of_0_is_accepted():
     assert not list(policy_faults(SolverParameter(lr_policy="step", gamma=0, stepsize=1), NODE))

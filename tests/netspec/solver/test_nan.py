@@ -70,7 +70,7 @@ def test_the_first_bad_parameter_is_named(write: Callable[..., None]) -> None:
 
 
 @pytest.mark.slow
-def test_a_training_goes_on_where_that_is_wanted(
+def test_a_training_with_nan_continues_on_request(
     write: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     write(0.1, LOG, "log")
@@ -80,7 +80,7 @@ def test_a_training_goes_on_where_that_is_wanted(
     assert "Optimization Done." in said
 
 
-def test_a_mean_that_is_no_number(tmp_path: Path) -> None:
+def test_a_mean_with_nan_is_refused(tmp_path: Path) -> None:
     mean = np.zeros((3, 2, 2), np.float32)
     mean[1, 1, 1] = np.nan
     write_mean(str(tmp_path / "m.binaryproto"), mean)

@@ -38,7 +38,7 @@ def test_without_test_iter_nothing_is_tested():
     assert named(nets('net: "a.prototxt"')) == [("train net", "a", "net file: a.prototxt")]
 
 
-def test_test_nets_come_in_caffes_order_the_general_net_last():
+def test_test_nets_have_caffes_order():
     found = nets(
         'net_param { name: "general" } test_net: "b.prototxt" test_net: "c.prototxt" test_net_param { name: "within" }'
         "test_iter: 1 test_iter: 2 test_iter: 3 test_iter: 4 test_iter: 5 test_interval: 1"
@@ -53,7 +53,7 @@ def test_test_nets_come_in_caffes_order_the_general_net_last():
     ]
 
 
-def test_a_net_for_training_alone():
+def test_a_net_without_test_net():
     found = nets('train_net: "a.prototxt" test_net: "b.prototxt" test_iter: 1 test_interval: 1')
     assert named(found) == [
         ("train net", "a", "train_net file: a.prototxt"),
@@ -80,7 +80,7 @@ def test_the_command_lines_level_and_stages_reach_the_training_net_only():
     assert not param.HasField("train_state")
 
 
-def test_a_net_within_the_solver_keeps_its_places():
+def test_a_net_within_the_solver_keeps_its_locations():
     (train,) = nets('net_param {\n  layer { name: "x"\n    type: "ReLU" }\n}')
     assert str(train.source.at(0, "type")).startswith("s.prototxt:3:5")
 
@@ -89,12 +89,12 @@ REFUSED = read_cases("netspec/solver/cases/nets.txt")
 
 
 @pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
-def test_what_caffe_refuses(case: dict[str, str]):
+def test_settings_that_caffe_refuses_are_refused(case: dict[str, str]):
     with pytest.raises(SpecError, match=case["message"]):
         nets(case["solver"])
 
 
-def test_a_file_is_read_once_however_many_nets_it_holds(monkeypatch: pytest.MonkeyPatch):
+def test_a_file_of_several_nets_is_read_once(monkeypatch: pytest.MonkeyPatch):
     read: list[str] = []
 
     def noted(text: str, file: str, message: Message, *report: Any) -> Place:
@@ -106,7 +106,7 @@ def test_a_file_is_read_once_however_many_nets_it_holds(monkeypatch: pytest.Monk
     assert read == ["s.prototxt", "a.prototxt", "b.prototxt"]
 
 
-def test_every_fault_is_reported_if_all_are_collected():
+def test_all_errors_are_reported_if_collected():
     Path("broken.prototxt").write_text("layer {")
     text = """net: "gone.prototxt" train_net: "broken.prototxt"
 test_net: "broken.prototxt" test_net: "missing.prototxt"

@@ -32,7 +32,7 @@ def losses(case: str, **options: Any) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("precision", "share"), [(BF16, 0.1), (FP16, 0.02)])
 @pytest.mark.parametrize("case", ["sgd_step", "adam", "nesterov", "residual_bn_shared", "residual_bn_private"])
-def test_a_rounded_training_follows_caffe_from_afar(
+def test_a_training_in_half_precision_approximates_caffe(
     case: str, precision: str, share: float, work_in: Callable[..., Path]
 ) -> None:
     """The losses of the first 20 iterations, to a share of the largest; a training in float32 is nearer."""
@@ -51,7 +51,7 @@ def test_tf32_is_for_gpus(work_in: Callable[..., Path]) -> None:
 
 
 @pytest.mark.parametrize("precision", [FP32, TF32, BF16, FP16])
-def test_float32_on_gpus_is_without_tf32(precision: str) -> None:
+def test_float32_on_gpus_does_not_use_tf32(precision: str) -> None:
     libraries = torch.backends.cuda.matmul, torch.backends.cudnn
     before = [library.allow_tf32 for library in libraries]
     with computing(precision, torch.device("cpu")):
@@ -80,7 +80,7 @@ def test_a_cpu_without_bf16_is_reported(
     assert caplog.text.count("precision bf16: this CPU has no instructions for it, so it is slower than fp32") == said
 
 
-def test_the_loss_scale_is_halved_by_an_overflow_and_doubled_by_patience() -> None:
+def test_the_loss_scale_is_halved_after_an_overflow_and_later_doubled() -> None:
     scale = LossScale(FP16)
     assert float(scale.of(torch.tensor(3.0))) == 3 * FIRST_SCALE
     gradients = [torch.tensor([1.0, -2.0]), torch.tensor(4.0)]
@@ -103,7 +103,7 @@ def test_other_precisions_scale_nothing(precision: str) -> None:
     assert scale.factor == 1
 
 
-def test_an_iteration_that_overflows_is_counted_and_changes_nothing(work_in: Callable[..., Path]) -> None:
+def test_an_overflow_is_counted_as_an_iteration_without_update(work_in: Callable[..., Path]) -> None:
     work_in("train/sgd_step")
     solver = load_solver("sgd_step/solver.prototxt", weights="sgd_step/init.caffemodel", precision=FP16)
     before = [item.parameter.detach().clone() for item in solver.net.learnable]
@@ -119,7 +119,7 @@ def test_an_iteration_that_overflows_is_counted_and_changes_nothing(work_in: Cal
     solver.close()
 
 
-def test_gradients_that_overflow_whatever_the_scale_end_the_training(
+def test_gradients_that_always_overflow_end_the_training(
     work_in: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work_in("train/sgd_step")

@@ -126,7 +126,7 @@ def test_two_processes_follow_one_with_twice_the_batch() -> None:
     alone.close()
 
 
-def test_each_process_has_its_own_statistics_and_draws_and_a_training_goes_on_to_the_bit() -> None:
+def test_processes_have_their_own_statistics_and_resume_bit_identically() -> None:
     """As the replicas of one process, to the bit: also where batches of half the size are not one of the whole."""
     write(batch=8, iterations=20, middle=OWN, snapshot=10)
     train()
@@ -154,7 +154,7 @@ def test_each_process_has_its_own_statistics_and_draws_and_a_training_goes_on_to
 
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
-def test_a_killed_process_ends_the_training_and_the_last_snapshot_is_whole() -> None:
+def test_a_killed_process_ends_the_training_with_a_complete_snapshot() -> None:
     write(batch=2, iterations=10**7, after="false")
     settings = Path("solver.prototxt")
     settings.write_text(settings.read_text().replace("test_interval: 20", "test_interval: 10000000"))
@@ -181,7 +181,7 @@ def test_a_killed_process_ends_the_training_and_the_last_snapshot_is_whole() -> 
 
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
-def test_a_process_that_is_asked_to_end_does_not_wait_for_one_that_hangs() -> None:
+def test_a_process_that_must_end_does_not_wait_for_a_hanging_one() -> None:
     """Gloo can miss the death of a process: one that is stopped is as silent."""
     write(batch=2, iterations=10**7, after="false")
     started = start()
@@ -198,13 +198,13 @@ def test_a_process_that_is_asked_to_end_does_not_wait_for_one_that_hangs() -> No
         end_all(started)
 
 
-def test_a_fault_of_the_files_is_reported_once() -> None:
+def test_an_error_in_the_files_is_reported_once() -> None:
     write(batch=8, iterations=10)
     Path("net.prototxt").write_text(Path("net.prototxt").read_text().replace("Convolution", "Convolutoin", 1))
     reported = train(status=1)
     assert len([line for line in reported.splitlines() if line.startswith("net.prototxt:")]) == 1, reported
 
 
-def test_a_gpu_is_not_chosen_where_torchrun_chooses() -> None:
+def test_gpu_is_refused_under_torchrun() -> None:
     write(batch=8, iterations=10)
     assert "leave out --gpu" in train("--gpu", "0,1", status=1)

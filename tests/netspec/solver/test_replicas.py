@@ -16,7 +16,7 @@ from paths import GOLDEN
 CPU = torch.device("cpu")
 
 
-def test_ranks_share_the_records_between_them() -> None:
+def test_ranks_divide_the_records() -> None:
     alone = Cursor(10, 6)
     ranks = [Cursor(10, 3, draws=Draws(rank=rank, ranks=2)) for rank in (0, 1)]
     for iteration in range(5):
@@ -27,7 +27,7 @@ def test_ranks_share_the_records_between_them() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("devices", [2, 4])
-def test_devices_with_a_share_of_the_batch_train_as_one_with_all_of_it(
+def test_several_devices_train_like_one_with_the_whole_batch(
     devices: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rounding: float
 ) -> None:
     (tmp_path / "pairs").symlink_to(GOLDEN / "pairs")
@@ -69,7 +69,9 @@ layer { name: "relu" type: "ReLU" bottom: "large" top: "relu" }
         ("all", 2, ""),
     ],
 )
-def test_threads_that_change_bits(net_of: Callable[..., Net], exact: str, threads: int, said: str) -> None:
+def test_threads_that_change_results_are_reported(
+    net_of: Callable[..., Net], exact: str, threads: int, said: str
+) -> None:
     found = dependence(net_of(NET, exact=exact), threads)
     assert found.startswith(said)
     assert bool(found) == bool(said)

@@ -129,7 +129,7 @@ def assert_same(straight: Solver, resumed: Solver) -> None:
 
 
 @pytest.mark.parametrize("name", NETS)
-def test_to_the_bit(name: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_resuming_is_bit_identical(name: str, caplog: pytest.LogCaptureFixture) -> None:
     write(NETS[name])
     straight, resumed, log, log_after = straight_and_resumed(caplog)
     assert_same(straight, resumed)
@@ -140,7 +140,7 @@ def test_to_the_bit(name: str, caplog: pytest.LogCaptureFixture) -> None:
 
 @pytest.mark.parametrize("kind", RULES)
 @pytest.mark.parametrize("form", ["BINARYPROTO", "HDF5"])
-def test_every_solver_and_form(kind: str, form: str) -> None:
+def test_every_solver_and_format_resumes(kind: str, form: str) -> None:
     momentum = "momentum: 0.9" if RULES[kind].momentum else ""
     write(NETS["Dropout"], f'type: "{kind}" {momentum} iter_size: 2 snapshot_format: {form}')
     straight = load_solver("solver.prototxt")
@@ -169,7 +169,7 @@ def test_a_snapshot_during_a_test_resumes_before_that_test() -> None:
     assert_same(training, resumed)
 
 
-def test_the_state_is_caffes_byte_for_byte_and_the_rest_is_beside_it() -> None:
+def test_the_state_is_byte_identical_to_caffes_with_the_rest_in_another_file() -> None:
     write(NETS["crop and mirror"])
     solver = load_solver("solver.prototxt")
     solver.step(2)
@@ -180,7 +180,7 @@ def test_the_state_is_caffes_byte_for_byte_and_the_rest_is_beside_it() -> None:
     assert found["nets"][0] == {"0": {"iteration": 2}}
 
 
-def test_without_the_file_a_state_resumes_as_caffe_does(caplog: pytest.LogCaptureFixture) -> None:
+def test_without_the_extra_file_a_state_resumes_like_caffe(caplog: pytest.LogCaptureFixture) -> None:
     write(NETS["batches of 8 of 37"])
     solver = load_solver("solver.prototxt")
     solver.step(2)
@@ -192,7 +192,7 @@ def test_without_the_file_a_state_resumes_as_caffe_does(caplog: pytest.LogCaptur
     assert [layer.iteration for layer in resumed.net.layers if hasattr(layer, "iteration")] == [0]
 
 
-def test_another_random_seed_is_said(warnings: Callable[[], list[str]]) -> None:
+def test_a_changed_random_seed_is_reported(warnings: Callable[[], list[str]]) -> None:
     write(NETS["crop and mirror"], "random_seed: 3")
     solver = load_solver("solver.prototxt")
     _, state = solver.snapshot()
@@ -213,7 +213,7 @@ OTHERWISE = [
 
 
 @pytest.mark.parametrize(("changed", "options", "reported"), OTHERWISE, ids=[reported for *_, reported in OTHERWISE])
-def test_what_changes_the_numbers_is_said(
+def test_changes_that_affect_results_are_reported(
     changed: dict[str, str], options: Any, reported: str, warnings: Callable[[], list[str]]
 ) -> None:
     write(NETS["crop and mirror"], "iter_size: 2 random_seed: 3")
@@ -228,12 +228,12 @@ def test_what_changes_the_numbers_is_said(
     assert reported in said
 
 
-def test_a_state_of_when_trainings_could_be_compiled() -> None:
+def test_a_missing_compiled_setting_counts_as_false() -> None:
     assert changes({"solver": {"compiled": False}}, {"solver": {}}) == ""
     assert changes({"solver": {"compiled": True}}, {"solver": {}}) == "compiled is the default, was True"
 
 
-def test_another_number_of_records_is_said(warnings: Callable[[], list[str]]) -> None:
+def test_a_changed_number_of_records_is_reported(warnings: Callable[[], list[str]]) -> None:
     write(NETS["crop and mirror"], "random_seed: 3")
     _, state = load_solver("solver.prototxt").snapshot()
     with lmdb.open("db", lock=False, map_size=1 << 24) as env, env.begin(write=True) as transaction:
@@ -242,7 +242,7 @@ def test_another_number_of_records_is_said(warnings: Callable[[], list[str]]) ->
     assert 'train net, layer "data" number of records is 36, was 37' in warnings()[-1]
 
 
-def test_what_changes_no_number_is_not_said(
+def test_changes_without_effect_are_not_reported(
     warnings: Callable[[], list[str]], caplog: pytest.LogCaptureFixture
 ) -> None:
     write(NETS["crop and mirror"], "random_seed: 3")
@@ -264,7 +264,7 @@ def counted(module: str, code: str) -> None:
     write(CROP + COUNTED.replace("MODULE", module) + classify("c"), "random_seed: 3")
 
 
-def test_a_python_layer_goes_on_with_what_it_remembers(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_python_layer_resumes_with_its_state(caplog: pytest.LogCaptureFixture) -> None:
     counted("counter_with_hooks", COUNTER + HOOKS)
     straight = load_solver("solver.prototxt", allow_python=True)
     straight.step(3)
@@ -276,7 +276,7 @@ def test_a_python_layer_goes_on_with_what_it_remembers(caplog: pytest.LogCapture
     assert "are restored" not in caplog.text
 
 
-def test_what_a_python_layer_forgets_is_said(warnings: Callable[[], list[str]]) -> None:
+def test_lost_state_of_a_python_layer_is_reported(warnings: Callable[[], list[str]]) -> None:
     counted("counter_without", COUNTER)
     _, state = load_solver("solver.prototxt", allow_python=True).snapshot()
     load_solver("solver.prototxt", snapshot=state, allow_python=True)
@@ -284,7 +284,7 @@ def test_what_a_python_layer_forgets_is_said(warnings: Callable[[], list[str]]) 
     assert 'layer "c" (Python): only the blobs of the Python layer are restored' in said
 
 
-def test_a_python_layer_that_remembers_what_json_cannot_hold() -> None:
+def test_state_of_a_python_layer_must_fit_json() -> None:
     counted("counter_of_sets", COUNTER + HOOKS.replace("self.passes}", "{1, 2}}"))
     with pytest.raises(SpecError, match=r"Counter.running_state: returned what JSON cannot hold \(Object of type set"):
         load_solver("solver.prototxt", allow_python=True).snapshot()
@@ -316,14 +316,14 @@ def refused(state: Path, message: str) -> None:
         ({"history": [np.full((4, 300), np.nan, np.float32), np.zeros(4, np.float32)]}, "history blob 0 has a NaN"),
     ],
 )
-def test_a_state_that_no_training_was_in(state: Path, change: dict, message: str) -> None:
+def test_an_impossible_state_is_refused(state: Path, change: dict, message: str) -> None:
     whole = read_state(state)
     path_beside(state).unlink()
     write_state(state, State(**{**vars(whole), **change}))
     refused(state, message)
 
 
-def test_weights_that_are_cut_at_the_border_of_a_layer(state: Path) -> None:
+def test_weights_truncated_between_layers_are_refused(state: Path) -> None:
     """Protobuf reads them without a word; the file beside the state knows what was written."""
     weights = state.with_suffix(".caffemodel")
     data = weights.read_bytes()
@@ -332,7 +332,7 @@ def test_weights_that_are_cut_at_the_border_of_a_layer(state: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["BINARYPROTO", "HDF5"])
-def test_every_command_compares_weights_with_what_was_written(form: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_checks_the_hash_of_weights(form: str, capsys: pytest.CaptureFixture[str]) -> None:
     """One bit of a number: every reader would take it."""
     write(NETS["batches of 8 of 37"], f"snapshot_format: {form}")
     weights = Path(load_solver("solver.prototxt").snapshot()[0])
@@ -359,7 +359,7 @@ def test_every_command_compares_weights_with_what_was_written(form: str, capsys:
     assert f"{weights.name} was not checked against it" in capsys.readouterr().err
 
 
-def test_the_weights_of_another_net(state: Path) -> None:
+def test_weights_of_another_net_are_refused(state: Path) -> None:
     path_beside(state).unlink()
     write(NETS["batches of 8 of 37"].replace('"ip"', '"other"'))
     refused(state, r"x_iter_1.caffemodel: contains weights for none of the net's 1 layers")
@@ -369,12 +369,12 @@ DAMAGED = r"x_iter_1.solverstate.extra: is damaged .*; if you remove it, the tra
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": 2}', '{"format": 1, "seed": "x"}', "[" * 5000])
-def test_a_damaged_file_beside_a_state(state: Path, text: str) -> None:
+def test_a_damaged_extra_file_is_refused(state: Path, text: str) -> None:
     path_beside(state).write_text(text)
     refused(state, DAMAGED)
 
 
-def test_one_changed_digit_beside_a_state(state: Path) -> None:
+def test_one_changed_digit_in_the_extra_file_is_refused(state: Path) -> None:
     path = path_beside(state)
     path.write_text(path.read_text().replace('"iteration": 1', '"iteration": 7'))
     refused(state, r"x_iter_1.solverstate.extra: is damaged \(its hash does not match\)")
@@ -392,7 +392,7 @@ def forged(state: Path, *path: str | int, value: object) -> None:
 
 
 @pytest.mark.parametrize("value", [True, -1, 1.0, 10**300, None, [{"shape": [-1], "float32": "AACAPw=="}], [{}], {}])
-def test_an_iteration_that_is_none(state: Path, value: object) -> None:
+def test_an_invalid_iteration_is_refused(state: Path, value: object) -> None:
     forged(state, "nets", 0, "0", "iteration", value=value)
     refused(state, DAMAGED)
 
@@ -413,7 +413,7 @@ def test_an_iteration_that_is_none(state: Path, value: object) -> None:
         (["settings", "solver"], 3),
     ],
 )
-def test_a_value_that_no_training_wrote(state: Path, path: list[str | int], value: object) -> None:
+def test_an_invalid_value_is_refused(state: Path, path: list[str | int], value: object) -> None:
     forged(state, *path, value=value)
     refused(state, DAMAGED)
 
@@ -426,12 +426,12 @@ def test_a_value_that_no_training_wrote(state: Path, path: list[str | int], valu
         ({"next": 3}, r"found a saved state with next \(int\), expected iteration \(int\)"),
     ],
 )
-def test_what_another_layer_remembers(state: Path, remembered: dict, message: str) -> None:
+def test_state_of_another_layer_type_is_refused(state: Path, remembered: dict, message: str) -> None:
     forged(state, "nets", 0, "0", value=remembered)
     refused(state, message)
 
 
-def test_the_weights_beside_a_state_go_before_those_of_the_same_name_elsewhere(state: Path) -> None:
+def test_weights_next_to_a_state_have_priority(state: Path) -> None:
     Path("backup").mkdir()
     for path in Path().glob("x_iter_1*"):
         shutil.copy(path, "backup")
@@ -446,7 +446,7 @@ def test_the_weights_beside_a_state_go_before_those_of_the_same_name_elsewhere(s
 # --resume
 
 
-def test_resume_finds_the_newest_whole_pair(
+def test_resume_finds_the_newest_complete_snapshot(
     warnings: Callable[[], list[str]], caplog: pytest.LogCaptureFixture
 ) -> None:
     write(NETS["crop and mirror"], "snapshot: 5")

@@ -20,7 +20,7 @@ STATES = sorted(path.relative_to(GOLDEN / "train") for path in GOLDEN.glob("trai
 
 
 @pytest.mark.parametrize("path", STATES, ids=lambda path: path.parent.name)
-def test_a_state_of_caffes_is_written_again_byte_for_byte(path: Path, tmp_path: Path):
+def test_rewriting_caffes_state_gives_identical_bytes(path: Path, tmp_path: Path):
     write_state(tmp_path / "again.solverstate", read_state(GOLDEN / "train" / path))
     assert (tmp_path / "again.solverstate").read_bytes() == (GOLDEN / "train" / path).read_bytes()
 
@@ -47,7 +47,7 @@ def _contents(path: Path) -> dict[str, tuple]:
 
 
 @pytest.mark.parametrize("ending", ["solverstate", "solverstate.h5"])
-def test_what_is_written_is_read(ending: str, tmp_path: Path):
+def test_written_files_can_be_read(ending: str, tmp_path: Path):
     history = [np.arange(6, dtype=np.float32).reshape(2, 3), np.array([7, 8], np.float32)]
     write_state(tmp_path / f"x.{ending}", State(123, "somewhere/x.caffemodel", 4, history))
     state = read_state(tmp_path / f"x.{ending}")
@@ -56,7 +56,7 @@ def test_what_is_written_is_read(ending: str, tmp_path: Path):
         np.testing.assert_array_equal(read, written)
 
 
-def test_a_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_file_is_complete_or_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = tmp_path / "x.solverstate"
     write_state(path, State(1, "", 0, []))
     before = path.read_bytes()
@@ -73,7 +73,7 @@ def test_a_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monkey
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_weights_are_looked_for_beside_the_state_then_as_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_weights_are_searched_next_to_the_state_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     Path("moved").mkdir()
     state, path = State(1, "run/x.caffemodel", 0, []), Path("moved/x.solverstate")
@@ -88,7 +88,7 @@ def test_the_weights_are_looked_for_beside_the_state_then_as_written(tmp_path: P
         find_learned_net(State(1, "", 0, []), path)
 
 
-def test_files_that_are_no_states(tmp_path: Path):
+def test_files_without_a_state_are_refused(tmp_path: Path):
     with pytest.raises(SpecError, match=r"nowhere\.solverstate: cannot be read"):
         read_state(tmp_path / "nowhere.solverstate")
     (tmp_path / "text.solverstate").write_text("a text, not a state\n" * 10)
@@ -129,7 +129,7 @@ def test_resume_from_caffes_state_ends_at_caffes_weights(work_in: Callable[..., 
     solver.close()
 
 
-def test_a_run_with_a_snapshot_is_caffes_run(work_in: Callable[..., Path], caffes_bits: bool, rounding: float):
+def test_a_training_with_a_snapshot_equals_caffes(work_in: Callable[..., Path], caffes_bits: bool, rounding: float):
     """Straight through to 60, with the snapshot at 40 on the way; then on from our snapshot as Caffe from its own."""
     work_in("snapshot", "sgd_step")
     state = read_state("sgd_step/ref_iter_40.solverstate")
@@ -164,9 +164,7 @@ def test_resume_from_caffes_hdf5_state(work_in: Callable[..., Path]):
 
 @pytest.mark.parametrize("case", ["adam", "adadelta", "rmsprop"])
 @pytest.mark.parametrize("form", ["BINARYPROTO", "HDF5"])
-def test_a_solver_goes_on_from_its_own_snapshot_as_if_nothing_had_happened(
-    case: str, form: str, work_in: Callable[..., Path]
-):
+def test_resuming_from_a_snapshot_is_bit_identical(case: str, form: str, work_in: Callable[..., Path]):
     """After 20 batches of 32 the 640 records begin again, in the run itself as in the resumed one."""
     work_in(f"train/{case}")
     with open(f"{case}/solver.prototxt", "a") as file:
@@ -184,7 +182,7 @@ def test_a_solver_goes_on_from_its_own_snapshot_as_if_nothing_had_happened(
     again.close()
 
 
-def test_a_state_of_another_solver_type_or_net_is_refused_and_nothing_changes(work_in: Callable[..., Path]):
+def test_a_state_of_another_solver_or_net_is_refused_and_changes_nothing(work_in: Callable[..., Path]):
     work_in("train/adam")
     work_in("train/residual_bn_shared")
     work_in("snapshot", "sgd_step")
@@ -216,7 +214,7 @@ def test_old_four_axis_history_fits(work_in: Callable[..., Path]):
 
 
 @pytest.mark.parametrize("copies", [True, False], ids=["copies", "parts"])
-def test_a_state_with_a_history_for_each_sharer_is_that_of_their_sum(
+def test_histories_of_shared_parameters_are_added(
     work_in: Callable[..., Path], warnings: Callable[[], list[str]], copies: bool
 ):
     """Caffe of 2014-15: two towers of four layers each, so sixteen histories of eight parameters, with old shapes."""
@@ -245,7 +243,7 @@ def test_a_state_with_a_history_for_each_sharer_is_that_of_their_sum(
     solver.close()
 
 
-def test_a_second_set_follows_the_first_of_all_sharers():
+def test_the_second_set_of_shared_histories_follows_the_first():
     history = [np.array([k], np.float32) for k in (1, 10, 2, 3, 30, 4)]
     assert [array.tolist() for array in merge_shared(history, [0, 1, 0])] == [[3], [10], [7], [30]]
     assert merge_shared([np.array([[5]], np.float32), np.array([5], np.float32)], [0, 0])[0].tolist() == [[5]]

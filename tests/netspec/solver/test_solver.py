@@ -58,17 +58,17 @@ def seen_tests(solver: Solver, run: Callable[[], None]) -> list[tuple[int, int]]
     return found
 
 
-def test_it_tests_before_the_update_and_once_more_at_the_end(make):
+def test_tests_run_before_the_update_and_at_the_end(make):
     solver = make("test_iter: 1 test_iter: 1 test_interval: 2 max_iter: 4 snapshot_after_train: false")
     assert seen_tests(solver, solver.solve) == [(0, 0), (0, 1), (2, 0), (2, 1), (4, 0), (4, 1)]
 
 
-def test_without_test_initialization_the_first_test_comes_later(make):
+def test_without_test_initialization_the_first_test_is_later(make):
     solver = make("test_iter: 1 test_interval: 2 max_iter: 3 test_initialization: false snapshot_after_train: false")
     assert seen_tests(solver, solver.solve) == [(2, 0)]
 
 
-def test_a_test_is_the_mean_over_its_batches_with_the_present_weights(make):
+def test_a_test_is_the_mean_over_its_batches_with_the_current_weights(make):
     solver = make("test_iter: 3 test_interval: 5", net=NET.replace('type: "gaussian" std: 1 } data', "value: 2 } data"))
     solver.step(1)
     before = solver.scores
@@ -90,7 +90,7 @@ def test_test_compute_loss_prints_the_mean_loss(make, caplog: pytest.LogCaptureF
 # What the loss is
 
 
-def test_the_loss_is_a_mean_over_a_window_that_begins_anew_with_each_step(make):
+def test_the_averaged_loss_restarts_with_each_step(make):
     solver = make("average_loss: 2", net=NET.replace('type: "gaussian" std: 1 } data', "value: 2 } data"))
     single = make("", net=NET.replace('type: "gaussian" std: 1 } data', "value: 2 } data"))
     raw, shown = [], []
@@ -114,7 +114,7 @@ def test_iter_size_takes_the_mean_of_its_passes(make):
 # What moves
 
 
-def test_a_parameter_without_a_rate_stays_whatever_the_decay(make):
+def test_a_parameter_with_rate_0_ignores_weight_decay(make):
     solver = make("weight_decay: 0.5 momentum: 0.9", net=NET.replace("lr_mult: 2", "lr_mult: 0 decay_mult: 1"))
     solver.net.params["ip"][1].data.fill_(1)
     before = weights(solver)
@@ -124,7 +124,7 @@ def test_a_parameter_without_a_rate_stays_whatever_the_decay(make):
     assert torch.equal(before[1], after[1])
 
 
-def test_after_a_step_the_gradients_hold_what_was_subtracted(make):
+def test_after_a_step_the_gradients_are_the_subtracted_values(make):
     solver = make("momentum: 0.9 snapshot_diff: true")
     solver.step(1)
     before = weights(solver)
@@ -139,7 +139,7 @@ def test_after_a_step_the_gradients_hold_what_was_subtracted(make):
 
 
 @pytest.mark.parametrize("exact", ["none", "small"])
-def test_gradients_stay_where_they_are(make, exact):
+def test_gradients_keep_their_memory(make, exact):
     """Fresh memory for the gradients of 70 million weights takes longer to get than the gradients themselves."""
     solver = make(exact=exact)
     solver.step(1)
@@ -156,7 +156,7 @@ def test_the_seed_decides_everything(make):
     assert not torch.equal(weights(first)[0], weights(third)[0])
 
 
-def test_the_learning_rate_is_that_of_the_iteration_to_come(make):
+def test_the_learning_rate_is_that_of_the_next_iteration(make):
     settings = SETTINGS.replace('"fixed"', '"step" stepsize: 2 gamma: 0.5')
     solver = make(settings=settings)
     rates = []
@@ -166,7 +166,7 @@ def test_the_learning_rate_is_that_of_the_iteration_to_come(make):
     assert rates == pytest.approx([0.1, 0.1, 0.05, 0.05])
 
 
-def test_a_step_asks_no_layer_what_it_is(make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_does_not_depend_on_layer_types(make, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether it is fed, or waits for records, is known before: to ask takes longer than a small layer's pass."""
     solver = make()
     solver.step(1)
@@ -190,7 +190,7 @@ def files() -> list[str]:
     return caffes
 
 
-def test_snapshots_come_at_their_interval_and_after_training(make):
+def test_snapshots_are_taken_at_their_interval_and_after_training(make):
     solver = make("snapshot: 2 max_iter: 5")
     solver.solve()
     assert files() == [f"s_iter_{n}.{kind}" for n in (2, 4, 5) for kind in ("caffemodel", "solverstate")]
@@ -210,7 +210,7 @@ def test_snapshot_after_train_can_be_turned_off(make):
     assert files() == []
 
 
-def test_a_stop_is_obeyed_after_the_iteration_and_leaves_a_snapshot(make, caplog: pytest.LogCaptureFixture):
+def test_a_stop_takes_effect_after_the_iteration_with_a_snapshot(make, caplog: pytest.LogCaptureFixture):
     asked = iter([None, "snapshot", "stop"])
     solver = make("max_iter: 9 test_iter: 1 test_interval: 100 test_initialization: false", action=lambda: next(asked))
     with caplog.at_level(logging.INFO, "netspec"):
@@ -222,7 +222,7 @@ def test_a_stop_is_obeyed_after_the_iteration_and_leaves_a_snapshot(make, caplog
     assert "Optimization Done." not in caplog.text
 
 
-def test_a_stop_is_obeyed_within_a_test(make, caplog: pytest.LogCaptureFixture):
+def test_a_stop_takes_effect_within_a_test(make, caplog: pytest.LogCaptureFixture):
     asked = iter([None, "snapshot", "stop", None])
     solver = make("max_iter: 9 test_iter: 5 test_interval: 3", action=lambda: next(asked))
     with caplog.at_level(logging.INFO, "netspec"):
@@ -233,7 +233,7 @@ def test_a_stop_is_obeyed_within_a_test(make, caplog: pytest.LogCaptureFixture):
     assert "Test interrupted." in caplog.text
 
 
-def test_after_a_stop_one_may_go_on(make):
+def test_training_can_continue_after_a_stop(make):
     asked = iter(["stop"])
     solver = make("max_iter: 3 snapshot_after_train: false", action=lambda: next(asked, None))
     solver.solve()
@@ -271,19 +271,19 @@ FAULTS = read_cases("netspec/solver/cases/settings.txt")
 
 
 @pytest.mark.parametrize("case", FAULTS.values(), ids=FAULTS)
-def test_faults_are_found_before_the_first_iteration(case: dict[str, str], make):
+def test_errors_are_found_before_the_first_iteration(case: dict[str, str], make):
     with pytest.raises(SpecError, match=case["message"]):
         make(settings=case["solver"])
 
 
-def test_a_prefix_for_the_last_snapshot_is_tried_before_training(make):
+def test_the_prefix_of_the_last_snapshot_is_checked_before_training(make):
     solver = make('max_iter: 5 snapshot_prefix: "gone/p"')
     with pytest.raises(SpecError, match=r'cannot write to snapshot prefix "gone/p": No such file or directory'):
         solver.solve()
     assert solver.iteration == 0
 
 
-def test_the_probe_leaves_nothing_behind(make):
+def test_the_check_of_the_prefix_leaves_no_file(make):
     make("snapshot: 1")
     assert sorted(path.name for path in Path().iterdir()) == ["net.prototxt", "s.prototxt"]
 
@@ -298,7 +298,7 @@ def test_gpu_mode_without_a_gpu_runs_on_the_cpu_and_warns_once(make, monkeypatch
     assert warnings == ["s.prototxt:4:1: solver_mode GPU, but torch finds no GPU; running on the CPU"]
 
 
-def test_a_gpu_that_is_not_there_is_refused(make, monkeypatch):
+def test_a_missing_gpu_is_refused(make, monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(
         SpecError, match=r"^s\.prototxt:6:1: found device_id 3, but torch finds 1 GPU\(s\) on this machine"
@@ -318,7 +318,7 @@ layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "label" top: "lo
 
 
 @pytest.mark.parametrize("where", ["after the gradients", "between two updates"])
-def test_an_interrupt_comes_after_the_iteration(make, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
+def test_an_interrupt_waits_for_the_end_of_the_iteration(make, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
     """After Ctrl-C in Python, a training can continue as if nothing had happened."""
     with h5py.File("records.h5", "w") as file:
         file["data"] = np.random.default_rng(0).normal(size=(7, 3)).astype("f4")
@@ -347,7 +347,7 @@ def test_an_interrupt_comes_after_the_iteration(make, monkeypatch: pytest.Monkey
     assert all(map(torch.equal, weights(solver), weights(undisturbed)))
 
 
-def test_a_second_interrupt_ends_an_iteration_at_once(make) -> None:
+def test_a_second_interrupt_ends_the_iteration_immediately(make) -> None:
     solver = make()
 
     def interrupt_twice() -> None:
@@ -362,7 +362,7 @@ def test_a_second_interrupt_ends_an_iteration_at_once(make) -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_programs_own_handler_of_interrupts_stays(make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_interrupt_handler_of_a_program_is_kept(make, monkeypatch: pytest.MonkeyPatch) -> None:
     came: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
     try:

@@ -48,7 +48,7 @@ def gradients() -> list[Tensors]:
         ({"type": "Adam", "momentum": 0.9, "delta": 0}, torch.optim.Adam, {"betas": (0.9, 0.999), "eps": 0}),
     ],
 )
-def test_at_a_constant_rate_a_rule_is_the_same_as_in_torch(fields, torch_class, settings, gradients):
+def test_at_a_constant_rate_rules_equal_torchs(fields, torch_class, settings, gradients):
     weights, _ = run(SolverParameter(**fields), gradients, [0.1] * len(gradients))
     theirs = [torch.nn.Parameter(torch.zeros(shape)) for shape in SHAPES]
     groups = [{"params": [theirs[0]], "lr": 0.1}, {"params": [theirs[1]], "lr": 0.2}]
@@ -76,7 +76,7 @@ def test_adam_adds_delta_before_the_bias_correction():
     assert weights[0][0, 0].item() == pytest.approx(-expected, rel=1e-5)
 
 
-def test_a_rate_of_0_moves_nothing_but_history_goes_on(gradients):
+def test_a_rate_of_0_updates_only_the_history(gradients):
     param = SolverParameter(momentum=0.9)
     history = [torch.ones(shape) for shape in SHAPES]
     diffs = [torch.zeros(shape) for shape in SHAPES]
@@ -100,13 +100,13 @@ def test_clip_scales_the_norm_of_all_gradients_together():
     torch.testing.assert_close(diffs, [torch.tensor([0.6]), torch.tensor([[0.8]])])
 
 
-def test_normalize_makes_the_sum_of_iter_size_passes_a_mean():
+def test_normalize_divides_by_iter_size():
     diffs = [torch.tensor([3.0, 6.0])]
     normalize(diffs, 3)
     torch.testing.assert_close(diffs[0], torch.tensor([1.0, 2.0]))
 
 
-def test_weight_decay_is_each_parameters_own():
+def test_weight_decay_differs_by_parameter():
     weights = [torch.tensor([2.0, -4.0, 0.0]), torch.tensor([8.0])]
     diffs = [torch.ones(3), torch.ones(1)]
     regularize(diffs, weights, [0.5, 0.0], "L2")
@@ -114,13 +114,13 @@ def test_weight_decay_is_each_parameters_own():
     assert diffs[1].tolist() == [1]
 
 
-def test_l1_pulls_by_the_sign_and_leaves_a_weight_of_0():
+def test_l1_decay_uses_the_sign_and_keeps_0():
     weights, diffs = [torch.tensor([2.0, -4.0, 0.0])], [torch.ones(3)]
     regularize(diffs, weights, [0.5], "L1")
     assert diffs[0].tolist() == [1.5, 0.5, 1]
 
 
-def test_the_type_is_known_in_any_case_of_letters():
+def test_the_type_is_case_insensitive():
     assert find_rule("ADAM") is RULES["Adam"]
     assert find_rule("rmsprop") is RULES["RMSProp"]
     assert find_rule(SolverParameter().type) is RULES["SGD"]
@@ -136,14 +136,14 @@ def test_the_type_is_known_in_any_case_of_letters():
         ({"type": "RMSProp", "rms_decay": 1}, "rms_decay 1, expected at least 0 and less than 1"),
     ],
 )
-def test_what_caffe_refuses(fields: dict, message: str):
+def test_settings_that_caffe_refuses_are_refused(fields: dict, message: str):
     (fault,) = rule_faults(SolverParameter(**fields), NOWHERE)
     assert re.search(message, str(fault))
 
 
 @pytest.mark.parametrize("name", RULES)
 @pytest.mark.parametrize("size", [1, 3, 5, 7])
-def test_an_update_in_blocks_is_the_update(name, size, gradients, monkeypatch):
+def test_an_update_in_blocks_equals_a_whole_update(name, size, gradients, monkeypatch):
     """Bit for bit, however tensors are cut or lie together in a block."""
     param = SolverParameter(type=name, momentum=0.9 if RULES[name].momentum else 0, iter_size=3, rms_decay=0.9)
 

@@ -52,18 +52,18 @@ def test_a_boolean_flag_never_takes_the_next_word() -> None:
     assert (arguments.gray, arguments.check_size, arguments.names) == (True, True, ["false", "true"])
 
 
-def test_flags_of_groups_and_flags_with_dashes_are_no_different() -> None:
+def test_flags_of_groups_and_flags_with_dashes_work_the_same() -> None:
     assert read("-at-most").at_most
     assert not read("-at-most", "--noat-most").at_most
     assert [read(*words).train for words in ([], ["--no-train"], ["-notrain"], ["--train=f"])] == [True, *[False] * 3]
 
 
 @pytest.mark.parametrize("words", ["-resize_width 64", "-resize_width=64", "--resize_width 64", "--resize_width=64"])
-def test_other_flags_take_a_value(words: str) -> None:
+def test_other_flags_have_a_value(words: str) -> None:
     assert read(*words.split(), "a", "b").resize_width == 64
 
 
-def test_numbers_may_be_negative() -> None:
+def test_values_can_be_negative_numbers() -> None:
     assert read("-shift", "-1.5").shift == -1.5
     assert read("--shift=-2").shift == -2
 
@@ -78,9 +78,7 @@ def test_numbers_may_be_negative() -> None:
         (["-color"], "unrecognized arguments: --color"),
     ],
 )
-def test_what_no_flag_is_written_like_ends_with_status_2(
-    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_misspelled_flags_end_with_status_2(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(command(lambda arguments: None), ["convert", *words]) == 2
     assert said in capsys.readouterr().err
 
@@ -95,7 +93,7 @@ def test_what_no_flag_is_written_like_ends_with_status_2(
         (["--allow-python-layers=false"], False),
     ],
 )
-def test_the_commands_of_netspec_read_boolean_flags_so(name: str, words: list[str], value: bool) -> None:
+def test_commands_of_netspec_accept_boolean_flags(name: str, words: list[str], value: bool) -> None:
     needed = {
         "test": ["-model", "m", "-weights=w"],
         "time": ["--model", "m"],
@@ -106,9 +104,7 @@ def test_the_commands_of_netspec_read_boolean_flags_so(name: str, words: list[st
 
 
 @pytest.mark.parametrize("module", ["netspec.cli", "lmdb_build.cli"])
-def test_a_program_says_its_version_and_what_a_mistyped_command_was_meant_to_be(
-    module: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_program_prints_its_version_and_suggests_commands(module: str, capsys: pytest.CaptureFixture[str]) -> None:
     made = import_module(module).parser()
     for spelling in ("--version", "-version"):
         assert run(made, [spelling]) == 0
@@ -123,21 +119,21 @@ def test_a_program_says_its_version_and_what_a_mistyped_command_was_meant_to_be(
     assert capsys.readouterr().err.endswith(f'there is no command "xyzzy"; see {made.prog} --help\n')
 
 
-def test_the_usage_that_is_shown_is_that_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_usage_of_the_command_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(command(lambda arguments: None), ["convert", "--gary"]) == 2
     said = capsys.readouterr().err
     assert said.startswith("usage: program convert [-h]")
     assert said.endswith('program convert: error: unrecognized arguments: --gary; did you mean "--gray"?\n')
 
 
-def test_an_option_that_was_typed_can_be_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_given_options_can_be_refused(capsys: pytest.CaptureFixture[str]) -> None:
     made = command(lambda arguments: refuse(arguments, ("gray", "shift"), "is for others"))
     for words, status in ((["-shift=0"], 2), (["-nogray"], 2), (["--", "--shift"], 0), (["-resize_width", "3"], 0)):
         assert run(made, ["convert", *words]) == status
     assert "program convert: error: --shift is for others\n" in capsys.readouterr().err
 
 
-def test_the_options_of_a_command_in_a_group_are_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_in_groups_have_their_own_options(capsys: pytest.CaptureFixture[str]) -> None:
     """A group of commands does not know their options: it once took -v for glog's, with the word after it."""
     parser = Parser("program")
     group = Commands(parser).add_group("look", help="commands that draw")
@@ -186,7 +182,7 @@ def test_glogs_own_flags_and_variable(
     assert all(line.endswith(" caffe.cpp:1] hello") for line in lines)
 
 
-def test_the_logger_is_left_as_it_was() -> None:
+def test_the_logger_is_restored() -> None:
     before = log.logger.level, log.logger.propagate, list(log.logger.handlers)
     read()
     assert (log.logger.level, log.logger.propagate, log.logger.handlers) == before
@@ -211,7 +207,7 @@ class Fault(SpecError):
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_each_end_has_its_status_and_one_line(
+def test_each_error_has_its_status_and_one_line(
     error: BaseException, status: int, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(arguments: argparse.Namespace) -> None:
@@ -222,7 +218,7 @@ def test_each_end_has_its_status_and_one_line(
     assert not log.logger.handlers or all(type(h) is not logging.StreamHandler for h in log.logger.handlers)
 
 
-def test_a_fault_of_the_program_is_not_hidden() -> None:
+def test_programming_errors_are_not_hidden() -> None:
     def fail(arguments: argparse.Namespace) -> None:
         raise AssertionError("a mistake in the program")
 

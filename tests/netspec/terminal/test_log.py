@@ -63,23 +63,21 @@ def losses(lines: list[tuple[str, list[float]]]) -> list[float]:
     [(TRAIN, "caffe_train.log"), (RESUME, "caffe_resume.log"), (TEST, "caffe_test.log")],
     ids=["train", "resume", "test"],
 )
-def test_a_run_logs_what_caffes_did(run: Callable[[list[str]], list[str]], arguments: list[str], golden: str) -> None:
+def test_a_training_has_caffes_log(run: Callable[[list[str]], list[str]], arguments: list[str], golden: str) -> None:
     found = [split_loss(line) for line in sentences(run(arguments))]
     expected = [split_loss(line) for line in sentences((GOLDEN / "log" / golden).read_text().splitlines())]
     assert [words for words, _ in found] == [words for words, _ in expected]
     np.testing.assert_allclose(losses(found), losses(expected), rtol=1e-4)
 
 
-def test_a_timing_logs_what_caffes_did(run: Callable[[list[str]], list[str]]) -> None:
+def test_a_timing_has_caffes_log(run: Callable[[list[str]], list[str]]) -> None:
     found = [split_loss(line)[0] for line in sentences(run(TIME))]
     expected = (GOLDEN / "log" / "caffe_time.log").read_text().splitlines()
     assert found == [split_loss(line)[0] for line in sentences(expected)]
 
 
 @pytest.mark.parametrize("arguments", [TRAIN, TEST, TIME], ids=lambda arguments: arguments[0])
-def test_every_line_has_exactly_the_four_fields_of_the_glog_of_caffes_time(
-    run: Callable[[list[str]], list[str]], arguments: list[str]
-) -> None:
+def test_every_line_has_glogs_four_fields(run: Callable[[list[str]], list[str]], arguments: list[str]) -> None:
     inside_proto = False
     lines = run(arguments)
     assert len(lines) > 100
@@ -92,7 +90,7 @@ def test_every_line_has_exactly_the_four_fields_of_the_glog_of_caffes_time(
             assert inside_proto, line
 
 
-def test_the_end_of_the_data_is_logged_each_time_it_is_met(run: Callable[[list[str]], list[str]]) -> None:
+def test_the_end_of_the_data_is_logged_each_time(run: Callable[[list[str]], list[str]]) -> None:
     """60 batches of 32 end the 640 records three times, and each test's four of 50 the 200 records once."""
     ends = [line for line in run(TRAIN) if line.endswith("Restarting data prefetching from start.")]
     assert len(ends) == 3 + 3
@@ -126,7 +124,7 @@ def test_log_parsers_find_rates_losses_and_scores_by_iteration(training_log: lis
     assert scores["Test"][25] == pytest.approx(0.0510559, rel=1e-4)
 
 
-def test_log_parsers_find_the_moment_of_the_start_and_of_each_line(training_log: list[str]) -> None:
+def test_log_parsers_find_the_times_of_the_start_and_of_each_line(training_log: list[str]) -> None:
     start = next(line for line in training_log if "Solving" in line)
     moments = []
     for line in training_log[training_log.index(start) :]:
@@ -151,5 +149,5 @@ def test_log_parsers_find_values_by_their_field(training_log: list[str]) -> None
     ("value", "text"),
     [(0.153106, "0.153106"), (1.0, "1"), (1e-5, "1e-05"), (123456.7, "123457"), (1234567.0, "1.23457e+06"), (0.0, "0")],
 )
-def test_numbers_are_printed_as_streams_of_c_plus_plus_print_them(value: float, text: str) -> None:
+def test_numbers_are_printed_like_cpp_streams(value: float, text: str) -> None:
     assert log.number(value) == text

@@ -27,9 +27,9 @@ def spins(**variables: str) -> set[str]:
     return found
 
 
-def test_threads_that_wait_soon_sleep_in_a_command() -> None:
+def test_idle_threads_of_a_command_sleep_soon() -> None:
     assert spins() <= {"2000", "0"}
 
 
-def test_the_users_own_choice_is_left() -> None:
+def test_settings_of_the_user_are_kept() -> None:
     assert spins(GOMP_SPINCOUNT="5", KMP_BLOCKTIME="5") == {"5"}

@@ -75,7 +75,7 @@ def test_an_unknown_field_of_a_window_is_refused(param: str) -> None:
         made(f'layer {{ name: "a" type: "{kind}" bottom: "data" top: "a" {param} no_such: 1 }} }}')
 
 
-def test_nothing_is_said_of_old_formats_and_fields_without_effect(caplog: pytest.LogCaptureFixture) -> None:
+def test_old_formats_and_fields_without_effect_give_no_warning(caplog: pytest.LogCaptureFixture) -> None:
     text = """input: "data" input_dim: 1 input_dim: 3 input_dim: 4 input_dim: 4
         layers { name: "a" type: POWER bottom: "data" top: "a" power_param { scale: 2 }
         relu_param { negative_slope: 1 } }"""
@@ -142,7 +142,7 @@ def test_a_parameter_of_another_size_is_refused() -> None:
         net.setParam("conv2", 1, [1, 2, 3])
 
 
-def test_a_net_without_weights_says_so() -> None:
+def test_a_net_without_weights_gives_a_warning() -> None:
     net = dnn.readNetFromCaffe(str(HERE / "classify.prototxt"))
     net.setInput(np.zeros((1, 3, 20, 20)))
     with pytest.raises(dnn.DnnError, match=r"this net was read without weights; also give the \.caffemodel"):
@@ -158,7 +158,7 @@ def test_weights_in_hdf5(tmp_path: Path) -> None:
     np.testing.assert_allclose(net.forward(), plain(data=values)["prob"].detach().numpy(), rtol=0, atol=1e-5)
 
 
-def test_the_profile_is_of_a_run_of_its_own() -> None:
+def test_the_profile_is_measured_in_a_separate_run() -> None:
     net = read("segment")
     net.setInput(np.ones((1, 3, 16, 16)))
     total, ticks = net.getPerfProfile()
@@ -176,7 +176,7 @@ def test_backends_and_targets_change_nothing() -> None:
     np.testing.assert_array_equal(net.forward(), expected)
 
 
-def test_opencvs_other_models_do_not_take_these_nets() -> None:
+def test_opencvs_other_models_refuse_these_nets() -> None:
     with pytest.raises(cv2.error):
         dnn.KeypointsModel(read("segment"))
 
@@ -194,12 +194,12 @@ def test_opencvs_other_models_do_not_take_these_nets() -> None:
         ("getOutputDetails", ()),
     ],
 )
-def test_methods_that_change_a_net_say_that_it_is_as_written(name: str, arguments: tuple[Any, ...]) -> None:
+def test_methods_that_change_a_net_are_refused(name: str, arguments: tuple[Any, ...]) -> None:
     with pytest.raises(dnn.DnnError):
         getattr(read("classify"), name)(*arguments)
 
 
-def test_every_method_of_opencv_4_is_there() -> None:
+def test_every_method_of_opencv_4_exists() -> None:
     methods = """addLayer addLayerToPrev connect dump dumpToFile empty enableFusion enableWinograd forward
         forwardAndRetrieve forwardAsync getFLOPS getInputDetails getLayer getLayerId getLayerNames getLayerShapes
         getLayerTypes getLayersCount getLayersShapes getMemoryConsumption getOutputDetails getParam getPerfProfile

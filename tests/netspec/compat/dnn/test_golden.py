@@ -18,7 +18,7 @@ def ours() -> dict[str, np.ndarray]:
     return dnn_program.record(dnn)
 
 
-def test_as_much_is_found_out(ours: dict[str, np.ndarray]) -> None:
+def test_the_same_properties_are_found(ours: dict[str, np.ndarray]) -> None:
     assert sorted(ours) == sorted(OPENCV)
 
 

@@ -19,7 +19,7 @@ def read(folder: Path) -> dnn.Net:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", OPENCV)
-def test_outputs_are_opencvs(name: str) -> None:
+def test_outputs_equal_opencvs(name: str) -> None:
     folder = shared("golden", "models", name)
     net, expected = read(folder), np.load(folder / "opencv.npz")
     (given,) = (key for key in expected.files if key.startswith("0/in/"))
@@ -31,7 +31,7 @@ def test_outputs_are_opencvs(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CAFFE)
-def test_outputs_are_caffes_at_both_sizes(name: str) -> None:
+def test_outputs_equal_caffes_at_both_sizes(name: str) -> None:
     folder = shared("golden", "models", name)
     net, expected = read(folder), np.load(folder / "caffe.npz")
     for k in (0, 1):

@@ -46,7 +46,7 @@ def test_a_missing_input_is_named() -> None:
         net.forward()
 
 
-def test_a_wrong_shape_says_both_shapes() -> None:
+def test_a_wrong_shape_is_reported_with_both_shapes() -> None:
     net = read("classify")
     net.setInput(DATA[:, :2])
     with pytest.raises(dnn.DnnError, match=r"bottom of shape \(1, 2, 20, 20\) .* made for 3 channels") as caught:
@@ -55,7 +55,7 @@ def test_a_wrong_shape_says_both_shapes() -> None:
     assert str(caught.value).endswith(ending)
 
 
-def test_a_net_goes_on_after_a_fault() -> None:
+def test_a_net_works_after_an_error() -> None:
     net = read("classify")
     net.setInput(DATA)
     expected = net.forward()
@@ -85,12 +85,12 @@ def test_files_are_given_as_content(as_content: Callable[[bytes], Any]) -> None:
     np.testing.assert_array_equal(outputs[2], outputs[1])
 
 
-def test_weights_that_are_none_are_refused() -> None:
+def test_other_files_than_weights_are_refused() -> None:
     with pytest.raises(dnn.DnnError, match="<caffeModel>: expected a binary NetParameter, found text"):
         dnn.readNetFromCaffe(HERE / "classify.prototxt", b"these are words, not weights")
 
 
-def test_other_files_go_to_opencv() -> None:
+def test_other_files_are_opened_by_opencv() -> None:
     with pytest.raises(cv2.error, match="Cannot determine an origin framework"):
         dnn.readNet("net.unknown")
 
@@ -106,7 +106,7 @@ def test_inputs_of_any_kind_of_number() -> None:
         np.testing.assert_array_equal(net.forward(), expected)
 
 
-def test_an_input_is_kept_apart_from_the_callers_array() -> None:
+def test_an_input_is_copied() -> None:
     net, values = made('layer { name: "x" type: "Split" bottom: "data" top: "x" }'), np.ones((1, 3, 8, 8), np.float32)
     net.setInput(values)
     values[:] = 7
@@ -176,7 +176,7 @@ def test_shapes_of_one_layer() -> None:
     assert [tuple(shape) for shape in (*bottoms, *tops)] == [(1, 3, 20, 28), (1, 6, 10, 14)]
 
 
-def test_costs_leave_the_net_as_it_is() -> None:
+def test_computing_costs_does_not_change_the_net() -> None:
     net = read("detect")
     net.setInput(np.ones((1, 3, 32, 32)))
     before = net.forward()
@@ -192,7 +192,7 @@ def test_backends_and_targets_are_accepted() -> None:
     assert dnn.Net().empty()
 
 
-def test_all_else_is_cv2_dnns() -> None:
+def test_other_names_are_those_of_cv2_dnn() -> None:
     assert dnn.blobFromImage is cv2.dnn.blobFromImage
     assert dnn.NMSBoxes is cv2.dnn.NMSBoxes
     assert {"NMSBoxes", "readNetFromCaffe"} <= set(dir(dnn))

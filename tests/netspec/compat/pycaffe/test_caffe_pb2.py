@@ -21,7 +21,7 @@ def ssd() -> None:
     use_dialect("ssd")
 
 
-def test_every_message_of_the_schema_is_there() -> None:
+def test_every_message_of_the_schema_exists() -> None:
     assert len(caffe_pb2.__all__) > 60
     for name, message in schema.pool.FindFileByName("caffe.proto").message_types_by_name.items():
         assert getattr(caffe_pb2, name).DESCRIPTOR is message
@@ -88,13 +88,13 @@ def test_a_dialect_adds_its_messages_and_fields(ssd: None) -> None:
     assert items.item[0].display_name == "background"
 
 
-def test_a_dialects_bytes_are_those_that_nets_are_read_from(ssd: None) -> None:
+def test_bytes_of_a_dialect_can_be_read_as_a_net(ssd: None) -> None:
     layer = caffe_pb2.LayerParameter(permute_param={"order": [0, 2]})
     read = schema.LayerParameter.FromString(layer.SerializeToString())
     assert list(schema.value(read, "permute_param").order) == [0, 2]
 
 
-def test_without_the_dialect_its_messages_are_gone(ssd: None) -> None:
+def test_without_the_dialect_its_messages_do_not_exist(ssd: None) -> None:
     before = caffe_pb2.LayerParameter
     deactivate("ssd")
     assert caffe_pb2.LayerParameter is schema.LayerParameter
@@ -114,7 +114,7 @@ def test_without_the_dialect_its_messages_are_gone(ssd: None) -> None:
         ("text_format.Merge('layer { permute_param { order: 1 } }', caffe_pb2.NetParameter())", "permute_param"),
     ],
 )
-def test_what_only_a_dialect_has_names_it(line: str, name: str) -> None:
+def test_an_error_names_the_dialect_that_has_a_name(line: str, name: str) -> None:
     names = {"caffe_pb2": caffe_pb2, "L": layers, "P": params, "text_format": text_format}
     with pytest.raises(Exception, match=r"ha(s|ve) no ") as caught:
         eval(line, names)

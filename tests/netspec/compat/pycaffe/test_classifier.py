@@ -34,7 +34,7 @@ def images() -> list[np.ndarray]:
     return [np.random.RandomState(seed).rand(16, 12, 3).astype(np.float32) for seed in range(3)]
 
 
-def test_it_predicts_from_the_center(files: tuple[str, str], images: list[np.ndarray]) -> None:
+def test_prediction_uses_the_center_crop(files: tuple[str, str], images: list[np.ndarray]) -> None:
     net = caffe.Classifier(*files, image_dims=(16, 12), raw_scale=255, channel_swap=(2, 1, 0), mean=np.ones(3))
     got = net.predict(images, oversample=False)
     assert got.shape == (3, 3)
@@ -77,7 +77,7 @@ def test_windows_are_warped_to_the_net(files: tuple[str, str], picture: str) -> 
         np.testing.assert_allclose(one["prediction"], seen.mean((0, 1)), rtol=1e-4)
 
 
-def test_windows_with_context_show_what_is_around_them(files: tuple[str, str], picture: str) -> None:
+def test_windows_can_include_context(files: tuple[str, str], picture: str) -> None:
     net = caffe.Detector(*files, mean=np.array([0.25, 0.5, 0.75]), context_pad=2)
     image = caffe.io.load_image(picture)
     inside = net.crop(image, np.array([6, 4, 9, 7]))

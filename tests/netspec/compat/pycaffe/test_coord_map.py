@@ -27,11 +27,11 @@ def mapped(n: NetSpec) -> Any:
 
 
 @pytest.mark.parametrize(("factor", "shift"), [(2, 0), (4, -1)])
-def test_down_and_up_again_is_the_identity_but_for_a_shift(factor: int, shift: int) -> None:
+def test_downsampling_and_upsampling_give_a_shift(factor: int, shift: int) -> None:
     assert mapped(spec(pool=factor, up=factor)) == (1, 1, shift)
 
 
-def test_pointwise_layers_and_1x1_convolutions_leave_coordinates_alone() -> None:
+def test_pointwise_layers_and_1x1_convolutions_keep_coordinates() -> None:
     n = spec()
     n.relu = L.ReLU(n.deconv)
     n.conv1x1 = L.Convolution(n.relu, num_output=10, kernel_size=1, stride=1, pad=0)
@@ -39,20 +39,20 @@ def test_pointwise_layers_and_1x1_convolutions_leave_coordinates_alone() -> None
 
 
 @pytest.mark.parametrize("pad", [1, 7])
-def test_padding_of_a_convolution_shifts_back_that_of_a_deconvolution_forth(pad: int) -> None:
+def test_padding_shifts_in_opposite_directions_for_deconvolutions(pad: int) -> None:
     axis, scale, shift = mapped(spec())
     assert mapped(spec(pad=pad)) == (axis, scale, shift - pad)
     assert mapped(spec(up_pad=pad)) == (axis, scale, shift + pad)
     assert mapped(spec(pad=pad, up_pad=pad)) == (axis, scale, shift)
 
 
-def test_several_bottoms_are_mapped_alike() -> None:
+def test_several_bottoms_have_the_same_mapping() -> None:
     n = spec()
     n.a, n.b = L.Convolution(n.data, n.aux, ntop=2, num_output=10, kernel_size=5, stride=2, pad=0)
     assert coord_map_from_to(n.a, n.data) == coord_map_from_to(n.b, n.aux)
 
 
-def test_axes_with_windows_of_their_own() -> None:
+def test_axes_can_have_different_windows() -> None:
     (axis_a, scale_a, shift_a), (axis_b, scale_b, shift_b) = mapped(spec(3, 1, 0)), mapped(spec(5, 2, 10))
     axis, scale, shift = mapped(spec([3, 5], [1, 2], [0, 10]))
     assert axis == axis_a == axis_b
@@ -112,7 +112,7 @@ def test_layers_without_a_mapping_disconnect() -> None:
     ("n", "message"),
     [(spec(pool=3, up=2), "scale mismatch"), (spec(up_pad=10), "negative width"), (spec(kernel=2), "noninteger")],
 )
-def test_crops_that_are_impossible(n: NetSpec, message: str) -> None:
+def test_impossible_crops_are_refused(n: NetSpec, message: str) -> None:
     with pytest.raises(AssertionError, match=message):
         crop(n.deconv, n.data)
 

@@ -38,15 +38,15 @@ def test_layers_and_blobs_are_nodes_with_edges_between_them(net) -> None:
     assert graph.get_rankdir() == "TB"
 
 
-def test_sideways_the_words_stand_below_each_other(net) -> None:
+def test_labels_have_several_lines_in_horizontal_drawings(net) -> None:
     assert r"pool\n(Pooling AVE)\nkernel size: 3\nstride: 2\npad: 0" in names(draw.get_pydot_graph(net, "LR"))
 
 
-def test_edges_may_go_without_labels(net) -> None:
+def test_edge_labels_are_optional(net) -> None:
     assert {edge.get_label() for edge in draw.get_pydot_graph(net, "LR", label_edges=False).get_edges()} == {'""'}
 
 
-def test_a_phase_leaves_the_others_layers_out(net) -> None:
+def test_a_phase_omits_layers_of_the_other(net) -> None:
     train = names(draw.get_pydot_graph(net, "TB", phase=caffe_pb2.TRAIN))
     test = names(draw.get_pydot_graph(net, "TB", phase=caffe_pb2.TEST))
     assert ("mnist (Data)" in train, "mnist (Data)" in test) == (True, False)
@@ -85,7 +85,7 @@ def test_graphviz_draws_the_picture(net, tmp_path: Path, monkeypatch: pytest.Mon
         draw.draw_net(net, "LR", "xyz")
 
 
-def test_without_pydot_one_line_says_what_to_install(net, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pydot_one_line_gives_advice(net, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pydot", None)
     with pytest.raises(ImportError, match=r"^caffe\.draw needs pydot: pip install pydot, or "):
         draw.get_pydot_graph(net, "LR")

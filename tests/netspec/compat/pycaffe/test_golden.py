@@ -42,7 +42,7 @@ def exact() -> Iterator[Callable[[str], None]]:
 
 
 @pytest.mark.parametrize("folder", LAYERS, ids=lambda folder: folder.name)
-def test_blobs_hold_what_caffes_held(folder: Path) -> None:
+def test_blobs_equal_caffes(folder: Path) -> None:
     case = LayerCase(folder)
     found = compute(case)
     assert set(found) == {key for key in case.golden if key.split("/")[0] not in ("in", "param_init", "topdiff")}
@@ -53,7 +53,7 @@ def test_blobs_hold_what_caffes_held(folder: Path) -> None:
 @pytest.mark.parametrize(
     "folder", [folder for folder in LAYERS if "all" in promised(folder)], ids=lambda folder: folder.name
 )
-def test_blobs_hold_caffes_bits(folder: Path, exact: Callable[[str], None], caffes_bits: bool) -> None:
+def test_blobs_are_bit_identical_to_caffes(folder: Path, exact: Callable[[str], None], caffes_bits: bool) -> None:
     exact("all")
     case = LayerCase(folder)
     assert_arrays(compute(case), case.golden, 0 if caffes_bits else TOLERANCE)
@@ -84,7 +84,7 @@ def test_solvers_follow_caffe(
 
 @pytest.mark.parametrize("case", STEPS)
 @pytest.mark.parametrize("choice", CHOICES)
-def test_each_step_is_caffes(
+def test_each_step_equals_caffes(
     case: str,
     choice: str,
     work_in: Callable[..., Path],

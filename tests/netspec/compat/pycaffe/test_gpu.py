@@ -28,7 +28,7 @@ def _gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", LAYERS, ids=lambda folder: folder.name)
-def test_blobs_hold_what_caffes_held(folder: Path) -> None:
+def test_blobs_equal_caffes(folder: Path) -> None:
     case = LayerCase(folder)
     for key, value in compute(case).items():
         expected = case.golden[key]
@@ -48,7 +48,7 @@ def test_a_training_as_scripts_have_it(work_in: Callable[..., Path]) -> None:
     np.testing.assert_allclose(found, golden[:6], rtol=1e-3)
 
 
-def test_what_scripts_write_reaches_the_gpu(net_of: Callable[..., caffe.Net]) -> None:
+def test_values_written_by_scripts_reach_the_gpu(net_of: Callable[..., caffe.Net]) -> None:
     net = net_of(SMALL, caffe.TRAIN)
     net.blobs["label"].data[...] = 3
     net.params["scores"][1].data[3] = 100

@@ -39,7 +39,7 @@ def test_a_scalar_blob() -> None:
     assert caffe.io.blobproto_to_array(blob_proto(np.full(1, 123.0))) == 123
 
 
-def test_data_and_diff_there_and_back() -> None:
+def test_data_and_diff_can_be_written_and_read() -> None:
     data, diff = RANDOM.rand(2, 3, 4).astype(np.float32), RANDOM.rand(2, 3, 4).astype(np.float32)
     proto = caffe.io.array_to_blobproto(data, diff)
     np.testing.assert_array_equal(caffe.io.blobproto_to_array(proto), data)
@@ -47,7 +47,7 @@ def test_data_and_diff_there_and_back() -> None:
     assert caffe.io.blobproto_to_array(proto).dtype == np.float64  # as Caffe has it
 
 
-def test_a_mean_file_as_scripts_read_it(tmp_path: Path) -> None:
+def test_scripts_can_read_a_mean_file(tmp_path: Path) -> None:
     mean = RANDOM.rand(1, 3, 5, 6).astype(np.float32)
     (tmp_path / "mean.binaryproto").write_bytes(caffe.io.array_to_blobproto(mean).SerializeToString())
     blob = caffe.io.caffe_pb2.BlobProto.FromString((tmp_path / "mean.binaryproto").read_bytes())
@@ -69,7 +69,7 @@ def test_a_label_that_is_not_given_is_not_in_the_datum() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32, np.int64])
-def test_a_datum_there_and_back(dtype: Any) -> None:
+def test_a_datum_can_be_written_and_read(dtype: Any) -> None:
     array = (RANDOM.rand(3, 4, 5) * 255).astype(dtype)
     datum = caffe.io.array_to_datum(array, np.int64(7))
     assert (datum.channels, datum.height, datum.width, datum.label) == (3, 4, 5, 7)
@@ -137,7 +137,7 @@ def test_a_mean_image_of_another_size_is_resized_as_in_caffe(transformer: Transf
     np.testing.assert_array_equal(transformer.mean["data"], np.full((3, 6, 5), 7))
 
 
-def test_what_caffe_imports_into_its_module_is_there() -> None:
+def test_names_that_caffe_imports_exist() -> None:
     from scipy.ndimage import zoom
 
     assert caffe.io.zoom is zoom
@@ -163,7 +163,7 @@ def test_means_of_other_shapes(transformer: Transformer, shape: tuple[int, ...],
         transformer.set_mean("data", np.zeros(shape))
 
 
-def test_settings_that_do_not_suit_the_input(transformer: Transformer) -> None:
+def test_settings_that_do_not_fit_the_input_are_refused(transformer: Transformer) -> None:
     with pytest.raises(Exception, match="Transpose order needs to have the same number of dimensions as the input"):
         transformer.set_transpose("data", (1, 0))
     with pytest.raises(Exception, match="Channel swap needs to have the same number of dimensions as the input chan"):
@@ -215,7 +215,7 @@ def test_a_constant_image_and_one_of_other_channels() -> None:
     np.testing.assert_allclose(got[0, 0], stack[0, 0], rtol=1e-6)
 
 
-def test_without_scikit_image_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_scikit_image_one_line_gives_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("skimage", "skimage.io", "skimage.transform"):
         monkeypatch.setitem(sys.modules, name, None)
     for call in (lambda: caffe.io.load_image("x.png"), lambda: caffe.io.resize_image(np.eye(3)[..., None], (2, 2))):
@@ -223,7 +223,7 @@ def test_without_scikit_image_one_line_says_what_to_install(monkeypatch: pytest.
             call()
 
 
-def test_what_scripts_take_from_caffes_module_because_it_imports_it() -> None:
+def test_names_that_scripts_import_from_caffes_io_exist() -> None:
     skimage = pytest.importorskip("skimage")
     from skimage.transform import resize
 

@@ -35,7 +35,7 @@ def test_outputs_are_views_that_the_next_pass_changes(net_of: Callable[..., caff
     assert np.shares_memory(first, second)
 
 
-def test_smaller_shapes_use_the_front_of_one_memory(net_of: Callable[..., caffe.Net]) -> None:
+def test_smaller_shapes_use_the_start_of_the_memory(net_of: Callable[..., caffe.Net]) -> None:
     """A public MTCNN demo keeps the outputs of all scales: the last one overwrites the front of the others."""
     net = net_of(PYRAMID)
     kept = []
@@ -59,7 +59,7 @@ def test_memory_is_as_large_as_its_largest_shape_was(net_of: Callable[..., caffe
     assert np.array_equal(kept[0].reshape(-1), kept[1].reshape(-1)[: kept[0].size])
 
 
-def test_grown_memory_is_new_and_old_views_keep_what_they_had(net_of: Callable[..., caffe.Net]) -> None:
+def test_grown_memory_is_new_and_old_views_keep_their_values(net_of: Callable[..., caffe.Net]) -> None:
     net = net_of(PYRAMID)
     old = net.forward(data=image(1, 3, 12, 12))["prob1"]
     before = old.copy()
@@ -70,7 +70,7 @@ def test_grown_memory_is_new_and_old_views_keep_what_they_had(net_of: Callable[.
     assert np.array_equal(old, before)
 
 
-def test_reshape_shows_at_once_and_values_stay(net_of: Callable[..., caffe.Net]) -> None:
+def test_reshape_takes_effect_immediately_and_keeps_values(net_of: Callable[..., caffe.Net]) -> None:
     net = net_of(PYRAMID)
     blob = net.blobs["data"]
     blob.data[...] = image(1, 3, 12, 12)
@@ -100,7 +100,7 @@ def test_fresh_arrays_and_reused_memory_give_the_same_numbers(net_of: Callable[.
         del held
 
 
-def test_in_place_layers_leave_the_last_writers_values(net_of: Callable[..., caffe.Net]) -> None:
+def test_in_place_layers_overwrite_values(net_of: Callable[..., caffe.Net]) -> None:
     text = INPUT + (
         'layer { name: "twice" type: "Power" bottom: "data" top: "x" power_param { scale: 2 } }'
         'layer { name: "relu" type: "ReLU" bottom: "x" top: "x" }'
@@ -118,7 +118,7 @@ def test_in_place_layers_leave_the_last_writers_values(net_of: Callable[..., caf
 
 
 @pytest.mark.parametrize("held", [False, True])
-def test_in_place_layers_keep_what_their_gradient_needs(net_of: Callable[..., caffe.Net], held: bool) -> None:
+def test_in_place_layers_keep_data_for_their_gradient(net_of: Callable[..., caffe.Net], held: bool) -> None:
     """The gradient of Scale reads what Scale has overwritten: Caffe keeps a copy, even if scripts view the blob."""
     text = INPUT + (
         'layer { name: "twice" type: "Power" bottom: "data" top: "x" power_param { scale: 2 } }'
@@ -203,7 +203,9 @@ READS = 'layer { name: "d" type: "HDF5Data" top: "x" hdf5_data_param { source: "
     ],
 )
 @pytest.mark.parametrize("alone", [False, True])
-def test_a_backward_pass_reads_draws_and_keeps_nothing(net_of: Callable[..., caffe.Net], net: str, alone: bool) -> None:
+def test_a_backward_pass_reads_no_data_and_draws_no_random_numbers(
+    net_of: Callable[..., caffe.Net], net: str, alone: bool
+) -> None:
     """Also before any forward pass, when autograd has recorded nothing."""
     with h5py.File("x.h5", "w") as file:
         file["x"] = np.arange(1, 9, dtype=np.float32).reshape(8, 1)
@@ -227,7 +229,7 @@ def test_a_backward_pass_reads_draws_and_keeps_nothing(net_of: Callable[..., caf
             np.testing.assert_array_equal(a.data, b.data)
 
 
-def test_split_copies_and_reshaped_blobs_lie_in_one_memory(net_of: Callable[..., caffe.Net]) -> None:
+def test_split_copies_and_reshaped_blobs_share_memory(net_of: Callable[..., caffe.Net]) -> None:
     text = INPUT + (
         'layer { name: "x" type: "Power" bottom: "data" top: "x" power_param { scale: 2 } }'
         'layer { name: "flat" type: "Flatten" bottom: "x" top: "flat" }'
@@ -250,7 +252,7 @@ def test_split_copies_and_reshaped_blobs_lie_in_one_memory(net_of: Callable[...,
     assert (net.blobs["data"].diff == 6).all()
 
 
-def test_blobs_in_one_memory_may_be_maps_of_one_pixel(net_of: Callable[..., caffe.Net]) -> None:
+def test_blobs_that_share_memory_can_be_maps_of_one_pixel(net_of: Callable[..., caffe.Net]) -> None:
     """Torch's copies misinterpret the strides of such maps as an overlap."""
     net = net_of(
         """
@@ -286,7 +288,7 @@ def test_backward_belongs_to_the_last_forward(net_of: Callable[..., caffe.Net]) 
         assert np.array_equal(net.backward()["data"], 2.0 * kept)
 
 
-def test_backward_reads_what_scripts_wrote_since(net_of: Callable[..., caffe.Net]) -> None:
+def test_backward_reads_values_that_scripts_wrote(net_of: Callable[..., caffe.Net]) -> None:
     """Caffe's backward pass reads data and weights from memory: between the passes, scripts may change them."""
     text = INPUT + (
         'layer { name: "relu" type: "ReLU" bottom: "data" top: "relu" }'
@@ -306,7 +308,7 @@ def test_backward_reads_what_scripts_wrote_since(net_of: Callable[..., caffe.Net
     assert (net.blobs["data"].diff[0, 1:] == 6).all()
 
 
-def test_what_needs_no_gradient_is_passed_over(net_of: Callable[..., caffe.Net]) -> None:
+def test_layers_without_gradients_are_skipped(net_of: Callable[..., caffe.Net]) -> None:
     net = net_of(PYRAMID.replace("force_backward: true", ""), caffe.TEST)
     net.forward(data=image(1, 3, 12, 12))
     net.blobs["prob1"].diff[...] = 1
@@ -340,7 +342,7 @@ def test_guided_backpropagation(net_of: Callable[..., caffe.Net]) -> None:
     assert not np.allclose(guided, plain["data"])
 
 
-def test_deep_dream_climbs(net_of: Callable[..., caffe.Net]) -> None:
+def test_deep_dream_increases_its_objective(net_of: Callable[..., caffe.Net]) -> None:
     net = net_of(PYRAMID)
     source, target = net.blobs["data"], net.blobs["pool1"]
     source.reshape(1, 3, 24, 24)
@@ -380,7 +382,7 @@ def test_net_surgery(net_of: Callable[..., caffe.Net], write: Callable[..., str]
     assert np.array_equal(again.params["fc-conv"][0].data, conv.params["fc-conv"][0].data)
 
 
-def test_shared_parameters_are_one_memory(net_of: Callable[..., caffe.Net]) -> None:
+def test_shared_parameters_share_memory(net_of: Callable[..., caffe.Net]) -> None:
     layer = (
         'layer {{ name: "{0}" type: "InnerProduct" bottom: "data" top: "{0}" param {{ name: "w" }} '
         'inner_product_param {{ num_output: 2 bias_term: false weight_filler {{ type: "xavier" }} }} }}'
@@ -393,7 +395,7 @@ def test_shared_parameters_are_one_memory(net_of: Callable[..., caffe.Net]) -> N
     assert (net.params["b"][0].diff == 2).all()
 
 
-def test_views_of_parameters_see_weights_that_are_read(net_of: Callable[..., caffe.Net]) -> None:
+def test_views_of_parameters_show_loaded_weights(net_of: Callable[..., caffe.Net]) -> None:
     net = net_of(PYRAMID)
     net.save("one.caffemodel")
     view = net.params["conv1"][0].data
@@ -403,7 +405,7 @@ def test_views_of_parameters_see_weights_that_are_read(net_of: Callable[..., caf
     assert np.array_equal(view, before)
 
 
-def test_a_net_can_have_attributes(net_of: Callable[..., Any]) -> None:
+def test_a_net_accepts_attributes(net_of: Callable[..., Any]) -> None:
     net = net_of(PYRAMID)
     net.transformer = net.mean = 5
     assert net.mean == 5
@@ -464,7 +466,7 @@ def test_forward_backward_all(net_of: Callable[..., caffe.Net]) -> None:
         ("net.blobs['data'].reshape(1, 1, 1, 1, 1); net.blobs['data'].num", ValueError, "num_axes() <= 4"),
     ],
 )
-def test_bad_use_is_answered_and_the_net_lives(
+def test_errors_do_not_damage_the_net(
     net_of: Callable[..., caffe.Net], code: str, kind: type[Exception], message: str
 ) -> None:
     net = net_of(PYRAMID)
@@ -483,13 +485,15 @@ CHECKS = read_cases("netspec/compat/pycaffe/cases/checks.txt")
 
 
 @pytest.mark.parametrize("case", CHECKS.values(), ids=CHECKS)
-def test_a_failed_check_has_caffes_words_and_the_place(net_of: Callable[..., caffe.Net], case: dict[str, str]) -> None:
+def test_a_failed_check_has_caffes_message_and_the_location(
+    net_of: Callable[..., caffe.Net], case: dict[str, str]
+) -> None:
     with pytest.raises(ValueError, match=rf"net\.prototxt:{case['place']}: ") as fault:
         net_of(X + case["layers"])
     assert case["check"] in str(fault.value)
 
 
-def test_a_failed_check_of_a_pass_has_caffes_words(net_of: Callable[..., caffe.Net], tmp_path: Path) -> None:
+def test_a_failed_check_of_a_pass_has_caffes_message(net_of: Callable[..., caffe.Net], tmp_path: Path) -> None:
     net = net_of(X + FOUR)
     net.blobs["x"].reshape(2, 3, 9, 9)
     for run in (net.forward, net.reshape):

@@ -38,13 +38,13 @@ def test_values_of_params_have_the_type_of_the_compiled_module(net_of: Callable[
     assert {type(blobs) for blobs in net_of(SMALL).params.values()} == {caffe._caffe.BlobVec}
 
 
-def test_what_caffe_has_on_the_class_of_nets() -> None:
+def test_the_class_net_has_caffes_attributes() -> None:
     for name in ("blobs", "params", "layer_dict", "inputs", "outputs", "top_names", "bottom_names"):
         assert isinstance(getattr(caffe.Net, name), property)
     assert caffe.Net._set_input_arrays is caffe.Net.set_input_arrays
 
 
-def test_paths_may_be_bytes(write: Callable[..., str], tmp_path: Path) -> None:
+def test_paths_can_be_bytes(write: Callable[..., str], tmp_path: Path) -> None:
     path = write(SMALL).encode()
     net = caffe.Net(path, caffe.TEST)
     for save in (net.save, net.save_hdf5):
@@ -56,12 +56,12 @@ def test_paths_may_be_bytes(write: Callable[..., str], tmp_path: Path) -> None:
     assert caffe.get_solver(solver).iter == 0
 
 
-def test_a_group_of_processes_has_a_name_of_its_own() -> None:
+def test_each_group_of_processes_has_its_own_name() -> None:
     assert isinstance(caffe.NCCL.new_uid(), bytes)
     assert caffe.NCCL.new_uid() != caffe.NCCL.new_uid()
 
 
-def test_nccl_is_there_where_torch_has_it() -> None:
+def test_nccl_exists_if_torch_has_it() -> None:
     assert caffe.has_nccl() == torch.distributed.is_nccl_available()
 
 
@@ -73,7 +73,7 @@ def test_timer(monkeypatch: pytest.MonkeyPatch) -> None:
     assert timer.ms == 250
 
 
-def test_a_seed_makes_nets_alike(net_of: Callable[..., caffe.Net], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_equal_seeds_give_equal_nets(net_of: Callable[..., caffe.Net], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mode._mode, "seed", None)
     nets = []
     for _ in range(2):
@@ -91,7 +91,7 @@ def test_a_seed_makes_nets_alike(net_of: Callable[..., caffe.Net], monkeypatch: 
     assert np.array_equal(first, nets[0][0].blobs["data"].data)
 
 
-def test_no_gpu_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_missing_gpu_is_reported_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     monkeypatch.setattr(mode._mode, "warned", False)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     caffe.set_mode_gpu()
@@ -109,7 +109,7 @@ def script(code: str, folder: Path, **environment: str) -> subprocess.CompletedP
 
 
 @pytest.mark.slow
-def test_the_log_is_glogs(write: Callable[..., str], tmp_path: Path) -> None:
+def test_the_log_has_glogs_format(write: Callable[..., str], tmp_path: Path) -> None:
     write(SMALL)
     code = "import netspec.pycaffe as caffe; caffe.log('hello'); caffe.Net('net.prototxt', caffe.TEST)"
     loud = script(code, tmp_path)
@@ -154,7 +154,7 @@ def test_two_processes_train_one_net(write: Callable[..., str], tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_program_may_take_the_log_over(tmp_path: Path) -> None:
+def test_a_program_can_handle_the_log(tmp_path: Path) -> None:
     code = "import logging, netspec.pycaffe as caffe\ncaffe.logs.stop()\n"
     code += "logging.basicConfig(level='INFO', format='own %(message)s')\ncaffe.log('hello')"
     assert script(code, tmp_path).stderr == "own hello\n"

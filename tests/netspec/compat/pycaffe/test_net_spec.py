@@ -41,7 +41,7 @@ def test_attributes_name_blobs_and_layers() -> None:
     assert len(built(proto).layers) == 7
 
 
-def test_without_names_the_types_count() -> None:
+def test_without_names_layers_are_numbered_by_type() -> None:
     data, label = L.DummyData(shape=[{"dim": [4, 8]}, {"dim": [4]}], ntop=2)
     first = L.ReLU(L.InnerProduct(data, num_output=5, weight_filler={"type": "xavier"}), in_place=True)
     loss = L.SoftmaxWithLoss(L.InnerProduct(first, num_output=3, weight_filler={"type": "xavier"}), label)
@@ -84,13 +84,13 @@ def test_a_tuple_of_tops_as_an_attribute_is_a_type_error() -> None:
         n.to_proto()
 
 
-def test_layers_that_nobody_asked_for_but_others_need_come_before_them() -> None:
+def test_required_layers_are_added_before_their_readers() -> None:
     n = NetSpec()
     n.top = L.ReLU(L.Power(L.Input(shape={"dim": [1, 1]}), scale=2))
     assert [layer.name for layer in n.to_proto().layer] == ["Input1", "Power1", "top"]
 
 
-def test_parameters_go_into_the_message_of_the_type_and_others_into_the_layer() -> None:
+def test_parameters_are_assigned_to_the_right_message() -> None:
     data = L.Input(shape={"dim": [1, 1, 8, 8]})
     options: dict[str, Any] = {
         "param": [{"lr_mult": 1, "decay_mult": 1}, {"lr_mult": 2}],
@@ -114,7 +114,7 @@ def test_parameters_go_into_the_message_of_the_type_and_others_into_the_layer() 
     assert (layer.name, layer.top) == ("own", ["Convolution1"])
 
 
-def test_an_enum_may_be_given_by_its_name_a_message_as_one() -> None:
+def test_enums_can_be_names_and_messages_can_be_objects() -> None:
     data = L.Input(input_param=caffe_pb2.InputParameter(shape=[caffe_pb2.BlobShape(dim=[1, 2, 4, 4])]))
     proto = L.Pooling(data, pool="AVE", kernel_size=2).to_proto()
     assert proto.layer[0].input_param.shape[0].dim == [1, 2, 4, 4]
@@ -165,7 +165,7 @@ def test_a_spec_is_copied() -> None:
 
 
 @pytest.mark.slow
-def test_a_deep_net_needs_no_deep_stack() -> None:
+def test_a_deep_net_does_not_exceed_the_recursion_limit() -> None:
     top = L.Input(shape={"dim": [1, 1]})
     for _ in range(3000):
         top = L.ReLU(top)

@@ -35,7 +35,7 @@ def assert_same(net: caffe.Net, expected: dict[str, np.ndarray]) -> None:
         np.testing.assert_allclose(blob.data, expected[name], rtol=1e-4, atol=1e-5, err_msg=name)
 
 
-def test_all_blobs_are_there_after_a_prepared_pass(net: caffe.Net) -> None:
+def test_all_blobs_exist_after_a_prepared_pass(net: caffe.Net) -> None:
     expected = by_layer(net)
     for blob in net.blobs.values():
         blob.data[...] = 0 if blob is not net.blobs["data"] else blob.data
@@ -58,7 +58,7 @@ def test_views_of_blobs_and_weights_stay_alive(net: caffe.Net) -> None:
         assert_same(net, expected)
 
 
-def test_writes_between_passes_count_after_weights_were_folded(net: caffe.Net) -> None:
+def test_weights_written_between_passes_are_used_after_folding(net: caffe.Net) -> None:
     for k in range(4):
         net.forward()
         net.forward()
@@ -80,7 +80,7 @@ def test_blobs_take_the_shapes_that_follow_from_the_input(net: caffe.Net) -> Non
         assert not np.shares_memory(net.blobs["kept"].data, net.blobs["conv"].data)
 
 
-def test_a_part_of_a_net_reads_what_was_written_to_blobs(net: caffe.Net) -> None:
+def test_a_part_of_a_net_reads_written_blobs(net: caffe.Net) -> None:
     net.forward()
     net.blobs["ip"].data[...] = 0
     np.testing.assert_allclose(net.forward(start="prob")["prob"], 0.2, rtol=1e-6)

@@ -63,7 +63,7 @@ def test_reshape(python_net: Callable[..., caffe.Net]) -> None:
     assert {blob.data.shape for blob in net.blobs.values()} == {(2, 3)}
 
 
-def test_exceptions_are_the_codes_own(python_net: Callable[..., caffe.Net]) -> None:
+def test_exceptions_of_a_python_layer_are_passed_on(python_net: Callable[..., caffe.Net]) -> None:
     with pytest.raises(RuntimeError, match="setup of a broken layer"):
         python_net(layer("Broken", "broken", ""))
     net = python_net('input: "data" input_shape { dim: 1 }' + layer("Breaks", "breaks", "data"))
@@ -115,7 +115,7 @@ def test_param_str(python_net: Callable[..., caffe.Net]) -> None:
     assert (net.blobs["data"].diff == 140).all()
 
 
-def test_the_script_reaches_the_layers_own_object(python_net: Callable[..., Any]) -> None:
+def test_scripts_can_access_the_python_object_of_a_layer(python_net: Callable[..., Any]) -> None:
     text = 'layer { type: "Python" name: "rows" top: "row" top: "label" python_param { module: "mine" layer: "Rows" } }'
     net = python_net(text)
     assert net.blobs["label"].data == [7]  # written in setup

@@ -106,7 +106,7 @@ def test_blobs_show_each_iteration(solver: caffe.SGDSolver) -> None:
 
 
 @pytest.mark.parametrize("net", [SMALL, MEMORY], ids=["constant labels", "data in memory"])
-def test_steps_at_once_leave_what_single_steps_leave(net: str, write: Callable[..., str]) -> None:
+def test_several_steps_equal_single_steps(net: str, write: Callable[..., str]) -> None:
     """Within a call only the last pass fills the blobs, unless code can read them, or has written to one."""
     write(net)
     rng = np.random.default_rng(0)
@@ -184,7 +184,7 @@ def test_inputs_of_a_training_net_are_written_by_the_script(write: Callable[...,
     np.testing.assert_allclose(solver.net.params["fc"][1].data, [1], atol=1e-3)
 
 
-def test_faults_of_the_file_are_exceptions(write: Callable[..., str]) -> None:
+def test_errors_in_files_are_exceptions(write: Callable[..., str]) -> None:
     write(SMALL)
     with pytest.raises(ValueError, match=r'solver.prototxt:\d+:\d+: unknown lr_policy "fxed"'):
         caffe.SGDSolver(write('net: "net.prototxt" base_lr: 0.01 lr_policy: "fxed"', "solver.prototxt"))
@@ -192,9 +192,7 @@ def test_faults_of_the_file_are_exceptions(write: Callable[..., str]) -> None:
         caffe.get_solver(write('net: "net.prototxt" type: "Sgd2" lr_policy: "fixed"', "solver.prototxt"))
 
 
-def test_debug_info_logs_what_netspecs_own_solver_logs(
-    write: Callable[..., str], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_debug_info_equals_that_of_netspecs_solver(write: Callable[..., str], caplog: pytest.LogCaptureFixture) -> None:
     write(SMALL.replace("force_backward: true", ""))
     settings = write(
         'net: "net.prototxt" base_lr: 0.1 lr_policy: "fixed" debug_info: true display: 1 random_seed: 1', "s.prototxt"
@@ -221,7 +219,7 @@ def shown(solver: caffe.Solver) -> dict[str, np.ndarray]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["sgd_step", "sgd_iter_size", "adam", "tiny", "lenet", "cifar10_quick", "pnet"])
-def test_single_steps_leave_in_the_blobs_what_passes_from_layer_to_layer_do(
+def test_prepared_steps_and_layer_by_layer_steps_give_equal_blobs(
     case: str, work_in: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Bit by bit if everything is computed in Caffe's order; otherwise kernels may round differently than autograd."""
@@ -257,7 +255,7 @@ def test_single_steps_leave_in_the_blobs_what_passes_from_layer_to_layer_do(
         np.testing.assert_array_equal(whole.net.blobs[last].data, slow.net.blobs[last].data)
 
 
-def test_a_net_that_draws_is_run_from_layer_to_layer(write: Callable[..., str]) -> None:
+def test_a_net_with_random_data_runs_layer_by_layer(write: Callable[..., str]) -> None:
     write(SMALL)  # its data are drawn
     solver = caffe.SGDSolver(write(SETTINGS, "solver.prototxt"))
     solver._training.is_watched = False

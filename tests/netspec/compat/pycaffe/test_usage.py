@@ -214,7 +214,7 @@ assert caffe.draw.get_pydot_graph(L.ReLU(L.Input()).to_proto(), 'TB').get_nodes(
 
 
 @pytest.mark.parametrize("use", USES)
-def test_what_scripts_do_with_nets_and_solvers(use: str, write: Callable[..., str]) -> None:
+def test_typical_uses_of_nets_and_solvers(use: str, write: Callable[..., str]) -> None:
     for name in ("deploy", "memory", "train", "solver"):
         write((NETS / f"usage_{name}.prototxt").read_text(), f"{name}.prototxt")
     net = caffe.Net("deploy.prototxt", caffe.TEST)
@@ -249,7 +249,7 @@ def as_in_netspec_run(write: Callable[..., str]) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("use", AROUND)
-def test_what_scripts_do_around_nets(use: str, as_in_netspec_run: None) -> None:
+def test_typical_uses_of_other_functions(use: str, as_in_netspec_run: None) -> None:
     if "draw" in use:
         pytest.importorskip("pydot")
     if any(word in AROUND[use] for word in ("load_image", "resize", "Classifier")):

@@ -45,7 +45,7 @@ def files(environment: Path) -> set[Path]:
 IMPORT = "import caffe, caffe.io; from caffe.proto import caffe_pb2; print(caffe.__name__, caffe_pb2.TEST)"
 
 
-def test_it_is_put_in_and_taken_away(environment: Path) -> None:
+def test_caffe_is_installed_and_removed(environment: Path) -> None:
     before = files(environment)
     run(environment, "python", "-c", IMPORT, rc=1)
     said = run(environment, "python", "-m", "netspec", "install-caffe").stdout.splitlines()
@@ -81,7 +81,7 @@ def test_caffes_command_trains(environment: Path) -> None:
     run(environment, "upgrade_net_proto_text", "net.prototxt", "new.prototxt")
 
 
-def test_what_is_there_already_is_refused_or_moved_aside(environment: Path) -> None:
+def test_existing_files_are_refused_or_renamed(environment: Path) -> None:
     (site,) = environment.glob("lib/python*/site-packages")
     (site / "caffe").mkdir()
     (site / "caffe" / "__init__.py").write_text("real = 1")
@@ -145,7 +145,7 @@ def test_shell_scripts_find_the_commands_where_caffe_is_built(environment: Path)
     assert {path.name for path in (environment / "build").rglob("*")} == {"mine"}
 
 
-def test_a_real_build_is_left_alone(environment: Path) -> None:
+def test_a_real_build_is_not_changed(environment: Path) -> None:
     tool = environment / "build" / "tools" / "caffe"
     tool.parent.mkdir(parents=True)
     tool.write_text("#!/bin/sh\necho real\n")

@@ -27,7 +27,7 @@ PROGRAMS = {path.stem: path.read_text() for path in (FOLDER / "programs").glob("
 WHO = "import sys; print(sys.argv, __name__, __file__, sys.path[0], __package__, __spec__ is None)"
 
 
-def test_a_script_or_module_sees_what_python_gives_it(run: Run, python: Run) -> None:
+def test_a_script_or_module_gets_the_usual_environment(run: Run, python: Run) -> None:
     files = dict.fromkeys(("sub/who.py", "pack/who.py", "pack/__main__.py"), WHO) | {"pack/__init__.py": ""}
     words = ("-x", "--gpu=1", "-minloglevel", "--plugin", "-m")
     for command in (("sub/who.py", *words), ("-m", "pack.who", *words), ("-m", "pack", *words)):
@@ -54,7 +54,7 @@ def test_a_scripts_own_excepthook_is_called(run: Run) -> None:
     assert run("s.py", rc=1, s=source).stdout == "mine bad\n"
 
 
-def test_wrong_usage_and_what_is_not_there_are_one_line(run: Run) -> None:
+def test_wrong_usage_and_missing_files_are_one_line(run: Run) -> None:
     assert "SCRIPT, or -m MODULE" in run(rc=2).stderr
     missing = "none.py: cannot be read: No such file or directory; relative paths start from "
     assert run("none.py", rc=1).stderr.startswith(missing)
@@ -65,7 +65,7 @@ def test_caffe_and_its_submodules_are_found(run: Run) -> None:
     assert run("s.py", s=PROGRAMS["imports"]).stdout == "Pooling1\n"
 
 
-def test_a_module_that_caffe_has_not(run: Run) -> None:
+def test_a_module_that_caffe_lacks_is_reported(run: Run) -> None:
     fault = run("s.py", rc=1, s="import caffe.nothing").stderr
     assert "No module named 'caffe.nothing'; to import Python files of a Caffe tree, add its folder " in fault
 
@@ -78,7 +78,7 @@ def test_a_real_caffe_is_used_unless_asked(run: Run) -> None:
     assert run("--shadow-caffe", "s.py", s=script).stdout == "netspec.compat.pycaffe\n"
 
 
-def test_caffes_sources_without_the_compiled_part_are_no_real_caffe(run: Run) -> None:
+def test_sources_without_the_compiled_part_are_not_a_real_caffe(run: Run) -> None:
     done = run("s.py", s=f"{TREE}import caffe\nprint(caffe.__name__)", files=SOURCES)
     assert (done.stdout, "is used" in done.stderr) == ("netspec.compat.pycaffe\n", False)
 
@@ -102,9 +102,7 @@ def test_python_files_of_a_caffe_tree_are_found_below_caffe(run: Run) -> None:
     ("shown", "half", "kinds"),
     [("print pool.map(phases, [0])", 1, ["spawn", "fork"]), ("print(pool.map(phases, [0]))", 1.5, ["forkserver"])],
 )
-def test_workers_that_are_started_anew_see_what_the_program_sees(
-    run: Run, shown: str, half: float, kinds: list[str]
-) -> None:
+def test_spawned_workers_get_the_programs_environment(run: Run, shown: str, half: float, kinds: list[str]) -> None:
     files = {"helper.py": "def half(n):\n    return n / 2", "of.a.pool.py": PROGRAMS["workers"] % shown}
     done = run("of.a.pool.py", *kinds, files=files)
     assert done.stdout == f"[(2, {half}, {half})]\n" * len(kinds)
@@ -120,7 +118,7 @@ def test_arrays_of_one_element_are_numbers(run: Run) -> None:
     assert third.startswith("only ")
 
 
-def test_a_numpy_that_is_too_new_is_named(run: Run) -> None:
+def test_a_numpy_that_is_too_new_is_reported(run: Run) -> None:
     if tuple(map(int, np.__version__.split(".")[:2])) < (2, 4):
         pytest.skip("this NumPy converts arrays of one element to numbers")
     said = (
@@ -134,28 +132,28 @@ def test_a_numpy_that_is_too_new_is_named(run: Run) -> None:
     assert run("s.py", s="print(1)").stderr == ""
 
 
-def test_a_file_that_caffe_has_beside_its_code_is_named(run: Run) -> None:
+def test_a_missing_file_of_caffes_package_is_reported(run: Run) -> None:
     script = "import caffe, os, numpy\nnumpy.load(os.path.dirname(caffe.__file__) + '/imagenet/ilsvrc_2012_mean.npy')"
     last = run("s.py", rc=1, s=script).stderr.splitlines()[-1]
     said = "netspec run: this is python/caffe/imagenet/ilsvrc_2012_mean.npy of Caffe's sources: put a copy at /"
     assert last.startswith(said)
 
 
-def test_a_dialect_is_there_before_the_script(run: Run) -> None:
+def test_a_dialect_is_active_before_the_script(run: Run) -> None:
     script = (
         "from caffe.proto import caffe_pb2; from caffe import params as P; print(caffe_pb2.LabelMap(), P.Resize.WARP)"
     )
     assert run("--plugin", "ssd", "s.py", s=script).stdout == " 1\n"
 
 
-def test_the_log_is_shown_once_and_as_the_environment_wants_it(run: Run) -> None:
+def test_the_log_is_shown_once_at_the_level_of_the_environment(run: Run) -> None:
     net = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } }'
     script = f"import caffe\nopen('net.prototxt', 'w').write('''{net}''')\ncaffe.Net('net.prototxt', caffe.TEST)"
     assert run("s.py", s=script).stderr.count("Creating Layer x") == 1
     assert run("-minloglevel", "2", "s.py", s=script).stderr == ""
 
 
-def test_names_that_were_dropped_are_given_back_in_the_script_only(run: Run) -> None:
+def test_removed_names_are_restored_in_the_script_only(run: Run) -> None:
     assert run("s.py", s=PROGRAMS["dropped_names"]).stdout == "fine\n"
     assert not hasattr(np, "float")
     assert not hasattr(np, "asscalar")
@@ -166,11 +164,11 @@ def test_scikit_images_old_names(run: Run) -> None:
     assert run("s.py", s=PROGRAMS["old_names_of_scikit_image"]).stdout == "(2, 3) True\n(2, 3, 3) (8, 12) (8, 12, 4)\n"
 
 
-def test_keys_of_databases_may_be_text(run: Run) -> None:
+def test_keys_of_databases_can_be_text(run: Run) -> None:
     assert run("-minloglevel", "2", "s.py", s=PROGRAMS["keys_as_text"]).stdout == "[0, 1] 2\nTrue None\n[0. 1.]\n"
 
 
-def test_nothing_is_loaded_that_the_script_does_not_ask_for(run: Run) -> None:
+def test_only_modules_that_the_script_imports_are_loaded(run: Run) -> None:
     script = "import sys; print([name for name in ('torch', 'scipy', 'cv2') if name in sys.modules])"
     assert run("s.py", s=script).stdout == "[]\n"
     light = "import caffe; from caffe.proto import caffe_pb2; from caffe import layers as L, params as P, NetSpec\n"
@@ -182,7 +180,7 @@ def test_in_a_notebook(python: Run) -> None:
     assert python("-c", PROGRAMS["notebook"]).stdout == "gone\n"
 
 
-def test_a_numpy_that_pip_put_beside_the_program_gets_its_names(run: Run) -> None:
+def test_a_numpy_next_to_the_program_gets_the_old_names(run: Run) -> None:
     files = {
         "lib/numpy/__init__.py": "__version__, inf, float64 = '1.0', 1e999, 0\ndef fromstring(): pass\n"
         "set_printoptions = fromstring\n",

@@ -64,7 +64,7 @@ def test_python_2_is_recognized(source: str) -> None:
 
 
 @pytest.mark.parametrize("source", [*ALSO_PYTHON_3, "def f(:\n"])  # the last is neither
-def test_what_runs_as_python_3_is_left_alone(source: str) -> None:
+def test_python_3_is_not_translated(source: str) -> None:
     assert not is_python2(source.encode(), "s.py")
 
 
@@ -78,7 +78,7 @@ def test_with_either_translator(package: str, monkeypatch: pytest.MonkeyPatch, p
     assert python("-c", translated(source.encode(), "s.py", alone=True)).stdout == "a 3 1 0.5 -3\n"
 
 
-def test_without_a_translator_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_translator_one_line_gives_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(python2, "_translator", lambda: "")
     assert is_python2(b"#none\nprint 'x'", "s.py")
     with pytest.raises(SpecError, match=r"^s\.py: this is Python 2, .* pip install fissix, or "):
@@ -103,7 +103,7 @@ def test_a_whole_script(run: Run, python: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [["--shadow-caffe", "s.py"], ["-m", "s"], ["s.py", "argument"]])
-def test_a_translation_that_is_only_written_takes_nothing_for_a_run(words: list[str], run: Run) -> None:
+def test_options_for_running_are_refused_with_write_py3(words: list[str], run: Run) -> None:
     said = run("--write-py3", "n.py", *words, s="print 1", rc=2).stderr
     assert "--write-py3 translates a script and runs nothing" in said
 
@@ -111,7 +111,7 @@ def test_a_translation_that_is_only_written_takes_nothing_for_a_run(words: list[
 HALF = "def half(n):\n    return n / 2\n"
 
 
-def test_modules_around_a_program_are_python_2_with_it(run: Run, tmp_path: Path) -> None:
+def test_modules_next_to_a_python_2_program_are_python_2(run: Run, tmp_path: Path) -> None:
     """Otherwise results would change silently, because these modules are valid in both languages."""
     places = ("bin/beside.py", "bin/pack/below.py", "lib/put.py", "lib/sub/deep.py", "given/elsewhere.py")
     names = ("beside", "pack.below", "put", "sub.deep", "three", "true", "elsewhere")
@@ -134,12 +134,12 @@ def test_modules_around_a_program_are_python_2_with_it(run: Run, tmp_path: Path)
         assert run(*words, files=files, PYTHONPATH=path).stdout == printed
 
 
-def test_with_true_division_it_stays() -> None:
+def test_true_division_is_not_translated() -> None:
     text = translated(b"from __future__ import division\nprint 7/2, round(0.5)\n", "s.py")
     assert text == "\nprint(7/2, round(0.5))\n"
 
 
-def test_a_call_that_raised_is_not_made_again_and_its_line_is_named(run: Run) -> None:
+def test_a_failed_call_is_not_repeated_and_its_line_is_reported(run: Run) -> None:
     """Otherwise, its effects before the exception would happen twice."""
     program = """import socket
 calls = []
@@ -186,12 +186,12 @@ class L(caffe.Layer):
     assert "__main__.py is Python 2" not in done.stderr
 
 
-def test_a_histogram_may_be_normed(run: Run) -> None:
+def test_a_histogram_accepts_normed(run: Run) -> None:
     s = "import numpy as np\nprint np.histogram([0, 1, 1, 1], bins=2, normed=True)[0].tolist()"
     assert run("s.py", s=s).stdout == "[0.5, 1.5]\n"
 
 
-def test_modules_of_the_script_too_and_nothing_is_left_for_plain_python(run: Run, tmp_path: Path) -> None:
+def test_modules_of_a_script_are_translated_without_cached_files(run: Run, tmp_path: Path) -> None:
     files = {"helper.py": "def quotient(a, b):\n    print 'dividing'\n    return a / b"}
     done = run("s.py", files=files, s="from helper import quotient\nprint quotient(7, 2)")
     assert done.stdout == "dividing\n3\n"
@@ -205,12 +205,12 @@ def test_the_traceback_has_the_translations_lines(run: Run) -> None:
     assert "s.py\", line 2, in <module>\n    raise ValueError('bad')" in fault
 
 
-def test_a_script_can_be_said_to_be_python_2(run: Run) -> None:
+def test_python2_forces_the_translation(run: Run) -> None:
     for words, expected in ((["--python2"], "3\n"), ([], "3.5\n")):
         assert run(*words, "s.py", s="print(7 / 2)").stdout == expected
 
 
-def test_nothing_to_translate_is_said(run: Run) -> None:
+def test_nothing_to_translate_is_reported(run: Run) -> None:
     done = run("--write-py3", "n.py", "s.py", s="print('x')", rc=1)
     assert done.stdout == ""
     assert "s.py: is already Python 3: no translation was written to n.py" in done.stderr
@@ -237,11 +237,11 @@ def test_rounding_and_comparing() -> None:
 
 
 @pytest.mark.parametrize("case", [name for name, case in CASES.items() if "prints" in case])
-def test_text_bytes_and_order_are_those_of_python_2(case: str, run: Run) -> None:
+def test_text_bytes_and_order_are_as_in_python_2(case: str, run: Run) -> None:
     assert run("--python2", "s.py", s=CASES[case]["program"]).stdout == f"{CASES[case]['prints']}\n"
 
 
-def test_imports_beside_a_module_are_python_2s_in_packages_only(run: Run) -> None:
+def test_implicit_relative_imports_work_in_python_2_packages_only(run: Run) -> None:
     files = {
         "main.py": "import settings\nprint settings.X, settings.which",
         "__init__.py": "",

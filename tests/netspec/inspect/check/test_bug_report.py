@@ -29,7 +29,7 @@ def test_versions_and_the_machine() -> None:
 
 
 @pytest.mark.parametrize("before", [None, "0"])
-def test_the_variable_that_torch_sets_does_not_stay(before: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torchs_environment_variable_is_removed(before: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     def torchs() -> str:
         os.environ["PIP_DISABLE_PIP_VERSION_CHECK"] = "1"
         return "PyTorch version: x"
@@ -47,7 +47,7 @@ def test_the_home_folder_is_not_reported(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "NETSPEC_SHARED: ~/x\n" in bug_report([])
 
 
-def test_a_prototxt_comes_with_what_check_says(tmp_path: Path) -> None:
+def test_a_prototxt_is_reported_with_the_output_of_check(tmp_path: Path) -> None:
     path = tmp_path / "net.prototxt"
     path.write_text('layer { name: "a" type: "ReLU" bottom: "x" top: "a" }\n# ```\x1b[2J' + "x" * 1000)
     text = bug_report([str(path)])
@@ -58,7 +58,7 @@ def test_a_prototxt_comes_with_what_check_says(tmp_path: Path) -> None:
     assert text.count("```") % 2 == 0
 
 
-def test_weights_logs_folders_and_what_is_none_of_them(tmp_path: Path) -> None:
+def test_other_kinds_of_files_are_described(tmp_path: Path) -> None:
     (tmp_path / "junk").write_bytes(b"\0\1\2" * 9)
     (tmp_path / "caf\udce9").write_bytes(b"\0")
     os.mkfifo(tmp_path / "pipe")

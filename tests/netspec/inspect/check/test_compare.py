@@ -39,7 +39,7 @@ def diff(first: str, second: str) -> list[str]:
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_what_differs_is_said_with_both_places_and_other_ways_of_writing_are_not(case: dict[str, str]) -> None:
+def test_differences_have_both_locations_and_spellings_are_ignored(case: dict[str, str]) -> None:
     assert diff(NET, case["second"] + "\n") == case["lines"].splitlines()
 
 
@@ -53,7 +53,7 @@ def test_old_formats_and_new_ones() -> None:
     assert diff(old, new) == []
 
 
-def test_absence_may_mean_something() -> None:
+def test_absent_fields_can_be_differences() -> None:
     norm = 'layer { name: "n" type: "BatchNorm" bottom: "a" top: "a" batch_norm_param { %s } }\n'
     assert diff(NET + norm % "", NET + norm % "eps: 1e-5") == []
     assert diff(NET + norm % "", NET + norm % "use_global_stats: false") == [
@@ -145,7 +145,7 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", nets_as_found(), ids=last_parts)
-def test_nets_as_they_are_found_equal_what_is_written_of_them(path: Path) -> None:
+def test_published_nets_equal_their_rewritten_files(path: Path) -> None:
     upgraded = write_text(parse_net(path)[0])
     Path("written").write_text(upgraded)
     assert [str(each) for each in compare_files(path, "written")] == []

@@ -36,7 +36,7 @@ NAMED = read_cases("netspec/inspect/check/cases/named.txt")  # of a net in phase
 
 
 @pytest.mark.parametrize("case", NAMED.values(), ids=NAMED)
-def test_what_is_wrong_is_named_once(run: Run, case: dict[str, str]) -> None:
+def test_each_error_is_reported_once(run: Run, case: dict[str, str]) -> None:
     faults = write_case(case)
     assert without_warnings(run("check", "net.prototxt").err) == faults
 
@@ -54,7 +54,7 @@ def test_what_is_wrong_is_named_once(run: Run, case: dict[str, str]) -> None:
         (b'layer { name: "a" }', "expected a binary NetParameter, found text"),
     ],
 )
-def test_weights_that_are_none_are_named_as_what_they_are(run: Run, content: bytes, kind: str) -> None:
+def test_other_files_than_weights_are_described(run: Run, content: bytes, kind: str) -> None:
     Path("net.caffemodel").write_bytes(content)
     (line,) = run("check", "net.caffemodel").err.splitlines()
     assert line.startswith("net.caffemodel: ")
@@ -107,7 +107,7 @@ def begin_with(lines: list[str], beginnings: list[str]) -> bool:
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize("case", [*CASES.values(), *FOUND_IN_DATA.values()], ids=[*CASES, *FOUND_IN_DATA])
-def test_check_reports_at_once_what_train_refuses(run: Run, case: dict[str, str]) -> None:
+def test_check_reports_the_errors_of_train(run: Run, case: dict[str, str]) -> None:
     faults = write_case(case)
     before = sorted(Path().rglob("*"))
     found = run("check", "s.prototxt", "--data")
@@ -123,7 +123,7 @@ def test_check_reports_at_once_what_train_refuses(run: Run, case: dict[str, str]
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_check_needs_no_data_for_the_faults_of_prototxts(
+def test_check_finds_errors_of_prototxts_without_data(
     run: Run, case: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     faults = write_case(case)
@@ -146,7 +146,7 @@ FILLED_BY_SCRIPT = {
 
 
 @pytest.mark.parametrize(("net", "message"), FILLED_BY_SCRIPT.values(), ids=FILLED_BY_SCRIPT)
-def test_a_net_that_a_script_fills_gets_a_warning(run: Run, net: str, message: str) -> None:
+def test_a_net_with_inputs_gets_a_warning(run: Run, net: str, message: str) -> None:
     """Scripts of Caffe train such nets; ``netspec train`` refuses them."""
     write(
         **{
@@ -179,7 +179,7 @@ SHAPES = {
 
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize("name", FOUND_IN_DATA)
-def test_check_opens_data_only_if_asked(run: Run, name: str) -> None:
+def test_check_opens_data_only_on_request(run: Run, name: str) -> None:
     write_case(FOUND_IN_DATA[name])
     shutil.rmtree("db")
     words = next((words for kind, words in SHAPES.items() if f'type: "{kind}"' in Path("net.prototxt").read_text()), [])
@@ -199,13 +199,13 @@ def test_weights_can_be_checked_against_a_net_or_a_solver(run: Run, files: None)
     assert "gone" not in run("check", "s.prototxt", "--weights", "other.caffemodel").err  # as train --weights
 
 
-def test_a_shape_stands_for_the_data_of_its_layer(run: Run, files: None) -> None:
+def test_a_given_shape_replaces_data(run: Run, files: None) -> None:
     write(**{"net.prototxt": READS % "gone"})
     assert run("check", "s.prototxt", "--data").status == 1
     assert run("check", "s.prototxt", "--data", "--shape", "data=2,3,6,8").status == 0
 
 
-def test_data_says_the_shapes_that_it_has(run: Run, files: None) -> None:
+def test_data_determines_shapes(run: Run, files: None) -> None:
     write(**{"net.prototxt": READS % "db"})
     result = run("check", "net.prototxt", "--data")
     assert result.status == 0

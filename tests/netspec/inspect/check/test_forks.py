@@ -30,14 +30,14 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def test_faults_in_the_fields_of_forks_are_found():
+def test_errors_in_fields_of_forks_are_found():
     Path("net.prototxt").write_text(INPUT + PERMUTE % (1, 1) + NORM + SHUFFLE)
     assert lines("net.prototxt") == [
         'net.prototxt:3:51: layer "p1" (Permute): PermuteParameter has no field "deeper";' + OWN
     ]
 
 
-def test_a_field_of_no_dialect_is_named_once_with_its_lines():
+def test_an_unknown_field_is_reported_once_with_its_lines():
     layer = 'layer { name: "c" type: "ReLU" bottom: "a" top: "a" quantize: true }\n'
     Path("net.prototxt").write_text(INPUT + POOL + layer * 12)
     assert lines("net.prototxt") == [
@@ -48,7 +48,7 @@ def test_a_field_of_no_dialect_is_named_once_with_its_lines():
     ]
 
 
-def test_what_cannot_be_passed_over_comes_after_what_was_found():
+def test_errors_before_a_fatal_error_are_reported():
     Path("net.prototxt").write_text(POOL + STRANGE + 'layer { odd { a: [1, 2] b { c: 1 }\n  top: "x" \n')
     found = lines("net.prototxt")
     assert [line.partition(" ")[0] for line in found] == [
@@ -80,7 +80,7 @@ def test_a_solver_and_its_nets_are_read_to_the_end():
     ]
 
 
-def test_an_unknown_field_hides_nothing_elsewhere():
+def test_an_unknown_field_hides_no_other_errors():
     """What may follow from it in its own layer is not said: here, that kernel_size is missing."""
     conv = (
         'layer { name: "c" type: "Convolution" bottom: "a" top: "c" convolution_param { num_output: 4 kernal: 3 } }\n'
@@ -101,13 +101,13 @@ def test_an_unknown_field_hides_nothing_elsewhere():
     assert set(found) <= set(messages)
 
 
-def test_what_is_meant_follows_from_what_differs():
+def test_differing_fields_decide_the_suggestion():
     for field, meant in (("spatial_wta_param", ""), ("pooling_parm", "pooling_param"), ("pool_param", "pooling_param")):
         Path("net.prototxt").write_text(f'{INPUT}layer {{ name: "s" type: "ReLU" {field} {{ }} }}')
         assert ("did you mean" in lines("net.prototxt")[0], meant in lines("net.prototxt")[0]) == (bool(meant), True)
 
 
-def test_a_solver_read_as_a_net_and_a_file_that_is_not_there():
+def test_solvers_given_as_nets_and_missing_files_are_reported():
     Path("solver.prototxt").write_text("lr_policies: 1\nbase_lr: 0.1\nbase_lr: 0.2\n")
     assert lines("solver.prototxt")[-1].startswith('solver.prototxt:3:1: "base_lr" was already given')
     (line,) = lines("nowhere.prototxt")

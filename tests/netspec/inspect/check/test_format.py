@@ -45,7 +45,7 @@ def test_small_texts(text: str, formed: str) -> None:
     assert format_text(formed, "f") == formed
 
 
-def test_what_does_not_fit_a_line_is_broken() -> None:
+def test_long_lines_are_broken() -> None:
     long = "a { " + " ".join(f"field_{k}: {k}" for k in range(12)) + " }"
     assert len(format_text(long, "f").splitlines()) == 14
     numbers = format_text(f"a: [{', '.join(map(str, range(100)))}]", "f")
@@ -64,7 +64,7 @@ def test_what_does_not_fit_a_line_is_broken() -> None:
         ("a {" * 101, "f:1:303: messages are nested more than 100 deep"),
     ],
 )
-def test_what_is_not_protobuf_text(text: str, message: str) -> None:
+def test_invalid_text_is_refused(text: str, message: str) -> None:
     with pytest.raises(SpecError) as raised:
         format_text(text, "f")
     assert str(raised.value) == message
@@ -102,7 +102,7 @@ def texts(draw: st.DrawFn, depth: int = 0) -> str:
 @pytest.mark.slow
 @given(texts())
 @example(" # one\nf:1 # two\n ;# three\n")
-def test_any_text_keeps_its_tokens_and_comments_and_is_formatted_once(text: str) -> None:
+def test_formatting_keeps_tokens_and_comments_and_is_idempotent(text: str) -> None:
     formed = format_text(text, "f")
     assert format_text(formed, "f") == formed
     assert meaning(formed) == meaning(text)
@@ -119,7 +119,7 @@ def comments(text: str) -> list[str]:
     [*nets_as_found(), *sorted(GOLDEN.rglob("*.prototxt")), *sorted(SHARED.glob("golden/**/*.prototxt"))],
     ids=last_parts,
 )
-def test_files_as_they_are_found_keep_their_meaning(path: Path) -> None:
+def test_published_files_keep_their_meaning(path: Path) -> None:
     text = text_of(path)
     formed = format_text(text, str(path))
     assert format_text(formed, str(path)) == formed
@@ -134,7 +134,7 @@ def test_files_as_they_are_found_keep_their_meaning(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", OWN, ids=last_parts)
-def test_the_projects_own_files_have_the_form(path: Path) -> None:
+def test_the_projects_files_are_formatted(path: Path) -> None:
     assert format_text(text_of(path), str(path)) == text_of(path)
 
 

@@ -100,7 +100,7 @@ DATA_LAYERS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["check", "time", "train"])
 @pytest.mark.parametrize("kind", DATA_LAYERS)
-def test_data_that_takes_too_much(command: str, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_data_layers_above_the_limit_are_refused(command: str, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Shapes known only from the data are refused before a batch is read."""
     settings, said = DATA_LAYERS[kind]
     cv2.imwrite("a.png", np.zeros((40, 40, 3), np.uint8))
@@ -137,7 +137,7 @@ def test_an_image_that_cannot_be_resized(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize("text", ["pad: 2000000000 dilation: 2000000000", "pad: 40000000 dilation: 40000000"])
-def test_a_pass_that_takes_too_much(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_pass_above_the_limit_is_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     """What a kernel needs for its work is counted nowhere."""
     Path("net.prototxt").write_text(
         'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1 dim: 32 dim: 32 } } }\n'
@@ -165,7 +165,7 @@ def test_a_net_on_a_gpu(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no devices")
-def test_a_file_without_end(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_endless_file_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     Path("list.txt").write_text("/dev/zero 1\n")
     images = 'layer { name: "d" type: "ImageData" top: "d" top: "l" image_data_param { source: "list.txt" } }'
     listed = images.replace("list.txt", "/dev/zero")
@@ -178,7 +178,7 @@ def test_a_file_without_end(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == "/dev/zero: cannot be read: it is a device, not a file\n"
 
 
-def test_what_is_said_of_a_sum(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_message_lists_the_parts_of_the_sum(capsys: pytest.CaptureFixture[str]) -> None:
     Path("net.prototxt").write_text(PARAMETERS)
     assert main(["check", "net.prototxt", "--limit", "200MiB"]) == 1
     assert capsys.readouterr().err.endswith(
@@ -189,7 +189,7 @@ def test_what_is_said_of_a_sum(capsys: pytest.CaptureFixture[str]) -> None:
     assert "\nmemory: at least 239 MiB: parameters 239 MiB, tops 477 KiB\n" in capsys.readouterr().out
 
 
-def test_nothing_is_filled_before(net_of: Callable[..., Net], filled: list[int]) -> None:
+def test_the_limit_is_checked_before_memory_is_filled(net_of: Callable[..., Net], filled: list[int]) -> None:
     """Each layer is within the limit, their sum is not."""
     layers = "".join(
         f'layer {{ name: "ip{i}" type: "InnerProduct" bottom: "data" top: "ip{i}" param {{ name: "w{i}" }} '
@@ -213,7 +213,7 @@ def test_shared_parameters_count_once(net_of: Callable[..., Net]) -> None:
     assert net_of(data + layers, limit=9 * MIB).need.parameters == 4 * MIB
 
 
-def test_tops_live_until_their_last_use_in_a_test(net_of: Callable[..., Net]) -> None:
+def test_tops_count_until_their_last_use_in_phase_test(net_of: Callable[..., Net]) -> None:
     assert net_of(CHAIN, phase=TEST).need.tops == 2 * 4 * MIB
     assert net_of(CHAIN, phase=TRAIN).need.tops == 11 * 4 * MIB
     in_place = CHAIN.replace('top: "1" }', 'top: "0" }').replace('bottom: "1"', 'bottom: "0"')
@@ -233,12 +233,12 @@ def test_sizes(text: str, size: int) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "-1", "1X", "GiB", "1e9", "nan"])
-def test_what_is_no_size(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_sizes_are_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "net.prototxt", f"--limit={text}"]) == 2
     assert "expected a size, e.g. 16GiB" in capsys.readouterr().err
 
 
-def test_a_container_has_less_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_memory_of_a_container_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     machine = limits.memory()
     monkeypatch.setattr(limits, "_CONTAINER", tmp_path / "memory.max")
     (tmp_path / "memory.max").write_text("1048576\n")
@@ -248,7 +248,7 @@ def test_a_container_has_less_memory(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.slow
-def test_a_training_that_fits_goes_on() -> None:
+def test_a_training_within_the_limit_runs() -> None:
     Path("net.prototxt").write_text(DUMMY)
     assert load_solver("solver.prototxt", limit=600 * MIB).net.need.tops == 4 * 64_000_000 + 4
 
@@ -269,9 +269,7 @@ def test_an_error_in_a_large_net_names_the_last_blobs(net_of: Callable[..., Net]
     assert f"available: {100 - splits.MOST_NAMES} more, r{99 - splits.MOST_NAMES}, " in str(faults[99])
 
 
-def test_similar_names_are_looked_for_only_so_often(
-    net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_number_of_suggestions_is_limited(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
     """Each search takes time for each blob there is: for 10,000 unknown blobs, minutes."""
     asked: list[str] = []
     monkeypatch.setattr(splits, "did_you_mean", lambda blob, known: asked.append(blob) or "")
@@ -279,7 +277,7 @@ def test_similar_names_are_looked_for_only_so_often(
     assert len(asked) == splits.MOST_HINTS
 
 
-def test_a_pyramid_of_more_windows_than_can_be_counted(net_of: Callable[..., Net]) -> None:
+def test_a_pyramid_with_too_many_windows_is_refused(net_of: Callable[..., Net]) -> None:
     spp = 'layer { name: "s" type: "SPP" bottom: "data" top: "s" spp_param { pyramid_height: 4000000000 } }'
     with pytest.raises(SpecError, match="pyramid_height must be at most 16, so that an int can count its windows"):
         net_of(INPUT + spp)

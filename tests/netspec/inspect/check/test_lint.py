@@ -61,7 +61,7 @@ def advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., lis
     return check
 
 
-def test_nothing_is_said_of_a_sound_net(advice: Callable[..., list[str]]) -> None:
+def test_a_correct_net_has_no_findings(advice: Callable[..., list[str]]) -> None:
     assert advice(siamese()) == []
 
 
@@ -91,7 +91,7 @@ def test_a_blob_used_by_nothing(advice: Callable[..., list[str]]) -> None:
     assert advice(siamese(extra=spare + silent)) == []
 
 
-def test_the_outputs_of_a_net_without_a_loss_are_what_it_is_for(advice: Callable[..., list[str]]) -> None:
+def test_outputs_of_a_net_without_a_loss_are_used(advice: Callable[..., list[str]]) -> None:
     assert advice('layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } }') == []
 
 
@@ -127,11 +127,11 @@ def test_a_phase_without_its_data_layer(advice: Callable[..., list[str]], tmp_pa
 SOLVER = 'base_lr: 0.1 lr_policy: "fixed" max_iter: 100 snapshot_prefix: "s"\n'
 
 
-def test_nothing_is_said_of_a_sound_solver(advice: Callable[..., list[str]]) -> None:
+def test_a_correct_solver_has_no_findings(advice: Callable[..., list[str]]) -> None:
     assert advice(in_phases(siamese()), SOLVER + "snapshot: 50") == []
 
 
-def test_a_test_on_what_the_net_is_trained_on(advice: Callable[..., list[str]]) -> None:
+def test_a_test_on_training_data_is_found(advice: Callable[..., list[str]]) -> None:
     source = str(GOLDEN / "pairs" / "train_lmdb")
     tested = SOLVER + "test_interval: 10\ntest_iter: 30\n"
     reported = 'layer "d" (Data): the test reads "%s", which the net is trained on; use another database'
@@ -146,7 +146,7 @@ def test_a_test_on_what_the_net_is_trained_on(advice: Callable[..., list[str]]) 
     ]
 
 
-def test_no_snapshot_is_ever_taken(advice: Callable[..., list[str]]) -> None:
+def test_a_training_without_snapshots_is_found(advice: Callable[..., list[str]]) -> None:
     without = SOLVER + "snapshot_after_train: false\n"
     assert advice(in_phases(siamese()), without + "snapshot: 101") == [
         "solver.prototxt:4:1: snapshot 101 is more than max_iter 100, so it has no effect; lower it"
@@ -177,7 +177,7 @@ def test_settings_that_the_policy_and_the_rule_do_not_read(
     assert advice(in_phases(siamese()), SOLVER + settings) == [f"solver.prototxt:{line}" for line in said]
 
 
-def test_every_policy_and_rule_finds_its_own_settings_sound(advice: Callable[..., list[str]]) -> None:
+def test_settings_of_each_policy_and_rule_have_no_findings(advice: Callable[..., list[str]]) -> None:
     for policy in (
         'lr_policy: "step" gamma: 0.1 stepsize: 10', 'lr_policy: "exp" gamma: 0.9', 'lr_policy: "poly" power: 2',
         'lr_policy: "inv" gamma: 0.1 power: 1', 'lr_policy: "multistep" gamma: 0.1 stepvalue: 9',
@@ -187,9 +187,7 @@ def test_every_policy_and_rule_finds_its_own_settings_sound(advice: Callable[...
 
 
 @pytest.mark.parametrize(("iterations", "far"), [(20, False), (19, False), (22, False), (4, True), (64, True)])
-def test_a_test_that_reads_far_more_or_less_than_there_is(
-    advice: Callable[..., list[str]], iterations: int, far: bool
-) -> None:
+def test_a_test_of_a_wrong_size_is_found(advice: Callable[..., list[str]], iterations: int, far: bool) -> None:
     source = str(GOLDEN / "pairs" / "test_lmdb")
     solver = SOLVER + f"test_interval: 10\ntest_iter: {iterations}"
     read = f"test_iter {iterations} x batch 10 = {10 * iterations}"

@@ -50,7 +50,7 @@ def found(net: str, solver: str | None = None) -> list[str]:
     return [f"{each.rule} {each.where.line}:{each.where.column}" for each in lint(net, solver).found]
 
 
-def test_nothing_is_found_in_a_sound_net_and_solver() -> None:
+def test_correct_nets_and_solvers_have_no_findings() -> None:
     assert found(SOUND) == []
     assert found(SOUND, 'lr_policy: "fixed"') == []
     assert found(DUMMY + CONV.replace("num_output", "bias_term: false num_output") + NORM + IP + LOSS) == []
@@ -86,7 +86,7 @@ def test_the_phases_of_a_net_see_the_same_images() -> None:
     assert len(linted.unknown) == 1  # three means tell the channels
 
 
-def test_a_net_of_one_phase_is_looked_at_in_that_phase() -> None:
+def test_a_net_of_one_phase_is_checked_in_that_phase() -> None:
     assert found(DUMMY.replace('top: "t"', 'top: "t" include { phase: TRAIN }') + CONV + IP + LOSS) == []
 
 
@@ -107,7 +107,7 @@ def test_rules_for_solvers(settings: str, lines: list[str]) -> None:
     assert found(SOUND, settings) == lines
 
 
-def test_what_concerns_a_whole_file_is_silenced_on_its_first_line() -> None:
+def test_findings_of_a_whole_file_are_ignored_on_its_first_line() -> None:
     def said(first: str) -> list[str]:
         Path("net.prototxt").write_text(SOUND)
         text = SOLVER.replace("snapshot: 50", "snapshot_after_train: false") + 'lr_policy: "fixed"'
@@ -135,7 +135,7 @@ def test_rules_that_need_no_shapes_are_applied_without_them() -> None:
     assert "give --shape x=2,C,H,W" in str(linted.unknown[0])
 
 
-def test_every_rule_says_why() -> None:
+def test_every_rule_has_a_reason() -> None:
     for rule in RULES.values():
         assert rule.reason.endswith("."), rule.name
 
@@ -161,7 +161,7 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["lint"]) == 2
 
 
-def test_faults_and_findings_as_json_for_editors(capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_and_findings_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     Path("net.prototxt").write_text(DUMMY + CONV + NORM + IP + LOSS)
     Path("faulty.prototxt").write_text(SOUND.replace('bottom: "c"', 'bottom: "cc"'))
     assert main(["lint", "--json", "net.prototxt", "faulty.prototxt"]) == 1
@@ -195,7 +195,7 @@ def pair_shape(path: Path) -> dict[str, tuple[int, ...]]:
     [path for path in sorted((ROOT / "prototxt").rglob("*.prototxt")) if "solver" not in path.name],
     ids=lambda path: "/".join(path.parts[-3:]),
 )
-def test_the_projects_own_nets_give_no_reason_to_complain(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_projects_nets_have_no_findings(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     shapes = pair_shape(path) if "train" in path.name else {}
     linted = lint_file(path.relative_to(ROOT), replace(ON_META, given_shapes=shapes))
@@ -207,7 +207,7 @@ def test_the_projects_own_nets_give_no_reason_to_complain(path: Path, monkeypatc
 @pytest.mark.parametrize(
     "path", sorted((ROOT / "prototxt").rglob("solver*.prototxt")), ids=lambda path: "/".join(path.parts[-3:])
 )
-def test_nor_do_its_solvers(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_projects_solvers_have_no_findings(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     linted = lint_file(path.relative_to(ROOT))
     assert [*map(str, linted.found), *map(str, linted.faults)] == []

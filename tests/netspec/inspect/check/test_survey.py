@@ -64,7 +64,7 @@ def test_floats(tmp_path: Path) -> None:
     assert found.channels.histogram is None
 
 
-def test_what_a_data_layer_refuses_is_a_fault(tmp_path: Path) -> None:
+def test_records_that_a_data_layer_refuses_are_errors(tmp_path: Path) -> None:
     nan = np.full((3, 6, 8), np.nan, np.float32)
     broken = encoded_datum(b"\x89PNG....", 1).SerializeToString()
     found = look(write(tmp_path / "db", [image(0), b"\xff\xff\xff", broken, image(1, (3, 6, 9)), nan, image(2)]))
@@ -77,7 +77,7 @@ def test_what_a_data_layer_refuses_is_a_fault(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.channels.mean, np.stack([image(0), image(2)]).mean(axis=(0, 2, 3)))
 
 
-def test_what_is_worth_a_look_is_noted(tmp_path: Path) -> None:
+def test_unusual_records_are_noted(tmp_path: Path) -> None:
     images: list[Any] = [(image(k), k // 50) for k in range(100)]
     images += [(image(0), 2), (image(0), 2), (np.zeros((3, 6, 8), np.uint8), 3)]
     notes = look(write(tmp_path / "db", images)).notes
@@ -107,7 +107,7 @@ def test_rows_of_hdf5_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("name", ["nothing", "folder", "empty.txt"])
-def test_what_is_no_database_is_refused(tmp_path: Path, name: str) -> None:
+def test_other_files_than_databases_are_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "empty.txt").write_text("")
     with pytest.raises(SpecError, match=name):
@@ -124,7 +124,7 @@ def test_hdf5_files_of_texts(tmp_path: Path) -> None:
         open_records(str(tmp_path / "y.h5"))
 
 
-def test_a_spread_is_even_and_always_the_same() -> None:
+def test_samples_are_even_and_reproducible() -> None:
     assert spread(5, None) == spread(5, 7) == [0, 1, 2, 3, 4]
     numbers = spread(1000, 40)
     assert [number // 25 for number in numbers] == list(range(40))
@@ -142,7 +142,7 @@ def test_pictures_of_records() -> None:
     assert as_picture(np.arange(5.0).reshape(5, 1, 1)).shape == (2, 3)
 
 
-def test_the_command_tells_and_its_status_says_whether_there_are_faults(run: Run, tmp_path: Path) -> None:
+def test_the_command_prints_statistics_and_has_status_1_for_errors(run: Run, tmp_path: Path) -> None:
     result = run("data", "stat", "pairs/train_lmdb")
     assert (result.status, result.err) == (0, "")
     assert "640 records" in result.out
@@ -156,7 +156,7 @@ def test_the_command_tells_and_its_status_says_whether_there_are_faults(run: Run
 
 
 @pytest.mark.slow
-def test_the_command_draws_pairs_side_by_side_and_faults_first(run: Run, tmp_path: Path) -> None:
+def test_the_command_draws_pairs_and_begins_with_errors(run: Run, tmp_path: Path) -> None:
     assert run("data", "show", "pairs/train_lmdb", "--out", "x.png", "--count", 6).status == 0
     assert cv2.imread("x.png") is not None
     path = write(tmp_path / "bad", [*(image(k) for k in range(30)), b"\xff"])
@@ -174,5 +174,5 @@ def test_wrong_usage(run: Run, words: tuple[str, ...]) -> None:
     assert run("data", *words).status == 2
 
 
-def test_a_picture_in_another_form_is_refused(run: Run) -> None:
+def test_an_unknown_image_format_is_refused(run: Run) -> None:
     assert run("data", "show", "pairs/test_lmdb", "--out", "x.html").fault.endswith(".png, .svg")

@@ -73,7 +73,7 @@ def test_the_saliency_of_a_linear_unit_is_its_greatest_weight_over_the_channels(
         of_unit(net, image(), unit=3)
 
 
-def test_the_saliency_of_a_distance_is_that_of_both_images(tmp_path: Path) -> None:
+def test_the_saliency_of_a_distance_covers_both_images(tmp_path: Path) -> None:
     net, weights = linear(tmp_path, channels=1)
     a, b = (image(k, (4, 5)) for k in range(2))
     difference = weights.reshape(3, -1) @ (a.astype(float) - b).reshape(-1)
@@ -94,7 +94,7 @@ def test_principal_components_keep_distances_in_a_plane() -> None:
 
 
 @pytest.mark.slow
-def test_tsne_keeps_clusters_apart_and_is_always_the_same() -> None:
+def test_tsne_separates_clusters_and_is_reproducible() -> None:
     rng = np.random.default_rng(0)
     values = np.concatenate([rng.normal(size=(20, 6)), rng.normal(size=(20, 6)) + 20])
     points, _ = in_plane(values, "tsne")
@@ -141,7 +141,7 @@ def test_a_picture_of_saliency_has_a_row_per_image() -> None:
     assert len(figure.axes) == 6
 
 
-def test_points_have_the_colors_of_their_labels_and_images_where_there_is_room() -> None:
+def test_points_have_label_colors_and_thumbnails() -> None:
     points = np.array([[0.0, 0], [0, 1e-6], [1, 1]])
     figure = embedding_figure(points, "t", [0, 1, None], {k: image(k) for k in range(3)})
     legend = figure.axes[0].get_legend()
@@ -239,7 +239,7 @@ def test_faults(run: Run, words: tuple[object, ...], said: str) -> None:
     assert not Path("x.png").exists()
 
 
-def test_descriptors_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+def test_nonfinite_descriptors_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "f.npz", feat=np.full((3, 2), np.nan))
     with pytest.raises(ValueError, match="expected two or more, of finite numbers"):
         read_features(tmp_path / "f.npz")

@@ -65,14 +65,14 @@ def words_in(svg: ElementTree.Element) -> set[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", nets_as_found(), ids=last_parts)
-def test_nets_as_they_are_found_are_drawn(path: Path) -> None:
+def test_published_nets_can_be_drawn(path: Path) -> None:
     options = BuildOptions(open_data=False, given_shapes={"pair_data": (8, 6, 224, 224)})
     diagram = diagram_of(*parse_net(path), PHASES, options)
     assert boxes_in(svg_of(diagram, unfolded=True)) == list(range(len(diagram.boxes)))
 
 
 @pytest.mark.slow
-def test_blocks_that_repeat_are_drawn_once_and_unfold() -> None:
+def test_repeated_blocks_are_drawn_once_and_can_be_unfolded() -> None:
     diagram = read(residual(100))
     assert len(diagram.boxes) == 302
     (block,) = find_blocks(diagram)
@@ -82,14 +82,14 @@ def test_blocks_that_repeat_are_drawn_once_and_unfold() -> None:
     assert [len(boxes_in(each)) for each in (folded, unfolded)] == [2 + 3, 302]
 
 
-def test_what_differs_does_not_fold() -> None:
+def test_different_blocks_are_not_merged() -> None:
     text = residual(4).replace('name: "b2" type: "Convolution"', 'name: "b2" type: "Convolution" propagate_down: true')
     assert [(block.first, block.copies) for block in find_blocks(read(text))] == []
     seen = residual(6) + layer("peek", "ReLU", "a3", "peek")  # a blob inside the fourth block is used elsewhere
     assert [(block.first, block.copies) for block in find_blocks(read(seen))] == [(1, 3)]
 
 
-def test_the_towers_of_a_siamese_net_stand_side_by_side() -> None:
+def test_the_towers_of_a_siamese_net_are_drawn_in_parallel() -> None:
     param = 'param { name: "w" } param { name: "b" }'
     text = INPUT + layer("cut", "Slice", "data", "p", 'top: "q"')
     for name in "pq":
@@ -103,7 +103,7 @@ def test_the_towers_of_a_siamese_net_stand_side_by_side() -> None:
     assert any("weights of cp" in words for words in words_in(svg_of(diagram)))
 
 
-def test_boxes_say_what_the_net_has() -> None:
+def test_boxes_show_the_settings_of_layers() -> None:
     text = 'name: "small"\n' + INPUT + conv("c", "data") + layer("r", "ReLU", "c", "c")
     text += layer("hit", "Softmax", "c", "hit", "include { phase: TEST }")
     box = read(text).boxes[1]
@@ -118,7 +118,7 @@ def test_every_layer_type_has_a_color() -> None:
     assert [name for name in layer_types() if color_of(kind_of(name)) == COLORS[""]] == []
 
 
-def test_a_layer_in_place_on_what_others_read_too_is_a_box_of_its_own() -> None:
+def test_an_in_place_layer_on_a_shared_blob_has_its_own_box() -> None:
     text = INPUT + conv("c", "data") + layer("p", "Pooling", "c", "p", "pooling_param { kernel_size: 3 }")
     diagram = read(text + layer("r", "ReLU", "c", "c") + layer("q", "Sigmoid", "c", "q"))
     assert [box.name for box in diagram.boxes] == ["data", "c", "p", "r", "q"]
@@ -197,7 +197,7 @@ def test_the_net_in_a_file_of_weights_is_drawn(tmp_path: Path) -> None:
     assert "conv" in picture
 
 
-def test_names_of_strangers_write_no_markup() -> None:
+def test_names_are_escaped_in_markup() -> None:
     diagram = Diagram(
         "<b>", (Box("<i>\x1b", "T&", "", "", (), Where("f"), "<", ""),), ((),), (("<u>",),), (SpecError("x"),)
     )
@@ -205,13 +205,13 @@ def test_names_of_strangers_write_no_markup() -> None:
         assert not re.search(r"<[biu]>|\x1b", text)
 
 
-def test_equal_names_are_nodes_of_their_own() -> None:
+def test_layers_of_equal_names_are_separate_nodes() -> None:
     text = INPUT + layer("a", "ReLU", "data", "b", "include { phase: TRAIN }")
     text += layer("a", "Sigmoid", "data", "b", "include { phase: TEST }") + layer('q\\"\\\\', "TanH", "b", "c")
     assert boxes_in(svg_of(read(text))) == [0, 1, 2, 3]
 
 
-def test_without_graphviz_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_graphviz_one_line_gives_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.which", lambda *words, **options: None)
     with pytest.raises(SpecError, match=r"^drawing a net needs Graphviz: pip install graphviz-pure$"):
         render("digraph {}", "svg")

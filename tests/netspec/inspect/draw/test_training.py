@@ -22,7 +22,7 @@ def titles(figure: Any) -> list[str]:
     return [axis.get_title("left") for axis in figure.axes]
 
 
-def test_each_kind_of_output_has_a_panel_and_each_run_its_curves() -> None:
+def test_each_output_has_a_panel_and_each_training_its_curves() -> None:
     run, other = read_log(CAFFES), read_log(CAFFES)
     other.tests[0]["accuracy"] = Curve([0, 25], [0.5, 0.75])
     figure = training_figure([run, other])
@@ -41,13 +41,13 @@ def test_a_blob_of_many_numbers_gets_no_panels() -> None:
     assert titles(training_figure([run])) == ["loss"]
 
 
-def test_losses_that_are_no_numbers_are_marked() -> None:
+def test_nan_losses_are_marked() -> None:
     figure = training_figure([TrainingLog("x", Curve([0, 1, 2], [1, float("nan"), float("inf")]))], Look(log=True))
     (marks,) = [line for line in figure.axes[0].lines if line.get_gid() == "run0-nan"]
     assert list(marks.get_xdata()) == [1, 2]  # pyright: ignore[reportArgumentType]
 
 
-def test_a_few_great_losses_do_not_hide_the_rest() -> None:
+def test_a_few_large_losses_do_not_set_the_scale() -> None:
     curve = Curve(list(range(100)), [80.0] + [1 + 0.01 * (k % 10) for k in range(99)])
     assert training_figure([TrainingLog("x", curve)]).axes[0].get_ylim()[1] < 2
 
@@ -100,7 +100,7 @@ def test_equal_names_are_distinguished_by_their_folders(run: Run_) -> None:
         ((CAFFES, "--names", "a,b", "--out", "x.png"), 2, "found 2 --names and 1 logs"),
     ],
 )
-def test_what_cannot_be_drawn(run: Run_, words: tuple[object, ...], status: int, said: str) -> None:
+def test_logs_that_cannot_be_drawn_are_refused(run: Run_, words: tuple[object, ...], status: int, said: str) -> None:
     result = run("plot", *words)
     assert result.status == status
     assert said in result.err
@@ -115,7 +115,7 @@ def test_a_logarithmic_axis_needs_losses_above_zero(run: Run_) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ending", ["png", "svg", "html"])
-def test_names_that_cannot_be_written_are_escaped(run: Run_, ending: str) -> None:
+def test_unprintable_names_are_escaped(run: Run_, ending: str) -> None:
     name = "caf\udce9\x1b.log"
     Path(name).write_bytes(CAFFES.read_bytes())
     result = run("plot", name, "--out", f"x.{ending}")

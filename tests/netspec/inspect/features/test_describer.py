@@ -24,7 +24,7 @@ def describe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Describer:
     return Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel")
 
 
-def test_an_image_gets_the_descriptor_that_the_whole_net_gives_it(describe: Describer) -> None:
+def test_descriptors_equal_those_of_the_whole_net(describe: Describer) -> None:
     net = load_net("sgd_step/train_val.prototxt", weights="sgd_step/init.caffemodel")
     expected = extract_records(net, ["feat"], 1)["feat"]
     net.close()
@@ -57,7 +57,7 @@ def test_images_of_any_size_are_resized(describe: Describer) -> None:
     assert np.array_equal(describe(image), describe(small))
 
 
-def test_zooms_are_views_of_the_middle_and_a_detector_sees_through_them(describe: Describer) -> None:
+def test_zooms_are_center_crops_that_a_detector_uses(describe: Describer) -> None:
     near = Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel", zooms="1,0.5")
     images = np.random.default_rng(1).integers(0, 256, (8, 56, 56, 3), dtype=np.uint8)
     descriptor = near(images[0])
@@ -73,12 +73,12 @@ def test_zooms_are_views_of_the_middle_and_a_detector_sees_through_them(describe
 @pytest.mark.parametrize(
     ("zooms", "fault"), [("1,x", "expected numbers"), (1.5, "at most 1"), ("0", "a number above 0")]
 )
-def test_odd_zooms(describe: Describer, zooms: str | float, fault: str) -> None:
+def test_invalid_zooms_are_refused(describe: Describer, zooms: str | float, fault: str) -> None:
     with pytest.raises(SpecError, match=fault):
         Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel", zooms=zooms)
 
 
-def test_a_detector_takes_it(describe: Describer) -> None:
+def test_a_detector_accepts_a_describer(describe: Describer) -> None:
     images = np.random.default_rng(1).integers(0, 256, (8, 28, 28, 3), dtype=np.uint8)
     detector = LoopDetector(describe, exclude_recent=2, threshold=-1e-3)
     for image in images:

@@ -37,7 +37,7 @@ def test_given_steps_replace_the_transform_param():
     assert str(scaling_of(Steps(scale=2.0), layer, SHAPE, "f")) == "0 to 255, times 2 (from the options)"
 
 
-def test_a_mean_image_is_cut_at_its_center():
+def test_a_mean_image_is_cropped_at_its_center():
     mean = np.arange(27, dtype=np.float32).reshape(3, 3, 3)
     assert scaled(Steps(mean=mean)) == [10 - 4, 20 - 13, 30 - 22]
     assert scaled(Steps(mean=mean[None])) == [10 - 4, 20 - 13, 30 - 22]
@@ -51,12 +51,12 @@ def test_a_mean_image_is_cut_at_its_center():
         (np.ones((3, 0, 3)), "expected at least"),
     ],
 )
-def test_a_mean_that_does_not_fit(mean: np.ndarray, fault: str):
+def test_a_mean_of_a_wrong_shape_is_refused(mean: np.ndarray, fault: str):
     with pytest.raises(SpecError, match=fault):
         scaled(Steps(mean=mean.astype(np.float32)))
 
 
-def test_odd_texts():
+def test_invalid_values_are_refused():
     with pytest.raises(SpecError, match="scale and raw_scale are numbers: could not convert"):
         Steps.of(None, "x", 1, False)
     with pytest.raises(SpecError, match='found swap "maybe", expected true or false'):
@@ -79,7 +79,7 @@ def colors(run: Callable[..., Any]) -> Path:
 
 
 @pytest.mark.slow
-def test_extract_and_the_describer_take_the_steps(run: Callable[..., Any], colors: Path):
+def test_extract_and_describer_accept_the_steps(run: Callable[..., Any], colors: Path):
     words = ["extract", "--model", "net.prototxt", "--blob", "p", "--out", "f.npz"]
     steps = ["--mean", "1,2,3", "--scale", "0.5", "--raw-scale", "2", "--swap"]
     result = run(*words, "--images", colors, *steps)

@@ -90,14 +90,14 @@ def test_a_loss_that_is_no_number(text: str) -> None:
     assert np.isnan(read("Iteration 1, loss = " + text).loss.values).all()
 
 
-def test_elements_of_one_output_have_names_of_their_own() -> None:
+def test_elements_of_one_output_have_separate_names() -> None:
     lines = [f"    Test net output #{k}: {name} = {k}" for k, name in enumerate(["p", "p", "q", "p = r"])]
     run = read("Iteration 5, Testing net (#0)", *lines, "Iteration 9, Testing net (#0)", *lines)
     assert {name: curve.values for name, curve in run.tests[0].items()} == {
         "p": [0, 0], "p[1]": [1, 1], "q": [2, 2], "p = r": [3, 3]}  # fmt: skip
 
 
-def test_a_resumed_training_replaces_what_it_repeats() -> None:
+def test_a_resumed_training_replaces_repeated_lines() -> None:
     test = ["    Test net output #0: loss = {} (* 1 = {} loss)".format(*2 * [value]) for value in "123"]
     run = read("Iteration 0, loss = 1", "Iteration 10, loss = 2", "Iteration 15, Testing net (#0)", test[0],
                "Iteration 20, loss = 3", "Initializing solver from parameters: ", "Iteration 10, Testing net (#0)",
@@ -106,7 +106,7 @@ def test_a_resumed_training_replaces_what_it_repeats() -> None:
     assert run.tests[0]["loss"] == Curve([10], [2])
 
 
-def test_the_years_end_does_not_turn_time_back() -> None:
+def test_times_continue_across_new_year() -> None:
     reader = LogReader("log")
     reader.feed("I1231 23:59:59.000000 1 solver.cpp:239] Iteration 0, loss = 1")
     reader.feed("I0101 00:00:01.000000 1 solver.cpp:239] Iteration 10, loss = 1")
@@ -126,14 +126,14 @@ def test_the_years_end_does_not_turn_time_back() -> None:
         ("I0101 00:00:00.000000 1 net.cpp:1] something", "running"),
     ],
 )
-def test_how_a_training_ended(line: str, state: str) -> None:
+def test_the_end_of_a_training_is_recognized(line: str, state: str) -> None:
     reader = LogReader("log")
     reader.feed(line)
     assert reader.log.state == state
 
 
 @pytest.mark.parametrize(("data", "what"), [(b"\xff\x00 no log", "contains no iteration"), (None, "cannot be read")])
-def test_what_is_no_log_is_refused(tmp_path: Path, data: bytes | None, what: str) -> None:
+def test_other_files_than_logs_are_refused(tmp_path: Path, data: bytes | None, what: str) -> None:
     path = tmp_path / "x.log"
     if data is not None:
         path.write_bytes(data)
@@ -158,7 +158,7 @@ def test_thinning_keeps_extremes_and_ends() -> None:
     np.testing.assert_array_equal(kept, y[few.astype(int)])
 
 
-def test_the_range_that_is_drawn_leaves_out_few_values_and_no_curve() -> None:
+def test_the_drawn_range_contains_all_curves() -> None:
     loss = np.concatenate([[80.0], np.linspace(2, 1, 99)])
     low, high = shown_range([loss]) or (0, 0)
     assert (low, high) == (1, pytest.approx(2.6, abs=0.1))
@@ -168,7 +168,7 @@ def test_the_range_that_is_drawn_leaves_out_few_values_and_no_curve() -> None:
 
 
 @pytest.mark.parametrize("digits", [11, 400, 5000])
-def test_numbers_that_no_training_has_are_not_read(digits: int) -> None:
+def test_impossible_numbers_are_not_read(digits: int) -> None:
     """Caffe's counts are ints of 32 bits, its losses floats of 32 bits."""
     long = "9" * digits
     run = read(
@@ -183,7 +183,7 @@ def test_numbers_that_no_training_has_are_not_read(digits: int) -> None:
     assert (len(run.rate), run.tests) == (0, {})
 
 
-def test_a_log_may_come_through_a_pipe(tmp_path: Path) -> None:
+def test_a_log_can_be_read_from_a_pipe(tmp_path: Path) -> None:
     reader, writer = os.pipe()
     os.write(writer, CAFFES.read_bytes())  # less than a pipe holds
     os.close(writer)
@@ -192,5 +192,5 @@ def test_a_log_may_come_through_a_pipe(tmp_path: Path) -> None:
     assert run.loss.iterations[:2] == [0, 10]
 
 
-def test_a_window_may_be_larger_than_the_curve() -> None:
+def test_a_window_can_be_larger_than_the_curve() -> None:
     assert smoothed(np.array([1.0, 3.0]), 10**30).tolist() == [2, 2]
