@@ -15,8 +15,8 @@ from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.export.formats.inputs import add_input, is_input, shapes_of_input
 from netspec.graph.options import BuildOptions
+from netspec.layers import class_of, layer_class
 from netspec.layers.contract.reading import channels_read, reads_data, source_of, takes_shapes
-from netspec.layers.contract.registry import class_of, layer_class
 from netspec.net.build import build_filtered
 from netspec.proto.binary import parse_net_binary
 from netspec.proto.schema import LayerParameter, NetParameter
