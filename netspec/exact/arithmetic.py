@@ -369,7 +369,7 @@ class AsCaffe(AsTorch):
 
     @override
     def log(self, x: torch.Tensor) -> torch.Tensor:
-        return losses.logarithm(x)
+        return pointwise(x, libm.log, lambda x, top, diff: diff / x)
 
     @override
     def lstm_unit(

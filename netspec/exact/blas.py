@@ -62,18 +62,9 @@ def array(values: torch.Tensor) -> np.ndarray:
     return values.detach().numpy()
 
 
-def _routine(name: str, values: np.ndarray) -> Callable[..., Any]:
+def routine(name: str, values: np.ndarray) -> Callable[..., Any]:
+    """Return SciPy's function for a routine of BLAS, e.g. "dot", for numbers of this type."""
     return getattr(_library("_fblas"), values.dtype.char.replace("f", "s") + name)
-
-
-def gemm_routine(values: np.ndarray) -> Callable[..., Any]:
-    """Return BLAS' product of matrices for numbers of this type: (1, b.T, a.T, 0, c.T, 0, 0, 1) makes c = a b."""
-    return _routine("gemm", values)
-
-
-def gemv_routine(values: np.ndarray) -> Callable[..., Any]:
-    """Return BLAS' product of a matrix and a vector: (1, a, x, 1, y, 0, 1, 0, 1, trans, 1) adds a x, or a.T x, to y."""
-    return _routine("gemv", values)
 
 
 def gemm(
@@ -159,7 +150,7 @@ def _step(matrices: torch.Tensor) -> int:
 def dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Return the sum of the products of two tensors of equal counts, () (caffe_cpu_dot)."""
     first, second = array(a).reshape(-1), array(b).reshape(-1)
-    return a.new_tensor(_routine("dot", first)(first, second))
+    return a.new_tensor(routine("dot", first)(first, second))
 
 
 def dots(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -168,7 +159,7 @@ def dots(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     if stride == 1 and length < _IN_DOUBLE:
         return sum_in_order((a * b).double(), 1).to(a.dtype)
     flat = [array(values.contiguous()).reshape(-1) for values in (a, b)]
-    call = _routine("dot", flat[0])
+    call = routine("dot", flat[0])
     starts = (n * length * stride + m for n in range(count) for m in range(stride))
     found = [call(*flat, n=length, offx=k, incx=stride, offy=k, incy=stride) for k in starts]
     return a.new_tensor(found).view(count, stride)
@@ -177,7 +168,7 @@ def dots(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 def sum_of_magnitudes(values: torch.Tensor) -> torch.Tensor:
     """Return the sum of the absolute values, () (caffe_cpu_asum)."""
     flat = array(values).reshape(-1)
-    return values.new_tensor(_routine("asum", flat)(flat))
+    return values.new_tensor(routine("asum", flat)(flat))
 
 
 def sum_of_squares(values: torch.Tensor) -> torch.Tensor:

@@ -10,27 +10,22 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from netspec.exact import libm
-from netspec.exact.blas import array, dots, one_thread, sum_in_order
-from netspec.exact.orders import class_sums
-from netspec.exact.pointwise import pointwise
+from netspec.exact.blas import add_sums, dots, one_thread, sum_in_order
 
 
 @one_thread()
 def softmax(scores: torch.Tensor) -> torch.Tensor:
     """Return the softmax along axis 1 of scores (outer, classes, inner) (src/caffe/layers/softmax_layer.cpp)."""
     p = libm.exp(scores - scores.amax(1, keepdim=True))
-    return p.div_(torch.from_numpy(class_sums(array(p))).unsqueeze(1))
+    sums = p.new_zeros(p.shape[0], p.shape[2])
+    add_sums(p, sums, axis=0)
+    return p.div_(sums.unsqueeze(1))
 
 
 @one_thread()
 def softmax_gradient(p: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
     """Return the gradient of the scores from that of their softmax p, both (outer, classes, inner)."""
     return (diff - dots(diff, p).unsqueeze(1)) * p
-
-
-def logarithm(values: torch.Tensor) -> torch.Tensor:
-    """Return natural logarithms."""
-    return pointwise(values, libm.log, lambda values, logarithms, diff: diff / values)
 
 
 class SigmoidCrossEntropy(torch.autograd.Function):

@@ -1,7 +1,8 @@
 """Products with learned weights at fixed shapes. They compute the same as products.py and vectors.py in netspec/exact.
 
 The arguments of the calls of BLAS are made once: they are views of memory that is reused. So the result of a function
-is valid until its next call. BLAS must use one thread.
+is valid until its next call. BLAS must use one thread. ``gemm(1, b.T, a.T, 0, c.T, 0, 0, 1)`` makes c = a b.
+``gemv(1, a, x, 1, y, 0, 1, 0, 1, trans, 1)`` adds a x, or with ``trans`` a.T x, to y.
 
 Caffe: src/caffe/layers/inner_product_layer.cpp, base_conv_layer.cpp
 """
@@ -17,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from netspec.exact.blas import gemm_routine, gemv_routine
+from netspec.exact.blas import routine
 from netspec.exact.products import Axes, Filter
 
 SMALL = 2**14  # numbers: for smaller tensors a copy takes less time than making a view
@@ -96,7 +97,7 @@ class BoundVectors:
         self._diff = torch.empty(shape, dtype=weight.dtype) if wanted else None
         self._diff_shown = None if self._diff is None else self._diff.view(rows, inputs).numpy().T
         self._ones = np.ones(rows, self._matrix.dtype)
-        self._gemm, self._gemv = gemm_routine(self._matrix), gemv_routine(self._matrix)
+        self._gemm, self._gemv = routine("gemm", self._matrix), routine("gemv", self._matrix)
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the products."""
@@ -162,7 +163,7 @@ class BoundColumns:
             self._spread = torch.empty(
                 (self._at_once, channels * math.prod(sliding.kernel), positions), dtype=weight.dtype
             )
-        self._gemm, self._gemv = gemm_routine(self._filters[0]), gemv_routine(self._filters[0])
+        self._gemm, self._gemv = routine("gemm", self._filters[0]), routine("gemv", self._filters[0])
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         """Return the responses."""

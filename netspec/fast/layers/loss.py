@@ -12,9 +12,9 @@ import torch
 import torch.nn.functional as F
 
 from netspec.exact import SMALL_ITEM
-from netspec.exact.losses import class_sums
 from netspec.fast.entry import Entry
 from netspec.fast.kernels import Learning
+from netspec.fast.orders import class_sums
 from netspec.layers.loss.base import normalizer
 from netspec.layers.loss.scores import FLT_MIN, SoftmaxWithLoss
 from netspec.run.recorded import Kernels

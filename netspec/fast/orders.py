@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netspec.exact.blas import gemv_routine, one_thread
+from netspec.exact.blas import one_thread, routine
 
 _FEW = 4  # images: for fewer, calls are as fast
 _LARGEST = 64  # numbers of an image: for more, calls are as fast
@@ -44,7 +44,7 @@ def class_sums(values: np.ndarray) -> np.ndarray:
 
 def _by_calls(values: np.ndarray) -> np.ndarray:
     sums = np.zeros((len(values), values.shape[2]), values.dtype)
-    add_up, ones = gemv_routine(values), np.ones(values.shape[1], values.dtype)
+    add_up, ones = routine("gemv", values), np.ones(values.shape[1], values.dtype)
     for image, total in zip(values, sums, strict=True):
         add_up(1.0, image.T, ones, 1.0, total, 0, 1, 0, 1, 0, 1)
     return sums
