@@ -19,7 +19,7 @@ of Caffe's, of an enum that has the new ones only::
       optional PoolMethod pool = 1036;
     }
 
-``schema.added_value(self.param.pooling_param, "pool")`` then is ``"AVE_EXC_PAD"``.
+``added_value(self.param.pooling_param, "pool")`` then is ``"AVE_EXC_PAD"``.
 
 The classes of Caffe's messages stay the same objects; while no dialect is active, the schema is Caffe's. Numbers must
 be above those that Caffe itself uses in the message. A fork that uses one of these (``interp_param = 143``) needs
@@ -34,6 +34,7 @@ from functools import cached_property
 from typing import Any
 
 from google.protobuf.descriptor_pb2 import FileDescriptorProto
+from google.protobuf.message import Message
 
 from netspec.dialects.declarations import read_declarations
 from netspec.errors import SpecError, Where
@@ -209,6 +210,14 @@ def active() -> list[str]:
 def active_dialects() -> tuple[Dialect, ...]:
     """Return the active dialects, in the order of their names."""
     return tuple(_active[name] for name in active())
+
+
+def added_value(message: Message, name: str) -> str:
+    """Return the name of the value of an enum field, if a dialect adds this value to the enum; else ""."""
+    field = fields_of(message.DESCRIPTOR).get(name + MORE)
+    if field is None or not field.present(message):
+        return ""
+    return field.descriptor.enum_type.values_by_number[field.get(message)].name
 
 
 def dialects_with_field(message: str, field: str) -> tuple[str, ...]:

@@ -22,21 +22,17 @@ class ParameterSums(torch.autograd.Function):
     """
 
     @staticmethod
-    def keep(
-        ctx: Any, bottom: torch.Tensor, parameters: Sequence[torch.Tensor | None], in_place: bool, *others: torch.Tensor
-    ) -> None:
-        """Save the bottom, the parameters and others for backward, and whether it must add ``in_place``."""
-        ctx.save_for_backward(bottom, *parameters, *others)
+    def keep(ctx: Any, bottom: torch.Tensor, parameters: Sequence[torch.Tensor | None], in_place: bool) -> None:
+        """Save the bottom and the parameters for backward, and whether it must add ``in_place``."""
+        ctx.save_for_backward(bottom, *parameters)
         ctx.adds = [in_place and isinstance(p, torch.nn.Parameter) and p.is_contiguous() for p in parameters]
 
     @staticmethod
     def sums(ctx: Any) -> list[torch.Tensor | None]:
         """Return where to add the gradient of each parameter; None if it is not needed."""
-        first, last = 1, 1 + len(ctx.adds)
         found: list[torch.Tensor | None] = []
-        for parameter, asked, adds in zip(
-            ctx.saved_tensors[first:last], ctx.needs_input_grad[first:last], ctx.adds, strict=True
-        ):
+        needed = ctx.needs_input_grad[1 : 1 + len(ctx.adds)]
+        for parameter, asked, adds in zip(ctx.saved_tensors[1:], needed, ctx.adds, strict=True):
             if not asked:
                 found.append(None)
             elif not adds:

@@ -28,7 +28,7 @@ def channels_side_by_side(maps: torch.Tensor) -> torch.Tensor:
         return maps
     if not torch.is_grad_enabled() or is_recorded():
         return maps.contiguous(memory_format=torch.channels_last)
-    return _SideBySide.apply(maps)
+    return _Relaid.apply(maps, torch.channels_last, torch.contiguous_format)
 
 
 def of_one_channel(maps: torch.Tensor) -> torch.Tensor:
@@ -48,39 +48,23 @@ def map_by_map(maps: torch.Tensor) -> torch.Tensor:
         return of_one_channel(maps.contiguous())
     if not torch.is_grad_enabled() or is_recorded():
         return maps.contiguous()
-    return _MapByMap.apply(maps)
+    return _Relaid.apply(maps, torch.contiguous_format, torch.channels_last)
 
 
-class _MapByMap(torch.autograd.Function):
-    """Return maps of channels_last in Caffe's layout. Their gradient is in channels_last, like the given maps."""
-
-    @staticmethod
-    def forward(maps: torch.Tensor) -> torch.Tensor:
-        return maps.contiguous()
+class _Relaid(torch.autograd.Function):
+    """Return maps in another layout. Their gradient gets the layout that the maps had, so that kernels stay fast."""
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[torch.Tensor], output: torch.Tensor) -> None:
-        """Save nothing for backward."""
+    def forward(maps: torch.Tensor, layout: torch.memory_format, before: torch.memory_format) -> torch.Tensor:
+        return maps.contiguous(memory_format=layout)
 
     @staticmethod
-    def backward(ctx: Any, *diffs: torch.Tensor) -> torch.Tensor:
-        return diffs[0].contiguous(memory_format=torch.channels_last)
-
-
-class _SideBySide(torch.autograd.Function):
-    """Return maps in channels_last. Their gradient has Caffe's layout, like the given maps."""
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: torch.Tensor) -> None:
+        ctx.before = inputs[2]
 
     @staticmethod
-    def forward(maps: torch.Tensor) -> torch.Tensor:
-        return maps.contiguous(memory_format=torch.channels_last)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[torch.Tensor], output: torch.Tensor) -> None:
-        """Save nothing for backward."""
-
-    @staticmethod
-    def backward(ctx: Any, *diffs: torch.Tensor) -> torch.Tensor:
-        return diffs[0].contiguous()
+    def backward(ctx: Any, *diffs: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        return diffs[0].contiguous(memory_format=ctx.before), None, None
 
 
 def by_channel(values: torch.Tensor, maps: torch.Tensor) -> torch.Tensor:

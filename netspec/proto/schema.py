@@ -174,14 +174,6 @@ def value(message: Message, name: str) -> Any:
     return _field(message, name).get(message)
 
 
-def added_value(message: Message, name: str) -> str:
-    """Return the name of the value of an enum field, if a dialect adds this value to the enum; else ""."""
-    field = fields_of(message.DESCRIPTOR).get(name + MORE)
-    if field is None or not field.present(message):
-        return ""
-    return field.descriptor.enum_type.values_by_number[field.get(message)].name
-
-
 def given(message: Message) -> set[str]:
     """Return the names of the fields that were given, including those of active dialects."""
     return {field.name for field, _ in message.ListFields()}

@@ -14,10 +14,11 @@ from typing_extensions import override
 
 from netspec.dialects.blocks.relu6 import Capped
 from netspec.dialects.layers import replace
+from netspec.dialects.registry import added_value
 from netspec.layers import common
 from netspec.layers.contract.base import Shape
 from netspec.layers.vision import convolution, pooling, windows
-from netspec.proto.schema import TRAIN, LayerParameter, added_value, has, value
+from netspec.proto.schema import TRAIN, LayerParameter, has, value
 
 DECLARATIONS = """
 extend ConvolutionParameter {

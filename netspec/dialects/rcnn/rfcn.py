@@ -14,10 +14,11 @@ from netspec.dialects.boxes import as_array, highest
 from netspec.dialects.layers import replace
 from netspec.dialects.rcnn.regions import RegionPooling, whole
 from netspec.dialects.rcnn.smooth import NORMALIZED, SmoothL1LossOHEM, divisor, four
+from netspec.dialects.registry import added_value
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
 from netspec.layers.loss.scores import SoftmaxWithLoss
-from netspec.proto.schema import added_value, value
+from netspec.proto.schema import value
 
 DECLARATIONS = """
 message PSROIPoolingParameter {

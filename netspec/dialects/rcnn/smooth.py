@@ -10,11 +10,12 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
+from netspec.dialects.registry import added_value
 from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.loss.base import VALID, Loss, normalization_mode, normalizer
-from netspec.proto.schema import added_value, value
+from netspec.proto.schema import value
 
 NORMALIZED = ("loss_param", "loss_param.normalization", "loss_param.pre_fixed_normalizer")
 

@@ -79,11 +79,6 @@ def upgrade_net(net: NetParameter, source: SourceMap) -> Upgraded:
     return net, source
 
 
-def net_needs_upgrade(net: NetParameter) -> bool:
-    """Return whether any pass would change a net."""
-    return any(step.needed(net) for step in _PASSES)
-
-
 def needs_data_upgrade(net: NetParameter) -> bool:
     """Return whether a V1 data layer has transformation fields among its own parameters."""
     return any(_own_transform(layer) for layer in net.layers)

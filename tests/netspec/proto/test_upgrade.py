@@ -45,13 +45,13 @@ def test_net_is_upgraded(case: dict[str, str]) -> None:
     net, source = parse_net_text(case["old"], "f")
     assert write_text(net) == write_text(net_of(case["new"]))
     assert len(source.layers) == len(net.layer)
-    assert not upgrade.net_needs_upgrade(net)
+    assert upgrade.upgrade_net(net, source)[0] is net
 
 
 @pytest.mark.parametrize("case", NETS.values(), ids=NETS)
 def test_passes_change_nothing_they_are_given_and_nothing_twice(case: dict[str, str]) -> None:
     net, source = parse_net_text(case["old"], "f", upgrade=False)
-    assert upgrade.net_needs_upgrade(net)
+    assert upgrade.upgrade_net(net, source)[0] is not net
     for step in PASSES:
         before = net.SerializeToString(deterministic=True), source
         after, after_source = step(net, source)
