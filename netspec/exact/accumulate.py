@@ -1,4 +1,4 @@
-"""The summation of gradients of parameters.
+"""Adds up the gradients of parameters in Caffe's order.
 
 Autograd computes the gradient of each use of a parameter separately, and then adds those of all uses and passes.
 Caffe adds each product to the parameter's ``diff`` at once: image by image, layer by layer, pass by pass. A net built
@@ -16,7 +16,7 @@ import torch
 
 
 class ParameterSums(torch.autograd.Function):
-    """Base of the functions that sum up gradients of parameters themselves.
+    """Base of functions that add up the gradients of their parameters themselves.
 
     Their arguments begin with one bottom, then the parameters, each a tensor or None.
     """
@@ -45,5 +45,5 @@ class ParameterSums(torch.autograd.Function):
 
     @staticmethod
     def for_autograd(ctx: Any, sums: Sequence[torch.Tensor | None]) -> list[torch.Tensor | None]:
-        """Return what autograd must add: nothing if it was already added."""
+        """Return the gradients for autograd to add; None for those that were already added."""
         return [None if added else total for added, total in zip(ctx.adds, sums, strict=True)]

@@ -1,8 +1,7 @@
-"""The two ways to compute what layers compute: as torch, or as Caffe to the last bit.
+"""The two arithmetics of layers: torch's, and Caffe's, which is equal to Caffe in every bit.
 
-A layer asks for one of them (:meth:`netspec.layers.contract.base.Layer.arithmetic`), and its ``forward`` is the formula
-in the operations that both have. Operations differ in the order of their sums, in how they round, and in the order in
-which gradients are added; not in what they compute.
+A layer gets one of them from :meth:`netspec.layers.contract.base.Layer.arithmetic`, and its ``forward`` is a formula of
+operations that both have. The two differ in the order of additions, also of gradients, and in rounding.
 """
 
 from __future__ import annotations
@@ -72,11 +71,11 @@ class AsTorch:
     def product_of_step(
         self, vectors: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Return an inner product of one time step among many; torch adds up the gradients of all steps."""
+        """Return the inner product of one time step; autograd adds the gradients of all steps."""
         return F.linear(vectors, weight, bias)
 
     def chosen_rows(self, index: torch.Tensor, rows: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
-        """Return the rows (input_dim, num_output) of an index (...): (..., num_output), plus the bias."""
+        """Look up rows (input_dim, num_output) by an index (...), and add the bias: (..., num_output)."""
         top = F.embedding(index, rows)
         return top if bias is None else top + bias
 
@@ -117,7 +116,7 @@ class AsTorch:
         return convolution(lay_out(maps), weight, bias, *geometry)
 
     def columns(self, maps: torch.Tensor, sliding: Filter) -> torch.Tensor:
-        """Lay the pixels of maps (N, C, ...) under each position of a filter in a column: (N, C kernel, positions)."""
+        """Copy the pixels under each position of a filter into a column (im2col): (N, C kernel, positions)."""
         return sliding.columns(maps)
 
     # Along axes
@@ -125,14 +124,14 @@ class AsTorch:
     def scaled(
         self, data: torch.Tensor, axis: int, factors: torch.Tensor | None, bias: torch.Tensor | None
     ) -> torch.Tensor:
-        """Multiply by factors and add a bias, which lie over the axes from ``axis`` on; one of them may be missing."""
+        """Multiply by factors and add a bias, aligned with the axes from ``axis`` on; one of them may be None."""
         if factors is not None and axis == 1 and factors.dim() == 1:
             return scales_channels(factors, bias)(data)
         top = data if factors is None else data * _laid_over(factors, axis, data)
         return top if bias is None else top + _laid_over(bias, axis, data)
 
     def sloped(self, x: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:
-        """Multiply the negative values of x (N, C, ...) by a slope of their channel (C,), or by a single one."""
+        """Multiply the negative values of x (N, C, ...) by the slope of their channel (C,), or by a single slope."""
         return F.prelu(x, slopes.reshape(-1))
 
     def normalized_batch(
@@ -186,12 +185,12 @@ class AsTorch:
         """Return the gradient of :meth:`softmax`."""
         return (diff - (diff * top).sum(axis, keepdim=True)) * top
 
-    # Number by number
+    # Elementwise
 
     def function(self, x: torch.Tensor, by_torch: Function, as_caffe: Function, gradient: Gradient) -> torch.Tensor:
-        """Apply a function that torch computes by ``by_torch``, and Caffe, rounding each step, by ``as_caffe``.
+        """Apply an elementwise function: ``by_torch``, with the gradient of autograd.
 
-        ``gradient(bottom, top, diff)`` is Caffe's; torch finds its own.
+        As in Caffe: ``as_caffe``, which rounds each step like Caffe, with the gradient ``gradient(bottom, top, diff)``.
         """
         return by_torch(x)
 
@@ -210,14 +209,14 @@ class AsTorch:
         return lstm_unit(cell, gates, keep)
 
     def weighted_sum(self, terms: Sequence[torch.Tensor], weights: Sequence[float]) -> torch.Tensor:
-        """Add up tensors times their weights."""
+        """Return the sum of tensors, each multiplied by its weight."""
         top, *others = (x if c == 1 else x * c for x, c in zip(terms, weights, strict=True))
         for x in others:
             top = top + x
         return top
 
     def product(self, factors: Sequence[torch.Tensor], stable: bool) -> torch.Tensor:
-        """Multiply tensors; unless ``stable``, Caffe divides the product by a factor for this factor's gradient."""
+        """Multiply tensors. Unless ``stable``, Caffe computes a factor's gradient as the product divided by it."""
         return sums.product(factors)
 
     def sigmoid_cross_entropy(self, x: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
@@ -244,7 +243,7 @@ class AsTorch:
         return values.sum()
 
     def infogain(self, scores: torch.Tensor, gain: torch.Tensor, least: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return -gain log(max(p, least)), p being the softmax of scores (outer, classes, inner), and p.
+        """Return -gain log(max(p, least)) and p, the softmax of scores (outer, classes, inner).
 
         The losses are those of each class, (outer, inner, classes), or their sums, (outer, inner, 1).
         """
@@ -252,10 +251,10 @@ class AsTorch:
         terms = gain.movedim(2, 1) * self.floored(log_p, math.log(least))
         return -terms.sum(1).unsqueeze(2), log_p.detach().exp()
 
-    # Several of one
+    # Copies
 
     def copies(self, x: torch.Tensor, count: int) -> tuple[torch.Tensor, ...]:
-        """Return a tensor several times, each with a gradient of its own; these are added up."""
+        """Return ``count`` views of a tensor. Their gradients are added."""
         return tuple(x.view_as(x) for _ in range(count))
 
     def tiles(self, x: torch.Tensor, axis: int, count: int) -> torch.Tensor:
@@ -424,9 +423,10 @@ class AsCaffe(AsTorch):
 
 
 def arithmetic(exact: str, values: torch.Tensor, small: bool = False, in_place: bool = False) -> AsTorch:
-    """Return how to compute with values, by the option ``exact``; ``small``: as little work as "small" means.
+    """Return the arithmetic for values under the option ``exact``.
 
-    ``in_place``: gradients of parameters are added to ``grad`` at once (netspec/exact/accumulate.py).
+    ``small``: whether there is so little work that ``exact: small`` applies. ``in_place``: whether gradients of
+    parameters are added to ``grad`` at once (netspec/exact/accumulate.py).
     """
     return _WAYS[applies(exact, values, small), in_place]
 
@@ -445,7 +445,7 @@ def _by_rows(products: Any, vectors: torch.Tensor, weight: torch.Tensor, *how: A
 
 
 def _of_rows(function: Function, x: torch.Tensor, axis: int | None) -> torch.Tensor:
-    """Apply a function from (M, K) to (M,) to the numbers on the axes from ``axis`` on (None: to all)."""
+    """Apply a function from (M, K) to (M,) over the axes from ``axis`` on (None: all)."""
     outer = x.shape[: axis or 0]
     return function(x.reshape(math.prod(outer), -1)).reshape(outer)
 
@@ -458,5 +458,5 @@ def _by_class(x: torch.Tensor, axis: int) -> torch.Tensor:
 
 
 def _laid_over(values: torch.Tensor, axis: int, data: torch.Tensor) -> torch.Tensor:
-    """Return ``values`` shaped to meet the axes of ``data`` from ``axis`` on."""
+    """Return ``values`` in a shape that broadcasts over ``data`` from ``axis`` on."""
     return values.reshape(*values.shape, *(1,) * (data.dim() - axis - values.dim()))

@@ -1,4 +1,4 @@
-"""Caffe's calls of BLAS, with the OpenBLAS of SciPy: on the same kind of CPU, equal calls give equal bits.
+"""Caffe's calls of BLAS, with SciPy's OpenBLAS. On the same kind of CPU, equal calls return equal bits.
 
 Caffe: src/caffe/util/math_functions.cpp
 """
@@ -53,7 +53,7 @@ _IN_DOUBLE = 32  # OpenBLAS' dot sums up fewer products than this in double, one
 
 
 def suits_blas(tensor: torch.Tensor) -> bool:
-    """Return whether the functions of this module accept it: values on the CPU, of single or double precision."""
+    """Return whether the functions of this module accept a tensor: on the CPU, float32 or float64, not empty."""
     return tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64) and tensor.numel() > 0
 
 
@@ -73,8 +73,8 @@ def gemm(
     """C = A B, or C += A B; ``a_t`` and ``b_t`` take the transposes of what is stored (caffe_cpu_gemm).
 
     All three are matrices, C stored row by row without gaps. BLAS stores by columns, so it sees their transposes.
-    Stacks of matrices (N, rows, columns) are multiplied one after the other, as Caffe goes from image to image. There a
-    single matrix stands for N times itself; as C it sums up the products, with ``add``.
+    Stacks of matrices (N, rows, columns) are multiplied one after the other, as Caffe does image by image. A single
+    matrix A or B is used N times. To a single matrix C, with ``add``, all products are added.
     """
     a, b = _without_gaps(a), _without_gaps(b)
     flags = [ctypes.create_string_buffer(b"T" if t else b"N") for t in (b_t, a_t)]
@@ -94,8 +94,8 @@ def gemm(
 def add_sums(a: torch.Tensor, sums: torch.Tensor, axis: int, factor: float = 1.0) -> None:
     """Add the sums of matrix A along an axis, times a factor, as its product with a vector of ones (caffe_cpu_gemv).
 
-    Of a stack of matrices (N, rows, columns) the sums of each are added, one after the other; with sums of two axes,
-    (N, ...), to those of its own.
+    For a stack of matrices (N, rows, columns), the sums of each matrix are added in turn, all to the same ``sums``. If
+    ``sums`` has two axes (N, ...), each matrix has its own row.
     """
     a = _without_gaps(a)
     ones = torch.ones(a.shape[axis - 2], dtype=a.dtype)

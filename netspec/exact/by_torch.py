@@ -1,4 +1,4 @@
-"""What torch's own kernels need around them, so that they compute what Caffe's layers compute."""
+"""Torch's kernels, adapted so that they compute what Caffe's layers compute."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class Floor(torch.autograd.Function):
 
 
 class Standardization(torch.autograd.Function):
-    """Rows to mean 0 and deviation 1, with Caffe's gradient.
+    """Normalize rows to mean 0 and standard deviation 1, with Caffe's gradient.
 
-    Caffe differentiates as if ``eps`` were not there, then divides by the deviation plus eps: a constant row has a
-    finite gradient, where autograd's is not a number.
+    Caffe differentiates as if ``eps`` were 0, and then divides by the deviation plus ``eps``. So a constant row has a
+    finite gradient, while autograd returns NaN.
     """
 
     @staticmethod
@@ -61,7 +61,7 @@ def _standardized_gradient(top: torch.Tensor, deviation: torch.Tensor, grad: tor
 
 
 def response_base(maps: torch.Tensor, settings: Settings) -> torch.Tensor:
-    """Return what LRN divides by a power of: k + alpha times the mean of the squares in the channels around."""
+    """Return the base of LRN's divisor: k + alpha times the mean of the squares in the neighboring channels."""
     return settings.k + settings.alpha / settings.size * window_sums(maps * maps, settings.size)
 
 
@@ -76,7 +76,10 @@ def window_sums(maps: torch.Tensor, size: int) -> torch.Tensor:
 
 
 def scales_channels(scale: torch.Tensor, bias: torch.Tensor | None) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return what scales each channel: batch normalization with mean 0 and variance 1, thrice as fast, backward too."""
+    """Return a function that scales and shifts the channels.
+
+    Batch normalization with mean 0 and variance 1 takes a third of the time of a product and a sum, also backward.
+    """
     arguments = (scale, bias, torch.zeros_like(scale), torch.ones_like(scale), False, 0.0, 0.0)
     return lambda data: torch.batch_norm(data, *arguments, torch.backends.cudnn.enabled)
 
@@ -95,13 +98,13 @@ def normalized_batch(
     eps: float,
     *options: Any,
 ) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Normalize a batch (N, C, ...) by torch's function ``normalize``, with factors and biases ``affine``.
+    """Normalize a batch (N, C, ...) with torch's function ``normalize``; ``affine`` are factors and biases, or None.
 
     Returns its result, its input, the means (C,) and the unbiased variances (C,).
     """
     made, mean, variance = _normalized(data, normalize, affine, eps, options)
     if _far_from_zero(mean, variance, eps):
-        # A constant taken off each channel changes neither the result nor the gradient, only the rounding.
+        # Subtracting a constant from each channel changes only the rounding, not the result or the gradient.
         data = data - by_channel(mean, data)
         made, _, variance = _normalized(data, normalize, affine, eps, options)
     # Torch's unbiased variance of one value is 0 / 0, Caffe's 0.

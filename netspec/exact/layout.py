@@ -15,7 +15,7 @@ import torch
 
 from netspec.exact.switch import is_recorded
 
-FEWEST = 3  # channels: with fewer, channels_last is not faster
+FEWEST = 3  # with fewer channels, channels_last is not faster
 
 
 def channels_side_by_side(maps: torch.Tensor) -> torch.Tensor:
@@ -68,5 +68,5 @@ class _Relaid(torch.autograd.Function):
 
 
 def by_channel(values: torch.Tensor, maps: torch.Tensor) -> torch.Tensor:
-    """Return one value for each channel (C,) in a shape that meets maps (N, C, ...)."""
+    """Return one value for each channel (C,) in a shape that broadcasts over maps (N, C, ...)."""
     return values.view(-1, *(1,) * (maps.dim() - 2))

@@ -114,7 +114,7 @@ def _expm1f(x: np.ndarray) -> np.ndarray:
     e = (r * (e - lost) - lost) - squared  # exp(r) - 1 = r - e
     scale = np.ldexp(_FLOAT(1), k.astype(np.int32))
     inverse = 1 / scale
-    # What is added to r - e first decides how the sum is rounded.
+    # The order of these additions determines the rounding.
     return np.select(
         [k < -1, k < 1, k < 23],
         [
@@ -127,7 +127,7 @@ def _expm1f(x: np.ndarray) -> np.ndarray:
 
 
 def _each(name: str, values: torch.Tensor) -> torch.Tensor:
-    """Return the values of a function of one float, called for each."""
+    """Call a function of the C library for each float."""
     function = getattr(ctypes.CDLL(None), name)
     function.restype, function.argtypes = ctypes.c_float, [ctypes.c_float]
     return _map(function, values)

@@ -1,4 +1,4 @@
-"""The losses of single items, with Caffe's gradients. The sums of losses are in netspec/exact/sums.py."""
+"""Losses of single items, with Caffe's gradients. netspec/exact/sums.py adds them up."""
 
 # pyright: reportPrivateImportUsage=false
 
@@ -49,10 +49,10 @@ class SigmoidCrossEntropy(torch.autograd.Function):
 
 
 class Infogain(torch.autograd.Function):
-    """Return -gain log(p) of each class, p being the softmax of the scores, and p.
+    """Return -gain log(p) of each class and p, the softmax of the scores.
 
     scores   (outer, classes, inner)
-    gain     of each class, for the label's: (outer, inner, classes)
+    gain     (outer, inner, classes): the row of the infogain matrix for each label
     returns  (outer, inner, classes) and (outer, classes, inner)
 
     Caffe: src/caffe/layers/infogain_loss_layer.cpp

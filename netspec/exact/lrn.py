@@ -83,12 +83,12 @@ def across_channels_gradient(
 
 
 def _framed(maps: torch.Tensor, size: int) -> torch.Tensor:
-    """Return the maps with channels of zeros before and after them: a window of ``size`` channels around each."""
+    """Pad the channels with zeros, so that there is a window of ``size`` channels around each."""
     return F.pad(maps, (0, 0, 0, 0, size // 2, size // 2))
 
 
 def _forward_sums(squares: torch.Tensor, size: int, factor: float, start: float) -> torch.Tensor:
-    """Return start + factor * sum for each window of channels. After the first, one is added and one subtracted."""
+    """Return start + factor * sum for each window. Between windows, one channel is added and one subtracted."""
     framed = _framed(squares, size)
     sums = torch.empty_like(squares)
     running = torch.full_like(squares[:, 0], start)
@@ -103,7 +103,7 @@ def _forward_sums(squares: torch.Tensor, size: int, factor: float, start: float)
 
 
 def _backward_sums(ratios: torch.Tensor, size: int) -> torch.Tensor:
-    """Return the sum of each window of channels: one is added in each step, and subtracted after its last window."""
+    """Return the sum of each window of channels. Each channel is added once, and subtracted after its last window."""
     framed = _framed(ratios, size)
     sums = torch.empty_like(ratios)
     running = torch.zeros_like(ratios[:, 0])

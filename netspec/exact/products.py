@@ -25,7 +25,7 @@ COLUMNS = 2**20  # numbers (4 MB): the columns of several images, which fit into
 
 @dataclass(frozen=True)
 class Filter:
-    """How a filter slides over a map: one number for each spatial axis.
+    """The geometry of a filter: one number for each spatial axis.
 
     Caffe: src/caffe/util/im2col.cpp
     """
@@ -51,7 +51,7 @@ class Filter:
         return [(n + 2 * p - d * (k - 1) - 1) // s + 1 for n, k, s, p, d in axes]
 
     def columns(self, maps: torch.Tensor) -> torch.Tensor:
-        """Return (N, C kernel, positions): a column for each position of the filter, the pixels under it (im2col)."""
+        """Return the pixels under each position of the filter as a column (im2col): (N, C kernel, positions)."""
         axes = len(self.kernel)
         windows = F.pad(maps, [p for pad in reversed(self.pad) for p in (pad, pad)]) if any(self.pad) else maps
         for axis in range(axes):
@@ -61,9 +61,9 @@ class Filter:
         return columns.reshape(len(maps), maps.shape[1] * math.prod(self.kernel), -1).contiguous()
 
     def spread(self, columns: torch.Tensor, size: Axes) -> torch.Tensor:
-        """Return the maps (N, C, size) to which columns add their pixels, one pixel of the filter at a time (col2im).
+        """Add columns up to maps (N, C, size), one pixel of the filter at a time (col2im).
 
-        Torch's own col2im adds in the same order; it is for two axes.
+        For two axes, torch's col2im adds in the same order.
         """
         if len(size) == 2:
             return F.fold(columns, size, self.kernel, self.dilation, self.pad, self.stride)
@@ -83,7 +83,7 @@ class Filter:
 
 
 def _gemm_by_group(a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, group: int, **how: bool) -> None:
-    """Multiply stacks of matrices group by group; the rows of a matrix are those of one group after the other."""
+    """Multiply stacks of matrices group by group; the rows of a matrix are ordered by group."""
     if group == 1:
         gemm(a, b, c, **how)
         return
@@ -307,7 +307,7 @@ def convolution(
 
 
 class Columns(torch.autograd.Function):
-    """Lay the pixels under each position of a filter one below the other.
+    """Copy the pixels under each position of a filter into a column.
 
     maps     (N, C, ...)
     returns  (N, C kernel, positions)

@@ -29,7 +29,7 @@ class SumInOrder(torch.autograd.Function):
 
 
 class RowSums(torch.autograd.Function):
-    """Sum up each row times a factor, as its product with a vector of factors (caffe_cpu_dot): (M, K) to (M,)."""
+    """Return the sum of each row times a factor: its product with a constant vector (caffe_cpu_dot), (M, K) to (M,)."""
 
     @staticmethod
     @one_thread()
@@ -64,7 +64,7 @@ def row_magnitudes(rows: torch.Tensor) -> torch.Tensor:
 
 
 class Copies(torch.autograd.Function):
-    """Return a tensor several times; add up the gradients of these, the first one's first.
+    """Return a tensor several times; add their gradients, beginning with the first.
 
     Caffe: src/caffe/layers/split_layer.cpp
     """
@@ -94,7 +94,8 @@ def tiles(values: torch.Tensor, count: int) -> torch.Tensor:
 class Product(torch.autograd.Function):
     """Multiply tensors element by element.
 
-    The gradient of one is ``stable``, the product of the others times the top's, or the top divided by it, times that.
+    The gradient of a factor is the gradient of the top times the product of the other factors. Unless ``stable``, this
+    product is computed as the top divided by the factor.
 
     Caffe: src/caffe/layers/eltwise_layer.cpp
     """

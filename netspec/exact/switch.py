@@ -1,4 +1,4 @@
-"""Decides whether a value is computed in Caffe's order."""
+"""Decides whether sums are computed in Caffe's order."""
 
 # pyright: reportPrivateImportUsage=false
 

@@ -249,7 +249,7 @@ def _checked(kernel: Kernel, layer: Layer) -> Kernel:
         nonlocal unchecked
         tops = kernel(*bottoms)
         if unchecked:
-            layer.check_promise(tops if isinstance(tops, tuple) else (tops,))
+            layer.check_shapes(tops if isinstance(tops, tuple) else (tops,))
             unchecked = False
         return tops
 

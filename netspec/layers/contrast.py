@@ -50,7 +50,7 @@ class LRN(Layer):
 
     @property
     def settings(self) -> Settings:
-        """The numbers of the formula."""
+        """The size, alpha, beta and k of the prototxt."""
         param = self.param.lrn_param
         return Settings(param.local_size, param.alpha, param.beta, param.k)
 

@@ -22,10 +22,10 @@ from netspec.layers.contract.registry import register
 class Recurrent(Layer):
     """Base of RNN and LSTM.
 
-    The hidden state continues in the next forward pass until a cont of 0 ends its sequence. It is 0 at first,
-    and when the number of streams changes. With expose_hidden, the state is bottoms and tops instead.
-    No gradient passes from a batch to the previous one, not even through these bottoms and tops. Unlike in Caffe, the
-    number of time steps can differ between batches.
+    The hidden state is kept for the next forward pass, until a cont of 0 begins a new sequence. It is 0 at first, and
+    after the number of streams has changed. With expose_hidden, bottoms and tops hold the state instead. Gradients do
+    not pass from a batch to the previous one, not even through these bottoms and tops. Unlike in Caffe, the number of
+    time steps can differ between batches.
     """
 
     bottoms = (2, 5)
@@ -34,7 +34,7 @@ class Recurrent(Layer):
     ignores = frozenset({"recurrent_param.debug_info"})
     state_names: ClassVar[tuple[str, ...]]
     remembers = True
-    how: AsTorch  # how this pass computes
+    how: AsTorch  # the arithmetic of the current forward pass
     gates: ClassVar[int] = 1  # number of inputs of a hidden unit
 
     def setup(self) -> None:
@@ -94,9 +94,9 @@ class Recurrent(Layer):
             static = self.multiply(others[0].reshape(streams, -1), 2)
             statics = self.how.copies(static, steps)
         state = self._first_state(x, others[self.has_static :])
-        goes_on = cont.detach().to(x.dtype).unsqueeze(2)
+        kept = cont.detach().to(x.dtype).unsqueeze(2)
         outputs = []
-        for t, keep in enumerate(goes_on):
+        for t, keep in enumerate(kept):
             output, state = self.step((inputs[t], *statics[t : t + 1]), keep, state)
             outputs.append(output)
         last = tuple(s.detach() for s in state)
@@ -127,8 +127,8 @@ class Recurrent(Layer):
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
         """Compute one time step; return its output (streams, hidden) and the state after it.
 
-        ``inputs`` are the products for x (with the bias) and x_static, (streams, gates * hidden) each; ``keep``
-        (streams, 1) is cont.
+        ``inputs`` are the products with x (and the bias) and with x_static, each (streams, gates * hidden). ``keep``
+        (streams, 1) is cont of this step.
         """
         raise NotImplementedError
 

@@ -82,15 +82,15 @@ class Forks:
         return ()
 
     def rate_fields(self) -> "frozenset[str]":
-        """Return the fields of SolverParameter that the rates of forks follow from."""
+        """Return the fields of SolverParameter from which forks compute the learning rate."""
         return frozenset()
 
     def policy_fault(self, param: "Any") -> str:
-        """Return what a SolverParameter lacks for its lr_policy, one that forks add; "" where it lacks nothing."""
+        """Return what a SolverParameter lacks for an lr_policy that a fork adds; "" if nothing is missing."""
         return ""
 
     def learning_rate(self, param: "Any", iteration: int, caffes: "Callable[[float], Any]") -> "Any":
-        """Return the rate of an iteration; ``caffes`` computes the one of its lr_policy from a ``base_lr``."""
+        """Return the learning rate of an iteration; ``caffes`` computes Caffe's rate from a ``base_lr``."""
         return caffes(param.base_lr)
 
     # The layers

@@ -40,7 +40,7 @@ class SourceMap:
 
     ``report`` gets each error in the net, from the first pass until the net is built and has its weights. By default it
     raises the first one; another function can collect them. ``dialects`` are those that a comment names.
-    ``left_out`` maps the blobs of excluded layers to a text that names the layer and says what to do.
+    ``left_out`` maps the blobs of excluded layers to a text with the layer's name and advice.
     """
 
     file: str

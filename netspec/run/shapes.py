@@ -25,7 +25,7 @@ def fitted(
         if known and not changes_itself(layer):
             layer = copy.copy(layer)
             layer.fit([shapes[v] for v in node.bottoms])
-            if layer.counted_axis is None and layer.promises:
+            if layer.counted_axis is None and layer.fixed_shapes:
                 shapes.update(zip(node.tops, layer.top_shapes, strict=False))
             found.append(layer)
         else:

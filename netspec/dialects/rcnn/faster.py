@@ -259,7 +259,7 @@ class RoIData(_Sampling):
     """
 
     bottoms, tops = (0, 0), (3, None)
-    promises = False  # images have different sizes
+    fixed_shapes = False  # images have different sizes
 
     def setup(self) -> None:
         if self.num_tops != 3:

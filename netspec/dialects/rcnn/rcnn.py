@@ -180,7 +180,7 @@ class Proposal(Layer):
     Fork: PVANet's and Intel's caffe, src/caffe/layers/proposal_layer.cpp
     """
 
-    promises = False  # there may be fewer
+    fixed_shapes = False  # there may be fewer
     bottoms = (3, 3)
     tops = (1, 2)
     label_bottoms = frozenset({0, 1, 2})

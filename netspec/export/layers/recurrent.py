@@ -95,8 +95,8 @@ class RecurrentExport(Exporter):
             for value in (inputs, keep)
         ]
         outputs = []
-        for gate_input, goes_on in zip(*parts, strict=True):
-            output, state = self.onnx_step(graph, gate_input, goes_on, state)
+        for gate_input, kept in zip(*parts, strict=True):
+            output, state = self.onnx_step(graph, gate_input, kept, state)
             outputs.append(output)
         top = outputs[0] if steps == 1 else graph.node("Concat", *outputs, axis=0)
         return (top, *state) if layer.exposed else (top,)

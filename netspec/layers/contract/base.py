@@ -27,8 +27,8 @@ from netspec.layers.contract import fillers
 from netspec.layers.contract.context import Context
 from netspec.layers.contract.learned import Learned, values_of
 
-MOST_AXES = 32  # of a blob of Caffe's (kMaxBlobAxes)
-MOST = 2**31 - 1  # numbers that a blob of Caffe's can hold (Blob::Reshape)
+MOST_AXES = 32  # the most axes of a blob in Caffe (kMaxBlobAxes)
+MOST = 2**31 - 1  # the most numbers in a blob in Caffe (Blob::Reshape)
 
 
 def shape_string(shape: Sequence[int]) -> str:
@@ -57,11 +57,13 @@ class Layer(torch.nn.Module):
     is_loss: ClassVar[bool] = False  # a missing top is added, and default_loss_weight is 1
     is_input: ClassVar[bool] = False  # its tops are given by the caller
     label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
-    reads: ClassVar[frozenset[str]] = frozenset()  # its own fields of LayerParameter; set where it is registered
+    reads: ClassVar[frozenset[str]] = frozenset()  # the fields of LayerParameter that it reads; set by ``register``
     ignores: frozenset[str] = frozenset()  # those of ``reads`` that have no effect, e.g. "data_param.scale"
     shares: frozenset[str] = frozenset()  # "data", "diff": what its tops share with its bottom in Caffe's memory
     counted_axis: ClassVar[int | None] = None  # the axis of the tops with a size that is known only after forward
-    promises: ClassVar[bool] = True  # its tops have the shapes that ``reshape`` returned, except in ``counted_axis``
+    fixed_shapes: ClassVar[bool] = (
+        True  # its tops have the shapes that ``reshape`` returned, except in ``counted_axis``
+    )
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
         super().__init__()
@@ -77,7 +79,7 @@ class Layer(torch.nn.Module):
         self.refuse(self._wrong_counts())
         self.setup()
         self.top_shapes: list[Shape] = self._reshaped(self.bottom_shapes)
-        self._kept_promise = False  # whether a pass at the present shapes gave tops of ``top_shapes``
+        self._shapes_checked = False  # whether a pass at the present shapes gave tops of ``top_shapes``
 
     @override
     def __setattr__(self, name: str, value: Any) -> None:
@@ -104,14 +106,14 @@ class Layer(torch.nn.Module):
     def small(self) -> bool | None:
         """Whether the layer is so small, at its present shapes, that summing in Caffe's order costs almost no time.
 
-        None: ``exact: small`` does not apply to this layer.
+        None if ``exact: small`` does not apply to this layer.
         """
         return None
 
     def arithmetic(self, bottom: torch.Tensor, small: bool | None = None) -> AsTorch:
-        """Return what to compute with: as torch, or, where the option ``exact`` says so, as Caffe to the last bit.
+        """Return the arithmetic to use for a bottom: torch's, or, depending on the option ``exact``, Caffe's.
 
-        ``small`` is instead of the property ``small``. Bottoms of another type of numbers than the blobs are torch's.
+        ``small`` overrides the property ``small``. If the blobs have another dtype than the bottom, it is torch's.
         """
         options, small = self.context.options, self.small if small is None else small
         found = arithmetic(options.exact, bottom, bool(small), options.accumulate_in_place)
@@ -137,15 +139,15 @@ class Layer(torch.nn.Module):
                 raise self.error(f"its pass needs more memory than available; {there}") from None
             raise
         tops = tops if isinstance(tops, tuple) else (tops,)
-        if not self._kept_promise:
-            self.check_promise(tops)
-            self._kept_promise = True
+        if not self._shapes_checked:
+            self.check_shapes(tops)
+            self._shapes_checked = True
         return tops
 
-    def check_promise(self, tops: Sequence[torch.Tensor]) -> None:
+    def check_shapes(self, tops: Sequence[torch.Tensor]) -> None:
         """Raise SpecError if the tops of a pass have other shapes than ``reshape`` returned."""
         found = [tuple(top.shape) if isinstance(top, torch.Tensor) else None for top in tops]
-        if self.promises and list(map(self._counted, found)) != list(map(self._counted, self.top_shapes)):
+        if self.fixed_shapes and list(map(self._counted, found)) != list(map(self._counted, self.top_shapes)):
             one, other = (" and ".join(map(str, shapes)) or "no top" for shapes in (found, self.top_shapes))
             raise self.error(f"forward returned a top of shape {one}, but reshape returned {other}", "type")
 
@@ -157,7 +159,7 @@ class Layer(torch.nn.Module):
     def fit(self, bottom_shapes: list[Shape]) -> None:
         """Reshape for bottoms of these shapes, if they have changed."""
         if bottom_shapes != self.bottom_shapes:
-            self.bottom_shapes, self._kept_promise = bottom_shapes, False
+            self.bottom_shapes, self._shapes_checked = bottom_shapes, False
             try:
                 self.top_shapes = [tuple(s) for s in self.reshape(bottom_shapes)]
             except SpecError:

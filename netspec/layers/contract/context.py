@@ -81,12 +81,12 @@ class Random:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a layer knows of its net: the ``phase``, the ``options``, and ``random`` numbers.
+    """What a layer knows about its net: the ``phase``, the ``options``, and ``random`` numbers.
 
     If ``options.open_data`` is false, a layer must not open its files. The shapes of its tops are then in
     ``options.given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``.
-    ``at(*path)`` is the place in the prototxt of a field of this layer. ``report`` is called with faults after which
-    building can go on (the default raises the first one).
+    ``at(*path)`` is the place in the prototxt of a field of this layer. ``report`` is called with each error that does
+    not stop the building of the net; by default it raises the error.
     """
 
     phase: int = TEST
@@ -94,10 +94,10 @@ class Context:
     random: Random = field(default_factory=lambda: Random(0))
     at: Callable[..., Where] = nowhere
     report: Report = raise_fault
-    created: Callable[[int], None] = lambda tops: None  # called after ``construct``, for the order of the log
-    take: Callable[[int], None] = lambda size: (
-        None
-    )  # called before memory is taken, with the bytes; may raise SpecError
+    # called after ``construct`` with the number of tops, for the order of the log
+    created: Callable[[int], None] = lambda tops: None
+    # called with a number of bytes before they are allocated; may raise SpecError
+    take: Callable[[int], None] = lambda size: None
 
     @property
     def device(self) -> torch.device:

@@ -18,22 +18,22 @@ FAN_IN, FAN_OUT, AVERAGE = 0, 1, 2  # caffe.proto: enum FillerParameter.Variance
 
 
 def fill(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    """Return a float32 CPU tensor of ``shape``, filled as ``filler`` (a FillerParameter) says.
+    """Return a float32 CPU tensor of ``shape``, filled by ``filler``, a FillerParameter.
 
-    Raises ValueError as :func:`check`. The distributions are Caffe's; the numbers drawn are not, since its random
-    generator belongs to the version of boost it was built with.
+    The distributions are Caffe's, but the numbers differ, because Caffe's random generator depends on its version of
+    Boost. Raises ValueError like :func:`check`.
     """
     check(filler, shape)
     return draw(filler, shape, generator)
 
 
 def draw(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    """Do the same as :func:`fill`, for a filler and a shape that were checked."""
+    """Do the same as :func:`fill`, without the check."""
     return _FILLERS[filler.type].draw(filler, shape, generator)
 
 
 def check(filler: Any, shape: Shape) -> None:
-    """Raise ValueError, in one plain sentence, for a filler that Caffe would refuse for a blob of this shape."""
+    """Raise ValueError if Caffe would refuse the filler for a blob of this shape."""
     if filler.type not in _FILLERS:
         known = sorted(_FILLERS)
         raise ValueError(
@@ -75,7 +75,7 @@ def _check_axis(filler: Any, shape: Shape) -> None:
 
 
 def constant(shape: Shape, value: float, device: torch.device | str = "cpu") -> torch.Tensor:
-    """Return a tensor of equal numbers. Zeros cost no time, because new memory from the system is zero."""
+    """Return a float32 tensor of equal numbers. Zeros are free, because new memory from the system is zero."""
     if value == 0:
         return torch.zeros(shape, dtype=torch.float32, device=device)
     return torch.full(shape, value, dtype=torch.float32, device=device)
@@ -108,7 +108,7 @@ def _bilinear(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Te
 
 
 def _fan(filler: Any, shape: Shape) -> float:
-    """Return the count that the variance is divided by. Caffe computes it from the blob, not from the layer.
+    """Return the divisor of the variance. Caffe computes it from the shape of the blob, not from the layer.
 
     So fan_out is ``num_output`` for an InnerProduct, and wrong by the factor ``group`` for a grouped convolution.
     """

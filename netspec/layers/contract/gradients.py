@@ -1,4 +1,4 @@
-"""Layers that compute gradients, like Caffe, from the content of memory at the time of the backward pass."""
+"""Layers that compute their gradients like Caffe: from the data in memory when the backward pass runs."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class IgnoresPropagateDown(Protocol):
 
 
 def gradient_reads(layer: Layer) -> frozenset[str]:
-    """Return what a layer's gradient reads from memory; nothing if autograd keeps all that it needs."""
+    """Return what a layer's gradient reads from memory; an empty set if autograd saves all that it needs."""
     return getattr(layer, "gradient_reads", NOTHING)
 
 

@@ -1,4 +1,4 @@
-"""Consecutive layers that one layer can compute together. netspec/run/parts.py uses it in training."""
+"""Consecutive layers that one layer can compute together. Trainings use it (netspec/run/parts.py)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Joined(Protocol):
 
     @property
     def joins_as(self) -> str:
-        """What the layer computes: "relu" is max(x, 0); "scale" has learned factors and biases of the channels."""
+        """What the layer computes: "relu" (max(x, 0)), "scale" (learned factors and biases of channels) or ""."""
         ...
 
 

@@ -67,8 +67,9 @@ def blobs_of(layers: Iterable[torch.nn.Module]) -> Callable[[], list[Any]]:
 class Seen:
     """The state of learned blobs at the time when kernels were made for them.
 
-    The kernels use the memory of the blobs and of their gradients, so replaced memory is a change. With ``values``, the
-    kernels hold copies of the values. Then a write to a blob, or a new alias of its memory, is a change as well.
+    The kernels use the memory of the blobs and of their gradients, so a blob with other memory counts as changed. With
+    ``values``, the kernels hold copies of the values: a write to a blob, or a new alias of its memory, is then a change
+    too.
     """
 
     __slots__ = ("_addresses", "_blobs", "_counts", "_gradients", "_values")
@@ -107,13 +108,13 @@ def may_have_alias(blob: torch.Tensor) -> bool:
     return _uses is None or _uses(blob.untyped_storage()._cdata) > _uses_of_one()
 
 
-# How many tensors and arrays share a storage. Torch has no public function for it; without this one, each blob that was
-# ever handed out is taken to have an alias still.
+# Returns how many tensors and arrays share a storage. Torch has no public function for this. If this one is missing, a
+# blob that was ever handed out counts as aliased.
 _uses = getattr(torch._C, "_storage_Use_Count", None)
 
 
 @cache
 def _uses_of_one() -> int:
-    """Return the uses of a storage that one tensor alone holds."""
+    """Return the result of ``_uses`` for a storage with a single tensor."""
     tensor = torch.empty(1)
     return _uses(tensor.untyped_storage()._cdata) if _uses else 0

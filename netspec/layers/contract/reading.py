@@ -45,7 +45,7 @@ class Waits(Protocol):
 
     @property
     def waited(self) -> float:
-        """How many seconds forward passes have waited for records."""
+        """The seconds that forward passes have waited for records."""
         ...
 
 
@@ -113,7 +113,7 @@ def channels_read(param: Any, layer: type[Layer] | None) -> int:
 
 
 def changes_itself(layer: Layer) -> bool:
-    """Return whether a layer changes its state in a pass. It can then be neither prepared nor copied."""
+    """Return whether a layer changes its state in a pass. Such a layer can be neither prepared nor copied."""
     return getattr(layer, "remembers", False)
 
 

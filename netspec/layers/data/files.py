@@ -28,13 +28,9 @@ from netspec.layers.contract.registry import register
 from netspec.proto.schema import PHASE_NAMES, value
 
 BACKENDS = ("leveldb", "lmdb")  # caffe.proto: enum DataParameter.DB
-MOVED = (
-    "scale",
-    "mean_file",
-    "crop_size",
-    "mirror",
-)  # fields that moved to transform_param; in a current layer they have no effect
-MOST_AT_ONCE = 1 << 16  # numbers in the batches that a thread makes at once, and at most 32 batches
+# Fields that moved to transform_param; in a current layer they have no effect.
+MOVED = ("scale", "mean_file", "crop_size", "mirror")
+MOST_AT_ONCE = 1 << 16  # a thread makes at most so many numbers at once, and at most 32 batches
 Batch = tuple[tuple[torch.Tensor, ...], int]
 T = TypeVar("T")
 
@@ -184,7 +180,7 @@ class ReadingLayer(Layer):
         for _ in range(wraps):
             self.log_restart()
         self.top_shapes = [tuple(top.shape) for top in tops]  # at batch size 1 images may differ in size
-        if self.context.device.type == "cpu":  # where they are: ``to`` lets other threads take Python's lock
+        if self.context.device.type == "cpu":  # even a ``to`` without effect lets other threads take Python's lock
             return tops
         return tuple(top.to(self.context.device, non_blocking=True) for top in tops)
 

@@ -38,7 +38,7 @@ class HDF5Data(ReadingLayer):
         return Hdf5Source(p.source, self.param.top, p.batch_size, p.shuffle, self.draws, self.place)
 
     def shapes_without_data(self) -> list[Shape]:
-        """Return the shapes given by the caller; the prototxt says nothing of them."""
+        """Return the shapes given by the caller; the prototxt does not contain them."""
         given = self.context.options.given_shapes
         self.refuse(self.shape_wanted(top, f"{self.batch_size},...") for top in self.param.top if top not in given)
         return [given[top] for top in self.param.top]

@@ -78,7 +78,7 @@ class Memory:
         return self._uploaded
 
     def put(self, tensor: torch.Tensor) -> None:
-        """Store the result of a layer. The tensor belongs to the memory from now on."""
+        """Store the result of a layer. The caller must not change the tensor afterwards."""
         self.reserve(tensor.numel())
         if tensor.dtype != self.dtype:
             self.cast(tensor.dtype)
@@ -106,7 +106,7 @@ class Memory:
             self.dtype, self._fresh, self._flat, self._uploaded, self._seen = dtype, None, None, None, _no_view
 
     def _settled(self, count: int) -> torch.Tensor:
-        """Return the memory that views show, with what was put last."""
+        """Return the memory that views show, after writing the last result into it."""
         self.reserve(count)
         fresh, self._fresh = self._fresh, None
         if self._flat is None:
@@ -136,7 +136,7 @@ class Blob:
     """
 
     def __init__(self, shape: Shape = (), data: Memory | None = None, diff: Memory | None = None) -> None:
-        """Make a blob, of zeros unless it is given memory."""
+        """Make a blob: of zeros, or with the given memory."""
         self.data_memory = data or Memory()
         self.diff_memory = diff or Memory()
         self._shape: Shape = ()

@@ -13,7 +13,7 @@ from netspec.layers.contract.registry import register
 
 
 def _axis(layer: Layer, shape: Shape, param_name: str, old_name: str) -> int:
-    """Return the axis of a Concat or a Slice, given as ``axis`` or by the older name, which may not be negative."""
+    """Return the axis of a Concat or a Slice, from ``axis`` or from the field with the older name."""
     p: Any = getattr(layer.param, param_name)
     if not p.HasField(old_name):
         return layer.canonical_axis(p.axis, shape, param_name, "axis")

@@ -46,7 +46,7 @@ _finders: tuple[Any, ...] = ()  # of modules inside it
 
 
 def offer(package: str, finder: Any) -> None:
-    """Let Python layers import a package as ``caffe``, not this module; ``finder`` finds the modules inside it."""
+    """Let Python layers import a package as ``caffe`` instead of this module; ``finder`` finds its submodules."""
     global _home, _finders
     _home, _finders = package, (finder,)
 

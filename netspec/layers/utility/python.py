@@ -66,7 +66,7 @@ class Python(Layer):
     bottoms = (0, None)
     tops = (0, None)
     takes_shapes = True  # if its code must not run
-    promises = False  # as in Caffe, the code may reshape its tops in forward
+    fixed_shapes = False  # as in Caffe, the code may reshape its tops in forward
 
     def setup(self) -> None:
         given = self.context.options.given_shapes

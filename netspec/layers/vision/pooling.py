@@ -33,7 +33,7 @@ class _PoolingBase(Layer):
             raise self.error(f"pad {windows.pad} must be less than the kernel {windows.kernel}", field)
 
     def pool(self, maps: torch.Tensor, windows: Windows, method: int) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Return the pooled maps (N, C, down, across) and, for MAX, the indices of the winners."""
+        """Return the pooled maps (N, C, down, across) and, for MAX, the index of each maximum."""
         if method == MAX:
             return max_pool(maps, windows)
         if method == AVE:

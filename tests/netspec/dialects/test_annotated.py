@@ -136,7 +136,7 @@ def test_a_crop_cuts_boxes_and_drops_those_outside(tmp_path: Path) -> None:
         ("emit_type: MIN_OVERLAP emit_overlap: 0.3", [1]),
     ],
 )
-def test_emit_constraint_says_which_boxes_stay(tmp_path: Path, constraint: str, kept: list[int]) -> None:
+def test_emit_constraint_selects_boxes(tmp_path: Path, constraint: str, kept: list[int]) -> None:
     boxes = [(1, (0.3, 0.3, 0.6, 0.6), False), (2, (0.0, 0.0, 0.48, 0.48), False)]  # 23 % of the second are inside
     emit = f"emit_constraint {{ {constraint} }}" if constraint else ""
     label = batch_of(reading(write(tmp_path, annotated(noise(20, 20), boxes)), f"crop_size: 10 {emit}"))[1]
@@ -159,7 +159,7 @@ SAMPLERS = "batch_sampler { max_sample: 1 max_trials: 1 } " + " ".join(
 
 
 @pytest.mark.slow
-def test_boxes_stay_on_what_they_show_however_an_image_is_varied(tmp_path: Path) -> None:
+def test_boxes_follow_their_objects_in_varied_images(tmp_path: Path) -> None:
     image = np.full((90, 120, 3), (104, 117, 123), np.uint8)
     image[30:60, 20:80] = 255
     source = write(tmp_path, annotated(image, [(1, (20 / 120, 30 / 90, 80 / 120, 60 / 90), False)]))
@@ -262,13 +262,13 @@ def test_windows_meet_their_constraint(tmp_path: Path, limits: str, meets: Calla
         ("", "", 2, 'record "0001" gives 3 x 8 x 9, the first 3 x 8 x 8; all must have the same size'),
     ],
 )
-def test_what_does_not_fit_is_refused(tmp_path: Path, transform: str, more: str, batch: int, fault: str) -> None:
+def test_unsuitable_settings_are_refused(tmp_path: Path, transform: str, more: str, batch: int, fault: str) -> None:
     source = write(tmp_path, annotated(noise(8, 8), OBJECTS), annotated(noise(8, 9), OBJECTS))
     with pytest.raises(SpecError, match=fault):
         batch_of(reading(source, transform, more, batch))
 
 
-def test_a_database_of_plain_images_says_what_it_is(tmp_path: Path) -> None:
+def test_a_database_of_plain_images_is_an_error_that_names_its_kind(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match='record "0000" is no AnnotatedDatum; for a database of plain images use'):
         reading(write(tmp_path, array_to_datum(noise(4, 4).transpose(2, 0, 1), 1)))
 
@@ -288,7 +288,7 @@ def test_shapes_are_known_without_data() -> None:
         assert layer.top_shapes == [shape, (1, 1, 1, 8)]
 
 
-def test_of_several_sizes_one_is_drawn_for_ten_batches(tmp_path: Path) -> None:
+def test_a_size_is_drawn_for_every_ten_batches(tmp_path: Path) -> None:
     source = write(tmp_path, annotated(noise(8, 12), OBJECTS), annotated(noise(10, 10), OBJECTS))
     sizes = " ".join(f"resize_param {{ prob: 0.5 height: {size} width: {size} }}" for size in (6, 9))
     layer = reading(source, sizes, batch=2)
@@ -308,7 +308,7 @@ def test_boxes_as_yolo_has_them(tmp_path: Path) -> None:
     assert not label[0, 0, 2:].any()
 
 
-def test_a_jitter_cuts_windows_of_its_own(tmp_path: Path) -> None:
+def test_each_jitter_crops_other_windows(tmp_path: Path) -> None:
     source = write(tmp_path, annotated(noise(40, 40), OBJECTS))
     layer = reading(source, "resize_param { height: 20 width: 20 }", more="yolo_data_type: 1 yolo_data_jitter: 0.5")
     sums = {float(batch_of(layer)[0].sum()) for _ in range(10)}

@@ -38,7 +38,7 @@ def test_relu6_and_its_gradient_at_the_bends(build: Build) -> None:
     assert run(build("blocks", 'type: "ReLU6"', (2,)), torch.tensor([float("-inf"), float("nan")]))[0] == 0
 
 
-def test_relu6_in_place_has_the_gradient_of_what_lies_in_memory() -> None:
+def test_relu6_in_place_has_the_gradient_of_the_data_in_memory() -> None:
     use_dialect("blocks")
     text = """
       layer { name: 'in' type: 'Input' top: 'x' input_param { shape { dim: 5 } } }
@@ -75,7 +75,7 @@ def test_shuffle_channel(build: Build, gradcheck: Gradcheck) -> None:
         layer.run(numbers(2, 7, 2, 3))
 
 
-def test_upsample_keeps_the_last_value_and_gives_each_the_gradient(build: Build) -> None:
+def test_upsample_keeps_the_last_value_and_all_values_get_the_gradient(build: Build) -> None:
     x = torch.tensor([[[[1.0, 2.0], [3.0, 4.0]]]], requires_grad=True)
     mask = torch.tensor([[[[0.0, 5.0], [5.0, 15.0]]]])
     (top,) = build("blocks", "type: 'Upsample' upsample_param { scale: 2 }", x.shape, mask.shape).run(x, mask)
@@ -123,7 +123,7 @@ def test_the_statistics_of_bn_are_never_learned(params: str) -> None:
     assert [p.requires_grad for p in net.params["b"]] == [True, True, False, False]
 
 
-def test_every_layer_says_what_it_takes_and_gives() -> None:
+def test_every_layer_documents_its_bottoms_and_tops() -> None:
     for name in ("ssd", "rcnn", "blocks", "layout", "yolo", "ristretto"):
         before = set(layer_types())
         use_dialect(name)

@@ -62,7 +62,7 @@ def names(cases: Sequence[Case]) -> list[str]:
 
 
 @pytest.mark.parametrize("case", NUMBERS, ids=names(NUMBERS))
-def test_the_numbers_are_those_of_the_loops(case: Case, gradcheck: Callable[..., None]) -> None:
+def test_the_numbers_equal_those_of_plain_loops(case: Case, gradcheck: Callable[..., None]) -> None:
     found, layer, bottoms, fixed = find(case)
     line = " ".join(f"{value:.7g}" for value, _ in found)
     assert len(found) == len(case.expected), line
@@ -73,7 +73,7 @@ def test_the_numbers_are_those_of_the_loops(case: Case, gradcheck: Callable[...,
 
 
 @pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
-def test_it_is_refused_at_its_place(case: dict[str, str]) -> None:
+def test_an_error_has_its_place(case: dict[str, str]) -> None:
     shapes = [tuple(map(int, line.split())) for line in case["bottoms"].splitlines()]
     use_dialect(case["dialect"])
     with pytest.raises(SpecError) as fault:

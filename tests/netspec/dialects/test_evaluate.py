@@ -77,7 +77,7 @@ def test_boxes_are_compared_in_whole_pixels_where_sizes_are_known(build: Build, 
         evaluate(build, settings + "0.5")
 
 
-def test_a_resumed_training_goes_on_with_the_next_size(build: Build, tmp_path: Path) -> None:
+def test_a_resumed_training_continues_with_the_next_size(build: Build, tmp_path: Path) -> None:
     (tmp_path / "sizes.txt").write_text("a 10 20\nb 1 1\n")
     settings = f"num_classes: 3 name_size_file: '{tmp_path / 'sizes.txt'}'"
     text = f"type: 'DetectionEvaluate' detection_evaluate_param {{ {settings} }}"

@@ -21,7 +21,7 @@ def of_faces() -> None:
 
 
 @pytest.mark.parametrize("times", [2, 3, 4])
-def test_margins_are_cosines_that_go_on_falling(times: int) -> None:
+def test_margins_are_cosines_that_decrease_monotonically(times: int) -> None:
     margin = MARGINS[times - 1]
     assert margin
     angles = torch.linspace(0.01, math.pi - 0.01, 400, dtype=torch.double)
@@ -92,7 +92,7 @@ def test_an_inner_product_with_normalize_has_weights_of_length_one() -> None:
     torch.testing.assert_close(top, x @ next(layer.parameters()).t())
 
 
-def test_a_channel_scale_keeps_the_gradients_it_is_asked_to() -> None:
+def test_a_channel_scale_computes_the_requested_gradients() -> None:
     x, scale = torch.randn(2, 3, 2, 2, requires_grad=True), torch.rand(2, 1, 2, 2, requires_grad=True)
     top = netspec.layer('type: "ChannelScale" channel_scale_param { do_backward_scale: false }')(x, scale)
     torch.testing.assert_close(top, x * scale)

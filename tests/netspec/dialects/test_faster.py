@@ -56,7 +56,7 @@ def move(box: np.ndarray, delta: np.ndarray) -> np.ndarray:
         ("feat_stride: 16\n", {"feat_stride": 16}),
     ],
 )
-def test_what_param_str_says(build: Build, text: str, found: dict[str, object]) -> None:
+def test_param_str_is_read(build: Build, text: str, found: dict[str, object]) -> None:
     escaped = text.replace("\n", "\\n")
     param = PYTHON.format("rpn.anchor_target_layer", "AnchorTargetLayer", escaped)
     layer = build("rcnn", param, (1, 18, 20, 30), (3, 5), (1, 3), tops=4)
@@ -155,7 +155,7 @@ def test_in_an_rfcn_the_tops_have_four_axes_and_the_forks_code_chooses() -> None
         net(p=TRUTH[:1], t=TRUTH[:1])
 
 
-def test_regions_have_the_attributes_of_what_they_show(build: Build) -> None:
+def test_regions_have_the_attributes_of_their_objects(build: Build) -> None:
     attributes = torch.zeros(3, 16)
     attributes[:, 0], attributes[1, 1:3] = torch.tensor([5.0, 0, 7]), torch.tensor([9.0, 8])
     truth = torch.cat([TRUTH, attributes], dim=1)
@@ -180,7 +180,7 @@ def test_proposals_of_the_python_layer_are_the_dialects(build: Build) -> None:
         assert torch.equal(build("rcnn", text, *shapes, phase=phase).run(*bottoms)[0], expected)
 
 
-def test_code_that_may_run_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_allowed_code_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "rpn").mkdir()
     (tmp_path / "rpn" / "proposal_layer.py").write_text("raise ValueError('this is mine')")
     net = 'layer {{ name: "p" top: "x" {} }}'
@@ -193,7 +193,7 @@ def test_code_that_may_run_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         netspec.load_net("net.prototxt", allow_python=True)
 
 
-def test_a_program_gives_the_images_as_it_did(tmp_path: Path) -> None:
+def test_a_program_passes_images_as_before(tmp_path: Path) -> None:
     text = PYTHON.format("roi_data_layer.layer", "RoIDataLayer", "'num_classes': 4")
     (tmp_path / "net.prototxt").write_text(f'layer {{ name: "d" top: "data" top: "im_info" top: "gt_boxes" {text} }}')
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((60, 80, 3)))

@@ -143,7 +143,7 @@ def test_faults_are_one_line(
     assert dialect.active() == []
 
 
-def test_two_dialects_with_one_type_number_or_name_do_not_go_together(fork: Path, tmp_path: Path) -> None:
+def test_two_dialects_with_the_same_type_number_or_name_are_refused(fork: Path, tmp_path: Path) -> None:
     use_dialect(fork)
     other = tmp_path / "tripling.py"
     other.write_text('from netspec.layers import Layer, register\n@register("Times")\nclass A(Layer): pass\n')
@@ -162,7 +162,7 @@ def test_two_dialects_with_one_type_number_or_name_do_not_go_together(fork: Path
         use_dialect(namesake)
 
 
-def test_a_file_name_that_is_no_word_will_do(tmp_path: Path) -> None:
+def test_any_file_name_can_be_used(tmp_path: Path) -> None:
     path = tmp_path / "my-fork 2.py"
     path.write_text('DECLARATIONS = "extend LayerParameter { optional int32 my_fork = 1002; }"\n')
     use_dialect(path)
@@ -205,7 +205,9 @@ def test_an_unknown_type_switches_its_dialect_on(tmp_path: Path, capsys: pytest.
     assert 'unknown layer type "Convolutoin"; did you mean "Convolution"?' in capsys.readouterr().err
 
 
-def test_a_type_that_two_dialects_have_is_asked_about(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_type_of_two_dialects_is_an_error_that_asks_for_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     dialect_files.announce_known()
     for name in ("ssd", "blocks"):
         known = dialect._known[name]
@@ -218,7 +220,7 @@ def test_a_type_that_two_dialects_have_is_asked_about(tmp_path: Path, capsys: py
 
 
 @pytest.mark.parametrize("name", sorted(known_files()))
-def test_what_is_read_from_a_files_syntax_is_what_running_it_registers(name: str) -> None:
+def test_the_types_read_from_a_files_syntax_equal_those_it_registers(name: str) -> None:
     before = set(layer_types())
     declared = read_dialect(find_file(name))
     use_dialect(name)
@@ -265,18 +267,18 @@ def test_a_packages_entry_point_is_found_and_used(tmp_path: Path, capsys: pytest
 # ---- Found by themselves ----
 
 
-def test_a_prototxt_switches_on_what_it_needs(files_afresh: None) -> None:
+def test_a_prototxt_activates_the_dialects_it_needs(files_afresh: None) -> None:
     text = 'layer { name: "n" type: "Normalize" bottom: "x" top: "n" norm_param { across_spatial: false } }'
     assert switched_on_by(text) == ["ssd"]
     assert layer_class("Normalize") is not None
 
 
-def test_a_prototxt_of_caffes_own_layers_switches_on_nothing(files_afresh: None) -> None:
+def test_a_prototxt_of_caffes_layers_activates_no_dialect(files_afresh: None) -> None:
     text = 'layer { name: "Normalize" type: "ReLU" bottom: "Permute" top: "Swish" }'  # names, not types
     assert switched_on_by(text) == []
 
 
-def test_a_field_that_caffe_has_in_another_message_is_of_the_message_around_it(files_afresh: None) -> None:
+def test_a_field_that_caffe_has_in_another_message_belongs_to_the_enclosing_message(files_afresh: None) -> None:
     before = layer_class("BatchNorm")
     text = 'layer { type: "Convolution" convolution_param { num_output: 1 bias_filler { type: "constant" } } }'
     assert switched_on_by(text) == []
@@ -290,7 +292,7 @@ def test_a_prototxt_of_two_dialects_switches_on_both(files_afresh: None) -> None
     assert switched_on_by(text) == ["ssd", "blocks"]
 
 
-def test_what_no_dialect_has_is_left_to_the_reader(files_afresh: None) -> None:
+def test_fields_of_no_dialect_are_left_to_the_reader(files_afresh: None) -> None:
     assert switched_on_by('layer { type: "NoSuchType" no_such_param { } }') == []
 
 

@@ -95,7 +95,7 @@ def difference(found: np.ndarray, golden: np.ndarray, key: str) -> float:
 
 
 @pytest.mark.parametrize("name", cases("layers"))
-def test_a_layer_computes_what_the_fork_computed(name: str) -> None:
+def test_a_layer_equals_the_forks_results(name: str) -> None:
     check(name, lambda: differences(LayerCase(FORKS / "layers" / name)))
 
 
@@ -108,7 +108,7 @@ def test_a_training_follows_the_fork(name: str, tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("name", [name for name in NAMED if NAMED[name] not in ("hed", "rcf")])
-def test_where_the_fork_is_unknown_a_warning_says_so(
+def test_an_unknown_fork_gets_a_warning(
     name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if name in os.listdir(FORKS / "training"):

@@ -31,7 +31,7 @@ def test_merge_crop_stacks_and_adds(build: Build) -> None:
 
 
 @pytest.mark.parametrize(("param", "learns"), [("", (True, False)), ("backward: 0 backward: 1", (False, True))])
-def test_merge_crop_gives_gradients_as_asked_for(build: Build, param: str, learns: tuple[bool, bool]) -> None:
+def test_merge_crop_computes_the_requested_gradients(build: Build, param: str, learns: tuple[bool, bool]) -> None:
     bottoms = [torch.randn(1, 2, 2, 2, requires_grad=True), torch.randn(1, 2, 4, 4, requires_grad=True)]
     layer = build("layout", f"type: 'MergeCrop' mergecrop_param {{ {param} }}", (1, 2, 2, 2), (1, 2, 4, 4))
     layer.run(*bottoms)[0].sum().backward()

@@ -20,7 +20,7 @@ layer { name: "conv" type: "Convolution" bottom: "data" top: "conv" convolution_
 FORK = PLAIN.replace("kernel_size: 3", "kernel_size: 3 hole: 2")
 
 
-def test_a_layer_in_place_of_caffes_is_for_nets_of_its_dialect(net_of: Callable[..., Net]) -> None:
+def test_a_replacement_of_caffes_layer_applies_to_nets_of_its_dialect(net_of: Callable[..., Net]) -> None:
     fork, plain = net_of(FORK), net_of(PLAIN)
     assert type(plain.layers[1]) is Convolution
     assert type(fork.layers[1]).__module__ == "netspec.dialects.blocks.filters"
@@ -30,7 +30,7 @@ def test_a_layer_in_place_of_caffes_is_for_nets_of_its_dialect(net_of: Callable[
     assert plain(values)["conv"].shape == (1, 2, 7, 7)
 
 
-def test_a_dialect_that_was_asked_for_counts_for_every_net(net_of: Callable[..., Net]) -> None:
+def test_a_requested_dialect_applies_to_every_net(net_of: Callable[..., Net]) -> None:
     use_dialect("filters")
     assert net_of(PLAIN).options.dialects == ("filters",)
     assert net_of(PLAIN.replace('"conv"', '"other"')).layers[1].__class__ is not Convolution
@@ -84,7 +84,7 @@ def test_a_layer_of_several_forks_is_taken_as_the_file_shows(
     assert all(others in line and "# dialect: " in line and "--plugin" in line for line in said)
 
 
-def test_a_comment_names_a_dialect_that_there_is(net_of: Callable[..., Net]) -> None:
+def test_a_comment_must_name_an_existing_dialect(net_of: Callable[..., Net]) -> None:
     with pytest.raises(SpecError, match=r':2:1: unknown dialect "hd"; did you mean "hed"'):
         net_of("\n# dialect: hd\n" + PLAIN)
 
@@ -118,7 +118,7 @@ def test_crop_without_offsets_aligns_its_bottoms_in_heds_branch(
     assert all(said in line for line in lines)
 
 
-def test_crops_of_a_hed_lie_where_coord_map_says(net_of: Callable[..., Net]) -> None:
+def test_crops_of_hed_are_where_coord_map_puts_them(net_of: Callable[..., Net]) -> None:
     last, text = "c", conv(35).partition('layer { name: "crop"')[0].replace('"conv"', '"c"')
     for step in range(5):
         if step:

@@ -23,7 +23,7 @@ LAYERS = {
 
 
 @pytest.mark.parametrize("path", ENTRIES)
-def test_an_entry_is_that_of_a_class(path: str) -> None:
+def test_an_entry_belongs_to_one_class(path: str) -> None:
     module, _, name = path.rpartition(".")
     assert f"class {name}(" in (ROOT / f"{module.replace('.', '/')}.py").read_text()
 

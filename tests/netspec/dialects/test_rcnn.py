@@ -34,7 +34,7 @@ def test_the_first_of_equal_pixels_gets_the_gradient_of_roi_pooling(build: Build
     assert maps.grad[0, 0].tolist() == [[1, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 0]]
 
 
-def test_bins_that_share_a_pixel_both_get_it(build: Build) -> None:
+def test_a_pixel_can_belong_to_two_bins(build: Build) -> None:
     maps = torch.arange(3.0).reshape(1, 1, 1, 3).requires_grad_()
     layer = build("rcnn", "type: 'ROIPooling' roi_pooling_param { pooled_h: 1 pooled_w: 2 }", maps.shape, (1, 5))
     (top,) = layer.run(maps, torch.tensor([[0.0, 0, 0, 2, 0]]))
@@ -56,7 +56,7 @@ def test_a_region_must_lie_in_an_image_of_the_batch(build: Build, dialect: str, 
         build(dialect, f"type: '{kind}' {settings[kind]}", (2, 1, 3), (1, 5))
 
 
-def test_fields_that_a_dialects_layers_read_are_not_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+def test_fields_read_by_a_dialects_layers_get_no_warning(caplog: pytest.LogCaptureFixture) -> None:
     use_dialect("rcnn")
     use_dialect("filters")
     text = """
@@ -87,7 +87,7 @@ SETTINGS = "ratio: 1 scale: 1 feat_stride: 10 base_size: 10 min_size: 4 nms_thre
 ONE = f"type: 'Proposal' proposal_param {{ {SETTINGS} %s }}"
 
 
-def test_the_anchors_are_those_of_faster_rcnn() -> None:
+def test_the_anchors_equal_faster_rcnns() -> None:
     np.testing.assert_array_equal(base_anchors(16, (0.5, 1, 2), (8, 16, 32)), ANCHORS)
 
 
@@ -118,7 +118,7 @@ def test_proposals_are_moved_and_scaled(build: Build) -> None:
     np.testing.assert_allclose(regions[0], [0, 0, 4.5, 20, 9.5], atol=1e-5)
 
 
-def test_of_overlapping_proposals_the_best_stays(build: Build) -> None:
+def test_the_best_of_overlapping_proposals_is_kept(build: Build) -> None:
     # Moved 5 pixels, the first is (5, 0, 15, 10) and shares 6 x 11 pixels with (10, 0, 20, 10): of 176, 0.375.
     regions, scores = proposals(build, [[0.5, 0.75]], dx=0.5)
     assert scores.tolist() == [0.75]

@@ -81,7 +81,7 @@ def test_classes_and_schema_are_caffes_without_a_dialect(fork: Dialect) -> None:
     parse_net_text("layer { warp_param {} }", "f")
 
 
-def test_an_unknown_type_or_field_tells_which_known_dialects_have_it() -> None:
+def test_an_unknown_type_or_field_is_an_error_with_the_dialects_that_have_it() -> None:
     dialect.announce(
         Dialect("one", "extend LayerParameter { optional int32 lens = 700; }", ("Lens",), "add --plugin one")
     )
@@ -130,7 +130,7 @@ def test_bad_declarations_are_refused(source: str, message: str) -> None:
     assert "bad" not in dialect.active()
 
 
-def test_two_dialects_with_one_field_are_not_active_together(fork: Dialect) -> None:
+def test_two_dialects_with_the_same_field_are_not_active_together(fork: Dialect) -> None:
     rival = Dialect("rival", "extend LayerParameter { optional int32 warp_param = 950; }")
     with pytest.raises(SpecError, match=r'^rival\.proto: caffe\.LayerParameter already has a field "warp_param"$'):
         dialect.activate(rival)
@@ -140,7 +140,7 @@ def test_two_dialects_with_one_field_are_not_active_together(fork: Dialect) -> N
     dialect.deactivate("rival")
 
 
-def test_declarations_mean_what_protoc_makes_of_them(tmp_path: Path) -> None:
+def test_declarations_equal_those_compiled_by_protoc(tmp_path: Path) -> None:
     protoc = pytest.importorskip("grpc_tools.protoc")
     (tmp_path / "fork.proto").write_text(
         f'syntax = "proto2"; package caffe.fork; import "caffe.proto";{SOURCE}', "utf-8"
@@ -175,7 +175,7 @@ def test_declarations_mean_what_protoc_makes_of_them(tmp_path: Path) -> None:
     assert resolved[0] == resolved[1]
 
 
-def test_layers_of_a_fork_are_read_that_has_a_number_of_caffes_for_its_own() -> None:
+def test_layers_of_a_fork_that_reuses_a_number_of_caffe_are_read() -> None:
     """caffe-face's center_loss_param has the number of Caffe's swish_param."""
     binary = LayerParameter(name="c", type="CenterLoss", blobs=[BlobProto(data=[1])]).SerializeToString()
     layer = LayerParameter.FromString(binary + b"\x9a\x09\x02\x08\x0a")  # 147 { 1: 10 }

@@ -105,7 +105,7 @@ def test_edge_maps(pairs: Path, dialect: str) -> None:
     assert torch.equal(labels, torch.where(gray > 127, 1, below))
 
 
-def test_which_of_two_forks_is_meant_is_asked(pairs: Path) -> None:
+def test_an_ambiguous_fork_is_an_error_that_asks_for_it(pairs: Path) -> None:
     text = EDGES % (pairs, pairs)
     assert switched_on_by(text) == []
     with pytest.raises(SpecError, match='dialects "hed" and "rcf" have "ImageLabelmapData"; add --plugin hed'):

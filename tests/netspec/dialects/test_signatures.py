@@ -12,7 +12,7 @@ from netspec.proto.schema import LayerParameter, fields_of
 
 
 @pytest.mark.parametrize("kind", SIGNATURES)
-def test_the_table_names_dialects_types_and_fields_that_there_are(kind: str) -> None:
+def test_the_table_has_existing_dialects_types_and_fields_only(kind: str) -> None:
     signature = SIGNATURES[kind]
     assert {fork.dialect for fork in signature.forks} <= known_files().keys()
     assert layer_class(kind) is not None
@@ -24,7 +24,7 @@ def test_the_table_names_dialects_types_and_fields_that_there_are(kind: str) -> 
         assert not inner or inner in fields_of(found.descriptor.message_type)
 
 
-def test_a_layer_that_nothing_decides_is_in_doubt(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_ambiguous_layer_gets_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     netspec.layer('type: "DiceCoefLoss"', (2, 3), (2, 3))
     assert "several forks define this layer type" in caplog.text
 

@@ -46,7 +46,7 @@ def test_normalize_begins_with_scale_1(build: Build) -> None:
 # ---- PriorBox ----
 
 
-def test_sizes_that_are_cut_are_named_since_forks_differ(build: Build, caplog: pytest.LogCaptureFixture) -> None:
+def test_truncated_sizes_are_named_because_forks_differ(build: Build, caplog: pytest.LogCaptureFixture) -> None:
     settings = "min_size: 9.2 min_size: 12 max_size: 11.5 max_size: 20 img_size: 60"
     build("ssd", f"type: 'PriorBox' prior_box_param {{ {settings} }}", (1, 1, 2, 2))
     cut, other = caplog.messages
@@ -79,7 +79,7 @@ def test_detection_output_with_the_variance_in_the_target(build: Build) -> None:
     np.testing.assert_allclose(top[0, 0], [[0, 1, 0.9, 0.35, 0.35, 0.75, 0.75]], rtol=1e-6)
 
 
-def test_what_detection_output_does_not_do_is_named(caplog: pytest.LogCaptureFixture) -> None:
+def test_unsupported_fields_of_detection_output_are_named(caplog: pytest.LogCaptureFixture) -> None:
     use_dialect("ssd")
     text = """
       layer { name: 'in' type: 'Input' top: 'loc' top: 'conf' top: 'prior' input_param { shape { dim: 1 dim: 4 }
@@ -161,7 +161,7 @@ def test_a_small_detector_learns_where_two_squares_are() -> None:
         assert overlap(tuple(best[3:].tolist()), tuple(row[3:7].tolist())) > 0.7
 
 
-def test_what_the_solver_of_ssd_has_more_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_additional_solver_fields_of_ssd_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     use_dialect("ssd")
     (tmp_path / "solver.prototxt").write_text(
         'net_param { layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } } }\n'

@@ -31,7 +31,7 @@ def _assert_close(found: np.ndarray, expected: np.ndarray, name: str, tolerance:
 
 
 @pytest.mark.parametrize("folder", CASES, ids=lambda path: path.name)
-def test_a_layer_computes_what_the_branch_computed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_layer_equals_the_branchs_results(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(SSD)  # name_size.txt
     case = LayerCase(folder)
     found = case.compute()
@@ -90,7 +90,7 @@ def test_equal_scores_come_in_the_order_of_std_sort() -> None:
     assert highest(values, 3).tolist() == order[:3]
 
 
-def test_a_number_that_is_none_does_not_stop_the_sort() -> None:
+def test_nan_does_not_stop_the_sort() -> None:
     assert len(highest(np.array([np.nan] * 20 + [1.0] * 20, np.float32), 40)) == 40
 
 

@@ -58,7 +58,7 @@ def test_frames_are_resized_as_ssd_resizes(net_of: Callable[..., Net], video: Pa
     )
 
 
-def test_pycaffe_reads_it_too(video: Path) -> None:
+def test_pycaffe_reads_the_file(video: Path) -> None:
     path = video.with_name("net.prototxt")
     path.write_text(text(video, transform=RESIZED))
     net = caffe.Net(str(path), caffe.TEST)
@@ -73,7 +73,7 @@ def test_a_shape_is_known_without_the_video(net_of: Callable[..., Net]) -> None:
     assert net.shapes == {"data": (1, 3, 20, 30), "label": (1,)}
 
 
-def test_a_camera_gives_its_next_frame(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_camera_returns_its_next_frame(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
     class Camera:
         count = 0
 
@@ -139,7 +139,7 @@ def test_wrong_settings(net_of: Callable[..., Net], video: Path) -> None:
         ("", []),
     ],
 )
-def test_its_fields_tell_which_fork_is_meant(net_of: Callable[..., Net], given: str, dialects: list[str]) -> None:
+def test_fields_determine_the_fork(net_of: Callable[..., Net], given: str, dialects: list[str]) -> None:
     net = LAYER % (given, 1, 4, "")
     assert switched_on_by(net) == dialects
     if not dialects:

@@ -15,7 +15,7 @@ Gradcheck = Callable[..., None]
 STEPS, ITEMS, CLASSES = 4, 2, 3
 
 
-def test_a_text_that_does_not_fit_costs_nothing(build: Build) -> None:
+def test_a_text_longer_than_its_sequence_has_loss_zero(build: Build) -> None:
     scores = torch.randn(2, 1, CLASSES, requires_grad=True)
     layer = build("text", "type: 'WarpCTCLoss'", scores.shape, (1, 2))
     (loss,) = layer.run(scores, torch.tensor([[1.0, 1.0]]))  # it needs a blank between
@@ -88,7 +88,7 @@ def test_reverse_of_the_first_steps(build: Build, copies: str, rest: list[int]) 
 LSTM = "type: 'Lstm' lstm_param { num_output: 3 weight_filler { type: 'uniform' min: -1 max: 1 } %s }"
 
 
-def test_lstm_goes_on_where_a_second_bottom_says_so(build: Build) -> None:
+def test_lstm_continues_where_the_second_bottom_is_not_zero(build: Build) -> None:
     data = torch.randn(4, 2, 5)
     whole = build("text", LSTM % "", data.shape)
     parts = build("text", LSTM % "", (2, 2, 5), (2, 2))
@@ -105,7 +105,7 @@ def test_lstm_goes_on_where_a_second_bottom_says_so(build: Build) -> None:
     assert running_state(whole) == {}
 
 
-def test_a_label_that_is_no_class_is_refused(build: Build) -> None:
+def test_an_invalid_label_is_refused(build: Build) -> None:
     layer = build("text", "type: 'CTCLoss'", (4, 2, 3), (2, 2))
     with pytest.raises(SpecError, match="found label 3, expected 0 to 2"):
         layer.run(torch.zeros(4, 2, 3), torch.tensor([[1.0, 3], [1, 1]]))

@@ -49,7 +49,7 @@ def test_frames_of_the_middle_of_each_part(videos: Path) -> None:
     assert labels.flatten().tolist() == [3, 5]
 
 
-def test_flow_is_turned_around_where_it_is_mirrored(videos: Path) -> None:
+def test_mirrored_flow_changes_its_sign(videos: Path) -> None:
     given = 'new_length: 2 num_segments: 1 modality: FLOW name_pattern: "flow_%c_%05d.png"'
     layer = video(videos, given, "mirror: true is_flow: true crop_size: 6 mean_value: 128", TRAIN)
     seen = set()

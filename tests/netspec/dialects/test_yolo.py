@@ -23,7 +23,7 @@ V3 = """type: 'Yolov3DetectionOutput' yolov3_detection_output_param { num_classe
     anchors_scale: 32 anchors_scale: 16 mask_group_num: 2 }"""
 
 
-def test_nothing_found_is_a_row_for_each_image(build: Build) -> None:
+def test_without_detections_there_is_a_row_for_each_image(build: Build) -> None:
     maps = [torch.randn(2, 21, 2, 2), torch.randn(2, 21, 4, 4)]
     found = run(build("yolo", V3 % 1.5, *(m.shape for m in maps)), *maps)
     assert found.tolist() == [[image, -1, -1, -1, -1, -1, -1] for image in (0, 1)]

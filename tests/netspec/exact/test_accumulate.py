@@ -58,7 +58,7 @@ def test_a_net_trains_side_by_side_as_torchs_wrappers_have_it(net_of, tmp_path) 
 
 
 @pytest.mark.parametrize("exact", ["none", "small", "all"])
-def test_in_place_leaves_nothing_for_autograd(net_of, exact: str) -> None:
+def test_gradients_added_in_place_are_not_returned_to_autograd(net_of, exact: str) -> None:
     """What one asks for when one builds so."""
     net = net_of(SIAMESE, phase=0, exact=exact, accumulate_in_place=True)
     parameters = [item.parameter for item in net.learnable]
@@ -91,7 +91,7 @@ def test_frozen_parameters_get_no_gradient(net_of, in_place: bool) -> None:
 
 @pytest.mark.parametrize("transposed", ["false", "true"])
 @pytest.mark.parametrize("exact", ["none", "small"])
-def test_an_inner_product_adds_up_in_memory_that_is_there(net_of, transposed: str, exact: str) -> None:
+def test_an_inner_product_adds_its_gradient_to_existing_memory(net_of, transposed: str, exact: str) -> None:
     """No tensor as large as the weights is made in a pass, be the product small or too large to be exact."""
     text = f"""
         layer {{ name: "data" type: "Input" top: "data" input_param {{ shape {{ dim: 2 dim: 600 }} }} }}

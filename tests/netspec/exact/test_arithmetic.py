@@ -106,7 +106,7 @@ def test_the_option_chooses() -> None:
     assert arithmetic(ALL, x, in_place=True).in_place
 
 
-def test_no_forward_asks_whose_arithmetic_it_is() -> None:
+def test_no_forward_depends_on_the_kind_of_arithmetic() -> None:
     """It is asked once, where a layer gets its arithmetic."""
     asking = {
         f"{path.name}:{function.name}"

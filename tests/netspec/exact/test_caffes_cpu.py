@@ -48,7 +48,7 @@ def test_the_kernels_are_caffes_unless_the_user_chose_others(wanted: str | None)
 
 
 @pytest.mark.slow
-def test_who_imports_scipys_linalg_afterwards_finds_all_of_it() -> None:
+def test_scipy_linalg_is_complete_when_imported_afterwards() -> None:
     done = subprocess.run([sys.executable, "-c", AFTERWARDS], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["scipy.linalg.cython_blas", "scipy.linalg._fblas"]
 

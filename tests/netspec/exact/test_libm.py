@@ -56,7 +56,7 @@ def test_the_functions_have_the_bits_of_the_golden_files() -> None:
     LIBRARY != "glibc" or tuple(map(int, VERSION.split("."))) >= (2, 41),
     reason="its tanhf has other bits",
 )
-def test_tanh_is_that_of_an_older_glibc() -> None:
+def test_tanh_equals_an_older_glibcs() -> None:
     values = torch.cat([values_of((20000,)), torch.rand(20000) * 2 - 1, torch.from_numpy(WIDE)])
     np.testing.assert_array_equal(libm.tanh(values), each("tanhf", ctypes.c_float, values))
 
@@ -98,7 +98,7 @@ def test_sigmoid_is_computed_in_double() -> None:
     np.testing.assert_array_equal(libm.sigmoid(values), expected.astype(np.float32))
 
 
-def test_what_is_not_on_the_cpu_gets_torchs_functions() -> None:
+def test_tensors_on_other_devices_use_torchs_functions() -> None:
     values = torch.ones(3, device="meta")
     for function in (libm.exp, libm.log, libm.sqrt, libm.tanh, libm.sigmoid):
         assert function(values).device.type == "meta"

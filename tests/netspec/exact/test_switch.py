@@ -20,7 +20,7 @@ CONVOLUTION = """
     ("exact", "small", "expected"),
     [("none", True, False), ("small", True, True), ("small", False, False), ("all", False, True)],
 )
-def test_it_applies_to_what_was_asked_for(exact: str, small: bool, expected: bool) -> None:
+def test_the_option_exact_determines_what_is_computed_like_caffe(exact: str, small: bool, expected: bool) -> None:
     assert applies(exact, torch.ones(3), small) == expected
     assert not applies(exact, torch.ones(0), small)
     assert not applies(exact, torch.ones(3, dtype=torch.half), small)
@@ -36,7 +36,7 @@ def functions(net) -> list[str]:
     return found
 
 
-def test_small_is_what_the_constants_say(net_of) -> None:
+def test_the_limits_of_small_are_the_constants(net_of) -> None:
     names = functions(net_of(CONVOLUTION))
     assert "ColumnProductsBackward" in names
     assert "VectorProductsBackward" in names

@@ -104,7 +104,7 @@ def test_regions_are_pooled(net_of: Callable[..., Net]) -> None:
         ),
     ],
 )
-def test_what_has_no_counterpart_is_refused_with_its_place_and_reason(
+def test_a_layer_without_counterpart_is_refused_with_its_place_and_reason(
     dialect: str, layer: str, shapes: dict[str, Shape], net_of: Callable[..., Net]
 ) -> None:
     use_dialect(dialect)

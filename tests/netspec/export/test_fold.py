@@ -74,7 +74,7 @@ def test_batch_norm_and_scale_become_part_of_the_weights(
     assert_same(here(small, random_inputs(net)), here(net, random_inputs(net)))
 
 
-def test_what_another_layer_reads_stays(net_of: Callable[..., Net], tmp_path: Path) -> None:
+def test_a_blob_with_another_reader_is_kept(net_of: Callable[..., Net], tmp_path: Path) -> None:
     text = f'{INPUT} layer {{ name: "conv" type: "Convolution" bottom: "data" top: "a" {CONV} }}' + NORM.format(*"abc")
     net = trained(net_of(text + 'layer { name: "sum" type: "Eltwise" bottom: "a" bottom: "c" top: "sum" }'))
     small = folded(net, tmp_path)

@@ -94,7 +94,7 @@ def test_the_layer_that_fixes_a_size_is_named(net_of: Callable[..., Net]) -> Non
 
 @pytest.mark.parametrize(("layer_type", "state"), [("RNN", "h"), ("LSTM", "h, c")])
 @pytest.mark.parametrize("target", ["ONNX", "PyTorch source", "torch.export"])
-def test_a_note_says_that_the_state_of_a_recurrent_layer_starts_at_zero(
+def test_a_note_reports_that_recurrent_state_starts_at_zero(
     net_of: Callable[..., Net], tmp_path: Path, target: str, layer_type: str, state: str
 ) -> None:
     net = net_of(RECURRENT % (layer_type, "", "false"))
@@ -117,7 +117,7 @@ def test_there_is_no_such_note_where_the_state_is_an_input_and_an_output(net_of:
     assert not any("starts at zero" in note for note in onnx_model(net_of(state + text))[1])
 
 
-def test_a_reshape_that_bakes_the_batch_does_what_caffes_does(net_of: Callable[..., Net]) -> None:
+def test_a_reshape_with_a_fixed_batch_equals_caffes(net_of: Callable[..., Net]) -> None:
     text = """layer { name: "flat" type: "Reshape" bottom: "conv" top: "flat"
       reshape_param { shape { dim: 1 dim: -1 dim: 4 } } }"""
     net = net_of(IMAGE + CONV + text)
@@ -219,7 +219,7 @@ FIXED = (
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_what_is_done_to_images_is_part_of_the_model(name: str, net_of: Callable[..., Net]) -> None:
+def test_the_preprocessing_of_images_is_part_of_the_model(name: str, net_of: Callable[..., Net]) -> None:
     steps = STEPS[name]
     net = trained(net_of(IMAGE + FIXED))
     model, _ = onnx_model(net, preprocess=steps)
@@ -242,7 +242,7 @@ def test_what_is_done_to_images_is_part_of_the_model(name: str, net_of: Callable
         (Preprocess(mean=np.zeros((3, 5, 20))), "found a mean of 5 x 20 pixels, expected at least 12 x 10"),
     ],
 )
-def test_a_mean_that_does_not_suit_is_refused(steps: Preprocess, fault: str, net_of: Callable[..., Net]) -> None:
+def test_an_unsuitable_mean_is_refused(steps: Preprocess, fault: str, net_of: Callable[..., Net]) -> None:
     with pytest.raises(SpecError) as caught:
         onnx_model(net_of(IMAGE + FIXED), preprocess=steps)
     assert fault in str(caught.value)
@@ -276,7 +276,7 @@ MODELS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
-def test_real_models_compute_what_caffe_or_opencv_computed(name: str) -> None:
+def test_real_models_equal_caffe_or_opencv(name: str) -> None:
     folder = shared("golden", "models", name)
     prototxt, weights, golden = MODELS[name]
     use_dialect("ssd")

@@ -66,7 +66,7 @@ def test_the_deploy_net_of_a_training_computes_the_same(trained: Callable[..., A
     torch.testing.assert_close(built(data=image)["ip"], ip)
 
 
-def test_a_shape_that_the_file_does_not_tell_is_asked_for(trained: Callable[..., Any]):
+def test_an_unknown_shape_is_an_error_that_asks_for_it(trained: Callable[..., Any]):
     trained("mirror: true")
     with pytest.raises(
         SpecError, match=r"w\.caffemodel: the shape of its input is not in the file.*; give --shape data=1,3,H,W or"
@@ -104,7 +104,7 @@ def test_the_commands_show_and_write_it(trained: Callable[..., Any], run: Callab
     assert run("upgrade_net_proto_text", "o.prototxt", "p.prototxt", "--shape", "data=1,3,9,9").status == 2
 
 
-def test_inputs_of_old_nets_are_blobs_that_nothing_makes(tmp_path: Path):
+def test_inputs_of_old_nets_are_the_blobs_without_a_layer(tmp_path: Path):
     net = NetParameter(name="old", input=["data"])
     layer = V1LayerParameter(name="c", type=V1LayerParameter.CONVOLUTION, bottom=["data"], top=["c"])
     layer.convolution_param.num_output = 2
@@ -119,7 +119,7 @@ def test_inputs_of_old_nets_are_blobs_that_nothing_makes(tmp_path: Path):
     assert [layer.type for layer in deploy.layer] == ["Input", "Convolution"]
 
 
-def test_what_holds_no_net(tmp_path: Path):
+def test_files_without_a_net_are_refused(tmp_path: Path):
     path = tmp_path / "w.caffemodel"
     path.write_bytes(NetParameter(layer=[LayerParameter(name="c", blobs=[BlobProto(data=[0.0])])]).SerializeToString())
     with pytest.raises(SpecError, match="contains weights but no net"):

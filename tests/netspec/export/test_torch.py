@@ -116,7 +116,7 @@ def test_names_that_python_does_not_take(net_of: Callable[..., Net]) -> None:
     assert_same(run_module(source_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
 
 
-def test_torch_export_takes_it_with_a_free_batch_and_size(net_of: Callable[..., Net], tmp_path: Path) -> None:
+def test_torch_export_accepts_it_with_a_dynamic_batch_and_size(net_of: Callable[..., Net], tmp_path: Path) -> None:
     net = trained(net_of(SMALL))
     assert export_pt2(net, tmp_path / "small.pt2") == []
     program = torch.export.load(tmp_path / "small.pt2").module()

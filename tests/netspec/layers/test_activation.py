@@ -74,7 +74,7 @@ def test_gradient_at_zero_is_the_negative_sides(build, text: str, expected: floa
     assert gradient_at(build(text, (1, 1)), 0.0) == expected
 
 
-def test_elu_takes_exp_minus_one_not_expm1(build) -> None:
+def test_elu_computes_exp_minus_one_without_expm1(build) -> None:
     x = torch.tensor([[-1e-4]])
     assert build('type: "ELU"', (1, 1)).run(x)[0].item() == (torch.exp(x) - 1).item() != torch.expm1(x).item()
 
@@ -183,7 +183,7 @@ def test_clip_without_both_ends_is_refused(build) -> None:
         ('type: "Clip" clip_param { min: -0.5 max: 0.75 }', lambda b, t: (b >= -0.5) & (b <= 0.75)),
     ],
 )
-def test_gradient_is_made_of_what_memory_holds(build, text: str, expected) -> None:
+def test_gradient_uses_the_data_in_memory(build, text: str, expected) -> None:
     bottom = torch.tensor([-1.5, -0.4, 0.25, 0.75, 2.0], dtype=torch.double)
     top = torch.tensor([0.3, -0.2, 0.5, 1.5, -4.0], dtype=torch.double)
     diff = torch.tensor([1.0, 2.0, -3.0, 0.5, 4.0], dtype=torch.double)

@@ -44,7 +44,7 @@ def test_inner_product_takes_another_batch_but_no_other_length(build) -> None:
 
 
 @pytest.mark.parametrize(("rows", "length", "bias"), [(500, 4243, True), (1003, 1050, True), (130, 8070, False)])
-def test_one_vectors_product_has_the_same_bits_however_many_threads_share_it(
+def test_the_product_of_one_vector_does_not_depend_on_the_number_of_threads(
     monkeypatch: pytest.MonkeyPatch, rows: int, length: int, bias: bool
 ) -> None:
     draw = torch.Generator().manual_seed(1)
@@ -59,7 +59,7 @@ def test_one_vectors_product_has_the_same_bits_however_many_threads_share_it(
     assert bool(divisions) == torch.backends.mkl.is_available()
 
 
-def test_a_product_is_not_divided_where_that_changes_its_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_product_is_not_split_if_its_bits_would_change(monkeypatch: pytest.MonkeyPatch) -> None:
     vector, weight = torch.randn(1, 4243), torch.randn(500, 4243)
     divide = torch.bmm
     monkeypatch.setattr(torch, "bmm", lambda *given: divide(*given) * (1 + 2**-20))
@@ -124,7 +124,7 @@ def test_embed_without_bias_takes_another_shape(build) -> None:
 
 
 @pytest.mark.parametrize("index", [-1.0, 5.0, 1.5, math.nan])
-def test_embed_refuses_what_is_no_index(build, index: float) -> None:
+def test_embed_refuses_invalid_indices(build, index: float) -> None:
     layer = build('type: "Embed" embed_param { num_output: 3 input_dim: 5 }', (2,))
     with pytest.raises(SpecError, match=rf"^bottom: found index {index:g}, expected integers from 0 to 4"):
         layer.run(torch.tensor([1.0, index]))

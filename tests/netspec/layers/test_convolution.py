@@ -125,7 +125,7 @@ PADDING = [  # filters that fit into the padding: SIGSEGV in oneDNN; and maps of
 
 @pytest.mark.parametrize(("shape", "text"), PADDING)
 @pytest.mark.parametrize("adds", [False, True])
-def test_calls_that_onednn_gets_wrong_are_not_made(build, shape: tuple[int, ...], text: str, adds: bool) -> None:
+def test_calls_with_wrong_results_in_onednn_are_avoided(build, shape: tuple[int, ...], text: str, adds: bool) -> None:
     layer = build(
         f'type: "Convolution" convolution_param {{ num_output: 16 {text} {FILL} }}',
         shape,
@@ -152,7 +152,7 @@ def test_calls_that_onednn_gets_wrong_are_not_made(build, shape: tuple[int, ...]
 
 
 @pytest.mark.parametrize("kind", ["Convolution", "Deconvolution"])
-def test_bottoms_add_to_the_filters_gradient_the_first_one_first(build, kind: str) -> None:
+def test_gradients_of_shared_filters_are_added_in_the_order_of_the_bottoms(build, kind: str) -> None:
     text = f'type: "{kind}" convolution_param {{ num_output: 4 kernel_size: 3 {FILL} }}'
     caffes = {"exact": "all", "accumulate_in_place": True}
     layer = build(text, *[(3, 3, 6, 6)] * 3, tops=3, **caffes)
@@ -212,7 +212,7 @@ def test_bottoms_share_the_filters_and_each_has_its_top(build) -> None:
     assert layer.multiply_adds() == 3 * 2 * 16 * 4 * 27
 
 
-def test_axis_says_where_the_channels_are_and_axes_before_it_are_images(build) -> None:
+def test_axis_selects_the_channels_and_earlier_axes_count_as_images(build) -> None:
     text = 'type: "Convolution" convolution_param { num_output: 2 kernel_size: 3 axis: %d ' + FILL + " }"
     data = torch.randn(2, 5, 3, 6, 7)
     layer = build(text % -3, data.shape)
@@ -245,7 +245,7 @@ def test_a_filter_too_long_by_less_than_its_stride_fits_once_over_zeros(build) -
     assert columns.flatten()[20:].tolist() == [0] * 5
 
 
-def test_another_batch_or_map_size_is_taken_as_it_comes(build) -> None:
+def test_the_batch_or_map_size_can_change(build) -> None:
     layer = build(f'type: "Convolution" convolution_param {{ num_output: 4 kernel_size: 3 {FILL} }}', (2, 3, 6, 6))
     for shape in ((5, 3, 6, 6), (1, 3, 9, 4), (0, 3, 6, 6)):
         (top,) = layer.run(torch.randn(shape))

@@ -131,7 +131,7 @@ def test_threads_start_with_the_first_batch_and_end_with_close() -> None:
     assert prefetching() == before
 
 
-def test_a_label_top_may_be_left_out() -> None:
+def test_the_label_top_is_optional() -> None:
     text = f'name: "d" type: "Data" top: "data" data_param {{ source: "{PAIRS}" batch_size: 3 backend: LMDB }}'
     layer = reading(text)
     assert layer.top_shapes == [(3, 2, 28, 28)]
@@ -139,7 +139,7 @@ def test_a_label_top_may_be_left_out() -> None:
     layer.close()
 
 
-def test_encoded_records_come_out_as_the_raw_ones() -> None:
+def test_encoded_records_equal_raw_records() -> None:
     raw, encoded = (pairs(6, source=IMAGES / name).run()[0] for name in ("lmdb_plain", "lmdb_encoded"))
     assert torch.equal(raw, encoded)
     grey = pairs(6, transform="force_gray: true", source=IMAGES / "lmdb_encoded")
@@ -160,7 +160,7 @@ def test_a_missing_database_is_refused_at_construction() -> None:
         pairs(source="nowhere")
 
 
-def test_an_lmdb_without_backend_says_what_to_write() -> None:
+def test_an_lmdb_without_backend_is_an_error_with_the_correct_setting() -> None:
     with pytest.raises(SpecError, match="LEVELDB is Caffe's default"):
         reading(f'name: "d" type: "Data" top: "data" data_param {{ source: "{PAIRS}" batch_size: 3 }}')
 
@@ -180,7 +180,7 @@ def test_a_record_of_another_shape_surfaces_from_the_threads(tmp_path: Path) -> 
     layer.close()
 
 
-def test_a_batch_of_one_takes_the_shape_of_its_image(tmp_path: Path) -> None:
+def test_a_batch_of_one_has_the_shape_of_its_image(tmp_path: Path) -> None:
     with Writer(str(tmp_path / "db")) as writer:
         for i, width in enumerate((8, 9)):
             writer.put(b"%08d" % i, array_to_datum(np.zeros((3, 8, width), np.uint8)).SerializeToString())
@@ -236,12 +236,12 @@ def test_shapes_are_known_without_data(text: str, given: Mapping[str, tuple[int,
     ("text", "wanted"),
     [(DATA, "--shape data=8,C,H,W"), (LIST % "batch_size: 8", "--shape data=8,C,H,W"), (ROWS, "--shape data=8,...")],
 )
-def test_a_shape_that_only_the_data_knows_is_asked_for(text: str, wanted: str) -> None:
+def test_an_unknown_shape_of_data_is_an_error_that_asks_for_it(text: str, wanted: str) -> None:
     with pytest.raises(SpecError, match=f'the shape of "data" is known only from its data; give {wanted}, or --data$'):
         data_layer(text, open_data=False)
 
 
-def test_every_shape_that_only_an_hdf5_file_knows_is_asked_for() -> None:
+def test_each_unknown_shape_of_hdf5_data_is_an_error_that_asks_for_it() -> None:
     reported: list[SpecError] = []
     with pytest.raises(SpecError, match=r"give --shape label=8,\.\.\., or --data") as raised:
         data_layer(ROWS, open_data=False, report=reported.append)
@@ -251,7 +251,7 @@ def test_every_shape_that_only_an_hdf5_file_knows_is_asked_for() -> None:
     ]
 
 
-def test_a_net_built_without_data_says_so_when_it_is_run() -> None:
+def test_running_a_net_built_without_data_is_an_error() -> None:
     with pytest.raises(SpecError, match="built without opening its data"):
         data_layer(DATA + CUT, open_data=False).run()
 
@@ -269,7 +269,7 @@ def image_data(tmp_path: Path, more: str = "", batch_size: int = 4) -> ReadingLa
     ("more", "database"),
     [("", "lmdb_plain"), ("is_color: false", "lmdb_gray"), ("new_width: 28 new_height: 20", "lmdb_resized")],
 )
-def test_image_data_reads_what_convert_imageset_stores(tmp_path: Path, more: str, database: str) -> None:
+def test_image_data_reads_the_same_images_as_convert_imageset_stores(tmp_path: Path, more: str, database: str) -> None:
     found, stored = image_data(tmp_path, more, 6).run(), pairs(6, source=IMAGES / database).run()
     assert torch.equal(found[0], stored[0])
     assert torch.equal(found[1], stored[1])
@@ -292,7 +292,7 @@ def test_image_data_names_a_missing_image_with_its_line(tmp_path: Path) -> None:
     layer.close()
 
 
-def test_image_data_wants_both_sides_or_none(tmp_path: Path) -> None:
+def test_image_data_needs_both_new_height_and_new_width_or_neither(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match="new_height and new_width must be given together"):
         image_data(tmp_path, "new_height: 5")
 
@@ -338,7 +338,7 @@ def test_hdf5_output_checks_its_bottoms(
 # WindowData
 
 
-def test_window_data_gives_windows_and_takes_no_scale_of_transform_param(tmp_path: Path) -> None:
+def test_window_data_returns_windows_and_ignores_the_scale_of_transform_param(tmp_path: Path) -> None:
     windows = f"# 0\n{IMAGES}/png/0.png\n3\n48\n64\n2\n4 0.9 0 0 20 20\n0 0.1 10 10 40 40\n"
     (tmp_path / "w.txt").write_text(windows)
     layer = reading(
@@ -369,7 +369,7 @@ def test_bad_window_params_are_refused(more: str, message: str) -> None:
 # Layers without files
 
 
-def test_input_takes_one_shape_for_all_or_one_each(build: Callable[..., Layer]) -> None:
+def test_input_has_one_shape_for_all_tops_or_one_each(build: Callable[..., Layer]) -> None:
     one = 'type: "Input" input_param { shape { dim: 2 dim: 3 } }'
     assert build(one, tops=2).top_shapes == [(2, 3), (2, 3)]
     two = 'type: "Input" input_param { shape { dim: 2 } shape { dim: 1 dim: 4 } }'
@@ -443,7 +443,7 @@ def test_memory_data_goes_round_its_arrays(build: Callable[..., Layer]) -> None:
 @pytest.mark.parametrize(
     ("images", "labels"), [((3, 1, 1, 3), 3), ((2, 1, 3, 1), 2), ((2, 1, 1, 3), 4), ((0, 1, 1, 3), 0)]
 )
-def test_memory_data_refuses_what_does_not_fit(build: Callable[..., Layer], images: tuple, labels: int) -> None:
+def test_memory_data_refuses_arrays_of_other_shapes(build: Callable[..., Layer], images: tuple, labels: int) -> None:
     layer = build(MEMORY, tops=2)
     assert isinstance(layer, MemoryData)
     with pytest.raises(SpecError, match="n a multiple of batch_size 2"):

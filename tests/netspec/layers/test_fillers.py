@@ -47,7 +47,7 @@ def test_gaussian_has_its_mean_and_deviation() -> None:
     assert np.mean(np.abs(values - 5) < 0.1) == pytest.approx(0.6827, abs=0.015)
 
 
-def test_gaussian_sparse_keeps_a_share_of_sparse_in_shape_0() -> None:
+def test_gaussian_sparse_keeps_each_value_with_probability_sparse_over_shape_0() -> None:
     values = draw('type: "gaussian" std: 2 sparse: 20', shape=(100, 800))
     kept = values[values != 0]
     assert kept.size / values.size == pytest.approx(0.2, abs=0.01)
@@ -126,7 +126,7 @@ def test_one_seed_gives_one_result() -> None:
         ("value: 1", (3, 0), "empty blob"),
     ],
 )
-def test_a_filler_that_caffe_would_refuse_says_why(text: str, shape: tuple[int, ...], words: str) -> None:
+def test_a_filler_that_caffe_refuses_is_an_error_with_the_reason(text: str, shape: tuple[int, ...], words: str) -> None:
     with pytest.raises(ValueError, match=r"^[^\n]+$") as error:
         draw(text, shape)
     assert words in str(error.value)

@@ -18,9 +18,7 @@ REAL_GPU = 1e-4  # likewise: its libraries choose among algorithms that round di
 
 @pytest.mark.parametrize("device", ["cpu", *(pytest.param(name, marks=pytest.mark.slow) for name in GPUS)])
 @pytest.mark.parametrize("folder", CASES, ids=lambda path: path.name)
-def test_layer_computes_what_caffe_computed(
-    folder: Path, device: str, record_property: Callable[[str, object], None]
-) -> None:
+def test_layer_equals_caffes_results(folder: Path, device: str, record_property: Callable[[str, object], None]) -> None:
     case = LayerCase(folder)
     with gpu(device) if device in GPUS else nullcontext("cpu") as name:
         for exact in CHOICES:

@@ -39,7 +39,7 @@ def _give_another_gradient(one: Learned) -> None:
     ],
     ids=["nothing", "write", "data", "array", "move", "gradient"],
 )
-def test_a_change_counts_for_what_holds_values_or_uses_memory(
+def test_changes_of_values_and_of_memory_are_detected(
     change: Callable[[Learned], object], memory: bool, values: bool
 ) -> None:
     one = blob()
@@ -48,7 +48,7 @@ def test_a_change_counts_for_what_holds_values_or_uses_memory(
     assert (seen[False].are([one]), seen[True].are([one])) == (memory, values)
 
 
-def test_other_blobs_are_not_those_that_were_seen() -> None:
+def test_other_blobs_count_as_changed() -> None:
     one, other = blob(), blob()
     for values in (False, True):
         assert not Seen([one], values).are([other])

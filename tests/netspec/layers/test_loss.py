@@ -182,7 +182,7 @@ def test_multinomial_loss_clamps_the_probability_at_1e_20_for_the_gradient_too(b
 
 
 @pytest.mark.parametrize("norm", ["L1", "L2"])
-def test_hinge_loss_is_one_against_all_over_n_without_a_half(build, norm: str) -> None:
+def test_hinge_loss_is_one_vs_all_divided_by_n(build, norm: str) -> None:
     layer = build(f'type: "HingeLoss" hinge_loss_param {{ norm: {norm} }}', (4, 3), (4,))
     x, labels = torch.randn(4, 3), torch.tensor([0.0, 2.0, 1.0, 1.0])
     total, expected = 0.0, np.zeros((4, 3))
@@ -233,7 +233,7 @@ def test_sigmoid_cross_entropy_takes_the_old_normalize(build, loss_param: str, d
 # EuclideanLoss
 
 
-def test_euclidean_loss_is_over_2n_and_gives_both_bottoms_a_gradient(build) -> None:
+def test_euclidean_loss_divides_by_2n_and_both_bottoms_have_a_gradient(build) -> None:
     layer = build('type: "EuclideanLoss"', (4, 3), (4, 3, 1, 1))
     a, b = torch.randn(4, 3, requires_grad=True), torch.randn(4, 3, 1, 1, requires_grad=True)
     loss = layer.run(a, b)[0]
@@ -364,7 +364,7 @@ def test_accuracy_of_each_class_along_another_axis(build) -> None:
         ("Accuracy", [(4, 3), (4,)]),
     ],
 )
-def test_labels_never_get_a_gradient_and_batches_may_change(build, kind: str, shapes: list) -> None:
+def test_labels_have_no_gradient_and_the_batch_size_can_change(build, kind: str, shapes: list) -> None:
     layer = build(f'type: "{kind}"', *shapes)
     for n in (4, 2):
         bottoms = [torch.rand(n if shape[0] == 4 else 3, *shape[1:], requires_grad=True) for shape in shapes]
@@ -377,7 +377,7 @@ def test_labels_never_get_a_gradient_and_batches_may_change(build, kind: str, sh
 
 @pytest.mark.parametrize("kind", ["SoftmaxWithLoss", "MultinomialLogisticLoss", "HingeLoss", "Accuracy"])
 @pytest.mark.parametrize("label", [-1.0, 3.0])
-def test_a_label_that_is_no_class_is_named(build, kind: str, label: float) -> None:
+def test_an_invalid_label_is_an_error_that_names_it(build, kind: str, label: float) -> None:
     layer = build(f'type: "{kind}"', (2, 3), (2,))
     with pytest.raises(SpecError, match=rf"found label {label:g}, expected 0 to 2: the scores have 3 classes"):
         layer.run(torch.rand(2, 3), torch.tensor([0.0, label]))

@@ -63,7 +63,7 @@ def test_batch_norm_without_a_past_divides_by_the_root_of_eps(build) -> None:
     torch.testing.assert_close(layer.run(data)[0], data / 0.2)
 
 
-def test_batch_norm_layers_that_share_their_sums_add_to_them_in_turn(build) -> None:
+def test_batch_norm_layers_with_shared_sums_update_them_in_order(build) -> None:
     text = 'type: "BatchNorm" batch_norm_param { moving_average_fraction: 0.5 }'
     first, second = (build(text, (4, 2), phase=TRAIN) for _ in range(2))
     for i in range(3):
@@ -79,7 +79,7 @@ def test_batch_norm_layers_that_share_their_sums_add_to_them_in_turn(build) -> N
     assert all(blob.grad is None for blob in first.blobs)
 
 
-def test_batch_norm_of_one_value_a_channel_has_no_variance(build) -> None:
+def test_batch_norm_of_one_value_per_channel_has_variance_zero(build) -> None:
     layer = build('type: "BatchNorm"', (1, 3), phase=TRAIN)
     data = torch.randn(1, 3, requires_grad=True)
     (top,) = layer.run(data)
@@ -107,7 +107,7 @@ def test_batch_norm_by_the_past_has_a_plain_division_for_a_gradient(build) -> No
 
 
 @pytest.mark.parametrize("phase", [TRAIN, TEST])
-def test_batch_norm_keeps_its_digits_far_from_zero(build, phase: int) -> None:
+def test_batch_norm_is_accurate_for_means_far_from_zero(build, phase: int) -> None:
     """torch's CPU kernel alone would be off by 1e-2 here, Caffe's sums by 3e-4."""
     layer = build('type: "BatchNorm"', (8, 2, 16, 16), phase=phase, exact="none")
     data = torch.randn(8, 2, 16, 16) + torch.tensor([10000.0, -3.0]).reshape(1, 2, 1, 1)

@@ -114,7 +114,7 @@ def test_nan_and_minus_infinity_never_win_a_maximum(build, value: float) -> None
         np.testing.assert_array_equal(bottom.grad, diff)
 
 
-def test_a_window_of_nothing_but_nan_is_minus_flt_max_without_gradient(build) -> None:
+def test_a_window_of_only_nan_is_minus_flt_max_without_gradient(build) -> None:
     data = torch.full((1, 1, 2, 4), math.nan)
     data[..., 2:] = torch.tensor([[1.0, 2.0], [2.0, 1.0]])
     bottom = data.requires_grad_()
@@ -144,7 +144,7 @@ def test_windows_are_counted_upwards_and_the_last_is_dropped_only_where_padded(b
     assert tops("kernel_size: 3 stride: 2", 2) == 1  # a kernel longer than the map
 
 
-def test_an_empty_last_window_is_minus_flt_max_or_zero_over_what_is_left_of_its_area(build) -> None:
+def test_an_empty_last_window_is_minus_flt_max_or_zero_over_its_remaining_area(build) -> None:
     text = 'type: "Pooling" pooling_param { pool: %s kernel_h: 1 stride_h: %d kernel_w: 1 stride_w: 1 }'
     top, mask = build(text % ("MAX", 3), (1, 1, 2, 1), tops=2).run(torch.ones(1, 1, 2, 1))
     assert top.flatten().tolist() == [1, LOWEST]

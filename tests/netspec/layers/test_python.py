@@ -45,7 +45,7 @@ def python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
     sys.modules.pop("layers_of_mine", None)
 
 
-def test_code_of_a_prototxt_runs_only_where_it_is_allowed_to(python) -> None:
+def test_python_code_runs_only_if_it_is_allowed(python) -> None:
     with pytest.raises(SpecError) as fault:
         python("TimesTen", (2, 3), allow_python=False)
     assert str(fault.value) == (
@@ -120,7 +120,7 @@ def test_a_data_layer_has_a_state_and_a_param_str(python) -> None:
     assert [batch.tolist() for batch in batches] == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
 
 
-def test_blobs_that_the_code_adds_are_learned(python, gradcheck) -> None:
+def test_blobs_added_by_the_code_are_learned(python, gradcheck) -> None:
     layer = python("Learned", (4, 3))
     assert layer.blob_shapes == [(2, 3), (1,)]
     assert layer.blobs[0].tolist() == [[0.5] * 3] * 2
@@ -133,7 +133,7 @@ def test_blobs_that_the_code_adds_are_learned(python, gradcheck) -> None:
     gradcheck(layer, bottom)
 
 
-def test_forward_may_give_the_top_another_shape(python) -> None:
+def test_forward_can_change_the_shape_of_the_top(python) -> None:
     layer = python("Half", (4, 3), phase=TRAIN)
     top = layer.run(torch.arange(12.0).reshape(4, 3))[0]
     assert top.shape == (2, 3, 1, 1)
@@ -158,13 +158,13 @@ def test_a_layer_without_tops_only_looks(python) -> None:
     assert layer.code.seen.tolist() == [[1] * 3] * 2
 
 
-def test_caffe_can_be_imported_by_that_code_only(python) -> None:
+def test_only_the_code_of_python_layers_can_import_caffe(python) -> None:
     python("TimesTen", (2, 3)).run(torch.ones(2, 3))
     assert "caffe" not in sys.modules
     assert str(Path.cwd()) not in sys.path[:1]
 
 
-def test_a_caffe_that_is_there_is_left_alone(python, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_installed_caffe_is_not_replaced(python, monkeypatch: pytest.MonkeyPatch) -> None:
     from netspec.layers.utility import pycaffe_shim
 
     real = types.ModuleType("caffe")
@@ -180,7 +180,9 @@ def test_a_folder_of_caffes_sources_is_no_caffe(python, tmp_path: Path) -> None:
     assert python("TimesTen", (2, 3)).run(torch.ones(2, 3))[0].sum() == 60
 
 
-def test_what_the_stand_in_lacks_is_named(python, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_attribute_of_the_module_caffe_is_named(
+    python, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from netspec.layers.utility import pycaffe_shim
 
     monkeypatch.setattr(pycaffe_shim, "_home", pycaffe_shim.__name__)  # as if nobody had imported netspec.pycaffe

@@ -80,7 +80,7 @@ def build(name: str, text: str, shapes: list[tuple[int, ...]], exact: str) -> La
     [(*case, *how) for case in ALL for how in product(CHOICES, (False, True))],
 )
 @one_thread()  # as Learning says; the two would share a product among threads in other ways, and round otherwise
-def test_kernels_are_what_autograd_computes(
+def test_kernels_compute_the_gradients_of_autograd(
     name: str, text: str, shapes: list[tuple[int, ...]], exact: str, sideways: bool
 ) -> None:
     """``sideways``: the channels of a pixel are contiguous, as torch's kernels leave them."""

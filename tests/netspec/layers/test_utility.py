@@ -101,7 +101,7 @@ def test_slice_cuts_an_axis(build, text: str, tops: int, sizes: list, axis: int)
 # Split, Tile, Silence, Parameter
 
 
-def test_split_gives_each_top_a_gradient_of_its_own_and_adds_them_up(build) -> None:
+def test_split_adds_the_gradients_of_its_tops(build) -> None:
     layer = build('type: "Split"', (2, 2), tops=3)
     bottom = torch.randn(2, 2, requires_grad=True)
     tops = layer.run(bottom)
@@ -128,7 +128,7 @@ def test_silence_has_no_top(build) -> None:
     assert layer.run(torch.ones(2, 3), torch.ones(4)) == ()
 
 
-def test_parameter_is_a_blob_of_zeros_that_learns(build) -> None:
+def test_parameter_is_a_learnable_blob_of_zeros(build) -> None:
     layer = build('type: "Parameter" parameter_param { shape { dim: 2 dim: 3 } }')
     assert (layer.top_shapes, layer.blob_shapes) == ([(2, 3)], [(2, 3)])
     top = layer.run()[0]
@@ -158,7 +158,7 @@ def test_batch_reindex_names_an_index_out_of_range(build, index: int) -> None:
         layer.run(torch.ones(3, 2), torch.tensor([0.0, index]))
 
 
-def test_filter_declares_the_whole_batch_and_keeps_what_is_selected(build) -> None:
+def test_filter_declares_the_whole_batch_and_returns_the_selected_items(build) -> None:
     layer = build('type: "Filter"', (4, 2), (4,), (4, 1), tops=2)
     assert layer.top_shapes == [(4, 2), (4,)]
     data = counting(4, 2).requires_grad_()
@@ -169,7 +169,7 @@ def test_filter_declares_the_whole_batch_and_keeps_what_is_selected(build) -> No
     assert data.grad.tolist() == [[0, 0], [1, 1], [0, 0], [1, 1]]
 
 
-def test_filter_may_keep_nothing(build) -> None:
+def test_filter_can_select_no_item(build) -> None:
     layer = build('type: "Filter"', (3, 2), (3,))
     assert layer.run(torch.ones(3, 2), torch.zeros(3))[0].shape == (0, 2)
 
@@ -194,7 +194,7 @@ def test_eltwise_combines_element_by_element(build, gradcheck, text: str, expect
     gradcheck(layer, *bottoms)
 
 
-def test_eltwise_max_gives_a_tie_to_the_second_bottom_never_to_a_later_one(build) -> None:
+def test_eltwise_max_resolves_ties_for_the_second_bottom_and_never_for_a_later_one(build) -> None:
     layer = build('type: "Eltwise" eltwise_param { operation: MAX }', (4,), (4,), (4,))
     bottoms = [
         torch.tensor(values, requires_grad=True)
@@ -254,7 +254,7 @@ def argmax(values: list[float], top_k: int) -> list[tuple[float, int]]:
     return sorted(((v, i) for i, v in enumerate(values)), reverse=True)[:top_k]
 
 
-def test_argmax_gives_ties_to_the_larger_index(build) -> None:
+def test_argmax_resolves_ties_for_the_larger_index(build) -> None:
     layer = build('type: "ArgMax" argmax_param { top_k: 3 }', (1, 5))
     assert layer.run(torch.tensor([[2.0, 7.0, 7.0, 1.0, 7.0]]))[0].tolist() == [[[4, 2, 1]]]
 
@@ -282,7 +282,7 @@ def test_argmax_without_axis_flattens_each_item(build, text: str, bottom: tuple,
 
 
 @pytest.mark.parametrize("out_max_val", ["false", "true"])
-def test_argmax_along_an_axis_gives_indices_or_values(build, out_max_val: str) -> None:
+def test_argmax_along_an_axis_returns_indices_or_values(build, out_max_val: str) -> None:
     layer = build(f'type: "ArgMax" argmax_param {{ axis: -2 top_k: 2 out_max_val: {out_max_val} }}', (2, 4, 3))
     x = torch.randint(0, 3, (2, 4, 3)).float()
     found = layer.run(x)[0]
@@ -304,7 +304,7 @@ def test_softmax_along_an_axis(build, gradcheck, text: str, axis: int) -> None:
     gradcheck(layer, torch.randn(2, 3, 4))
 
 
-def test_softmax_gradient_is_made_of_what_memory_holds(build) -> None:
+def test_softmax_gradient_uses_the_data_in_memory(build) -> None:
     layer = build('type: "Softmax"', (1, 3))
     top, diff = torch.tensor([[1.0, 2.0, -1.0]]), torch.tensor([[3.0, 0.5, 1.0]])
     assert layer.caffes_gradient(torch.zeros(1, 3), top, diff).tolist() == [[0, -5, 2]]

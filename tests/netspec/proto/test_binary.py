@@ -11,7 +11,7 @@ from netspec.proto.schema import BlobProto, NetParameter, SolverState
 from paths import GOLDEN
 
 
-def test_files_that_caffe_wrote() -> None:
+def test_files_written_by_caffe_are_read() -> None:
     net, source = parse_net_binary(GOLDEN / "snapshot" / "ref_iter_40.caffemodel")
     assert "conv1" in [layer.name for layer in net.layer]
     assert len(source.layers) == len(net.layer)

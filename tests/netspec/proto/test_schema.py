@@ -74,7 +74,7 @@ def test_every_enum_is_caffes() -> None:
     assert enums == rows
 
 
-def test_compiled_schema_is_that_of_the_proto_file(tmp_path: Path) -> None:
+def test_the_compiled_schema_equals_the_proto_file(tmp_path: Path) -> None:
     protoc = pytest.importorskip("grpc_tools.protoc")
     out = tmp_path / "caffe.desc"
     assert protoc.main(["protoc", f"-I{PROTO}", f"--descriptor_set_out={out}", "caffe.proto"]) == 0
@@ -83,7 +83,7 @@ def test_compiled_schema_is_that_of_the_proto_file(tmp_path: Path) -> None:
     assert list(fresh.file) == [compiled()]
 
 
-def test_stub_for_type_checkers_is_that_of_the_proto_file(tmp_path: Path) -> None:
+def test_the_stub_for_type_checkers_equals_the_proto_file(tmp_path: Path) -> None:
     protoc = pytest.importorskip("grpc_tools.protoc")
     plugin = Path(sys.executable).with_name("protoc-gen-mypy")
     arguments = [f"-I{PROTO}", f"--plugin=protoc-gen-mypy={plugin}", f"--mypy_out={tmp_path}", "caffe.proto"]

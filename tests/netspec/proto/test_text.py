@@ -74,7 +74,7 @@ def test_a_list_of_devices_is_its_first(caplog: pytest.LogCaptureFixture) -> Non
     )
 
 
-def test_what_only_the_cpp_parser_takes() -> None:
+def test_texts_that_only_the_cpp_parser_accepts_are_read() -> None:
     """Python's own parser, or that of some versions, refuses these; Caffe's does not."""
     net = read("name: 'two\nlines\\? \\u00e9\\U0001F600' input_dim: 3input_dim: - 4 layer { loss_weight: 0.5F }")
     assert net.name == "two\nlines? é😀"
@@ -144,7 +144,7 @@ def logged(start: str, log: str) -> str:
         ("Initializing net from parameters:", NetParameter()),
     ],
 )
-def test_writes_what_caffe_logs(start: str, message: Any) -> None:
+def test_the_text_equals_caffes_log(start: str, message: Any) -> None:
     text = logged(start, "caffe_train.log")
     assert text.count("\n") > 15
     assert write_text(read(text, message)) == text
@@ -218,7 +218,7 @@ def test_random_messages_survive_text(cls: type[Any], seed: int) -> None:
 
 
 def only_for_cpp(text: str) -> bool:
-    """Say whether a text has what test_what_only_the_cpp_parser_takes is about."""
+    """Say whether a text has what test_texts_that_only_the_cpp_parser_accepts_are_read is about."""
     tokens = list(Lexer(text, ""))
     several_lines = any(token.kind == STRING and "\n" in token.text for token in tokens)
     glued = any(

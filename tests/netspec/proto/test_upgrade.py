@@ -49,7 +49,7 @@ def test_net_is_upgraded(case: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize("case", NETS.values(), ids=NETS)
-def test_passes_change_nothing_they_are_given_and_nothing_twice(case: dict[str, str]) -> None:
+def test_passes_do_not_change_their_arguments_and_are_idempotent(case: dict[str, str]) -> None:
     net, source = parse_net_text(case["old"], "f", upgrade=False)
     assert upgrade.upgrade_net(net, source)[0] is not net
     for step in PASSES:
@@ -64,7 +64,7 @@ def test_passes_change_nothing_they_are_given_and_nothing_twice(case: dict[str, 
 
 
 @pytest.mark.parametrize("case", NETS.values(), ids=NETS)
-def test_every_part_has_a_place_with_its_own_value_in_that_line(case: dict[str, str]) -> None:
+def test_the_place_of_every_part_is_the_line_with_its_value(case: dict[str, str]) -> None:
     net, source = parse_net_text(case["old"], "f")
     lines = case["old"].splitlines()
     for layer, place in zip(net.layer, source.layers, strict=True):
@@ -241,7 +241,7 @@ def test_input_without_a_shape_among_others_is_refused(text: str, message: str) 
         ('input: "a" input_shape {}\ninput_dim: 1', "f:2:1: input_dim together with input_shape is not used"),
     ],
 )
-def test_input_fields_that_are_not_used_are_named(text: str, message: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_unused_input_fields_are_named(text: str, message: str, caplog: pytest.LogCaptureFixture) -> None:
     net, _ = parse_net_text(text, "f")
     assert message in caplog.messages
     assert not len(net.input) + len(net.input_shape) + len(net.input_dim)
@@ -250,7 +250,7 @@ def test_input_fields_that_are_not_used_are_named(text: str, message: str, caplo
 # ---- What is logged ----
 
 
-def test_says_what_caffe_says(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_log_equals_caffes(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO):
         parse_net_text(V1, "old.prototxt")
     said = [(record.levelname, getattr(record, "site", ""), record.message) for record in caplog.records]
@@ -279,7 +279,7 @@ def test_says_what_caffe_says(caplog: pytest.LogCaptureFixture) -> None:
     ]
 
 
-def test_current_net_is_returned_as_it_is(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_current_net_is_returned_unchanged(caplog: pytest.LogCaptureFixture) -> None:
     net, source = parse_net_text('layer { name: "a" }', "f", upgrade=False)
     assert upgrade.upgrade_net(net, source) == (net, source)
     assert not caplog.messages

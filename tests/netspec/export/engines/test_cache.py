@@ -34,7 +34,7 @@ def test_an_entry_is_made_once(tmp_path: Path) -> None:
     assert sorted(path.name for path in cache.iterdir()) == ["key", "other"]
 
 
-def test_a_maker_that_fails_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failed_maker_leaves_no_files(tmp_path: Path) -> None:
     def make(folder: Path) -> None:
         (folder / "half").write_text("a")
         raise KeyboardInterrupt
@@ -44,7 +44,7 @@ def test_a_maker_that_fails_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_with_other_things_keeps_them(tmp_path: Path) -> None:
+def test_other_files_in_the_folder_are_kept(tmp_path: Path) -> None:
     """However large and old they are."""
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -139,7 +139,7 @@ def test_where_the_cache_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         ("torch", "int8", "found precision 'int8', expected 'fp32', 'bf16'"),
     ],
 )
-def test_choices_that_there_are_not(engine: str, precision: str, fault: str) -> None:
+def test_unknown_choices_are_refused(engine: str, precision: str, fault: str) -> None:
     with pytest.raises(SpecError) as found:
         Choice.of(engine, precision)
     assert str(found.value) == fault

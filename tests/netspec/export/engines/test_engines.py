@@ -57,7 +57,7 @@ def entries(folder: Path) -> list[Path]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
-def test_the_numbers_are_those_of_torch(engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_numbers_equal_torchs(engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
     net, expected = load(engine), load("torch")
     assert type(net) is netspec.Net
     net.load_state_dict(expected.state_dict())
@@ -74,7 +74,7 @@ def test_the_numbers_are_those_of_torch(engine: str, data: np.ndarray, caplog: p
 
 
 @pytest.mark.slow
-def test_blobs_that_are_asked_for_are_kept(engine: str, files: Path, data: np.ndarray) -> None:
+def test_requested_blobs_are_kept(engine: str, files: Path, data: np.ndarray) -> None:
     net, expected = load(engine), load("torch")
     net.keep = expected.keep = ["conv"]
     net(data=data)
@@ -126,7 +126,7 @@ def test_changed_parameters_take_effect_and_are_not_kept(engine: str, files: Pat
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
-def test_parameters_that_may_change_unseen_are_read_at_every_pass(
+def test_parameters_with_aliases_are_read_in_every_pass(
     engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture
 ) -> None:
     net = load(engine)
@@ -155,7 +155,7 @@ def test_random_weights_are_not_kept(engine: str, files: Path, data: np.ndarray)
 
 
 @pytest.mark.usefixtures("files")
-def test_a_pass_that_needs_gradients_is_torchs(engine: str, data: np.ndarray) -> None:
+def test_torch_runs_passes_with_gradients(engine: str, data: np.ndarray) -> None:
     given = torch.from_numpy(data).requires_grad_()
     load(engine)(data=given)["feat"].sum().backward()
     assert given.grad is not None
@@ -175,7 +175,7 @@ def test_a_pass_that_needs_gradients_is_torchs(engine: str, data: np.ndarray) ->
         ("", "TRAIN", "it runs nets in phase TEST, but this net is in phase TRAIN"),
     ],
 )
-def test_what_it_cannot_do_is_torchs(
+def test_torch_runs_what_the_engine_cannot(
     layer: str, phase: str, reason: str, engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture
 ) -> None:
     Path("net.prototxt").write_text(NET + (f"layer {{ {layer} }}" if layer else ""))
@@ -191,7 +191,7 @@ def test_what_it_cannot_do_is_torchs(
 
 
 @pytest.mark.usefixtures("files")
-def test_a_state_that_goes_on_from_run_to_run_is_torchs(engine: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_torch_runs_layers_with_state(engine: str, caplog: pytest.LogCaptureFixture) -> None:
     Path("net.prototxt").write_text(
         """layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 3 dim: 2 dim: 4 } } }
         layer { name: "cont" type: "Input" top: "cont" input_param { shape { dim: 3 dim: 2 } } }
@@ -238,7 +238,7 @@ def test_a_cache_that_cannot_be_written_is_reported(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
-def test_bf16_says_how_far_it_is_from_fp32(engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
+def test_bf16_reports_its_difference_from_fp32(engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
     expected = load(engine)(data=data)["feat"]
     with caplog.at_level(logging.WARNING):
         found = [load(engine, precision="bf16")(data=data)["feat"] for _ in range(2)]
@@ -384,7 +384,7 @@ def test_signals_are_handled_after_nets_of_openvino_are_gone(precision: str) -> 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
-def test_a_size_that_the_net_does_not_take_is_refused_by_all(engine: str) -> None:
+def test_a_size_that_does_not_fit_the_net_is_refused_by_all(engine: str) -> None:
     odd = np.zeros((2, 3, 19, 12), np.float32)
     faults = []
     for net in (load("torch"), load(engine)):
