@@ -166,7 +166,7 @@ class Assembly:
             given_shapes={**self.options.given_shapes, **self.shapes},
             allow_python=False,
         )
-        silent = replace(self._plan, source=self._plan.source.telling(lambda fault: None))
+        silent = replace(self._plan, source=self._plan.source.reporting_to(lambda fault: None))
         with log.silent():
             return Assembly(silent, seen).need
 

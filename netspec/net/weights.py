@@ -27,7 +27,7 @@ from netspec.files.whole_file import write_whole
 from netspec.layers.contract.base import Layer, shape_string
 from netspec.net.net import Net
 from netspec.net.sealed import check_weights
-from netspec.proto.binary import MOST_BYTES, net_beside_numbers
+from netspec.proto.binary import MOST_BYTES, net_without_numbers
 from netspec.proto.forks import forks
 from netspec.proto.schema import NetParameter
 
@@ -58,7 +58,7 @@ def load_weights(
             elif is_safetensors(head_of(each)):
                 loaded |= _copy(partial(_from_safetensors, net, each), faults.append)
             else:
-                with net_beside_numbers(each) as (message, file):
+                with net_without_numbers(each) as (message, file):
                     loaded |= _copy(partial(_from_message, net, message, each, file), faults.append)
                     if faults and message.name and message.name != net.name:
                         names = f'"{message.name}" (this one is "{net.name}")' if net.name else f'"{message.name}"'

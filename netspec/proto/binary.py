@@ -1,4 +1,4 @@
-"""Messages in protobuf's binary format: .caffemodel, .solverstate, .binaryproto. Any size that fits in memory."""
+"""Reads messages in protobuf's binary format: .caffemodel, .solverstate, .binaryproto."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def read_net_binary(path: str | Path) -> NetParameter:
 
 
 @contextmanager
-def net_beside_numbers(path: str | Path) -> Iterator[tuple[NetParameter, BinaryIO | None]]:
+def net_without_numbers(path: str | Path) -> Iterator[tuple[NetParameter, BinaryIO | None]]:
     """Yield the net of a .caffemodel without the numbers of its large blobs, and the open file that contains them.
 
     See :func:`netspec.proto.wire.without_numbers`. If this fails, yield the complete net and None instead.
@@ -91,7 +91,7 @@ def net_beside_numbers(path: str | Path) -> Iterator[tuple[NetParameter, BinaryI
             file = stack.enter_context(open(path, "rb", buffering=0))
             message = without_numbers(_Slices(file), 0, os.fstat(file.fileno()).st_size, "NetParameter")
             found = _upgraded(parse_binary(message, str(path), NetParameter), path)[0], file
-        except (OSError, ValueError):  # also SpecError: reading the whole file may give a better error
+        except (OSError, ValueError):  # also SpecError: reading the whole file may raise a better error
             stack.close()
             found = read_net_binary(path), None
         yield found

@@ -1,9 +1,8 @@
 """Reads protobuf's text format into a message, by reflection, with the place of every part.
 
-It accepts exactly the files that Caffe's C++ parser accepts, and refuses others with one line that gives the place and
-the reason. One field is added: ``ceil_mode: true`` in a pooling_param, which
-many forks use for ``round_mode: CEIL``. If Caffe lacks a field or value and exactly one known fork has it, it is added
-to the schema when it is read (netspec/proto/forks.py).
+It accepts the files that Caffe's C++ parser accepts, and refuses others with one line that gives the place and the
+reason. It also accepts ``ceil_mode: true`` in a pooling_param, which many forks use for ``round_mode: CEIL``. If Caffe
+lacks a field or value and exactly one known fork has it, it is added to the schema (netspec/proto/forks.py).
 """
 
 from __future__ import annotations

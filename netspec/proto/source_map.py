@@ -70,7 +70,7 @@ class SourceMap:
         """Return the place of a field of layer ``index``, labeled with the layer's name and type."""
         return replace(self.layers[index].find(*path), layer=layer, type=type)
 
-    def telling(self, report: Report) -> SourceMap:
+    def reporting_to(self, report: Report) -> SourceMap:
         """Return a map of the same net that passes errors to ``report``."""
         return replace(self, report=report)
 

@@ -1,4 +1,4 @@
-"""protobuf's wire format: the positions of a message's fields, without parsing it.
+"""Protobuf's wire format: finds the fields of a message without parsing it.
 
 protobuf copies all numbers of a net's weights while it parses them, and passes them to Python one by one.
 """

@@ -63,7 +63,9 @@ def net_of() -> Callable[..., Net]:
     def build(text: str, phase: PhaseValue = TEST, report: Report = raise_fault, **options: Any) -> Net:
         net, source = parse_net_text(text, "net.prototxt")
         return build_net(
-            with_state(net, phase), source.telling(report), BuildOptions(**{"seed": 0, "speed": speed(), **options})
+            with_state(net, phase),
+            source.reporting_to(report),
+            BuildOptions(**{"seed": 0, "speed": speed(), **options}),
         )
 
     return build

@@ -113,7 +113,7 @@ def _check_net(
 ) -> Checked:
     """Build a net (its ``state`` set) without memory, check weights against it, and collect the errors."""
     faults: list[SpecError] = []
-    built = build_net(net, source.telling(faults.append), replace(options, seed=seed))
+    built = build_net(net, source.reporting_to(faults.append), replace(options, seed=seed))
     if fault := built.need.fault(memory() if options.limit is None else options.limit):
         faults.append(fault)
     if files := [path for paths in weights for path in split_paths(paths)]:

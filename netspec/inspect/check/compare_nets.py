@@ -63,7 +63,7 @@ def compare_in_state(first: tuple[NetParameter, SourceMap], second: tuple[NetPar
 def _seen(net: NetParameter, source: SourceMap) -> _Seen:
     with log.silent():
         filtered, placed = filter_net(net, source)
-    plan = make_plan(filtered, placed.telling(lambda fault: None))
+    plan = make_plan(filtered, placed.reporting_to(lambda fault: None))
     keys = _keys(node.name for node in plan.nodes)
     makers = {v: (key, j) for key, node in zip(keys, plan.nodes, strict=True) for j, v in enumerate(node.tops)}
     return _Seen(plan, {key: i for i, key in enumerate(keys)}, makers)

@@ -145,7 +145,7 @@ def diagram_of(
     faults: list[SpecError] = []
     options = replace(options or BuildOptions(open_data=False), device="meta", seed=0, write_files=False, passes=())
     with log.silent():
-        source = source.telling(faults.append)
+        source = source.reporting_to(faults.append)
         seen = [
             _look(with_state(net, phase, options.level, options.stages), source, PHASE_NAMES[phase], options)
             for phase in phases
@@ -160,7 +160,7 @@ def _look(net: NetParameter, source: SourceMap, phase: str, options: BuildOption
     numbers = [int(place.where.file) for place in numbers.layers]
     placed = source.with_layers(source.layers[k] for k in numbers)
     # The build, which plans again with splits, reports errors in the connections.
-    plan = make_plan(filtered, placed.telling(lambda fault: None))
+    plan = make_plan(filtered, placed.reporting_to(lambda fault: None))
     waiting: dict[str, list[int]] = {}
     for number, layer in zip(numbers, filtered.layer, strict=True):
         waiting.setdefault(layer.name, []).append(number)

@@ -1,4 +1,4 @@
-"""Public nets that need a dialect: they build with what their authors' Caffe made of them."""
+"""Public nets that need a dialect are built with the shapes of their authors' Caffe."""
 
 from pathlib import Path
 

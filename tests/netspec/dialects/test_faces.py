@@ -1,4 +1,4 @@
-"""Layers of face recognition: angular margins against their formula, and what the goldens of the forks leave out."""
+"""Layers of face recognition: angular margins compared with their formula, and cases without golden files."""
 
 import math
 

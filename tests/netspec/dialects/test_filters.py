@@ -1,4 +1,4 @@
-"""Fields that forks added to Caffe's own layers: Convolution's holes and sides, BatchNorm's slopes and biases."""
+"""Fields that forks added to Caffe's layers: Convolution's hole and pads, BatchNorm's slopes and biases."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""What forks themselves computed: their layers one by one, and trainings of nets with them.
+"""Results of the forks themselves: single layers, and trainings of nets with them.
 
 tests/golden/forks/README.md says which forks, how they were built, and where a fork is odd. Their oddities are
 repeated, but for the faults listed below. Each case agrees, is refused by a message that says why, or is such a fault.

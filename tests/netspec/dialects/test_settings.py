@@ -1,4 +1,4 @@
-"""Settings of nets that forks added: a warning says what has no effect. Those of solvers: solver/test_lr_policy.py."""
+"""Settings of nets that forks added: those without effect get a warning (for solvers: solver/test_lr_policy.py)."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What SSD's own branch computed (weiliu89/caffe, ssd, built for CPUs): layers, data, trainings, average precision.
+"""Results of SSD's own branch (weiliu89/caffe, ssd, built for CPUs): layers, data, trainings, average precision.
 
 Its oddities are repeated: the gradient of Normalize leaves the scales out of a sum (normalize_*_per_channel,
 training/norm_per_channel), labels of a logistic loss without mining stand at other priors (multibox_logistic_none), and

@@ -1,4 +1,4 @@
-"""Gradients go where the net was built to have them: to autograd, or product by product into ``grad``."""
+"""Gradients of parameters are returned to autograd or added to ``grad`` at once, as the net was built."""
 
 from pathlib import Path
 

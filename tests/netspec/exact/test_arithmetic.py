@@ -1,4 +1,4 @@
-"""Both arithmetics compute the same, but for rounding; each operation has both, and gradients."""
+"""Both arithmetics have all operations, and compute the same results and gradients except for rounding."""
 
 import ast
 import inspect

@@ -1,4 +1,4 @@
-"""BLAS' routines compute what they say."""
+"""The routines of BLAS compute the documented products and sums."""
 
 from itertools import product
 

@@ -1,4 +1,4 @@
-"""The kernels of BLAS with which Caffe computed the golden files, those for AVX-512, are chosen where they run."""
+"""BLAS uses its kernels for AVX-512, which computed the golden files, on CPUs that have them."""
 
 import os
 import subprocess

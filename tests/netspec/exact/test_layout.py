@@ -1,4 +1,4 @@
-"""The gradient of maps has their layout in memory, whatever layout a kernel wants."""
+"""The gradient of maps has the same memory layout as the maps."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""When Caffe's order is taken, and when torch's kernels are."""
+"""When sums are computed in Caffe's order, and when by torch's kernels."""
 
 import pytest
 import torch

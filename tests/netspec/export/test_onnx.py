@@ -1,4 +1,4 @@
-"""ONNX models as a whole: names, free sizes, where they came from, what is done to images, large weights, real nets."""
+"""Whole ONNX models: names, dynamic sizes, metadata, preprocessing of images, large weights, real nets."""
 
 from collections.abc import Callable
 from pathlib import Path

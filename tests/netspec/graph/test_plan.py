@@ -65,7 +65,7 @@ def test_all_errors_can_be_collected() -> None:
         'layer { name: "b" type: "ReLU" bottom: "nor" top: "x" }',
         "net",
     )
-    make_plan(*insert_splits(net, source.telling(faults.append)))
+    make_plan(*insert_splits(net, source.reporting_to(faults.append)))
     assert len(faults) == 3
 
 

@@ -1,4 +1,4 @@
-"""The activations: their functions, their gradients, and what Caffe does at the corners."""
+"""The activations: functions, gradients, and Caffe's results in special cases."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Fillers: the distributions of Caffe's seven, and what they refuse.
+"""Fillers: the distributions of Caffe's seven fillers, and their errors.
 
 The samples are seeded, of 40,000 values and more, and the tolerances six standard errors or more: they hold for good.
 """

@@ -1,4 +1,4 @@
-"""Whether learned blobs are as they were when something was made for them."""
+"""Changes of learned blobs and of their memory are detected."""
 
 from collections.abc import Callable
 

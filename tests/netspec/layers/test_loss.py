@@ -1,4 +1,4 @@
-"""The losses and Accuracy: against plain loops in numpy, and what Caffe does at the corners."""
+"""The losses and Accuracy: compared with plain loops in numpy, and Caffe's results in special cases."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The Python layer: code as people wrote it for pycaffe runs, if it is allowed to."""
+"""The Python layer runs code written for pycaffe, if this is allowed."""
 
 import sys
 import types

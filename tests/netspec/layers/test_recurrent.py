@@ -1,4 +1,4 @@
-"""RNN, LSTM and LSTMUnit: against plain loops in numpy, and how Caffe carries the hidden state."""
+"""RNN, LSTM and LSTMUnit: compared with plain loops in numpy; how the hidden state is kept."""
 
 import numpy as np
 import pytest

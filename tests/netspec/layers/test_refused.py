@@ -1,4 +1,4 @@
-"""What layers refuse when they are built: settings and bottoms, each in one line that names the field."""
+"""Invalid settings and bottoms are refused in one line that names the field."""
 
 import pytest
 

@@ -15,7 +15,7 @@ from netspec.inspect.stored_weights import stored_layers
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, net_to_proto, save_weights
-from netspec.proto.binary import net_beside_numbers
+from netspec.proto.binary import net_without_numbers
 from netspec.proto.schema import TRAIN, BlobProto, BlobShape, NetParameter, V0LayerParameter, V1LayerParameter
 from netspec.proto.text import parse_net, parse_net_text
 from paths import GOLDEN
@@ -275,7 +275,7 @@ def field(number: int, contents: bytes) -> bytes:
 @pytest.mark.parametrize("turned", [False, True])
 def test_numbers_are_read_directly_from_the_file(kind: str, turned: bool, tmp_path: Path) -> None:
     (tmp_path / "w.caffemodel").write_bytes(wide(kind))
-    with net_beside_numbers(tmp_path / "w.caffemodel") as (message, file):
+    with net_without_numbers(tmp_path / "w.caffemodel") as (message, file):
         left = file is not None and not message.layer[0].blobs[0].data
         assert left == (kind in ("current", "V1", "V0", "numbers before the shape"))
     net = net_of(WIDE)

@@ -1,4 +1,4 @@
-"""Every fault of a text file is one line: where, what was found, what was expected, what to do."""
+"""Every error in a text file is one line: place, found, expected, advice."""
 
 from pathlib import Path
 

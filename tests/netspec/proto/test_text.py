@@ -1,4 +1,4 @@
-"""Text is read as protobuf reads it, and written as Caffe prints it."""
+"""Text is read like protobuf reads it, and written like Caffe prints it."""
 
 import itertools
 import random

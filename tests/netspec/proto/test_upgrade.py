@@ -1,4 +1,4 @@
-"""Older formats become the current one, and every part keeps the place it came from."""
+"""Older formats are upgraded to the current one, and every part keeps its place in the file."""
 
 import logging
 import re

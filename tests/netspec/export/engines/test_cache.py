@@ -1,4 +1,4 @@
-"""The folder of exported models: whole entries or none, by content."""
+"""The cache of exported models: entries are complete or absent, and found by their content."""
 
 import logging
 import os
