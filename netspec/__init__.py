@@ -1,11 +1,12 @@
 """netspec, the living Caffe: runs Caffe's prototxt in PyTorch, unmodified, with Caffe's numbers.
 
 The public names are loaded when they are first used, so that ``import netspec.proto.text`` does not import torch. This
-file imports only a module without imports of its own: until it has run, a program cannot handle signals
+file imports only modules without imports of their own: until it has run, a program cannot handle signals
 (netspec/terminal/main.py), and ``python -m netspec`` still searches the working directory for modules first
 (netspec/__main__.py).
 """
 
+from netspec.graph import speed as _speed
 from netspec.proto import forks as _forks
 
 TYPE_CHECKING = False
@@ -56,7 +57,19 @@ def _find_forks() -> "_forks.Forks | None":
     return Dialects()
 
 
+def _find_speed() -> "Any":
+    """Return the object that makes nets faster, or None if netspec/fast is not installed."""
+    import importlib.util
+
+    if importlib.util.find_spec("netspec.fast") is None:
+        return None
+    from netspec.fast.speed import Fast
+
+    return Fast()
+
+
 _forks.find = _find_forks
+_speed.find = _find_speed
 
 
 def load_ipython_extension(ipython: object) -> None:

@@ -1,6 +1,6 @@
 """The public functions :func:`load_net` and :func:`load_solver`, which build a net or a solver from files.
 
-Only this module connects a net with the optional packages netspec/fast and netspec/export/engines.
+A net for another engine comes from the optional package netspec/export.
 """
 
 from __future__ import annotations
@@ -12,23 +12,14 @@ from typing import TYPE_CHECKING
 
 from netspec.errors import SpecError, several
 from netspec.graph.options import FP32, PASSES, TORCH, BuildOptions
+from netspec.graph.speed import speed
 from netspec.proto.schema import phase_of
 
 if TYPE_CHECKING:
     import torch
 
-    from netspec.fast.speed import Fast
     from netspec.net.net import Net
     from netspec.solver.solver import Solver
-
-
-def speed() -> Fast | None:
-    """Return netspec/fast for :class:`~netspec.graph.options.BuildOptions`, or None if it is not installed."""
-    if find_spec("netspec.fast") is None:
-        return None
-    from netspec.fast.speed import Fast
-
-    return Fast()
 
 
 def load_net(

@@ -17,7 +17,7 @@ import netspec
 from netspec.exact import CHOICES
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
-from netspec.load import speed
+from netspec.graph.speed import speed
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import PHASES, Datum

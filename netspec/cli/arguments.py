@@ -10,7 +10,7 @@ from netspec import log
 from netspec.errors import SpecError
 from netspec.files.limits import read_amount
 from netspec.graph.options import BF16, ENGINES, EXACT, FP32, OPENVINO, PASSES, PRECISIONS, TORCH, BuildOptions
-from netspec.load import speed
+from netspec.graph.speed import speed
 from netspec.proto.binary import split_paths
 from netspec.proto.forks import use_dialect
 from netspec.proto.schema import PHASES

@@ -54,12 +54,15 @@ def to_array(proto: Any) -> np.ndarray:
     If the blob has neither data nor double_data, the numbers in its raw_data are returned; half precision and
     integers become float32. Raises ValueError if the number of values does not match the shape.
     """
-    return _values(proto, _DATA)
-
-
-def diff_to_array(proto: Any) -> np.ndarray | None:
-    """Return the gradient in the blob's shape, or None if the blob has no gradient; see :func:`to_array`."""
-    return _values(proto, _DIFF) if any(len(getattr(proto, name)) for name in _DIFF) else None
+    name, dtype = ("double_data", "<f8") if len(proto.double_data) else ("data", "<f4")
+    found, shape = len(getattr(proto, name)), shape_of(proto)
+    count, stored = math.prod(shape), proto.SerializeToString()
+    if not found and count and (runs := _Runs.FromString(stored)).raw_data:
+        return _raw_values(runs, count).reshape(shape)
+    _check_count(found, name, shape)
+    number = BlobProto.DESCRIPTOR.fields_by_name[name].number
+    start = next((field.start for field in fields(stored, 0, len(stored)) if field.number == number), 0)
+    return np.frombuffer(stored, dtype, count, start).reshape(shape)
 
 
 def from_array(values: np.ndarray, diff: np.ndarray | None = None) -> Any:
@@ -85,19 +88,6 @@ def in_half_precision(values: np.ndarray) -> Any:
 def _of_shape(shape: Shape) -> Any:
     """Return a BlobProto with a shape. As in Caffe, the field ``shape`` is absent if there are no axes."""
     return BlobProto(shape=BlobShape(dim=shape)) if shape else BlobProto()
-
-
-def _values(proto: Any, names: tuple[str, str]) -> np.ndarray:
-    single, double = names
-    name, dtype = (double, "<f8") if len(getattr(proto, double)) else (single, "<f4")
-    found, shape = len(getattr(proto, name)), shape_of(proto)
-    count, stored = math.prod(shape), proto.SerializeToString()
-    if not found and count and names == _DATA and (runs := _Runs.FromString(stored)).raw_data:
-        return _raw_values(runs, count).reshape(shape)
-    _check_count(found, name, shape)
-    number = BlobProto.DESCRIPTOR.fields_by_name[name].number
-    start = next((field.start for field in fields(stored, 0, len(stored)) if field.number == number), 0)
-    return np.frombuffer(stored, dtype, count, start).reshape(shape)
 
 
 def _check_count(found: int, name: str, shape: Shape) -> None:

@@ -17,8 +17,8 @@ from netspec.errors import Report, raise_fault
 from netspec.exact.blas import CAFFES, kernels
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
+from netspec.graph.speed import speed
 from netspec.layers import Layer
-from netspec.load import speed
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, PhaseValue

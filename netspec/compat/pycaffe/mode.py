@@ -14,8 +14,8 @@ from netspec import log
 from netspec.errors import check_choice
 from netspec.exact import CHOICES, SMALL
 from netspec.graph.options import BuildOptions
+from netspec.graph.speed import speed
 from netspec.layers.contract.context import Random
-from netspec.load import speed
 
 
 @dataclass

@@ -21,9 +21,9 @@ from netspec.compat.pycaffe.errors import caffes_errors
 from netspec.compat.pycaffe.net import FilePath, Net
 from netspec.compat.pycaffe.whole import WholeRun
 from netspec.graph.options import BuildOptions
+from netspec.graph.speed import speed
 from netspec.layers.contract.reading import Constant
 from netspec.layers.utility.python import Python
-from netspec.load import speed
 from netspec.net import net as core
 from netspec.proto.text import parse_solver
 from netspec.solver import solver as core_solver

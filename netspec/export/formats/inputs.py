@@ -7,9 +7,9 @@ from pathlib import Path
 
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where, did_you_mean
-from netspec.graph import check_blobs
 from netspec.layers import class_of
 from netspec.layers.contract.reading import takes_shapes
+from netspec.net.net import check_blobs
 from netspec.proto.schema import LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.rewrite import copy_without

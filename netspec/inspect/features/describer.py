@@ -9,9 +9,9 @@ import numpy as np
 
 from netspec.export.engines.choice import Choice
 from netspec.graph.options import BuildOptions
+from netspec.graph.speed import speed
 from netspec.inspect.features.images import ImageInput, ImageNet
 from netspec.inspect.features.scaling import Steps, read_zooms
-from netspec.load import speed
 from netspec.proto.binary import split_paths
 
 

@@ -25,8 +25,8 @@ from netspec.files.kinds import unreadable
 from netspec.files.opencv import cv2
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import TORCH, BuildOptions
+from netspec.graph.speed import speed
 from netspec.inspect.features.scaling import Steps, middle, scaling_of
-from netspec.load import speed
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap

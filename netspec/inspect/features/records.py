@@ -17,8 +17,7 @@ from netspec import log
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
 from netspec.errors import SpecError, Where
-from netspec.graph import check_blobs
-from netspec.net.net import Net
+from netspec.net.net import Net, check_blobs
 
 Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm: wraps an iterable
 

@@ -11,7 +11,7 @@ def test_values_and_gradients_can_be_written_and_read():
     assert list(proto.shape.dim) == [2, 3, 4]
     assert list(proto.data) == list(range(24))
     np.testing.assert_array_equal(blobs.to_array(proto), values)
-    np.testing.assert_array_equal(blobs.diff_to_array(proto), -values)
+    np.testing.assert_array_equal(np.array(proto.diff, np.float32).reshape(2, 3, 4), -values)
     assert blobs.to_array(proto).dtype == np.float32
 
 
@@ -21,13 +21,14 @@ def test_doubles_are_kept():
     assert list(proto.double_data) == [np.pi, np.e]
     assert not proto.data
     assert blobs.to_array(proto).dtype == np.float64
-    np.testing.assert_array_equal(blobs.diff_to_array(proto), values)
+    np.testing.assert_array_equal(np.array(proto.double_diff).reshape(2, 1), values)
 
 
 def test_messages_written_by_protobuf_are_read():
     proto = BlobProto(shape=BlobShape(dim=[3]), data=[1.5, -2.5, 1e-30])
     np.testing.assert_array_equal(blobs.to_array(proto), np.array([1.5, -2.5, 1e-30], np.float32))
-    assert blobs.diff_to_array(proto) is None
+    assert not proto.diff
+    assert not proto.double_diff
 
 
 def test_a_transposed_array_is_written_in_row_major_order():
@@ -96,7 +97,8 @@ def test_numbers_of_raw_data_are_read(kind: int | None, dtype: str, found: type)
     proto = with_raw(BlobProto(shape=BlobShape(dim=[2, 3])), kind, values.tobytes())
     np.testing.assert_array_equal(blobs.to_array(proto), values)
     assert blobs.to_array(proto).dtype == found
-    assert blobs.diff_to_array(proto) is None
+    assert not proto.diff
+    assert not proto.double_diff
 
 
 def test_half_precision_is_read_exactly():
