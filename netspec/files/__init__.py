@@ -1,1 +1,1 @@
-"""Files: written whole or not at all, read within limits. The ground of netspec and loopclosure."""
+"""Files: they are written completely or not at all, and read within limits. Both netspec and loopclosure use it."""

@@ -1,7 +1,7 @@
-"""Arrays of .npz and .npy files, read with care.
+"""Safe reading of .npz and .npy files.
 
-numpy makes room for what a header announces before it reads, and a small packed file may unpack to any size: both are
-checked here against what the file holds. Python objects are refused: to unpickle them could run anything.
+NumPy allocates the size that a header declares before it reads, and a small compressed file can decompress to any size.
+Both are checked here against the size of the file. Python objects are refused, because unpickling can run any code.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _FAULTS = (
 
 @contextmanager
 def _opened(path: Path, expected: str) -> Iterator[BinaryIO]:
-    """Yield a file. Raises InputError, which says what was expected, for what cannot be read within the block."""
+    """Yield an open file. Errors within the block become an InputError that contains ``expected``."""
     try:
         with path.open("rb") as stream:
             yield stream
@@ -45,10 +45,7 @@ def _opened(path: Path, expected: str) -> Iterator[BinaryIO]:
 
 
 def read_npz(path: str | Path, expected: str) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz file, by name.
-
-    Raises InputError, which says what was expected, for any other file.
-    """
+    """Return the arrays of an .npz file by name. Raises InputError, with ``expected``, for any other file."""
     with _opened(Path(path), expected) as stream:
         if stream.seekable():
             return unpack(stream, os.fstat(stream.fileno()).st_size)
@@ -57,16 +54,16 @@ def read_npz(path: str | Path, expected: str) -> dict[str, np.ndarray]:
 
 
 def read_npy(path: str | Path, expected: str) -> np.ndarray:
-    """Return the array of an .npy file. Raises InputError, which says what was expected, for any other file."""
+    """Return the array of an .npy file. Raises InputError, with ``expected``, for any other file."""
     with _opened(Path(path), expected) as stream:
         return _read(stream, os.fstat(stream.fileno()).st_size)
 
 
 class Rows:
-    """The array (N, ...) of an .npy file, of which only the rows that are asked for are read: ``rows[first:end]``.
+    """The array (N, ...) of an .npy file. ``rows[first:end]`` reads only these rows.
 
-    They are read and not mapped: where the file was cut meanwhile, a page of a map would end the process. Raises
-    InputError, which says what was expected, for any other file.
+    The file is not memory-mapped, because reading a mapped file that was truncated meanwhile ends the process. Raises
+    InputError, with ``expected``, for any other file.
     """
 
     def __init__(self, path: str | Path, expected: str) -> None:
@@ -91,7 +88,7 @@ class Rows:
 
 
 def regular(path: str | Path, expected: str) -> Path:
-    """Return the path of a file. Raises InputError for a pipe or a device, which might be waited for without end."""
+    """Return the path of a file. Raises InputError for a pipe or device, because reading it might never end."""
     path = Path(path)
     if path.exists() and not path.is_file():
         raise InputError(f"is not a regular file; expected {expected}", path)
@@ -99,7 +96,7 @@ def regular(path: str | Path, expected: str) -> Path:
 
 
 def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:
-    """Return the arrays of an open .npz of ``stored`` bytes; raises what zipfile and numpy raise."""
+    """Return the arrays of an open .npz file of ``stored`` bytes. Raises the exceptions of zipfile and NumPy."""
     with zipfile.ZipFile(packed) as archive:
         entries = archive.infolist()
         size = sum(entry.file_size for entry in entries)
@@ -113,7 +110,7 @@ def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:
 
 
 def _header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, order by columns, and dtype of an array in the format .npy, of ``size`` bytes in a stream."""
+    """Return shape, whether the order is column-major, and dtype of an .npy array of ``size`` bytes in a stream."""
     version = np.lib.format.read_magic(stream)
     if version == (1, 0):
         shape, by_columns, dtype = np.lib.format.read_array_header_1_0(stream)
@@ -129,7 +126,7 @@ def _header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dty
 
 
 def _read(stream: IO[bytes], size: int) -> np.ndarray:
-    """Return the array in the format .npy, of ``size`` bytes, that a stream holds."""
+    """Return the .npy array of ``size`` bytes in a stream."""
     shape, by_columns, dtype = _header(stream, size)
     count = math.prod(shape)
     data = stream.read(count * dtype.itemsize)
@@ -151,7 +148,7 @@ def _fault(error: BaseException, path: Path, expected: str) -> InputError:
 
 
 def check_array(arrays: Mapping[str, Any], name: str, kinds: str, shape: tuple[int, ...], finite: bool = True) -> None:
-    """Raise ValueError for an array that is missing, of another kind or shape, or contains a NaN or an infinity."""
+    """Raise ValueError if an array is missing, has another kind or shape, or contains a NaN or an infinity."""
     values = arrays.get(name)
     if values is None:
         raise ValueError(f'has no array "{name}"')
@@ -162,9 +159,9 @@ def check_array(arrays: Mapping[str, Any], name: str, kinds: str, shape: tuple[i
 
 
 def from_json(made: type[T], values: Any) -> T:
-    """Return an object of a dataclass whose fields are numbers, texts, truth values, or None, from what JSON has of it.
+    """Return an object of a dataclass made from a JSON value. Its fields are numbers, strings, Booleans or None.
 
-    Raises ValueError for a field that is missing or of another type, and what the class itself raises.
+    Raises ValueError for a missing field or one of another type, and the exceptions of the class.
     """
     known = {field.name: str(field.type).split(" | ") for field in fields(cast(Any, made))}
     if not isinstance(values, dict) or set(values) != set(known):

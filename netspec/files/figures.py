@@ -1,11 +1,11 @@
-"""How figures of matplotlib look in both packages, and their PNG. It does not import matplotlib."""
+"""The style of matplotlib figures, and their conversion to PNG. This module does not import matplotlib."""
 
 from __future__ import annotations
 
 import io
 from typing import Any
 
-# Color-blind readers can distinguish these too (Okabe and Ito).
+# Distinguishable for color-blind readers (Okabe and Ito).
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 STYLE: dict[Any, Any] = {  # for matplotlib.rc_context
     "axes.spines.top": False,
@@ -16,7 +16,7 @@ STYLE: dict[Any, Any] = {  # for matplotlib.rc_context
 
 
 def png(figure: Any) -> bytes:
-    """Return a matplotlib figure as PNG; the same figure gives the same bytes."""
+    """Return a matplotlib figure as PNG. Equal figures give equal bytes."""
     data = io.BytesIO()
     figure.savefig(data, format="png", metadata={"Software": None})
     return data.getvalue()

@@ -1,9 +1,9 @@
-"""HDF5 files: read with care, and written whole.
+"""Safe reading of HDF5 files, and writing them completely or not at all.
 
-The library follows links to any file of the machine, believes any size, and has many kinds of exceptions.
+The library follows links to any file of the machine, allocates any declared size, and raises many kinds of exceptions.
 
-h5py writes into a Python file here. Where HDF5's own driver meets a full disk, the library keeps what it could not
-write, tries again when the process ends, and kills it.
+Files are written by h5py into a Python file object. With HDF5's own driver, the library keeps data that did not fit on
+a full disk, tries to write it again when the process exits, and crashes.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from netspec.files.kinds import head_of, pointer_fault
 from netspec.files.limits import ALWAYS, amount, bomb
 from netspec.files.whole_file import whole_file
 
-_MOST_LINKS = 16  # from link to link
-_MOST_DEFLATED = 1032  # times its size: what deflate can unpack to
+_MOST_LINKS = 16  # of consecutive links
+_MOST_DEFLATED = 1032  # times its size: the most that deflate can expand data
 _SUM = 4  # bytes of a checksum
 _FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_LZF}
 LIBRARY_FAULTS = (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError)
@@ -35,9 +35,9 @@ LIBRARY_FAULTS = (OSError, RuntimeError, LookupError, ValueError, TypeError, Ari
 
 @contextmanager
 def open_hdf5(path: str | Path, where: Where | None = None) -> Iterator[Hdf5Group]:
-    """Yield what is in an HDF5 file. Raises SpecError, at ``where``, for all that cannot be read within the block.
+    """Yield the root group of an HDF5 file. Errors within the block become a SpecError at ``where``.
 
-    Nothing outside of the file is read: links to other files, and datasets stored in them, are refused.
+    Links to other files, and datasets stored in other files, are refused.
     """
     place = where or Where(str(path))
     named = f'HDF5 file "{path}" ' if where else ""
@@ -52,7 +52,7 @@ def open_hdf5(path: str | Path, where: Where | None = None) -> Iterator[Hdf5Grou
 
 
 class Hdf5Group:
-    """A group of an HDF5 file. Its methods raise SpecError, without a place."""
+    """A group of an HDF5 file. Its methods raise SpecError without a location."""
 
     def __init__(self, group: Any, file_size: int, path: str = "", above: frozenset[Any] = frozenset()) -> None:
         self._group, self._file_size, self._path = group, file_size, path
@@ -72,9 +72,9 @@ class Hdf5Group:
         return Hdf5Group(found, self._file_size, f"{self._path}/{name}", self._seen)
 
     def dataset(self, name: str) -> h5py.Dataset | None:
-        """Return a member that is a dataset, stored in this file and not larger than it can be; None if there is none.
+        """Return a member that is a dataset of this file with a plausible size, or None if there is none.
 
-        What is read of it in slices is checked as if it were read at once.
+        The size of the whole dataset is checked, even if only slices are read later.
         """
         found = self._member(name)
         if not isinstance(found, h5py.Dataset):
@@ -116,9 +116,9 @@ class Hdf5Group:
 
 
 def _wrong_chunks(dataset: h5py.Dataset, shape: tuple[int, ...]) -> str:
-    """Return what is wrong with a dataset's chunks of this shape, if anything.
+    """Return an error in a dataset's chunks of this shape, or "".
 
-    The library makes room for whatever size a chunk announces, and for all that it unpacks to.
+    The library allocates the size that a chunk declares, and the size to which it decompresses.
     """
     packing = dataset.id.get_create_plist()
     filters = [packing.get_filter(i)[0] for i in range(packing.get_nfilters())]
@@ -128,7 +128,7 @@ def _wrong_chunks(dataset: h5py.Dataset, shape: tuple[int, ...]) -> str:
     stored: list[tuple[tuple[int, ...], int]] = []
     dataset.id.chunk_iter(lambda chunk: stored.append((chunk.chunk_offset, chunk.size)))
     for place, packed in stored:
-        if packed > size + size // 8 + 4096:  # packing adds a few bytes to what cannot be packed
+        if packed > size + size // 8 + 4096:  # compression adds a few bytes to incompressible data
             return f"has a chunk of {amount(packed)}, and its chunks hold {amount(size)}"
         if h5z.FILTER_DEFLATE in filters and packed * _MOST_DEFLATED > ALWAYS:
             mask, data = dataset.id.read_direct_chunk(place)
@@ -138,7 +138,7 @@ def _wrong_chunks(dataset: h5py.Dataset, shape: tuple[int, ...]) -> str:
 
 
 def layer_groups(data: Hdf5Group, prefix: str = "") -> Iterator[tuple[str, dict[str, h5py.Dataset]]]:
-    """Yield the layers of a file of weights, /data/<layer>/<i>, in Caffe's (alphabetical) order.
+    """Yield the layers of a weights file, /data/<layer>/<i>, in Caffe's (alphabetical) order.
 
     A layer with a slash in its name is a group within a group.
     """
@@ -157,21 +157,21 @@ def _parts(path: str) -> list[str]:
 
 
 def _one_line(fault: BaseException) -> str:
-    if isinstance(fault, OSError) and fault.errno:  # HDF5's sentence would have the number three times
+    if isinstance(fault, OSError) and fault.errno:  # HDF5's message contains the number three times
         return os.strerror(fault.errno)
     return " ".join(str(fault).split()) or type(fault).__name__
 
 
 @contextmanager
 def new_hdf5(path: str | Path) -> Iterator[h5py.File]:
-    """Yield a new HDF5 file, which appears at ``path`` at the end of the block; see :func:`whole_file`."""
+    """Yield a new HDF5 file. It appears at ``path`` at the end of the block; see :func:`whole_file`."""
     with whole_file(path) as unfinished, hdf5_in(unfinished) as file:
         yield file
 
 
 @contextmanager
 def hdf5_in(unfinished: Path) -> Iterator[h5py.File]:
-    """Yield an HDF5 file to fill, in a file that is there for it. Raises OSError if it cannot be written."""
+    """Yield a new HDF5 file at an existing path. Raises OSError if it cannot be written."""
     with _Patient(unfinished) as stream:
         with h5py.File(stream, "w") as file:
             yield file
@@ -179,14 +179,14 @@ def hdf5_in(unfinished: Path) -> Iterator[h5py.File]:
 
 
 class _Patient(io.FileIO):
-    """A file to read and write whose first error is kept: the library gets no error."""
+    """A file that stores its first error and does not raise it in the library."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "w+b")
         self._fault: OSError | None = None
 
     def check(self) -> None:
-        """Raise the first error that came."""
+        """Raise the stored error."""
         if self._fault is not None:
             raise self._fault
 
@@ -194,7 +194,7 @@ class _Patient(io.FileIO):
         rest = memoryview(data).cast("B")
         size = len(rest)
         try:
-            while len(rest) and self._fault is None:  # a write to a file may be cut short
+            while len(rest) and self._fault is None:  # a write can be incomplete
                 rest = rest[super().write(rest) :]
         except OSError as fault:
             self._fault = fault

@@ -1,4 +1,4 @@
-"""The images of a folder or a list, their order and their time stamps: the rule of docs/images.md."""
+"""Finds the images of a folder or a list, with their order and time stamps, as described in docs/images.md."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _COMMENT = re.compile(r"\s+#")
 
 @dataclass(frozen=True)
 class ImageList:
-    """Image files in order: ``paths``, their ``names``, and ``stamps`` (N,) [s] if all have one.
+    """Image files in order: ``paths``, ``names``, and ``stamps`` (N,) in seconds if all images have one.
 
-    This is all that networks need. ``loopclosure`` adds poses, a camera and videos (its ImageSequence).
+    ``ImageSequence`` in ``loopclosure.places`` adds poses, a camera and videos.
     """
 
     paths: tuple[Path, ...]
@@ -50,7 +50,7 @@ def list_images(source: str | Path) -> ImageList:
 
 
 def natural_order(name: str) -> tuple[list[str | int], str]:
-    """Return a sort key: 2.png comes before 10.png, and a before B."""
+    """Return a sort key that orders 2.png before 10.png, and a before B."""
     return [int(part) if k % 2 else part.lower() for k, part in enumerate(re.split(r"(\d+)", name))], name
 
 

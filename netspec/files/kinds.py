@@ -1,6 +1,6 @@
-"""What a file is that was taken for another, by its first bytes; and whether a PNG file is cut.
+"""Recognizes wrong files by their first bytes, and truncated PNG files.
 
-A Git LFS pointer is the few lines of text that a clone without Git LFS has in the place of each large file.
+A Git LFS pointer is a short text that replaces a large file in a clone made without Git LFS.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def pointer_fault(data: bytes) -> str:
 
 
 def head_of(path: str | os.PathLike[str]) -> bytes:
-    """Return the first bytes of a file; b"" of what is none, or cannot be read."""
+    """Return the first bytes of a file, or b"" if it is not a regular file or cannot be read."""
     try:
         with open(path if os.path.isfile(path) else os.devnull, "rb") as file:
             return file.read(_LONGEST)
@@ -48,12 +48,12 @@ _KINDS = {
 
 
 def is_safetensors(data: bytes) -> bool:
-    """Say whether a file that begins with these bytes is one of safetensors: a length, and an object in JSON."""
+    """Return whether a file that begins with these bytes is a safetensors file: a length and a JSON object."""
     return len(data) > 9 and data[8:9] == b"{" and int.from_bytes(data[:8], "little") < 1 << 30
 
 
 def kind_of(data: bytes) -> str:
-    """Return what a file that begins with these bytes is, and what to do with it; "" where that is not known."""
+    """Return the kind of a file that begins with these bytes, with advice, or "" if it is unknown."""
     if is_safetensors(data):
         return "a .safetensors file"
     start = data[:64].lstrip().lower() if data[:1].isspace() or data[:1] == b"<" else data[:64]
@@ -61,7 +61,7 @@ def kind_of(data: bytes) -> str:
 
 
 def unreadable(path: object, fault: OSError | ValueError, expected: str = "") -> str:
-    """Return why a file cannot be read, what was ``expected``, and where to look if it is not there."""
+    """Return why a file cannot be read and what was ``expected``; for a missing file also the nearest existing path."""
     text = str(path)
     if "://" in text or text.startswith(("http:/", "https:/")):
         return "is a web address; download the file and give its path"
@@ -72,13 +72,15 @@ def unreadable(path: object, fault: OSError | ValueError, expected: str = "") ->
 
 
 def nearest_existing(path: str | os.PathLike[str]) -> str:
-    """Return how far a path exists that does not, what has a similar name there, and where a relative one starts."""
+    """Return advice for a missing path: the part that exists, a similar name, and where relative paths start."""
     missing = Path(path)
     while not os.path.exists(missing.parent):
         missing = missing.parent
     try:
-        stems = {Path(name).stem: name for name in os.listdir(missing.parent)}  # a common suffix is no likeness
-    except OSError:  # it is no folder, or not to be listed
+        stems = {
+            Path(name).stem: name for name in os.listdir(missing.parent)
+        }  # a common suffix does not count as similarity
+    except OSError:  # not a folder, or not readable
         stems = {}
     close = difflib.get_close_matches(missing.stem, stems, n=1)
     found = f'; "{missing.parent}" has no "{missing.name}"' if missing != Path(path) else ""
@@ -87,9 +89,9 @@ def nearest_existing(path: str | os.PathLike[str]) -> str:
 
 
 def is_cut_png(data: bytes) -> bool:
-    """Return whether data is that of a PNG file with a part that announces more than there is.
+    """Return whether data is a PNG file with a chunk that declares more bytes than the file has.
 
-    OpenCV makes room for the 4 GiB that a part may announce before it looks at how much there is.
+    OpenCV allocates the declared size, up to 4 GiB, before it reads the chunk.
     """
     at = 8 if data.startswith(b"\x89PNG\r\n\x1a\n") else len(data)
     while at < len(data):

@@ -1,4 +1,4 @@
-"""How much is too much: sizes that a file announces are believed within limits."""
+"""Limits on memory and on the sizes that files declare."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import stat
 import zlib
 from pathlib import Path
 
-ALWAYS = 1 << 28  # bytes that any file may ask for
-MOST_PACKED = 100  # times a file's size: real data is packed 2 to 20 times, a file made to fill the memory 1000 times
+ALWAYS = 1 << 28  # bytes that any file may declare
+MOST_PACKED = 100  # times a file's size: real data is compressed 2 to 20 times, a malicious file 1000 times
 
 _UNITS = {"": 0, "k": 10, "m": 20, "g": 30, "t": 40}
-_CONTAINER = Path("/sys/fs/cgroup/memory.max")  # Linux: what a container may use, a number or "max"
+_CONTAINER = Path("/sys/fs/cgroup/memory.max")  # Linux: the limit of a container, a number or "max"
 
 
 def memory() -> int:
-    """Return the bytes of the machine's memory; a guess of 8 GiB where the system does not tell.
+    """Return the bytes of the machine's memory, or 8 GiB if the system does not report it.
 
-    In a container it is what the container may use.
+    In a container, return the container's limit.
     """
     try:
         machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -34,16 +34,16 @@ def memory() -> int:
 
 
 def is_out_of_memory(fault: BaseException) -> bool:
-    """Say whether an exception means that there was no memory, or never could be: torch raises a RuntimeError."""
+    """Return whether an exception means that memory ran out, or a size is impossible. Torch raises RuntimeError."""
     if isinstance(fault, RuntimeError):
         return any(word in str(fault) for word in ("allocate", "calculation overflowed", "multiplication overflow"))
     return isinstance(fault, MemoryError)
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """Return what a file or a pipe holds, unpacked where its name ends in .gz.
+    """Return the content of a file or pipe, decompressed if the name ends in .gz.
 
-    Raises OSError, for a device too: it may have no end.
+    Raises OSError, also for a device, because it may be endless.
     """
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "a file name cannot contain a NUL character", str(path))
@@ -63,7 +63,7 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def bomb(size: int, stored: int) -> str:
-    """Return what to say of data of ``size`` bytes in a file of ``stored`` bytes that cannot be meant; "" if it can."""
+    """Return an error if ``size`` bytes of data in a file of ``stored`` bytes are implausible, or ""."""
     if size <= ALWAYS or (size <= MOST_PACKED * stored and size <= memory()):
         return ""
     return f"would take {amount(size)} of memory, but the file has only {amount(stored)}; it was not read"
@@ -78,7 +78,7 @@ def read_amount(text: str) -> int:
 
 
 def amount(size: int) -> str:
-    """Return a number of bytes for people: ``1.5 GiB``."""
+    """Return a number of bytes as text, such as ``1.5 GiB``."""
     for power, unit in ((60, "EiB"), (50, "PiB"), (40, "TiB"), (30, "GiB"), (20, "MiB"), (10, "KiB")):
         if size >= 1 << power:
             return f"{size / (1 << power):.3g} {unit}"

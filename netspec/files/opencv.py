@@ -1,6 +1,6 @@
-"""OpenCV, which refuses images of more than 2^27 pixels: a small file may unpack to gigabytes.
+"""OpenCV with a limit of 2^27 pixels per image, because a small file can decompress to gigabytes.
 
-It reads the limit from the environment when it is loaded. Where something else has loaded it, its own limit stays.
+OpenCV reads the limit from the environment when it is loaded. If other code has loaded it before, its limit is kept.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Folders that netspec keeps files of its own in, such as a map or a cache: no link in them is followed.
+"""Folders with netspec's own files, such as a map or a cache. Symbolic links in them are not followed.
 
-Such a folder may come from somebody else. A symbolic link in it could lead to files of the user, which must neither be
-overwritten nor removed.
+Such a folder may come from another person, and a symbolic link in it could lead to the user's files, which must not be
+overwritten or removed.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from netspec.errors import SpecError, Where
 
 
 def inside(folder: str | Path, *names: str) -> Path:
-    """Return the path of a file or folder to write, below a folder of our own.
+    """Return the path of a file or folder to write, below one of netspec's own folders.
 
-    The folder itself may be a link. Raises SpecError where a name below it is one.
+    The folder itself can be a symbolic link. Raises SpecError if a path below it is one.
     """
     path = Path(folder)
     for name in names:

@@ -1,8 +1,7 @@
-"""Files and folders that appear whole or not at all, and locks that end with their process.
+"""Writing files and folders completely or not at all, lock files, and a check whether a path is writable.
 
-What is being written has a hidden name next to its path, ``.NAME.XXXXXXXX.unfinished``, and is locked. A killed run
-leaves it behind, unlocked; the next run that writes into the same folder removes it. Also a check, before a long run,
-whether a file can be written.
+An unfinished file has a hidden name next to its path, ``.NAME.XXXXXXXX.unfinished``, and is locked. If its process is
+killed, the next process that writes into the same folder removes it.
 """
 
 from __future__ import annotations
@@ -27,25 +26,25 @@ from netspec.errors import SpecError, Where, printable
 
 try:
     import fcntl
-except ImportError:  # Windows: there, a file that is open cannot be removed
+except ImportError:  # Windows, where an open file cannot be removed
     fcntl: Any = None
 
 NO_NUL = "a file name cannot contain a NUL character"
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.unfinished")
 _MARK = re.compile(rb"a lock of netspec, held by process (\d+)\n")
-_AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # no link, and no pipe that nobody writes to
-_UNSEEN = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")  # controls, but for tabs and ends of lines
-_FORMULA = tuple("=+-@\t\r\n")  # what a formula begins with, for some spreadsheet
+_AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # no links, and no waiting for pipes
+_UNSEEN = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")  # control characters except tabs and line ends
+_FORMULA = tuple("=+-@\t\r\n")  # first characters of formulas in spreadsheets
 _swept: set[Path] = set()
 
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary name next to ``path`` to write to; it is renamed once the block is done and all is on disk.
+    """Yield a temporary path next to ``path``. At the end of the block it is synced to disk and renamed to ``path``.
 
-    A symbolic link stays one; a pipe or a device is written to. The new file gets the mode and owner of the old one.
-    If the block fails, the temporary file is removed, and what was at ``path`` is still there. Raises SpecError if it
-    cannot be written.
+    Symbolic links are kept, and pipes and devices are written to. The new file gets the mode and owner of the old one.
+    If the block fails, the temporary file is removed and the old file is kept. Raises SpecError if the file cannot be
+    written.
     """
     if "\0" in str(path):
         raise _fault(f"cannot be written: {NO_NUL}", path)
@@ -65,36 +64,33 @@ def whole_file(path: str | Path) -> Iterator[Path]:
                 if fcntl is not None:
                     unfinished.replace(real)  # while it is locked, so that no sweep removes it
             if fcntl is None:
-                unfinished.replace(real)  # Windows renames no open file
+                unfinished.replace(real)  # Windows cannot rename open files
             sync_folder(real.parent)
     except OSError as fault:
-        reason = os.strerror(fault.errno) if fault.errno else fault  # h5py's own text is a paragraph
+        reason = os.strerror(fault.errno) if fault.errno else fault  # h5py's own message is a paragraph
         raise _fault(f"cannot be written: {reason}", path) from None
 
 
 def write_whole(path: str | Path, content: str | bytes, errors: str = "strict") -> None:
-    """Write bytes, or text as UTF-8, to a file that appears whole; see :func:`whole_file`.
+    """Write bytes, or text as UTF-8, completely or not at all; see :func:`whole_file`.
 
-    ``errors``, as in :func:`open`, is for text that UTF-8 does not have: names of files may be any bytes.
+    ``errors`` is as in :func:`open`, for file names that are not UTF-8.
     """
     with whole_file(path) as unfinished:
         unfinished.write_bytes(content.encode("utf-8", errors) if isinstance(content, str) else content)
 
 
 def write_csv(path: str | Path, head: Sequence[str], rows: Iterable[Sequence[object]], errors: str = "strict") -> None:
-    """Write a table as CSV to a file that appears whole; ``errors`` as in :func:`write_whole`.
-
-    The cells are those of :func:`safe_cell`.
-    """
+    """Write a table as CSV, with the cells of :func:`safe_cell`; ``errors`` as in :func:`write_whole`."""
     text = io.StringIO()
     csv.writer(text).writerows([head, *([safe_cell(value) for value in row] for row in rows)])
     write_whole(path, text.getvalue(), errors)
 
 
 def safe_cell(value: object) -> object:
-    """Return what stands in a table for a value: a text that a spreadsheet would compute gets an apostrophe.
+    """Return the cell of a table for a value. A string that a spreadsheet would evaluate gets an apostrophe.
 
-    Control characters, which a terminal would obey, are written as escapes; bytes that are not UTF-8 stay.
+    Control characters, which could control a terminal, are escaped. Bytes that are not UTF-8 are kept.
     """
     if not isinstance(value, str):
         return value
@@ -110,14 +106,14 @@ def safe_cell(value: object) -> object:
 
 @contextmanager
 def whole_folder(path: str | Path) -> Iterator[Path]:
-    """Yield a new folder next to ``path`` to fill; it is renamed once the block is done and all is on disk.
+    """Yield a new folder next to ``path``. At the end of the block it is synced to disk and renamed to ``path``.
 
-    If the block fails, it is removed. Raises OSError if it cannot be made or renamed.
+    If the block fails, it is removed. Raises OSError if it cannot be created or renamed.
     """
     real = Path(os.path.realpath(path))
     with _temporary(real) as unfinished:
         unfinished.mkdir()
-        held = None if fcntl is None else os.open(unfinished, os.O_RDONLY)  # Windows opens no folders
+        held = None if fcntl is None else os.open(unfinished, os.O_RDONLY)  # Windows cannot open folders
         try:
             if held is not None:
                 _lock(held)
@@ -134,11 +130,11 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def only_one(path: str | Path, advice: str) -> Iterator[None]:
-    """Hold the lock file ``path`` within the block; it is released whichever way the process ends.
+    """Hold the lock file ``path`` within the block. The lock also ends if the process is killed.
 
-    A lock that a killed run left is taken; any other file stays as it is. Where the system or the file system
-    has no locks, nothing is locked. Raises SpecError, which ends with ``advice``, if another process holds it or it
-    cannot be made.
+    The lock file of a killed process is reused; any other file is not changed. If the system or the file system has no
+    locks, nothing is locked. Raises SpecError, with ``advice``, if another process holds the lock, or if the file
+    cannot be created.
     """
     path = Path(path)
     mark = f"a lock of netspec, held by process {os.getpid()}\n".encode()
@@ -166,7 +162,7 @@ def only_one(path: str | Path, advice: str) -> Iterator[None]:
         try:
             yield
         finally:
-            with suppress(OSError):  # Windows removes no open file: it stays, unlocked
+            with suppress(OSError):  # Windows cannot remove open files; the file stays, unlocked
                 path.unlink()
     finally:
         os.close(held)
@@ -178,9 +174,9 @@ def has_locks() -> bool:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to disk, where the system can: a rename is otherwise lost with the power.
+    """Sync a folder to disk, since a power failure could otherwise undo a rename.
 
-    Windows opens no folders, and some file systems do not sync them; that is logged once.
+    If the system or the file system cannot do this, a warning is logged once.
     """
     try:
         _sync(folder)
@@ -189,9 +185,9 @@ def sync_folder(folder: Path) -> None:
 
 
 def why_unwritable(path: str | Path) -> str:
-    """Return why no file can be written at ``path``, in the words of the operating system; "" if one can.
+    """Return the operating system's reason why no file can be written at ``path``, or "".
 
-    Nothing is written; only the path and its permissions are checked: a full disk, for example, is not detected.
+    Only the path and its permissions are checked. A full disk, for example, is not detected.
     """
     path = Path(path)
     folder = path.parent
@@ -217,7 +213,7 @@ def why_unwritable(path: str | Path) -> str:
 
 @contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """Yield a name for what becomes ``path``, and remove what is still there at the end; sweep the folder first."""
+    """Yield the temporary path of ``path``, after sweeping the folder. At the end, remove it if it still exists."""
     _sweep(path.parent)
     unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.unfinished")
     try:
@@ -237,7 +233,7 @@ def _created(path: Path, mode: int) -> Iterator[int]:
 
 
 def _pass_on(before: os.stat_result, held: int) -> None:
-    """Give a file the owner and the mode of the one that it replaces; another group gets no rights."""
+    """Give a file the owner and mode of the file that it replaces. If the group differs, it gets no permissions."""
     mode = stat.S_IMODE(before.st_mode)
     with suppress(OSError):
         os.fchown(held, before.st_uid, -1)
@@ -251,7 +247,7 @@ def _pass_on(before: os.stat_result, held: int) -> None:
 def _open_locked(path: Path, flags: int, mode: int = 0o666) -> tuple[int, bool]:
     """Open a file and lock it; return its descriptor, and False if another process holds the lock.
 
-    Another process may remove the file before it is locked here: then it is opened again.
+    If another process removes the file before it is locked, it is opened again.
     """
     while True:
         held = os.open(path, flags | _AS_IT_IS, mode)
@@ -263,7 +259,7 @@ def _open_locked(path: Path, flags: int, mode: int = 0o666) -> tuple[int, bool]:
 
 
 def _lock(descriptor: int) -> bool | None:
-    """Lock an open file; return False if another process holds it, None if there are no locks here."""
+    """Lock an open file. Return False if another process holds the lock, and None if locks are not supported."""
     if fcntl is None:
         return None
     try:
@@ -276,7 +272,7 @@ def _lock(descriptor: int) -> bool | None:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove what killed runs left in a folder, once per process."""
+    """Remove the unfinished files of killed processes from a folder, once per process."""
     if folder in _swept:
         return
     _swept.add(folder)
@@ -287,7 +283,7 @@ def _sweep(folder: Path) -> None:
 
 
 def _is_abandoned(path: Path) -> bool:
-    """Say whether nobody holds the lock of an unfinished file; without locks, only an open file cannot be removed."""
+    """Return whether an unfinished file is not locked. Without locks return True, since open files are not removed."""
     if fcntl is None:
         return True
     try:
@@ -327,7 +323,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def _copied_to(device: Path) -> Iterator[Path]:
-    """Yield a temporary name; copy what was written there into a pipe or a device."""
+    """Yield a temporary path, and copy what is written there into a pipe or device."""
     with TemporaryDirectory() as folder:
         yield Path(folder, device.name)
         with Path(folder, device.name).open("rb") as source, device.open("wb") as target:
