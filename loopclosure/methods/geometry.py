@@ -134,6 +134,7 @@ def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: G
     there, instead = np.flatnonzero(matches.there), given.single
     if lines is not None and not matches.by_lines:
         instead = np.where(lines.match >= 0, lines.match, instead)
+    alone = None if lines is None or not matches.by_lines else lines.alone
     for query in progress(there, "verification", len(there)):
         # The lamps of a tunnel repeat: one verified image does not overrule an accepted sequence.
         other = matches.match if matches.line[query] else instead
@@ -145,6 +146,5 @@ def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: G
             if matches.inliers[query]:
                 if reference != matches.match[query]:
                     matches.match[query] = reference
-                    by_line = lines is not None and matches.by_lines
-                    matches.score[query] = lines.alone[query] if by_line else given.scores[query, reference]
+                    matches.score[query] = given.scores[query, reference] if alone is None else alone[query]
                 break
