@@ -142,3 +142,12 @@ def did_you_mean(word: str, known: Iterable[str], near: bool = False) -> str:
 
 def _digits(word: str) -> str:
     return "".join(filter(str.isdigit, word))
+
+
+def check_blobs(wanted: Iterable[str], known: Iterable[str], file: str) -> None:
+    """Raise SpecError for the first of the blobs that a net, read from ``file``, does not have."""
+    blobs = list(dict.fromkeys(known))
+    for name in wanted:
+        if name not in blobs:
+            hint = did_you_mean(name, blobs) or ";"
+            raise SpecError(f'no blob "{name}" in this net{hint} it has: {", ".join(blobs)}', Where(file))

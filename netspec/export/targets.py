@@ -6,10 +6,12 @@ Layers use only these two protocols, and no library of the target.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import torch
+
+if TYPE_CHECKING:
+    import torch  # a stored model of another engine runs without torch
 
 Sizes = tuple[int | None, ...]  # a shape; None where the size is known only when the exported net runs
 

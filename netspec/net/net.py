@@ -15,7 +15,7 @@ import torch
 from typing_extensions import override
 
 from netspec import log
-from netspec.errors import SpecError, Where, did_you_mean
+from netspec.errors import SpecError, Where, check_blobs, did_you_mean
 from netspec.exact import ALL
 from netspec.exact.blas import other_kernels
 from netspec.graph.options import BuildOptions
@@ -48,15 +48,6 @@ class ByName(dict[str, V]):
             raise KeyError(f'{self._kind} "{name}" was not kept; set net.keep = "all", or ["{name}"], and run the net')
         hint = did_you_mean(str(name), [*self, *self._known]) or ";"
         raise KeyError(f'no {self._kind} "{name}" in this net{hint} it has: {", ".join(self._known or self)}')
-
-
-def check_blobs(wanted: Iterable[str], known: Iterable[str], file: str) -> None:
-    """Raise SpecError for the first of the blobs that a net, read from ``file``, does not have."""
-    blobs = list(dict.fromkeys(known))
-    for name in wanted:
-        if name not in blobs:
-            hint = did_you_mean(name, blobs) or ";"
-            raise SpecError(f'no blob "{name}" in this net{hint} it has: {", ".join(blobs)}', Where(file))
 
 
 class Net(torch.nn.Module):

@@ -6,10 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from netspec.data.blobs import Shape
-from netspec.errors import SpecError, Where, did_you_mean
-from netspec.layers import class_of
-from netspec.layers.contract.reading import takes_shapes
-from netspec.net.net import check_blobs
+from netspec.errors import SpecError, Where, check_blobs, did_you_mean
 from netspec.proto.schema import LayerParameter, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.rewrite import copy_without
@@ -70,6 +67,9 @@ def prune(
 
 def not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
     """Return an error for each given shape of a blob that is not a top of a data layer (or Python layer)."""
+    from netspec.layers import class_of  # imports torch, which a stored model of another engine does not need
+    from netspec.layers.contract.reading import takes_shapes
+
     layers = [layer for net in nets for layer in net.layer]
     makers = [layer for layer in layers if not layer.bottom or ((cls := class_of(layer)) and takes_shapes(cls))]
     blobs = list(dict.fromkeys(top for layer in makers for top in layer.top))

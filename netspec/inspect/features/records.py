@@ -16,8 +16,8 @@ import torch
 from netspec import log
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
-from netspec.errors import SpecError, Where
-from netspec.net.net import Net, check_blobs
+from netspec.errors import SpecError, Where, check_blobs
+from netspec.net.net import Net
 
 Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm: wraps an iterable
 
