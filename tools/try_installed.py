@@ -20,6 +20,7 @@ EXTRAS = {
     "onnxruntime",
     "openvino",
     "plyvel",
+    "plyvel_next",
     "skimage",
     "pydot",
     "fissix",

@@ -1,4 +1,4 @@
-"""Caffe's databases: LMDB, and LevelDB through the optional package plyvel (the extra ``leveldb``).
+"""Caffe's databases: LMDB, and LevelDB through an optional package (the extra ``leveldb``).
 
 Records are numbered in the order of their keys, which is the order in which Caffe reads them.
 
@@ -14,7 +14,8 @@ import threading
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from importlib import import_module
 from itertools import islice
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -169,7 +170,7 @@ class _LevelDbReader(Reader):
     """
 
     def __init__(self, source: str) -> None:
-        plyvel = _plyvel()
+        library = leveldb()
         self._source, self._stamp = source, _contents(source)
         folder = mkdtemp(prefix="netspec-leveldb-")
         # Unlike weakref's finalizers, this also runs at the end of a worker, and never in a process forked later.
@@ -179,10 +180,10 @@ class _LevelDbReader(Reader):
                 raise ValueError(f"is damaged: its file {name} is truncated; copy or write the database again")
             os.symlink(os.path.abspath(os.path.join(source, name)), os.path.join(folder, name))
         try:
-            self._db = plyvel.DB(folder, create_if_missing=False, paranoid_checks=True)
+            self._db = library.DB(folder, create_if_missing=False, paranoid_checks=True)
             with self._db.iterator(include_value=False, verify_checksums=True) as keys:
                 self._keys: list[bytes] = list(keys)
-        except (plyvel.Error, OSError) as fault:
+        except (library.Error, OSError) as fault:
             raise ValueError(f"cannot be opened as a LevelDB ({_message(fault)})") from None
 
     def __len__(self) -> int:
@@ -194,7 +195,7 @@ class _LevelDbReader(Reader):
     def records(self, numbers: Sequence[int]) -> list[bytes]:
         try:
             return [value for run in _runs(numbers) for value in self._values([self._keys[i] for i in numbers[run]])]
-        except (_plyvel().Error, OSError) as fault:
+        except (leveldb().Error, OSError) as fault:
             raise SpecError(f'database "{self._source}" is damaged ({_message(fault)})') from None
 
     def _values(self, keys: Sequence[bytes]) -> list[bytes]:
@@ -260,12 +261,15 @@ def _contents(folder: str) -> dict[str, tuple[int, int]]:
         return {}
 
 
-def _plyvel() -> ModuleType:
-    try:
-        import plyvel
-    except ImportError:
-        raise ValueError("is a LevelDB, which needs an extra package: pip install 'netspec-caffe[leveldb]'") from None
-    return plyvel
+def leveldb() -> ModuleType:
+    """Return the library for LevelDB: plyvel, or plyvel-next, which has wheels for Python 3.12 and later.
+
+    Raises ValueError if none is installed.
+    """
+    for name in ("plyvel", "plyvel_next"):
+        with suppress(ImportError):
+            return import_module(name)
+    raise ValueError("is a LevelDB, which needs an extra package: pip install 'netspec-caffe[leveldb]'")
 
 
 class Writer:
@@ -374,7 +378,7 @@ class _LmdbStore:
 
 class _LevelDbStore:
     def __init__(self, folder: str) -> None:
-        self._db = _plyvel().DB(folder, create_if_missing=True, error_if_exists=True)
+        self._db = leveldb().DB(folder, create_if_missing=True, error_if_exists=True)
         self._batch = self._db.write_batch()
         self._bytes = self._records = 0
 

@@ -13,6 +13,7 @@ from benchmarks import environment, feeding, growth
 from benchmarks.cli import main
 from benchmarks.report import Row, table
 from benchmarks.rounds import difference, measure, ratio
+from optional_packages import leveldb
 
 
 @pytest.fixture(autouse=True)
@@ -183,7 +184,7 @@ def test_what_keeps_growth_from_being_measured_is_said(capsys: pytest.CaptureFix
 def test_waiting_for_data_is_reported_for_each_source(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    pytest.importorskip("plyvel")
+    leveldb()
     monkeypatch.setattr(feeding, "SECONDS", 0.0)
     words = ["--batch", "1", "--threads", "1", "--json", str(tmp_path / "feeding.json")]
     assert main(["feeding", "tiny", "squeezenet", *words]) == 0

@@ -30,6 +30,7 @@ from netspec.inspect.features.images import read_pixels as read_for_features
 from netspec.load import load_net, load_solver
 from netspec.net.weights import load_weights
 from netspec.solver.snapshot import read_state
+from optional_packages import leveldb
 from paths import ROOT
 
 HUGE = (1 << 20, 1 << 20)
@@ -347,18 +348,18 @@ def test_a_database_that_is_changed_while_it_is_read(change: str, database: Path
 @pytest.mark.parametrize("backend", ["lmdb", "leveldb"])
 def test_a_database_that_was_written_to_is_opened_anew(backend: str, tmp_path: Path) -> None:
     """A notebook continues: only databases that were opened earlier have old contents."""
-    plyvel = pytest.importorskip("plyvel") if backend == "leveldb" else None
+    library = leveldb() if backend == "leveldb" else None
     path = str(tmp_path / "db")
     with Writer(path, backend) as writer:
         writer.put(b"00000000", b"old")
     before = open_reader(path, backend)
     assert open_reader(path, backend) is before
-    if plyvel is None:
+    if library is None:
         with lmdb.open(path, lock=False, map_size=1 << 24) as env, env.begin(write=True) as transaction:
             transaction.put(b"00000001", b"new")
         os.utime(tmp_path / "db" / "data.mdb", (1, 1))  # clocks of file systems are coarse
     else:
-        store = plyvel.DB(path)
+        store = library.DB(path)
         store.put(b"00000001", b"new")
         store.close()
     after = open_reader(path, backend)

@@ -15,6 +15,7 @@ from lmdb_build.databases import read_pairs, read_single_list
 from netspec.data.database import open_reader
 from netspec.data.datum import datum_to_array, parse_datum
 from netspec.errors import SpecError
+from optional_packages import leveldb
 from paths import ROOT
 
 GOLDEN = ROOT / "tests" / "golden" / "images"
@@ -172,7 +173,7 @@ def test_quoted_names_can_contain_spaces(tmp_path: Path) -> None:
 
 
 def test_leveldb_can_be_written(tmp_path: Path, pair_list: str) -> None:
-    pytest.importorskip("plyvel")
+    leveldb()
     assert convert_pairs_lmdb(["-backend=leveldb", PNG, pair_list, f"{tmp_path}/db"]) == 0
     assert (tmp_path / "db" / "CURRENT").exists()
 

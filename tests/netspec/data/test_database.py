@@ -17,6 +17,7 @@ import pytest
 from netspec.data import database
 from netspec.data.database import Writer, open_reader
 from netspec.errors import SpecError, Where
+from optional_packages import leveldb
 from paths import GOLDEN
 
 PLACE = Where("net.prototxt", 7, 3)
@@ -287,7 +288,7 @@ def test_an_unknown_backend_is_reported(tmp_path: Path) -> None:
 
 
 def test_leveldb_can_be_written_and_read(tmp_path: Path) -> None:
-    pytest.importorskip("plyvel")
+    leveldb()
     records = {b"%08d" % i: bytes([i % 256]) * i for i in range(2500)}
     write(tmp_path / "db", records, "leveldb")
     reader = open_reader(str(tmp_path / "db"), "LEVELDB")
@@ -298,10 +299,10 @@ def test_leveldb_can_be_written_and_read(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_reading_a_leveldb_neither_locks_nor_changes_it(tmp_path: Path) -> None:
-    plyvel = pytest.importorskip("plyvel")
+    library = leveldb()
     write(tmp_path / "db", {b"%04d" % i: bytes(i) for i in range(3000)}, "leveldb")
     before = {path.name: path.read_bytes() for path in (tmp_path / "db").iterdir()}
-    other = plyvel.DB(str(tmp_path / "db"))  # as another process that reads it
+    other = library.DB(str(tmp_path / "db"))  # as another process that reads it
     during = {path.name: path.read_bytes() for path in (tmp_path / "db").iterdir()}
     reader = open_reader(str(tmp_path / "db"), "leveldb")
     assert [len(reader.record(i)) for i in range(3000)] == list(range(3000))
@@ -333,10 +334,10 @@ def flip(data: bytes) -> bytes:
 )
 def test_a_damaged_leveldb_is_refused(tmp_path: Path, kind: str, damage: Callable[[bytes], bytes], says: str) -> None:
     """The library alone reads fewer or other records."""
-    plyvel = pytest.importorskip("plyvel")
+    library = leveldb()
     write(tmp_path / "db", {b"%08d" % i: bytes([i % 256]) * 100 for i in range(2500)}, "leveldb")
     if kind == "*.ldb":
-        tables = plyvel.DB(str(tmp_path / "db"))
+        tables = library.DB(str(tmp_path / "db"))
         tables.compact_range()
         tables.close()
     (place,) = (path for path in (tmp_path / "db").glob(kind) if path.stat().st_size)
@@ -347,9 +348,9 @@ def test_a_damaged_leveldb_is_refused(tmp_path: Path, kind: str, damage: Callabl
 
 def test_a_leveldb_that_is_damaged_after_opening_is_reported(tmp_path: Path) -> None:
     """What was not read when it was opened is checked when it is read."""
-    plyvel = pytest.importorskip("plyvel")
+    library = leveldb()
     write(tmp_path / "db", {b"%08d" % i: random.Random(i).randbytes(10_000) for i in range(200)}, "leveldb")
-    tables = plyvel.DB(str(tmp_path / "db"))
+    tables = library.DB(str(tmp_path / "db"))
     tables.compact_range()
     tables.close()
     reader = open_reader(str(tmp_path / "db"), "leveldb")
@@ -362,14 +363,23 @@ def test_a_leveldb_that_is_damaged_after_opening_is_reported(tmp_path: Path) -> 
         reader.record(3)
 
 
-def test_without_plyvel_a_message_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "plyvel", None)
+def test_without_a_library_a_message_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("plyvel", "plyvel_next"):
+        monkeypatch.setitem(sys.modules, name, None)
     make_leveldb(tmp_path / "db")
     with pytest.raises(SpecError, match=r"pip install 'netspec-caffe\[leveldb\]'"):
         open_reader(str(tmp_path / "db"), "leveldb", PLACE)
     with pytest.raises(SpecError, match=r"pip install 'netspec-caffe\[leveldb\]'"):
         write(tmp_path / "new", {}, "leveldb")
     assert os.listdir(tmp_path) == ["db"]
+
+
+def test_either_library_reads_a_leveldb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    library = leveldb()
+    write(tmp_path / "db", {b"0": b"one"}, "leveldb")
+    monkeypatch.setitem(sys.modules, "plyvel", None)
+    monkeypatch.setitem(sys.modules, "plyvel_next", library)
+    assert open_reader(str(tmp_path / "db"), "leveldb").record(0) == b"one"
 
 
 def test_a_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

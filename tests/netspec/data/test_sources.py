@@ -14,6 +14,7 @@ from netspec.data.transformer import Transformer
 from netspec.errors import SpecError, Where
 from netspec.fast.stacked import Stacker
 from netspec.proto.schema import Datum, TransformationParameter
+from optional_packages import leveldb
 
 PLACE = Where("net.prototxt", 9, 5)
 
@@ -136,7 +137,7 @@ def test_small_records_read_together_equal_single_reads(
     tmp_path: Path, records: list[bytes], at_once: bool, backend: str
 ) -> None:
     if backend == "leveldb":
-        pytest.importorskip("plyvel")
+        leveldb()
     one_by_one = [parse_datum(record) for record in records]
     found = Stacker()(records)
     assert (found is not None) == at_once

@@ -16,6 +16,7 @@ from netspec.errors import SpecError
 from netspec.inspect.check.survey import Survey, survey
 from netspec.inspect.draw.style import as_picture, images_in, split
 from netspec.inspect.records import open_records, spread
+from optional_packages import leveldb
 from paths import GOLDEN
 
 Run = Callable[..., Any]
@@ -43,7 +44,7 @@ def look(path: str) -> Survey:
 @pytest.mark.parametrize("backend", ["lmdb", "leveldb"])
 def test_statistics_are_those_of_numpy(tmp_path: Path, backend: str) -> None:
     if backend == "leveldb":
-        pytest.importorskip("plyvel")
+        leveldb()
     images = [image(k) for k in range(9)]
     found = look(write(tmp_path / "db", images, backend))
     together = np.stack(images)
