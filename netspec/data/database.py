@@ -15,7 +15,6 @@ import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
-from importlib import import_module
 from itertools import islice
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -266,9 +265,14 @@ def leveldb() -> ModuleType:
 
     Raises ValueError if none is installed.
     """
-    for name in ("plyvel", "plyvel_next"):
-        with suppress(ImportError):
-            return import_module(name)
+    with suppress(ImportError):
+        import plyvel  # pyright: ignore[reportMissingImports]
+
+        return plyvel
+    with suppress(ImportError):
+        import plyvel_next  # pyright: ignore[reportMissingImports]
+
+        return plyvel_next
     raise ValueError("is a LevelDB, which needs an extra package: pip install 'netspec-caffe[leveldb]'")
 
 

@@ -108,7 +108,7 @@ class ELU(Rounded):
     @override
     def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:
         # exp(x) - 1 as Caffe computes it, not the more exact expm1.
-        return torch.where(x > 0, x, self.alpha * (functions.exp(x.clamp(max=0)) - 1))
+        return torch.where(x > 0, x, self.alpha * (functions.exp(torch.where(x > 0, 0, x)) - 1))
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * (self.alpha + top))
@@ -212,7 +212,9 @@ class Clip(Activation):
         self.high: float = p.max
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return x.clamp(max=self.high).clamp(min=self.low)
+        # The gradient of clamp at its bounds is 0 from PyTorch 2.15 on.
+        inside = (x >= self.low) & (x <= self.high)
+        return torch.where(inside, x, x.detach().clamp(max=self.high).clamp(min=self.low))
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return diff * ((bottom >= self.low) & (bottom <= self.high))
