@@ -36,7 +36,7 @@ NOISE = 4.0  # gray levels, camera noise between frames at one position
 SEASONS, SAME = (2, 3), 0
 WALKS = (41, 42)  # seeds
 OTHER_LIGHT, BACK = "three laps, the last in another light", "there, and back in reverse"
-# Made when the method was final, and judged once. Houses and seeds differ from all that were looked at before.
+# No setting was chosen on these walks. Houses and seeds differ from all that were looked at before.
 RENDERED = {
     OTHER_LIGHT: Walk(270, 160, 120, laps=3, rooms=6, seed=201),
     BACK: Walk(130, 160, 120, laps=1, rooms=6, seed=202),

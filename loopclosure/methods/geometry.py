@@ -131,10 +131,11 @@ def _left(given: Candidates) -> list[tuple[int, int]]:
 
 def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: Geometry, progress: Progress) -> None:
     """Verify the match of each query, or else its best single image or line, which then becomes its match."""
-    there, instead = np.flatnonzero(matches.there), given.single
-    if lines is not None and not matches.by_lines:
+    there, instead, alone = np.flatnonzero(matches.there), given.single, None
+    if lines is not None and matches.by_lines:
+        alone = lines.alone
+    elif lines is not None:
         instead = np.where(lines.match >= 0, lines.match, instead)
-    alone = None if lines is None or not matches.by_lines else lines.alone
     for query in progress(there, "verification", len(there)):
         # The lamps of a tunnel repeat: one verified image does not overrule an accepted sequence.
         other = matches.match if matches.line[query] else instead

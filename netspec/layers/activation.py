@@ -107,8 +107,10 @@ class ELU(Rounded):
 
     @override
     def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:
-        # exp(x) - 1 as Caffe computes it, not the more exact expm1.
-        return torch.where(x > 0, x, self.alpha * (functions.exp(torch.where(x > 0, 0, x)) - 1))
+        # exp(x) - 1 as Caffe computes it, not the more exact expm1. The gradient of clamp at 0 depends on
+        # the version of PyTorch.
+        above = x > 0
+        return torch.where(above, x, self.alpha * (functions.exp(torch.where(above, 0, x)) - 1))
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * (self.alpha + top))

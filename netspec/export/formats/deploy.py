@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from netspec.files.whole_file import whole_file
 from netspec.graph.filter import filter_net
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import origins
+from netspec.graph.speed import speed
 from netspec.layers.contract.offers import passes_on
 from netspec.layers.contract.reading import reads_data
 from netspec.net.build import build_net
@@ -96,7 +96,7 @@ def fold(net: Net) -> NetParameter:
 
 
 def _found_folds(net: Net) -> list[Any]:
-    if find_spec("netspec.fast") is None:
+    if speed() is None:
         raise SpecError("folding a net needs netspec/fast, which is not installed", Where(net.plan.source.file))
     from netspec.fast.fold import find_folds
 

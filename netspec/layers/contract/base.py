@@ -61,9 +61,8 @@ class Layer(torch.nn.Module):
     ignores: frozenset[str] = frozenset()  # those of ``reads`` that have no effect, e.g. "data_param.scale"
     shares: frozenset[str] = frozenset()  # "data", "diff": what its tops share with its bottom in Caffe's memory
     counted_axis: ClassVar[int | None] = None  # the axis of the tops with a size that is known only after forward
-    fixed_shapes: ClassVar[bool] = (
-        True  # its tops have the shapes that ``reshape`` returned, except in ``counted_axis``
-    )
+    # whether its tops have the shapes that ``reshape`` returned, except in ``counted_axis``
+    fixed_shapes: ClassVar[bool] = True
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
         super().__init__()
