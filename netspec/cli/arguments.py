@@ -307,7 +307,7 @@ def load_weights(net: Any, paths: str | None, strict: bool) -> None:
     from netspec.net import weights
 
     if paths:
-        weights.load_weights(net, split_paths(paths), strict, some=True)
+        weights.load_weights(net, split_paths(paths), strict, need_one=True)
 
 
 def run_by(net: Any, arguments: argparse.Namespace, weights: str | None) -> Any:

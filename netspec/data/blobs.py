@@ -95,8 +95,8 @@ def _check_count(found: int, name: str, shape: Shape) -> None:
         raise ValueError(f"found {found} numbers in {name}, expected {math.prod(shape)} for shape {shape}")
 
 
-class Elsewhere(NamedTuple):
-    """Numbers that were not read from a file (little-endian float32): their position and shape."""
+class InFile(NamedTuple):
+    """Numbers that are still in a file (little-endian float32): their position and shape."""
 
     file: BinaryIO
     start: int
@@ -117,8 +117,8 @@ class Elsewhere(NamedTuple):
             yield done, here
 
 
-def elsewhere(proto: Any, file: BinaryIO | None) -> Elsewhere | None:
-    """Return the position of a blob's numbers in the file; None if the blob contains them.
+def in_file(proto: Any, file: BinaryIO | None) -> InFile | None:
+    """Return the position of a blob's numbers in the file; None if the blob itself contains the numbers.
 
     Raises ValueError as :func:`to_array`.
     """
@@ -127,7 +127,7 @@ def elsewhere(proto: Any, file: BinaryIO | None) -> Elsewhere | None:
         return None
     start, size = place
     _check_count(size // 4, "data", shape_of(proto))
-    return Elsewhere(file, start, shape_of(proto))
+    return InFile(file, start, shape_of(proto))
 
 
 def _raw_values(runs: Any, count: int) -> np.ndarray:

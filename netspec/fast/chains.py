@@ -1,6 +1,6 @@
-"""Fold layers that only scale, shift or copy into the layers before them.
+"""Finds chains of layers that one of them can compute, because the others only scale and shift channels.
 
-This module knows no layer types. Its callers say what each layer can do (:class:`Roles`); fold.py asks the layers.
+This module knows no layer types. Its callers say what each layer can do (:class:`Roles`).
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ class Roles:
     - ``absorbs_before``: it can also scale and shift the channels of its bottom, before its own work.
     - ``affine``: it only scales and shifts the channels of its single bottom.
     - ``passes_on``: it returns its bottom unchanged.
-    - ``finishes``: it can be computed in place, at the end of the step before it.
-    - ``fresh``: its top has memory of its own.
+    - ``is_activation``: it can be computed in place, at the end of the step before it.
+    - ``fresh``: its top has memory of its own, not that of a bottom.
 
-    Only :func:`netspec.fast.steps.schedule` reads the last two.
+    ``is_activation`` and ``fresh`` are read only by :func:`netspec.fast.steps.schedule`.
     """
 
     absorbs: Sequence[bool]
     affine: Sequence[bool]
     absorbs_before: Sequence[bool]
     passes_on: Sequence[bool]
-    finishes: Sequence[bool] = ()
+    is_activation: Sequence[bool] = ()
     fresh: Sequence[bool] = ()
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Layers in running order that one of them, the first or the last, computes. The others are not run."""
+    """Consecutive layers of which only one runs: the ``keeper``, the first or the last, which computes all of them."""
 
     keeper: int
     folded: tuple[int, ...]
@@ -47,18 +47,18 @@ class Chain:
 
 
 def find_chains(plan: Plan, roles: Roles, kept: Collection[int] = ()) -> list[Chain]:
-    """Return the chains of a plan. A value inside a chain has no other reader, and is no output and not ``kept``."""
+    """Return the chains of a plan. No value inside a chain is an output or in ``kept``, or has a reader outside."""
     origin = origins(plan, roles.passes_on)
     readers: dict[int, list[int]] = {}
     for i, node in enumerate(plan.nodes):
         for v in node.bottoms if not roles.passes_on[i] else ():
             readers.setdefault(origin[v], []).append(i)
-    put_out = {origin[v] for v in (*plan.outputs.values(), *kept)}
+    needed = {origin[v] for v in (*plan.outputs.values(), *kept)}
 
     def follower(i: int) -> int | None:
-        """Return the affine layer that is the only reader of the only top of layer ``i``."""
+        """Return the layer that can be folded together with layer ``i``: an affine one, the only reader of its top."""
         tops = plan.nodes[i].tops
-        if len(tops) != 1 or origin[tops[0]] in put_out:
+        if len(tops) != 1 or origin[tops[0]] in needed:
             return None
         read_by = readers.get(origin[tops[0]], [])
         return read_by[0] if len(read_by) == 1 and roles.affine[read_by[0]] else None

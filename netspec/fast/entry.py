@@ -15,10 +15,11 @@ from netspec.run.recorded import Kernels
 class Entry:
     """Functions that make kernels for a class of layers. Each takes a layer of the class, at its present shapes.
 
-    ``inference`` returns the kernel for runs without gradients, and ``learning`` the kernels for training. They return
-    None where ``forward`` and autograd are as good. ``folds`` returns how the layer can be joined with its neighbors.
-    ``fresh`` says whether its single top has memory of its own. ``any_layout``: the kernel, or ``forward``, also takes
-    bottoms in channels_last.
+    - ``inference`` returns the kernel for runs without gradients; None where ``forward`` is as fast.
+    - ``learning`` returns the two kernels for training; None where ``forward`` and autograd are as fast.
+    - ``folds`` returns how the layer can be joined with its neighbors.
+    - ``fresh``: whether its single top has memory of its own, not that of a bottom.
+    - ``any_layout``: whether the kernel, or ``forward`` if there is none, also takes bottoms in channels_last.
     """
 
     inference: Callable[[Any, Inference], Kernel | None] = lambda layer, how: None

@@ -1,9 +1,9 @@
 """Folds layers that scale and shift channels into the weights of other layers.
 
-A convolution y = W x + b followed by z = s y + t, both s and t one number for each channel, is a convolution with the
-weights s W and the bias s b + t. A BatchNorm with stored statistics is such a map, s = 1 / sqrt(var + eps) and t =
--mean s, and so is a Scale. Consecutive maps are one map. The arithmetic is in double precision. The entry of a layer
-says how it can be joined with its neighbors (folding.py); this module only combines them.
+A convolution y = W x + b followed by z = s y + t, where s and t have one number for each channel, is a convolution with
+the weights s W and the bias s b + t. A BatchNorm with stored statistics computes such a z, with s = 1 / sqrt(var + eps)
+and t = -mean s. So does a Scale. Several of them in a row are combined into one s and one t, in double precision. The
+entry of a layer says how it can be joined with its neighbors (folding.py).
 """
 
 from __future__ import annotations
@@ -23,35 +23,36 @@ from netspec.layers.contract.offers import passes_on
 
 @dataclass(frozen=True)
 class Fold:
-    """A chain of layers, and the parameters and learned blobs (double) with which its keeper computes all of it."""
+    """A chain of layers, and the settings and learned blobs (double) with which its keeper computes the whole chain."""
 
     chain: Chain
     absorbed: Absorbed
 
 
 def roles_of(plan: Plan, layers: Sequence[Layer]) -> Roles:
-    """Return what each layer of a plan can do in folding."""
+    """Return what each layer of a plan can do, except for ``is_activation`` and ``fresh``."""
     folds = [folds_of(layer) for layer in layers]
     one_top = [len(node.tops) == 1 for node in plan.nodes]
-    one_to_one = [one and len(node.bottoms) == 1 for one, node in zip(one_top, plan.nodes, strict=True)]
-    affine = [one and its.affine is not None for one, its in zip(one_to_one, folds, strict=True)]
+    one_bottom = [len(node.bottoms) == 1 for node in plan.nodes]
+    affine = [t and b and fold.affine is not None for t, b, fold in zip(one_top, one_bottom, folds, strict=True)]
     return Roles(
-        absorbs=[one and its.absorb is not None for one, its in zip(one_top, folds, strict=True)],
+        absorbs=[t and fold.absorb is not None for t, fold in zip(one_top, folds, strict=True)],
         affine=affine,
-        absorbs_before=[a and its.absorb_before is not None for a, its in zip(affine, folds, strict=True)],
+        absorbs_before=[a and fold.absorb_before is not None for a, fold in zip(affine, folds, strict=True)],
         passes_on=[passes_on(layer) for layer in layers],
     )
 
 
 def find_folds(plan: Plan, layers: Sequence[Layer]) -> list[Fold]:
-    """Return everything that can be folded, with the present weights. The layers are not changed."""
+    """Return all chains that can be folded, with the present weights. The layers are not changed."""
     return [Fold(chain, absorbed_by(chain, layers)) for chain in find_chains(plan, roles_of(plan, layers))]
 
 
 def absorbed_by(chain: Chain, layers: Sequence[Layer], like: torch.Tensor | None = None) -> Absorbed:
-    """Return the layer that computes a whole chain, in double or in the precision of ``like``.
+    """Return the settings and blobs with which the keeper computes a whole chain.
 
-    Scales and shifts are always combined in double.
+    The blobs have the type and device of ``like``, by default double on the CPU. Scales and shifts are always combined
+    in double.
     """
     affine, keeper = [folds_of(layers[i]).affine for i in chain.folded], folds_of(layers[chain.keeper])
     scale, shift = composed([each() for each in affine if each])
@@ -63,7 +64,7 @@ def absorbed_by(chain: Chain, layers: Sequence[Layer], like: torch.Tensor | None
 
 
 def composed(maps: Sequence[Affine]) -> Affine:
-    """Return the map that is the composition of these, in order."""
+    """Return the scale and shift that have the effect of all these, in order."""
     scale, shift = torch.ones((), dtype=torch.double), torch.zeros((), dtype=torch.double)
     for each in maps:
         scale, shift = each[0] * scale, each[0] * shift + each[1]

@@ -1,9 +1,4 @@
-"""The types that describe how a layer can be joined with its neighbors; chains.py and fold.py join them.
-
-A convolution y = W x + b followed by z = s y + t, both s and t one number for each channel, is a convolution with the
-weights s W and the bias s b + t. An elementwise function can be applied in place to the top of the layer before it.
-Both save a layer as long as the weights do not change.
-"""
+"""Types that describe how a layer can be joined with its neighbors. fold.py says how scales and shifts are folded."""
 
 from __future__ import annotations
 
@@ -14,7 +9,7 @@ from typing import Any
 
 import torch
 
-from netspec.fast.kernels import Finish
+from netspec.fast.kernels import Activation
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import values_of
 
@@ -23,26 +18,26 @@ Affine = tuple[torch.Tensor, torch.Tensor]  # scale and shift of each channel, (
 
 @dataclass(frozen=True)
 class Absorbed:
-    """A layer that has absorbed another: its LayerParameter and its learned blobs."""
+    """The LayerParameter and the learned blobs of a layer that also scales and shifts channels."""
 
     param: Any
     blobs: tuple[torch.Tensor, ...]
 
 
-Absorb = Callable[[torch.Tensor, torch.Tensor], Absorbed]  # of a scale and a shift, in their precision
+Absorb = Callable[[torch.Tensor, torch.Tensor], Absorbed]  # takes a scale and a shift; the blobs get their precision
 
 
 @dataclass(frozen=True)
 class Folds:
     """How a layer can be joined with its neighbors, at its present settings.
 
-    - ``finish``: the layer is this elementwise function.
+    - ``activation``: the layer only computes this elementwise function.
     - ``affine``: returns the scale and shift of the channels (axis 1), if the layer does nothing else.
     - ``absorb``: returns a layer that also scales and shifts the channels of its top.
     - ``absorb_before``: returns a layer that first scales and shifts the channels of its bottom.
     """
 
-    finish: Finish | None = None
+    activation: Activation | None = None
     affine: Callable[[], Affine] | None = None
     absorb: Absorb | None = None
     absorb_before: Absorb | None = None
@@ -64,7 +59,7 @@ def blob_in_double(layer: Layer, index: int) -> torch.Tensor:
 
 
 def blob_like(layer: Layer, index: int, other: torch.Tensor) -> torch.Tensor:
-    """Return a learned blob with the precision of another tensor, on its device."""
+    """Return a learned blob with the precision and on the device of ``other``."""
     return values_of(layer.blob(index)).to(other)
 
 

@@ -1,6 +1,7 @@
-"""Kernels of oneDNN that torch's compiler uses: weights laid out in advance, an activation in the same pass.
+"""Kernels of oneDNN that torch's compiler uses: with weights laid out in advance, and an activation in the same kernel.
 
-They take and return maps in channels_last. Where torch does not have them, the usual functions are used.
+They are private operators of torch, so :func:`suits` says whether this version of torch has them. They take and return
+maps in channels_last.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ import torch
 import torch.nn.functional as F
 
 from netspec.exact.products import Filter
-from netspec.fast.kernels import Finish, Inference, Kernel, finished
+from netspec.fast.kernels import Activation, Inference, Kernel, with_activation
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.learned import values_of
 
 _NEEDED = ("_convolution_pointwise", "_linear_pointwise", "_convolution_transpose_pointwise")
-_DIVIDED, _ROWS = 2**20, 64  # the least size of a matrix that is divided among threads, and the least rows of a part
+_LEAST_DIVIDED = 2**20  # numbers of a matrix: a smaller one is not divided among threads
+_LEAST_ROWS = 64  # of a part of a divided matrix
 
 
 def _ops() -> Any:
@@ -27,9 +29,9 @@ def _ops() -> Any:
 
 
 def suits(weight: torch.Tensor) -> bool:
-    """Return whether oneDNN's kernels take these weights."""
-    here = weight.device.type == "cpu" and weight.dtype == torch.float32 and weight.numel() > 0
-    return here and torch.backends.mkldnn.is_available() and all(hasattr(_ops(), name) for name in _NEEDED)
+    """Return whether torch has these kernels, for weights like this one."""
+    is_usual = weight.device.type == "cpu" and weight.dtype == torch.float32 and weight.numel() > 0
+    return is_usual and torch.backends.mkldnn.is_available() and all(hasattr(_ops(), name) for name in _NEEDED)
 
 
 def convolution(
@@ -39,13 +41,13 @@ def convolution(
     geometry = [list(sliding.pad), list(sliding.stride), list(sliding.dilation), group]
     weight = _laid_out(_ops()._reorder_convolution_weight, weight, geometry, shape, how)
     bias = _kept(bias, how)
-    call, (operation, rest) = _ops()._convolution_pointwise.default, _within(how.finish)
+    call, (operation, rest) = _ops()._convolution_pointwise.default, _within(how.activation)
     arguments = (*geometry, *operation, "")
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         return call(maps.contiguous(memory_format=torch.channels_last), weight, bias, *arguments)
 
-    return finished(kernel, rest)
+    return with_activation(kernel, rest)
 
 
 def deconvolution(
@@ -53,7 +55,7 @@ def deconvolution(
 ) -> Kernel:
     """Return a transposed convolution of maps (N, C, H, W) by fixed weights (C, num_output, kernel_h, kernel_w).
 
-    An activation is a separate pass here, because with one oneDNN falls back to a slow kernel.
+    The activation is applied separately, because oneDNN uses a slow kernel for a deconvolution with an activation.
     """
     geometry = [list(sliding.pad), [0, 0], list(sliding.stride), list(sliding.dilation), 1]
     call = _ops()._convolution_transpose_pointwise.default
@@ -63,30 +65,30 @@ def deconvolution(
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         return call(maps.contiguous(memory_format=torch.channels_last), weight, bias, *geometry, "none", [], "")
 
-    return finished(kernel, how.finish)
+    return with_activation(kernel, how.activation)
 
 
 def spread_by_channel(
     shape: Shape, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, how: Inference
 ) -> Kernel:
-    """Return a transposed convolution by weights (C, 1, kernel_h, kernel_w), each channel of (N, C, H, W) by itself.
+    """Return a transposed convolution of each channel of maps (N, C, H, W) by a filter (C, 1, kernel_h, kernel_w).
 
-    oneDNN's own kernel is slow. A convolution with mirrored filters, on maps with ``stride`` - 1 zeros between the
-    pixels, computes the same.
+    oneDNN's own kernel for this is slow. So it is computed as a convolution with mirrored filters, of maps with
+    ``stride`` - 1 zeros between the pixels.
     """
     (count, channels, *size), (down, across) = shape, sliding.stride
-    framed = (count, channels, (size[0] - 1) * down + 1, (size[1] - 1) * across + 1)
-    zeros = partial(values_of(weight).new_zeros, framed)
-    frame = how.memo(f"frame {framed}", lambda: zeros().contiguous(memory_format=torch.channels_last))
-    pixels = frame[:, :, ::down, ::across]
+    spread_shape = (count, channels, (size[0] - 1) * down + 1, (size[1] - 1) * across + 1)
+    zeros = partial(values_of(weight).new_zeros, spread_shape)
+    spread = how.memo(f"spread {spread_shape}", lambda: zeros().contiguous(memory_format=torch.channels_last))
+    pixels = spread[:, :, ::down, ::across]
     axes = zip(sliding.kernel, sliding.dilation, sliding.pad, strict=True)
-    turned = replace(sliding, stride=(1, 1), pad=tuple(d * (k - 1) - p for k, d, p in axes))
-    under_own_key = replace(how, memo=lambda name, make: how.memo(f"turned {name}", make))
-    convolve = convolution(framed, values_of(weight).flip(2, 3), bias, turned, channels, under_own_key)
+    mirrored = replace(sliding, stride=(1, 1), pad=tuple(d * (k - 1) - p for k, d, p in axes))
+    own_names = replace(how, memo=lambda name, make: how.memo(f"mirrored {name}", make))
+    convolve = convolution(spread_shape, values_of(weight).flip(2, 3), bias, mirrored, channels, own_names)
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         pixels.copy_(maps)
-        return convolve(frame)
+        return convolve(spread)
 
     return kernel
 
@@ -96,9 +98,9 @@ def _kept(bias: torch.Tensor | None, how: Inference) -> torch.Tensor | None:
 
 
 def _laid_out(reorder: Any, weight: torch.Tensor, geometry: Sequence[Any], shape: Shape, how: Inference) -> Any:
-    """Return filters in the layout that oneDNN prefers for maps of this shape. Others may be ten times as slow.
+    """Return filters in the layout that oneDNN prefers for maps of this shape. Other layouts may be ten times as slow.
 
-    Shapes that prefer the same layout share the memory.
+    If it prefers the same layout for several shapes, their kernels share the memory.
     """
     name = f"{reorder} {tuple(weight.shape)} {geometry}"
 
@@ -113,47 +115,49 @@ def _laid_out(reorder: Any, weight: torch.Tensor, geometry: Sequence[Any], shape
 
 def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Inference) -> Kernel:
     """Return the product of vectors (M, K) with fixed weights (num_output, K)."""
-    name = f"rows {tuple(weight.shape)} {weight.stride()}"  # a layer may use the transpose of another's
+    name = f"rows {tuple(weight.shape)} {weight.stride()}"  # layers may share a weight, one of them transposed
     weight = how.memo(name, lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))
     bias = _kept(bias, how)
-    call, (operation, rest) = _ops()._linear_pointwise.default, _within(how.finish)
-    return finished(lambda vectors: call(vectors, weight, bias, *operation, ""), rest)
+    call, (operation, rest) = _ops()._linear_pointwise.default, _within(how.activation)
+    return with_activation(lambda vectors: call(vectors, weight, bias, *operation, ""), rest)
 
 
 def vector_product(weight: torch.Tensor, bias: torch.Tensor | None) -> Callable[[torch.Tensor], torch.Tensor]:
     """Return a function that multiplies one vector (1, K) with weights (num_output, K), on several threads.
 
-    Torch uses one thread, which cannot read large weights at the full speed of memory. MKL sums up four rows at a time,
-    so parts that begin at multiples of four give the same bits as the whole. The function checks this first.
+    Torch uses one thread, which cannot read large weights at the full speed of memory. Here the rows of the weights are
+    divided into parts, one for each thread. The result has the same bits if each part begins at a multiple of four
+    rows, because MKL sums up four rows at a time. This is checked with an example first.
     """
     count, length = weight.shape
     same_bits: dict[int, bool] = {}  # by number of parts
 
     def divided(vector: torch.Tensor, parts: int) -> torch.Tensor:
         step = count // (4 * parts) * 4
-        most = (
-            count - (parts - 1) * step
-        )  # rows of the last part; all parts compute as many, and the surplus is dropped
-        rows = weight.as_strided((parts, length, most), (step * length, 1, length))
+        # The last part has more rows. All parts compute as many, and the others' surplus is dropped.
+        rows_of_last = count - (parts - 1) * step
+        rows = weight.as_strided((parts, length, rows_of_last), (step * length, 1, length))
         found = torch.bmm(vector.expand(parts, 1, length), rows)[:, 0]
         top = torch.cat([found[:-1, :step].reshape(-1), found[-1]]).view(1, count)
         return top if bias is None else top.add_(bias)
 
     def kernel(vector: torch.Tensor) -> torch.Tensor:
         threads = torch.get_num_threads()
-        parts = min(2 * threads, count // _ROWS) if threads > 1 else 1
+        parts = min(2 * threads, count // _LEAST_ROWS) if threads > 1 else 1
         if parts > 1 and parts not in same_bits:
             probe = torch.linspace(-1, 1, length).view(1, length)
             same_bits[parts] = torch.equal(divided(probe, parts), F.linear(probe, weight, bias))
         return divided(vector, parts) if same_bits.get(parts) else F.linear(vector, weight, bias)
 
     by_mkl = torch.backends.mkl.is_available() and suits(weight) and weight.is_contiguous()
-    return kernel if by_mkl and weight.numel() >= _DIVIDED else lambda vector: F.linear(vector, weight, bias)
+    if by_mkl and weight.numel() >= _LEAST_DIVIDED:
+        return kernel
+    return lambda vector: F.linear(vector, weight, bias)
 
 
-def _within(finish: Finish | None) -> tuple[tuple[str, list[float]], Finish | None]:
-    """Return the operation that oneDNN's kernel applies itself, and what must be applied after it."""
-    if finish is None or finish.operation is None:
-        return ("none", []), finish
-    name, numbers = finish.operation
+def _within(activation: Activation | None) -> tuple[tuple[str, list[float]], Activation | None]:
+    """Return the activation that oneDNN's kernel applies itself, and one that must be applied after it, if any."""
+    if activation is None or activation.operation is None:
+        return ("none", []), activation
+    name, numbers = activation.operation
     return (name, list(numbers)), None

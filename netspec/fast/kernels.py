@@ -1,8 +1,8 @@
-"""The types that kernels share. A kernel runs a layer again and again at fixed shapes.
+"""Types and functions that kernels share. A kernel is a function that computes a layer at fixed shapes.
 
-A layer has its own kernels (layers/) where they are faster than its ``forward`` and autograd. They compute the same
-numbers: they call the same functions with less overhead, with learned blobs in another layout, or with memory that is
-kept from run to run, as Caffe's blobs are.
+Layers have kernels of their own (layers/) where these are faster than ``forward`` and autograd. They compute the same
+numbers, by the same functions: with less overhead, with learned blobs in another layout, or with memory that is kept
+from run to run, as Caffe's blobs are.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
-from netspec.fast.bound import BoundColumns, BoundVectors
+from netspec.fast.products import PreparedColumns, PreparedVectors
 from netspec.layers.contract.base import Layer
 from netspec.run.recorded import Diff
 
@@ -23,41 +23,42 @@ Kernel = Callable[..., Any]  # takes the bottoms; returns the top, or a tuple of
 
 
 @dataclass(frozen=True)
-class Finish:
-    """An elementwise function. ``change`` applies it to a tensor in place, and returns the tensor.
+class Activation:
+    """An elementwise function. ``apply`` applies it to a tensor in place, and returns the tensor.
 
     ``operation`` is its name and arguments in oneDNN's kernels, if they compute the same bits (except for NaN).
     """
 
     name: str
-    change: Callable[[torch.Tensor], torch.Tensor] = field(compare=False)
+    apply: Callable[[torch.Tensor], torch.Tensor] = field(compare=False)
     operation: tuple[str, tuple[float, ...]] | None = None
 
 
-RELU = Finish("relu", F.relu_, ("relu", ()))
+RELU = Activation("relu", F.relu_, ("relu", ()))
 
 
-def clip(low: float, high: float) -> Finish:
+def clip(low: float, high: float) -> Activation:
     """Return the function max(low, min(x, high)). ``low`` must not exceed ``high``."""
-    return Finish(f"clip {low} {high}", lambda x: x.clamp_(low, high), ("hardtanh", (low, high)))
+    return Activation(f"clip {low} {high}", lambda x: x.clamp_(low, high), ("hardtanh", (low, high)))
 
 
 @dataclass(frozen=True)
 class Inference:
     """How to make the kernel of a layer for runs without gradients.
 
-    - ``finish``: is applied to the top in place.
+    - ``activation``: the kernel must apply it to the top.
     - ``reuse``: the kernel may overwrite the first bottom.
-    - ``memo(name, make)``: returns what ``make`` returns, and calls it only once for kernels of all shapes.
-    - ``pack``: weights may be stored in the layout that the kernel prefers.
     - ``lasts``: the next run must not overwrite the top.
+    - ``memo(name, make)``: returns the result of ``make()``. Kernels of the same layer at other shapes get the same
+      object, so ``make`` is called once.
+    - ``pack``: weights may be stored in the layout that the kernel prefers.
     - ``keeps``: must be called with the number of bytes that the kernel keeps for its shapes.
 
-    From now on only this kernel uses the layer, at these shapes. The kernel may keep copies of the blobs, because a new
-    kernel is made after a write to them. It must not keep an alias of them.
+    Nothing but the kernel uses the given layer object. The kernel may keep copies of the blobs, because a new kernel is
+    made after a write to them. It must not keep tensors that share memory with them.
     """
 
-    finish: Finish | None = None
+    activation: Activation | None = None
     reuse: bool = False
     lasts: bool = True
     memo: Callable[[str, Callable[[], Any]], Any] = lambda _, make: make()
@@ -71,11 +72,12 @@ class Learning:
 
     - ``wanted[i]``: whether the gradient of bottom i is needed.
     - ``sums[j]``: the tensor to which the gradient of learnable blob j is added; None if it is not learned.
-    - ``steady``: bottoms do not change before the backward kernel has run. Otherwise it must read them again, as
-      Caffe's does.
+    - ``steady``: bottoms do not change between the forward and the backward kernel. If they may, the backward kernel
+      must read them again, as Caffe's does.
 
-    The two kernels run in turn, without autograd, and BLAS uses one thread. The backward kernel gets None for a top
-    without a gradient, but never for all tops. A tensor that a kernel returns is valid until its next call.
+    The forward and the backward kernel run alternately, without autograd, and BLAS uses one thread. The backward kernel
+    gets None for a top without a gradient, but never for all tops. A tensor that a kernel returns is valid until the
+    next call of that kernel.
     """
 
     wanted: tuple[bool, ...]
@@ -83,29 +85,32 @@ class Learning:
     steady: bool = True
 
 
-def finished(kernel: Kernel, finish: Finish | None) -> Kernel:
-    """Return a kernel of one top that also applies ``finish`` to it in place."""
-    if finish is None:
+def with_activation(kernel: Kernel, activation: Activation | None) -> Kernel:
+    """Return a kernel of one top that also applies ``activation`` to the top, in place."""
+    if activation is None:
         return kernel
-    change = finish.change
+    apply = activation.apply
 
     def both(*bottoms: torch.Tensor) -> torch.Tensor:
         top = kernel(*bottoms)
-        return change(top[0] if isinstance(top, tuple) else top)
+        return apply(top[0] if isinstance(top, tuple) else top)
 
     return both
 
 
 def copies(blobs: Sequence[torch.Tensor], how: Inference) -> list[torch.Tensor]:
-    """Return copies of a layer's blobs. Kernels of all shapes share them."""
+    """Return copies of a layer's blobs, which its kernels for all shapes share."""
     copy = partial(torch.clone, memory_format=torch.contiguous_format)
     return [how.memo(f"copy {i}", partial(copy, blob)) for i, blob in enumerate(blobs)]
 
 
-def overwriting(bound: BoundVectors | BoundColumns, how: Inference) -> Kernel:
-    """Return the kernel of a layer of one top. Its next run overwrites the memory of the top."""
-    how.keeps(bound.nbytes)
-    kernel = finished(bound.forward, how.finish)
+def product_kernel(product: PreparedVectors | PreparedColumns, how: Inference) -> Kernel:
+    """Return the kernel of a layer that computes ``product``.
+
+    The product overwrites its result in the next run, so the top is copied if it must last.
+    """
+    how.keeps(product.nbytes)
+    kernel = with_activation(product.forward, how.activation)
     return (lambda *bottoms: kernel(*bottoms).clone()) if how.lasts else kernel
 
 
@@ -116,8 +121,8 @@ def weight_and_bias(layer: Layer, how: Learning) -> tuple[tuple[torch.Tensor, to
     return (values[0], values[1] if has_bias else None), (how.sums[0], how.sums[1] if has_bias else None)
 
 
-class Room:
-    """Memory for a result. ``room.like(x)`` returns memory with the shape and strides of ``x``, always the same."""
+class Buffer:
+    """A tensor that is allocated once, and then used for the result of each run."""
 
     __slots__ = ("_kept",)
 
@@ -125,7 +130,7 @@ class Room:
         self._kept: torch.Tensor | None = None
 
     def like(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the memory."""
+        """Return the tensor. The first call allocates it with the shape and strides of ``x``."""
         if self._kept is None:
             self._kept = torch.empty_like(x)
         return self._kept

@@ -1,8 +1,8 @@
 """Sums over the classes of many small images at once, in the order in which BLAS sums up each image.
 
-Caffe calls BLAS for each image. For a few classes, the calls take longer than the sums. The order of the sums depends
-on the CPU and on the shape, so it is found by experiment: an order is used if it gave the same bits as the calls for
-thousands of random images.
+Caffe calls BLAS once for each image. With few classes, the calls take longer than the sums. In which order BLAS adds
+depends on the CPU and on the shape, so the order is found by experiment: one of the known orders is used if it gave the
+same bits as BLAS for thousands of random images.
 """
 
 from __future__ import annotations
@@ -14,28 +14,31 @@ import numpy as np
 
 from netspec.exact.blas import one_thread, routine
 
-_FEW = 4  # images: for fewer, calls are as fast
-_LARGEST = 64  # numbers of an image: for more, calls are as fast
-_FIRST, _ALL = 64, 2048  # random images to search for an order, and to verify it
+_FEWEST = 4  # images: for fewer, calls of BLAS are as fast
+_LARGEST = 64  # numbers of an image: for more, calls of BLAS are as fast
+_SEARCHED, _VERIFIED = 64, 2048  # random images to search for an order, and to verify it
 
 
 class _Order(NamedTuple):
-    """Classes are summed in blocks of ``block``, then the blocks. The rest is one more block, or added one by one."""
+    """Blocks of ``size`` classes are summed, then the sums of the blocks.
+
+    The classes that do not fill a block are one more block if ``short_block``; otherwise they are added one by one.
+    """
 
     size: int
-    block: bool
+    short_block: bool
 
 
-_ORDERS = [_Order(size, block) for size in (1, 2, 4, 8, 16) for block in (False, True) if size > 1 or not block]
+_ORDERS = [_Order(1, False), *(_Order(size, short) for size in (2, 4, 8, 16) for short in (False, True))]
 
 
 def class_sums(values: np.ndarray) -> np.ndarray:
-    """Return the sums (N, inner) over axis 1 of values (N, classes, inner), each image's by gemv (caffe_cpu_gemv).
+    """Return the sums (N, inner) over axis 1 of values (N, classes, inner), with the bits of gemv (caffe_cpu_gemv).
 
-    BLAS must have one thread. Of values that are all -0.0 the sum may have that sign.
+    BLAS must have one thread. The sum of values that are all -0.0 may be 0.0 or -0.0.
     """
     count, classes, inner = values.shape
-    if count >= _FEW and classes * inner <= _LARGEST:
+    if count >= _FEWEST and classes * inner <= _LARGEST:
         order = _order(classes, inner, values.dtype.char)
         if order is not None:
             return _in_order(values, order)
@@ -56,7 +59,7 @@ def _in_order(values: np.ndarray, order: _Order) -> np.ndarray:
         whole = classes - classes % order.size
         blocks = _one_by_one(values[:, :whole].reshape(count, -1, order.size, inner), 2)
         rest = values[:, whole:]
-        if order.block and whole < classes:
+        if order.short_block and whole < classes:
             rest = _one_by_one(rest, 1)[:, None]
         values = np.concatenate([blocks, rest], 1)
     return _one_by_one(values, 1)
@@ -69,12 +72,15 @@ def _one_by_one(values: np.ndarray, axis: int) -> np.ndarray:
 @cache
 @one_thread()
 def _order(classes: int, inner: int, kind: str) -> _Order | None:
-    """Return the order in which BLAS sums this number of classes; None if it is not one of the known orders."""
+    """Return the order in which BLAS sums this number of classes; None if it is not one of the known orders.
+
+    ``kind``: the type of the values, as numpy's dtype.char.
+    """
     random = np.random.default_rng(0)
-    shape = (_ALL, classes, inner)
+    shape = (_VERIFIED, classes, inner)
     size = np.exp2(random.integers(-12, 12, shape))  # sums of numbers of one size often agree in any order
     values = (random.uniform(-1, 1, shape) * size).astype(kind)
-    found = [order for order in _ORDERS if _agree(values[:_FIRST], order)]
+    found = [order for order in _ORDERS if _agree(values[:_SEARCHED], order)]
     return next((order for order in found if _agree(values, order)), None)
 
 

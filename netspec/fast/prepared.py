@@ -1,9 +1,9 @@
-"""Runs of a net without gradients: each layer is prepared once for the current shapes.
+"""Runs of a net without gradients, by kernels that are made once for each set of input shapes and of blobs to keep.
 
-A program is the sequence of kernels for one set of input shapes and of blobs to keep. Programs keep copies of weights,
-folded or in the layout of a kernel. Before each run, a program checks whether a learned blob was written to, or could
-be through an alias that is still alive. Layers with such blobs read them directly until they have not changed for a
-run.
+Kernels keep copies of weights: folded, or in the layout that they prefer. These copies must not become outdated. So
+before each run, a KernelSequence checks whether a learned blob was written to, or whether another tensor that shares
+its memory is still alive, through which it could be written to. Layers with such blobs read them directly in each run.
+They are prepared again once the blobs have stayed the same for a whole run.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from netspec.exact.switch import is_recorded
 from netspec.fast import steps as planned
 from netspec.fast.fold import absorbed_by, roles_of
 from netspec.fast.folding import Absorbed, absorbing
-from netspec.fast.kernels import Inference, Kernel, finished
+from netspec.fast.kernels import Inference, Kernel, with_activation
 from netspec.fast.steps import Schedule, schedule
 from netspec.fast.table import entry_of, folds_of, inference_kernel, is_fresh
 from netspec.files.memory import give_back_freed_memory
@@ -37,39 +37,43 @@ from netspec.layers.contract.reading import changes_itself
 from netspec.run.shapes import fitted
 from netspec.run.walk import Result, Step, Values, losses_of, walk
 
-PROGRAMS = 64  # the most that a net keeps; pyramids of images need one for each size
-RUNS = 4  # all programs together may keep this many times the memory of one run
-Given = tuple[int, Shape, torch.dtype]
+MOST_SEQUENCES = 64  # that a net keeps; image pyramids need one for each size
+MEMORY_FACTOR = 4  # all sequences together may keep this many times the memory of one run
+Given = tuple[int, Shape, torch.dtype]  # a value known before the first step: its number, shape and type
 
 
 @dataclass
-class PreparedLine:
+class KernelSequence:
     """The kernels of a run in order, for one set of shapes of the inputs and of values to keep."""
 
-    line: list[Step]
+    steps: list[Step]
     schedule: Schedule
-    kinds: list[str]
+    kinds: list[str]  # of the steps, see Prepared._kernel
     one_thread: bool
-    frozen: list[int]  # indices of the learned blobs that it holds values of
+    frozen: list[int]  # indices of the learned blobs whose values it may have copied
     seen: Seen  # the state of these blobs
-    waiting: list[tuple[torch.Tensor, Seen]]  # blobs that were changing, with their state
-    memos: set[Any]  # the keys of other tensors that it keeps in memory
-    kept: int  # bytes that kernels keep for these shapes
-    need: int  # bytes: the peak of the values, and what kernels keep
+    changing: list[tuple[torch.Tensor, Seen]]  # the other blobs, which are read in each run, with their state
+    memos: set[Any]  # the keys of the tensors in Prepared.memos that it uses
+    kept_bytes: int  # that kernels keep for these shapes, in addition to memos
+    needed_bytes: int  # the peak of the values, and kept_bytes
 
     def is_current(self, blobs: list[torch.Tensor]) -> bool:
-        """Return whether no blob was written to or replaced since, and all blobs that were changing still are."""
-        if not self.seen.are([blobs[i] for i in self.frozen] if self.waiting else blobs):
+        """Return whether the kernels still fit the learned blobs.
+
+        They do not if a frozen blob was written to or replaced, or if a changing blob has stayed the same since the
+        last call, so that faster kernels are possible.
+        """
+        if not self.seen.are([blobs[i] for i in self.frozen] if self.changing else blobs):
             return False
-        if not self.waiting:
+        if not self.changing:
             return True
-        resting = [before.are([blob]) and not may_have_alias(blob) for blob, before in self.waiting]
-        self.waiting = [(blob, Seen([blob], values=True)) for blob, _ in self.waiting]
-        return not any(resting)
+        unchanged = [before.are([blob]) and not may_have_alias(blob) for blob, before in self.changing]
+        self.changing = [(blob, Seen([blob], values=True)) for blob, _ in self.changing]
+        return not any(unchanged)
 
 
 class Prepared:
-    """Runs a net by programs. One is made for each set of shapes and kept values, when it is first needed."""
+    """A runner without gradients. It makes a KernelSequence for each set of shapes and kept values, when needed."""
 
     def __init__(
         self,
@@ -88,8 +92,8 @@ class Prepared:
             for i, (node, layer) in enumerate(zip(plan.nodes, self._layers, strict=True))
             if not node.bottoms and not layer.is_input
         ]
-        self.made: OrderedDict[Any, PreparedLine] = OrderedDict()
-        self.memos: dict[Any, tuple[Seen, Any]] = {}  # tensors that layers keep, by key
+        self.sequences: OrderedDict[Any, KernelSequence] = OrderedDict()
+        self.memos: dict[Any, tuple[Seen, Any]] = {}  # tensors that kernels of several sequences share, by key
         self._blobs = blobs_of(self._layers)
         self._seen: dict[int, Seen] = {}
 
@@ -102,46 +106,48 @@ class Prepared:
             return None
         values: Values = dict(given)
         loss = walk(self._sources, values, self._exact) if self._sources else None
-        program = self.line_for(tuple([(v, x.shape, x.dtype) for v, x in values.items()]), kept)
-        with one_thread() if program.one_thread else nullcontext():
-            term = walk(program.line, values, self._exact)
-        origin = program.schedule.origin
+        sequence = self.sequence_for(tuple([(v, x.shape, x.dtype) for v, x in values.items()]), kept)
+        with one_thread() if sequence.one_thread else nullcontext():
+            term = walk(sequence.steps, values, self._exact)
+        origin = sequence.schedule.origin
         loss = term if loss is None else loss if term is None else loss + term
         return loss, {v: values[origin[v]].contiguous() for v in kept}
 
-    def line_for(self, given: tuple[Given, ...], kept: frozenset[int]) -> PreparedLine:
-        """Return the program for values of these shapes and types. Make it if there is none."""
+    def sequence_for(self, given: tuple[Given, ...], kept: frozenset[int]) -> KernelSequence:
+        """Return the kernels for values of these shapes and types. Make them if there are none, or if blobs changed."""
         key = (given, kept)
-        program = self.made.get(key)
-        if program is None or not program.is_current(self._blobs()):
-            give_back_freed_memory()
-            with torch.inference_mode(False), torch.no_grad():
-                program = self.made[key] = self._make(given, kept)
-            self.made.move_to_end(key)
-            self._trim()
-        self.made.move_to_end(key)
-        return program
+        sequence = self.sequences.get(key)
+        if sequence is not None and sequence.is_current(self._blobs()):
+            self.sequences.move_to_end(key)
+            return sequence
+        give_back_freed_memory()
+        with torch.inference_mode(False), torch.no_grad():
+            sequence = self.sequences[key] = self._make(given, kept)
+        self.sequences.move_to_end(key)
+        self._trim()
+        return sequence
 
     def _trim(self) -> None:
-        """Remove the least recently used programs until the rest are within the limits."""
+        """Remove the least recently used sequences until the rest are within the limits."""
         learned = sum(blob.nbytes for layer in self._layers for blob in layer.blobs)
-        most = RUNS * (learned + max(program.need for program in self.made.values()))
+        most = MEMORY_FACTOR * (learned + max(sequence.needed_bytes for sequence in self.sequences.values()))
         while True:
-            used = set[Any]().union(*(program.memos for program in self.made.values()))
+            used = set[Any]().union(*(sequence.memos for sequence in self.sequences.values()))
             self.memos = {key: memo for key, memo in self.memos.items() if key in used}
-            if len(self.made) == 1 or (len(self.made) <= PROGRAMS and self.kept_bytes() <= most):
+            if len(self.sequences) == 1 or (len(self.sequences) <= MOST_SEQUENCES and self.kept_bytes() <= most):
                 return
-            self.made.popitem(last=False)
+            self.sequences.popitem(last=False)
 
     def kept_bytes(self) -> int:
-        """Return the bytes that programs keep in addition to the learned blobs."""
+        """Return the bytes that sequences keep in addition to the learned blobs."""
         values = [value for _, value in self.memos.values()]
         tensors = [blob for value in values for blob in (value.blobs if isinstance(value, Absorbed) else (value,))]
-        own = sum(program.kept for program in self.made.values())
+        own = sum(sequence.kept_bytes for sequence in self.sequences.values())
         return own + sum({id(tensor): tensor.nbytes for tensor in tensors}.values())
 
-    def _make(self, given: tuple[Given, ...], kept: frozenset[int]) -> PreparedLine:
+    def _make(self, given: tuple[Given, ...], kept: frozenset[int]) -> KernelSequence:
         plan = self._plan
+        # The layers at these shapes; None where the shapes depend on values.
         found, shapes = fitted(plan, self._layers, {v: tuple(shape) for v, shape, _ in given})
         layers = [fit or layer for fit, layer in zip(found, self._layers, strict=True)]
         changing = self._changing()
@@ -157,49 +163,51 @@ class Prepared:
                 absorbs=_both(roles.absorbs, foldable),
                 affine=_both(roles.affine, foldable),
                 absorbs_before=_both(roles.absorbs_before, foldable),
-                finishes=[fit is not None and folds_of(fit).finish is not None for fit in found],
+                is_activation=[fit is not None and folds_of(fit).activation is not None for fit in found],
                 fresh=[fit is not None and is_fresh(fit) for fit in found],
             ),
             given=[v for v, *_ in given],
             kept=kept | {v for node, losses in zip(plan.nodes, self._losses, strict=True) if losses for v in node.tops},
             passes=self.passes,
         )
-        line, kinds, memos, own = [], [], set[Any](), list[int]()
+        steps, kinds, memos, own_bytes = [], [], set[Any](), list[int]()
         for step in order.steps:
-            kernel, kind = self._kernel(step, layers, found[step.node] is None, as_is[step.node], memos, own.append)
+            depends_on_values = found[step.node] is None
+            kernel, kind = self._kernel(step, layers, depends_on_values, as_is[step.node], memos, own_bytes.append)
             kinds.append("exact" if exact[step.node] else kind)
-            line.append(Step(step.node, kernel, step.bottoms, step.tops, self._losses[step.node], step.ends))
+            steps.append(Step(step.node, kernel, step.bottoms, step.tops, self._losses[step.node], step.ends))
         blobs = self._blobs()
         frozen = [i for i, blob in enumerate(blobs) if id(blob) not in changing]
-        return PreparedLine(
-            line,
+        return KernelSequence(
+            steps,
             order,
             kinds,
-            any(exact),
-            frozen,
-            Seen([blobs[i] for i in frozen], values=True),
-            [(blob, Seen([blob], values=True)) for blob in blobs if id(blob) in changing],
-            memos,
-            sum(own),
-            sum(own) + _most_alive(order.steps, shapes),
+            one_thread=any(exact),
+            frozen=frozen,
+            seen=Seen([blobs[i] for i in frozen], values=True),
+            changing=[(blob, Seen([blob], values=True)) for blob in blobs if id(blob) in changing],
+            memos=memos,
+            kept_bytes=sum(own_bytes),
+            needed_bytes=sum(own_bytes) + _most_alive(order.steps, shapes),
         )
 
     def _kernel(
         self,
         step: planned.PlannedStep,
         layers: Sequence[Layer],
-        unknown: bool,
+        depends_on_values: bool,
         as_is: bool,
         memos: set[Any],
         keeps: Callable[[int], None],
     ) -> tuple[Kernel, str]:
         """Return the kernel of a step, and its kind: "by value", "as is", "packed" or "prepared".
 
-        The keys of the memos that it uses are added to ``memos``; ``keeps`` is called with the bytes of the rest.
+        ``depends_on_values``: the shapes of the layer do. ``as_is``: the kernel must not copy the layer's blobs. The
+        keys of the memos that it uses are added to ``memos``; ``keeps`` is called with the number of other bytes.
         """
         layer = layers[step.node]
-        promised = layers[step.chain.last if step.chain else step.node]
-        if unknown:
+        last = layers[step.chain.last if step.chain else step.node]
+        if depends_on_values:
             layer = layer if changes_itself(layer) else copy.copy(layer)
             return lambda *bottoms: layer.run(*(bottom.contiguous() for bottom in bottoms)), "by value"
         members = (step.node, *(step.chain.folded if step.chain else ()))
@@ -208,7 +216,8 @@ class Prepared:
 
         def memo(name: str, make: Callable[[], Any]) -> Any:
             uses.append(name)
-            key = (name, step.node if step.chain else -1, *map(id, blobs))  # layers that share blobs share this too
+            # Layers that share blobs share their memos too, unless other layers are folded into them.
+            key = (name, step.node if step.chain else -1, *map(id, blobs))
             memos.add(key)
             kept = self.memos.get(key)
             if kept is None or not kept[0].are(blobs):
@@ -218,18 +227,20 @@ class Prepared:
         if step.chain:
             chain = step.chain
             layer = absorbing(layer, memo("fold", lambda: absorbed_by(chain, layers, layers[chain.keeper].blobs[0])))
-        finish = None if step.finish is None else folds_of(layers[step.finish]).finish
+        activation = None if step.activation is None else folds_of(layers[step.activation]).activation
         how = Inference(
-            finish=finish, reuse=step.reuse, lasts=step.lasts, memo=memo, pack=PACK in self.passes, keeps=keeps
+            activation=activation, reuse=step.reuse, lasts=step.lasts, memo=memo, pack=PACK in self.passes, keeps=keeps
         )
         own = None if as_is else inference_kernel(layer, how)
-        kernel = own or finished(layer.forward, finish)
+        kernel = own or with_activation(layer.forward, activation)
         if not entry_of(layer).any_layout or self._exact == ALL:
-            inner = kernel
-            kernel = lambda *bottoms: inner(*(bottom.contiguous() for bottom in bottoms))  # noqa: E731
+            kernel = _contiguous(kernel)
         if own is None:
-            kernel = _checked(kernel, promised)
-        return kernel, "as is" if as_is else "packed" if len(uses) > bool(step.chain) else "prepared"
+            kernel = _checked(kernel, last)
+        if as_is:
+            return kernel, "as is"
+        own_uses = [name for name in uses if name != "fold"]
+        return kernel, "packed" if own_uses else "prepared"
 
     def _changing(self) -> set[int]:
         """Return the learned blobs that may change between runs: those that did, and those with a live alias."""
@@ -242,8 +253,13 @@ class Prepared:
         return found
 
 
+def _contiguous(kernel: Kernel) -> Kernel:
+    """Return a kernel that makes its bottoms contiguous first."""
+    return lambda *bottoms: kernel(*(bottom.contiguous() for bottom in bottoms))
+
+
 def _checked(kernel: Kernel, layer: Layer) -> Kernel:
-    """Return a kernel that checks, in its first pass, the shapes that the layer promised."""
+    """Return a kernel that compares the shapes of its tops with the layer's ``top_shapes`` in its first run."""
 
     def checked(*bottoms: torch.Tensor) -> Any:
         nonlocal unchecked

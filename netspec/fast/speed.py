@@ -1,6 +1,6 @@
 """The implementation of :class:`netspec.run.speed.Speed`.
 
-Its methods import what they need, because a command whose net is run by another engine does not load torch.
+Its methods import what they need. So a command whose net is run by another engine does not load torch.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Fast:
-    """Makes nets faster with the kernels of this package (implements :class:`netspec.run.speed.Speed`)."""
+    """Gives nets the runners and kernels of this package."""
 
     def prepared(self, eager: Eager, passes: Collection[str]) -> Prepared:
         """Return the runner for passes without gradients."""
@@ -43,13 +43,13 @@ class Fast:
         return TrainingStep(eager.plan, parts, eager.loss_weights, eager.overwritten, weighted)
 
     def reads_at_once(self, decode: Callable[[Any], np.ndarray]) -> AtOnce:
-        """Return what reads many raw Datums at once."""
+        """Return a function that reads many raw Datums at once; ``decode`` returns the numbers of one."""
         from netspec.fast.stacked import Stacker
 
         return Stacker(decode)
 
     def is_fresh(self, layer: Layer) -> bool:
-        """Return whether the top of a prepared layer has memory of its own."""
+        """Return whether the top of a prepared layer has memory of its own, not that of a bottom."""
         from netspec.fast.table import is_fresh
 
         return is_fresh(layer)

@@ -1,7 +1,8 @@
-"""Reading many small Datums of the same form together, as one array.
+"""Reads many small Datums of the same form together, as one array.
 
-Parsing each record takes longer than a small net needs to process it. The records of a database often differ only in
-the bytes of their numbers and labels. So the layout of one parsed record applies to all that have the same other bytes.
+A small net takes less time for a record than parsing the record takes. The records of a database often differ only in
+the bytes of their numbers and labels. So one record is parsed, and its layout is used for all records that have the
+same other bytes.
 """
 
 from __future__ import annotations
@@ -17,13 +18,16 @@ from netspec.data.datum import datum_to_array, parse_datum
 from netspec.proto.schema import Datum
 from netspec.proto.wire import BYTES, FOUR, fields
 
-MOST_BYTES = 1 << 16  # bytes of a record; for a larger one, copying takes longer than parsing
-_MOST_FORMS = 64
+MOST_BYTES = 1 << 16  # of a record; for a larger one, copying takes longer than parsing
+_MOST_FORMS = 64  # that are remembered
 _DATA, _LABEL, _FLOATS = (Datum.DESCRIPTOR.fields_by_name[name].number for name in ("data", "label", "float_data"))
 
 
 class _Form(NamedTuple):
-    """The positions of numbers and label in records of one size, and the first record, whose other bytes are equal."""
+    """A parsed record, and the positions of its numbers and its label.
+
+    Records of the same form have the same size and the same bytes at all other positions.
+    """
 
     record: np.ndarray
     shape: Shape
@@ -35,7 +39,7 @@ class _Form(NamedTuple):
 class Stacker:
     """Reads records as arrays, and remembers their forms.
 
-    ``decode`` returns the numbers (C, H, W) of a raw Datum: the first ones if there are more, or all.
+    ``decode`` returns the numbers of a raw Datum as an array (C, H, W).
     """
 
     def __init__(self, decode: Callable[[Any], np.ndarray] = datum_to_array) -> None:
@@ -45,9 +49,10 @@ class Stacker:
     def __call__(self, records: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray] | None:
         """Return images (N, C, H, W), uint8 or float32, and labels (N,), float32.
 
-        Returns None if the records have different forms, or are encoded, large or wrong. Read them one by one then.
+        Returns None if the records have different forms, or are encoded, large or wrong. The caller then reads them one
+        by one.
         """
-        sizes = list(map(len, records))
+        sizes = [len(record) for record in records]
         if max(sizes) > MOST_BYTES:
             return None
         if min(sizes) == max(sizes):
@@ -73,7 +78,7 @@ class Stacker:
             return None
         rows = np.frombuffer(b"".join(records), np.uint8).reshape(len(records), size)
         found = _unpacked(rows, form)
-        if found is None and (rows[0] != form.record).any():  # a form of other records
+        if found is None and (rows[0] != form.record).any():  # the remembered form is that of other records
             form = _form_of(records[0], self._decode)
             found = None if form is None else _unpacked(rows, form)
         if form is not None:
@@ -91,7 +96,7 @@ def _unpacked(rows: np.ndarray, form: _Form) -> tuple[np.ndarray, np.ndarray] | 
             return None
         start = part.stop
     labels, values = rows[:, form.label], rows[:, form.values]
-    count = labels.shape[1]
+    count = labels.shape[1]  # of bytes; all but the last have the highest bit set (a varint)
     if count and ((labels[:, :-1] < 128).any() or (labels[:, -1] >= 128).any()):
         return None
     if form.step == 5:

@@ -1,4 +1,4 @@
-"""The table of entries. A class without an entry, such as a subclass with its own ``forward``, runs by ``forward``."""
+"""The table of entries by class. A layer whose class has none, such as a user's subclass, runs by its ``forward``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def folds_of(layer: Layer) -> Folds:
 
 
 def is_fresh(layer: Layer) -> bool:
-    """Return whether a layer's single top has memory of its own, and not a bottom's."""
+    """Return whether a layer's single top has memory of its own, not that of a bottom."""
     fresh = entry_of(layer).fresh
     return fresh(layer) if callable(fresh) else fresh
 

@@ -1,8 +1,7 @@
-"""Training passes of small nets: each layer is prepared once, and then run forward and backward without autograd.
+"""Trains small nets without autograd: each layer is prepared once as a forward and a backward kernel.
 
-Autograd costs about a millisecond for ten layers, whatever their size. A net of small layers or batches spends most of
-its time there. Here a layer is a pair of kernels (kernels.py, layers/) for the present shapes, and a pass calls one
-after the other. The numbers are the same.
+Autograd takes about a millisecond for ten layers, whatever their size, which is most of the time of a net with small
+layers or batches. Here a run calls the kernels of the layers (kernels.py, layers/) in order. The numbers are the same.
 """
 
 # pyright: reportPrivateImportUsage=false
@@ -28,7 +27,7 @@ from netspec.run.parts import Part
 from netspec.run.recorded import Backward, Kernels, recorded
 from netspec.run.walk import losses_of
 
-LARGEST = 2**22  # numbers in all tops: in larger nets the cost of autograd is negligible, and it needs less memory
+LARGEST = 2**22  # numbers in all tops: in larger nets the time of autograd is negligible, and it needs less memory
 Values = list[Any]  # by value number, a tensor or None
 
 
@@ -69,10 +68,11 @@ class _Prepared:
 
 
 class TrainingStep:
-    """Forward and backward passes of a net that trains.
+    """Runs a net that trains forward and backward.
 
-    ``loss_weights[i][j]`` is the loss weight of layer i's top j, ``weighted(top, weight)`` its part of the loss.
-    ``overwritten[i]``: layer i's gradient reads memory that is overwritten in place (netspec/run/eager.py).
+    ``loss_weights[i][j]`` is the loss weight of top j of layer i, and ``weighted(top, weight)`` returns what the top
+    adds to the loss. ``overwritten[i]``: the gradient of layer i reads memory that a later layer overwrites in place
+    (netspec/run/eager.py).
     """
 
     def __init__(
@@ -100,11 +100,15 @@ class TrainingStep:
         self._blobs = blobs_of(layers)
         self._made: dict[Any, _Prepared] = {}  # by shapes, and by the blobs that learn
         self._values: Values = []
-        self.keeps = False  # whether ``passed`` keeps the values and gradients of a pass until the next one
+        self.keeps = False  # whether to keep in ``passed`` the values and gradients of the last run
         self.passed: tuple[Values, Values] | None = None
 
     def is_watched(self) -> bool:
-        """Return whether layers or learnable blobs have hooks that need autograd, or autograd is switched off."""
+        """Return whether this class must not run the net.
+
+        So it is if layers or learnable blobs have hooks, which need autograd, if gradients are switched off, or under
+        autocast.
+        """
         if any(self._hooks) or not torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
             return True
         return any(blob._backward_hooks or blob._post_accumulate_grad_hooks for blob in self._blobs())
@@ -137,7 +141,7 @@ class TrainingStep:
             raise
 
     def _run(self, prepared: _Prepared, values: Values) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        # netspec/run/walk.py took up to 1.1 times as long: here values are in a list, and a scalar loss is not copied.
+        # netspec/run/walk.py would take up to 1.1 times as long: its values are in a dict, and it copies scalar losses.
         self._values = values
         loss: torch.Tensor | None = None
         for kernel, bottoms, tops, losses in prepared.forward:
@@ -196,13 +200,13 @@ class TrainingStep:
         return made
 
     def _losses(self, i: int, layer: Layer, made: _Prepared) -> tuple[tuple[int, float], ...]:
-        """Record the gradients of a layer's losses. Return pairs of a top's index and its loss weight."""
+        """Add the gradients of a layer's losses to ``made.start``. Return (index of the top, loss weight) of each."""
         for j, weight in self._loss_of[i]:
             made.start[self._tops(i)[j]] = torch.full(layer.top_shapes[j], weight)
         return self._loss_of[i]
 
     def _tops(self, i: int) -> tuple[int, ...]:
-        """Return the values that layer ``i`` makes. A loss may have a top without a name."""
+        """Return the numbers of the values that layer ``i`` makes. A loss without a named top makes one too."""
         return self._plan.nodes[i].tops or (len(self._plan.blobs) + i,)
 
     def _kernels(self, part: Part, wanted: tuple[bool, ...]) -> Kernels:
@@ -217,7 +221,7 @@ class TrainingStep:
         return (whole and learning_kernels(part.layer, how)) or recorded(part.layer.run, wanted, part.blobs)
 
     def _overwritten_kernels(self, i: int) -> Kernels:
-        """Return the kernels of a layer with a gradient that reads what later layers wrote into its memory."""
+        """Return the kernels of a layer whose gradient reads what later layers wrote into the memory of its blobs."""
         node, layer = self._plan.nodes[i], self._layers[i]
         final = self._plan.final[node.tops[0]]
         held = node.in_place[0] and bool(gradient_reads(layer) & {"bottom", "sign"})

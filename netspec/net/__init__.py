@@ -1,1 +1,1 @@
-"""Runnable nets: building them from text, running them, and reading and writing weights."""
+"""Builds nets from text, runs them, and reads and writes their weights."""

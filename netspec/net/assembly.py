@@ -1,6 +1,7 @@
-"""Makes the layers of a plan in order, connects shared parameters, and works out what the net needs to run.
+"""Makes the layers of a plan in order, connects shared parameters, and determines which layers run backward.
 
-Caffe: Net::Init (src/caffe/net.cpp); the sites in the log calls are the lines of that file that print the same.
+Caffe: Net::Init (src/caffe/net.cpp). The places in the log calls, such as net.cpp:124, are the lines of that file that
+print the same.
 """
 
 from __future__ import annotations
@@ -31,21 +32,21 @@ from netspec.proto.schema import TEST
 from netspec.run.eager import last_uses
 
 BYTES = 4  # of a number: float32
-UNCHECKED_SHARE = 8  # once a net has taken 1/8 of the limit, the need of the whole net is added up
+UNCHECKED_SHARE = 8  # the need of the whole net is computed only once its layers have taken 1/8 of the limit
 
-#: Fields of every layer, which the net reads.
+#: Fields that every layer has and that the net reads, not the layer.
 COMMON = frozenset(
     {"name", "type", "bottom", "top", "phase", "loss_weight", "param", "blobs", "propagate_down", "include", "exclude"}
 )
-#: Fields that choose an implementation in Caffe. No result depends on them.
+#: Fields that only choose an implementation in Caffe, so results do not depend on them.
 WITHOUT_EFFECT = frozenset({"engine", "force_nd_im2col", "share_in_parallel", "stable_prod_grad"})
 
-_Fields = tuple[str, ...]
+_FieldPath = tuple[str, ...]  # the names from the layer's field to the field inside it
 
 
 @dataclass(frozen=True)
 class Learnable:
-    """A parameter as the solver sees it: once, with the place of its owner and its multipliers."""
+    """A learnable blob with the layer that owns it, its index there, and its multipliers."""
 
     parameter: torch.nn.Parameter
     lr_mult: float
@@ -55,11 +56,12 @@ class Learnable:
 
 
 class Assembly:
-    """The layers of a plan. ``layers[i]`` belongs to node i; where errors are collected, faulty layers are missing.
+    """The layers of a plan, and what the net needs to run them.
 
-    ``shapes`` has the shape of each blob, and ``loss_weights[i][j]`` is the loss weight of top j of layer i.
-    ``backward`` says which layers need backward computation; it is None if a layer is missing. ``options`` are the
-    options given, with the dialects of the net added.
+    ``layers[i]`` belongs to node i. If errors are collected rather than raised, faulty layers are missing. ``shapes``
+    has the shape of each blob, and ``loss_weights[i][j]`` is the loss weight of top j of layer i. ``backward`` says
+    which layers need backward computation; it is None if a layer is missing. ``options`` are the given options, with
+    the dialects of the net added.
     """
 
     def __init__(self, plan: Plan, options: BuildOptions) -> None:
@@ -70,24 +72,24 @@ class Assembly:
         self.layers: dict[int, Layer] = {}
         self.shapes: dict[str, Shape] = {}
         self.loss_weights: list[list[float]] = []
-        self.learnable: list[Learnable] = []
-        self.need = Need(plan, last_uses(plan))
+        self.learnable: list[Learnable] = []  # a shared blob is there once
+        self.need = MemoryNeed(plan, last_uses(plan))
         self.backward: Backward | None = None
         self.random = Random(int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed)
         self._device = device_of(options.device)
         self._values: dict[int, Shape] = {}
         self._memory = 0  # as Caffe counts it
-        self._surveyed, self._too_much = False, None  # whether the whole net was looked at, and what was found
+        self._whole_checked, self._whole_fault = False, None  # whether the whole net needs too much memory
         for i in range(len(plan.nodes)):
-            if layer := self._made(i):
+            if layer := self._make_layer(i):
                 self._set_up(i, layer)
         if self._device.type != "meta" and (fault := self.need.fault(limit_on(self._device, options.limit))):
             self._report(fault)
         if len(self.layers) == len(plan.nodes):
             self.backward = self._finish(list(self.layers.values()))
 
-    def _made(self, i: int) -> Layer | None:
-        """Return layer ``i``. Return None if it has a fault, which is reported, or if a layer it depends on has one."""
+    def _make_layer(self, i: int) -> Layer | None:
+        """Return layer ``i``, or None if it or a layer that it depends on has a fault. The fault is reported."""
         node, param = self._plan.nodes[i], self._plan.net.layer[i]
         this = _LayerInNet(self._plan, i, partial(self._take, i))
         log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
@@ -107,8 +109,8 @@ class Assembly:
         except (MemoryError, RuntimeError) as fault:
             if not is_out_of_memory(fault):
                 raise
-            there = f"this machine has {amount(memory())}"
-            raise SpecError(f"its blobs need more memory than available: {there}", this.at()) from None
+            message = f"its blobs need more memory than available: this machine has {amount(memory())}"
+            raise SpecError(message, this.at()) from None
         this.take_from = None
         return layer
 
@@ -133,32 +135,32 @@ class Assembly:
         self.need.add(i, layer, BYTES * sum(item.parameter.numel() for item in self.learnable[owned:]))
 
     def _take(self, i: int, size: int) -> None:
-        """Let layer ``i`` take ``size`` bytes of memory while the net is built.
+        """Check, before layer ``i`` takes ``size`` bytes of memory, that it may.
 
         Raises SpecError if the layer or the whole net needs too much. The need of the whole net is computed only once
         the layers have taken 1 / UNCHECKED_SHARE of the limit.
         """
-        if (
-            self._device.type == "meta"
-            or self.need.total + size <= (limit := limit_on(self._device, self.options.limit)) // UNCHECKED_SHARE
-        ):
+        if self._device.type == "meta":
             return
-        if not self._surveyed:
-            self._surveyed, self._too_much = True, self._survey().fault(limit)
-        if self._too_much:
-            raise self._too_much
+        limit = limit_on(self._device, self.options.limit)
+        if self.need.total + size <= limit // UNCHECKED_SHARE:
+            return
+        if not self._whole_checked:
+            self._whole_checked, self._whole_fault = True, self._need_of_whole_net().fault(limit)
+        if self._whole_fault:
+            raise self._whole_fault
         if self.need.parameters + size > limit:
             raise SpecError(
                 f"needs {amount(size)} of memory in addition to {self.need}; {limit_text(limit)}",
                 _LayerInNet(self._plan, i).at(),
             )
 
-    def _survey(self) -> Need:
-        """Return what the net needs, computed from the shapes known so far, without memory, data or Python layers.
+    def _need_of_whole_net(self) -> MemoryNeed:
+        """Return the need of all layers, by building the net a second time on the device meta, without data.
 
-        Making a layer also fills its memory, so the need must be known before the layers are made.
+        Layers that are made take their memory at once, so this must be known before they are made.
         """
-        seen = replace(
+        options = replace(
             self.options,
             device="meta",
             open_data=False,
@@ -168,10 +170,10 @@ class Assembly:
         )
         silent = replace(self._plan, source=self._plan.source.reporting_to(lambda fault: None))
         with log.silent():
-            return Assembly(silent, seen).need
+            return Assembly(silent, options).need
 
     def _adopt_params(self, i: int, layer: Layer) -> None:
-        """Connect the shared parameters of layer ``i`` to their owners; list the others as learnable."""
+        """Replace the shared parameters of layer ``i`` by those of their owners; add the others to ``learnable``."""
         node = self._plan.nodes[i]
         if len(node.params) > len(layer.blobs):
             message = f"found {len(node.params)} param {{ }}, expected at most {len(layer.blobs)}, one per blob"
@@ -205,7 +207,7 @@ class Assembly:
             log.info("net.cpp:467", f"Sharing parameters '{spec.name}' {place}")
 
     def _finish(self, layers: list[Layer]) -> Backward:
-        """Return which layers need backward computation, by Caffe's rules. Log them, and the outputs of the net."""
+        """Return which layers need backward computation, by Caffe's rules. Log the end of Caffe's Net::Init."""
         learns = []
         for node, layer in zip(self._plan.nodes, layers, strict=True):
             learns.append(any(_spec(node, layer, j).lr_mult for j in range(len(layer.blobs))))
@@ -227,9 +229,10 @@ class Assembly:
 
 
 class _LayerInNet:
-    """Layer ``i`` as part of its net: its place in the file, and its log. ``take_from`` counts memory it takes.
+    """What layer ``i`` must know about its net: its place in the file, and its blobs for the log.
 
-    It has slots and does not keep the net alive, because a net may have very many layers.
+    ``take_from`` is called with the bytes that the layer takes. The class has slots and no reference to the Assembly,
+    because a net may have very many layers.
     """
 
     __slots__ = ("_i", "_plan", "take_from")
@@ -277,16 +280,16 @@ def _loss_weights(layer: Layer, report: Report) -> list[float]:
     return [layer.default_loss_weight if j == 0 else 0.0 for j in range(layer.num_tops)]
 
 
-# What a net needs
+# Memory
 
 
-class Need:
+class MemoryNeed:
     """The least memory that a net needs, in bytes, as far as the shapes of its layers are known.
 
     ``parameters`` counts a shared parameter once. ``tops`` is the peak memory of the tops: in phase TEST a top is freed
-    after its last use, in phase TRAIN the backward pass needs all tops. A top that is computed in place, or that shares
-    the memory of its bottom, needs none. ``ahead`` is the memory of batches that data layers read ahead. Gradients, the
-    solver's history and the work memory of kernels are not counted.
+    after its last use; in phase TRAIN all tops are needed for the backward computation. A top that is computed in
+    place, or that shares the memory of its bottom, needs none. ``ahead`` is the memory of batches that data layers read
+    ahead. Gradients, the solver's history and the work memory of kernels are not counted.
     """
 
     def __init__(self, plan: Plan, last_uses: Sequence[Sequence[int]]) -> None:
@@ -295,9 +298,9 @@ class Need:
         self._ends = last_uses if plan.net.state.phase == TEST else [()] * len(plan.nodes)
         self._home: dict[int, int] = {}  # value -> the value that owns its memory
         self._sizes: dict[int, int] = {}
-        self._users: dict[int, int] = {}
+        self._users: dict[int, int] = {}  # how many values that are still needed are in the memory of a value
         self._alive = 0
-        self._largest = (0, 0)  # bytes of the layer that needs most, and its index, negative: the first of equals
+        self._largest = (0, 0)  # bytes of the layer that needs most, and minus its index, so that the first one wins
 
     @property
     def total(self) -> int:
@@ -329,14 +332,14 @@ class Need:
                 self._alive -= 0 if self._users[home] else self._sizes.pop(home)
 
     def fault(self, limit: int) -> SpecError | None:
-        """Return an error that names the layer that needs most, if the net needs more than ``limit``, in bytes."""
+        """Return an error that names the layer that needs most, or None if ``limit`` bytes are enough."""
         if self.total <= limit:
             return None
         size, i = self._largest[0], -self._largest[1]
         node = self._plan.nodes[i]
-        most_of_all = f"needs {amount(size)} of memory, more than any other layer"
         return SpecError(
-            f"{most_of_all}; the net needs at least {self}; {limit_text(limit)}",
+            f"needs {amount(size)} of memory, more than any other layer; "
+            f"the net needs at least {self}; {limit_text(limit)}",
             self._plan.source.at(i, layer=node.name, type=node.type),
         )
 
@@ -354,16 +357,16 @@ def limit_on(device: torch.device, limit: int | None = None) -> int:
 
 
 def limit_text(limit: int) -> str:
-    """Return the words of a message that give the limit and say how to change it."""
+    """Return the part of a message that states the limit and how to change it."""
     return f"the limit is {amount(limit)}; change it with --limit SIZE"
 
 
-# What has no effect
+# Warnings
 
 
 def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
     """Yield a warning for each field that has no effect: its first place in the file, and how many more there are."""
-    found: dict[tuple[str, _Fields, str], list[int]] = {}
+    found: dict[tuple[str, _FieldPath, str], list[int]] = {}
     for i, layer in enumerate(layers):
         for path, reason in _unused(layer):
             found.setdefault((layer.type, path, reason), []).append(i)
@@ -384,7 +387,8 @@ def doubtful_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
         yield f"{plan.source.at(i, layer=plan.nodes[i].name, type=plan.nodes[i].type)}: {doubt}"
 
 
-def _unused(layer: Layer) -> Iterator[tuple[_Fields, str]]:
+def _unused(layer: Layer) -> Iterator[tuple[_FieldPath, str]]:
+    """Yield each field of a layer that it does not read, with the reason to print."""
     partly = {name.partition(".")[0] for name in layer.reads if "." in name}
     for field, value in layer.param.ListFields():
         if field.name in COMMON or field.name in WITHOUT_EFFECT:

@@ -1,4 +1,4 @@
-"""From a prototxt to a runnable net: read, filter, insert splits, plan, build, load weights.
+"""Builds a net from a prototxt: reads and filters it, inserts splits, makes a plan and the layers, loads weights.
 
 Caffe: Net::Init (src/caffe/net.cpp)
 """
@@ -28,9 +28,9 @@ from netspec.proto.text import parse_net, write_text
 def load_net(
     path: str | Path, phase: PhaseValue = TEST, options: BuildOptions | None = None, weights: Iterable[str | Path] = ()
 ) -> Net:
-    """Build the net of a prototxt, with the weights of files. Raises SpecError for every fault of the files.
+    """Build the net of a prototxt and load weights from files. Raises SpecError for every fault of the files.
 
-    ``netspec.load_net`` (netspec/load.py) is this with a keyword for each option.
+    ``netspec.load_net`` (netspec/load.py) has a keyword for each of the options.
     """
     options = options or BuildOptions()
     net, source = parse_net(path)
@@ -41,14 +41,14 @@ def load_net(
 
 
 def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None = None) -> Net:
-    """Filter by the net's own ``state``, insert splits, plan, and build."""
+    """Build a net; only the layers of its ``state`` are kept. ``source`` has the places of its parts in the file."""
     options = options or BuildOptions()
     return build_filtered(*filter_net(net, source), options)
 
 
 @no_collection()
 def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOptions) -> Net:
-    """Insert splits, plan, and build a net that is already filtered by its ``state``."""
+    """Build a net that has only the layers of its ``state``."""
     if log.logger.isEnabledFor(logging.INFO):
         log.dump("net.cpp:53", "Initializing net from parameters: ", write_text(filtered).rstrip("\n"))
     split, source = insert_splits(filtered, source)
@@ -63,15 +63,14 @@ def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOpti
 
 
 def check_sources(net: NetParameter, source: SourceMap, options: BuildOptions) -> None:
-    """Raise SpecError for the first data layer of a net's ``state`` that reads from a path where nothing is.
+    """Raise SpecError for the first data layer of a net's ``state`` whose source does not exist.
 
-    Building the net would raise the same, but perhaps after a long log.
+    Building the whole net would raise the same error, but perhaps after a long log.
     """
     with log.silent():
         net, source = filter_net(net, source)
         for i, layer in enumerate(net.layer):
             path = source_of(layer, class_of(layer))
-            if path and not os.path.exists(path):  # the layer itself knows what to say of it
-                build_filtered(
-                    NetParameter(layer=[layer], state=net.state), source.with_layers([source.layers[i]]), options
-                )
+            if path and not os.path.exists(path):
+                only = NetParameter(layer=[layer], state=net.state)
+                build_filtered(only, source.with_layers([source.layers[i]]), options)  # the layer raises the error

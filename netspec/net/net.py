@@ -1,4 +1,4 @@
-"""Net: a torch.nn.Module that executes a Plan. It knows no layer by its type.
+"""Net: a torch.nn.Module that executes a Plan. Nothing here depends on a type of layer.
 
 Caffe: src/caffe/net.cpp
 """
@@ -37,7 +37,10 @@ V = TypeVar("V")
 
 
 class ByName(dict[str, V]):
-    """Values by the name of a blob or layer. ``known``: other names of the net, which a forward pass could keep."""
+    """A dict by the names of blobs or layers, whose KeyError says what names there are.
+
+    ``known`` are the names of blobs that the last pass did not keep, but could.
+    """
 
     def __init__(self, kind: str, values: Mapping[str, V], known: Iterable[str] = ()) -> None:
         super().__init__(values)
@@ -59,7 +62,8 @@ class Net(torch.nn.Module):
     ``params`` maps layer names to lists of tensors in Caffe's blob order; shared parameters are one object.
     ``layers[i]`` belongs to ``param.layer[i]``, splits included. Gradients are computed by torch.
 
-    Threads may share a net: one waits for the pass of another, and ``blobs`` has what its own last pass kept.
+    Threads may share a net. Each waits until the pass of another has finished, and ``blobs`` has the blobs that the
+    last pass of the same thread kept.
 
         >>> net = netspec.load_net("deploy.prototxt", weights="x.caffemodel")
         >>> net.inputs, net.outputs, net.shapes["feat"]
@@ -79,35 +83,35 @@ class Net(torch.nn.Module):
         self.phase = plan.net.state.phase
         self.device = device_of(options.device)
         self.keep: str | Iterable[str] = ()
-        self._kept_of: dict[str | tuple[str, ...], frozenset[int]] = {}  # by ``keep``, as it was last
-        self._passing = _Passing()
-        if options.exact == ALL and self.device.type == "cpu" and (said := other_kernels()):
-            log.warning("net.cpp:53", said)
-        made = Assembly(plan, options)
-        self.options = made.options
-        self.layers: Any = torch.nn.ModuleList(made.layers.values())
-        self.shapes = ByName("blob", made.shapes)
-        self.loss_weights, self.learnable = made.loss_weights, made.learnable
-        self.need, self.random = made.need, made.random
+        self._kept_values: dict[str | tuple[str, ...], frozenset[int]] = {}  # what the last ``keep`` means
+        self._passes = _Passes()
+        if options.exact == ALL and self.device.type == "cpu" and (warning := other_kernels()):
+            log.warning("net.cpp:53", warning)
+        assembly = Assembly(plan, options)
+        self.options = assembly.options
+        self.layers: Any = torch.nn.ModuleList(assembly.layers.values())
+        self.shapes = ByName("blob", assembly.shapes)
+        self.loss_weights, self.learnable = assembly.loss_weights, assembly.learnable
+        self.need, self.random = assembly.need, assembly.random
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
         self._need_input = [layer for layer in self.layers if isinstance(layer, NeedsInput)]
-        self._given = [
+        self._input_values = [
             v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops
         ]
-        if made.backward is not None:  # otherwise errors were collected, and the net will not run
-            self.backward_plan = made.backward
-            self.plan = unblocked(plan, made.backward)
+        if assembly.backward is not None:  # otherwise errors were collected, and the net will not run
+            self.backward_plan = assembly.backward
+            self.plan = unblocked(plan, assembly.backward)
             self._set_runners()
 
     def _set_runners(self) -> None:
-        """Make the runners. The first one that can run a pass does; the last, ``eager``, always can."""
+        """Make the runners. The first one that can run a pass runs it; the last, ``eager``, can run any."""
         options = self.options
         self.eager = Eager(self.plan, list(self.layers), self.loss_weights, options.exact)
         prepares = options.speed and options.passes and self.phase == TEST
         self.prepared: Any = options.speed.prepared(self.eager, options.passes) if prepares else None
-        self._training: Trainer | str | None = None  # made at the first pass that trains
-        self.largest_trained: float | None = None  # numbers in all tops, for new_trainer
+        self._trainer: Trainer | str | None = None  # made at the first pass that trains
+        self.largest_trained: float | None = None  # the most numbers in all tops for which a trainer is made
         self.runners: list[Runner] = [runner for runner in (self.prepared, self.eager) if runner]
 
     def replace_layer(self, i: int, layer: Layer) -> None:
@@ -117,13 +121,13 @@ class Net(torch.nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the runners."""
-        gone = {"runners", "eager", "prepared", "_training", "_passing"}
+        gone = {"runners", "eager", "prepared", "_trainer", "_passes"}
         return {name: value for name, value in self.__dict__.items() if name not in gone}
 
     @override
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
-        self._passing = _Passing()
+        self._passes = _Passes()
         self._set_runners()
 
     def __repr__(self) -> str:
@@ -135,20 +139,20 @@ class Net(torch.nn.Module):
 
     @override
     def __call__(self, /, *values: Any, **inputs: Any) -> Any:
-        if "self" in inputs and not values:  # the name of a parameter of torch's own, and of an input
+        if "self" in inputs and not values:  # an input named "self" cannot be a keyword of torch's __call__
             return super().__call__(inputs)
         return super().__call__(*values, **inputs)
 
     @override
     def forward(self, /, *values: Array | Mapping[str, Array], **inputs: Array) -> dict[str, torch.Tensor]:
-        """Run the net and return its output blobs; ``inputs`` are the values of the blobs in ``self.inputs``.
+        """Run the net and return its output blobs. ``inputs`` are the values of the blobs in ``self.inputs``.
 
-        They may be one mapping. The value of a net's only input needs no name: ``net(images)``.
+        They may also be given as one mapping, and the value of a net's only input without a name: ``net(images)``.
         """
         return self.forward_loss(**(self._named(values, inputs) if values else inputs))[1]
 
     def _named(self, values: tuple[Any, ...], inputs: Mapping[str, Array]) -> Mapping[str, Array]:
-        """Return the values of inputs that were given without names, by name."""
+        """Return the inputs by name. ``values`` are those that were given without a name."""
         first, *more = values
         if not more and not inputs and isinstance(first, Mapping):
             return first
@@ -160,42 +164,42 @@ class Net(torch.nn.Module):
 
     def forward_loss(self, /, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""
-        with self._passing.lock:
+        with self._passes.lock:
             given, kept = self.given(inputs), self._kept()
             loss, values = next(found for runner in self.runners if (found := runner.run(given, kept)) is not None)
             blobs = self.plan.blobs
-            self._passing.own.blobs = self._passing.last = {blobs[v]: values[v] for v in sorted(kept)}
+            self._passes.of_thread.blobs = self._passes.last = {blobs[v]: values[v] for v in sorted(kept)}
         outputs = {name: values[v] for name, v in self.plan.outputs.items()}
         return (torch.zeros((), device=self.device) if loss is None else loss), outputs
 
     @property
     def blobs(self) -> dict[str, torch.Tensor]:
-        """The blobs kept by the last pass of this thread, or of any thread if it made none; see ``keep``."""
-        return ByName("blob", getattr(self._passing.own, "blobs", self._passing.last), self.shapes)
+        """The blobs kept by the last pass of this thread, or of any thread if this one made none; see ``keep``."""
+        return ByName("blob", getattr(self._passes.of_thread, "blobs", self._passes.last), self.shapes)
 
     def forward_backward(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]] | None:
-        """Run forward and backward by kernels prepared once; return the loss and the outputs, as forward_loss does.
+        """Run forward and backward by prepared kernels; return the loss and the outputs, as forward_loss does.
 
-        Gradients are added to ``grad``. Returns None if autograd is needed: see :meth:`new_trainer`, or because of
-        hooks or ``keep``. The loss is valid until the next call.
+        Gradients are added to ``grad``. The loss is valid until the next call. Returns None, without running anything,
+        if autograd is needed: because of hooks or ``keep``, or because :meth:`new_trainer` gives a reason.
         """
-        training = self.trainer()
-        if training is None or self.keep or training.is_watched():
+        trainer = self.trainer()
+        if trainer is None or self.keep or trainer.is_watched():
             return None
-        with self._passing.lock:
-            loss, outputs = training.run()
-            self._passing.own.blobs = self._passing.last = outputs
+        with self._passes.lock:
+            loss, outputs = trainer.run()
+            self._passes.of_thread.blobs = self._passes.last = outputs
         return loss, outputs
 
     def trainer(self) -> Trainer | None:
-        """Return the trainer that :meth:`forward_backward` runs, or None. It is made once."""
-        if self._training is None:
-            self._training = self.new_trainer()
-        return None if isinstance(self._training, str) else self._training
+        """Return the trainer that :meth:`forward_backward` runs, or None if there is none. It is made once."""
+        if self._trainer is None:
+            self._trainer = self.new_trainer()
+        return None if isinstance(self._trainer, str) else self._trainer
 
     def forget_trainer(self) -> None:
-        """Forget the trainer. The next :meth:`forward_backward` makes a new one, in other memory."""
-        self._training = None
+        """Discard the trainer. The next :meth:`forward_backward` makes a new one, with new memory."""
+        self._trainer = None
 
     def new_trainer(self) -> Trainer | str:
         """Return a trainer that is faster than autograd, or the reason why there is none."""
@@ -204,14 +208,14 @@ class Net(torch.nn.Module):
         return self.options.speed.trainer(self.eager, self.largest_trained)
 
     def given(self, inputs: Mapping[str, Array]) -> dict[int, torch.Tensor]:
-        """Return the values of the net's inputs. Raises SpecError where one is missing, or unknown."""
+        """Return the inputs as tensors, by value number. Raises SpecError for a missing or an unknown one."""
         unknown = sorted(set(inputs) - set(self.inputs))
         missing = [name for name in self.inputs if name not in inputs]
         if unknown or missing:
             found = f"unknown input {unknown[0]!r}" if unknown else f"no value for input {missing[0]!r}"
             known = ", ".join(self.inputs) or "none (the net reads its own data)"
             raise SpecError(f"{found}; this net's inputs: {known}", Where(self.plan.source.file))
-        return {v: self._as_input(inputs[self.plan.blobs[v]]) for v in self._given}
+        return {v: self._as_input(inputs[self.plan.blobs[v]]) for v in self._input_values}
 
     def _as_input(self, value: Array) -> torch.Tensor:
         dtype = self.learnable[0].parameter.dtype if self.learnable else torch.float32
@@ -226,13 +230,14 @@ class Net(torch.nn.Module):
         return torch.as_tensor(array).to(self.device, dtype)
 
     def _kept(self) -> frozenset[int]:
-        asked = self.keep if isinstance(self.keep, str) else tuple(self.keep)
-        if asked not in self._kept_of:
-            current = {name: v for v, name in enumerate(self.plan.blobs)}
-            names = list(current) if asked == "all" else [asked] if isinstance(asked, str) else asked
-            check_blobs(names, current, self.plan.source.file)
-            self._kept_of = {asked: frozenset((*self.plan.outputs.values(), *(current[name] for name in names)))}
-        return self._kept_of[asked]
+        """Return the numbers of the values to keep: the outputs, and what ``keep`` says."""
+        keep = self.keep if isinstance(self.keep, str) else tuple(self.keep)
+        if keep not in self._kept_values:
+            values = {name: v for v, name in enumerate(self.plan.blobs)}  # of an in-place chain, the last one
+            names = list(values) if keep == "all" else [keep] if isinstance(keep, str) else keep
+            check_blobs(names, values, self.plan.source.file)
+            self._kept_values = {keep: frozenset((*self.plan.outputs.values(), *(values[name] for name in names)))}
+        return self._kept_values[keep]
 
     # Parameters and data
 
@@ -253,9 +258,9 @@ class Net(torch.nn.Module):
         return {name: weights[v] for name, v in self.plan.outputs.items()}
 
     def share_weights_with(self, other: Net) -> None:
-        """Use the learnable blobs of ``other`` in the layers of equal names (Caffe: ShareTrainedLayersWith).
+        """Use the learnable blobs of ``other`` in the layers with the same names (Caffe: ShareTrainedLayersWith).
 
-        It is a fault of this net if the blobs of a layer have other shapes there.
+        If the shapes of a layer's blobs differ, an error goes to ``plan.source.report``.
         """
         mine = {layer.param.name: layer for layer in self.layers}
         for theirs in other.layers:
@@ -271,9 +276,9 @@ class Net(torch.nn.Module):
                 layer.blobs[j] = blob
 
     def set_input_arrays(self, data: np.ndarray, labels: np.ndarray | None = None) -> None:
-        """Give the MemoryData layer, the first if there are several, its images (n, C, H, W) and labels (n,).
+        """Give images (n, C, H, W) and labels (n,) to the first MemoryData layer.
 
-        Without labels they are 0. n must be a multiple of the layer's batch size; each pass then takes the next batch.
+        Labels default to 0. n must be a multiple of the layer's batch size. Each pass takes the next batch.
         Raises SpecError for other shapes, and for a net without such a layer.
         Caffe: Net_SetInputArrays (python/caffe/_caffe.cpp)
         """
@@ -284,7 +289,7 @@ class Net(torch.nn.Module):
         taker.set_input_arrays(data, np.zeros(len(data), np.float32) if labels is None else labels)
 
     def missing_inputs(self) -> Iterator[SpecError]:
-        """Yield an error for each layer that needs inputs: a solver gives no inputs to its nets."""
+        """Yield an error for each layer that needs inputs. A solver needs a net without such layers."""
         yield from filter(None, [layer.missing_input() for layer in self._need_input])
 
     def restart_data(self) -> None:
@@ -299,13 +304,13 @@ class Net(torch.nn.Module):
             layer.close()
 
 
-class _Passing:
-    """The thread that runs a net, and the blobs kept by the last pass of each thread. A copy of a net has its own."""
+class _Passes:
+    """The lock for the passes of a net, and the blobs that they kept. A copy of a net gets a new object."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self.own = threading.local()
-        self.last: dict[str, torch.Tensor] = {}
+        self.of_thread = threading.local()  # ``blobs``: those of the last pass of the thread
+        self.last: dict[str, torch.Tensor] = {}  # the blobs of the last pass of any thread
 
     def __reduce__(self) -> Any:
-        return _Passing, ()
+        return _Passes, ()

@@ -37,11 +37,11 @@ def layer(
     allow_python: bool = False,
     exact: str = SMALL,
 ) -> OneLayer:
-    """Return the layer described by ``text``, the part between the braces of ``layer { }``.
+    """Return a layer that can be called with tensors. ``text`` is what stands between the braces of ``layer { }``.
 
-    Bottoms and tops need no names; ``tops`` is the number of tops, by default the smallest. The layer is built when the
-    shapes of its bottoms are known: at the first call, or at once if ``shapes`` are given. ``exact`` is as for a net
-    (netspec/exact). Raises SpecError.
+    Bottoms and tops need no names. ``tops`` is the number of tops, by default the fewest that the type allows. The
+    layer is built when the shapes of its bottoms are known: at the first call, or at once if ``shapes`` are given.
+    ``exact`` is as for a net (netspec/exact). Raises SpecError.
 
         >>> netspec.layer('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }')(images).shape
         torch.Size([2, 3, 16, 16])
@@ -52,9 +52,9 @@ def layer(
 
 
 class OneLayer(torch.nn.Module):
-    """A layer to call with its bottoms, tensors or arrays; it returns its top, or a tuple of tops.
+    """A function of a layer's bottoms, tensors or arrays, that returns its top, or a tuple if it has several.
 
-    ``layer`` is the Layer, with its ``blobs`` and ``top_shapes``; None before it is built.
+    ``layer`` is the Layer, with its ``blobs`` and ``top_shapes``. It is None before the layer is built.
     """
 
     def __init__(self, make: Callable[[Sequence[Shape]], Layer], shapes: Sequence[Shape] = ()) -> None:
@@ -71,9 +71,9 @@ class OneLayer(torch.nn.Module):
 
 
 def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int | None = None) -> Layer:
-    """Build the layer of a text for bottoms of these shapes.
+    """Build the layer that ``text`` describes, for bottoms of these shapes.
 
-    Places in errors are those of the text, unless ``context`` has others.
+    Errors name a line of ``text``, unless ``context`` has another ``at``.
     """
     param = LayerParameter()
     place = read_text(text, FILE, param)

@@ -14,25 +14,25 @@ from netspec.layers.contract.base import Layer
 
 _HEAD = ("layer", "type", "bottoms", "tops", "shapes", "parameters", "MiB", "multiply-adds")
 _LISTS = (2, 3, 4)  # columns of lists, which may take several lines
-_SPARED = ("tops", "MiB", "bottoms", "type", "multiply-adds")  # columns that a narrow table lacks, the first first
-_LEAST = 16  # characters that a list or a name keeps before another column goes
-MOST_WORDS = 20  # blobs of one layer that are listed
-_WORDS = 5  # columns of words, aligned left; then come the numbers
+_OMITTED = ("tops", "MiB", "bottoms", "type", "multiply-adds")  # columns that a narrow table omits, in this order
+_NARROWEST = 16  # characters: lists and names are made this narrow before a column is omitted
+MOST_BLOBS = 20  # of one layer that are listed
+_TEXT_COLUMNS = 5  # aligned left; the columns after them have numbers
 _Row = tuple[list[str], ...]  # the lines of each cell
 
 
 def table(plan: Plan, layers: Sequence[Layer], width: int | None = None) -> str:
-    """Return one line per layer: its name and type, its blobs, the shapes of its tops, its costs; and totals.
+    """Return one line per layer: its name and type, its blobs, the shapes of its tops and its costs; and totals.
 
-    Costs: number of learnable values ("shared" if an earlier layer owns them), memory of its tops, multiply-adds of
-    one forward pass. Splits are left out: a reader of a copy counts as a reader of the blob. In a table of at
-    most ``width`` characters lists take several lines, and if that is not enough, columns are left out, as its last
-    line says.
+    Costs are the number of learnable values ("shared" if an earlier layer owns them), the memory of its tops, and the
+    multiply-adds of one forward pass. Splits are omitted: a reader of a copy is shown as a reader of the blob. So that
+    the table fits into ``width`` characters, lists take several lines. If that is not enough, columns are omitted, and
+    the last line names them.
     """
     rows: list[_Row] = []
     totals = [0, 0, 0]
     counted: set[int] = set()
-    origin: dict[int, int] = {}  # of the copies of a blob
+    origin: dict[int, int] = {}  # copy of a blob -> the blob
     for node, layer in zip(plan.nodes, layers, strict=True):
         bottoms = [origin.get(v, v) for v in node.bottoms]
         if is_split(node.name, node.type):
@@ -56,10 +56,15 @@ def table(plan: Plan, layers: Sequence[Layer], width: int | None = None) -> str:
     return "\n".join(_lines(rows, width))
 
 
-def _listed(words: Iterable[str]) -> list[str]:
-    first = list(islice(words := iter(words), MOST_WORDS))
-    more = sum(1 for _ in words)
-    words = [*first, *([f"and {more:,} more"] if more else [])] or ["-"]
+def _listed(blobs: Iterable[str]) -> list[str]:
+    """Return the words of a list with commas: at most MOST_BLOBS, and how many more there are."""
+    rest = iter(blobs)
+    words = list(islice(rest, MOST_BLOBS))
+    more = sum(1 for _ in rest)
+    if more:
+        words.append(f"and {more:,} more")
+    if not words:
+        return ["-"]
     return [*(f"{word}," for word in words[:-1]), words[-1]]
 
 
@@ -72,17 +77,17 @@ def _lines(rows: Sequence[_Row], width: int | None) -> list[str]:
     """Return the lines of the table, which fit into ``width``, if there is one."""
     columns = list(range(len(_HEAD)))
     whole = [max(len(" ".join(row[k])) for row in rows) for k in columns]
-    spared = [_HEAD.index(name) for name in _SPARED]
+    omitted_next = [_HEAD.index(name) for name in _OMITTED]
     widths = list(whole)
     while width is not None and (over := sum(widths) + 2 * (len(columns) - 1) - width) > 0:
-        # The widest list gives way first; a column is left out where all lists and the names are narrow.
-        shrinks = [k for k in (0, *_LISTS) if k in columns and widths[k] > _LEAST]
-        if shrinks:
-            k = max(shrinks, key=lambda k: widths[k])
-            next_ = max([_LEAST, *(widths[j] for j in shrinks if widths[j] < widths[k])])
-            widths[k] = max(next_, widths[k] - over)
-        elif spared:
-            columns.remove(spared.pop(0))
+        # The widest list becomes narrower first, until another is as wide. Once all are narrow, a column is omitted.
+        wide = [k for k in (0, *_LISTS) if k in columns and widths[k] > _NARROWEST]
+        if wide:
+            widest = max(wide, key=lambda k: widths[k])
+            second = max([_NARROWEST, *(widths[k] for k in wide if widths[k] < widths[widest])])
+            widths[widest] = max(second, widths[widest] - over)
+        elif omitted_next:
+            columns.remove(omitted_next.pop(0))
             widths = [0 if k not in columns else whole[k] for k in range(len(_HEAD))]
         else:
             break
@@ -91,7 +96,7 @@ def _lines(rows: Sequence[_Row], width: int | None) -> list[str]:
         cells = [(k, _wrapped(row[k], widths[k])) for k in columns]
         for line in zip_longest(*(cell for _, cell in cells), fillvalue=""):
             aligned = (
-                word.ljust(widths[k]) if k < _WORDS else word.rjust(widths[k])
+                word.ljust(widths[k]) if k < _TEXT_COLUMNS else word.rjust(widths[k])
                 for (k, _), word in zip(cells, line, strict=True)
             )
             lines.append("  ".join(aligned).rstrip())
@@ -101,7 +106,7 @@ def _lines(rows: Sequence[_Row], width: int | None) -> list[str]:
 
 
 def _wrapped(words: Sequence[str], width: int) -> list[str]:
-    """Return the words in lines of at most ``width`` characters; a word that is longer loses its middle."""
+    """Return the words in lines of at most ``width`` characters. The middle of a longer word becomes an ellipsis."""
     lines: list[str] = []
     for word in words:
         if lines and len(lines[-1]) + 1 + len(word) <= width:

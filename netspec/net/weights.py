@@ -1,4 +1,6 @@
-"""caffemodel <-> Net, by layer name: Caffe's binary form, and its HDF5 form in files that end in ``.h5``.
+"""Loads and saves the weights of a net: in Caffe's binary form, and in its HDF5 form (``.h5``). Also loads safetensors.
+
+Layers of a file and of a net belong together if they have the same name.
 
 Caffe: Net::CopyTrainedLayersFrom, Net::ToProto, Net::ToHDF5 (src/caffe/net.cpp)
 """
@@ -25,28 +27,30 @@ from netspec.files.kinds import head_of, is_safetensors, unreadable
 from netspec.files.memory import give_back_freed_memory
 from netspec.files.whole_file import write_whole
 from netspec.layers.contract.base import Layer, shape_string
+from netspec.net.extra_file import check_weights
 from netspec.net.net import Net
-from netspec.net.sealed import check_weights
 from netspec.proto.binary import MOST_BYTES, net_without_numbers
 from netspec.proto.forks import forks
 from netspec.proto.schema import NetParameter
 
 MOST_NAMES = 20  # layers that a warning names
-Copies = list[tuple[Layer, int, np.ndarray | blobs.Elsewhere]]  # the layer, the blob's number in it, the values
+Copies = list[tuple[Layer, int, np.ndarray | blobs.InFile]]  # the layer, the index of its blob, the values
 
 
 def load_weights(
-    net: Net, path: str | Path | Iterable[str | Path], strict: bool = False, *, some: bool = False
+    net: Net, path: str | Path | Iterable[str | Path], strict: bool = False, *, need_one: bool = False
 ) -> None:
-    """Copy the weights of a .caffemodel, .caffemodel.h5 or .safetensors into the layers of the same names, all or none.
+    """Copy weights from a .caffemodel, .caffemodel.h5 or .safetensors file into the layers with the same names.
 
-    Several files are loaded in order; a later one overrides an earlier one. Layers that only a file has are ignored,
-    and the log names them. One warning names the layers that no file has; they keep their initial values. With
-    ``strict`` this is a SpecError. With ``some`` it is a SpecError if no layer fits. There are also SpecErrors for a
-    file that cannot be read, or that its snapshot did not write, and for another number or shape of blobs than in the
-    net. All go to ``net.plan.source.report``.
+    Several files are loaded in order, and a later one overrides an earlier one. A file with a fault changes nothing in
+    the net. Layers that only a file has are ignored, and the log names them. Layers that no file has keep their initial
+    values, and a warning names them.
+
+    These faults go to ``net.plan.source.report`` as SpecErrors: a file that cannot be read; a file that is not the one
+    that was written with its snapshot; blobs whose number or shapes differ from the net's; with ``strict``, layers that
+    no file has; with ``need_one``, files that have weights for none of the layers.
     """
-    paths: list[str] = [os.fspath(each) for each in several(path)]  # not a Path: of a web address that loses a slash
+    paths: list[str] = [os.fspath(each) for each in several(path)]  # no Path, which removes a slash of a web address
     loaded: set[int] = set()
     whole = True
     for each in paths:
@@ -71,21 +75,21 @@ def load_weights(
         whole = whole and not faults
     give_back_freed_memory()
     if whole:
-        _report_missing(net, loaded, paths, strict, some)
+        _report_missing(net, loaded, paths, strict, need_one)
 
 
 def copy_weights(net: Net, message: NetParameter, path: str | Path) -> None:
-    """Copy the weights in a message, read from ``path``, into the layers of the same names, all or none.
+    """Copy the weights in a message, read from ``path``, into the layers with the same names.
 
-    Layers that only one side has are left alone. For SpecErrors see :func:`load_weights`.
+    Other layers are ignored. For SpecErrors see :func:`load_weights`.
     """
     _copy(partial(_from_message, net, message, str(path), None), net.plan.source.report)
 
 
 def _copy(find: Callable[[Report], Copies], report: Report) -> set[int]:
-    """Copy the values if none has a fault. On the device meta there is nothing to copy.
+    """Copy the values that ``find`` returns, if it reports no fault. Return the ids of the net's blobs that it found.
 
-    Return the ids of the net's blobs that were found.
+    On the device meta nothing is copied.
     """
     faults: list[SpecError] = []
     copies = find(faults.append)
@@ -94,17 +98,19 @@ def _copy(find: Callable[[Report], Copies], report: Report) -> set[int]:
     with torch.no_grad():
         for layer, j, values in copies if not faults else ():
             blob = layer.blob(j)
-            if isinstance(values, blobs.Elsewhere) and not blob.is_meta:
+            if blob.is_meta:
+                continue
+            if isinstance(values, blobs.InFile):
                 _read_into(blob, values)
-            elif not blob.is_meta:
-                with warnings.catch_warnings():  # values may lie in read-only memory: they are only read
+            else:
+                with warnings.catch_warnings():  # torch warns of read-only memory, but it is only read here
                     warnings.simplefilter("ignore", UserWarning)
                     blob.copy_(torch.from_numpy(np.ascontiguousarray(values)).view(blob.shape))
     return {id(layer.blobs[j]) for layer, j, _ in copies}
 
 
-def _read_into(blob: torch.Tensor, values: blobs.Elsewhere) -> None:
-    """Copy numbers from their file into a blob. Raises SpecError where the file cannot be read."""
+def _read_into(blob: torch.Tensor, values: blobs.InFile) -> None:
+    """Copy numbers from their file into a blob. Raises SpecError if the file cannot be read."""
     target = blob if blob.is_contiguous() else torch.empty_like(blob, memory_format=torch.contiguous_format)
     flat = target.view(-1)
     try:
@@ -116,8 +122,8 @@ def _read_into(blob: torch.Tensor, values: blobs.Elsewhere) -> None:
         blob.copy_(target)
 
 
-def _report_missing(net: Net, loaded: set[int], paths: list[str], strict: bool, some: bool) -> None:
-    """Warn of layers with a blob that was not loaded, or report them. Weights in the prototxt count as loaded."""
+def _report_missing(net: Net, loaded: set[int], paths: list[str], strict: bool, need_one: bool) -> None:
+    """Warn of layers with a blob that was not loaded, or report an error. Weights in the prototxt count as loaded."""
     learning = [layer for layer in net.layers if len(layer.blobs)]
     missing = [
         layer for layer in learning if not layer.param.blobs and any(id(blob) not in loaded for blob in layer.blobs)
@@ -131,7 +137,7 @@ def _report_missing(net: Net, loaded: set[int], paths: list[str], strict: bool, 
         fault = f"contains weights for none of the net's {len(learning)} layers with weights: {names}"
     else:
         fault = f"lacks weights for {len(missing)} of the net's {len(learning)} layers with weights: {names}"
-    if strict or (some and nothing):
+    if strict or (need_one and nothing):
         advice = "is it the file of another net?" if nothing else "without strict they keep their fillers' values"
         net.plan.source.report(SpecError(f"{fault}; {advice}", Where(files)))
     else:
@@ -144,10 +150,11 @@ def _names(layers: list[str]) -> str:
 
 
 def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:
-    """Write all layers of the net, splits included, and their weights; with ``diff`` their gradients too.
+    """Write all layers of the net, splits included, and their weights; with ``diff`` also their gradients.
 
-    A shared blob is written for each of its layers, in HDF5 only for its owner. Raises SpecError if the file cannot be
-    written; an older file is then not changed.
+    A file whose name ends in ``.h5`` is HDF5, any other is binary. The binary form has a shared blob in each of its
+    layers, HDF5 only in its owner. Raises SpecError if the file cannot be written; an existing file then stays as it
+    is.
 
         >>> net = netspec.load_net("deploy.prototxt", seed=1)
         >>> netspec.save_weights(net, "random.caffemodel")
@@ -156,25 +163,25 @@ def save_weights(net: Net, path: str | Path, diff: bool = False) -> None:
 
 
 def write_binary(net: Net, path: str | Path, diff: bool = False) -> None:
-    """Do what :func:`save_weights` does in Caffe's binary form, whatever the file's name."""
+    """Write like :func:`save_weights`, but always in Caffe's binary form."""
     if (size := binary_bytes(net, diff)) > MOST_BYTES:
         raise SpecError(f"cannot be written: {too_large(size)}", Where(str(path)))
     write_whole(path, net_to_proto(net, diff).SerializeToString(deterministic=True))
 
 
 def binary_bytes(net: Net, diff: bool = False) -> int:
-    """Return the approximate size in bytes of the weights in Caffe's binary form: the size of their numbers."""
+    """Return the size in bytes of the numbers in Caffe's binary form, which is nearly the size of the file."""
     numbers = sum(math.prod(shape) for layer in net.layers for shape in layer.blob_shapes)
     return (2 if diff else 1) * np.dtype(np.float32).itemsize * numbers
 
 
 def too_large(size: int) -> str:
-    """Return the message for a binary file that would be too large, with advice."""
+    """Return the message for a binary file that would be too large."""
     return f"{size / 2**30:.2f} GiB is more than the 2 GiB limit of a binary file; set snapshot_format: HDF5"
 
 
 def write_hdf5(net: Net, path: str | Path, diff: bool = False) -> None:
-    """Do what :func:`save_weights` does in HDF5, whatever the file's name."""
+    """Write like :func:`save_weights`, but always in HDF5."""
     shared = _shared(net)
     nested = [layer.param.name for layer in net.layers if "/" in layer.param.name and layer.blobs]
     if nested:
@@ -198,17 +205,17 @@ def write_hdf5(net: Net, path: str | Path, diff: bool = False) -> None:
 
 
 def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
-    """Return the net's name, its layers as they run (filtered, split, each with its phase), and their blobs."""
+    """Return the net as a message: its name, and its layers as they run (with splits and phases) with their blobs."""
     proto = NetParameter(name=net.name)
     for layer in net.layers:
         written = proto.layer.add()
         written.CopyFrom(layer.param)
         if layer.default_loss_weight and layer.num_tops == 1 and not written.loss_weight:
-            written.loss_weight.append(1)  # Caffe's loss layers note their default (loss_layer.cpp)
+            written.loss_weight.append(1)  # Caffe's loss layers write their default (loss_layer.cpp)
         del written.blobs[:]
         for j in range(len(layer.blobs)):
             if j == len(written.param) and layer.param_spec(j, None).lr_mult == 0:
-                written.param.add(lr_mult=0)  # as Caffe's BatchNorm notes it (batch_norm_layer.cpp)
+                written.param.add(lr_mult=0)  # as Caffe's BatchNorm does (batch_norm_layer.cpp)
             written.blobs.append(blobs.from_array(_values(layer, j), _gradient(layer, j) if diff else None))
     return proto
 
@@ -232,7 +239,7 @@ def _from_message(net: Net, message: Any, path: str, file: BinaryIO | None, repo
                 report(_wrong_shape(path, source.name, j, blobs.shape_of(blob), target.blob_shapes[j]))
                 continue
             try:
-                copies.append((target, j, blobs.elsewhere(blob, file) or blobs.to_array(blob)))
+                copies.append((target, j, blobs.in_file(blob, file) or blobs.to_array(blob)))
             except ValueError as fault:
                 report(SpecError(f'layer "{source.name}", blob {j}: {fault}', Where(str(path))))
     return copies
@@ -250,7 +257,7 @@ def _from_hdf5(net: Net, path: str, report: Report) -> Copies:
 
 
 def _from_safetensors(net: Net, path: str, report: Report) -> Copies:
-    """Find the weights in what ``netspec export --to safetensors`` writes: LAYER.INDEX."""
+    """Find the weights in a file of ``netspec export --to safetensors``, whose tensors are named LAYER.INDEX."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -293,11 +300,11 @@ def _from_arrays(net: Net, layers: Iterable[tuple[str, Any]], path: str, report:
     return copies
 
 
-# The net's side
+# Net
 
 
 def _layers_by_name(net: Net) -> dict[str, Any]:
-    """Return the layers by name; of equal names the first is used, as in Caffe."""
+    """Return the layers by name. If several have the same name, the first is used, as in Caffe."""
     return {layer.param.name: layer for layer in reversed(net.layers)}
 
 
@@ -324,7 +331,7 @@ def _gradient(layer: Any, j: int) -> np.ndarray:
     return gradient.detach().cpu().numpy().reshape(layer.blob_shapes[j])
 
 
-# The messages
+# Messages
 
 
 def _ignore(name: str) -> None:
@@ -337,7 +344,7 @@ def _wrong_count(path: str, name: str, found: int, expected: int) -> SpecError:
 
 
 def _fits_loosely(layer: Layer, j: int, shape: tuple[int, ...]) -> bool:
-    """Return whether a file's blob differs only in axes of size 1, in a layer type where forks differ in them."""
+    """Return whether a file's blob differs only in axes of size 1, in which forks differ for this layer type."""
     return [n for n in shape if n != 1] == [n for n in layer.blob_shapes[j] if n != 1] and forks().is_loose(layer)
 
 

@@ -3,7 +3,7 @@
 Caffe saves neither its position in the data nor its random numbers. In netspec, all random numbers depend only on the
 seed and the iteration. The file has the seeds, the positions in the data, the state that layers keep between passes,
 and the losses that ``average_loss`` still needs. It also has the settings that affect the results, and the sizes and
-hashes of the weights and the state that belong to it (netspec/net/sealed.py). Caffe does not read it.
+hashes of the weights and the state that belong to it (netspec/net/extra_file.py). Caffe does not read it.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from netspec.errors import SpecError, Where
 from netspec.files.whole_file import write_whole
 from netspec.layers.contract import reading
 from netspec.net.assembly import WITHOUT_EFFECT
+from netspec.net.extra_file import FAULTS, Digest, damaged, extra_text, read_content, shown, whole_number
 from netspec.net.net import Net
-from netspec.net.sealed import FAULTS, Digest, damaged, sealed, shown, unsealed, whole_number
 from netspec.proto.schema import fields_of
 from netspec.solver.snapshot import find_learned_net, read_state
 
@@ -142,14 +142,14 @@ def resume(net: Net, states: Remembered) -> None:
 
 def write_extra(path: str | Path, extra: Extra) -> None:
     """Write the file. Raises SpecError if it cannot be written."""
-    write_whole(path, sealed(asdict(extra)))
+    write_whole(path, extra_text(asdict(extra)))
 
 
 def read_extra(state: str | Path) -> Extra | None:
     """Return the Extra of a state; None if there is no such file, as for Caffe's states. Raises SpecError."""
     path = path_beside(state)
     try:
-        found = unsealed(path)
+        found = read_content(path)
         return Extra(
             whole_number(found["seed"], "seed"),
             [_loss(loss) for loss in _list(found["losses"])],

@@ -13,7 +13,7 @@ import torch
 
 from netspec import log
 from netspec.errors import SpecError, Where
-from netspec.net.sealed import Digest
+from netspec.net.extra_file import Digest
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import SolverParameter
 from netspec.solver import nets

@@ -45,8 +45,8 @@ from netspec.files.scores import Score, Scores, Snapshot, read_scores
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
+from netspec.net.extra_file import Digest, extra_text
 from netspec.net.net import Net
-from netspec.net.sealed import Digest, sealed
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST
 from netspec.proto.text import parse_net_text, parse_solver_text
@@ -113,7 +113,7 @@ def unhashed(data: bytes) -> bytes:
 def hashed(data: bytes) -> bytes:
     """Return an .extra file of damaged content with a valid hash, if the content is JSON."""
     try:
-        return sealed(json.loads(data)).encode()
+        return extra_text(json.loads(data)).encode()
     except (ValueError, TypeError, RecursionError):
         return data
 

@@ -274,7 +274,8 @@ class VideoData(files.ReadingLayer):
             if getattr(p, name) < 1:
                 yield self.error(f"{name} must be at least 1", GROUP, name)
         try:
-            assert not p.name_pattern or p.name_pattern % (("x", 1) if p.modality == FLOW else (1,))
+            if p.name_pattern:
+                _ = p.name_pattern % (("x", 1) if p.modality == FLOW else (1,))
         except (TypeError, ValueError):
             expected = "flow_%c_%05d.jpg" if p.modality == FLOW else "img_%05d.jpg"
             yield self.error(f'found "{p.name_pattern}", expected a pattern as {expected}', GROUP, "name_pattern")

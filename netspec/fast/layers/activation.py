@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from netspec.exact import ALL
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Folds
-from netspec.fast.kernels import RELU, Finish, Inference, Kernel, Learning, Room, clip, finished
+from netspec.fast.kernels import RELU, Activation, Buffer, Inference, Kernel, Learning, clip, with_activation
 from netspec.layers.activation import BNLL, ELU, Clip, PReLU, ReLU, Rounded, Sigmoid, Swish, TanH, Threshold
 from netspec.layers.contract.learned import values_of
 from netspec.layers.powers import AbsVal, Exp, Log, Power
@@ -23,21 +23,21 @@ _VECTORS = 2**12  # numbers: for fewer, one call of torch is faster than several
 
 def _relu_folds(layer: ReLU) -> Folds:
     if not layer.slope:
-        return Folds(finish=RELU)
-    return Folds(finish=Finish(f"leaky_relu {layer.slope}", partial(F.leaky_relu_, negative_slope=layer.slope)))
+        return Folds(activation=RELU)
+    return Folds(activation=Activation(f"leaky_relu {layer.slope}", partial(F.leaky_relu_, negative_slope=layer.slope)))
 
 
 def _learn_relu(layer: ReLU, how: Learning) -> Kernels | None:
     if layer.slope:
         return None
-    rooms, gradient = (Room(), Room()), torch.ops.aten.threshold_backward.grad_input
+    buffers, gradient = (Buffer(), Buffer()), torch.ops.aten.threshold_backward.grad_input
 
     def forward(x: torch.Tensor) -> torch.Tensor:
-        return torch.clamp_min(x, 0, out=rooms[0].like(x))
+        return torch.clamp_min(x, 0, out=buffers[0].like(x))
 
     def backward(diff: torch.Tensor) -> torch.Tensor:
-        top = rooms[0].like(diff)
-        return gradient(diff, top, 0, grad_input=rooms[1].like(top))  # in the order in which autograd has it
+        top = buffers[0].like(diff)
+        return gradient(diff, top, 0, grad_input=buffers[1].like(top))  # with strides as in autograd
 
     return Kernels(forward, backward)
 
@@ -46,7 +46,7 @@ def _prelu(layer: PReLU, how: Inference) -> Kernel | None:
     if layer.context.options.exact == ALL:
         return None
     slopes = values_of(layer.blob(0)).clone().reshape(-1)
-    return finished(lambda x: torch.prelu(x, slopes), how.finish)
+    return with_activation(lambda x: torch.prelu(x, slopes), how.activation)
 
 
 def _learn_prelu(layer: PReLU, how: Learning) -> Kernels | None:
@@ -63,7 +63,7 @@ def _learn_prelu(layer: PReLU, how: Learning) -> Kernels | None:
         return torch.prelu(x, flat)
 
     def backward(diff: torch.Tensor) -> torch.Tensor:
-        if diff.numel() > _VECTORS and diff.stride() == given.stride():  # torch takes number by number
+        if diff.numel() > _VECTORS and diff.stride() == given.stride():  # torch's own kernel is not vectorized
             above = given > 0
             found, terms = torch.where(above, diff, diff * by_channel), torch.where(above, 0, given * diff)
         else:
@@ -78,31 +78,31 @@ def _learn_prelu(layer: PReLU, how: Learning) -> Kernels | None:
 def _learn_tanh(layer: TanH, how: Learning) -> Kernels | None:
     if layer.context.options.exact == ALL:
         return None
-    rooms, gradient = (Room(), Room()), torch.ops.aten.tanh_backward.grad_input
+    buffers, gradient = (Buffer(), Buffer()), torch.ops.aten.tanh_backward.grad_input
 
     def forward(x: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(x, out=rooms[0].like(x))
+        return torch.tanh(x, out=buffers[0].like(x))
 
     def backward(diff: torch.Tensor) -> torch.Tensor:
-        return gradient(diff, rooms[0].like(diff), grad_input=rooms[1].like(diff))
+        return gradient(diff, buffers[0].like(diff), grad_input=buffers[1].like(diff))
 
     return Kernels(forward, backward)
 
 
-def _in_place(finish: Finish, layer: Rounded) -> Folds:
-    return Folds(finish=None if layer.context.options.exact == ALL else finish)
+def _in_place(activation: Activation, layer: Rounded) -> Folds:
+    return Folds(activation=None if layer.context.options.exact == ALL else activation)
 
 
 def _clip_folds(layer: Clip) -> Folds:
-    return Folds(finish=clip(layer.low, layer.high) if layer.low <= layer.high else None)
+    return Folds(activation=clip(layer.low, layer.high) if layer.low <= layer.high else None)
 
 
 ENTRIES = {
     ReLU: Entry(learning=_learn_relu, folds=_relu_folds, fresh=True, any_layout=True),
     PReLU: Entry(_prelu, _learn_prelu, fresh=True, any_layout=True),
-    Sigmoid: Entry(folds=partial(_in_place, Finish("sigmoid", torch.sigmoid_)), fresh=True, any_layout=True),
+    Sigmoid: Entry(folds=partial(_in_place, Activation("sigmoid", torch.sigmoid_)), fresh=True, any_layout=True),
     TanH: Entry(
-        learning=_learn_tanh, folds=partial(_in_place, Finish("tanh", torch.tanh_)), fresh=True, any_layout=True
+        learning=_learn_tanh, folds=partial(_in_place, Activation("tanh", torch.tanh_)), fresh=True, any_layout=True
     ),
     Clip: Entry(folds=_clip_folds, fresh=True, any_layout=True),
     Power: Entry(any_layout=True),

@@ -9,10 +9,19 @@ import torch.nn.functional as F
 
 from netspec.exact import SMALL_PRODUCT
 from netspec.fast import fused
-from netspec.fast.bound import BoundVectors, Weights, at_rest
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Absorbed, Folds, blob_like, copy_of
-from netspec.fast.kernels import Inference, Kernel, Learning, Room, copies, finished, overwriting, weight_and_bias
+from netspec.fast.kernels import (
+    Buffer,
+    Inference,
+    Kernel,
+    Learning,
+    copies,
+    product_kernel,
+    weight_and_bias,
+    with_activation,
+)
+from netspec.fast.products import PreparedVectors, Weights, fixed_weights
 from netspec.layers.common import Dropout, InnerProduct
 from netspec.proto.schema import TRAIN
 from netspec.run.recorded import Kernels
@@ -24,16 +33,16 @@ def _inner_product(layer: InnerProduct, how: Inference) -> Kernel | None:
     rows = math.prod(top_shape[:-1])
     one_by_one = (rows, layer.inputs)
     if layer.arithmetic(weight).is_caffes and math.prod(layer.bottom_shapes[0]):
-        learned = at_rest(*copies(layer.values(), how))
-        return overwriting(BoundVectors(layer.bottom_shapes[0], top_shape, transposed, learned), how)
+        learned = fixed_weights(*copies(layer.values(), how))
+        return product_kernel(PreparedVectors(layer.bottom_shapes[0], top_shape, transposed, learned), how)
     weight = weight.t() if transposed else weight
     # A single vector is multiplied as fast as memory gives the weights, whatever their layout.
     if rows == 1:
-        multiply = finished(fused.vector_product(weight, bias), how.finish)
+        multiply = with_activation(fused.vector_product(weight, bias), how.activation)
     elif how.pack and fused.suits(weight) and rows * weight.numel() > SMALL_PRODUCT:
         multiply = fused.product(weight, bias, how)
     else:
-        multiply = finished(lambda vectors: F.linear(vectors, weight, bias), how.finish)
+        multiply = with_activation(lambda vectors: F.linear(vectors, weight, bias), how.activation)
     if layer.axis == 1:
         return lambda data: multiply(data.reshape(one_by_one))
     return lambda data: multiply(data.reshape(one_by_one)).view(top_shape)
@@ -46,8 +55,8 @@ def _learn_inner_product(layer: InnerProduct, how: Learning) -> Kernels | None:
     if math.prod(top_shape) == 0 or inputs == 0:
         return None
     if layer.arithmetic(weight).is_caffes:
-        bound = BoundVectors(layer.bottom_shapes[0], top_shape, transposed, Weights(weight, bias, *sums), wanted)
-        return Kernels(bound.forward, bound.backward)
+        product = PreparedVectors(layer.bottom_shapes[0], top_shape, transposed, Weights(weight, bias, *sums), wanted)
+        return Kernels(product.forward, product.backward)
     tops = weight.new_empty(math.prod(top_shape[:-1]), top_shape[-1])
     top, matrix = tops.view(top_shape), weight if transposed else weight.t()
     diff = torch.empty(layer.bottom_shapes[0]) if wanted else None
@@ -90,18 +99,18 @@ def _inner_product_folds(layer: InnerProduct) -> Folds:
 
 
 def _learn_dropout(layer: Dropout, how: Learning) -> Kernels:
-    """Return kernels that keep the numbers drawn, which scale the gradients too."""
+    """Return kernels that use the same random mask for the numbers and for their gradients."""
     if layer.phase != TRAIN:
         return Kernels(lambda data: data, lambda diff: diff)
-    draws, rooms, share = layer.context.random, (Room(), Room(), Room()), 1 - layer.ratio
+    draws, buffers, share = layer.context.random, (Buffer(), Buffer(), Buffer()), 1 - layer.ratio
 
     def forward(data: torch.Tensor) -> torch.Tensor:
-        kept, top = rooms[0].like(data), rooms[1].like(data)
+        kept, top = buffers[0].like(data), buffers[1].like(data)
         kept.bernoulli_(share, generator=draws.on(data.device)).mul_(1 / share)
         return torch.mul(data, kept, out=top)
 
     def backward(diff: torch.Tensor) -> torch.Tensor:
-        return torch.mul(diff, rooms[0].like(diff), out=rooms[2].like(diff))
+        return torch.mul(diff, buffers[0].like(diff), out=buffers[2].like(diff))
 
     return Kernels(forward, backward)
 

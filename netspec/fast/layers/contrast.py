@@ -6,7 +6,7 @@ import torch
 
 from netspec.exact import ALL
 from netspec.fast.entry import Entry
-from netspec.fast.kernels import Inference, Kernel, finished
+from netspec.fast.kernels import Inference, Kernel, with_activation
 from netspec.layers.contrast import ACROSS_CHANNELS, LRN
 
 
@@ -15,7 +15,7 @@ def _lrn(layer: LRN, how: Inference) -> Kernel | None:
     if param.norm_region != ACROSS_CHANNELS or layer.context.options.exact == ALL:
         return None
     size, channels, reach = param.local_size, shape[1], param.local_size // 2
-    frames: dict[bool, torch.Tensor] = {}
+    frames: dict[bool, torch.Tensor] = {}  # the squares with zeros before and after them, by layout
 
     def kernel(data: torch.Tensor) -> torch.Tensor:
         side_by_side = not data.is_contiguous()
@@ -35,7 +35,7 @@ def _lrn(layer: LRN, how: Inference) -> Kernel | None:
             return root.mul_(root.sqrt()).mul_(data)
         return base.pow_(-param.beta).mul_(data)
 
-    return finished(kernel, how.finish)
+    return with_activation(kernel, how.activation)
 
 
 ENTRIES = {LRN: Entry(_lrn, fresh=True, any_layout=True)}

@@ -13,7 +13,7 @@ from netspec.run.recorded import Kernels
 
 
 def _capped_folds(layer: Any) -> Folds:
-    return Folds(finish=None if layer.slope else clip(0, 6))
+    return Folds(activation=None if layer.slope else clip(0, 6))
 
 
 def _framed(layer: Any, how: Inference) -> Kernel | None:

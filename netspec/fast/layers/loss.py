@@ -29,9 +29,9 @@ def _learn_softmax(layer: SoftmaxWithLoss, how: Learning) -> Kernels | None:
     divisor = float(normalizer(layer.normalization, layer.outer, layer.inner, None))
     exact = layer.arithmetic(torch.empty(1), small=math.prod(split[1:]) <= SMALL_ITEM).is_caffes
     label, diff = torch.empty(flat, dtype=torch.long), torch.empty(split)
-    normalize = _bound_softmax(split) if exact else partial(F.softmax, dim=1)
-    sum_up = _bound_cross_entropy(split, FLT_MIN, divisor) if exact else lambda p, _: _mean(p, label, divisor)
-    # p and its gradient are arrays, because the overhead of torch's calls exceeds the work.
+    normalize = _prepared_softmax(split) if exact else partial(F.softmax, dim=1)
+    sum_up = _prepared_cross_entropy(split, FLT_MIN, divisor) if exact else lambda p, _: _mean(p, label, divisor)
+    # Numpy works on p and its gradient, because its calls have less overhead than torch's.
     p, classes, found = torch.empty(0), label.numpy().reshape(-1), diff.numpy()
     unsigned, starts = classes.view(np.uint64), np.arange(layer.outer * layer.inner)
     starts += (layer.classes - 1) * layer.inner * (starts // layer.inner)  # where the first class is
@@ -59,8 +59,8 @@ def _mean(p: torch.Tensor, label: torch.Tensor, divisor: float) -> torch.Tensor:
     return (-p.gather(1, label).clamp_(min=FLT_MIN).log()).sum() / divisor
 
 
-def _bound_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return a function like netspec.exact.losses.softmax, for float32 scores of one shape, with its own memory.
+def _prepared_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return a function like netspec.exact.losses.softmax, for float32 scores of one shape. It reuses its memory.
 
     It must run in one thread.
     """
@@ -78,12 +78,12 @@ def _bound_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torc
     return run
 
 
-def _bound_cross_entropy(
+def _prepared_cross_entropy(
     shape: tuple[int, int, int], least: float, divisor: float
 ) -> Callable[[torch.Tensor, np.ndarray], torch.Tensor]:
-    """Return a function that computes the sum of -log(max(p, least)) / ``divisor``, (), adding one by one.
+    """Return a function of p, float32 of this shape, and of the positions of the labels' probabilities in it.
 
-    It takes p, float32 of this shape, and the places of the numbers to use.
+    It returns the sum of -log(max(probability, least)) / ``divisor`` as a scalar, added one by one as in Caffe.
     """
     one, loss = torch.ones(()), torch.empty(())
     chosen, logs = torch.empty(2, shape[0] * shape[2])

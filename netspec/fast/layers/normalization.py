@@ -10,7 +10,7 @@ import torch
 from netspec.exact.by_torch import normalized_batch
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Affine, Folds, blob_in_double
-from netspec.fast.kernels import Inference, Kernel, Learning, Room, finished
+from netspec.fast.kernels import Buffer, Inference, Kernel, Learning, with_activation
 from netspec.layers.normalization import BatchNorm, means
 from netspec.run.recorded import Kernels
 
@@ -29,13 +29,13 @@ def _folds(layer: BatchNorm) -> Folds:
 def _by_past(layer: BatchNorm, how: Inference) -> Kernel | None:
     if not layer.use_global_stats:
         return None
-    return finished(layer.by_past(layer.arithmetic(layer.blob(0))), how.finish)
+    return with_activation(layer.by_past(layer.arithmetic(layer.blob(0))), how.activation)
 
 
 def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
     if layer.use_global_stats or math.prod(layer.top_shapes[0]) == 0 or layer.arithmetic(layer.blob(0)).is_caffes:
         return None
-    room, rectifies, sums = Room(), layer.rectifies, [*how.sums[3:], None, None][:2]
+    buffer, rectifies, sums = Buffer(), layer.rectifies, [*how.sums[3:], None, None][:2]
     asked = [how.wanted[0], *(total is not None for total in sums)]
     gradients, rectified = torch.ops.aten.native_batch_norm_backward, torch.ops.aten.threshold_backward.grad_input
     given = top = mean = deviation = torch.empty(0)
@@ -49,7 +49,7 @@ def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
 
     def backward(diff: torch.Tensor) -> torch.Tensor | None:
         if rectifies:
-            diff = rectified(diff, top, 0, grad_input=room.like(top))
+            diff = rectified(diff, top, 0, grad_input=buffer.like(top))
         factors = layer.factors()[0]
         found, *learned = gradients(diff, given, factors, None, None, mean, deviation, True, layer.eps, asked)
         for total, gradient in zip(sums, learned, strict=True):

@@ -7,7 +7,7 @@ import torch
 from netspec.exact.by_torch import scales_channels
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Absorbed, Affine, Folds, blob_in_double, copy_of
-from netspec.fast.kernels import Inference, Kernel, Learning, finished
+from netspec.fast.kernels import Inference, Kernel, Learning, with_activation
 from netspec.layers.scale import Bias, Scale
 from netspec.run.recorded import Kernels, recorded
 
@@ -17,19 +17,20 @@ def _scale(layer: Scale, how: Inference) -> Kernel | None:
         return None
     scale, bias = layer.blob(0), layer.blob(1) if len(layer.blobs) > 1 else None
     if not layer.arithmetic(scale).is_caffes:
-        return finished(scales_channels(scale, bias), how.finish)
+        return with_activation(scales_channels(scale, bias), how.activation)
     axes = (-1, *(1,) * (len(layer.bottom_shapes[0]) - 2))
     factors, *shifts = (values.clone().view(axes) for values in layer.values())
     if not shifts:
-        return finished(lambda data: data * factors, how.finish)
-    return finished(lambda data: (data * factors).add_(shifts[0]), how.finish)
+        return with_activation(lambda data: data * factors, how.activation)
+    return with_activation(lambda data: (data * factors).add_(shifts[0]), how.activation)
 
 
 def _learn_scale(layer: Scale, how: Learning) -> Kernels | None:
     if not layer.by_channel:
         return None
-    adds = layer.arithmetic(layer.blob(0)).is_caffes and layer.context.options.accumulate_in_place  # as Caffe, itself
-    return recorded(layer.run, how.wanted, list(layer.blobs)) if adds and how.steady else None
+    # Then the layer itself adds to its gradients in Caffe's order, so they are not added a second time.
+    adds_itself = layer.arithmetic(layer.blob(0)).is_caffes and layer.context.options.accumulate_in_place
+    return recorded(layer.run, how.wanted, list(layer.blobs)) if adds_itself and how.steady else None
 
 
 def _scale_folds(layer: Scale) -> Folds:

@@ -6,7 +6,7 @@ import torch
 
 from netspec.exact import switch
 from netspec.fast.entry import Entry
-from netspec.fast.kernels import Inference, Kernel, Learning, finished
+from netspec.fast.kernels import Inference, Kernel, Learning, with_activation
 from netspec.layers.utility.arithmetic import Eltwise, Softmax
 from netspec.layers.utility.parts import Concat, Slice
 from netspec.layers.utility.shape import Split
@@ -20,7 +20,7 @@ def _adds_two(layer: Eltwise) -> bool:
 def _eltwise(layer: Eltwise, how: Inference) -> Kernel | None:
     if not _adds_two(layer):
         return None
-    return finished(torch.Tensor.add_ if how.reuse else torch.add, how.finish)
+    return with_activation(torch.Tensor.add_ if how.reuse else torch.add, how.activation)
 
 
 def _learn_eltwise(layer: Eltwise, how: Learning) -> Kernels | None:
@@ -38,7 +38,7 @@ def _split(layer: Split, how: Inference) -> Kernel:
 
 
 def _learn_split(layer: Split, how: Learning) -> Kernels:
-    """Return kernels that add gradients in Caffe's order, or in the order of autograd: the last one first."""
+    """Return kernels that add gradients in Caffe's order if sums are exact, or as autograd does: the last one first."""
     order = 1 if layer.num_tops > 2 and switch.applies(layer.context.options.exact, torch.empty(1)) else -1
     tops = layer.num_tops
 

@@ -14,10 +14,10 @@ from netspec.exact import SMALL_PRODUCT
 from netspec.exact.layout import channels_side_by_side, map_by_map, of_one_channel
 from netspec.exact.products import Filter, laid_out_like
 from netspec.fast import fused
-from netspec.fast.bound import BoundColumns, Weights, at_rest
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Absorbed, Folds, blob_like, copy_of
-from netspec.fast.kernels import Inference, Kernel, Learning, copies, finished, overwriting, weight_and_bias
+from netspec.fast.kernels import Inference, Kernel, Learning, copies, product_kernel, weight_and_bias, with_activation
+from netspec.fast.products import PreparedColumns, Weights, fixed_weights
 from netspec.layers.vision.convolution import Convolution, Deconvolution
 from netspec.layers.vision.pooling import AVE, STOCHASTIC, Pooling
 from netspec.layers.vision.windows import CEIL, LOWEST, Windows, max_pool
@@ -27,37 +27,38 @@ SLICED, SLICED_BY_TWO = 2**12, 2**17  # numbers in a bottom: for more, slices ar
 
 
 def is_usual(layer: Convolution) -> bool:
-    """Return whether a convolution has a single bottom (N, C, H, W), and no zeros but the padding around it."""
+    """Return whether torch has this convolution: a single bottom (N, C, H, W), the same padding on both sides."""
     over_maps = layer.channel_axis == 1 and layer.spatial_axes == 2 and not any(layer.overhang(layer.bottom_shapes[0]))
     return over_maps and len(layer.bottom_shapes) == 1 and math.prod(layer.top_shapes[0]) > 0
 
 
 def convolution(layer: Convolution, how: Inference) -> Kernel | None:
-    """Return the kernel for a single bottom (N, C, H, W)."""
+    """Return the kernel of a usual convolution; None for others."""
     if not is_usual(layer):
         return None
     shape, sliding = layer.bottom_shapes[0], Filter(layer.kernel, layer.stride, layer.pad, layer.dilation)
     weight, bias = layer.blob(0), layer.blob(1) if len(layer.blobs) > 1 else None
     if layer.arithmetic(weight).is_caffes:
-        return overwriting(BoundColumns(shape, sliding, layer.group, at_rest(*copies(layer.values(), how))), how)
+        weights = fixed_weights(*copies(layer.values(), how))
+        return product_kernel(PreparedColumns(shape, sliding, layer.group, weights), how)
     if sliding.reads_padding_alone:
         return None
     if shape[0] * layer.work > SMALL_PRODUCT and how.pack and fused.suits(weight):
         return fused.convolution(shape, weight, bias, sliding, layer.group, how)
     geometry = (layer.stride, layer.pad, layer.dilation, layer.group)
-    return finished(lambda maps: torch.conv2d(of_one_channel(maps), weight, bias, *geometry), how.finish)
+    return with_activation(lambda maps: torch.conv2d(of_one_channel(maps), weight, bias, *geometry), how.activation)
 
 
 def learn_convolution(layer: Convolution, how: Learning) -> Kernels | None:
-    """Return the kernels for a single bottom (N, C, H, W)."""
+    """Return the training kernels of a usual convolution; None for others."""
     if not is_usual(layer):
         return None
     shape, sliding = layer.bottom_shapes[0], Filter(layer.kernel, layer.stride, layer.pad, layer.dilation)
     (weight, bias), sums = weight_and_bias(layer, how)
     weights = Weights(weight, bias, *sums)
     if layer.arithmetic(weight).is_caffes:
-        bound = BoundColumns(shape, sliding, layer.group, weights, how.wanted[0], how.steady)
-        return Kernels(bound.forward, bound.backward)
+        product = PreparedColumns(shape, sliding, layer.group, weights, how.wanted[0], how.steady)
+        return Kernels(product.forward, product.backward)
     if sliding.reads_padding_alone:
         return None
     lay_out = channels_side_by_side if math.prod(shape) > 2 * weight.numel() else map_by_map
@@ -71,12 +72,16 @@ def _convolutions(
     wanted: bool,
     lay_out: Callable[[torch.Tensor], torch.Tensor],
 ) -> Kernels:
-    """Return the result of SummedConvolutions (exact/products.py) for maps in the layout that ``lay_out`` makes."""
+    """Return kernels with the numbers of SummedConvolutions (exact/products.py).
+
+    ``lay_out`` returns maps in the memory layout that the kernels use.
+    """
     weight, bias, *sums = weights
     geometry = (sliding.stride, sliding.pad, sliding.dilation)
     asked = (wanted, *(total is not None for total in sums))
     bias_shape = None if bias is None else list(bias.shape)
-    # As autograd does it: of a single image, the strides that a reshape leaves decide how BatchNorm rounds.
+    # The reshapes below are those of autograd. They set the strides of a single image, on which the rounding of
+    # BatchNorm depends.
     shape, top_shape, group = layer.bottom_shapes[0], layer.top_shapes[0], layer.group
     gradients = torch.ops.aten.convolution_backward.default
     maps = laid_out = weight
@@ -100,7 +105,7 @@ def _convolutions(
 
 
 def convolution_folds(layer: Convolution) -> Folds:
-    """Return how a convolution, or a deconvolution, scales and shifts the channels of its top as well."""
+    """Return how a convolution or deconvolution absorbs scales and shifts of the channels of its top."""
 
     def absorb(scale: torch.Tensor, shift: torch.Tensor) -> Absorbed:
         param = copy_of(layer.param)
@@ -112,7 +117,7 @@ def convolution_folds(layer: Convolution) -> Folds:
 
 
 def _scaled_filters(layer: Convolution, scale: torch.Tensor) -> torch.Tensor:
-    """Return blobs[0] with the filters of each output channel multiplied by a number of their own."""
+    """Return blobs[0] with the filters of output channel c multiplied by ``scale[c]``."""
     filters = blob_like(layer, 0, scale)
     if not isinstance(layer, Deconvolution):
         return filters * scale.reshape(-1, *(1,) * (filters.dim() - 1))
@@ -147,7 +152,7 @@ def _pooling(layer: Pooling, how: Inference) -> Kernel | None:
     windows = layer.windows
     geometry, ceil = (windows.kernel, windows.stride, windows.pad), windows.round_mode == CEIL
     if layer.method == AVE:
-        return finished(lambda maps: F.avg_pool2d(maps, *geometry, ceil, True), how.finish)
+        return with_activation(lambda maps: F.avg_pool2d(maps, *geometry, ceil, True), how.activation)
 
     size = 0 if any(windows.pad) else math.prod(layer.bottom_shapes[0])
     small = size <= (SLICED_BY_TWO if max(windows.kernel) <= 2 else math.inf)  # where channels lie side by side
@@ -157,10 +162,10 @@ def _pooling(layer: Pooling, how: Inference) -> Kernel | None:
             values = largest(maps, windows)
         else:
             values = torch.max_pool2d(maps, *geometry, 1, ceil)
-        # As in max_pool: in torch NaN wins.
+        # As in max_pool: torch returns NaN if a window contains NaN, Caffe does not.
         return values if values.amin().item() > LOWEST else max_pool(maps, windows)[0]
 
-    return finished(kernel, how.finish)
+    return with_activation(kernel, how.activation)
 
 
 def _learn_pooling(layer: Pooling, how: Learning) -> Kernels | None:
@@ -186,7 +191,7 @@ def _learn_pooling(layer: Pooling, how: Learning) -> Kernels | None:
         nonlocal given, bottom, indices, is_usual
         given, bottom = maps, channels_side_by_side(maps)
         values, indices = F.max_pool2d(bottom, *geometry, 1, ceil, return_indices=True)
-        is_usual = values.amin().item() > LOWEST  # as in max_pool: in torch NaN wins
+        is_usual = values.amin().item() > LOWEST  # as in max_pool, because torch treats NaN differently
         return values if is_usual else record(maps)
 
     def backward(diff: torch.Tensor) -> Any:
@@ -199,10 +204,10 @@ def _learn_pooling(layer: Pooling, how: Learning) -> Kernels | None:
 
 
 def largest(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
-    """Return the maximum of each window, unpadded and known to torch, of maps (N, C, H, W) in this order.
+    """Return the maximum of each window of contiguous maps (N, C, H, W), by slices: first of rows, then of columns.
 
-    NaN wins; a zero may have either sign. It reduces rows first, then columns, because torch's kernel reads such maps
-    pixel by pixel, which is up to ten times as slow.
+    Windows must have no padding and be ``known_to_torch``. This is up to ten times as fast as torch's kernel, which
+    reads such maps pixel by pixel. The maximum of a window with NaN is NaN; a maximum of zero may have either sign.
     """
     for axis, (_, kernel, stride, _), count in zip((2, 3), windows.axes(), windows.count, strict=True):
         first, *more = (

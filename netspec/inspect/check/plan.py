@@ -40,9 +40,9 @@ def plan_text(net: Net) -> str:
         if not node.bottoms
         for v, shape in zip(node.tops, layer.top_shapes, strict=False)
     )
-    program = net.prepared.line_for(given, frozenset(net.plan.outputs.values()))
-    steps = program.schedule.steps
-    used = [kind for kind in KINDS if kind in program.kinds]
+    sequence = net.prepared.sequence_for(given, frozenset(net.plan.outputs.values()))
+    steps = sequence.schedule.steps
+    used = [kind for kind in KINDS if kind in sequence.kinds]
     names = [_name(net, step) for step in steps]
     width = max((len(kind) for kind in used), default=0)
     passes = ", ".join(name for name in PASSES if name in net.prepared.passes)
@@ -50,7 +50,7 @@ def plan_text(net: Net) -> str:
     return "\n".join(
         [
             f"{layers} layers run as {len(steps)} steps; passes: {passes}; {bfloat16}",
-            *(f"  {kind:{width}}  {name}" for kind, name in zip(program.kinds, names, strict=True)),
+            *(f"  {kind:{width}}  {name}" for kind, name in zip(sequence.kinds, names, strict=True)),
             *(f"{kind}: {KINDS[kind]}" for kind in used),
         ]
     )
@@ -58,5 +58,5 @@ def plan_text(net: Net) -> str:
 
 def _name(net: Net, step: Any) -> str:
     members = [step.node, *(step.chain.folded if step.chain else ())]
-    members = sorted(members) + ([step.finish] if step.finish is not None else [])
+    members = sorted(members) + ([step.activation] if step.activation is not None else [])
     return " + ".join(net.plan.nodes[i].name for i in members)

@@ -208,7 +208,7 @@ def _build(net: NetParameter, source: SourceMap, weights: Sequence[str | Path], 
 
     built = build_filtered(net, source, options)
     if weights:
-        load_weights(built, weights, options.strict, some=True)
+        load_weights(built, weights, options.strict, need_one=True)
     return built
 
 

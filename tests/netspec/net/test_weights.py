@@ -418,8 +418,8 @@ def test_weights_that_fit_no_layer_are_a_warning_or_an_error(tmp_path: Path, war
     (line,) = warnings()
     assert "contains weights for none of the net's 2 layers with weights: one, two; they keep" in line
     with pytest.raises(SpecError, match="none of the net's 2 layers with weights: one, two; is it the file of an"):
-        load_weights(net_of(TWO), path, some=True)
-    load_weights(net_of(TWO), holding(tmp_path, "two"), some=True)
+        load_weights(net_of(TWO), path, need_one=True)
+    load_weights(net_of(TWO), holding(tmp_path, "two"), need_one=True)
 
 
 def test_several_files_can_together_have_all_layers(tmp_path: Path, warnings):

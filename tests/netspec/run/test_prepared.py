@@ -15,7 +15,7 @@ from typing_extensions import override
 from exported import trained
 from netspec.exact.blas import one_thread
 from netspec.export.table import exported
-from netspec.fast import prepared as programs
+from netspec.fast import prepared
 from netspec.fast.entry import Entry
 from netspec.fast.table import entry_of
 from netspec.graph.options import PASSES
@@ -68,27 +68,27 @@ def assert_same(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor
         assert float((found[name] - blob).abs().max()) <= 1e-5 * max(1.0, float(blob.abs().max()))
 
 
-def last_line(net: Net) -> programs.PreparedLine:
+def last_sequence(net: Net) -> prepared.KernelSequence:
     assert net.prepared is not None
-    return next(reversed(net.prepared.made.values()))
+    return next(reversed(net.prepared.sequences.values()))
 
 
 def test_norms_fold_into_the_convolution_and_the_activation_fuses(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK))
     assert_same(quickly(net, data=images()), slowly(net, data=images()))
-    program = last_line(net)
-    (step,) = program.schedule.steps
+    sequence = last_sequence(net)
+    (step,) = sequence.schedule.steps
     assert step.chain is not None
     assert [net.plan.nodes[i].name for i in (step.node, *step.chain.folded)] == ["conv", "bn", "scale"]
-    assert step.finish is not None
-    assert net.plan.nodes[step.finish].name == "relu"
-    assert program.kinds == ["packed"]
+    assert step.activation is not None
+    assert net.plan.nodes[step.activation].name == "relu"
+    assert sequence.kinds == ["packed"]
 
 
 def test_identity_layers_are_skipped_and_sums_are_computed_in_place(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED))
     assert_same(quickly(net, data=images()), slowly(net, data=images()))
-    steps = last_line(net).schedule.steps
+    steps = last_sequence(net).schedule.steps
     assert [net.plan.nodes[step.node].name for step in steps] == ["conv", "left", "right", "sum"]
     assert steps[-1].reuse
 
@@ -100,7 +100,7 @@ def test_weights_of_deconvolutions_are_packed(how: str, net_of: Callable[..., Ne
     net = trained(net_of(text.replace('type: "ReLU"', 'type: "ReLU" relu_param { negative_slope: 0.1 }')))
     x = images(1, 8, 80, 80)
     assert_same(quickly(net, data=x), slowly(net, data=x))
-    assert last_line(net).kinds == ["packed"]
+    assert last_sequence(net).kinds == ["packed"]
 
 
 @pytest.mark.parametrize("passes", [(), *((name,) for name in PASSES), PASSES], ids="-".join)
@@ -128,10 +128,10 @@ def test_small_layers_keep_caffes_order_of_sums(net_of: Callable[..., Net]) -> N
     net = trained(net_of(text))
     x = images(1, 8, 6, 6)
     np.testing.assert_array_equal(quickly(net, data=x)["scale"], slowly(net, data=x)["scale"])
-    assert last_line(net).kinds == ["exact", "exact", "exact"]
+    assert last_sequence(net).kinds == ["exact", "exact", "exact"]
     loose = trained(net_of(text, exact="none"))
     assert_same(quickly(loose, data=x), slowly(loose, data=x))
-    assert len(last_line(loose).kinds) == 1
+    assert len(last_sequence(loose).kinds) == 1
 
 
 def write_in_place(net: Net) -> None:
@@ -185,7 +185,7 @@ def test_changed_parameters_are_used_in_the_next_run(
     for _ in range(2):
         assert_same(quickly(net, data=images()), slowly(net, data=images()))
     if write is not replace_the_parameter:  # a parameter of another class does not say what is written to it
-        assert last_line(net).kinds == ["packed"]
+        assert last_sequence(net).kinds == ["packed"]
 
 
 def test_writes_through_an_alias_are_noticed(net_of: Callable[..., Net]) -> None:
@@ -195,11 +195,11 @@ def test_writes_through_an_alias_are_noticed(net_of: Callable[..., Net]) -> None
     for value in (0.1, 0.2, 0.3):
         held[...] = value
         assert_same(quickly(net, data=images()), slowly(net, data=images()))
-        assert last_line(net).kinds[0] == "as is"
+        assert last_sequence(net).kinds[0] == "as is"
     del held
     quickly(net, data=images())
     assert_same(quickly(net, data=images()), slowly(net, data=images()))
-    assert last_line(net).kinds == ["packed"]
+    assert last_sequence(net).kinds == ["packed"]
 
 
 def test_shapes_may_change_from_run_to_run(net_of: Callable[..., Net]) -> None:
@@ -207,60 +207,61 @@ def test_shapes_may_change_from_run_to_run(net_of: Callable[..., Net]) -> None:
     for shape in ((1, 8, 40, 40), (3, 8, 20, 31), (1, 8, 5, 5), (1, 8, 40, 40), (3, 8, 20, 31)):
         assert_same(quickly(net, data=images(*shape)), slowly(net, data=images(*shape)))
     assert net.prepared is not None
-    assert len(net.prepared.made) == 3
+    assert len(net.prepared.sequences) == 3
 
 
 @pytest.mark.parametrize("exact", ["none", "small"])
-def test_programs_are_kept_for_earlier_shapes(exact: str, net_of: Callable[..., Net]) -> None:
+def test_sequences_are_kept_for_earlier_shapes(exact: str, net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED, exact=exact))
     sizes = (5, 40, 7)
     for size in sizes:
         quickly(net, data=images(1, 8, size, size))
     assert net.prepared is not None
-    before = list(net.prepared.made.values())
+    before = list(net.prepared.sequences.values())
     for size in sizes:
         quickly(net, data=images(1, 8, size, size))
-    assert all(a is b for a, b in zip(net.prepared.made.values(), before, strict=True))
-    assert "as is" not in {kind for program in before for kind in program.kinds}
+    assert all(a is b for a, b in zip(net.prepared.sequences.values(), before, strict=True))
+    assert "as is" not in {kind for sequence in before for kind in sequence.kinds}
 
 
-def test_the_number_of_programs_is_limited(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(programs, "PROGRAMS", 2)
+def test_the_number_of_sequences_is_limited(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(prepared, "MOST_SEQUENCES", 2)
     net = trained(net_of(BLOCK))
     for size in (7, 8, 9, 7):
         assert_same(quickly(net, data=images(1, 8, size, size)), slowly(net, data=images(1, 8, size, size)))
     assert net.prepared is not None
-    assert len(net.prepared.made) == 2
+    assert len(net.prepared.sequences) == 2
 
 
-@pytest.mark.parametrize(("runs", "fewest", "most"), [(programs.RUNS, 2, 16), (0, 1, 1)])
-def test_the_memory_of_programs_is_limited(
+@pytest.mark.parametrize(("runs", "fewest", "most"), [(prepared.MEMORY_FACTOR, 2, 16), (0, 1, 1)])
+def test_the_memory_of_sequences_is_limited(
     runs: int, fewest: int, most: int, net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(programs, "RUNS", runs)
+    monkeypatch.setattr(prepared, "MEMORY_FACTOR", runs)
     net = trained(net_of(BLOCK + SHARED))
     assert net.prepared is not None
     learned = sum(item.parameter.nbytes for item in net.learnable)
     for size in range(8, 24):
         quickly(net, data=images(1, 8, size, 9))
-        made = net.prepared.made.values()
-        limit = runs * (learned + max(program.need for program in made))
+        made = net.prepared.sequences.values()
+        limit = runs * (learned + max(sequence.needed_bytes for sequence in made))
         assert len(made) == 1 or net.prepared.kept_bytes() <= limit
-        assert set().union(*(program.memos for program in made)) == set(net.prepared.memos)
-    assert fewest <= len(net.prepared.made) <= most
+        assert set().union(*(sequence.memos for sequence in made)) == set(net.prepared.memos)
+    assert fewest <= len(net.prepared.sequences) <= most
     assert_same(quickly(net, data=images(1, 8, 8, 9)), slowly(net, data=images(1, 8, 8, 9)))
 
 
-def test_exact_programs_share_copies_of_blobs_and_count_their_memory(net_of: Callable[..., Net]) -> None:
+def test_exact_sequences_share_copies_of_blobs_and_count_their_memory(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK, exact="all"))
     assert net.prepared is not None
     for size in range(8, 40):
         quickly(net, data=images(1, 8, size, size))
-    made = net.prepared.made.values()
+    made = net.prepared.sequences.values()
     assert net.prepared.memos.keys() == next(iter(made)).memos
-    assert min(program.kept for program in made) > 0
+    assert min(sequence.kept_bytes for sequence in made) > 0
     learned = sum(item.parameter.nbytes for item in net.learnable)
-    assert net.prepared.kept_bytes() <= programs.RUNS * (learned + max(program.need for program in made))
+    needed = max(sequence.needed_bytes for sequence in made)
+    assert net.prepared.kept_bytes() <= prepared.MEMORY_FACTOR * (learned + needed)
 
 
 @pytest.mark.slow
@@ -273,7 +274,7 @@ def test_runs_of_many_sizes_need_little_more_memory_than_one(tmp_path: Path) -> 
             convolution_param {{ num_output: 32 kernel_size: 3 pad: 1 weight_filler {{ type: "xavier" }} }} }}"""
     path = tmp_path / "net.prototxt"
     path.write_text(text)
-    program = f"""if True:
+    sequence = f"""if True:
         import os, torch, netspec
         from pathlib import Path
         torch.set_num_threads(1)
@@ -284,7 +285,7 @@ def test_runs_of_many_sizes_need_little_more_memory_than_one(tmp_path: Path) -> 
                 net(c0=torch.ones(size, 32, 40, 40))
             grown.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
         print(max(grown) - grown[0])"""
-    reported = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=True)
+    reported = subprocess.run([sys.executable, "-c", sequence], capture_output=True, text=True, timeout=300, check=True)
     one_run = 3 * 4 * 70 * 32 * 40 * 40  # bytes: the input, a bottom and a top
     assert int(reported.stdout) < 3 * one_run
 
@@ -369,7 +370,7 @@ layer {{ name: "{name}" type: "InnerProduct" bottom: "{bottom}" top: "{name}" pa
 """
     net, x = net_of(text, exact="none"), torch.randn(8, 300)
     assert_same(quickly(net, data=x), slowly(net, data=x))
-    assert last_line(net).kinds == ["packed"] * 3
+    assert last_sequence(net).kinds == ["packed"] * 3
 
 
 def test_a_subclass_with_its_own_forward_inherits_no_kernels() -> None:
@@ -408,4 +409,4 @@ layer {{ name: "clip" type: "Clip" bottom: "c" top: "c" clip_param {{ min: {low}
 """
     net, x = net_of(text, exact="none"), torch.randn(2, 8, 20, 20)
     assert_same(quickly(net, data=x), slowly(net, data=x))
-    assert len(last_line(net).line) == steps
+    assert len(last_sequence(net).steps) == steps

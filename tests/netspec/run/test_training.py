@@ -23,7 +23,7 @@ def made(folder: Path, net: str, exact: str = "small", more: str = "") -> Solver
 
 
 def is_prepared(solver: Solver) -> bool:
-    return isinstance(solver.net._training, TrainingStep)
+    return isinstance(solver.net._trainer, TrainingStep)
 
 
 @pytest.mark.slow
@@ -35,7 +35,7 @@ def test_training_kernels_equal_autograd(tmp_path: Path, net: str, exact: str, m
     for prepares in (False, True):
         solver = made(tmp_path, NETS[net], exact, more)
         if not prepares:
-            solver.net._training = "as by autograd"
+            solver.net._trainer = "as by autograd"
         losses = []
         solver.on_iteration = lambda losses=losses, solver=solver: losses.append(solver.loss)
         solver.step(4)
@@ -86,7 +86,7 @@ def test_changes_of_the_weights_are_noticed(tmp_path: Path) -> None:
     for prepares in (False, True):
         solver = made(tmp_path, NETS["typical"], more="momentum: 0.9")
         if not prepares:
-            solver.net._training = "as by autograd"
+            solver.net._trainer = "as by autograd"
         convolution, inner, *_ = (layer for layer in solver.net.layers if len(layer.blobs))
         solver.step(2)
         with torch.no_grad():
@@ -108,4 +108,4 @@ def test_the_reason_for_not_being_prepared_is_given(tmp_path: Path) -> None:
     )
     solver = made(tmp_path, NETS["typical"].replace('layer { name: "c"', f'{rows}layer {{ name: "c"'))
     solver.step(1)
-    assert solver.net._training == '"b0" shares parameters, and only autograd adds up their gradients'
+    assert solver.net._trainer == '"b0" shares parameters, and only autograd adds up their gradients'

@@ -18,7 +18,7 @@ from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
 from netspec.errors import SpecError
 from netspec.load import load_solver
-from netspec.net.sealed import sealed
+from netspec.net.extra_file import extra_text
 from netspec.solver.extra import changes, newest_pair, path_beside, read_extra
 from netspec.solver.snapshot import State, read_state, write_state
 from netspec.solver.solver import Solver
@@ -388,7 +388,7 @@ def forged(state: Path, *path: str | int, value: object) -> None:
         inside = inside[step]
     inside[path[-1]] = value
     del content["hash"], content["format"]
-    path_beside(state).write_text(sealed(content))
+    path_beside(state).write_text(extra_text(content))
 
 
 @pytest.mark.parametrize("value", [True, -1, 1.0, 10**300, None, [{"shape": [-1], "float32": "AACAPw=="}], [{}], {}])

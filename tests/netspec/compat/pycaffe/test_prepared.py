@@ -41,7 +41,7 @@ def test_all_blobs_exist_after_a_prepared_pass(net: caffe.Net) -> None:
         blob.data[...] = 0 if blob is not net.blobs["data"] else blob.data
     net.forward()
     assert net.runner.net.prepared is not None
-    assert net.runner.net.prepared.made
+    assert net.runner.net.prepared.sequences
     assert_same(net, expected)
 
 

@@ -1,8 +1,10 @@
-"""Products with learned weights at fixed shapes. They compute the same as products.py and vectors.py in netspec/exact.
+"""Products with learned weights at fixed shapes, with the numbers of products.py and vectors.py in netspec/exact.
 
-The arguments of the calls of BLAS are made once: they are views of memory that is reused. So the result of a function
-is valid until its next call. BLAS must use one thread. ``gemm(1, b.T, a.T, 0, c.T, 0, 0, 1)`` makes c = a b.
-``gemv(1, a, x, 1, y, 0, 1, 0, 1, trans, 1)`` adds a x, or with ``trans`` a.T x, to y.
+They are faster because the arguments of BLAS are made once, as views of memory that each call reuses. A result is
+therefore valid only until the next call. BLAS must use one thread.
+
+BLAS stores matrices by column, so it gets transposed views: ``gemm(1, b.T, a.T, 0, c.T, 0, 0, 1)`` computes c = a b.
+``gemv(1, a, x, 1, y, 0, 1, 0, 1, trans, 1)`` adds a x to y, or a.T x if ``trans`` is 1.
 
 Caffe: src/caffe/layers/inner_product_layer.cpp, base_conv_layer.cpp
 """
@@ -21,37 +23,37 @@ import torch
 from netspec.exact.blas import routine
 from netspec.exact.products import Axes, Filter
 
-SMALL = 2**14  # numbers: for smaller tensors a copy takes less time than making a view
+SMALL = 2**14  # numbers in a tensor: for fewer, a copy takes less time than making a view
 
 
-class Matrix:
-    """Gives BLAS a transposed view of a tensor as a matrix with ``columns`` columns.
+class TransposedView:
+    """Makes transposed views of tensors of one shape, as matrices with ``columns`` columns, and reuses them.
 
-    The view is kept for the next call with the same memory. A tensor that is not contiguous is copied. So is a small
+    A view is kept for the next call with the same memory. A tensor that is not contiguous is copied. So is a small
     tensor in other memory than last time, because a copy takes less time than a new view.
     """
 
-    __slots__ = ("_columns", "_copy", "_place", "_shown", "_tensor")
+    __slots__ = ("_address", "_columns", "_copy", "_copy_view", "_view")
 
     def __init__(self, columns: int) -> None:
         self._columns = columns
-        self._place: int | None = None  # the view keeps the memory: nothing else comes to lie there
-        self._tensor: torch.Tensor | None = None
+        self._address: int | None = None  # the view keeps its memory alive, so no other tensor gets this address
+        self._copy: torch.Tensor | None = None
 
     def __call__(self, tensor: torch.Tensor) -> np.ndarray:
         """Return the view, (columns, rows)."""
-        place = tensor.data_ptr() if tensor.is_contiguous() else None
-        if place is not None and place == self._place:
-            return self._shown
-        if place is not None and (self._place is None or tensor.numel() > SMALL):
-            self._place = place
-            self._shown = tensor.view(-1, self._columns).numpy().T
-            return self._shown
-        if self._tensor is None:
-            self._tensor = torch.empty(tensor.shape, dtype=tensor.dtype)
-            self._copy = self._tensor.view(-1, self._columns).numpy().T
-        self._tensor.copy_(tensor)
-        return self._copy
+        address = tensor.data_ptr() if tensor.is_contiguous() else None
+        if address is not None and address == self._address:
+            return self._view
+        if address is not None and (self._address is None or tensor.numel() > SMALL):
+            self._address = address
+            self._view = tensor.view(-1, self._columns).numpy().T
+            return self._view
+        if self._copy is None:
+            self._copy = torch.empty(tensor.shape, dtype=tensor.dtype)
+            self._copy_view = self._copy.view(-1, self._columns).numpy().T
+        self._copy.copy_(tensor)
+        return self._copy_view
 
 
 class Weights(NamedTuple):
@@ -63,16 +65,17 @@ class Weights(NamedTuple):
     bias_sums: torch.Tensor | None
 
 
-def at_rest(weight: torch.Tensor, bias: torch.Tensor | None = None) -> Weights:
+def fixed_weights(weight: torch.Tensor, bias: torch.Tensor | None = None) -> Weights:
     """Return the Weights of a layer that does not learn."""
     return Weights(weight, bias, None, None)
 
 
-class BoundVectors:
+class PreparedVectors:
     """:class:`netspec.exact.vectors.VectorProducts` of vectors of one shape, and of one matrix.
 
-    ``shape`` is the shape of the bottom, which consists of rows of K numbers; ``top_shape`` is that of the top.
-    ``wanted`` says whether the gradient of the bottom is computed. ``nbytes`` of memory are kept between passes.
+    ``shape`` is the shape of the bottom, whose numbers are vectors of length K one after the other; ``top_shape`` is
+    the shape of the top. ``wanted`` says whether the gradient of the bottom is computed. ``nbytes`` is the memory that
+    is kept between runs.
     """
 
     def __init__(
@@ -90,41 +93,42 @@ class BoundVectors:
         self._top = torch.empty(top_shape, dtype=weight.dtype)
         self.nbytes = self._top.nbytes
         self._rows = self._top.view(rows, outputs)
-        self._shown = self._rows.numpy().T
-        self._vectors, self._diffs = Matrix(inputs), Matrix(outputs)
+        self._rows_view = self._rows.numpy().T
+        self._vectors, self._diffs = TransposedView(inputs), TransposedView(outputs)
         self._weight_sums = None if weight_sums is None else weight_sums.numpy().T
         self._bias_sums = None if bias_sums is None else bias_sums.numpy()
         self._diff = torch.empty(shape, dtype=weight.dtype) if wanted else None
-        self._diff_shown = None if self._diff is None else self._diff.view(rows, inputs).numpy().T
+        self._diff_view = None if self._diff is None else self._diff.view(rows, inputs).numpy().T
         self._ones = np.ones(rows, self._matrix.dtype)
         self._gemm, self._gemv = routine("gemm", self._matrix), routine("gemv", self._matrix)
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the products."""
         self._read = self._vectors(data)
-        self._gemm(1.0, self._matrix, self._read, 0.0, self._shown, not self._transposed, 0, 1)
+        self._gemm(1.0, self._matrix, self._read, 0.0, self._rows_view, not self._transposed, 0, 1)
         if self._bias is not None:
             self._rows.add_(self._bias)
         return self._top
 
     def backward(self, diff: torch.Tensor) -> torch.Tensor | None:
-        """Add up the gradients of the weights; return the vectors'."""
+        """Add the gradients of the weights to their sums; return the gradient of the bottom."""
         rows = self._diffs(diff)
         if self._weight_sums is not None:
             first, second = (rows, self._read) if self._transposed else (self._read, rows)
             self._gemm(1.0, first, second, 1.0, self._weight_sums, 0, 1, 1)
         if self._bias_sums is not None:
             self._gemv(1.0, rows, self._ones, 1.0, self._bias_sums, 0, 1, 0, 1, 0, 1)
-        if self._diff_shown is not None:
-            self._gemm(1.0, self._matrix, rows, 0.0, self._diff_shown, self._transposed, 0, 1)
+        if self._diff_view is not None:
+            self._gemm(1.0, self._matrix, rows, 0.0, self._diff_view, self._transposed, 0, 1)
         return self._diff
 
 
-class BoundColumns:
+class PreparedColumns:
     """:class:`netspec.exact.products.ColumnProducts` of maps (N, C, H, W) of one shape.
 
-    If the columns of a batch fit into :data:`netspec.exact.products.COLUMNS`, they are kept for the backward pass,
-    unless maps may change before it (not ``steady``). About ``nbytes`` of memory are kept between passes.
+    If the columns of a batch fit into :data:`netspec.exact.products.COLUMNS`, they are kept for the backward pass. If
+    maps may change before it (not ``steady``), they are computed again. ``nbytes`` is about the memory that is kept
+    between runs.
     """
 
     def __init__(
@@ -149,14 +153,14 @@ class BoundColumns:
         self.nbytes = self._top.nbytes + columns * weight.itemsize
         self._tops = [_by_group(image.numpy(), group) for image in self._top.flatten(2)]
         whole, rest = divmod(count, self._at_once)
-        of = partial(_columns, dtype=weight.dtype, sliding=sliding, fits=fits, group=group)
-        self._columns = [of((self._at_once, channels, *size))] * whole
+        columns_of = partial(_columns, dtype=weight.dtype, sliding=sliding, fits=fits, group=group)
+        self._columns = [columns_of((self._at_once, channels, *size))] * whole
         if rest:
-            self._columns.append(of((rest, channels, *size)))
+            self._columns.append(columns_of((rest, channels, *size)))
         self._filters = _by_group(weight.flatten(1).numpy(), group)
         self._weight_sums = None if weight_sums is None else _by_group(weight_sums.flatten(1).numpy(), group)
         self._bias_sums = None if bias_sums is None else bias_sums.numpy()
-        self._diffs = Matrix(positions)
+        self._diffs = TransposedView(positions)
         self._ones = np.ones(positions, self._filters[0].dtype)
         self._spread = None
         if wanted:
@@ -179,7 +183,7 @@ class BoundColumns:
         return self._top
 
     def backward(self, diff: torch.Tensor) -> torch.Tensor | None:
-        """Add up the gradients of filters and bias; return the maps'."""
+        """Add the gradients of filters and bias to their sums; return the gradient of the maps."""
         count, outputs = self._top.shape[:2]
         diffs = self._diffs(diff).T.reshape(count, outputs, -1)
         if self._bias_sums is not None:
@@ -231,15 +235,16 @@ def _columns(
     strides = (channels * area, area, dilation[0] * size[1], dilation[1], stride[0] * size[1], stride[1])
     columns = torch.empty((count, channels, *kernel, *fits), dtype=dtype)
     layout, found = columns.shape, [_by_group(image, group) for image in columns.view(flat).numpy()]
-    place, pixels = None, columns if frame is None else frame.as_strided(layout, strides)
+    address, pixels = None, columns if frame is None else frame.as_strided(layout, strides)
 
     def lay_out(maps: torch.Tensor) -> list[list[np.ndarray]]:
-        nonlocal place, pixels
+        nonlocal address, pixels
         if frame is not None:
             inner.copy_(maps)
-        elif maps.data_ptr() != place or not maps.is_contiguous():  # the view keeps the memory of the last maps
+        elif maps.data_ptr() != address or not maps.is_contiguous():
             whole = maps.contiguous()
-            place, pixels = whole.data_ptr(), whole.as_strided(layout, strides)
+            # The view keeps its memory alive, so no other tensor gets this address.
+            address, pixels = whole.data_ptr(), whole.as_strided(layout, strides)
         columns.copy_(pixels)
         return found
 

@@ -1,7 +1,8 @@
-"""Protects snapshots: ``X.solverstate.extra`` has the sizes and hashes of their files.
+"""The file ``X.solverstate.extra`` of a snapshot, which has the sizes and hashes of the other files of the snapshot.
 
-That file is JSON, and has a hash of itself, because one changed digit would change the results of a training. Readers
-of ``X.caffemodel`` compare it with the hash, because protobuf reads most damaged files without an error.
+Whoever reads ``X.caffemodel`` compares it with its hash, because protobuf reads most damaged files without an error.
+The .extra file is JSON. It also has a hash of its own content, because one changed digit would change the results of a
+training.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from netspec.files.kinds import unreadable
 FORMAT = 2
 _BLOCK = 1 << 20  # bytes
 _SHOWN = 40  # characters of a wrong value
-MOST = 2**63 - 1
-#: The exceptions that Python raises for a damaged JSON file.
+MOST = 2**63 - 1  # the largest whole number in the file
+#: The exceptions that reading a damaged JSON file may raise.
 FAULTS = (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError)
 
 
@@ -45,7 +46,7 @@ class Digest:
 
     @classmethod
     def read(cls, value: Any) -> Digest:
-        """Return the digest that a value of JSON describes. Raises ValueError for any other value."""
+        """Return the digest that is written as ``value`` in JSON. Raises one of FAULTS for anything else."""
         size, hashed = value["size"], value["hash"]
         if not isinstance(hashed, str):
             raise ValueError(f"found hash {shown(hashed)}, expected a text")
@@ -66,18 +67,18 @@ def whole_number(value: Any, name: str, most: int = MOST) -> int:
 
 
 def shown(value: Any) -> str:
-    """Return a wrong value for an error message, cut where it is long."""
+    """Return a wrong value as text for an error message, shortened if it is long."""
     text = f"a number of {value.bit_length()} bits" if type(value) is int and abs(value) > MOST else repr(value)
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
-def sealed(content: Mapping[str, Any]) -> str:
+def extra_text(content: Mapping[str, Any]) -> str:
     """Return the text of an .extra file: the content, the format, and the hash of both."""
     whole = {"format": FORMAT, **content}
     return json.dumps({**whole, "hash": _hash(whole)}, indent=1) + "\n"
 
 
-def unsealed(path: Path) -> dict[str, Any]:
+def read_content(path: Path) -> dict[str, Any]:
     """Return the content of an .extra file. Raises FileNotFoundError, and SpecError for any other fault."""
     try:
         found = json.loads(path.read_text("utf-8"))
@@ -101,16 +102,16 @@ def damaged(path: Path, reason: Exception) -> SpecError:
 
 
 def check_weights(path: Path) -> None:
-    """Compare ``X.caffemodel`` with ``X.solverstate.extra``, if that is there. Raises SpecError if they do not fit.
+    """Compare ``X.caffemodel`` with its hash in ``X.solverstate.extra``. Raises SpecError if it is another file.
 
-    If the .extra is damaged, nothing is compared, and a warning says so.
+    Without an .extra file there is nothing to compare. If that file is damaged, a warning says so.
     """
     found = re.fullmatch(r"(.+)\.caffemodel(\.h5)?", path.name)
     extra = path.with_name(f"{found[1]}.solverstate{found[2] or ''}.extra") if found else None
     if extra is None or not extra.is_file() or not path.is_file():
         return
     try:
-        digest = Digest.read(unsealed(extra)["weights"])
+        digest = Digest.read(read_content(extra)["weights"])
     except SpecError as fault:
         log.logger.warning(f"{fault.where}: {fault.message.partition(';')[0]}: {path.name} was not checked against it")
         return
