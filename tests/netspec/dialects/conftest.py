@@ -1,4 +1,4 @@
-"""Layers of dialects for a test."""
+"""Fixtures that build single layers of a dialect and check their gradients."""
 
 from collections.abc import Callable
 
@@ -33,7 +33,7 @@ def build() -> Callable[..., Layer]:
 
 @pytest.fixture
 def gradcheck(gradcheck: Callable[..., None]) -> Callable[..., None]:
-    """The same, and a GPU computes what the CPU does."""
+    """Return the gradcheck of all tests, which here also compares a GPU with the CPU."""
 
     def check(layer: Layer, *bottoms: torch.Tensor, fixed: tuple[int, ...] = ()) -> None:
         gradcheck(layer, *bottoms, fixed=fixed)

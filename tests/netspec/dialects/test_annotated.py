@@ -1,4 +1,4 @@
-"""SSD's AnnotatedData compared with plain loops, and pictures whose boxes must stay on what they show."""
+"""SSD's AnnotatedData: images and boxes as they are read, resized, cropped, augmented and sampled."""
 
 import itertools
 from collections.abc import Callable
@@ -49,8 +49,8 @@ def noise(height: int, width: int, channels: int = 3) -> np.ndarray:
 OBJECTS = [(3, (0.1, 0.2, 0.5, 0.75), False), (3, (0.0, 0.0, 0.25, 0.5), True), (5, (0.5, 0.25, 1.0, 1.0), False)]
 
 
-@pytest.mark.parametrize("encode", [False, True])
-def test_images_and_rows_of_boxes(tmp_path: Path, encode: bool) -> None:
+@pytest.mark.parametrize("encode", [False, True], ids=["raw", "encoded"])
+def test_tops_are_images_and_rows_of_boxes(tmp_path: Path, encode: bool) -> None:
     first, second = noise(8, 12), noise(8, 12) // 2
     source = write(tmp_path, annotated(first, OBJECTS, encode), annotated(second, OBJECTS[2:], encode))
     data, label = batch_of(reading(source, "mean_value: 10 mean_value: 20 mean_value: 30 scale: 0.5", batch=2))
@@ -65,13 +65,13 @@ def test_images_and_rows_of_boxes(tmp_path: Path, encode: bool) -> None:
     np.testing.assert_allclose(label[0, 0], rows, atol=1e-6)
 
 
-def test_without_any_box_there_is_one_row_of_minus_one(tmp_path: Path) -> None:
+def test_label_without_boxes_is_one_row_of_minus_one(tmp_path: Path) -> None:
     layer = reading(write(tmp_path, annotated(noise(4, 4), [])))
     assert layer.top_shapes[1] == (1, 1, 1, 8)
     assert np.array_equal(batch_of(layer)[1], np.full((1, 1, 1, 8), -1))
 
 
-def test_records_without_a_type_give_their_labels(tmp_path: Path) -> None:
+def test_label_of_records_without_a_type_is_that_of_the_datum(tmp_path: Path) -> None:
     datum = annotated(noise(4, 4), OBJECTS)
     datum.ClearField("type")
     source = write(tmp_path, datum)
@@ -79,7 +79,7 @@ def test_records_without_a_type_give_their_labels(tmp_path: Path) -> None:
     assert batch_of(reading(source, more="anno_type: BBOX"))[1].shape == (1, 1, 3, 8)
 
 
-def test_an_image_is_warped_and_its_boxes_stay(tmp_path: Path) -> None:
+def test_resize_mode_warp_keeps_the_relative_boxes(tmp_path: Path) -> None:
     image = noise(9, 15)
     layer = reading(write(tmp_path, annotated(image, OBJECTS)), "resize_param { height: 6 width: 6 }")
     data, label = batch_of(layer)
@@ -87,8 +87,10 @@ def test_an_image_is_warped_and_its_boxes_stay(tmp_path: Path) -> None:
     np.testing.assert_allclose(label[0, 0, :, 3:7], [box for _, box, _ in OBJECTS], atol=1e-6)
 
 
-@pytest.mark.parametrize(("height", "width", "inner"), [(10, 20, (15, 30)), (20, 10, (30, 15))])
-def test_an_image_is_fitted_in_and_its_boxes_with_it(
+@pytest.mark.parametrize(
+    ("height", "width", "inner"), [(10, 20, (15, 30)), (20, 10, (30, 15))], ids=["landscape", "portrait"]
+)
+def test_resize_mode_fit_large_size_and_pad_moves_the_boxes(
     tmp_path: Path, height: int, width: int, inner: tuple[int, int]
 ) -> None:
     image = noise(height, width)
@@ -109,7 +111,7 @@ def test_an_image_is_fitted_in_and_its_boxes_with_it(
     np.testing.assert_allclose(label[0, 0, :, 3:7], moved, atol=1e-6)
 
 
-def test_an_image_is_fitted_around_and_its_boxes_counted_in_parts_of_a_given_size(tmp_path: Path) -> None:
+def test_resize_mode_fit_small_size_scales_boxes_by_height_scale_and_width_scale(tmp_path: Path) -> None:
     resize = "resize_param { resize_mode: FIT_SMALL_SIZE height: 8 width: 8 %s }"
     source = write(tmp_path, annotated(noise(10, 20), OBJECTS))
     data, label = batch_of(reading(source, resize % ""))
@@ -119,7 +121,7 @@ def test_an_image_is_fitted_around_and_its_boxes_counted_in_parts_of_a_given_siz
     np.testing.assert_allclose(scaled[0, 0, :, 3:7], np.array([box for _, box, _ in OBJECTS]) / 2, atol=1e-6)
 
 
-def test_a_crop_cuts_boxes_and_drops_those_outside(tmp_path: Path) -> None:
+def test_crop_clips_boxes_and_drops_those_outside(tmp_path: Path) -> None:
     boxes = [(1, (0.0, 0.0, 0.5, 0.5), False), (2, (0.0, 0.0, 0.2, 0.2), False)]
     image = noise(20, 40)
     data, label = batch_of(reading(write(tmp_path, annotated(image, boxes)), "crop_h: 10 crop_w: 20"))
@@ -135,6 +137,7 @@ def test_a_crop_cuts_boxes_and_drops_those_outside(tmp_path: Path) -> None:
         ("emit_type: MIN_OVERLAP emit_overlap: 0.1", [1, 2]),
         ("emit_type: MIN_OVERLAP emit_overlap: 0.3", [1]),
     ],
+    ids=["none", "CENTER", "MIN_OVERLAP_0.1", "MIN_OVERLAP_0.3"],
 )
 def test_emit_constraint_selects_boxes(tmp_path: Path, constraint: str, kept: list[int]) -> None:
     boxes = [(1, (0.3, 0.3, 0.6, 0.6), False), (2, (0.0, 0.0, 0.48, 0.48), False)]  # 23 % of the second are inside
@@ -159,7 +162,7 @@ SAMPLERS = "batch_sampler { max_sample: 1 max_trials: 1 } " + " ".join(
 
 
 @pytest.mark.slow
-def test_boxes_follow_their_objects_in_varied_images(tmp_path: Path) -> None:
+def test_boxes_stay_on_their_objects_in_augmented_images(tmp_path: Path) -> None:
     image = np.full((90, 120, 3), (104, 117, 123), np.uint8)
     image[30:60, 20:80] = 255
     source = write(tmp_path, annotated(image, [(1, (20 / 120, 30 / 90, 80 / 120, 60 / 90), False)]))
@@ -177,7 +180,7 @@ def test_boxes_follow_their_objects_in_varied_images(tmp_path: Path) -> None:
     assert len(shapes) > 40
 
 
-def test_a_record_is_varied_the_same_in_each_run_and_differently_in_each_epoch(tmp_path: Path) -> None:
+def test_augmentation_is_determined_by_the_seed_and_differs_in_each_epoch(tmp_path: Path) -> None:
     source = write(tmp_path, annotated(noise(40, 50), OBJECTS))
     runs = [reading(source, SSD + DISTORT, SAMPLERS, batch=4, phase=TRAIN, seed=seed) for seed in (1, 1, 2)]
     first, again, other = (batch_of(layer) for layer in runs)
@@ -196,8 +199,11 @@ def test_a_record_is_varied_the_same_in_each_run_and_differently_in_each_epoch(t
         ("saturation_prob: 1 saturation_lower: 0 saturation_upper: 0", lambda x: x.max(axis=2, keepdims=True) + 0 * x),
         ("hue_prob: 0 hue_delta: 90", lambda x: x),
     ],
+    ids=["brightness", "less_contrast", "more_contrast", "no_saturation", "hue_prob_0"],
 )
-def test_colors(tmp_path: Path, settings: str, expected: Callable[[np.ndarray], np.ndarray | None]) -> None:
+def test_distort_param_changes_the_colors(
+    tmp_path: Path, settings: str, expected: Callable[[np.ndarray], np.ndarray | None]
+) -> None:
     image = noise(6, 6)
     data, _ = batch_of(reading(write(tmp_path, annotated(image, [])), f"distort_param {{ {settings} }}", phase=TRAIN))
     wanted = expected(image)
@@ -209,7 +215,7 @@ def test_colors(tmp_path: Path, settings: str, expected: Callable[[np.ndarray], 
         np.testing.assert_array_equal(found, wanted)
 
 
-def test_a_channel_order_is_drawn(tmp_path: Path) -> None:
+def test_random_order_prob_permutes_the_channels(tmp_path: Path) -> None:
     image = noise(3, 3)
     layer = reading(write(tmp_path, annotated(image, [])), "distort_param { random_order_prob: 1 }", batch=40)
     orders = set()
@@ -218,17 +224,20 @@ def test_a_channel_order_is_drawn(tmp_path: Path) -> None:
     assert orders == set(itertools.permutations(range(3)))
 
 
-CONSTRAINTS = [
-    ("min_jaccard_overlap: 0.4", lambda jaccard, sample, object_: jaccard >= 0.4),
-    ("max_jaccard_overlap: 0.2", lambda jaccard, sample, object_: jaccard <= 0.2),
-    ("min_sample_coverage: 0.5 max_sample_coverage: 0.8", lambda jaccard, sample, object_: 0.5 <= sample <= 0.8),
-    ("min_object_coverage: 0.9", lambda jaccard, sample, object_: object_ >= 0.9),
-]
+CONSTRAINTS = {
+    "min_jaccard_overlap": ("min_jaccard_overlap: 0.4", lambda jaccard, sample, object_: jaccard >= 0.4),
+    "max_jaccard_overlap": ("max_jaccard_overlap: 0.2", lambda jaccard, sample, object_: jaccard <= 0.2),
+    "sample_coverage": (
+        "min_sample_coverage: 0.5 max_sample_coverage: 0.8",
+        lambda jaccard, sample, object_: 0.5 <= sample <= 0.8,
+    ),
+    "min_object_coverage": ("min_object_coverage: 0.9", lambda jaccard, sample, object_: object_ >= 0.9),
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("limits", "meets"), CONSTRAINTS)
-def test_windows_meet_their_constraint(tmp_path: Path, limits: str, meets: Callable[..., bool]) -> None:
+@pytest.mark.parametrize(("limits", "meets"), CONSTRAINTS.values(), ids=CONSTRAINTS)
+def test_sampled_windows_meet_their_constraint(tmp_path: Path, limits: str, meets: Callable[..., bool]) -> None:
     """The image shows its own coordinates, so that the window can be read from it."""
     y, x = np.mgrid[:200, :200].astype(np.uint8)
     image = np.dstack([y, x, np.zeros_like(x)])
@@ -261,14 +270,25 @@ def test_windows_meet_their_constraint(tmp_path: Path, limits: str, meets: Calla
         ("", "batch_sampler { sampler { min_aspect_ratio: 0 } }", 1, "found aspect ratios 0 to 1"),
         ("", "", 2, 'record "0001" gives 3 x 8 x 9, the first 3 x 8 x 8; all must have the same size'),
     ],
+    ids=[
+        "resize_param_width",
+        "FIT_SMALL_SIZE_batch_size",
+        "max_expand_ratio",
+        "mean_values",
+        "crop_size",
+        "contrast",
+        "sampler_scale",
+        "sampler_aspect_ratio",
+        "size_of_a_record",
+    ],
 )
-def test_unsuitable_settings_are_refused(tmp_path: Path, transform: str, more: str, batch: int, fault: str) -> None:
+def test_invalid_settings_are_refused(tmp_path: Path, transform: str, more: str, batch: int, fault: str) -> None:
     source = write(tmp_path, annotated(noise(8, 8), OBJECTS), annotated(noise(8, 9), OBJECTS))
     with pytest.raises(SpecError, match=fault):
         batch_of(reading(source, transform, more, batch))
 
 
-def test_a_database_of_plain_images_is_an_error_that_names_its_kind(tmp_path: Path) -> None:
+def test_a_database_of_plain_images_is_refused_with_its_kind(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match='record "0000" is no AnnotatedDatum; for a database of plain images use'):
         reading(write(tmp_path, array_to_datum(noise(4, 4).transpose(2, 0, 1), 1)))
 
@@ -288,7 +308,7 @@ def test_shapes_are_known_without_data() -> None:
         assert layer.top_shapes == [shape, (1, 1, 1, 8)]
 
 
-def test_a_size_is_drawn_for_every_ten_batches(tmp_path: Path) -> None:
+def test_one_of_several_resize_params_is_drawn_every_ten_batches(tmp_path: Path) -> None:
     source = write(tmp_path, annotated(noise(8, 12), OBJECTS), annotated(noise(10, 10), OBJECTS))
     sizes = " ".join(f"resize_param {{ prob: 0.5 height: {size} width: {size} }}" for size in (6, 9))
     layer = reading(source, sizes, batch=2)
@@ -299,7 +319,7 @@ def test_a_size_is_drawn_for_every_ten_batches(tmp_path: Path) -> None:
         reading(source, sizes.replace("0.5", "1"))
 
 
-def test_boxes_as_yolo_has_them(tmp_path: Path) -> None:
+def test_yolo_data_type_1_returns_boxes_by_center_and_size(tmp_path: Path) -> None:
     source = write(tmp_path, annotated(noise(8, 12), OBJECTS))
     _, label = batch_of(reading(source, more="yolo_data_type: 1 yolo_data_jitter: 0 train_diffcult: false"))
     assert label.shape == (1, 1, 300, 5)
@@ -308,7 +328,7 @@ def test_boxes_as_yolo_has_them(tmp_path: Path) -> None:
     assert not label[0, 0, 2:].any()
 
 
-def test_each_jitter_crops_other_windows(tmp_path: Path) -> None:
+def test_yolo_data_jitter_crops_other_windows_in_each_batch(tmp_path: Path) -> None:
     source = write(tmp_path, annotated(noise(40, 40), OBJECTS))
     layer = reading(source, "resize_param { height: 20 width: 20 }", more="yolo_data_type: 1 yolo_data_jitter: 0.5")
     sums = {float(batch_of(layer)[0].sum()) for _ in range(10)}

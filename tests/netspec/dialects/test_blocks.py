@@ -1,4 +1,4 @@
-"""The building blocks of many forks, each compared with plain loops."""
+"""Dialect blocks, the layers that many forks share: special cases beside those of test_cases.py."""
 
 from collections.abc import Callable
 
@@ -27,7 +27,7 @@ def run(layer: Layer, *bottoms: torch.Tensor) -> np.ndarray:
     return top.detach().numpy()
 
 
-def test_relu6_and_its_gradient_at_the_bends(build: Build) -> None:
+def test_relu6_values_and_gradients_at_zero_and_six(build: Build) -> None:
     x = torch.tensor([-2.0, 0.0, 3.0, 6.0, 7.0, float("inf")], requires_grad=True)
     layer = build("blocks", 'type: "ReLU6" relu6_param { negative_slope: 0.5 }', (6,))
     (top,) = layer.run(x)
@@ -66,7 +66,7 @@ def test_convolution_depthwise_without_a_bias_and_with_dilation(build: Build) ->
     assert layer.ignores == {"convolution_param.group", "convolution_param.num_output"}
 
 
-def test_shuffle_channel(build: Build, gradcheck: Gradcheck) -> None:
+def test_shuffle_channel_interleaves_its_groups(build: Build, gradcheck: Gradcheck) -> None:
     x = numbers(2, 6, 2, 3)
     layer = build("blocks", "type: 'ShuffleChannel' shuffle_channel_param { group: 3 }", x.shape)
     np.testing.assert_array_equal(run(layer, x), x.numpy()[:, [0, 2, 4, 1, 3, 5]])
@@ -75,7 +75,7 @@ def test_shuffle_channel(build: Build, gradcheck: Gradcheck) -> None:
         layer.run(numbers(2, 7, 2, 3))
 
 
-def test_upsample_keeps_the_last_value_and_all_values_get_the_gradient(build: Build) -> None:
+def test_upsample_of_a_repeated_index_keeps_the_last_value_and_all_get_the_gradient(build: Build) -> None:
     x = torch.tensor([[[[1.0, 2.0], [3.0, 4.0]]]], requires_grad=True)
     mask = torch.tensor([[[[0.0, 5.0], [5.0, 15.0]]]])
     (top,) = build("blocks", "type: 'Upsample' upsample_param { scale: 2 }", x.shape, mask.shape).run(x, mask)
@@ -85,7 +85,7 @@ def test_upsample_keeps_the_last_value_and_all_values_get_the_gradient(build: Bu
     assert x.grad.flatten().tolist() == [0, 5, 5, 15]
 
 
-def test_upsample_undoes_pooling() -> None:
+def test_upsample_puts_maxima_back_to_their_pixels() -> None:
     use_dialect("blocks")
     text = """
       layer { name: 'in' type: 'Input' top: 'x' input_param { shape { dim: 1 dim: 2 dim: 5 dim: 6 } } }
@@ -110,7 +110,11 @@ def test_upsample_refuses_a_mask_of_a_larger_map(build: Build) -> None:
 PSPNET = "slope_filler { type: 'uniform' min: 0.5 max: 2 } bias_filler { type: 'uniform' } momentum: 0.8 eps: 0.01"
 
 
-@pytest.mark.parametrize("params", ["", "param { lr_mult: 2 decay_mult: 0 }", "param {} param {} param {} param {}"])
+@pytest.mark.parametrize(
+    "params",
+    ["", "param { lr_mult: 2 decay_mult: 0 }", "param {} param {} param {} param {}"],
+    ids=["no_param", "one_param", "four_params"],
+)
 def test_the_statistics_of_bn_are_never_learned(params: str) -> None:
     use_dialect("blocks")
     text = f"""

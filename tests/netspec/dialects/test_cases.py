@@ -24,18 +24,18 @@ def bottom(given: Draw | str, rng: np.random.Generator) -> torch.Tensor:
     return torch.tensor(GIVEN[given] if isinstance(given, str) else given(rng), dtype=torch.float32)
 
 
-def weights(like: torch.Tensor) -> torch.Tensor:
+def coefficients(like: torch.Tensor) -> torch.Tensor:
     return torch.tensor(np.random.default_rng(like.numel()).uniform(-1, 1, like.shape), dtype=torch.float64)
 
 
-def summed(values: torch.Tensor) -> tuple[float, float]:
-    """Return the sum of numbers times fixed ones, and how far from it rounding may bring it."""
-    parts = values.detach().double().nan_to_num(7) * weights(values)
+def weighted_sum(values: torch.Tensor) -> tuple[float, float]:
+    """Return the sum of values times fixed coefficients, and the tolerance for rounding."""
+    parts = values.detach().double().nan_to_num(7) * coefficients(values)
     return float(parts.sum()), 3e-5 * float(parts.abs().sum()) + 1e-7
 
 
-def find(case: Case) -> tuple[list[tuple[float, float]], Layer, list[torch.Tensor], tuple[int, ...]]:
-    """Run a case: what is found, the layer, its bottoms, and which of these get no gradient."""
+def run_case(case: Case) -> tuple[list[tuple[float, float]], Layer, list[torch.Tensor], tuple[int, ...]]:
+    """Run a case; return its results, the layer, its bottoms, and which of these get no gradient."""
     rng = np.random.default_rng(5)
     bottoms = [bottom(given, rng) for given in (*case.bottoms, *case.fixed)]
     use_dialect(case.dialect)
@@ -46,12 +46,12 @@ def find(case: Case) -> tuple[list[tuple[float, float]], Layer, list[torch.Tenso
     before = [blob.detach().clone() for blob in layer.blobs]
     tops = layer.run(*inputs)
     assert layer.counted_axis is not None or [tuple(top.shape) for top in tops] == layer.top_shapes
-    found = [summed(top) for top in tops]
+    found = [weighted_sum(top) for top in tops]
     learned = [top for top in tops if top.requires_grad]
     if learned:
-        torch.autograd.backward(learned, [weights(top).to(top) for top in learned])
-        found += [summed(each.grad) for each in (*inputs, *layer.blobs) if each.grad is not None]
-    found += [summed(b) for b, a in zip(layer.blobs, before, strict=True) if not torch.equal(a, b)]
+        torch.autograd.backward(learned, [coefficients(top).to(top) for top in learned])
+        found += [weighted_sum(each.grad) for each in (*inputs, *layer.blobs) if each.grad is not None]
+    found += [weighted_sum(b) for b, a in zip(layer.blobs, before, strict=True) if not torch.equal(a, b)]
     return found, layer, [each.detach() for each in bottoms], tuple(range(len(case.bottoms), len(bottoms)))
 
 
@@ -62,8 +62,8 @@ def names(cases: Sequence[Case]) -> list[str]:
 
 
 @pytest.mark.parametrize("case", NUMBERS, ids=names(NUMBERS))
-def test_the_numbers_equal_those_of_plain_loops(case: Case, gradcheck: Callable[..., None]) -> None:
-    found, layer, bottoms, fixed = find(case)
+def test_layer_results_equal_those_of_plain_loops(case: Case, gradcheck: Callable[..., None]) -> None:
+    found, layer, bottoms, fixed = run_case(case)
     line = " ".join(f"{value:.7g}" for value, _ in found)
     assert len(found) == len(case.expected), line
     assert all(abs(a - b) <= slack for (a, slack), b in zip(found, case.expected, strict=True)), line
@@ -73,7 +73,7 @@ def test_the_numbers_equal_those_of_plain_loops(case: Case, gradcheck: Callable[
 
 
 @pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
-def test_an_error_has_its_place(case: dict[str, str]) -> None:
+def test_invalid_fields_and_bottoms_are_refused_at_their_place(case: dict[str, str]) -> None:
     shapes = [tuple(map(int, line.split())) for line in case["bottoms"].splitlines()]
     use_dialect(case["dialect"])
     with pytest.raises(SpecError) as fault:

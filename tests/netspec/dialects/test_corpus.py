@@ -1,4 +1,4 @@
-"""Public nets that need a dialect are built with the shapes of their authors' Caffe."""
+"""SENets, which need a dialect, have the output and the number of parameters that their paper states."""
 
 from pathlib import Path
 
@@ -11,13 +11,12 @@ from paths import SHARED
 pytestmark = pytest.mark.slow
 
 SENET = SHARED / "corpus" / "hujie-frank+SENet" / "models"
-#: Parameters as the SENet paper has them (table 2 and section 4), in millions, without the batch norms' statistics.
+# Parameters as the SENet paper has them (table 2 and section 4), in millions, without the batch norms' statistics.
 PARAMETERS = {"SE-ResNet-50": 28.1, "SE-ResNet-101": 49.3, "SE-ResNet-152": 66.8, "SE-ResNeXt-50": 27.6}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(SENET.glob("*.prototxt")), ids=lambda path: path.stem)
-def test_senets_build(path: Path) -> None:
+def test_senet_has_the_published_number_of_parameters(path: Path) -> None:
     (checked,) = check_file(path, TEST)
     assert checked.faults == []
     assert checked.net is not None

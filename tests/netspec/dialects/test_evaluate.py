@@ -1,4 +1,4 @@
-"""SSD's DetectionEvaluate compared with plain loops, its average precision, and a small SSD from training to test."""
+"""SSD's DetectionEvaluate, its average precision, and a small SSD that is trained and tested by commands."""
 
 import json
 from collections.abc import Callable
@@ -44,7 +44,7 @@ def evaluate(build: Build, settings: str = "", found: list[tuple[float, ...]] = 
     return top[0, 0].numpy()
 
 
-def test_each_detection_is_right_wrong_or_not_counted(build: Build) -> None:
+def test_each_detection_is_a_true_or_false_positive_or_not_counted(build: Build) -> None:
     expected = [
         (-1, 1, 1, -1, -1),
         (-1, 2, 2, -1, -1),
@@ -60,13 +60,13 @@ def test_each_detection_is_right_wrong_or_not_counted(build: Build) -> None:
     np.testing.assert_allclose(evaluate(build), expected)
 
 
-def test_the_threshold_is_of_the_overlap(build: Build) -> None:
+def test_overlap_threshold_separates_true_from_false_positives(build: Build) -> None:
     found = [(0, 1, 0.9, 0.1, 0.1, 0.5, 0.45)]  # overlap 0.875
     assert evaluate(build, "overlap_threshold: 0.87", found)[2, 3:].tolist() == [1, 0]
     assert evaluate(build, "overlap_threshold: 0.88", found)[2, 3:].tolist() == [0, 1]
 
 
-def test_boxes_are_compared_in_whole_pixels_where_sizes_are_known(build: Build, tmp_path: Path) -> None:
+def test_boxes_are_compared_in_whole_pixels_with_name_size_file(build: Build, tmp_path: Path) -> None:
     (tmp_path / "sizes.txt").write_text("a 10 20\nb 10 20\nc 10 20\n")
     settings = f"name_size_file: '{tmp_path / 'sizes.txt'}' overlap_threshold: "
     found = [(0, 1, 0.9, 0.1, 0.1, 0.5, 0.4)]  # (8 + 1) (3 + 1) of (8 + 1) (4 + 1) pixels
@@ -77,7 +77,7 @@ def test_boxes_are_compared_in_whole_pixels_where_sizes_are_known(build: Build, 
         evaluate(build, settings + "0.5")
 
 
-def test_a_resumed_training_continues_with_the_next_size(build: Build, tmp_path: Path) -> None:
+def test_resuming_continues_at_the_next_line_of_name_size_file(build: Build, tmp_path: Path) -> None:
     (tmp_path / "sizes.txt").write_text("a 10 20\nb 1 1\n")
     settings = f"num_classes: 3 name_size_file: '{tmp_path / 'sizes.txt'}'"
     text = f"type: 'DetectionEvaluate' detection_evaluate_param {{ {settings} }}"
@@ -90,7 +90,7 @@ def test_a_resumed_training_continues_with_the_next_size(build: Build, tmp_path:
         resume(second, {"image": -1})
 
 
-def test_average_precision() -> None:
+def test_average_precision_of_each_version_equals_hand_computed_values() -> None:
     use_dialect("ssd")
     from netspec.dialects.ssd.evaluate import average_precision
 

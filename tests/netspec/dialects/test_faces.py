@@ -1,4 +1,4 @@
-"""Layers of face recognition: angular margins compared with their formula, and cases without golden files."""
+"""Layers of face recognition and related forks compared with their formulas, where no golden file has the case."""
 
 import math
 
@@ -34,7 +34,7 @@ def test_margins_are_cosines_that_decrease_monotonically(times: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["SINGLE", "DOUBLE", "TRIPLE", "QUADRUPLE"])
-def test_large_margins_gradient_is_the_derivative(kind: str) -> None:
+def test_large_margin_inner_product_gradient_is_the_derivative(kind: str) -> None:
     layer = netspec.layer(
         f'type: "LargeMarginInnerProduct" largemargin_inner_product_param {{ num_output: 4 type: {kind} base: 2 '
         'weight_filler { type: "gaussian" std: 1 } }'
@@ -45,7 +45,7 @@ def test_large_margins_gradient_is_the_derivative(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["TRIPLE", "QUADRUPLE"])
-def test_spheres_label_has_the_margin_and_a_gradient_of_length_one(kind: str) -> None:
+def test_margin_inner_product_computes_its_formula_with_a_bounded_gradient(kind: str) -> None:
     text = f"num_output: 3 type: {kind} base: 3 power: 0 weight_filler {{ type: 'gaussian' std: 1 }}"
     layer = netspec.layer(f'type: "MarginInnerProduct" margin_inner_product_param {{ {text} }}')
     x, labels = torch.randn(4, 5, requires_grad=True), torch.tensor([2.0, 0, 1, 2])
@@ -77,13 +77,14 @@ def test_spheres_label_has_the_margin_and_a_gradient_of_length_one(kind: str) ->
         ('type: "L1Loss" l1_loss_param { l2_per_location: true l2_prescale_by_channels: true epsilon: 0 plateau: 2 }',
          [[3.0, 4], [1, 1]], 12.5**0.5 / 2),
     ],
+    ids=["Flip", "Flip_height", "Mean_SUBTRACT", "Mean_ADD", "NegReLU", "L1Loss", "L1Loss_l2", "L1Loss_plateau"],
 )  # fmt: skip
-def test_layers_of_one_bottom(text: str, found: object, expected: object) -> None:
+def test_layers_of_one_bottom_compute_the_given_values(text: str, found: object, expected: object) -> None:
     top = netspec.layer(text)(torch.tensor(found))
     torch.testing.assert_close(top, torch.tensor(expected))
 
 
-def test_an_inner_product_with_normalize_has_weights_of_length_one() -> None:
+def test_inner_product_with_normalize_has_weights_of_length_one() -> None:
     fields = "num_output: 3 normalize: true bias_term: false weight_filler { type: 'gaussian' std: 1 }"
     layer = netspec.layer(f'type: "InnerProduct" inner_product_param {{ {fields} }}')
     x = torch.randn(2, 4)
@@ -92,7 +93,7 @@ def test_an_inner_product_with_normalize_has_weights_of_length_one() -> None:
     torch.testing.assert_close(top, x @ next(layer.parameters()).t())
 
 
-def test_a_channel_scale_computes_the_requested_gradients() -> None:
+def test_channel_scale_without_backward_scale_and_with_global_scale() -> None:
     x, scale = torch.randn(2, 3, 2, 2, requires_grad=True), torch.rand(2, 1, 2, 2, requires_grad=True)
     top = netspec.layer('type: "ChannelScale" channel_scale_param { do_backward_scale: false }')(x, scale)
     torch.testing.assert_close(top, x * scale)
@@ -108,7 +109,7 @@ def test_a_channel_scale_computes_the_requested_gradients() -> None:
     torch.testing.assert_close(tops[0], x * scale.mean())
 
 
-def test_a_bias_is_added_to_the_labels_score_and_grows() -> None:
+def test_label_specific_add_adds_a_growing_bias_to_the_labels_score() -> None:
     fields = "bias_base: 0 bias_gamma: 1 bias_max: 1.5"
     layer = netspec.layer(f'type: "LabelSpecificAdd" phase: TRAIN label_specific_add_param {{ {fields} }}')
     scores, labels = torch.tensor([[1.0, 2], [-3, 4]]), torch.tensor([1.0, 0])
@@ -118,7 +119,7 @@ def test_a_bias_is_added_to_the_labels_score_and_grows() -> None:
         layer(scores, torch.tensor([2.0, 0]))
 
 
-def test_focal_losses_of_both_types() -> None:
+def test_focal_loss_of_both_types_computes_its_formula() -> None:
     scores, labels = torch.randn(3, 4), torch.tensor([0.0, 3, 1])
     p = scores.softmax(1)[range(3), labels.long()]
     for kind, factor in (("ORIGIN", (1 - p) ** 3), ("ONEADDP", (1 + p) ** 3)):
@@ -126,7 +127,7 @@ def test_focal_losses_of_both_types() -> None:
         torch.testing.assert_close(layer(scores, labels), (-factor * p.log()).mean())
 
 
-def test_segmentations_are_counted_pixel_by_pixel() -> None:
+def test_seg_accuracy_counts_pixels_and_refuses_invalid_labels() -> None:
     scores, labels = torch.randn(2, 3, 4, 5), torch.randint(0, 3, (2, 1, 4, 5)).float()
     labels[0, 0, 0, 0] = 255
     layer = netspec.layer('type: "SegAccuracy" seg_accuracy_param { ignore_label: 255 reset: false }')

@@ -1,4 +1,4 @@
-"""Faster R-CNN's layers that were Python code: compared with plain loops, and a training whose losses fall."""
+"""Faster R-CNN's Python layers, built in: compared with plain loops, and a training whose losses fall."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -39,8 +39,8 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return width * height / (area + other - width * height)
 
 
-def move(box: np.ndarray, delta: np.ndarray) -> np.ndarray:
-    """The box that a target describes, as the proposals compute it from learned values."""
+def apply_delta(box: np.ndarray, delta: np.ndarray) -> np.ndarray:
+    """Return the box that a target describes, as proposals are computed from predictions."""
     sizes = box[2:] - box[:2] + 1
     center = box[:2] + sizes / 2 + delta[:2] * sizes
     half = np.exp(delta[2:]) * sizes / 2
@@ -55,6 +55,7 @@ def move(box: np.ndarray, delta: np.ndarray) -> np.ndarray:
         ("{'feat_stride': 8, 'scales': (2, 4), 'allowed_border': 0}", {"scales": [2, 4], "allowed_border": 0}),
         ("feat_stride: 16\n", {"feat_stride": 16}),
     ],
+    ids=["one_line", "tuple_tag", "braces", "without_quotes"],
 )
 def test_param_str_is_read(build: Build, text: str, found: dict[str, object]) -> None:
     escaped = text.replace("\n", "\\n")
@@ -63,7 +64,7 @@ def test_param_str_is_read(build: Build, text: str, found: dict[str, object]) ->
     assert found.items() <= settings(layer, "feat_stride", "scales", "ratios", "allowed_border").items()
 
 
-def test_ratios_make_other_anchors_and_another_name_is_refused(build: Build) -> None:
+def test_ratios_determine_the_anchors_and_an_unknown_setting_is_refused(build: Build) -> None:
     text = ANCHORS.replace("'feat_stride': 16", "'feat_stride': 16, 'ratios': [0.5, 1]")
     layer = build("rcnn", text, (1, 12, 20, 30), (3, 5), (1, 3), tops=4)
     anchors: Any = layer.anchors
@@ -74,7 +75,7 @@ def test_ratios_make_other_anchors_and_another_name_is_refused(build: Build) -> 
         build("rcnn", text.replace("ratios", "ration"), (1, 18, 20, 30), (3, 5), (1, 3), tops=4)
 
 
-def test_anchors_that_show_an_object_are_moved_onto_it(build: Build) -> None:
+def test_anchor_targets_equal_plain_loops(build: Build) -> None:
     scores = torch.zeros(1, 18, 20, 30)
     layer = build("rcnn", ANCHORS, scores.shape, TRUTH.shape, IMAGE.shape, phase=TRAIN, tops=4)
     labels, moves, inner, outer = (top.numpy() for top in layer.run(scores, TRUTH, IMAGE))
@@ -95,12 +96,12 @@ def test_anchors_that_show_an_object_are_moved_onto_it(build: Build) -> None:
     assert (by_anchor[~within] == -1).all()
     assert (table[by_anchor == 0].max(axis=1) < 0.3).all()
     for k in np.flatnonzero(objects):
-        np.testing.assert_allclose(move(anchors[k], deltas[k]), truth[table[k].argmax(), :4], atol=1e-3)
+        np.testing.assert_allclose(apply_delta(anchors[k], deltas[k]), truth[table[k].argmax(), :4], atol=1e-3)
     assert (inside == (by_anchor == 1)[:, None]).all()
     np.testing.assert_allclose(outside, (by_anchor >= 0)[:, None] / np.float32((by_anchor >= 0).sum()) * np.ones(4))
 
 
-def test_an_image_without_a_true_box_is_background(build: Build) -> None:
+def test_targets_without_true_boxes_are_background(build: Build) -> None:
     scores, none = torch.zeros(1, 18, 20, 30), torch.zeros(0, 5)
     layer = build("rcnn", ANCHORS, scores.shape, (3, 5), IMAGE.shape, phase=TRAIN, tops=4)
     labels = layer.run(scores, none, IMAGE)[0]
@@ -112,7 +113,7 @@ def test_an_image_without_a_true_box_is_background(build: Build) -> None:
     assert labels.tolist() == [0]
 
 
-def test_regions_that_show_an_object_are_moved_onto_it(build: Build) -> None:
+def test_proposal_targets_equal_plain_loops(build: Build) -> None:
     rng = np.random.default_rng(0)
     near = TRUTH[rng.integers(0, 3, 300), :4] + torch.from_numpy(rng.uniform(-30, 30, (300, 4)))
     low, high = torch.minimum(near[:, :2], near[:, 2:]), torch.maximum(near[:, :2], near[:, 2:])
@@ -135,14 +136,14 @@ def test_regions_that_show_an_object_are_moved_onto_it(build: Build) -> None:
             columns = slice(4 * int(own[4]), 4 * int(own[4]) + 4)
             weights[columns] = 1
             delta = moves[k, columns] * [0.1, 0.1, 0.2, 0.2]
-            np.testing.assert_allclose(move(regions[k, 1:], delta), own[:4], atol=1e-2)
+            np.testing.assert_allclose(apply_delta(regions[k, 1:], delta), own[:4], atol=1e-2)
         else:
             assert max(table) < 0.5
         assert (inner[k] == weights).all()
         assert (outer[k] == weights).all()
 
 
-def test_in_an_rfcn_the_tops_have_four_axes_and_the_forks_code_chooses() -> None:
+def test_proposal_targets_of_rfcn_have_four_axes_and_need_the_forks_code() -> None:
     """OHEM adds a loss of each region (R, 1, 1, 1) to one that has the labels' shape."""
     tops = "".join(f' top: "{name}"' for name in "rlmio")
     text = f"""layer {{ name: "in" type: "Input" top: "p" top: "t" input_param {{ shape {{ dim: [1, 5] }} }} }}
@@ -155,7 +156,7 @@ def test_in_an_rfcn_the_tops_have_four_axes_and_the_forks_code_chooses() -> None
         net(p=TRUTH[:1], t=TRUTH[:1])
 
 
-def test_regions_have_the_attributes_of_their_objects(build: Build) -> None:
+def test_proposal_targets_have_the_attributes_of_their_objects(build: Build) -> None:
     attributes = torch.zeros(3, 16)
     attributes[:, 0], attributes[1, 1:3] = torch.tensor([5.0, 0, 7]), torch.tensor([9.0, 8])
     truth = torch.cat([TRUTH, attributes], dim=1)
@@ -169,7 +170,7 @@ def test_regions_have_the_attributes_of_their_objects(build: Build) -> None:
 
 
 @pytest.mark.slow
-def test_proposals_of_the_python_layer_are_the_dialects(build: Build) -> None:
+def test_python_layer_proposal_layer_equals_layer_proposal(build: Build) -> None:
     text = PYTHON.format("rpn.proposal_layer", "ProposalLayer", "'feat_stride': 16")
     torch.manual_seed(1)
     bottoms = torch.rand(1, 18, 20, 30), torch.randn(1, 36, 20, 30) / 5, IMAGE
@@ -180,7 +181,7 @@ def test_proposals_of_the_python_layer_are_the_dialects(build: Build) -> None:
         assert torch.equal(build("rcnn", text, *shapes, phase=phase).run(*bottoms)[0], expected)
 
 
-def test_allowed_code_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_allow_python_runs_the_forks_own_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "rpn").mkdir()
     (tmp_path / "rpn" / "proposal_layer.py").write_text("raise ValueError('this is mine')")
     net = 'layer {{ name: "p" top: "x" {} }}'
@@ -193,7 +194,7 @@ def test_allowed_code_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         netspec.load_net("net.prototxt", allow_python=True)
 
 
-def test_a_program_passes_images_as_before(tmp_path: Path) -> None:
+def test_set_roidb_passes_images_boxes_and_attributes(tmp_path: Path) -> None:
     text = PYTHON.format("roi_data_layer.layer", "RoIDataLayer", "'num_classes': 4")
     (tmp_path / "net.prototxt").write_text(f'layer {{ name: "d" top: "data" top: "im_info" top: "gt_boxes" {text} }}')
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((60, 80, 3)))

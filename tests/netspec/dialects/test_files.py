@@ -1,4 +1,4 @@
-"""Dialects are found by name, by entry point and by path; an error in one is reported in one line."""
+"""Dialects are found by name, by path, by entry point and by what a prototxt uses; their errors take one line."""
 
 import re
 import subprocess
@@ -30,7 +30,7 @@ layer { name: "times" type: "Times" bottom: "x" top: "y" times_param { factor: 5
 
 
 def example() -> str:
-    """The file that the documentation shows."""
+    """Return the file that the documentation shows."""
     shown = str(netspec.dialects.__doc__).split("pass ``--plugin doubling.py``::")[1]
     lines = shown.split("``DECLARATIONS`` is a string")[0].splitlines()
     return "\n".join(line.removeprefix("    ") for line in lines)
@@ -38,7 +38,7 @@ def example() -> str:
 
 @pytest.fixture(scope="session")
 def fork(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One file for all tests of a process: what it declares stays in the schema's pool, unseen, after a test."""
+    """Write the documented example, once per process: what it declares stays in the schema's pool after a test."""
     path = tmp_path_factory.mktemp("fork") / "doubling.py"
     path.write_text(example())
     path.with_name("net.prototxt").write_text(NET)
@@ -46,7 +46,7 @@ def fork(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def files_afresh() -> Iterator[None]:
+def fresh_files() -> Iterator[None]:
     known_files.cache_clear()
     dialect_files.announce_known.cache_clear()
     yield
@@ -54,10 +54,10 @@ def files_afresh() -> Iterator[None]:
     dialect_files.announce_known.cache_clear()
 
 
-# ---- One's own file ----
+# ---- A file of the user ----
 
 
-def test_the_documented_example_runs_from_the_command_line(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_documented_example_works_in_commands(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
     net = str(fork.with_name("net.prototxt"))
     assert main(["check", net]) == 1
     assert 'LayerParameter has no field "times_param"' in capsys.readouterr().err
@@ -77,14 +77,14 @@ def test_the_documented_example_computes(fork: Path) -> None:
     np.testing.assert_array_equal(net(x=x)["y"].numpy(), 5 * x)
 
 
-def test_upgrading_keeps_a_dialects_fields(fork: Path, tmp_path: Path) -> None:
+def test_upgrade_net_proto_text_keeps_fields_of_a_dialect(fork: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.prototxt"
     net = str(fork.with_name("net.prototxt"))
     assert main(["upgrade_net_proto_text", net, str(out), "--plugin", str(fork)]) == 0
     assert "times_param {\n    factor: 5" in out.read_text()
 
 
-def test_several_plugins_at_once(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_plugins_are_active_at_once(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["layers", "--plugin", str(fork), "--plugin", "ssd", "--plugin", "blocks"]) == 0
     found = {line.split()[0] for line in capsys.readouterr().out.splitlines()}
     assert {"Times", "PriorBox", "MultiBoxLoss", "Axpy", "Convolution"} <= found
@@ -93,7 +93,7 @@ def test_several_plugins_at_once(fork: Path, capsys: pytest.CaptureFixture[str])
 
 FAULTS = {
     "no such dialect": (None, "ssdd", 'unknown dialect "ssdd"; did you mean "ssd"?'),
-    "nothing like it": (
+    "no similar dialect": (
         None,
         "x" * 20,
         f'unknown dialect "{"x" * 20}"; expected one of: blocks, c3d, densenet, faces, filters, flownet, happynear,',
@@ -131,7 +131,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize(("content", "name", "message"), FAULTS.values(), ids=FAULTS.keys())
-def test_faults_are_one_line(
+def test_errors_of_a_plugin_are_reported_in_one_line(
     content: bytes | None, name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / f"faulty_{abs(hash(message))}.py"
@@ -170,7 +170,7 @@ def test_any_file_name_can_be_used(tmp_path: Path) -> None:
     parse_net_text("layer { my_fork: 3 }", "f")
 
 
-# ---- Found without being asked for ----
+# ---- Activated by fields and types, and layer types ----
 
 FOUND = """
 import sys
@@ -182,7 +182,7 @@ print(active(), "torch" in sys.modules)
 """
 
 
-def test_an_unknown_field_switches_its_dialect_on_without_torch() -> None:
+def test_a_field_activates_its_dialect_without_importing_torch() -> None:
     texts = [
         "layer { prior_box_param { min_size: 1 } }",
         "layer { dropout_param { scale_train: true } }",
@@ -193,7 +193,7 @@ def test_an_unknown_field_switches_its_dialect_on_without_torch() -> None:
     assert said == "['blocks', 'filters', 'ssd'] False\n"
 
 
-def test_an_unknown_type_switches_its_dialect_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_layer_type_activates_its_dialect(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     net = tmp_path / "net.prototxt"
     for kind in ("MultiBoxLoss", "Axpy", "PSROIPooling"):
         net.write_text(f'layer {{ name: "l" type: "{kind}" top: "x" }}')
@@ -205,7 +205,7 @@ def test_an_unknown_type_switches_its_dialect_on(tmp_path: Path, capsys: pytest.
     assert 'unknown layer type "Convolutoin"; did you mean "Convolution"?' in capsys.readouterr().err
 
 
-def test_a_type_of_two_dialects_is_an_error_that_asks_for_one(
+def test_a_layer_type_of_two_dialects_is_refused_with_the_options_to_give(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     dialect_files.announce_known()
@@ -220,7 +220,7 @@ def test_a_type_of_two_dialects_is_an_error_that_asks_for_one(
 
 
 @pytest.mark.parametrize("name", sorted(known_files()))
-def test_the_types_read_from_a_files_syntax_equal_those_it_registers(name: str) -> None:
+def test_layer_types_read_from_the_source_equal_those_registered(name: str) -> None:
     before = set(layer_types())
     declared = read_dialect(find_file(name))
     use_dialect(name)
@@ -232,7 +232,7 @@ def test_the_types_read_from_a_files_syntax_equal_those_it_registers(name: str) 
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files_afresh: None) -> Iterator[Path]:
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fresh_files: None) -> Iterator[Path]:
     """An installed package with three entry points: a dialect, one that does not exist, and one that is none."""
     folder = tmp_path / "site" / "forky"
     info = tmp_path / "site" / "forky-1.0.dist-info"
@@ -252,7 +252,9 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files_afresh: None)
 
 
 @pytest.mark.usefixtures("package")
-def test_a_packages_entry_point_is_found_and_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_entry_point_of_a_package_is_used_and_invalid_ones_are_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     net = tmp_path / "net.prototxt"
     net.write_text(NET.replace("Times", "Thrice").replace("times_param", "thrice_param"))
     assert main(["check", str(net)]) == 0
@@ -264,21 +266,21 @@ def test_a_packages_entry_point_is_found_and_used(tmp_path: Path, capsys: pytest
     assert cls.__module__ == "forky.doubling"
 
 
-# ---- Found by themselves ----
+# ---- Activated by a whole prototxt ----
 
 
-def test_a_prototxt_activates_the_dialects_it_needs(files_afresh: None) -> None:
+def test_a_prototxt_activates_the_dialects_it_needs(fresh_files: None) -> None:
     text = 'layer { name: "n" type: "Normalize" bottom: "x" top: "n" norm_param { across_spatial: false } }'
     assert switched_on_by(text) == ["ssd"]
     assert layer_class("Normalize") is not None
 
 
-def test_a_prototxt_of_caffes_layers_activates_no_dialect(files_afresh: None) -> None:
+def test_a_prototxt_of_caffes_layers_activates_no_dialect(fresh_files: None) -> None:
     text = 'layer { name: "Normalize" type: "ReLU" bottom: "Permute" top: "Swish" }'  # names, not types
     assert switched_on_by(text) == []
 
 
-def test_a_field_that_caffe_has_in_another_message_belongs_to_the_enclosing_message(files_afresh: None) -> None:
+def test_a_field_that_caffe_has_in_another_message_activates_its_dialect(fresh_files: None) -> None:
     before = layer_class("BatchNorm")
     text = 'layer { type: "Convolution" convolution_param { num_output: 1 bias_filler { type: "constant" } } }'
     assert switched_on_by(text) == []
@@ -287,16 +289,16 @@ def test_a_field_that_caffe_has_in_another_message_belongs_to_the_enclosing_mess
 
 
 @pytest.mark.slow
-def test_a_prototxt_of_two_dialects_switches_on_both(files_afresh: None) -> None:
+def test_a_prototxt_of_two_dialects_activates_both(fresh_files: None) -> None:
     text = 'layer { type: "Permute" permute_param { order: 0 } } layer { type: "Axpy" } layer { type: "Normalize" }'
     assert switched_on_by(text) == ["ssd", "blocks"]
 
 
-def test_fields_of_no_dialect_are_left_to_the_reader(files_afresh: None) -> None:
+def test_unknown_fields_and_types_activate_no_dialect(fresh_files: None) -> None:
     assert switched_on_by('layer { type: "NoSuchType" no_such_param { } }') == []
 
 
-def test_the_page_names_every_dialect() -> None:
+def test_docs_netspec_md_lists_every_dialect() -> None:
     table = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "netspec.md").read_text(), re.MULTILINE)
     own = {name for name, file in known_files().items() if file.module.startswith("netspec.dialects.")}
     assert own <= set(table)

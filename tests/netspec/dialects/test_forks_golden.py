@@ -95,20 +95,20 @@ def difference(found: np.ndarray, golden: np.ndarray, key: str) -> float:
 
 
 @pytest.mark.parametrize("name", cases("layers"))
-def test_a_layer_equals_the_forks_results(name: str) -> None:
+def test_layer_equals_the_forks_results(name: str) -> None:
     check(name, lambda: differences(LayerCase(FORKS / "layers" / name)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", cases("training"))
-def test_a_training_follows_the_fork(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_follows_the_fork(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(FORKS / "training" / name, tmp_path / name)
     monkeypatch.chdir(tmp_path / name)
     check(name, training_differences)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMED if NAMED[name] not in ("hed", "rcf")])
-def test_an_unknown_fork_gets_a_warning(
+def test_layer_of_an_unknown_fork_gets_a_warning(
     name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if name in os.listdir(FORKS / "training"):
@@ -119,7 +119,7 @@ def test_an_unknown_fork_gets_a_warning(
     assert f'"{NAMED[name]}" (' in caplog.text
 
 
-def test_the_tables_name_cases() -> None:
+def test_the_tables_contain_existing_cases_only() -> None:
     names = {path.name for folder in ("layers", "training") for path in (FORKS / folder).iterdir()}
     assert {*FAULTS, *REFUSED, *NAMED, *OPEN} <= names
 

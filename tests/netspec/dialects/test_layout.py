@@ -1,4 +1,4 @@
-"""Layers that only move numbers, compared with plain loops over their indices."""
+"""MergeCrop of dialect layout: its values and gradients."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,6 @@ import torch
 from netspec.layers import Layer
 
 Build = Callable[..., Layer]
-Gradcheck = Callable[..., None]
 
 
 def run(layer: Layer, *bottoms: torch.Tensor) -> np.ndarray:
@@ -18,7 +17,7 @@ def run(layer: Layer, *bottoms: torch.Tensor) -> np.ndarray:
     return top.detach().numpy()
 
 
-def test_merge_crop_stacks_and_adds(build: Build) -> None:
+def test_merge_crop_concatenates_or_adds_the_cropped_bottom(build: Build) -> None:
     small, large = torch.randn(2, 3, 4, 2), torch.randn(2, 3, 7, 4)
     cut = large[:, :, 1:5, 1:3]
     layer = build("layout", "type: 'MergeCrop'", small.shape, large.shape)
@@ -30,7 +29,9 @@ def test_merge_crop_stacks_and_adds(build: Build) -> None:
     np.testing.assert_array_equal(run(layer, small, large), torch.cat([torch.zeros_like(small), cut], 1))
 
 
-@pytest.mark.parametrize(("param", "learns"), [("", (True, False)), ("backward: 0 backward: 1", (False, True))])
+@pytest.mark.parametrize(
+    ("param", "learns"), [("", (True, False)), ("backward: 0 backward: 1", (False, True))], ids=["first", "second"]
+)
 def test_merge_crop_computes_the_requested_gradients(build: Build, param: str, learns: tuple[bool, bool]) -> None:
     bottoms = [torch.randn(1, 2, 2, 2, requires_grad=True), torch.randn(1, 2, 4, 4, requires_grad=True)]
     layer = build("layout", f"type: 'MergeCrop' mergecrop_param {{ {param} }}", (1, 2, 2, 2), (1, 2, 4, 4))

@@ -1,4 +1,4 @@
-"""MultiBoxLoss compared with the loss summed up prior by prior, and its oddities one by one."""
+"""MultiBoxLoss: mining, suppression, what counts in the loss, and invalid true boxes."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,6 @@ from netspec.layers import Layer
 pytestmark = pytest.mark.slow
 
 Build = Callable[..., Layer]
-Gradcheck = Callable[..., None]
 
 IMAGES, PRIORS, CLASSES = 3, 16, 4
 TRUTH = [  # image, label, instance, xmin, ymin, xmax, ymax, difficult
@@ -25,8 +24,8 @@ TRUTH = [  # image, label, instance, xmin, ymin, xmax, ymax, difficult
 ]
 
 
-def scene(kinds: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Predicted boxes, confidences, priors (some beyond the image), variances."""
+def random_predictions(kinds: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return predicted boxes, confidences, priors (some beyond the image) and variances."""
     rng = np.random.default_rng(3)
     centre, half = rng.uniform(0.1, 0.9, (PRIORS, 2)), rng.uniform(0.1, 0.3, (PRIORS, 2))
     priors = np.concatenate([centre - half, centre + half], axis=1)
@@ -52,7 +51,7 @@ def layer_of(build: Build, settings: dict[str, Any], given: list[torch.Tensor], 
 
 
 def test_a_batch_without_true_boxes_has_no_loss_and_no_gradient(build: Build) -> None:
-    given = bottoms(*scene(), TRUTH[-1:])
+    given = bottoms(*random_predictions(), TRUTH[-1:])
     for settings in ({}, {"mining_type": "HARD_EXAMPLE"}):
         loc, conf = (g.clone().requires_grad_() for g in given[:2])
         (loss,) = layer_of(build, settings, given).run(loc, conf, *given[2:])
@@ -64,9 +63,8 @@ def test_a_batch_without_true_boxes_has_no_loss_and_no_gradient(build: Build) ->
         assert not conf.grad.any()
 
 
-def test_parts_that_are_not_propagated_do_not_count(build: Build) -> None:
-    scenery = scene()
-    given = bottoms(*scenery, TRUTH)
+def test_losses_with_propagate_down_false_are_left_out(build: Build) -> None:
+    given = bottoms(*random_predictions(), TRUTH)
     down = "propagate_down: {} propagate_down: {} propagate_down: false propagate_down: false"
     (both,) = layer_of(build, {}, given).run(*given)
     (boxes,) = layer_of(build, {}, given, down.format("true", "false")).run(*given)
@@ -76,8 +74,8 @@ def test_parts_that_are_not_propagated_do_not_count(build: Build) -> None:
     torch.testing.assert_close(boxes + confidences, both)
 
 
-def test_with_the_variance_in_the_target_the_gradient_is_not_divided_by_it(build: Build) -> None:
-    given = bottoms(*scene(), TRUTH)
+def test_gradient_is_not_divided_by_a_variance_encoded_in_the_target(build: Build) -> None:
+    given = bottoms(*random_predictions(), TRUTH)
     settings = {"encode_variance_in_target": True, "loc_loss_type": "SMOOTH_L1", "conf_loss_type": "SOFTMAX"}
     loc = given[0].clone().requires_grad_()
     layer_of(build, settings, given, "loss_param { normalization: NONE }").run(loc, *given[1:])[0].backward()
@@ -85,20 +83,20 @@ def test_with_the_variance_in_the_target_the_gradient_is_not_divided_by_it(build
     assert loc.grad.abs().max() == 1  # where |d| > 1; 1 / 0.25 at least if it were divided
 
 
-def test_objects_of_any_label_are_one_class(build: Build) -> None:
-    loc, conf, priors, variances = scene()
+def test_map_object_to_agnostic_makes_all_labels_one_class(build: Build) -> None:
+    loc, conf, priors, variances = random_predictions()
     given = bottoms(loc, conf[..., :2], priors, variances, TRUTH)
     text = "type: 'MultiBoxLoss' multibox_loss_param { num_classes: 2 map_object_to_agnostic: true }"
     (loss,) = build("ssd", text, *(b.shape for b in given)).run(*given)
-    relabelled = [(t[0], min(t[1], 1), *t[2:]) for t in TRUTH]
+    relabeled = [(t[0], min(t[1], 1), *t[2:]) for t in TRUTH]
     (expected,) = build(
         "ssd", "type: 'MultiBoxLoss' multibox_loss_param { num_classes: 2 }", *(b.shape for b in given)
-    ).run(*bottoms(loc, conf[..., :2], priors, variances, relabelled))
+    ).run(*bottoms(loc, conf[..., :2], priors, variances, relabeled))
     assert loss == expected
 
 
-def test_hard_examples_that_overlap_one_of_greater_loss_are_suppressed(build: Build) -> None:
-    # Two priors nearly alike, of which only that of greater loss is trained, one apart, and one next to nothing.
+def test_hard_examples_that_overlap_one_of_larger_loss_are_suppressed(build: Build) -> None:
+    # Two priors that overlap, of which only that of larger loss is trained, one that overlaps none, and a tiny one.
     boxes = [[0.1, 0.1, 0.4, 0.4], [0.11, 0.1, 0.4, 0.4], [0.6, 0.6, 0.9, 0.9], [0.5, 0.5, 0.502, 0.502]]
     priors = np.array(boxes, np.float32)
     variances = np.full((4, 4), 0.1, np.float32)
@@ -115,8 +113,8 @@ def test_hard_examples_that_overlap_one_of_greater_loss_are_suppressed(build: Bu
     assert trained == [[False, True, True, False], [False, True, False, False], [True, True, True, True]]
 
 
-def test_suppression_without_a_top_k_leaves_nothing(build: Build) -> None:
-    given = bottoms(*scene(), TRUTH)
+def test_suppression_without_top_k_leaves_no_example(build: Build) -> None:
+    given = bottoms(*random_predictions(), TRUTH)
     text = "num_classes: 4 mining_type: HARD_EXAMPLE nms_param { nms_threshold: 0.5 }"
     (loss,) = build("ssd", f"type: 'MultiBoxLoss' multibox_loss_param {{ {text} }}", *(b.shape for b in given)).run(
         *given
@@ -131,9 +129,10 @@ def test_suppression_without_a_top_k_leaves_nothing(build: Build) -> None:
         ((0, 4, 0, 0.1, 0.1, 0.4, 0.4, 0), "found a true box of label 4"),
         ((0, 1, 0, 0.4, 0.1, 0.4, 0.4, 0), "expected xmin < xmax and ymin < ymax"),
     ],
+    ids=["label_of_background", "label_too_large", "empty_box"],
 )
-def test_true_boxes_that_are_refused(build: Build, row: tuple[float, ...], message: str) -> None:
-    given = bottoms(*scene(), [row])
+def test_invalid_true_boxes_are_refused(build: Build, row: tuple[float, ...], message: str) -> None:
+    given = bottoms(*random_predictions(), [row])
     layer = layer_of(build, {"code_type": "CENTER_SIZE"}, given)
     with pytest.raises(SpecError, match=message):
         layer.run(*given)

@@ -1,4 +1,4 @@
-"""A dialect belongs to the nets that use it: others in the same process have Caffe's own layers."""
+"""Each net has its own dialects; other nets of the process have Caffe's own layers."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -36,7 +36,7 @@ def test_a_requested_dialect_applies_to_every_net(net_of: Callable[..., Net]) ->
     assert net_of(PLAIN.replace('"conv"', '"other"')).layers[1].__class__ is not Convolution
 
 
-def test_a_layer_type_names_its_dialect(net_of: Callable[..., Net]) -> None:
+def test_a_layer_type_of_one_dialect_activates_it_and_one_of_several_does_not(net_of: Callable[..., Net]) -> None:
     sure = (
         'layer { name: "n" type: "CropCenter" bottom: "data" top: "n" crop_center_param { crop_size: [0, 0, 1, 1] } }'
     )
@@ -70,8 +70,23 @@ TWO_TOPS = NORMALIZE.replace('top: "n"', 'top: "n" top: "l"')
         (SMOOTH % "loss_weight: 1 smooth_l1_loss_param { sigma: 1 }", ""),
         (SMOOTH % "loss_weight: 1 loss_param { normalization: NONE }", ""),
     ],
+    ids=[
+        "Normalize",
+        "Normalize_with_comment",
+        "Normalize_with_two_tops",
+        "BN",
+        "BN_with_comment",
+        "BN_with_Interp",
+        "BN_with_bn_mode",
+        "SmoothL1Loss",
+        "FocalLoss_alpha",
+        "FocalLoss_alpha_1",
+        "FocalLoss_with_comment",
+        "SmoothL1Loss_with_sigma",
+        "SmoothL1Loss_with_normalization",
+    ],
 )
-def test_a_layer_of_several_forks_is_taken_as_the_file_shows(
+def test_a_layer_of_several_forks_gets_a_warning_unless_the_file_shows_the_fork(
     net_of: Callable[..., Net], caplog: pytest.LogCaptureFixture, text: str, others: str
 ) -> None:
     net_of(PLAIN + text)
@@ -84,7 +99,7 @@ def test_a_layer_of_several_forks_is_taken_as_the_file_shows(
     assert all(others in line and "# dialect: " in line and "--plugin" in line for line in said)
 
 
-def test_a_comment_must_name_an_existing_dialect(net_of: Callable[..., Net]) -> None:
+def test_a_comment_with_an_unknown_dialect_is_refused(net_of: Callable[..., Net]) -> None:
     with pytest.raises(SpecError, match=r':2:1: unknown dialect "hd"; did you mean "hed"'):
         net_of("\n# dialect: hd\n" + PLAIN)
 
@@ -106,8 +121,9 @@ def conv(pad: int) -> str:
         (conv(35), 34, "aligns its bottoms as HED's branch does, by 34 and 34"),
         (conv(35).replace('"crop" }', '"crop" crop_param { offset: 0 } }'), 0, ""),
     ],
+    ids=["pad_1", "pad_2", "pad_2_hed", "pad_35", "pad_35_with_offset"],
 )
-def test_crop_without_offsets_aligns_its_bottoms_in_heds_branch(
+def test_crop_without_offsets_aligns_its_bottoms_in_hed_only(
     net_of: Callable[..., Net], caplog: pytest.LogCaptureFixture, text: str, offset: int, said: str
 ) -> None:
     if "crop_param" in text:
@@ -118,7 +134,7 @@ def test_crop_without_offsets_aligns_its_bottoms_in_heds_branch(
     assert all(said in line for line in lines)
 
 
-def test_crops_of_hed_are_where_coord_map_puts_them(net_of: Callable[..., Net]) -> None:
+def test_crop_offsets_of_hed_equal_those_of_coord_map(net_of: Callable[..., Net]) -> None:
     last, text = "c", conv(35).partition('layer { name: "crop"')[0].replace('"conv"', '"c"')
     for step in range(5):
         if step:
@@ -133,15 +149,17 @@ def test_crops_of_hed_are_where_coord_map_puts_them(net_of: Callable[..., Net]) 
     assert [crop.window[2].start for crop in crops] == [34, 35, 36, 38, 42]  # by BVLC's coord_map
 
 
-@pytest.mark.parametrize(("fields", "weight"), [("smooth_l1_loss_param { sigma: 3 }", 0), ("loss_weight: 2", 2)])
-def test_a_loss_of_fast_rcnn_counts_with_a_loss_weight_only(
+@pytest.mark.parametrize(
+    ("fields", "weight"), [("smooth_l1_loss_param { sigma: 3 }", 0), ("loss_weight: 2", 2)], ids=["without", "with"]
+)
+def test_smooth_l1_loss_of_fast_rcnn_counts_with_a_loss_weight_only(
     net_of: Callable[..., Net], fields: str, weight: float
 ) -> None:
     assert net_of(PLAIN + SMOOTH % fields).loss_weights[-1] == [weight]
     assert net_of("# dialect: ssd\n" + PLAIN + SMOOTH % "").loss_weights[-1] == [1]
 
 
-def test_files_have_blobs_of_bn_with_two_axes_or_four(net_of: Callable[..., Net], tmp_path: Path) -> None:
+def test_bn_blobs_of_two_axes_in_a_file_are_loaded(net_of: Callable[..., Net], tmp_path: Path) -> None:
     message = NetParameter()
     blobs = message.layer.add(name="n", type="BN").blobs
     for _ in range(4):
@@ -170,7 +188,7 @@ layer { name: "loss" type: "SmoothL1Loss" bottom: "boxes" bottom: "targets" bott
 """
 
 
-def test_losses_of_rfcn_have_tops_for_each_region(net_of: Callable[..., Net]) -> None:
+def test_losses_of_rfcn_have_a_top_with_the_loss_of_each_region(net_of: Callable[..., Net]) -> None:
     net = net_of(OHEM)
     shapes = [(6, 3), (6, 1, 1, 1), (6, 8), (6, 8), (6, 8), (6, 5)]
     given = dict(zip(net.inputs, (torch.randn(shape) for shape in shapes), strict=True))

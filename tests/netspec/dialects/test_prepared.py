@@ -1,4 +1,4 @@
-"""Nets of dialects' layers that replace or extend Caffe's compute the same when they are prepared."""
+"""Prepared nets with layers of dialects give the same results as before they are prepared."""
 
 from collections.abc import Callable
 
@@ -23,13 +23,13 @@ LAYERS = {
 
 
 @pytest.mark.parametrize("path", ENTRIES)
-def test_an_entry_belongs_to_one_class(path: str) -> None:
+def test_each_entry_names_an_existing_class(path: str) -> None:
     module, _, name = path.rpartition(".")
     assert f"class {name}(" in (ROOT / f"{module.replace('.', '/')}.py").read_text()
 
 
 @pytest.mark.parametrize("layer", LAYERS)
-def test_a_prepared_net_computes_the_same(layer: str, net_of: Callable[..., Net]) -> None:
+def test_a_prepared_net_gives_the_same_results(layer: str, net_of: Callable[..., Net]) -> None:
     text = f"""layer {{ name: "x" type: "Input" top: "x" input_param {{ shape {{ dim: 2 dim: 3 dim: 9 dim: 8 }} }} }}
         layer {{ name: "it" {LAYERS[layer]} bottom: "x" top: "y" }}
         layer {{ name: "relu" type: "ReLU" bottom: "y" top: "y" }}"""

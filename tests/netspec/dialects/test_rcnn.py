@@ -1,4 +1,4 @@
-"""The layers of R-CNN and R-FCN compared with plain loops over pixels."""
+"""Dialects rcnn and rfcn: pooling of regions and proposals in cases computed by hand, and refused regions."""
 
 import math
 from collections.abc import Callable
@@ -18,7 +18,6 @@ from netspec.proto.text import parse_net_text
 pytestmark = pytest.mark.slow
 
 Build = Callable[..., Layer]
-Gradcheck = Callable[..., None]
 
 
 def test_the_first_of_equal_pixels_gets_the_gradient_of_roi_pooling(build: Build) -> None:
@@ -34,7 +33,7 @@ def test_the_first_of_equal_pixels_gets_the_gradient_of_roi_pooling(build: Build
     assert maps.grad[0, 0].tolist() == [[1, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 0]]
 
 
-def test_a_pixel_can_belong_to_two_bins(build: Build) -> None:
+def test_a_pixel_can_belong_to_two_bins_of_roi_pooling(build: Build) -> None:
     maps = torch.arange(3.0).reshape(1, 1, 1, 3).requires_grad_()
     layer = build("rcnn", "type: 'ROIPooling' roi_pooling_param { pooled_h: 1 pooled_w: 2 }", maps.shape, (1, 5))
     (top,) = layer.run(maps, torch.tensor([[0.0, 0, 0, 2, 0]]))
@@ -42,7 +41,7 @@ def test_a_pixel_can_belong_to_two_bins(build: Build) -> None:
 
 
 @pytest.mark.parametrize(("dialect", "kind"), [("rcnn", "ROIPooling"), ("rfcn", "PSROIPooling")])
-def test_a_region_must_lie_in_an_image_of_the_batch(build: Build, dialect: str, kind: str) -> None:
+def test_regions_of_a_missing_image_or_a_wrong_shape_are_refused(build: Build, dialect: str, kind: str) -> None:
     settings = {
         "ROIPooling": "roi_pooling_param { pooled_h: 1 pooled_w: 1 }",
         "PSROIPooling": "psroi_pooling_param { spatial_scale: 1 output_dim: 1 group_size: 1 }",
@@ -87,7 +86,7 @@ SETTINGS = "ratio: 1 scale: 1 feat_stride: 10 base_size: 10 min_size: 4 nms_thre
 ONE = f"type: 'Proposal' proposal_param {{ {SETTINGS} %s }}"
 
 
-def test_the_anchors_equal_faster_rcnns() -> None:
+def test_anchors_equal_those_of_faster_rcnn() -> None:
     np.testing.assert_array_equal(base_anchors(16, (0.5, 1, 2), (8, 16, 32)), ANCHORS)
 
 
@@ -102,7 +101,7 @@ def proposals(build: Build, scores: list[list[float]], more: str = "", **moves: 
     return regions.numpy(), found.numpy()
 
 
-def test_proposals_are_the_anchors_by_score_cut_at_the_border(build: Build) -> None:
+def test_proposals_are_sorted_by_score_and_clipped_to_the_image(build: Build) -> None:
     regions, scores = proposals(build, [[0.5, 0.75, 0.125], [0.25, 1, 0.625], [0.375, 0.0625, 0.875]])
     assert scores.tolist() == [1, 0.875, 0.75, 0.625, 0.5, 0.375, 0.25, 0.125, 0.0625]
     # An anchor of 10 to 19 becomes 10 to 20: its size counts both corners, the box made of it does not.
@@ -112,13 +111,13 @@ def test_proposals_are_the_anchors_by_score_cut_at_the_border(build: Build) -> N
     assert len(proposals(build, [[0.5, 0.75]], "post_nms_topn: 1")[0]) == 1
 
 
-def test_proposals_are_moved_and_scaled(build: Build) -> None:
+def test_proposals_are_moved_and_scaled_by_the_predicted_deltas(build: Build) -> None:
     regions, _ = proposals(build, [[1, 0]], dx=0.5, dy=0.2, dw=math.log(2), dh=math.log(0.5))
     # The anchor is 10 x 10 around (5, 5): around (10, 7), 20 x 5.
     np.testing.assert_allclose(regions[0], [0, 0, 4.5, 20, 9.5], atol=1e-5)
 
 
-def test_the_best_of_overlapping_proposals_is_kept(build: Build) -> None:
+def test_only_the_best_of_overlapping_proposals_is_kept(build: Build) -> None:
     # Moved 5 pixels, the first is (5, 0, 15, 10) and shares 6 x 11 pixels with (10, 0, 20, 10): of 176, 0.375.
     regions, scores = proposals(build, [[0.5, 0.75]], dx=0.5)
     assert scores.tolist() == [0.75]
@@ -126,12 +125,12 @@ def test_the_best_of_overlapping_proposals_is_kept(build: Build) -> None:
     assert len(proposals(build, [[0.5, 0.75]], "pre_nms_topn: 1")[0]) == 1
 
 
-def test_small_proposals_have_no_score(build: Build) -> None:
+def test_proposals_below_min_size_have_score_zero(build: Build) -> None:
     _, scores = proposals(build, [[1, 0.5]], dw=math.log(0.25))
     assert scores.tolist() == [0.5, 0]
 
 
-def test_a_placeholder_of_regions_is_refused_when_the_net_runs(build: Build) -> None:
+def test_regions_of_four_columns_are_refused_in_the_forward_pass(build: Build) -> None:
     layer = build(
         "rcnn", "name: 'p' type: 'ROIPooling' roi_pooling_param { pooled_w: 2 pooled_h: 2 }", (1, 3, 8, 8), (1, 4)
     )

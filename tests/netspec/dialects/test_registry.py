@@ -1,4 +1,4 @@
-"""A fork's fields and messages are known while its dialect is active, and only then."""
+"""The declarations of dialects: their fields and messages are known only while the dialect is active."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""R-FCN's losses of the hardest examples, compared with plain loops over regions."""
+"""R-FCN's choice of the hardest regions (online hard example mining)."""
 
 from collections.abc import Callable
 
@@ -7,14 +7,13 @@ import torch
 from netspec.layers import Layer
 
 Build = Callable[..., Layer]
-Gradcheck = Callable[..., None]
 
 
 def regions_of(images: list[int]) -> torch.Tensor:
     return torch.tensor([[float(image), 0, 0, 5, 5] for image in images])
 
 
-def test_the_hardest_regions_of_each_image_are_kept(build: Build) -> None:
+def test_box_annotator_ohem_keeps_the_hardest_regions_of_each_image(build: Build) -> None:
     regions, losses = regions_of([0, 1, 0, 1, 0]), torch.tensor([0.5, 3, 0.75, 1, 0.25]).reshape(5, 1, 1, 1)
     labels, weights = torch.tensor([4.0, 3, 2, 1, 0]), torch.arange(10.0).reshape(5, 2)
     text = "type: 'BoxAnnotatorOHEM' box_annotator_ohem_param { roi_per_img: %d ignore_label: -1 }"

@@ -42,7 +42,7 @@ def powers(values: torch.Tensor, least: int, most: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("precision", ["fixed", "powers"])
-def test_numbers_are_rounded(build: Build, kind: str, precision: str) -> None:
+def test_layers_equal_caffes_on_rounded_numbers(build: Build, kind: str, precision: str) -> None:
     data = torch.randn(2, 2, 4, 5) * 3
     how = FIXED if precision == "fixed" else "precision: INTEGER_POWER_OF_2_WEIGHTS exp_min: -5 exp_max: -2"
     layer = build("ristretto", f"type: '{kind}' {KINDS[kind]} quantization_param {{ {how} }}", data.shape)

@@ -1,4 +1,4 @@
-"""Images with labels for their pixels: SegNet's and ENet's, HED's and RCF's."""
+"""Data layers of images with a label for each pixel: those of SegNet and ENet, of HED and of RCF."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +18,6 @@ from netspec.proto.schema import TRAIN
 from netspec.proto.text import parse_net_text
 
 Build = Callable[..., Layer]
-Gradcheck = Callable[..., None]
 
 
 @pytest.fixture
@@ -40,7 +39,7 @@ def dense(pairs: Path, given: str = "", transform: str = "") -> Layer:
     return make_layer(text, (), Context(TRAIN), 2)
 
 
-def test_labels_are_mirrored_and_cut_as_their_images(pairs: Path) -> None:
+def test_labels_are_mirrored_and_cropped_as_their_images(pairs: Path) -> None:
     layer = dense(pairs, "mirror: true crop_height: 4 crop_width: 5 shuffle: true", "mean_value: 3 scale: 0.5")
     seen = set()
     for _ in range(12):
@@ -53,7 +52,7 @@ def test_labels_are_mirrored_and_cut_as_their_images(pairs: Path) -> None:
     assert len(seen) > 12  # other windows, mirrored or not
 
 
-def test_labels_are_resized_without_mixing_and_may_be_smaller(pairs: Path) -> None:
+def test_labels_are_resized_by_nearest_neighbor_and_label_divide_factor(pairs: Path) -> None:
     layer = dense(pairs, "new_height: 12 new_width: 16 label_divide_factor: 4")
     images, labels = layer.run()
     layer.close()
@@ -71,13 +70,14 @@ def test_labels_are_resized_without_mixing_and_may_be_smaller(pairs: Path) -> No
         ("crop_height: 7 crop_width: 7", "", "smaller than the crop"),
         ("label_divide_factor: 0", "", "label_divide_factor must be at least 1"),
     ],
+    ids=["new_width", "mirror", "crop_size", "crop_height", "label_divide_factor"],
 )
-def test_faults(pairs: Path, given: str, transform: str, fault: str) -> None:
+def test_invalid_settings_are_refused(pairs: Path, given: str, transform: str, fault: str) -> None:
     with pytest.raises(SpecError, match=fault):
         dense(pairs, given, transform)
 
 
-def test_a_list_has_two_names_a_line(pairs: Path) -> None:
+def test_lines_other_than_two_existing_names_are_refused(pairs: Path) -> None:
     (pairs / "list.txt").write_text("/a.png 0 1\n")
     with pytest.raises(
         SpecError, match=r'list\.txt:1:1: found "/a.png 0 1", expected the names of an image and of its labels'
@@ -94,7 +94,7 @@ EDGES = """layer { name: "data" type: "ImageLabelmapData" top: "data" top: "labe
 
 
 @pytest.mark.parametrize("dialect", ["hed", "rcf"])
-def test_edge_maps(pairs: Path, dialect: str) -> None:
+def test_values_below_127_in_edge_maps_are_zero_for_hed_and_kept_for_rcf(pairs: Path, dialect: str) -> None:
     use_dialect(dialect)
     (text,) = (EDGES % (pairs, pairs)).partition("{")[2:]
     layer = make_layer(text.rpartition("}")[0], (), Context(TRAIN), 2)
@@ -105,14 +105,14 @@ def test_edge_maps(pairs: Path, dialect: str) -> None:
     assert torch.equal(labels, torch.where(gray > 127, 1, below))
 
 
-def test_an_ambiguous_fork_is_an_error_that_asks_for_it(pairs: Path) -> None:
+def test_a_layer_type_of_hed_and_rcf_is_refused_with_the_options_to_give(pairs: Path) -> None:
     text = EDGES % (pairs, pairs)
     assert switched_on_by(text) == []
     with pytest.raises(SpecError, match='dialects "hed" and "rcf" have "ImageLabelmapData"; add --plugin hed'):
         build_net(*parse_net_text(text, "net.prototxt"))
 
 
-def test_segnets_bn_shows_the_mean_and_variance_of_its_batch(build: Build) -> None:
+def test_segnets_bn_has_tops_for_mean_and_variance_of_the_batch(build: Build) -> None:
     """The program that prepares SegNet and ENet for testing averages them over all batches."""
     data = torch.arange(12.0).reshape(2, 2, 1, 3).requires_grad_()
     layer = build("blocks", "type: 'BN' bn_param { scale_filler { value: 1 } }", data.shape, tops=3)

@@ -1,4 +1,4 @@
-"""Settings of nets that forks added: those without effect get a warning (for solvers: solver/test_lr_policy.py)."""
+"""Settings of nets that forks added and that have no effect get a warning."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from netspec.net.build import build_net
 from netspec.proto.text import parse_net_text
 
 
-def test_types_and_memory_have_no_effect(caplog: pytest.LogCaptureFixture) -> None:
+def test_settings_of_types_engines_and_memory_get_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     text = """mem_param { optimize_train: true } default_forward_type: FLOAT16 engine: "MKLDNN"
         layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 } } }
         layer { name: "relu" type: "ReLU" bottom: "data" top: "relu" forward_math: FLOAT16 engine: "MKL2017" }"""

@@ -1,4 +1,4 @@
-"""The table of forks and their layers names existing layers, and its warning is only about layers of this project."""
+"""The table of layer types that several forks define, and the warning about such layers."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from netspec.proto.schema import LayerParameter, fields_of
 
 
 @pytest.mark.parametrize("kind", SIGNATURES)
-def test_the_table_has_existing_dialects_types_and_fields_only(kind: str) -> None:
+def test_the_table_contains_existing_dialects_types_and_fields_only(kind: str) -> None:
     signature = SIGNATURES[kind]
     assert {fork.dialect for fork in signature.forks} <= known_files().keys()
     assert layer_class(kind) is not None
@@ -24,7 +24,7 @@ def test_the_table_has_existing_dialects_types_and_fields_only(kind: str) -> Non
         assert not inner or inner in fields_of(found.descriptor.message_type)
 
 
-def test_an_ambiguous_layer_gets_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_layer_of_several_forks_gets_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     netspec.layer('type: "DiceCoefLoss"', (2, 3), (2, 3))
     assert "several forks define this layer type" in caplog.text
 
@@ -41,7 +41,7 @@ class Dice(Layer):
 """
 
 
-def test_a_layer_of_a_plugin_is_in_no_doubt(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_layer_of_a_plugin_gets_no_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "own_dice.py"
     path.write_text(OWN)
     netspec.use_dialect(path)

@@ -1,4 +1,4 @@
-"""SSD's layers compared with plain loops over single boxes."""
+"""SSD's layers in special cases, its warnings, and a small detector that is trained."""
 
 import math
 from collections.abc import Callable
@@ -18,7 +18,6 @@ from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
 
 Build = Callable[..., Layer]
-Gradcheck = Callable[..., None]
 Box = tuple[float, float, float, float]
 
 
@@ -39,14 +38,14 @@ def test_the_gradient_of_normalize_leaves_the_scales_out_of_the_sum(build: Build
     torch.testing.assert_close(x.grad, plain.grad * scale)
 
 
-def test_normalize_begins_with_scale_1(build: Build) -> None:
+def test_normalize_scale_is_initialized_to_one(build: Build) -> None:
     assert build("ssd", "type: 'Normalize'", (2, 3, 4, 5)).blobs[0] == 1
 
 
 # ---- PriorBox ----
 
 
-def test_truncated_sizes_are_named_because_forks_differ(build: Build, caplog: pytest.LogCaptureFixture) -> None:
+def test_prior_box_warns_of_sizes_cut_to_whole_pixels(build: Build, caplog: pytest.LogCaptureFixture) -> None:
     settings = "min_size: 9.2 min_size: 12 max_size: 11.5 max_size: 20 img_size: 60"
     build("ssd", f"type: 'PriorBox' prior_box_param {{ {settings} }}", (1, 1, 2, 2))
     cut, other = caplog.messages
@@ -69,7 +68,7 @@ def overlap(a: Box, b: Box) -> float:
     return width * height / union
 
 
-def test_detection_output_with_the_variance_in_the_target(build: Build) -> None:
+def test_detection_output_with_the_variance_encoded_in_the_target(build: Build) -> None:
     settings = (
         "num_classes: 2 variance_encoded_in_target: true confidence_threshold: 0.5 nms_param { nms_threshold: 0 }"
     )
@@ -79,7 +78,7 @@ def test_detection_output_with_the_variance_in_the_target(build: Build) -> None:
     np.testing.assert_allclose(top[0, 0], [[0, 1, 0.9, 0.35, 0.35, 0.75, 0.75]], rtol=1e-6)
 
 
-def test_unsupported_fields_of_detection_output_are_named(caplog: pytest.LogCaptureFixture) -> None:
+def test_unsupported_fields_of_detection_output_get_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     use_dialect("ssd")
     text = """
       layer { name: 'in' type: 'Input' top: 'loc' top: 'conf' top: 'prior' input_param { shape { dim: 1 dim: 4 }
@@ -92,7 +91,7 @@ def test_unsupported_fields_of_detection_output_are_named(caplog: pytest.LogCapt
     assert "detection_output_param.save_output_param has no effect" in warning
 
 
-# ---- All together ----
+# ---- A detector ----
 
 NET = """
   layer { name: 'in' type: 'Input' top: 'data' input_param { shape { dim: 2 dim: 3 dim: 64 dim: 64 } } }
@@ -161,7 +160,7 @@ def test_a_small_detector_learns_where_two_squares_are() -> None:
         assert overlap(tuple(best[3:].tolist()), tuple(row[3:7].tolist())) > 0.7
 
 
-def test_additional_solver_fields_of_ssd_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_solver_fields_of_ssd_without_effect_get_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     use_dialect("ssd")
     (tmp_path / "solver.prototxt").write_text(
         'net_param { layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } } }\n'
@@ -173,8 +172,8 @@ def test_additional_solver_fields_of_ssd_are_named(tmp_path: Path, caplog: pytes
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("bound", [math.inf, 3e38, 3e19])
-def test_boxes_without_bounds_suppress_none(bound: float) -> None:
-    """What a net that was not trained predicts: exp of anything."""
+def test_infinite_boxes_do_not_suppress_other_boxes(bound: float) -> None:
+    """A net that was not trained predicts such boxes, since it computes exp of large values."""
     without, plain = [-bound, -bound, bound, bound], [0.1, 0.1, 0.4, 0.4]
     assert suppress(np.array([without, plain, without, plain], np.float32), 0.45) == [0, 1, 2]
     codes = np.array([[bound, -bound, bound, bound]], np.float32)

@@ -1,8 +1,9 @@
 """Results of SSD's own branch (weiliu89/caffe, ssd, built for CPUs): layers, data, trainings, average precision.
 
-Its oddities are repeated: the gradient of Normalize leaves the scales out of a sum (normalize_*_per_channel,
-training/norm_per_channel), labels of a logistic loss without mining stand at other priors (multibox_logistic_none), and
-equal scores come in the order of std::sort (test_equal_scores_come_in_the_order_of_std_sort).
+Where the branch differs from its formulas, the layers do as it does: the gradient of Normalize leaves the scales out of
+a sum (normalize_*_per_channel, training/norm_per_channel), labels of a logistic loss without mining are those of other
+priors (multibox_logistic_none), and equal scores come in the order of std::sort
+(test_equal_scores_come_in_the_order_of_std_sort).
 """
 
 import logging
@@ -31,7 +32,7 @@ def _assert_close(found: np.ndarray, expected: np.ndarray, name: str, tolerance:
 
 
 @pytest.mark.parametrize("folder", CASES, ids=lambda path: path.name)
-def test_a_layer_equals_the_branchs_results(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_layer_equals_the_results_of_ssds_branch(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(SSD)  # name_size.txt
     case = LayerCase(folder)
     found = case.compute()
@@ -41,7 +42,7 @@ def test_a_layer_equals_the_branchs_results(folder: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("folder", DATA, ids=lambda path: path.name)
-def test_images_and_boxes_are_read_as_the_branch_does(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_and_boxes_equal_those_of_ssds_branch(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(SSD / "training")
     golden = np.load(folder / "golden.npz")
     net = load_net(folder / "net.prototxt")
@@ -55,7 +56,7 @@ def test_images_and_boxes_are_read_as_the_branch_does(folder: Path, monkeypatch:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", TRAININGS)
-def test_a_training_follows_the_branch(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_follows_ssds_branch(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _lay_out(variant, tmp_path)
     monkeypatch.chdir(tmp_path)
     golden = np.load(SSD / "training" / variant / "trajectory.npz")
@@ -68,7 +69,7 @@ def test_a_training_follows_the_branch(variant: str, tmp_path: Path, monkeypatch
 @pytest.mark.slow
 @pytest.mark.parametrize("version", ["11point", "Integral", "MaxIntegral"])
 @pytest.mark.parametrize("variant", TRAININGS)
-def test_the_mean_average_precision_is_the_branchs(
+def test_mean_average_precision_is_logged_as_by_ssds_branch(
     variant: str, version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     _lay_out(variant, tmp_path)
@@ -90,11 +91,11 @@ def test_equal_scores_come_in_the_order_of_std_sort() -> None:
     assert highest(values, 3).tolist() == order[:3]
 
 
-def test_nan_does_not_stop_the_sort() -> None:
+def test_scores_of_nan_are_sorted_without_an_error() -> None:
     assert len(highest(np.array([np.nan] * 20 + [1.0] * 20, np.float32), 40)) == 40
 
 
 def _lay_out(variant: str, folder: Path) -> None:
-    """Lay out a training as its paths want it."""
+    """Copy the files of a training to where its relative paths expect them."""
     for name in ("boxes_lmdb", variant):
         shutil.copytree(SSD / "training" / name, folder / name)

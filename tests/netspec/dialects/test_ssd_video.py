@@ -1,4 +1,4 @@
-"""SSD's VideoData compared with the frames that OpenCV reads, and with the VideoData of temporal segments."""
+"""SSD's VideoData compared with the frames that OpenCV reads, and how it is told from the VideoData of tsn."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -49,7 +49,7 @@ def test_frames_come_in_order_until_the_video_ends(
         net()
 
 
-def test_frames_are_resized_as_ssd_resizes(net_of: Callable[..., Net], video: Path) -> None:
+def test_frames_are_resized_by_resize_param_and_mean_values_subtracted(net_of: Callable[..., Net], video: Path) -> None:
     net = net_of(text(video, batch=3, transform=RESIZED))
     net()
     resized = np.stack([cv2.resize(frame, (30, 20)) for frame in frames_of(video)[:3]])
@@ -58,7 +58,7 @@ def test_frames_are_resized_as_ssd_resizes(net_of: Callable[..., Net], video: Pa
     )
 
 
-def test_pycaffe_reads_the_file(video: Path) -> None:
+def test_pycaffe_reads_frames_until_the_video_ends(video: Path) -> None:
     path = video.with_name("net.prototxt")
     path.write_text(text(video, transform=RESIZED))
     net = caffe.Net(str(path), caffe.TEST)
@@ -68,12 +68,14 @@ def test_pycaffe_reads_the_file(video: Path) -> None:
         net.forward()
 
 
-def test_a_shape_is_known_without_the_video(net_of: Callable[..., Net]) -> None:
+def test_shapes_are_known_without_the_video(net_of: Callable[..., Net]) -> None:
     net = net_of(text("none.avi", transform=RESIZED), open_data=False)
     assert net.shapes == {"data": (1, 3, 20, 30), "label": (1,)}
 
 
-def test_a_camera_returns_its_next_frame(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_of_a_camera_are_the_next_ones_with_skip_frames_left_out(
+    net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Camera:
         count = 0
 
@@ -109,8 +111,9 @@ def test_a_camera_returns_its_next_frame(net_of: Callable[..., Net], monkeypatch
         ("video_type: WEBCAM device_id: 97", "camera 97 cannot be opened"),
         ('video_type: VIDEO video_file: "v.avi" skip_frames: 99', f'video "v.avi" has {COUNT} frames, too few for'),
     ],
+    ids=["missing_file", "not_a_video", "no_video_file", "no_camera", "skip_frames"],
 )
-def test_faults_are_one_line(
+def test_errors_are_reported_in_one_line_with_their_place(
     video: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], given: str, fault: str
 ) -> None:
     monkeypatch.chdir(video.parent)
@@ -122,7 +125,7 @@ def test_faults_are_one_line(
     assert "Traceback" not in "".join(said)
 
 
-def test_wrong_settings(net_of: Callable[..., Net], video: Path) -> None:
+def test_invalid_settings_are_refused(net_of: Callable[..., Net], video: Path) -> None:
     with pytest.raises(SpecError, match="batch_size of data_param must be above 0"):
         net_of(text(video, batch=0))
     with pytest.raises(SpecError, match="expected one resize_param"):
@@ -138,8 +141,11 @@ def test_wrong_settings(net_of: Callable[..., Net], video: Path) -> None:
         ("device_id: 1", ["ssd_video"]),
         ("", []),
     ],
+    ids=["video_file", "skip_frames", "num_segments", "device_id", "no_field"],
 )
-def test_fields_determine_the_fork(net_of: Callable[..., Net], given: str, dialects: list[str]) -> None:
+def test_fields_of_video_data_param_activate_their_dialect(
+    net_of: Callable[..., Net], given: str, dialects: list[str]
+) -> None:
     net = LAYER % (given, 1, 4, "")
     assert switched_on_by(net) == dialects
     if not dialects:

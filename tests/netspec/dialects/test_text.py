@@ -1,4 +1,4 @@
-"""The layers that read text, compared with the sum over all paths that the paper defines."""
+"""Layers of text recognition: CTC loss, decoding, accuracy, sequences, and Lstm."""
 
 import sys
 from collections.abc import Callable
@@ -11,11 +11,10 @@ from netspec.layers import Layer
 from netspec.layers.contract.reading import resume, running_state
 
 Build = Callable[..., Layer]
-Gradcheck = Callable[..., None]
 STEPS, ITEMS, CLASSES = 4, 2, 3
 
 
-def test_a_text_longer_than_its_sequence_has_loss_zero(build: Build) -> None:
+def test_ctc_loss_of_a_text_longer_than_its_sequence_is_zero(build: Build) -> None:
     scores = torch.randn(2, 1, CLASSES, requires_grad=True)
     layer = build("text", "type: 'WarpCTCLoss'", scores.shape, (1, 2))
     (loss,) = layer.run(scores, torch.tensor([[1.0, 1.0]]))  # it needs a blank between
@@ -23,8 +22,8 @@ def test_a_text_longer_than_its_sequence_has_loss_zero(build: Build) -> None:
     assert not torch.autograd.grad(loss, scores)[0].any()
 
 
-def test_the_same_texts_in_all_forms(build: Build) -> None:
-    """Two bottoms: labels without blanks. Three: counted from 0 where there is a blank 0. Four: with lengths."""
+def test_ctc_loss_is_equal_for_all_forms_of_its_bottoms(build: Build) -> None:
+    """Two bottoms: labels from 1. Three: labels from 0, with indicators. Four: labels from 1, with lengths."""
     scores = torch.randn(STEPS, ITEMS, CLASSES)
     plain = build("text", "type: 'CTCLoss'", scores.shape, (ITEMS, 2)).run(scores, torch.tensor([[1.0, 2], [2, 0]]))
     begins = torch.ones(STEPS, ITEMS).index_fill(0, torch.tensor([0]), 0)
@@ -44,13 +43,16 @@ SCORES = torch.eye(3)[torch.tensor([[1, 2], [1, 0], [0, 0], [1, 1]])]  # the pat
 @pytest.mark.parametrize(
     ("given", "texts"),
     [("", [[1, 1], [2, 1]]), ("ctc_merge_repeated: false", [[1, 1, 1], [2, 1]]), ("blank_index: 1", [[0], [2, 0]])],
+    ids=["default", "without_merging", "blank_1"],
 )
-def test_greedy_decoding(build: Build, given: str, texts: list[list[int]]) -> None:
+def test_greedy_decoder_merges_repeated_labels_and_removes_blanks(
+    build: Build, given: str, texts: list[list[int]]
+) -> None:
     layer = build("text", f"type: 'CTCGreedyDecoder' ctc_decoder_param {{ {given} }}", SCORES.shape)
     assert layer.run(SCORES)[0].reshape(2, 4).tolist() == [text + [-1] * (4 - len(text)) for text in texts]
 
 
-def test_how_well_decoded_texts_agree_with_labels(build: Build) -> None:
+def test_accuracy_of_decoded_texts(build: Build) -> None:
     labels = torch.tensor([[1.0, 1, 0], [1, 1, 0]])
     layer = build("text", "type: 'CTCGreedyDecoder'", SCORES.shape, labels.shape)
     assert layer.run(SCORES, labels)[0].flatten().tolist() == [0.75, 0.5]
@@ -59,7 +61,7 @@ def test_how_well_decoded_texts_agree_with_labels(build: Build) -> None:
     assert layer.run(scores, labels)[0].item() == 0.5
 
 
-def test_edit_distance(build: Build) -> None:
+def test_edit_distance_equals_known_values(build: Build) -> None:
     build("text", "type: 'Reverse'", (1,))
     edit_distance = sys.modules["netspec.dialects.text.ctc"].edit_distance
     assert [edit_distance(a, b) for a, b in (("kitten", "sitting"), ("", "ab"), ("ab", "ab"), ("abc", "c"))] == [
@@ -70,25 +72,25 @@ def test_edit_distance(build: Build) -> None:
     ]
 
 
-def test_sequences_begin_with_the_batch(build: Build) -> None:
+def test_continuation_indicator_is_zero_in_the_first_step_only(build: Build) -> None:
     text = "type: 'ContinuationIndicator' continuation_indicator_param { time_step: 3 batch_size: 2 }"
     assert build("text", text).run()[0].tolist() == [[0, 0], [1, 1], [1, 1]]
 
 
-@pytest.mark.parametrize(("copies", "rest"), [("true", [4, 5]), ("false", [0, 0])])
-def test_reverse_of_the_first_steps(build: Build, copies: str, rest: list[int]) -> None:
+@pytest.mark.parametrize(("copies", "rest"), [("true", [5, 7, 9]), ("false", [0, 0, 0])], ids=["copied", "zero"])
+def test_reverse_time_reverses_the_first_steps_of_each_sequence(build: Build, copies: str, rest: list[int]) -> None:
     data = torch.arange(10.0).reshape(5, 2, 1)
     layer = build("text", f"type: 'ReverseTime' reverse_time_param {{ copy_remaining: {copies} }}", data.shape, (2,))
     (top,) = layer.run(data, torch.tensor([5.0, 2]))
     assert top[:, 0, 0].tolist() == [8, 6, 4, 2, 0]
-    assert top[:, 1, 0].tolist()[:2] == [3, 1]
-    assert top[2, 1, 0] == (5 if copies == "true" else 0)
+    assert top[:2, 1, 0].tolist() == [3, 1]
+    assert top[2:, 1, 0].tolist() == rest
 
 
 LSTM = "type: 'Lstm' lstm_param { num_output: 3 weight_filler { type: 'uniform' min: -1 max: 1 } %s }"
 
 
-def test_lstm_continues_where_the_second_bottom_is_not_zero(build: Build) -> None:
+def test_lstm_state_continues_where_the_second_bottom_is_one(build: Build) -> None:
     data = torch.randn(4, 2, 5)
     whole = build("text", LSTM % "", data.shape)
     parts = build("text", LSTM % "", (2, 2, 5), (2, 2))

@@ -1,4 +1,4 @@
-"""Temporal segment networks: videos as folders of frames, windows of several sizes, shuffled databases."""
+"""Temporal segment networks: videos as folders of frames, crops of several sizes, shuffled databases."""
 
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def video(videos: Path, given: str, transform: str = "", phase: int = TEST) -> L
     return layer_of(text, phase)
 
 
-def test_frames_of_the_middle_of_each_part(videos: Path) -> None:
+def test_frames_in_testing_are_the_middle_ones_of_each_segment(videos: Path) -> None:
     layer = video(videos, 'new_length: 2 num_segments: 2 modality: RGB name_pattern: "img_%05d.png"')
     frames, labels = layer.run()
     layer.close()
@@ -49,7 +49,7 @@ def test_frames_of_the_middle_of_each_part(videos: Path) -> None:
     assert labels.flatten().tolist() == [3, 5]
 
 
-def test_mirrored_flow_changes_its_sign(videos: Path) -> None:
+def test_mirrored_flow_is_negated_along_x(videos: Path) -> None:
     given = 'new_length: 2 num_segments: 1 modality: FLOW name_pattern: "flow_%c_%05d.png"'
     layer = video(videos, given, "mirror: true is_flow: true crop_size: 6 mean_value: 128", TRAIN)
     seen = set()
@@ -65,7 +65,7 @@ def test_mirrored_flow_changes_its_sign(videos: Path) -> None:
     assert len(seen) > 10  # parts begin anywhere
 
 
-def test_windows_of_several_sizes_and_places() -> None:
+def test_multi_scale_crops_are_resized_to_crop_size() -> None:
     """Images are 40 x 30 at least; all sizes come to crop_size."""
     given = "crop_size: 16 multi_scale: true fix_crop: true more_fix_crop: true scale_ratios: [1, 0.75] max_distort: 1"
     text = f"type: 'Data' data_param {{ source: '{GOLDEN}/pairs/train_lmdb' backend: LMDB batch_size: 4 }}"
@@ -98,19 +98,20 @@ def test_the_first_epoch_is_read_in_order_and_later_ones_are_shuffled() -> None:
         ('name_pattern: "flow_%c_%05d.png"', "multi_scale: true", "multi_scale and fix_crop need crop_size"),
         ('name_pattern: "none_%c_%05d.png"', "", "none_x_00005.png"),
     ],
+    ids=["new_width", "num_segments", "name_pattern", "multi_scale", "missing_frame"],
 )
-def test_faults(videos: Path, given: str, transform: str, fault: str) -> None:
+def test_invalid_settings_are_refused(videos: Path, given: str, transform: str, fault: str) -> None:
     with pytest.raises(SpecError, match=fault):
         video(videos, f"new_length: 4 {given}", transform)
 
 
-def test_a_line_has_a_folder_frames_and_a_label(videos: Path) -> None:
+def test_a_line_without_a_label_is_refused(videos: Path) -> None:
     (videos / "list.txt").write_text("one 12\n")
     with pytest.raises(SpecError, match='found "one 12", expected the folder of a video, how many frames it has'):
         video(videos, "")
 
 
-def test_a_field_is_known_by_the_message_around_it() -> None:
+def test_shuffle_activates_tsn_in_data_param_only() -> None:
     """Caffe has a field shuffle too, in image_data_param and hdf5_data_param."""
     text = """layer { name: "data" type: "Data" top: "data" data_param { source: "x" %s } }
         layer { name: "image" type: "ImageData" top: "image" image_data_param { source: "x" shuffle: true } }"""

@@ -1,4 +1,4 @@
-"""YOLO's detections compared with plain loops over the cells of its maps."""
+"""YOLO's detection output without detections, and the activation of its dialect."""
 
 from collections.abc import Callable
 
@@ -23,11 +23,11 @@ V3 = """type: 'Yolov3DetectionOutput' yolov3_detection_output_param { num_classe
     anchors_scale: 32 anchors_scale: 16 mask_group_num: 2 }"""
 
 
-def test_without_detections_there_is_a_row_for_each_image(build: Build) -> None:
+def test_output_without_detections_is_a_row_of_minus_one_per_image(build: Build) -> None:
     maps = [torch.randn(2, 21, 2, 2), torch.randn(2, 21, 4, 4)]
     found = run(build("yolo", V3 % 1.5, *(m.shape for m in maps)), *maps)
     assert found.tolist() == [[image, -1, -1, -1, -1, -1, -1] for image in (0, 1)]
 
 
-def test_the_dialect_is_found_by_the_layer_type() -> None:
+def test_the_layer_type_activates_the_dialect() -> None:
     assert switched_on_by(f"layer {{ {V3 % 1} }}") == ["yolo"]

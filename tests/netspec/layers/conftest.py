@@ -1,4 +1,4 @@
-"""How the tests of single layers build one from text, and check its gradient."""
+"""Fixtures that build single layers from text, with both ways to sum."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,12 +20,12 @@ def _seeded() -> None:
 
 @pytest.fixture(params=["none", "all"])
 def exact(request: pytest.FixtureRequest) -> str:
-    """Whose sums are Caffe's to the last bit. The tests of a layer run twice, since it sums up in two ways."""
+    """Return which layers' sums equal Caffe's bit for bit. Tests of a layer run with both, since its code differs."""
     return request.param
 
 
 def _at(*path: str | int) -> Where:
-    """Say where a fault is by the path to it: an error reads ``convolution_param.pad.1: ...``."""
+    """Return a place that errors show as the path of a field, as in ``convolution_param.pad.1: ...``."""
     return Where(".".join(map(str, path)))
 
 

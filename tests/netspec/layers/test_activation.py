@@ -1,4 +1,4 @@
-"""The activations: functions, gradients, and Caffe's results in special cases."""
+"""Activation layers: their formulas, their gradients, and Caffe's results in special cases."""
 
 import math
 
@@ -17,39 +17,43 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
     return 1 / (1 + np.exp(-x))
 
 
-ORACLES = {
-    'type: "ReLU"': lambda x: np.maximum(x, 0),
-    'type: "ReLU" relu_param { negative_slope: 0.1 }': lambda x: np.where(x > 0, x, 0.1 * x),
-    'type: "PReLU" prelu_param { channel_shared: true }': lambda x: np.where(x > 0, x, 0.25 * x),
-    'type: "ELU" elu_param { alpha: 2 }': lambda x: np.where(x > 0, x, 2 * (np.exp(np.minimum(x, 0)) - 1)),
-    'type: "Sigmoid"': sigmoid,
-    'type: "TanH"': np.tanh,
-    'type: "AbsVal"': np.abs,
-    'type: "Power" power_param { power: 2 scale: 3 shift: -1 }': lambda x: (3 * x - 1) ** 2,
-    'type: "Power" power_param { scale: 3 shift: -1 }': lambda x: 3 * x - 1,
-    'type: "Exp" exp_param { scale: 0.1 shift: 0.5 }': lambda x: np.exp(0.1 * x + 0.5),
-    'type: "Exp" exp_param { base: 2 scale: 0.5 shift: 1 }': lambda x: 2.0 ** (0.5 * x + 1),
-    'type: "Log" log_param { shift: 71 }': lambda x: np.log(x + 71),
-    'type: "Log" log_param { base: 10 scale: -2 shift: 141 }': lambda x: np.log10(141 - 2 * x),
-    'type: "BNLL"': lambda x: np.logaddexp(x, 0),
-    'type: "Threshold" threshold_param { threshold: 0.3 }': lambda x: (x > 0.3) * 1.0,
-    'type: "Clip" clip_param { min: -0.5 max: 1.5 }': lambda x: np.clip(x, -0.5, 1.5),
-    'type: "Swish"': lambda x: x * sigmoid(x),
-    'type: "Swish" swish_param { beta: 0.5 }': lambda x: x * sigmoid(0.5 * x),
+FORMULAS = {  # id: layer, its formula
+    "ReLU": ('type: "ReLU"', lambda x: np.maximum(x, 0)),
+    "ReLU_slope": ('type: "ReLU" relu_param { negative_slope: 0.1 }', lambda x: np.where(x > 0, x, 0.1 * x)),
+    "PReLU": ('type: "PReLU" prelu_param { channel_shared: true }', lambda x: np.where(x > 0, x, 0.25 * x)),
+    "ELU": (
+        'type: "ELU" elu_param { alpha: 2 }',
+        lambda x: np.where(x > 0, x, 2 * (np.exp(np.minimum(x, 0)) - 1)),
+    ),
+    "Sigmoid": ('type: "Sigmoid"', sigmoid),
+    "TanH": ('type: "TanH"', np.tanh),
+    "AbsVal": ('type: "AbsVal"', np.abs),
+    "Power": ('type: "Power" power_param { power: 2 scale: 3 shift: -1 }', lambda x: (3 * x - 1) ** 2),
+    "Power_linear": ('type: "Power" power_param { scale: 3 shift: -1 }', lambda x: 3 * x - 1),
+    "Exp_e": ('type: "Exp" exp_param { scale: 0.1 shift: 0.5 }', lambda x: np.exp(0.1 * x + 0.5)),
+    "Exp_2": ('type: "Exp" exp_param { base: 2 scale: 0.5 shift: 1 }', lambda x: 2.0 ** (0.5 * x + 1)),
+    "Log_e": ('type: "Log" log_param { shift: 71 }', lambda x: np.log(x + 71)),
+    "Log_10": ('type: "Log" log_param { base: 10 scale: -2 shift: 141 }', lambda x: np.log10(141 - 2 * x)),
+    "BNLL": ('type: "BNLL"', lambda x: np.logaddexp(x, 0)),
+    "Threshold": ('type: "Threshold" threshold_param { threshold: 0.3 }', lambda x: (x > 0.3) * 1.0),
+    "Clip": ('type: "Clip" clip_param { min: -0.5 max: 1.5 }', lambda x: np.clip(x, -0.5, 1.5)),
+    "Swish": ('type: "Swish"', lambda x: x * sigmoid(x)),
+    "Swish_beta": ('type: "Swish" swish_param { beta: 0.5 }', lambda x: x * sigmoid(0.5 * x)),
 }
 
 
-@pytest.mark.parametrize("text", ORACLES)
-def test_activation_is_its_formula(build, text: str) -> None:
+@pytest.mark.parametrize(("text", "formula"), FORMULAS.values(), ids=FORMULAS)
+def test_activation_computes_its_formula(build, text: str, formula) -> None:
     layer = build(text, (2, 4))
     top = layer.run(X.reshape(2, 4))[0]
     assert layer.top_shapes == [(2, 4)]
-    expected = ORACLES[text](X.double().numpy()).reshape(2, 4)
+    expected = formula(X.double().numpy()).reshape(2, 4)
     np.testing.assert_allclose(top.detach().numpy(), expected, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("text", [t for t in ORACLES if "Threshold" not in t])
-def test_activation_gradient_is_the_derivative(build, gradcheck, text: str) -> None:
+@pytest.mark.parametrize("name", [name for name in FORMULAS if name != "Threshold"])
+def test_activation_gradient_is_the_derivative(build, gradcheck, name: str) -> None:
+    text, _ = FORMULAS[name]
     gradcheck(build(text, (3, 2)), torch.tensor([[-3.0, -0.4], [0.2, 1.0], [2.5, 4.0]]))
 
 
@@ -69,8 +73,9 @@ def gradient_at(layer, x: float) -> float:
         ('type: "ELU" elu_param { alpha: 3 }', 3),
         ('type: "AbsVal"', 0),
     ],
+    ids=["ReLU", "ReLU_slope", "PReLU", "ELU", "AbsVal"],
 )
-def test_gradient_at_zero_is_the_negative_sides(build, text: str, expected: float) -> None:
+def test_gradient_at_zero_is_that_of_negative_inputs(build, text: str, expected: float) -> None:
     assert gradient_at(build(text, (1, 1)), 0.0) == expected
 
 
@@ -79,27 +84,29 @@ def test_elu_computes_exp_minus_one_without_expm1(build) -> None:
     assert build('type: "ELU"', (1, 1)).run(x)[0].item() == (torch.exp(x) - 1).item() != torch.expm1(x).item()
 
 
-def test_threshold_is_strict(build) -> None:
+def test_threshold_is_zero_at_the_threshold_and_has_no_gradient(build) -> None:
     layer = build('type: "Threshold" threshold_param { threshold: 0.5 }', (3,))
     top = layer.run(torch.tensor([0.4, 0.5, 0.6], requires_grad=True))[0]
     assert top.tolist() == [0, 0, 1]
     assert not top.requires_grad
 
 
-def test_clip_passes_gradients_at_both_ends(build) -> None:
+def test_clip_passes_gradients_at_min_and_max(build) -> None:
     layer = build('type: "Clip" clip_param { min: -0.5 max: 0.75 }', (1, 1))
     assert [gradient_at(layer, x) for x in (-0.75, -0.5, 0.0, 0.75, 1.0)] == [0, 1, 1, 1, 0]
 
 
 @pytest.mark.parametrize(
-    ("text", "value"), [("power: 0 shift: -2", 1), ("power: 3 scale: 0 shift: 2", 8), ("power: 0 scale: 0", 1)]
+    ("text", "value"),
+    [("power: 0 shift: -2", 1), ("power: 3 scale: 0 shift: 2", 8), ("power: 0 scale: 0", 1)],
+    ids=["power_0", "scale_0", "both_0"],
 )
 def test_power_ignores_the_bottom_where_scale_or_power_is_zero(build, text: str, value: float) -> None:
     layer = build(f'type: "Power" power_param {{ {text} }}', (3,))
     assert layer.run(torch.tensor([math.nan, math.inf, 1.0]))[0].tolist() == [value] * 3
 
 
-def test_power_without_shift_has_a_gradient_at_zero(build) -> None:
+def test_power_without_shift_has_gradient_zero_at_zero(build) -> None:
     # Caffe's is power * top / bottom: 0 / 0.
     assert gradient_at(build('type: "Power" power_param { power: 3 }', (1, 1)), 0.0) == 0
     assert gradient_at(build('type: "Power" power_param { power: 2 scale: 5 }', (1, 1)), 0.0) == 0
@@ -111,15 +118,21 @@ def test_exp_with_a_large_shift_overflows_to_infinity_only_where_the_result_does
     assert top.tolist() == [1, math.inf]
 
 
-@pytest.mark.parametrize("shared", ["false", "true"])
-@pytest.mark.parametrize("shape", [(2, 3, 5, 4), (3, 7), (4, 6, 20, 21), (2, 3, 40, 40, 2), (5, 9, 1, 1)])
-@pytest.mark.parametrize("turned", [False, True])
-def test_kernels_of_prelu_give_the_bits_of_autograd(build, shape: tuple[int, ...], shared: str, turned: bool) -> None:
+@pytest.mark.parametrize("shared", ["false", "true"], ids=["per_channel", "shared"])
+@pytest.mark.parametrize(
+    "shape",
+    [(2, 3, 5, 4), (3, 7), (4, 6, 20, 21), (2, 3, 40, 40, 2), (5, 9, 1, 1)],
+    ids=lambda shape: "x".join(map(str, shape)),
+)
+@pytest.mark.parametrize("channels_last", [False, True], ids=["contiguous", "channels_last"])
+def test_prelu_training_kernels_equal_autograd_bit_for_bit(
+    build, shape: tuple[int, ...], shared: str, channels_last: bool
+) -> None:
     layer = build(f'type: "PReLU" prelu_param {{ channel_shared: {shared} }}', shape, exact="small")
     x, diff = torch.randn(shape), torch.randn(shape)
-    if turned and len(shape) == 4:
+    if channels_last and len(shape) == 4:
         x, diff = x.contiguous(memory_format=torch.channels_last), diff.contiguous(memory_format=torch.channels_last)
-    x[(0,) * len(shape)] = math.nan if not turned else 0.0
+    x[(0,) * len(shape)] = math.nan if not channels_last else 0.0
     leaf, (slopes,) = x.clone().requires_grad_(), layer.blobs
     (top,) = layer.run(leaf)
     expected = torch.autograd.grad(top, [leaf, slopes], diff)
@@ -133,7 +146,7 @@ def test_kernels_of_prelu_give_the_bits_of_autograd(build, shape: tuple[int, ...
             assert torch.equal(found.nan_to_num(), wanted.nan_to_num())
 
 
-def test_prelu_learns_one_slope_a_channel_or_one_for_all(build, gradcheck) -> None:
+def test_prelu_learns_a_slope_per_channel_or_one_shared_slope(build, gradcheck) -> None:
     bottom = torch.tensor([[[-1.0, 2.0], [-3.0, -4.0], [5.0, -6.0]]])
     layer = build('type: "PReLU"', (1, 3, 2))
     assert layer.blob_shapes == [(3,)]
@@ -148,7 +161,7 @@ def test_prelu_learns_one_slope_a_channel_or_one_for_all(build, gradcheck) -> No
     gradcheck(layer, torch.randn(2, 3, 4))
 
 
-def test_clip_without_both_ends_is_refused(build) -> None:
+def test_clip_without_max_is_refused(build) -> None:
     from netspec.layers import layer_class
     from netspec.proto.schema import LayerParameter
 
@@ -160,7 +173,7 @@ def test_clip_without_both_ends_is_refused(build) -> None:
         clip(param, [(3,)])
 
 
-# What Caffe's backward makes of memory that was written over (run/eager.py): bottom and top are any data.
+# The gradients that Caffe computes from overwritten memory (netspec/run/eager.py): bottom and top are arbitrary.
 
 
 @pytest.mark.parametrize(
@@ -182,8 +195,25 @@ def test_clip_without_both_ends_is_refused(build) -> None:
         ('type: "Swish" swish_param { beta: 2 }', lambda b, t: 2 * t + sigmoid(2 * b) * (1 - 2 * t)),
         ('type: "Clip" clip_param { min: -0.5 max: 0.75 }', lambda b, t: (b >= -0.5) & (b <= 0.75)),
     ],
+    ids=[
+        "ReLU",
+        "ReLU_slope",
+        "ELU",
+        "Sigmoid",
+        "TanH",
+        "Power_3",
+        "Power_3_without_shift",
+        "Power_2",
+        "Power_1",
+        "Power_0",
+        "Exp",
+        "Log",
+        "BNLL",
+        "Swish",
+        "Clip",
+    ],
 )
-def test_gradient_uses_the_data_in_memory(build, text: str, expected) -> None:
+def test_caffes_gradient_is_computed_from_the_given_bottom_and_top(build, text: str, expected) -> None:
     bottom = torch.tensor([-1.5, -0.4, 0.25, 0.75, 2.0], dtype=torch.double)
     top = torch.tensor([0.3, -0.2, 0.5, 1.5, -4.0], dtype=torch.double)
     diff = torch.tensor([1.0, 2.0, -3.0, 0.5, 4.0], dtype=torch.double)

@@ -1,4 +1,4 @@
-"""InnerProduct, Dropout and Embed."""
+"""InnerProduct, Dropout and Embed, and negative sizes."""
 
 import math
 
@@ -14,8 +14,8 @@ FILL = 'weight_filler { type: "gaussian" } bias_filler { type: "gaussian" }'
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2, 3, -1, -2])
-@pytest.mark.parametrize("transpose", [False, True])
-def test_inner_product_flattens_from_axis_on(build, axis: int, transpose: bool) -> None:
+@pytest.mark.parametrize("transpose", [False, True], ids=["plain", "transposed"])
+def test_inner_product_flattens_axis_and_all_later_axes(build, axis: int, transpose: bool) -> None:
     settings = f"num_output: 6 axis: {axis} transpose: {str(transpose).lower()} {FILL}"
     data = torch.randn(2, 3, 4, 5)
     layer = build(f'type: "InnerProduct" inner_product_param {{ {settings} }}', data.shape)
@@ -30,13 +30,17 @@ def test_inner_product_flattens_from_axis_on(build, axis: int, transpose: bool) 
     assert layer.multiply_adds() == math.prod(outer) * 6 * length
 
 
-@pytest.mark.parametrize("settings", ["", "transpose: true", "bias_term: false", "axis: 2"])
-def test_inner_product_gradients(build, gradcheck, settings: str) -> None:
+@pytest.mark.parametrize(
+    "settings",
+    ["", "transpose: true", "bias_term: false", "axis: 2"],
+    ids=["default", "transposed", "without_bias", "axis_2"],
+)
+def test_inner_product_gradients_are_the_derivatives(build, gradcheck, settings: str) -> None:
     layer = build(f'type: "InnerProduct" inner_product_param {{ num_output: 3 {settings} {FILL} }}', (2, 3, 2, 2))
     gradcheck(layer, torch.randn(2, 3, 2, 2))
 
 
-def test_inner_product_takes_another_batch_but_no_other_length(build) -> None:
+def test_inner_product_accepts_another_batch_size_but_no_other_length(build) -> None:
     layer = build('type: "InnerProduct" inner_product_param { num_output: 3 }', (2, 3, 4))
     assert layer.run(torch.randn(7, 4, 3))[0].shape == (7, 3)  # only the count matters
     with pytest.raises(SpecError, match=r"^bottom: .* has 15 values from axis 1 on, expected 12"):
@@ -81,7 +85,7 @@ def test_dropout_zeroes_a_share_and_scales_the_rest_in_training(build, ratio: fl
     assert not torch.equal(kept, layer.run(data)[0] != 0)  # another one next time
 
 
-def test_dropout_repeats_itself_from_its_seed(build) -> None:
+def test_dropout_masks_are_determined_by_the_seed(build) -> None:
     text, data = 'type: "Dropout"', torch.ones(50, 50)
     first = build(text, (50, 50), phase=TRAIN, seed=3).run(data)[0]
     assert torch.equal(first, build(text, (50, 50), phase=TRAIN, seed=3).run(data)[0])
@@ -94,7 +98,7 @@ def test_dropout_changes_nothing_in_the_test_phase(build) -> None:
     assert torch.equal(build('type: "Dropout"', (3, 4), phase=TEST).run(data)[0], data)
 
 
-def test_the_phase_of_a_layer_wins_over_the_nets(build) -> None:
+def test_the_phase_of_a_layer_overrides_the_nets(build) -> None:
     data = torch.ones(10, 100)
     assert torch.equal(build('type: "Dropout" phase: TEST', data.shape, phase=TRAIN).run(data)[0], data)
 
@@ -117,7 +121,7 @@ def test_embed_looks_rows_up_and_adds_up_their_gradients(build) -> None:
     assert bias.grad.tolist() == [8, 8, 8]
 
 
-def test_embed_without_bias_takes_another_shape(build) -> None:
+def test_embed_without_bias_accepts_another_shape(build) -> None:
     layer = build(f'type: "Embed" embed_param {{ num_output: 3 input_dim: 5 bias_term: false {FILL} }}', (2,))
     assert len(layer.blobs) == 1
     torch.testing.assert_close(layer.run(torch.tensor([[3.0]]))[0], layer.blobs[0][3].reshape(1, 1, 3))
@@ -131,7 +135,7 @@ def test_embed_refuses_invalid_indices(build, index: float) -> None:
 
 
 @pytest.mark.parametrize("missing", ["num_output", "input_dim"])
-def test_embed_needs_both_its_sizes(build, missing: str) -> None:
+def test_embed_without_num_output_or_input_dim_is_refused(build, missing: str) -> None:
     given = "input_dim" if missing == "num_output" else "num_output"
     with pytest.raises(SpecError, match=rf"^embed_param\.{missing}: {missing} must be at least 1"):
         build(f'type: "Embed" embed_param {{ {given}: 4 }}', (2,))
@@ -144,7 +148,8 @@ def test_embed_needs_both_its_sizes(build, missing: str) -> None:
         'type: "DummyData" dummy_data_param { shape { dim: 2 dim: -3 } }',
         'type: "Parameter" parameter_param { shape { dim: 2 dim: -3 } }',
     ],
+    ids=["Input", "DummyData", "Parameter"],
 )
-def test_no_blob_has_a_size_below_0(build, text: str) -> None:
+def test_a_negative_size_is_refused(build, text: str) -> None:
     with pytest.raises(SpecError, match=r"found shape \(2, -3\), expected no negative size"):
         build(text)

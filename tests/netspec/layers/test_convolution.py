@@ -27,7 +27,7 @@ def taps(bottom: tuple, top: tuple, kernel: tuple, stride: tuple, pad: tuple, di
                 yield y, k, x
 
 
-def correlate(data: np.ndarray, weight: np.ndarray, bias: np.ndarray, group: int, *geometry: tuple) -> np.ndarray:
+def convolve(data: np.ndarray, weight: np.ndarray, bias: np.ndarray, group: int, *geometry: tuple) -> np.ndarray:
     top = positions(data.shape[2:], weight.shape[2:], *geometry)
     result = np.zeros((data.shape[0], weight.shape[0], *top)) + bias.reshape(1, -1, *(1,) * len(top))
     for y, k, x in taps(data.shape[2:], top, weight.shape[2:], *geometry):
@@ -38,7 +38,7 @@ def correlate(data: np.ndarray, weight: np.ndarray, bias: np.ndarray, group: int
     return result
 
 
-def spread(data: np.ndarray, weight: np.ndarray, bias: np.ndarray, group: int, *geometry: tuple) -> np.ndarray:
+def deconvolve(data: np.ndarray, weight: np.ndarray, bias: np.ndarray, group: int, *geometry: tuple) -> np.ndarray:
     stride, pad, dilation = geometry
     sizes = zip(data.shape[2:], weight.shape[2:], stride, pad, dilation, strict=True)
     top = tuple(s * (n - 1) + d * (k - 1) + 1 - 2 * p for n, k, s, p, d in sizes)
@@ -63,7 +63,7 @@ def geometry_text(kernel: tuple, stride: tuple, pad: tuple, dilation: tuple) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["Convolution", "Deconvolution"])
 @pytest.mark.parametrize("axes", [1, 2, 3])
-def test_filters_agree_with_plain_loops_at_random_settings(build, kind: str, axes: int) -> None:
+def test_convolution_and_deconvolution_agree_with_plain_loops_at_random_settings(build, kind: str, axes: int) -> None:
     random = np.random.default_rng(axes)
     for _ in range(12):
         group = int(random.integers(1, 4))
@@ -76,7 +76,7 @@ def test_filters_agree_with_plain_loops_at_random_settings(build, kind: str, axe
         text = f"{geometry_text(kernel, stride, pad, dilation)} num_output: {outputs} group: {group} {FILL}"
         layer = build(f'type: "{kind}" convolution_param {{ {text} }}', data.shape)
         weight, bias = (blob.detach().numpy() for blob in layer.blobs)
-        oracle = correlate if kind == "Convolution" else spread
+        oracle = convolve if kind == "Convolution" else deconvolve
         expected = oracle(data, weight, bias, group, stride, pad, dilation)
         (top,) = layer.run(torch.from_numpy(data))
         assert layer.top_shapes == [expected.shape] == [top.shape], text
@@ -95,14 +95,15 @@ def test_filters_agree_with_plain_loops_at_random_settings(build, kind: str, axe
         "kernel_size: 2 dilation: 2 group: 2",
         "kernel_h: 1 kernel_w: 3 bias_term: false",
     ],
+    ids=["stride_and_pad", "dilation_and_group", "without_bias"],
 )
-def test_gradients_of_bottom_filters_and_bias(build, gradcheck, kind: str, settings: str) -> None:
+def test_gradients_of_bottom_filters_and_bias_are_the_derivatives(build, gradcheck, kind: str, settings: str) -> None:
     layer = build(f'type: "{kind}" convolution_param {{ num_output: 2 {settings} {FILL} }}', (2, 4, 4, 5))
     gradcheck(layer, torch.randn(2, 4, 4, 5))
 
 
 @pytest.mark.parametrize("size", [40, 250])
-def test_the_way_to_sum_does_not_show(build, size: int) -> None:
+def test_results_agree_for_every_choice_of_exact(build, size: int) -> None:
     text = f"num_output: 3 kernel_h: 3 kernel_w: 5 stride: 2 pad: 1 dilation: 2 {FILL}"
     data = torch.randn(2, 4, size, size, requires_grad=True)
     found = []
@@ -115,22 +116,27 @@ def test_the_way_to_sum_does_not_show(build, size: int) -> None:
             torch.testing.assert_close(torchs, other, rtol=1e-4, atol=1e-4 * float(torchs.detach().abs().max()))
 
 
-PADDING = [  # filters that fit into the padding: SIGSEGV in oneDNN; and maps of one channel, wrong numbers there
-    ((5, 2, 12, 1), "kernel_size: 1 stride_h: 1 stride_w: 2 pad_h: 2 pad_w: 1"),
-    ((2, 64, 12, 1), "group: 16 kernel_h: 3 kernel_w: 1 dilation: 2 stride: 2 pad_h: 0 pad_w: 1"),
-    ((5, 8, 12, 1), "group: 8 kernel_size: 1 stride: 2 pad: 1"),
-    ((5, 1, 12, 1), "kernel_size: 2 stride_h: 1 stride_w: 3 pad_h: 0 pad_w: 1"),
-]
+WRONG_IN_ONEDNN = {  # filters that fit into the padding crash oneDNN; maps of one channel give wrong numbers
+    "in_padding": ((5, 2, 12, 1), "kernel_size: 1 stride_h: 1 stride_w: 2 pad_h: 2 pad_w: 1"),
+    "in_padding_grouped": (
+        (2, 64, 12, 1),
+        "group: 16 kernel_h: 3 kernel_w: 1 dilation: 2 stride: 2 pad_h: 0 pad_w: 1",
+    ),
+    "in_padding_depthwise": ((5, 8, 12, 1), "group: 8 kernel_size: 1 stride: 2 pad: 1"),
+    "one_channel": ((5, 1, 12, 1), "kernel_size: 2 stride_h: 1 stride_w: 3 pad_h: 0 pad_w: 1"),
+}
 
 
-@pytest.mark.parametrize(("shape", "text"), PADDING)
-@pytest.mark.parametrize("adds", [False, True])
-def test_calls_with_wrong_results_in_onednn_are_avoided(build, shape: tuple[int, ...], text: str, adds: bool) -> None:
+@pytest.mark.parametrize(("shape", "text"), WRONG_IN_ONEDNN.values(), ids=WRONG_IN_ONEDNN)
+@pytest.mark.parametrize("in_place", [False, True], ids=["new_gradients", "accumulate_in_place"])
+def test_calls_with_wrong_results_in_onednn_are_avoided(
+    build, shape: tuple[int, ...], text: str, in_place: bool
+) -> None:
     layer = build(
         f'type: "Convolution" convolution_param {{ num_output: 16 {text} {FILL} }}',
         shape,
         exact="none",
-        accumulate_in_place=adds,
+        accumulate_in_place=in_place,
     )
     sliding = Filter(layer.kernel, layer.stride, layer.pad, layer.dilation)
     assert sliding.reads_padding_alone or shape[1] == 1
@@ -168,8 +174,8 @@ def test_gradients_of_shared_filters_are_added_in_the_order_of_the_bottoms(build
 
 
 @pytest.mark.parametrize("size", [5, 50])
-def test_the_maps_are_kept_as_they_come(build, size: int) -> None:
-    """Few pixels under many filters are laid out otherwise for the product; the copy is not kept."""
+def test_the_bottom_is_saved_for_backward_without_a_copy(build, size: int) -> None:
+    """With few pixels and many filters, the product runs on a copy in another layout, which must not be saved."""
     text = f'type: "Convolution" convolution_param {{ num_output: 40 kernel_size: 3 {FILL} }}'
     layer = build(text, (2, 32, size, size), exact="none", accumulate_in_place=True)
     maps = torch.randn(2, 32, size, size).contiguous(memory_format=torch.channels_last).requires_grad_()
@@ -184,10 +190,10 @@ def test_the_maps_are_kept_as_they_come(build, size: int) -> None:
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("order", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize("order", [torch.contiguous_format, torch.channels_last], ids=["contiguous", "channels_last"])
 @pytest.mark.parametrize("size", [5, 50])
-def test_gradients_lie_in_memory_as_their_maps_do(build, size: int, order: torch.memory_format) -> None:
-    """Otherwise torch's kernels further back take 10 to 20 times as long."""
+def test_bottom_gradients_have_the_memory_format_of_the_bottom(build, size: int, order: torch.memory_format) -> None:
+    """With another format, torch's kernels of earlier layers take 10 to 20 times as long."""
     convolution = f'type: "Convolution" convolution_param {{ num_output: 40 kernel_size: 3 {FILL} }}'
     pooling = 'type: "Pooling" pooling_param { pool: MAX kernel_size: 2 stride: 2 }'
     for text, options in ((convolution, {"exact": "none", "accumulate_in_place": True}), (pooling, {})):
@@ -200,7 +206,7 @@ def test_gradients_lie_in_memory_as_their_maps_do(build, size: int, order: torch
         assert seen[0].is_contiguous(memory_format=order), text
 
 
-def test_bottoms_share_the_filters_and_each_has_its_top(build) -> None:
+def test_several_bottoms_share_the_filters_and_each_has_its_top(build) -> None:
     layer = build(
         f'type: "Convolution" convolution_param {{ num_output: 4 kernel_size: 3 {FILL} }}', *[(2, 3, 6, 6)] * 3, tops=3
     )
@@ -273,12 +279,12 @@ def test_im2col_agrees_with_plain_loops_at_random_settings(build, axes: int) -> 
         np.testing.assert_array_equal(layer.run(torch.from_numpy(data))[0], expected, err_msg=text)
 
 
-def test_im2col_gradient(build, gradcheck) -> None:
+def test_im2col_gradient_is_the_derivative(build, gradcheck) -> None:
     layer = build('type: "Im2col" convolution_param { kernel_size: 3 stride: 2 pad: 1 dilation: 2 }', (2, 2, 6, 5))
     gradcheck(layer, torch.randn(2, 2, 6, 5))
 
 
-def test_a_top_without_a_pixel_and_unlike_bottoms_are_refused(build) -> None:
+def test_an_empty_top_and_bottoms_of_different_shapes_are_refused(build) -> None:
     text = 'type: "{}" convolution_param {{ num_output: 1 {} }}'
     with pytest.raises(SpecError, match=r"^convolution_param: the filter does not fit: .*a map of 0 x 3 "):
         build(text.format("Convolution", "kernel_size: 4"), (1, 1, 3, 6))
@@ -300,8 +306,9 @@ def test_a_top_without_a_pixel_and_unlike_bottoms_are_refused(build) -> None:
         ("axis: -1 offset: 3", np.s_[:, :, :, 3:9]),
         ("axis: 1 offset: 1 offset: 0 offset: 2", np.s_[:, 1:3, 0:5, 2:8]),
     ],
+    ids=["default", "one_offset", "offset_per_axis", "last_axis", "axis_1"],
 )
-def test_crop_cuts_the_axes_from_axis_on(build, gradcheck, settings: str, window: tuple) -> None:
+def test_crop_crops_axis_and_all_later_axes(build, gradcheck, settings: str, window: tuple) -> None:
     data, wanted = torch.randn(2, 3, 8, 9), torch.randn(2, 2, 5, 6)
     layer = build(f'type: "Crop" crop_param {{ {settings} }}', data.shape, wanted.shape)
     assert torch.equal(layer.run(data, wanted)[0], data[window])

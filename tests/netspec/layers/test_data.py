@@ -1,3 +1,5 @@
+"""The layers that read data (Data, ImageData, HDF5Data, WindowData), and those that make or hold it."""
+
 from __future__ import annotations
 
 import logging
@@ -59,7 +61,7 @@ def golden_records() -> list[tuple[np.ndarray, int]]:
 # Data
 
 
-def test_data_hands_out_the_records_in_order() -> None:
+def test_data_returns_the_records_in_order() -> None:
     layer = pairs(transform="scale: 0.00390625")
     assert layer.top_shapes == [(32, 2, 28, 28), (32,)]
     records = golden_records()
@@ -75,7 +77,7 @@ def test_data_hands_out_the_records_in_order() -> None:
 
 
 @pytest.mark.parametrize("prefetch", [0, 1, 7])
-def test_batches_do_not_depend_on_the_threads(prefetch: int) -> None:
+def test_batches_do_not_depend_on_prefetch(prefetch: int) -> None:
     transform = "mirror: true crop_size: 20"
     expected = pairs(50, "prefetch: 0", transform, phase=TRAIN, seed=3)
     layer = pairs(50, f"prefetch: {prefetch}", transform, phase=TRAIN, seed=3)
@@ -95,7 +97,7 @@ def test_restart_returns_to_the_first_record_or_to_any_iteration() -> None:
     layer.close()
 
 
-def test_seed_and_phase_change_the_draws_but_not_the_records() -> None:
+def test_seed_and_phase_change_the_crops_but_not_the_records() -> None:
     first, other, test = (
         pairs(64, transform="crop_size: 20", phase=phase, seed=seed).run()
         for phase, seed in ((TRAIN, 0), (TRAIN, 1), (TEST, 0))
@@ -105,7 +107,7 @@ def test_seed_and_phase_change_the_draws_but_not_the_records() -> None:
     assert torch.equal(first[1], other[1])
 
 
-def test_the_log_is_caffes(caplog: pytest.LogCaptureFixture) -> None:
+def test_data_logs_what_caffe_logs(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     layer = pairs(32)
     assert caplog.messages == [f"Opened lmdb {PAIRS}", "output data size: 32,2,28,28"]
@@ -118,7 +120,7 @@ def test_the_log_is_caffes(caplog: pytest.LogCaptureFixture) -> None:
     layer.close()
 
 
-def test_threads_start_with_the_first_batch_and_end_with_close() -> None:
+def test_prefetch_threads_start_with_the_first_batch_and_end_with_close() -> None:
     def prefetching() -> int:
         return sum(thread.name.startswith("prefetch") for thread in threading.enumerate())
 
@@ -131,7 +133,7 @@ def test_threads_start_with_the_first_batch_and_end_with_close() -> None:
     assert prefetching() == before
 
 
-def test_the_label_top_is_optional() -> None:
+def test_data_without_a_label_top_returns_images_only() -> None:
     text = f'name: "d" type: "Data" top: "data" data_param {{ source: "{PAIRS}" batch_size: 3 backend: LMDB }}'
     layer = reading(text)
     assert layer.top_shapes == [(3, 2, 28, 28)]
@@ -139,7 +141,7 @@ def test_the_label_top_is_optional() -> None:
     layer.close()
 
 
-def test_encoded_records_equal_raw_records() -> None:
+def test_encoded_records_equal_raw_records_and_become_gray_with_force_gray() -> None:
     raw, encoded = (pairs(6, source=IMAGES / name).run()[0] for name in ("lmdb_plain", "lmdb_encoded"))
     assert torch.equal(raw, encoded)
     grey = pairs(6, transform="force_gray: true", source=IMAGES / "lmdb_encoded")
@@ -153,19 +155,19 @@ def test_rand_skip_passes_over_the_first_records() -> None:
     assert pairs(1, "rand_skip: 500", seed=4).keys(0) == [f"{skipped:08d}"]
 
 
-def test_a_missing_database_is_refused_at_construction() -> None:
+def test_a_missing_database_is_refused_when_the_layer_is_built() -> None:
     with pytest.raises(
         SpecError, match=r'^net.prototxt:1:2: layer "data_param.source": database "nowhere" does not exist'
     ):
         pairs(source="nowhere")
 
 
-def test_an_lmdb_without_backend_is_an_error_with_the_correct_setting() -> None:
+def test_an_lmdb_without_backend_is_refused_with_advice() -> None:
     with pytest.raises(SpecError, match="LEVELDB is Caffe's default"):
         reading(f'name: "d" type: "Data" top: "data" data_param {{ source: "{PAIRS}" batch_size: 3 }}')
 
 
-def test_a_record_of_another_shape_surfaces_from_the_threads(tmp_path: Path) -> None:
+def test_a_record_of_another_shape_is_an_error_in_the_pass_that_reads_it(tmp_path: Path) -> None:
     with Writer(str(tmp_path / "db")) as writer:
         for i in range(20):
             shape = (3, 8, 8) if i != 13 else (3, 8, 9)
@@ -180,7 +182,7 @@ def test_a_record_of_another_shape_surfaces_from_the_threads(tmp_path: Path) -> 
     layer.close()
 
 
-def test_a_batch_of_one_has_the_shape_of_its_image(tmp_path: Path) -> None:
+def test_top_of_batch_size_one_has_the_shape_of_each_image(tmp_path: Path) -> None:
     with Writer(str(tmp_path / "db")) as writer:
         for i, width in enumerate((8, 9)):
             writer.put(b"%08d" % i, array_to_datum(np.zeros((3, 8, width), np.uint8)).SerializeToString())
@@ -200,13 +202,14 @@ def test_a_batch_of_one_has_the_shape_of_its_image(tmp_path: Path) -> None:
         ("batch_size: 1 backend: LMDB", "source", "source is missing"),
         (f'batch_size: 1 backend: LMDB rand_skip: 9999999 source: "{PAIRS}"', "rand_skip", "cannot skip"),
     ],
+    ids=["batch_size", "source", "rand_skip"],
 )
-def test_bad_data_params_are_refused_where_they_stand(param: str, place: str, message: str) -> None:
+def test_invalid_data_params_are_refused_at_their_place(param: str, place: str, message: str) -> None:
     with pytest.raises(SpecError, match=f'^net.prototxt:1:2: layer "data_param.{place}": {message}'):
         reading(f'name: "d" type: "Data" top: "data" data_param {{ {param} }}')
 
 
-# Without opening data
+# Layers built without opening their data
 
 DATA = 'name: "d" type: "Data" top: "data" top: "label" data_param { source: "x" batch_size: 8 }'
 LIST = 'name: "d" type: "ImageData" top: "data" top: "label" image_data_param { source: "x" %s }'
@@ -227,6 +230,15 @@ IMAGE_BATCH, GREY_BATCH, LABELS = [(8, 3, 6, 6), (8,)], [(8, 1, 5, 4), (8,)], [(
         (ROWS, {"data": (2, 5), "label": (2,)}, LABELS),
         (WINDOWS + "transform_param { crop_size: 6 }", {}, IMAGE_BATCH),
     ],
+    ids=[
+        "Data_given",
+        "Data_and_label_given",
+        "Data_cropped",
+        "ImageData_resized",
+        "ImageData_cropped",
+        "HDF5Data_given",
+        "WindowData_cropped",
+    ],
 )
 def test_shapes_are_known_without_data(text: str, given: Mapping[str, tuple[int, ...]], expected: list) -> None:
     assert data_layer(text, open_data=False, given_shapes=given, device="meta").top_shapes == expected
@@ -235,13 +247,14 @@ def test_shapes_are_known_without_data(text: str, given: Mapping[str, tuple[int,
 @pytest.mark.parametrize(
     ("text", "wanted"),
     [(DATA, "--shape data=8,C,H,W"), (LIST % "batch_size: 8", "--shape data=8,C,H,W"), (ROWS, "--shape data=8,...")],
+    ids=["Data", "ImageData", "HDF5Data"],
 )
-def test_an_unknown_shape_of_data_is_an_error_that_asks_for_it(text: str, wanted: str) -> None:
+def test_an_unknown_shape_of_data_is_refused_with_the_option_to_give(text: str, wanted: str) -> None:
     with pytest.raises(SpecError, match=f'the shape of "data" is known only from its data; give {wanted}, or --data$'):
         data_layer(text, open_data=False)
 
 
-def test_each_unknown_shape_of_hdf5_data_is_an_error_that_asks_for_it() -> None:
+def test_each_unknown_shape_of_hdf5_data_is_reported() -> None:
     reported: list[SpecError] = []
     with pytest.raises(SpecError, match=r"give --shape label=8,\.\.\., or --data") as raised:
         data_layer(ROWS, open_data=False, report=reported.append)
@@ -251,7 +264,7 @@ def test_each_unknown_shape_of_hdf5_data_is_an_error_that_asks_for_it() -> None:
     ]
 
 
-def test_running_a_net_built_without_data_is_an_error() -> None:
+def test_running_a_layer_built_without_data_is_an_error() -> None:
     with pytest.raises(SpecError, match="built without opening its data"):
         data_layer(DATA + CUT, open_data=False).run()
 
@@ -268,6 +281,7 @@ def image_data(tmp_path: Path, more: str = "", batch_size: int = 4) -> ReadingLa
 @pytest.mark.parametrize(
     ("more", "database"),
     [("", "lmdb_plain"), ("is_color: false", "lmdb_gray"), ("new_width: 28 new_height: 20", "lmdb_resized")],
+    ids=["color", "gray", "resized"],
 )
 def test_image_data_reads_the_same_images_as_convert_imageset_stores(tmp_path: Path, more: str, database: str) -> None:
     found, stored = image_data(tmp_path, more, 6).run(), pairs(6, source=IMAGES / database).run()
@@ -282,7 +296,7 @@ def test_image_data_is_shuffled_anew_each_epoch(tmp_path: Path) -> None:
     assert len({tuple(epoch) for epoch in epochs}) > 3
 
 
-def test_image_data_names_a_missing_image_with_its_line(tmp_path: Path) -> None:
+def test_image_data_reports_a_missing_image_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_text("0.png 0\nnix.png 1\n")
     source = f'source: "{tmp_path}/list.txt" root_folder: "{IMAGES}/png/"'
     layer = reading(LIST.replace('source: "x"', source) % "batch_size: 1")
@@ -300,7 +314,7 @@ def test_image_data_needs_both_new_height_and_new_width_or_neither(tmp_path: Pat
 # HDF5
 
 
-def test_hdf5_rows_go_through(tmp_path: Path, build: Callable[..., Layer]) -> None:
+def test_hdf5_output_writes_what_hdf5_data_reads(tmp_path: Path, build: Callable[..., Layer]) -> None:
     with h5py.File(tmp_path / "in.h5", "w") as file:
         file["data"], file["label"] = np.arange(30.0).reshape(5, 2, 3), np.arange(5)
     (tmp_path / "list.txt").write_text(f"{tmp_path}/in.h5\n")
@@ -320,15 +334,17 @@ def test_hdf5_rows_go_through(tmp_path: Path, build: Callable[..., Layer]) -> No
     assert data.shape == (6, 2, 3, 1)
 
 
-def test_hdf5_data_does_not_transform(tmp_path: Path) -> None:
+def test_hdf5_data_with_transform_param_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match="HDF5Data does not transform data"):
         data_layer(ROWS + "transform_param { scale: 2 }")
 
 
 @pytest.mark.parametrize(
-    ("shapes", "message"), [([(3, 2), (4,)], "expected the same number"), ([(3, 1, 1, 1, 1), (3,)], "at most 4 axes")]
+    ("shapes", "message"),
+    [([(3, 2), (4,)], "expected the same number"), ([(3, 1, 1, 1, 1), (3,)], "at most 4 axes")],
+    ids=["unequal_counts", "five_axes"],
 )
-def test_hdf5_output_checks_its_bottoms(
+def test_hdf5_output_refuses_unequal_counts_and_five_axes(
     tmp_path: Path, build: Callable[..., Layer], shapes: list, message: str
 ) -> None:
     with pytest.raises(SpecError, match=message):
@@ -360,13 +376,14 @@ def test_window_data_returns_windows_and_ignores_the_scale_of_transform_param(tm
         ('transform_param { crop_size: 8 } window_data_param { crop_mode: "round" }', "unknown crop_mode"),
         ("transform_param { crop_size: 8 } window_data_param { context_pad: 4 }", "leaves no pixels of crop_size 8"),
     ],
+    ids=["crop_size", "crop_mode", "context_pad"],
 )
-def test_bad_window_params_are_refused(more: str, message: str) -> None:
+def test_invalid_window_data_params_are_refused(more: str, message: str) -> None:
     with pytest.raises(SpecError, match=message):
         data_layer(WINDOWS + more)
 
 
-# Layers without files
+# Input, DummyData and MemoryData
 
 
 def test_input_has_one_shape_for_all_tops_or_one_each(build: Callable[..., Layer]) -> None:
@@ -401,7 +418,7 @@ def test_dummy_data_fills_constants_once_and_draws_the_rest(build: Callable[...,
     assert first[1].tolist() == [7, 7, 7]
 
 
-def test_dummy_data_without_filler_is_zero_and_takes_the_old_axes(build: Callable[..., Layer]) -> None:
+def test_dummy_data_without_filler_is_zero_and_reads_num_channels_height_and_width(build: Callable[..., Layer]) -> None:
     layer = build('type: "DummyData" dummy_data_param { num: 2 channels: 3 channels: 1 height: 4 width: 5 }', tops=2)
     assert layer.top_shapes == [(2, 3, 4, 5), (2, 1, 4, 5)]
     assert not any(top.any() for top in layer.run())
@@ -416,8 +433,9 @@ def test_dummy_data_without_filler_is_zero_and_takes_the_old_axes(build: Callabl
         ("found 3 data_filler", "shape { dim: 1 } data_filler { } data_filler { } data_filler { }"),
         ('did you mean "gaussian"', 'shape { dim: 1 } data_filler { type: "gausian" }'),
     ],
+    ids=["no_shape", "no_width", "shape_and_width", "too_many_fillers", "unknown_filler"],
 )
-def test_bad_dummy_data_params_are_refused(build: Callable[..., Layer], param: str, message: str) -> None:
+def test_invalid_dummy_data_params_are_refused(build: Callable[..., Layer], param: str, message: str) -> None:
     with pytest.raises(SpecError, match=message):
         build(f'type: "DummyData" dummy_data_param {{ {param} }}', tops=2)
 
@@ -425,7 +443,7 @@ def test_bad_dummy_data_params_are_refused(build: Callable[..., Layer], param: s
 MEMORY = 'type: "MemoryData" memory_data_param { batch_size: 2 channels: 1 height: 1 width: 3 }'
 
 
-def test_memory_data_goes_round_its_arrays(build: Callable[..., Layer]) -> None:
+def test_memory_data_repeats_its_arrays(build: Callable[..., Layer]) -> None:
     layer = build(MEMORY, tops=2)
     assert isinstance(layer, MemoryData)
     assert layer.top_shapes == [(2, 1, 1, 3), (2,)]
@@ -441,7 +459,9 @@ def test_memory_data_goes_round_its_arrays(build: Callable[..., Layer]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("images", "labels"), [((3, 1, 1, 3), 3), ((2, 1, 3, 1), 2), ((2, 1, 1, 3), 4), ((0, 1, 1, 3), 0)]
+    ("images", "labels"),
+    [((3, 1, 1, 3), 3), ((2, 1, 3, 1), 2), ((2, 1, 1, 3), 4), ((0, 1, 1, 3), 0)],
+    ids=["not_a_multiple", "other_size", "more_labels", "empty"],
 )
 def test_memory_data_refuses_arrays_of_other_shapes(build: Callable[..., Layer], images: tuple, labels: int) -> None:
     layer = build(MEMORY, tops=2)
@@ -450,12 +470,12 @@ def test_memory_data_refuses_arrays_of_other_shapes(build: Callable[..., Layer],
         layer.set_input_arrays(np.zeros(images), np.zeros(labels))
 
 
-def test_memory_data_needs_its_sizes(build: Callable[..., Layer]) -> None:
+def test_memory_data_without_sizes_is_refused(build: Callable[..., Layer]) -> None:
     with pytest.raises(SpecError, match="must all be given and above 0"):
         build('type: "MemoryData" memory_data_param { batch_size: 2 }', tops=2)
 
 
-def test_a_net_hands_its_arrays_to_its_memory_data(net_of: Callable[..., Any]) -> None:
+def test_set_input_arrays_of_a_net_fills_its_memory_data(net_of: Callable[..., Any]) -> None:
     net = net_of(f'layer {{ name: "m" {MEMORY} top: "data" top: "label" }}')
     net.set_input_arrays(np.arange(12).reshape(4, 1, 1, 3), np.array([5, 6, 7, 8]))
     assert [net()["label"].tolist() for _ in range(3)] == [[5, 6], [7, 8], [5, 6]]

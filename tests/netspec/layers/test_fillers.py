@@ -1,6 +1,6 @@
 """Fillers: the distributions of Caffe's seven fillers, and their errors.
 
-The samples are seeded, of 40,000 values and more, and the tolerances six standard errors or more: they hold for good.
+The samples have a fixed seed and at least 40,000 values; the tolerances are at least six standard errors.
 """
 
 import math
@@ -86,6 +86,7 @@ def test_default_fan_is_fan_in(kind: str) -> None:
         ((64, 8, 9, 9), 64 * 81),  # a convolution of 64 filters in 4 groups, 32 channels: shape[1] is 32 / 4
         ((40000,), 40000),  # a bias: no second axis, so the whole count
     ],
+    ids=["inner_product", "grouped_convolution", "bias"],
 )
 def test_fan_out_is_count_over_shape_1(shape: tuple[int, ...], fan_out: int) -> None:
     values = draw('type: "xavier" variance_norm: FAN_OUT', shape)
@@ -102,7 +103,7 @@ def test_bilinear_interpolates_when_a_deconvolution_upsamples_by_its_factor() ->
     np.testing.assert_allclose(values[2, 1], np.outer(odd, odd), rtol=1e-6)
 
 
-def test_one_seed_gives_one_result() -> None:
+def test_equal_seeds_give_equal_values_and_other_seeds_other_values() -> None:
     for kind in ("uniform", "gaussian", "positive_unitball", "xavier", "msra"):
         first = draw(f'type: "{kind}"', seed=3)
         assert (first == draw(f'type: "{kind}"', seed=3)).all()
@@ -125,8 +126,22 @@ def test_one_seed_gives_one_result() -> None:
         ('type: "positive_unitball"', (), "at least one axis"),
         ("value: 1", (3, 0), "empty blob"),
     ],
+    ids=[
+        "unknown",
+        "gaussian_std_0",
+        "gaussian_std_negative",
+        "gaussian_sparse_negative",
+        "gaussian_sparse_too_large",
+        "xavier_sparse",
+        "uniform_min_above_max",
+        "bilinear_not_square",
+        "bilinear_two_axes",
+        "msra_scalar",
+        "positive_unitball_scalar",
+        "constant_empty",
+    ],
 )
-def test_a_filler_that_caffe_refuses_is_an_error_with_the_reason(text: str, shape: tuple[int, ...], words: str) -> None:
+def test_invalid_fillers_are_refused_with_the_reason(text: str, shape: tuple[int, ...], words: str) -> None:
     with pytest.raises(ValueError, match=r"^[^\n]+$") as error:
         draw(text, shape)
     assert words in str(error.value)

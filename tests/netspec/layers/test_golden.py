@@ -13,7 +13,7 @@ from paths import GOLDEN
 
 CASES = sorted((GOLDEN / "layers").iterdir())
 TOLERANCE = 1e-5  # of the largest element
-REAL_GPU = 1e-4  # likewise: its libraries choose among algorithms that round differently
+REAL_GPU = 1e-4  # of the largest element too: GPU libraries choose among algorithms that round differently
 
 
 @pytest.mark.parametrize("device", ["cpu", *(pytest.param(name, marks=pytest.mark.slow) for name in GPUS)])
@@ -31,15 +31,15 @@ def test_layer_equals_caffes_results(folder: Path, device: str, record_property:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", CASES, ids=lambda path: path.name)
-def test_a_run_without_gradients_computes_the_same(folder: Path) -> None:
+def test_layer_without_gradients_equals_caffes_results(folder: Path) -> None:
     case = LayerCase(folder)
     for exact in CHOICES:
         assert_arrays(case.outputs(exact), case.golden, TOLERANCE, exact)
 
 
 @pytest.mark.parametrize("folder", CASES, ids=lambda path: path.name)
-def test_layer_computes_caffes_bits(folder: Path, caffes_bits: bool) -> None:
-    """On other CPUs than Caffe's, whose BLAS rounds in another way, within the tolerance."""
+def test_layer_equals_caffes_results_bit_for_bit(folder: Path, caffes_bits: bool) -> None:
+    """On CPUs other than the one Caffe ran on, BLAS rounds differently, and the results are within the tolerance."""
     case = LayerCase(folder)
     for exact in promised(folder):
         for found in (case.compute(exact), case.outputs(exact)):

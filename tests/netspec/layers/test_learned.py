@@ -8,7 +8,7 @@ import torch
 from netspec.layers.contract.learned import Learned, Seen
 
 
-def blob() -> Learned:
+def ones_with_gradient() -> Learned:
     made = Learned(torch.ones(3))
     made.grad = torch.zeros(3)
     return made
@@ -42,14 +42,14 @@ def _give_another_gradient(one: Learned) -> None:
 def test_changes_of_values_and_of_memory_are_detected(
     change: Callable[[Learned], object], memory: bool, values: bool
 ) -> None:
-    one = blob()
+    one = ones_with_gradient()
     seen = {kind: Seen([one], values=kind) for kind in (False, True)}
     change(one)
     assert (seen[False].are([one]), seen[True].are([one])) == (memory, values)
 
 
-def test_other_blobs_count_as_changed() -> None:
-    one, other = blob(), blob()
+def test_other_blobs_are_detected_as_a_change() -> None:
+    one, other = ones_with_gradient(), ones_with_gradient()
     for values in (False, True):
         assert not Seen([one], values).are([other])
         assert not Seen([one], values).are([one, other])

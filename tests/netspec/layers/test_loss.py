@@ -1,4 +1,4 @@
-"""The losses and Accuracy: compared with plain loops in numpy, and Caffe's results in special cases."""
+"""The losses and Accuracy compared with plain loops in numpy, and with Caffe's results in special cases."""
 
 import math
 from pathlib import Path
@@ -83,20 +83,21 @@ def test_softmax_with_loss_clamps_the_probability_at_flt_min_but_not_its_gradien
         ("normalize: false normalization: FULL", 12),  # normalization wins
         ("normalize: true normalization: NONE", 1),
     ],
+    ids=["default", "normalize_false", "normalize_true", "false_and_FULL", "true_and_NONE"],
 )
-def test_normalize_counts_only_without_normalization(build, loss_param: str, divisor: int) -> None:
+def test_normalize_is_ignored_if_normalization_is_set(build, loss_param: str, divisor: int) -> None:
     layer = build(f'type: "SoftmaxWithLoss" loss_param {{ {loss_param} }}', (4, 2, 3), (4, 3))
     loss = layer.run(torch.zeros(4, 2, 3), torch.zeros(4, 3))[0].item()
     assert loss == pytest.approx(12 * math.log(2) / divisor)
 
 
-def test_everything_ignored_is_a_loss_of_zero(build) -> None:
+def test_softmax_with_loss_of_ignored_labels_only_is_zero(build) -> None:
     layer = build('type: "SoftmaxWithLoss" loss_param { ignore_label: -1 }', (2, 3), (2,))
     loss, grad = value_and_gradient(layer, torch.randn(2, 3), torch.tensor([-1.0, -1.0]))
     assert (loss, np.abs(grad).max()) == (0, 0)
 
 
-def test_softmax_with_loss_along_another_axis(build) -> None:
+def test_softmax_with_loss_along_another_axis_equals_plain_loops(build) -> None:
     layer = build('type: "SoftmaxWithLoss" softmax_param { axis: -1 }', (2, 3, 4), (2, 3, 1))
     x, labels = torch.randn(2, 3, 4), torch.randint(0, 4, (2, 3, 1)).float()
     expected, grad = softmax_loss(x.double().reshape(6, 4, 1).numpy(), labels.reshape(6, 1).numpy(), VALID, None)
@@ -117,7 +118,7 @@ def test_second_top_is_the_softmax_and_brings_no_gradient(build, kind: str) -> N
     torch.testing.assert_close(p, torch.softmax(bottoms[0].detach(), 1))
 
 
-def test_a_loss_without_top_is_made_one(build) -> None:
+def test_a_loss_layer_without_a_top_gets_one(build) -> None:
     layer = build('type: "SoftmaxWithLoss"', (2, 3), (2,), tops=0)
     assert layer.top_shapes == [()]
     assert len(layer.run(torch.randn(2, 3), torch.zeros(2))) == 1
@@ -196,7 +197,7 @@ def test_hinge_loss_is_one_vs_all_divided_by_n(build, norm: str) -> None:
     np.testing.assert_allclose(grad, expected, atol=1e-6)
 
 
-def test_hinge_loss_has_no_gradient_where_the_margin_is_just_met(build) -> None:
+def test_hinge_loss_has_gradient_zero_exactly_at_the_margin(build) -> None:
     layer = build('type: "HingeLoss"', (1, 2), (1,))
     assert value_and_gradient(layer, torch.tensor([[1.0, -1.0]]), torch.tensor([0.0]))[1].tolist() == [[0, 0]]
 
@@ -206,7 +207,9 @@ def test_hinge_loss_has_no_gradient_where_the_margin_is_just_met(build) -> None:
 
 @pytest.mark.parametrize("ignore", [None, 1])
 @pytest.mark.parametrize("mode", [None, FULL, VALID, BATCH_SIZE, NONE])
-def test_sigmoid_cross_entropy_defaults_to_the_batch_size(build, mode: str | None, ignore: int | None) -> None:
+def test_sigmoid_cross_entropy_in_every_normalization_with_batch_size_as_default(
+    build, mode: str | None, ignore: int | None
+) -> None:
     given = ("" if mode is None else f"normalization: {mode} ") + ("" if ignore is None else f"ignore_label: {ignore}")
     layer = build(f'type: "SigmoidCrossEntropyLoss" loss_param {{ {given} }}', (3, 4), (3, 4, 1))
     x = torch.randn(3, 4) * 30
@@ -224,8 +227,10 @@ def test_sigmoid_cross_entropy_defaults_to_the_batch_size(build, mode: str | Non
     np.testing.assert_allclose(grad.flatten(), expected / scale, atol=1e-6)
 
 
-@pytest.mark.parametrize(("loss_param", "divisor"), [("normalize: true", 6), ("normalize: false", 2)])
-def test_sigmoid_cross_entropy_takes_the_old_normalize(build, loss_param: str, divisor: int) -> None:
+@pytest.mark.parametrize(
+    ("loss_param", "divisor"), [("normalize: true", 6), ("normalize: false", 2)], ids=["true", "false"]
+)
+def test_sigmoid_cross_entropy_reads_the_deprecated_normalize(build, loss_param: str, divisor: int) -> None:
     layer = build(f'type: "SigmoidCrossEntropyLoss" loss_param {{ {loss_param} }}', (2, 3), (2, 3))
     assert layer.run(torch.zeros(2, 3), torch.ones(2, 3))[0].item() == pytest.approx(6 * math.log(2) / divisor)
 
@@ -246,7 +251,7 @@ def test_euclidean_loss_divides_by_2n_and_both_bottoms_have_a_gradient(build) ->
     np.testing.assert_allclose(b.grad.numpy().reshape(4, 3), -difference / 4, atol=1e-7)
 
 
-def test_euclidean_loss_compares_item_by_item_whatever_the_axes(build) -> None:
+def test_euclidean_loss_compares_element_by_element_without_broadcasting(build) -> None:
     layer = build('type: "EuclideanLoss"', (3,), (3, 1))
     # Broadcasting (3,) against (3, 1) would give 9 differences.
     assert layer.run(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([[1.0], [2.0], [3.0]]))[0].item() == 0
@@ -276,9 +281,9 @@ def contrastive_loss(
     return total / len(a) / 2, grad / len(a)
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-@pytest.mark.parametrize("shape", [(6, 5), (6, 5, 1, 1)])
-def test_contrastive_loss_and_its_gradients(build, shape: tuple, legacy: bool) -> None:
+@pytest.mark.parametrize("legacy", [False, True], ids=["current", "legacy"])
+@pytest.mark.parametrize("shape", [(6, 5), (6, 5, 1, 1)], ids=["two_axes", "four_axes"])
+def test_contrastive_loss_and_its_gradients_equal_plain_loops(build, shape: tuple, legacy: bool) -> None:
     text = f'type: "ContrastiveLoss" contrastive_loss_param {{ margin: 3 legacy_version: {str(legacy).lower()} }}'
     layer = build(text, shape, shape, (6,))
     a, b = torch.randn(shape, requires_grad=True), torch.randn(shape, requires_grad=True)
@@ -334,7 +339,7 @@ def test_accuracy_leaves_ignored_labels_out_and_is_zero_without_any_other(build)
     assert (accuracy.item(), each.tolist()) == (0, [0, 0])
 
 
-def test_accuracy_of_each_class_along_another_axis(build) -> None:
+def test_accuracy_of_each_class_along_another_axis_equals_plain_loops(build) -> None:
     layer = build('type: "Accuracy" accuracy_param { axis: -1 top_k: 2 }', (4, 5, 6), (4, 5), tops=2)
     assert layer.top_shapes == [(), (6,)]
     scores, labels = torch.randn(4, 5, 6), torch.randint(0, 5, (4, 5))  # class 5 does not occur
@@ -349,41 +354,43 @@ def test_accuracy_of_each_class_along_another_axis(build) -> None:
     assert not accuracy.requires_grad
 
 
-# All of them
+# Several layers
 
 
-@pytest.mark.parametrize(
-    ("kind", "shapes"),
-    [
-        ("SoftmaxWithLoss", [(4, 3), (4,)]),
-        ("InfogainLoss", [(4, 3), (4,), (3, 3)]),
-        ("MultinomialLogisticLoss", [(4, 3), (4,)]),
-        ("HingeLoss", [(4, 3), (4,)]),
-        ("SigmoidCrossEntropyLoss", [(4, 3), (4, 3)]),
-        ("ContrastiveLoss", [(4, 3), (4, 3), (4,)]),
-        ("Accuracy", [(4, 3), (4,)]),
-    ],
-)
+BOTTOMS = {
+    "SoftmaxWithLoss": [(4, 3), (4,)],
+    "InfogainLoss": [(4, 3), (4,), (3, 3)],
+    "MultinomialLogisticLoss": [(4, 3), (4,)],
+    "HingeLoss": [(4, 3), (4,)],
+    "SigmoidCrossEntropyLoss": [(4, 3), (4, 3)],
+    "ContrastiveLoss": [(4, 3), (4, 3), (4,)],
+    "Accuracy": [(4, 3), (4,)],
+}
+
+
+@pytest.mark.parametrize(("kind", "shapes"), BOTTOMS.items(), ids=BOTTOMS)
 def test_labels_have_no_gradient_and_the_batch_size_can_change(build, kind: str, shapes: list) -> None:
     layer = build(f'type: "{kind}"', *shapes)
     for n in (4, 2):
         bottoms = [torch.rand(n if shape[0] == 4 else 3, *shape[1:], requires_grad=True) for shape in shapes]
         top = layer.run(*bottoms)[0]
+        assert top.requires_grad == (kind != "Accuracy")
         if top.requires_grad:
             top.backward()
+        assert layer.label_bottoms
         for i in layer.label_bottoms:
             assert bottoms[i].grad is None
 
 
 @pytest.mark.parametrize("kind", ["SoftmaxWithLoss", "MultinomialLogisticLoss", "HingeLoss", "Accuracy"])
 @pytest.mark.parametrize("label", [-1.0, 3.0])
-def test_an_invalid_label_is_an_error_that_names_it(build, kind: str, label: float) -> None:
+def test_an_invalid_label_is_refused_with_its_value(build, kind: str, label: float) -> None:
     layer = build(f'type: "{kind}"', (2, 3), (2,))
     with pytest.raises(SpecError, match=rf"found label {label:g}, expected 0 to 2: the scores have 3 classes"):
         layer.run(torch.rand(2, 3), torch.tensor([0.0, label]))
 
 
-def test_an_unreadable_infogain_matrix_is_named(build, tmp_path: Path) -> None:
+def test_an_unreadable_infogain_matrix_is_refused_with_its_path(build, tmp_path: Path) -> None:
     for name, content in (("absent", None), ("broken", b"\xff\xff\xff")):
         source = tmp_path / name
         if content is not None:

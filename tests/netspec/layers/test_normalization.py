@@ -27,8 +27,10 @@ def normalized(data: torch.Tensor, eps: float = 1e-5) -> torch.Tensor:
     return ((data.double() - mean) / torch.sqrt(variance + eps)).float()
 
 
-@pytest.mark.parametrize("shape", [(6, 3), (4, 3, 5), (4, 3, 5, 6), (2, 3, 4, 3, 2)])
-def test_batch_norm_uses_the_batch_in_training(build, shape: tuple) -> None:
+@pytest.mark.parametrize(
+    "shape", [(6, 3), (4, 3, 5), (4, 3, 5, 6), (2, 3, 4, 3, 2)], ids=lambda shape: f"{len(shape)}_axes"
+)
+def test_batch_norm_normalizes_by_the_batch_in_training(build, shape: tuple) -> None:
     layer = build('type: "BatchNorm" batch_norm_param { eps: 0.01 }', shape, phase=TRAIN)
     data = torch.randn(shape) * 3 + 2
     torch.testing.assert_close(layer.run(data)[0], normalized(data, 0.01), atol=2e-6, rtol=1e-6)
@@ -57,7 +59,7 @@ def test_batch_norm_adds_to_sums_and_divides_them_by_their_weight(build) -> None
     assert all(torch.equal(a, b) for a, b in zip(layer.blobs, tester.blobs, strict=True))  # testing leaves them alone
 
 
-def test_batch_norm_without_a_past_divides_by_the_root_of_eps(build) -> None:
+def test_batch_norm_without_statistics_divides_by_the_root_of_eps(build) -> None:
     data = torch.randn(2, 3, 4, 4)
     layer = build('type: "BatchNorm" batch_norm_param { eps: 0.04 }', data.shape, phase=TEST)
     torch.testing.assert_close(layer.run(data)[0], data / 0.2)
@@ -92,7 +94,7 @@ def test_batch_norm_of_one_value_per_channel_has_variance_zero(build) -> None:
     assert layer.blobs[2].item() == 1
 
 
-def test_batch_norm_by_the_past_has_a_plain_division_for_a_gradient(build) -> None:
+def test_batch_norm_gradient_with_global_stats_is_divided_by_the_deviation(build) -> None:
     layer = build('type: "BatchNorm" batch_norm_param { use_global_stats: true }', (4, 2, 3), phase=TRAIN)
     for blob, values in zip(layer.blobs, ([2.0, 4.0], [8.0, 18.0], [2.0]), strict=True):
         blob.data = torch.tensor(values)
@@ -106,7 +108,7 @@ def test_batch_norm_by_the_past_has_a_plain_division_for_a_gradient(build) -> No
     assert layer.blobs[2].item() == 2  # and adds nothing to the sums
 
 
-@pytest.mark.parametrize("phase", [TRAIN, TEST])
+@pytest.mark.parametrize("phase", [TRAIN, TEST], ids=["TRAIN", "TEST"])
 def test_batch_norm_is_accurate_for_means_far_from_zero(build, phase: int) -> None:
     """torch's CPU kernel alone would be off by 1e-2 here, Caffe's sums by 3e-4."""
     layer = build('type: "BatchNorm"', (8, 2, 16, 16), phase=phase, exact="none")
@@ -131,15 +133,17 @@ def test_batch_norm_is_accurate_for_means_far_from_zero(build, phase: int) -> No
         torch.testing.assert_close(bottom.grad, centred.grad, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("settings", ["", "batch_norm_param { use_global_stats: true }"])
-def test_batch_norm_gradient(build, gradcheck, settings: str) -> None:
+@pytest.mark.parametrize(
+    "settings", ["", "batch_norm_param { use_global_stats: true }"], ids=["batch_stats", "global_stats"]
+)
+def test_batch_norm_gradient_is_the_derivative(build, gradcheck, settings: str) -> None:
     layer = build(f'type: "BatchNorm" {settings}', (4, 2, 3), phase=TRAIN)
     layer.blobs[1].data.fill_(2)
     layer.blobs[2].data.fill_(1)
     gradcheck(layer, torch.randn(4, 2, 3))
 
 
-def test_batch_norm_takes_another_map_but_no_other_channels(build) -> None:
+def test_batch_norm_accepts_another_map_size_but_no_other_number_of_channels(build) -> None:
     layer = build('type: "BatchNorm" param { lr_mult: 0 }', (2, 3, 4, 4), phase=TRAIN)
     assert layer.run(torch.randn(5, 3, 2, 2))[0].shape == (5, 3, 2, 2)
     with pytest.raises(SpecError, match=r"found a bottom of shape \(2, 4, 4, 4\), expected 3 channels"):
@@ -158,13 +162,16 @@ OPERANDS = [  # axis, num_axes, the operand's shape, the same to broadcast: over
     (-3, 1, (3,), (1, 3, 1, 1)),
     (1, 0, (), ()),
 ]
+OPERAND_IDS = [f"axis_{axis}-num_axes_{num_axes}" for axis, num_axes, *_ in OPERANDS]
 SHAPE = (2, 3, 4, 5)
 SCALE_FILL = 'filler { type: "gaussian" }'
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("axis", "num_axes", "shape", "broadcast"), OPERANDS)
-def test_learned_scale_and_bias_lie_over_their_axes(build, gradcheck, axis, num_axes, shape, broadcast) -> None:
+@pytest.mark.parametrize(("axis", "num_axes", "shape", "broadcast"), OPERANDS, ids=OPERAND_IDS)
+def test_learned_scale_and_bias_are_broadcast_from_axis_over_num_axes(
+    build, gradcheck, axis, num_axes, shape, broadcast
+) -> None:
     data = torch.randn(SHAPE)
     where = f"axis: {axis} num_axes: {num_axes} {SCALE_FILL}"
     scale = build(f'type: "Scale" scale_param {{ {where} bias_term: true bias_filler {{ type: "gaussian" }} }}', SHAPE)
@@ -180,8 +187,8 @@ def test_learned_scale_and_bias_lie_over_their_axes(build, gradcheck, axis, num_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("axis", "num_axes", "shape", "broadcast"), OPERANDS)
-def test_a_second_bottom_is_the_operand(build, gradcheck, axis, num_axes, shape, broadcast) -> None:
+@pytest.mark.parametrize(("axis", "num_axes", "shape", "broadcast"), OPERANDS, ids=OPERAND_IDS)
+def test_scale_and_bias_broadcast_a_second_bottom(build, gradcheck, axis, num_axes, shape, broadcast) -> None:
     data, operand = torch.randn(SHAPE), torch.randn(shape)
     scale = build(f'type: "Scale" scale_param {{ axis: {axis} }}', SHAPE, shape)
     assert len(scale.blobs) == 0
@@ -193,8 +200,8 @@ def test_a_second_bottom_is_the_operand(build, gradcheck, axis, num_axes, shape,
     gradcheck(bias, data, operand)
 
 
-@pytest.mark.parametrize("shape", [(3,), (3, 4)])
-def test_scale_by_a_second_bottom_can_still_learn_a_bias(build, gradcheck, shape: tuple) -> None:
+@pytest.mark.parametrize("shape", [(3,), (3, 4)], ids=["one_axis", "two_axes"])
+def test_scale_by_a_second_bottom_can_learn_a_bias(build, gradcheck, shape: tuple) -> None:
     text = 'type: "Scale" scale_param { bias_term: true bias_filler { value: 2 } }'
     data, operand = torch.randn(SHAPE), torch.randn(shape)
     layer = build(text, SHAPE, shape)
@@ -204,7 +211,7 @@ def test_scale_by_a_second_bottom_can_still_learn_a_bias(build, gradcheck, shape
     gradcheck(layer, data, operand)
 
 
-def test_scale_begins_as_the_identity_and_a_filler_replaces_that(build) -> None:
+def test_scale_is_initialized_to_one_unless_it_has_a_filler_and_bias_to_zero(build) -> None:
     assert build('type: "Scale" scale_param { bias_term: true }', SHAPE).blobs[0].tolist() == [1, 1, 1]
     assert build('type: "Scale" scale_param { bias_term: true }', SHAPE).blobs[1].tolist() == [0, 0, 0]
     assert build('type: "Scale" scale_param { filler { } }', SHAPE).blobs[0].tolist() == [0, 0, 0]  # constant, value 0
@@ -212,13 +219,13 @@ def test_scale_begins_as_the_identity_and_a_filler_replaces_that(build) -> None:
 
 
 @pytest.mark.parametrize("kind", ["Scale", "Bias"])
-def test_a_scalar_operand_suits_any_bottom_whatever_the_axis(build, kind: str) -> None:
+def test_scale_and_bias_accept_a_scalar_second_bottom(build, kind: str) -> None:
     data = torch.randn(5)
     top = build(f'type: "{kind}"', (5,), ()).run(data, torch.tensor(3.0))[0]
     torch.testing.assert_close(top, data * 3 if kind == "Scale" else data + 3)
 
 
-def test_scale_takes_another_batch_but_no_other_channels(build) -> None:
+def test_scale_accepts_another_batch_size_but_no_other_number_of_channels(build) -> None:
     layer = build('type: "Scale"', SHAPE)
     assert layer.run(torch.randn(7, 3, 2))[0].shape == (7, 3, 2)
     with pytest.raises(SpecError, match=r"operand of shape \(3,\) does not match"):
@@ -244,7 +251,7 @@ def plain_lrn(data: np.ndarray, size: int, alpha: float, beta: float, k: float, 
 
 @pytest.mark.parametrize("region", ["ACROSS_CHANNELS", "WITHIN_CHANNEL"])
 @pytest.mark.parametrize("size", [1, 3, 5, 9])
-def test_lrn_divides_by_alpha_over_n_and_ignores_k_within_a_channel(build, region: str, size: int) -> None:
+def test_lrn_equals_plain_loops_and_ignores_k_within_a_channel(build, region: str, size: int) -> None:
     settings = f"local_size: {size} alpha: 0.7 beta: 0.6 k: 2.5 norm_region: {region}"
     data = np.random.default_rng(size).standard_normal((2, 6, 4, 5)).astype(np.float32)
     layer = build(f'type: "LRN" lrn_param {{ {settings} }}', data.shape)
@@ -253,12 +260,12 @@ def test_lrn_divides_by_alpha_over_n_and_ignores_k_within_a_channel(build, regio
 
 
 @pytest.mark.parametrize("region", ["ACROSS_CHANNELS", "WITHIN_CHANNEL"])
-def test_lrn_gradient(build, gradcheck, region: str) -> None:
+def test_lrn_gradient_is_the_derivative(build, gradcheck, region: str) -> None:
     layer = build(f'type: "LRN" lrn_param {{ local_size: 3 norm_region: {region} }}', (2, 4, 3, 3))
     gradcheck(layer, torch.randn(2, 4, 3, 3))
 
 
-def test_wrong_lrn_is_refused(build) -> None:
+def test_lrn_of_an_even_size_or_a_bottom_without_four_axes_is_refused(build) -> None:
     for size in (4, 0):
         with pytest.raises(SpecError, match=rf"^lrn_param\.local_size: local_size must be odd, found {size}"):
             build(f'type: "LRN" lrn_param {{ local_size: {size} }}', (2, 3, 4, 4))
@@ -269,8 +276,8 @@ def test_wrong_lrn_is_refused(build) -> None:
 # MVN
 
 
-@pytest.mark.parametrize("across", [False, True])
-@pytest.mark.parametrize("variance", [False, True])
+@pytest.mark.parametrize("across", [False, True], ids=["per_channel", "across_channels"])
+@pytest.mark.parametrize("variance", [False, True], ids=["mean_only", "normalize_variance"])
 def test_mvn_adds_eps_to_the_deviation(build, gradcheck, across: bool, variance: bool) -> None:
     flags = f"across_channels: {str(across).lower()} normalize_variance: {str(variance).lower()}"
     data = torch.randn(2, 3, 4, 5)
@@ -302,7 +309,7 @@ def test_mvn_of_a_constant_map_is_zero_with_a_finite_gradient(build) -> None:
     assert data.grad.flatten().tolist() == [-4, -2, 0, 6]
 
 
-def test_mvn_fills_missing_axes_up_to_four(build) -> None:
+def test_mvn_appends_axes_of_size_one_up_to_four_axes(build) -> None:
     layer = build('type: "MVN" mvn_param { across_channels: true }', (2, 6))
     data = torch.randn(2, 6)
     (top,) = layer.run(data)

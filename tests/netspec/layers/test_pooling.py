@@ -1,4 +1,4 @@
-"""Pooling and SPP compared with Caffe's loops written plainly, at random settings; corner cases; errors."""
+"""Pooling and SPP compared with plain versions of Caffe's loops at random settings, and in corner cases."""
 
 import math
 
@@ -20,7 +20,7 @@ def window_count(size: int, kernel: int, stride: int, pad: int, padded: bool, fl
 
 
 def plain_pool(data: np.ndarray, kernel, stride, pad, floor: bool, average: bool, top_diff=None):
-    """Pool as Caffe's loops do: top, mask (of MAX), and for a ``top_diff`` of ones or given the bottom's gradient."""
+    """Return top, mask (of MAX) and the bottom's gradient as Caffe's loops do; ``top_diff`` is 1 by default."""
     size = data.shape[2:]
     counts = [window_count(size[i], kernel[i], stride[i], pad[i], any(pad), floor) for i in range(2)]
     top = np.full((*data.shape[:2], *counts), 0 if average else LOWEST, data.dtype)
@@ -48,7 +48,7 @@ def plain_pool(data: np.ndarray, kernel, stride, pad, floor: bool, average: bool
 
 
 def random_settings(random: np.random.Generator):
-    """Yield settings that Caffe takes: kernel, stride, pad, floor, size of the map."""
+    """Yield settings that Caffe accepts: kernel, stride, pad, floor, size of the map."""
     for _ in range(150):
         kernel, stride = (tuple(map(int, random.integers(1, 6, 2))) for _ in range(2))
         pad = tuple(int(random.integers(0, k)) for k in kernel) if random.random() < 0.5 else (0, 0)
@@ -99,7 +99,7 @@ def test_pooling_agrees_with_plain_loops_at_random_settings(build, method: str) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("value", [np.nan, -np.inf, np.inf])
-def test_nan_and_minus_infinity_never_win_a_maximum(build, value: float) -> None:
+def test_max_pooling_of_nan_and_infinity_agrees_with_plain_loops(build, value: float) -> None:
     random = np.random.default_rng(3)
     for kernel, stride, pad, floor, size in random_settings(random):
         data = random.standard_normal((2, 2, *size)).astype(np.float32)
@@ -133,7 +133,7 @@ def test_the_first_of_equal_maxima_gets_the_gradient(build) -> None:
     assert bottom.grad.nonzero()[:, 2:].tolist() == [[0, 0], [0, 2], [2, 0], [2, 2]]
 
 
-def test_windows_are_counted_upwards_and_the_last_is_dropped_only_where_padded(build) -> None:
+def test_window_count_rounds_up_and_drops_a_last_window_in_the_padding(build) -> None:
     def tops(settings: str, height: int) -> int:
         return build(f'type: "Pooling" pooling_param {{ {settings} }}', (1, 1, height, height)).top_shapes[0][2]
 
@@ -157,7 +157,7 @@ def test_an_empty_last_window_is_minus_flt_max_or_zero_over_its_remaining_area(b
 
 
 @pytest.mark.parametrize("method", ["MAX", "AVE"])
-def test_global_pooling_follows_the_map(build, method: str) -> None:
+def test_global_pooling_covers_maps_of_any_size(build, method: str) -> None:
     layer = build(f'type: "Pooling" pooling_param {{ pool: {method} global_pooling: true }}', (2, 3, 5, 7))
     for shape in ((2, 3, 5, 7), (4, 3, 2, 9)):
         data = torch.randn(shape)
@@ -166,9 +166,11 @@ def test_global_pooling_follows_the_map(build, method: str) -> None:
         torch.testing.assert_close(top[..., 0, 0], data.amax((2, 3)) if method == "MAX" else data.mean((2, 3)))
 
 
-@pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize(
+    "memory_format", [torch.contiguous_format, torch.channels_last], ids=["contiguous", "channels_last"]
+)
 @pytest.mark.parametrize("kernel", [2, 3])
-def test_large_maps_are_pooled_by_slices_in_any_order_in_memory(build, kernel: int, memory_format) -> None:
+def test_inference_kernel_pools_large_maps_of_both_memory_formats(build, kernel: int, memory_format) -> None:
     data = torch.randn(2, 19, 61, 62)
     data[0, 0, :4, :4] = torch.nan  # which never wins
     layer = build(pooling_text("MAX", (kernel, kernel), (2, 2), (0, 0), False), data.shape)
@@ -187,8 +189,9 @@ def test_large_maps_are_pooled_by_slices_in_any_order_in_memory(build, kernel: i
         "pool: AVE kernel_size: 3 stride: 2 pad: 2",
         "pool: STOCHASTIC kernel_size: 3 stride: 2",
     ],
+    ids=["MAX", "MAX_padded", "MAX_with_gaps", "AVE_pad_1", "AVE_pad_2", "STOCHASTIC"],
 )
-def test_gradients(build, gradcheck, settings: str) -> None:
+def test_pooling_gradients_are_the_derivatives(build, gradcheck, settings: str) -> None:
     layer = build(f'type: "Pooling" pooling_param {{ {settings} }}', (2, 2, 6, 5))
     gradcheck(layer, torch.rand(2, 2, 6, 5) + 0.1)
 
@@ -239,7 +242,7 @@ def test_stochastic_pooling_in_the_test_phase_weights_each_pixel_by_itself(build
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["MAX", "AVE"])
-def test_spp_puts_the_levels_side_by_side(build, gradcheck, method: str) -> None:
+def test_spp_concatenates_its_levels(build, gradcheck, method: str) -> None:
     layer = build(f'type: "SPP" spp_param {{ pyramid_height: 3 pool: {method} }}', (2, 3, 9, 12))
     for size in ((9, 12), (11, 6), (12, 15)):
         data = torch.rand(2, 3, *size)

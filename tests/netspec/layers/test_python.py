@@ -1,4 +1,4 @@
-"""The Python layer runs code written for pycaffe, if this is allowed."""
+"""Layers of type Python, which run code written for pycaffe if this is allowed."""
 
 import sys
 import types
@@ -55,7 +55,7 @@ def test_python_code_runs_only_if_it_is_allowed(python) -> None:
     assert "layers_of_mine" not in sys.modules
 
 
-def test_checking_a_net_takes_given_shapes_and_runs_no_code(python) -> None:
+def test_a_layer_built_without_data_has_the_given_shapes_and_runs_no_code(python) -> None:
     given = {"image": (1, 3, 8, 8), "label": (1,)}
     layer = python("Count", tops=("image", "label"), allow_python=False, open_data=False, given_shapes=given)
     assert layer.top_shapes == [(1, 3, 8, 8), (1,)]
@@ -64,8 +64,8 @@ def test_checking_a_net_takes_given_shapes_and_runs_no_code(python) -> None:
         python("Count", tops=("image", "other"), allow_python=False, open_data=False, given_shapes=given)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_first_example_of_caffe(python, dtype: torch.dtype) -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+def test_python_layer_computes_tops_and_gradients_of_any_shape_and_dtype(python, dtype: torch.dtype) -> None:
     layer = python("TimesTen", (2, 3))
     assert layer.top_shapes == [(2, 3)]
     for shape in ((2, 3), (4, 5, 1)):
@@ -80,7 +80,7 @@ def test_first_example_of_caffe(python, dtype: torch.dtype) -> None:
     assert layer.top_shapes == [(4, 5, 1)]
 
 
-def test_first_example_as_a_net(python, tmp_path: Path) -> None:
+def test_net_of_python_layers_computes_tops_and_gradients(python, tmp_path: Path) -> None:
     layers = [
         f"layer {{ type: 'Python' name: '{name}' bottom: '{bottom}' top: '{name}' "
         "python_param { module: 'layers_of_mine' layer: 'TimesTen' } }"
@@ -99,7 +99,7 @@ def test_first_example_as_a_net(python, tmp_path: Path) -> None:
     assert net(data=np.ones((4, 4, 4, 4), np.float32))["three"].shape == (4, 4, 4, 4)
 
 
-def test_second_example_of_caffe_gets_which_bottoms_want_a_gradient(python) -> None:
+def test_backward_is_told_which_bottoms_need_a_gradient(python) -> None:
     layer = python("Euclidean", (4, 3), (4, 3))
     a, b = torch.randn(4, 3, requires_grad=True), torch.randn(4, 3, requires_grad=True)
     loss = layer.run(a, b)[0]
@@ -113,7 +113,7 @@ def test_second_example_of_caffe_gets_which_bottoms_want_a_gradient(python) -> N
     assert layer.code.asked == [True, False]
 
 
-def test_a_data_layer_has_a_state_and_a_param_str(python) -> None:
+def test_python_data_layer_keeps_state_and_reads_param_str(python) -> None:
     layer = python("Count", param_str="{'size': 3}")
     assert layer.top_shapes == [(3,)]
     batches = [layer.run()[0] for _ in range(3)]
@@ -152,7 +152,7 @@ def test_in_place_bottom_and_top_are_one_blob(python) -> None:
         assert bottom.grad.tolist() == [5 * factor, 6 * factor, 7 * factor]
 
 
-def test_a_layer_without_tops_only_looks(python) -> None:
+def test_python_layer_without_tops_receives_its_bottoms(python) -> None:
     layer = python("Look", (2, 3), tops=())
     assert layer.run(torch.ones(2, 3)) == ()
     assert layer.code.seen.tolist() == [[1] * 3] * 2
@@ -175,12 +175,12 @@ def test_an_installed_caffe_is_not_replaced(python, monkeypatch: pytest.MonkeyPa
     assert sys.modules["caffe"] is real
 
 
-def test_a_folder_of_caffes_sources_is_no_caffe(python, tmp_path: Path) -> None:
+def test_a_folder_named_caffe_is_not_imported_as_caffe(python, tmp_path: Path) -> None:
     (tmp_path / "caffe").mkdir()
     assert python("TimesTen", (2, 3)).run(torch.ones(2, 3))[0].sum() == 60
 
 
-def test_a_missing_attribute_of_the_module_caffe_is_named(
+def test_a_missing_attribute_of_module_caffe_is_reported(
     python, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from netspec.layers.utility import pycaffe_shim
@@ -207,8 +207,9 @@ def test_a_missing_attribute_of_the_module_caffe_is_named(
         ("Euclidean", {}, "layers_of_mine.Euclidean.setup: Exception: Need two inputs to compute distance. ("),
         ("Count", {"param_str": "{}"}, "layers_of_mine.Count.setup: KeyError: 'size' ("),
     ],
+    ids=["missing_module", "missing_class", "not_a_layer", "exception_in_setup", "key_error_in_setup"],
 )
-def test_faults_of_the_code_are_one_line(python, name: str, options: dict, message: str) -> None:
+def test_errors_of_the_code_are_reported_in_one_line(python, name: str, options: dict, message: str) -> None:
     with pytest.raises(SpecError) as fault:
         python(name, (2, 3), **options)
     text = str(fault.value)
@@ -217,7 +218,7 @@ def test_faults_of_the_code_are_one_line(python, name: str, options: dict, messa
     assert "\n" not in text
 
 
-def test_faults_of_old_python_name_file_and_line(python, tmp_path: Path) -> None:
+def test_python_2_syntax_is_reported_with_file_line_and_advice(python, tmp_path: Path) -> None:
     (tmp_path / "of_2014.py").write_text('import caffe\nprint "hello"\n')
     with pytest.raises(SpecError) as fault:
         python("Mine", (2,), module="of_2014")
@@ -233,10 +234,10 @@ import random
 import caffe
 import their_helper
 
-class Deep(caffe.Layer):
+class InRandom(caffe.Layer):
     def setup(self, bottom, top): random.sample(range(2), 3)
 
-class Deeper(caffe.Layer):
+class InHelper(caffe.Layer):
     def setup(self, bottom, top): their_helper.fails()
 
 class InNetspec(caffe.Layer):
@@ -246,10 +247,11 @@ class InNetspec(caffe.Layer):
 
 
 @pytest.mark.parametrize(
-    ("name", "place"), [("Deep", "faulty.py:7"), ("Deeper", "their_helper.py:2"), ("InNetspec", "faulty.py:14")]
+    ("name", "place"),
+    [("InRandom", "faulty.py:7"), ("InHelper", "their_helper.py:2"), ("InNetspec", "faulty.py:14")],
+    ids=["in_the_standard_library", "in_the_users_helper", "in_netspec"],
 )
-def test_the_place_of_a_fault_is_a_line_of_the_user(python, tmp_path: Path, name: str, place: str) -> None:
-    """Python's own files and netspec's are not where one looks for it."""
+def test_errors_are_reported_at_a_line_of_the_users_files(python, tmp_path: Path, name: str, place: str) -> None:
     (tmp_path / "faulty.py").write_text(FAULTY)
     (tmp_path / "their_helper.py").write_text("def fails():\n    raise ValueError('bad')\n")
     with pytest.raises(SpecError) as fault:
@@ -259,7 +261,7 @@ def test_the_place_of_a_fault_is_a_line_of_the_user(python, tmp_path: Path, name
     assert str(fault.value).endswith(f"{place})")
 
 
-def test_faults_of_forward_and_of_a_missing_backward_name_them(python) -> None:
+def test_errors_in_reshape_and_a_missing_backward_name_the_method(python) -> None:
     layer = python("Euclidean", (2, 3), (2, 3))
     with pytest.raises(SpecError, match=r"layers_of_mine.Euclidean.reshape: Exception: Inputs must have the same dim"):
         layer.run(torch.ones(2, 3), torch.ones(2, 4))

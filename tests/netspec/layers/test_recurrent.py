@@ -1,4 +1,4 @@
-"""RNN, LSTM and LSTMUnit: compared with plain loops in numpy; how the hidden state is kept."""
+"""RNN, LSTM and LSTMUnit compared with plain loops in numpy, and how they keep the hidden state."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def text(kind: str, expose: bool = False) -> str:
     return f'type: "{kind}" ' + PARAM % str(expose).lower()
 
 
-def states(kind: str) -> int:
+def number_of_states(kind: str) -> int:
     return {"RNN": 1, "LSTM": 2}[kind]
 
 
@@ -48,20 +48,20 @@ def blobs_of(layer) -> list:
 
 
 def zeros(kind: str) -> list:
-    return [np.zeros((N, D))] * states(kind)
+    return [np.zeros((N, D))] * number_of_states(kind)
 
 
-def some(*shape: int) -> np.ndarray:
+def random_values(*shape: int) -> np.ndarray:
     return torch.randn(shape).double().numpy()
 
 
 @pytest.mark.parametrize("kind", ["RNN", "LSTM"])
-@pytest.mark.parametrize("with_static", [False, True])
-def test_recurrence_is_its_formula(build, kind: str, with_static: bool) -> None:
+@pytest.mark.parametrize("with_static", [False, True], ids=["without_static", "with_static"])
+def test_rnn_and_lstm_compute_their_formulas(build, kind: str, with_static: bool) -> None:
     shapes = [(T, N, INPUTS, 2), (T, N), *([(N, STATIC)] if with_static else [])]
     layer = build(text(kind), *shapes)
-    x, cont = some(*shapes[0]), np.array([[0, 0], [1, 1], [1, 0], [1, 1]])
-    static = some(N, STATIC) if with_static else None
+    x, cont = random_values(*shapes[0]), np.array([[0, 0], [1, 1], [1, 0], [1, 1]])
+    static = random_values(N, STATIC) if with_static else None
     bottoms = [x, cont, *([static] if with_static else [])]
     found = layer.run(*(torch.tensor(b).float() for b in bottoms))
     expected, _ = unroll(kind, blobs_of(layer), x, cont, zeros(kind), static)
@@ -69,7 +69,7 @@ def test_recurrence_is_its_formula(build, kind: str, with_static: bool) -> None:
     np.testing.assert_allclose(found[0].detach().numpy(), expected, atol=1e-5)
 
 
-def test_blobs_come_in_caffes_order(build) -> None:
+def test_blobs_are_in_caffes_order(build) -> None:
     shapes = [(T, N, INPUTS), (T, N), (N, STATIC)]
     assert build(text("LSTM"), *shapes[:2]).blob_shapes == [(4 * D, INPUTS), (4 * D,), (4 * D, D)]
     assert build(text("LSTM"), *shapes).blob_shapes == [(4 * D, INPUTS), (4 * D,), (4 * D, STATIC), (4 * D, D)]
@@ -77,16 +77,16 @@ def test_blobs_come_in_caffes_order(build) -> None:
     assert build(text("RNN"), *shapes).blob_shapes == [(D, INPUTS), (D,), (D, STATIC), (D, D), (D, D), (D,)]
 
 
-def test_work_is_counted_by_matrix_and_time_step(build) -> None:
+def test_multiply_adds_count_each_matrix_in_each_time_step(build) -> None:
     shapes = [(T, N, INPUTS), (T, N), (N, STATIC)]
     assert build(text("LSTM"), *shapes[:2]).multiply_adds() == T * N * 4 * D * (INPUTS + D)
     assert build(text("RNN"), *shapes).multiply_adds() == N * D * (T * (INPUTS + D + D) + STATIC)
 
 
 @pytest.mark.parametrize("kind", ["RNN", "LSTM"])
-def test_hidden_state_lives_on_from_batch_to_batch(build, kind: str) -> None:
+def test_hidden_state_continues_in_the_next_batch(build, kind: str) -> None:
     layer = build(text(kind), (T, N, INPUTS), (T, N))
-    x, cont = some(2 * T, N, INPUTS), np.ones((2 * T, N))
+    x, cont = random_values(2 * T, N, INPUTS), np.ones((2 * T, N))
     cont[T, 1] = 0  # the second stream begins anew with the second batch
     expected, _ = unroll(kind, blobs_of(layer), x, cont, zeros(kind), None)
     for part in (slice(0, T), slice(T, 2 * T)):
@@ -96,28 +96,30 @@ def test_hidden_state_lives_on_from_batch_to_batch(build, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["RNN", "LSTM"])
-def test_hidden_state_starts_at_zero_again_when_the_streams_change(build, kind: str) -> None:
+def test_hidden_state_is_reset_when_the_number_of_streams_changes(build, kind: str) -> None:
     layer = build(text(kind), (T, N, INPUTS), (T, N))
     layer.run(torch.randn(T, N, INPUTS), torch.ones(T, N))
-    x = some(T + 1, N + 1, INPUTS)  # more time steps, too
+    x = random_values(T + 1, N + 1, INPUTS)  # more time steps, too
     found = layer.run(torch.tensor(x).float(), torch.ones(T + 1, N + 1))[0]
-    start = [np.zeros((N + 1, D))] * states(kind)
+    start = [np.zeros((N + 1, D))] * number_of_states(kind)
     expected, _ = unroll(kind, blobs_of(layer), x, np.ones((T + 1, N + 1)), start, None)
     np.testing.assert_allclose(found.detach().numpy(), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["RNN", "LSTM"])
-@pytest.mark.parametrize("with_static", [False, True])
-def test_exposed_state_goes_in_and_out_without_gradient(build, kind: str, with_static: bool) -> None:
-    state_shapes = [(1, N, D)] * states(kind)
+@pytest.mark.parametrize("with_static", [False, True], ids=["without_static", "with_static"])
+def test_expose_hidden_makes_the_state_bottoms_and_tops_without_gradient(build, kind: str, with_static: bool) -> None:
+    state_shapes = [(1, N, D)] * number_of_states(kind)
     static_shape = [(N, STATIC)] if with_static else []
-    layer = build(text(kind, True), (T, N, INPUTS), (T, N), *static_shape, *state_shapes, tops=1 + states(kind))
+    layer = build(
+        text(kind, True), (T, N, INPUTS), (T, N), *static_shape, *state_shapes, tops=1 + number_of_states(kind)
+    )
     assert layer.top_shapes == [(T, N, D), *state_shapes]
-    x, cont, start = some(T, N, INPUTS), np.ones((T, N)), [some(N, D) for _ in state_shapes]
-    static = some(N, STATIC) if with_static else None
+    x, cont, start = random_values(T, N, INPUTS), np.ones((T, N)), [random_values(N, D) for _ in state_shapes]
+    static = random_values(N, STATIC) if with_static else None
     given = [torch.tensor(s[None]).float().requires_grad_() for s in start]
     middle = [torch.tensor(static).float()] if with_static else []
-    for _ in range(2):  # nothing lives on inside
+    for _ in range(2):  # the second pass starts from the given state too
         found = layer.run(torch.tensor(x).float(), torch.tensor(cont).float(), *middle, *given)
     expected, last = unroll(kind, blobs_of(layer), x, cont, start, static)
     np.testing.assert_allclose(found[0].detach().numpy(), expected, atol=1e-5)
@@ -125,12 +127,12 @@ def test_exposed_state_goes_in_and_out_without_gradient(build, kind: str, with_s
         np.testing.assert_allclose(top.detach().numpy(), state[None], atol=1e-5)
         assert not top.requires_grad
     found[0].sum().backward()
-    assert [s.grad for s in given] == [None] * states(kind)
+    assert [s.grad for s in given] == [None] * number_of_states(kind)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["RNN", "LSTM"])
-def test_gradients_go_back_through_time(build, gradcheck, kind: str) -> None:
+def test_gradients_through_time_are_the_derivatives(build, gradcheck, kind: str) -> None:
     layer = build(text(kind), (3, N, INPUTS), (3, N), (N, 2))
     cont = torch.tensor([[0.0, 0.0], [1.0, 1.0], [1.0, 0.0]]).double()
     gradcheck(layer, torch.randn(3, N, INPUTS), cont, torch.randn(N, 2), fixed=[1])
@@ -139,10 +141,10 @@ def test_gradients_go_back_through_time(build, gradcheck, kind: str) -> None:
 # LSTMUnit
 
 
-def test_lstm_unit_takes_gates_in_the_order_i_f_o_g_and_cont_zero_forgets_the_cell(build) -> None:
+def test_lstm_unit_has_gates_in_the_order_i_f_o_g_and_cont_zero_forgets_the_cell(build) -> None:
     layer = build('type: "LSTMUnit"', (1, N, D), (1, N, 4 * D), (1, N), tops=2)
     assert layer.top_shapes == [(1, N, D)] * 2
-    cell, gates, cont = some(1, N, D), some(1, N, 4 * D), np.array([[1.0, 0.0]])
+    cell, gates, cont = random_values(1, N, D), random_values(1, N, 4 * D), np.array([[1.0, 0.0]])
     c, h = layer.run(*(torch.tensor(b).float() for b in (cell, gates, cont)))
     i, f, o, g = np.split(gates, 4, 2)
     expected = cont[:, :, None] * sigmoid(f) * cell + sigmoid(i) * np.tanh(g)
@@ -157,6 +159,3 @@ def test_lstm_unit_gradients_are_the_derivatives(build) -> None:
     torch.autograd.gradcheck(lambda cell, gates: layer.run(cell, gates, cont), (cell, gates))
     torch.autograd.backward([top.sum() for top in layer.run(cell, gates, cont)])
     assert cont.grad is None
-
-
-# Faults

@@ -15,7 +15,7 @@ def at(*path: str | int) -> Where:
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_an_invalid_field_is_refused_at_its_place(case: dict[str, str]) -> None:
+def test_an_invalid_field_or_bottom_is_refused_at_its_place(case: dict[str, str]) -> None:
     shapes = [tuple(map(int, line.split())) for line in case["bottoms"].splitlines()]
     with pytest.raises(SpecError) as fault:
         make_layer(case["layer"], shapes, context(at=at), int(case.get("tops", 1)))

@@ -1,4 +1,4 @@
-"""The utilities: shapes, parts, copies, rows, arithmetic between blobs and over axes."""
+"""Layers that reshape, join, split or select values, and arithmetic between blobs and over axes."""
 
 import math
 
@@ -26,6 +26,7 @@ def counting(*shape: int) -> torch.Tensor:
         ("axis: 0", (2, 3), (6,)),
         ("axis: 1 end_axis: 1", (2, 3, 4), (2, 3, 4)),
     ],
+    ids=["default", "axis", "end_axis", "negative", "all", "one_axis"],
 )
 def test_flatten_joins_axes(build, text: str, bottom: tuple, top: tuple) -> None:
     layer = build(f'type: "Flatten" flatten_param {{ {text} }}', bottom)
@@ -46,6 +47,17 @@ def test_flatten_joins_axes(build, text: str, bottom: tuple, top: tuple) -> None
         ("axis: 1 num_axes: 1", (2, 1, 3), (2, 3)),  # no shape: the axes go
         ("shape { dim: -1 dim: 0 } axis: 1", (2, 6, 2), (2, 6, 2)),  # 0 copies the axis of its own place
     ],
+    ids=[
+        "sizes",
+        "copied_and_inferred",
+        "inferred_in_the_middle",
+        "one_axis",
+        "replaced_axis",
+        "inserted_last",
+        "inserted_first",
+        "removed_axis",
+        "copied_from_axis",
+    ],
 )
 def test_reshape_replaces_axes(build, text: str, bottom: tuple, top: tuple) -> None:
     layer = build(f'type: "Reshape" reshape_param {{ {text} }}', bottom)
@@ -53,7 +65,7 @@ def test_reshape_replaces_axes(build, text: str, bottom: tuple, top: tuple) -> N
     assert torch.equal(layer.run(counting(*bottom))[0], counting(*top))
 
 
-def test_reshape_follows_the_batch(build) -> None:
+def test_reshape_accepts_another_batch_size(build) -> None:
     layer = build('type: "Reshape" reshape_param { shape { dim: 0 dim: -1 } }', (2, 3, 4))
     assert layer.run(counting(5, 3, 4))[0].shape == (5, 12)
 
@@ -69,6 +81,7 @@ def test_reshape_follows_the_batch(build) -> None:
         ("concat_dim: 0", [(2, 3), (1, 3)], 0),
         ("axis: 0", [(2, 3)], 0),
     ],
+    ids=["default", "last_axis", "concat_dim", "one_bottom"],
 )
 def test_concat_joins_along_an_axis(build, text: str, shapes: list, axis: int) -> None:
     layer = build(f'type: "Concat" concat_param {{ {text} }}', *shapes)
@@ -88,6 +101,7 @@ def test_concat_joins_along_an_axis(build, text: str, shapes: list, axis: int) -
         ("axis: -3", 2, [1, 1], 0),
         ("", 1, [6], 1),
     ],
+    ids=["equal_parts", "slice_points", "slice_dim", "negative_axis", "one_top"],
 )
 def test_slice_cuts_an_axis(build, text: str, tops: int, sizes: list, axis: int) -> None:
     layer = build(f'type: "Slice" slice_param {{ {text} }}', (2, 6, 4), tops=tops)
@@ -113,7 +127,9 @@ def test_split_adds_the_gradients_of_its_tops(build) -> None:
     assert bottom.grad.tolist() == [[111, 111], [111, 111]]
 
 
-@pytest.mark.parametrize(("text", "top"), [("tiles: 3", (2, 9, 2)), ("axis: -1 tiles: 2", (2, 3, 4))])
+@pytest.mark.parametrize(
+    ("text", "top"), [("tiles: 3", (2, 9, 2)), ("axis: -1 tiles: 2", (2, 3, 4))], ids=["default_axis", "last_axis"]
+)
 def test_tile_repeats_the_whole_axis(build, text: str, top: tuple) -> None:
     layer = build(f'type: "Tile" tile_param {{ {text} }}', (2, 3, 2))
     assert layer.top_shapes == [top]
@@ -152,7 +168,7 @@ def test_batch_reindex_adds_up_the_gradients_of_an_item_chosen_twice(build) -> N
 
 
 @pytest.mark.parametrize("index", [-1, 3])
-def test_batch_reindex_names_an_index_out_of_range(build, index: int) -> None:
+def test_batch_reindex_refuses_an_index_out_of_range(build, index: int) -> None:
     layer = build('type: "BatchReindex"', (3, 2), (2,))
     with pytest.raises(SpecError, match=rf"bottom.1: found index {index}, expected 0 to 2"):
         layer.run(torch.ones(3, 2), torch.tensor([0.0, index]))
@@ -185,6 +201,7 @@ def test_filter_can_select_no_item(build) -> None:
         ("operation: PROD", lambda a, b, c: a * b * c),
         ("operation: MAX", lambda a, b, c: np.maximum(np.maximum(a, b), c)),
     ],
+    ids=["SUM", "SUM_with_coefficients", "PROD", "MAX"],
 )
 def test_eltwise_combines_element_by_element(build, gradcheck, text: str, expected) -> None:
     layer = build(f'type: "Eltwise" eltwise_param {{ {text} }}', (2, 3), (2, 3), (2, 3))
@@ -229,8 +246,9 @@ def test_eltwise_prod_has_the_true_gradient_at_zeros(build, stable: str) -> None
         ("SUMSQ", lambda x, axes: (x**2).sum(axes)),
         ("MEAN", lambda x, axes: x.mean(axes)),
     ],
+    ids=["SUM", "ASUM", "SUMSQ", "MEAN"],
 )
-def test_reduction_takes_the_axes_to_the_end(build, gradcheck, operation: str, expected, axis: int) -> None:
+def test_reduction_reduces_axis_and_all_later_axes(build, gradcheck, operation: str, expected, axis: int) -> None:
     layer = build(f'type: "Reduction" reduction_param {{ operation: {operation} axis: {axis} coeff: 2 }}', (2, 3, 4))
     bottom = torch.randn(2, 3, 4)
     top = layer.run(bottom)[0].numpy()
@@ -239,7 +257,7 @@ def test_reduction_takes_the_axes_to_the_end(build, gradcheck, operation: str, e
     gradcheck(layer, bottom)
 
 
-def test_reduction_asum_has_no_gradient_at_zero(build) -> None:
+def test_reduction_asum_has_gradient_zero_at_zero(build) -> None:
     bottom = torch.tensor([-2.0, 0.0, 3.0], requires_grad=True)
     build('type: "Reduction" reduction_param { operation: ASUM }', (3,)).run(bottom)[0].backward()
     assert bottom.grad is not None
@@ -249,8 +267,8 @@ def test_reduction_asum_has_no_gradient_at_zero(build) -> None:
 # ArgMax
 
 
-def argmax(values: list[float], top_k: int) -> list[tuple[float, int]]:
-    """As Caffe: pairs of value and index, the greatest first."""
+def top_pairs(values: list[float], top_k: int) -> list[tuple[float, int]]:
+    """Return the greatest pairs of value and index, the greatest first, as Caffe sorts them."""
     return sorted(((v, i) for i, v in enumerate(values)), reverse=True)[:top_k]
 
 
@@ -268,6 +286,7 @@ def test_argmax_resolves_ties_for_the_larger_index(build) -> None:
         ("top_k: 3", (2, 3, 2, 2, 2), (2, 1, 3, 1, 1)),
         ("out_max_val: true", (3,), (3, 2, 1)),
     ],
+    ids=["default", "top_2", "top_2_with_values", "top_3_of_five_axes", "one_axis_with_values"],
 )
 def test_argmax_without_axis_flattens_each_item(build, text: str, bottom: tuple, top: tuple) -> None:
     layer = build(f'type: "ArgMax" argmax_param {{ {text} }}', bottom)
@@ -276,7 +295,7 @@ def test_argmax_without_axis_flattens_each_item(build, text: str, bottom: tuple,
     assert layer.top_shapes == [top] == [tuple(found.shape)]
     assert not found.requires_grad
     for item, row in zip(x.reshape(bottom[0], -1).tolist(), found.reshape(top[:3]).tolist(), strict=True):
-        pairs = argmax(item, top[2])
+        pairs = top_pairs(item, top[2])
         assert row[0] == [i for _, i in pairs]
         assert row[1:] == ([[v for v, _ in pairs]] if top[1] == 2 else [])
 
@@ -288,15 +307,15 @@ def test_argmax_along_an_axis_returns_indices_or_values(build, out_max_val: str)
     found = layer.run(x)[0]
     assert layer.top_shapes == [(2, 2, 3)]
     for n, c in np.ndindex(2, 3):
-        pairs = argmax(x[n, :, c].tolist(), 2)
+        pairs = top_pairs(x[n, :, c].tolist(), 2)
         assert found[n, :, c].tolist() == [v if out_max_val == "true" else i for v, i in pairs]
 
 
 # Softmax
 
 
-@pytest.mark.parametrize(("text", "axis"), [("", 1), ("axis: -1", 2), ("axis: 0", 0)])
-def test_softmax_along_an_axis(build, gradcheck, text: str, axis: int) -> None:
+@pytest.mark.parametrize(("text", "axis"), [("", 1), ("axis: -1", 2), ("axis: 0", 0)], ids=["default", "last", "first"])
+def test_softmax_along_an_axis_computes_its_formula(build, gradcheck, text: str, axis: int) -> None:
     layer = build(f'type: "Softmax" softmax_param {{ {text} }}', (2, 3, 4))
     bottom = torch.randn(2, 3, 4) * 50
     e = np.exp(bottom.double().numpy() - bottom.double().numpy().max(axis, keepdims=True))
@@ -304,13 +323,13 @@ def test_softmax_along_an_axis(build, gradcheck, text: str, axis: int) -> None:
     gradcheck(layer, torch.randn(2, 3, 4))
 
 
-def test_softmax_gradient_uses_the_data_in_memory(build) -> None:
+def test_softmax_caffes_gradient_is_computed_from_the_given_top(build) -> None:
     layer = build('type: "Softmax"', (1, 3))
     top, diff = torch.tensor([[1.0, 2.0, -1.0]]), torch.tensor([[3.0, 0.5, 1.0]])
     assert layer.caffes_gradient(torch.zeros(1, 3), top, diff).tolist() == [[0, -5, 2]]
 
 
-# Gradients and faults
+# Gradients
 
 
 @pytest.mark.parametrize(
@@ -321,10 +340,11 @@ def test_softmax_gradient_uses_the_data_in_memory(build) -> None:
         ('type: "Slice" slice_param { slice_point: 1 }', 2),
         ('type: "Tile" tile_param { tiles: 2 }', 1),
     ],
+    ids=["Flatten", "Reshape", "Slice", "Tile"],
 )
-def test_moving_numbers_moves_gradients(build, gradcheck, text: str, tops: int) -> None:
+def test_gradients_of_layers_that_rearrange_values_are_the_derivatives(build, gradcheck, text: str, tops: int) -> None:
     gradcheck(build(text, (2, 3, 2), tops=tops), torch.randn(2, 3, 2))
 
 
-def test_concat_moves_gradients(build, gradcheck) -> None:
+def test_concat_gradient_is_the_derivative(build, gradcheck) -> None:
     gradcheck(build('type: "Concat"', (2, 3), (2, 1)), torch.randn(2, 3), torch.randn(2, 1))
