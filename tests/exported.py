@@ -1,4 +1,4 @@
-"""Runs nets, here and exported, and compares the results."""
+"""Run nets here and as exported, and compare the results."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def other_inputs(net: Net, shapes: NetShapes, inputs: Arrays) -> dict[str, np.nd
 
 
 def trained(net: Net, seed: int = 1) -> Net:
-    """Give a net weights as if it had been trained: none zero, maps that neither vanish nor grow."""
+    """Give a net random weights like those of a trained net: none is zero, and maps neither vanish nor grow."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(blob: torch.Tensor, low: float, high: float) -> None:
@@ -143,7 +143,7 @@ def source_module(net: Net) -> torch.nn.Module:
 
 
 def assert_same(found: Arrays, expected: Arrays, scalars_have_an_axis: bool = False) -> None:
-    """Compare all outputs; ``scalars_have_an_axis`` takes (1,) for (), as OpenCV gives it."""
+    """Compare all outputs; with ``scalars_have_an_axis`` a shape (1,) equals (), which OpenCV does not have."""
     assert sorted(found) == sorted(expected)
     for name, wanted in expected.items():
         got = found[name]

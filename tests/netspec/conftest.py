@@ -1,4 +1,4 @@
-"""How tests build a net from text, keep what it warns of, get a folder to train in, and run commands there."""
+"""Fixtures that build a net from text, collect warnings, copy golden folders, and run commands."""
 
 import logging
 import shutil

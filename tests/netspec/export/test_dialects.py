@@ -1,4 +1,4 @@
-"""The layers of forks, exported: the same numbers in onnxruntime, OpenCV 5 and PyTorch, at other sizes too."""
+"""Exported layers of dialects: the same results in onnxruntime, OpenCV 5 and PyTorch, at other sizes too."""
 
 from collections.abc import Callable, Mapping
 
@@ -47,7 +47,7 @@ CASES = read_cases("netspec/export/cases/dialects.txt")
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_layer_computes_the_same(case: dict[str, str], net_of: Callable[..., Net]) -> None:
+def test_exported_layer_computes_the_same(case: dict[str, str], net_of: Callable[..., Net]) -> None:
     use_dialect(case["dialect"])
     net = trained(net_of(case["net"]))
     inputs = random_inputs(net)
@@ -61,7 +61,7 @@ def test_layer_computes_the_same(case: dict[str, str], net_of: Callable[..., Net
             assert_same(in_opencv(model, given), expected, scalars_have_an_axis=True)
 
 
-def test_unpooling_brings_values_to_where_they_came_from(net_of: Callable[..., Net]) -> None:
+def test_upsample_puts_maxima_back_to_their_pixels(net_of: Callable[..., Net]) -> None:
     use_dialect("blocks")
     text = """layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 dim: 8 dim: 6 } } }
     layer { name: "pool" type: "Pooling" bottom: "x" top: "pool" top: "mask"
@@ -78,7 +78,7 @@ def test_unpooling_brings_values_to_where_they_came_from(net_of: Callable[..., N
         assert_same(in_opencv(model, inputs), expected)
 
 
-def test_regions_are_pooled(net_of: Callable[..., Net]) -> None:
+def test_roi_pooling_computes_the_same_in_onnxruntime_and_is_refused_for_pytorch(net_of: Callable[..., Net]) -> None:
     use_dialect("rcnn")
     layer = "type: 'ROIPooling' roi_pooling_param { pooled_h: 3 pooled_w: 2 spatial_scale: 0.5 }"
     net = net_of(net_text(layer, {"x": (2, 4, 9, 8), "rois": (4, 5)}))
@@ -103,8 +103,9 @@ def test_regions_are_pooled(net_of: Callable[..., Net]) -> None:
             {"loc": (1, 8), "conf": (1, 6), "prior": (1, 2, 8), "truth": (1, 1, 1, 8)},
         ),
     ],
+    ids=["PSROIPooling", "MultiBoxLoss"],
 )
-def test_a_layer_without_counterpart_is_refused_with_its_place_and_reason(
+def test_a_layer_that_cannot_be_exported_is_refused_at_its_place(
     dialect: str, layer: str, shapes: dict[str, Shape], net_of: Callable[..., Net]
 ) -> None:
     use_dialect(dialect)
@@ -155,7 +156,7 @@ DETECTIONS = {
 
 @pytest.mark.parametrize("images", [1, 2])
 @pytest.mark.parametrize("name", DETECTIONS)
-def test_detections_are_the_same(name: str, images: int, net_of: Callable[..., Net]) -> None:
+def test_detection_output_computes_the_same(name: str, images: int, net_of: Callable[..., Net]) -> None:
     settings = DETECTIONS[name]
     net, inputs = detections(net_of, settings, images, 60, 3 if "false" in settings else 1)
     expected = here(net, inputs)
@@ -168,7 +169,7 @@ def test_detections_are_the_same(name: str, images: int, net_of: Callable[..., N
         assert_same(run_module(source_module(net), net, inputs), expected)
 
 
-def test_an_adaptive_threshold_is_refused(net_of: Callable[..., Net]) -> None:
+def test_an_adaptive_nms_threshold_is_refused(net_of: Callable[..., Net]) -> None:
     net, _ = detections(net_of, "nms_param { nms_threshold: 0.6 eta: 0.9 }", 1, 4, 1)
     with pytest.raises(SpecError, match=r"cannot be exported to ONNX: .*eta must be 1"):
         onnx_model(net)

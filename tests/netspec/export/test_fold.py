@@ -1,4 +1,4 @@
-"""Folded nets give the same results with fewer layers, and other programs read them."""
+"""Folding: nets with BatchNorm, Scale, Dropout and Split folded give the same results with fewer layers."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -41,7 +41,7 @@ layer { name: "bn_p" type: "BatchNorm" bottom: "x" top: "z" {shared} }
 
 
 def folded(net: Net, folder: Path) -> Net:
-    """Return the folded net, as it is read from its files."""
+    """Return the folded net, written to files and read from them."""
     prototxt, weights = write_caffe(fold(net), folder / "folded")
     return netspec.load_net(prototxt, weights=weights)
 
@@ -74,7 +74,7 @@ def test_batch_norm_and_scale_become_part_of_the_weights(
     assert_same(here(small, random_inputs(net)), here(net, random_inputs(net)))
 
 
-def test_a_blob_with_another_reader_is_kept(net_of: Callable[..., Net], tmp_path: Path) -> None:
+def test_a_blob_that_another_layer_reads_is_kept(net_of: Callable[..., Net], tmp_path: Path) -> None:
     text = f'{INPUT} layer {{ name: "conv" type: "Convolution" bottom: "data" top: "a" {CONV} }}' + NORM.format(*"abc")
     net = trained(net_of(text + 'layer { name: "sum" type: "Eltwise" bottom: "a" bottom: "c" top: "sum" }'))
     small = folded(net, tmp_path)
@@ -82,7 +82,7 @@ def test_a_blob_with_another_reader_is_kept(net_of: Callable[..., Net], tmp_path
     assert_same(here(small, random_inputs(net)), here(net, random_inputs(net)))
 
 
-def test_dropout_and_split_are_gone_and_outputs_keep_their_names(net_of: Callable[..., Net], tmp_path: Path) -> None:
+def test_dropout_and_split_are_removed_and_outputs_keep_their_names(net_of: Callable[..., Net], tmp_path: Path) -> None:
     text = f"""{INPUT}
     layer {{ name: "conv" type: "Convolution" bottom: "data" top: "a" {CONV} }}
     layer {{ name: "drop" type: "Dropout" bottom: "a" top: "b" }}
@@ -103,7 +103,7 @@ SHARED = 'param { name: "m" lr_mult: 0 } param { name: "v" lr_mult: 0 } param { 
 
 
 @pytest.mark.parametrize("shared", [SHARED, ""], ids=["with shared statistics", "each with its own"])
-def test_towers_share_their_weights_where_folding_leaves_them_equal(
+def test_towers_share_folded_weights_if_they_share_statistics(
     shared: str, net_of: Callable[..., Net], tmp_path: Path
 ) -> None:
     net = trained(net_of(TOWERS.replace("{shared}", shared)))
@@ -149,7 +149,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda path: path.name)
-def test_golden_nets_fold(case: Path, tmp_path: Path) -> None:
+def test_folded_golden_nets_compute_the_same(case: Path, tmp_path: Path) -> None:
     net = netspec.load_net(case / "net.prototxt", phase="TEST")
     small = folded(trained(net), tmp_path)
     assert_same(here(small, random_inputs(net)), here(net, random_inputs(net)))

@@ -1,4 +1,4 @@
-"""Whole ONNX models: names, dynamic sizes, metadata, preprocessing of images, large weights, real nets."""
+"""ONNX models: names, dynamic sizes, notes, preprocessing, large weights, results of every layer and of real nets."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -83,7 +83,7 @@ def test_batch_height_and_width_are_free_where_the_net_allows_it(net_of: Callabl
     assert sizes_of(model.graph.output) == {"conv": ["N", 4, "conv_2", "conv_3"]}
 
 
-def test_the_layer_that_fixes_a_size_is_named(net_of: Callable[..., Net]) -> None:
+def test_a_note_names_the_layer_that_fixes_a_size(net_of: Callable[..., Net]) -> None:
     text = 'layer { name: "ip" type: "InnerProduct" bottom: "conv" top: "ip" inner_product_param { num_output: 2 } }'
     model, notes = onnx_model(net_of(IMAGE + CONV + text))
     assert sizes_of(model.graph.input) == {"data": ["N", 3, 12, 10]}
@@ -111,7 +111,7 @@ def test_a_note_reports_that_recurrent_state_starts_at_zero(
     assert note in notes
 
 
-def test_there_is_no_such_note_where_the_state_is_an_input_and_an_output(net_of: Callable[..., Net]) -> None:
+def test_no_note_is_given_if_the_state_is_an_input_and_an_output(net_of: Callable[..., Net]) -> None:
     text = RECURRENT % ("RNN", 'bottom: "h0" top: "h1"', "true")
     state = 'layer { name: "h0" type: "Input" top: "h0" input_param { shape { dim: 1 dim: 2 dim: 5 } } }'
     assert not any("starts at zero" in note for note in onnx_model(net_of(state + text))[1])
@@ -157,7 +157,7 @@ def test_pooling_has_caffes_windows_at_every_size(
 
 
 @pytest.mark.parametrize("kind", ["Convolution", "Im2col", "Deconvolution"])
-def test_filters_of_one_pixel_are_padded(kind: str, net_of: Callable[..., Net]) -> None:
+def test_padded_filters_of_one_pixel_compute_the_same(kind: str, net_of: Callable[..., Net]) -> None:
     outputs = "" if kind == "Im2col" else "num_output: 8"
     settings = f"convolution_param {{ {outputs} kernel_size: 1 pad_h: 1 pad_w: 2 }}"
     net = trained(net_of(IMAGE + f'layer {{ name: "y" type: "{kind}" bottom: "data" top: "y" {settings} }}'))
@@ -168,7 +168,7 @@ def test_filters_of_one_pixel_are_padded(kind: str, net_of: Callable[..., Net]) 
         assert_same(in_opencv(model, inputs), here(net, inputs))
 
 
-def test_windows_that_miss_the_map_are_refused(net_of: Callable[..., Net]) -> None:
+def test_pooling_windows_outside_the_map_are_refused(net_of: Callable[..., Net]) -> None:
     text = 'layer { name: "y" type: "Pooling" bottom: "data" top: "y" pooling_param { kernel_size: 1 stride: 3 } }'
     with pytest.raises(SpecError, match=r'layer "y" \(Pooling\): cannot be exported to ONNX: .*stride'):
         onnx_model(net_of(IMAGE + text))
@@ -241,20 +241,21 @@ def test_the_preprocessing_of_images_is_part_of_the_model(name: str, net_of: Cal
         (Preprocess(mean=np.zeros(2)), "found a mean of shape (2,), expected one number for each of the 3 channels"),
         (Preprocess(mean=np.zeros((3, 5, 20))), "found a mean of 5 x 20 pixels, expected at least 12 x 10"),
     ],
+    ids=["channels", "pixels"],
 )
-def test_an_unsuitable_mean_is_refused(steps: Preprocess, fault: str, net_of: Callable[..., Net]) -> None:
+def test_a_mean_of_wrong_size_is_refused(steps: Preprocess, fault: str, net_of: Callable[..., Net]) -> None:
     with pytest.raises(SpecError) as caught:
         onnx_model(net_of(IMAGE + FIXED), preprocess=steps)
     assert fault in str(caught.value)
 
 
-def test_cropping_needs_a_size(net_of: Callable[..., Net]) -> None:
+def test_cropping_in_a_net_of_dynamic_size_is_refused(net_of: Callable[..., Net]) -> None:
     with pytest.raises(SpecError, match="the height and width of data are dynamic"):
         onnx_model(net_of(IMAGE + CONV), preprocess=Preprocess(crop=True))
 
 
 @pytest.mark.parametrize("name", ["siamese_8", "siamese_128", "siamese_resnet27_256"])
-def test_the_papers_nets_compute_the_same(name: str) -> None:
+def test_nets_of_the_paper_compute_the_same(name: str) -> None:
     net = trained(netspec.load_net(ROOT / "prototxt" / "small" / name / "deploy.prototxt", seed=0))
     inputs = random_inputs(net)
     expected = here(net, inputs)
@@ -274,7 +275,6 @@ MODELS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_real_models_equal_caffe_or_opencv(name: str) -> None:
     folder = shared("golden", "models", name)
@@ -299,14 +299,12 @@ def test_real_models_equal_caffe_or_opencv(name: str) -> None:
             assert_same(in_opencv(model, inputs), here(net, inputs))
 
 
-# Every layer in ONNX: the same numbers in onnxruntime and in OpenCV 5, at other batches and sizes too
+# Every layer: the same results in onnxruntime and in OpenCV 5, and in onnxruntime at other batch sizes and sizes
 CASES = sorted((GOLDEN / "layers").iterdir())
-pytest.importorskip("onnx", reason=ONNX_EXTRA)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda path: path.name)
-def test_golden_layer_computes_the_same_in_onnxruntime_and_opencv_and_at_other_sizes(case: Path) -> None:
+def test_golden_layer_computes_the_same_in_onnxruntime_and_opencv(case: Path) -> None:
     net, inputs = golden_net(case)
     model, _ = onnx_model(net)
     expected = here(net, inputs)

@@ -1,7 +1,7 @@
-"""The way back: OpenCV 4's own reader of Caffe's files runs what is saved and what is folded here, to the same numbers.
+"""Prototxt and weights written here, folded or not, give the same results in OpenCV 4's reader of Caffe's files.
 
-``tests/golden/export/opencv4`` has such files and what OpenCV 4.12 made of them. NETSPEC_OPENCV4 names a Python that
-has OpenCV 4, to run it afresh; with it set, this file, run as a program, writes the golden files anew.
+``tests/golden/export/opencv4`` has such files and the results of OpenCV 4.12. If NETSPEC_OPENCV4 is the path of a
+Python that has OpenCV 4, the tests run it too, and this file, run as a program, writes the golden files again.
 """
 
 import os
@@ -52,14 +52,14 @@ def in_opencv_4(folder: Path, name: str, data: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["built", "folded"])
-def test_opencv_4_computed_the_same_from_these_files(name: str) -> None:
+def test_results_equal_those_of_opencv_4_for_the_golden_files(name: str) -> None:
     golden = np.load(FOLDER / "opencv.npz")
     net = netspec.load_net(FOLDER / f"{name}.prototxt", weights=FOLDER / f"{name}.caffemodel")
     assert len(net.layers) == {"built": 19, "folded": 12}[name]
     assert_same(here(net, {"data": golden["data"]}), {"prob": golden[name]})
 
 
-def test_the_files_are_written_as_they_were(tmp_path: Path) -> None:
+def test_written_files_equal_the_golden_files(tmp_path: Path) -> None:
     write_files(tmp_path)
     for name in ("built", "folded"):
         assert (tmp_path / f"{name}.prototxt").read_text() == (FOLDER / f"{name}.prototxt").read_text()
@@ -72,7 +72,7 @@ def test_the_files_are_written_as_they_were(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not PYTHON, reason="NETSPEC_OPENCV4 names no Python that has OpenCV 4")
 @pytest.mark.parametrize("name", ["built", "folded"])
-def test_opencv_4_computes_the_same(name: str, tmp_path: Path) -> None:
+def test_opencv_4_computes_the_same_from_written_files(name: str, tmp_path: Path) -> None:
     net = write_files(tmp_path)
     inputs = random_inputs(net)
     assert_same({"prob": in_opencv_4(tmp_path, name, inputs["data"])}, here(net, inputs))

@@ -1,4 +1,4 @@
-"""The net inside a .caffemodel, for weights whose prototxt is lost."""
+"""The deploy net that is read from a .caffemodel, for weights whose prototxt is lost."""
 
 import shutil
 from collections.abc import Callable
@@ -66,7 +66,7 @@ def test_the_deploy_net_of_a_training_computes_the_same(trained: Callable[..., A
     torch.testing.assert_close(built(data=image)["ip"], ip)
 
 
-def test_an_unknown_shape_is_an_error_that_asks_for_it(trained: Callable[..., Any]):
+def test_an_unknown_shape_is_refused_with_the_option_to_give(trained: Callable[..., Any]):
     trained("mirror: true")
     with pytest.raises(
         SpecError, match=r"w\.caffemodel: the shape of its input is not in the file.*; give --shape data=1,3,H,W or"
@@ -78,7 +78,7 @@ def test_an_unknown_shape_is_an_error_that_asks_for_it(trained: Callable[..., An
     assert deploy.layer[-1].type == "SoftmaxWithLoss"
 
 
-def test_the_shape_of_records_is_read_where_they_are(trained: Callable[..., Any]):
+def test_the_input_shape_is_read_from_the_database_of_the_training(trained: Callable[..., Any]):
     trained("mirror: true")
     shutil.copytree(GOLDEN / "images" / "lmdb_plain", "gone")
     deploy, _ = recover_net("w.caffemodel", {})
@@ -92,7 +92,9 @@ def test_the_shape_of_records_is_read_where_they_are(trained: Callable[..., Any]
 
 
 @pytest.mark.slow
-def test_the_commands_show_and_write_it(trained: Callable[..., Any], run: Callable[..., Any]):
+def test_check_and_upgrade_net_proto_text_read_the_net_of_a_caffemodel(
+    trained: Callable[..., Any], run: Callable[..., Any]
+):
     trained("mirror: true")
     assert "give --shape data=1,3,H,W" in run("check", "w.caffemodel").fault
     result = run("check", "w.caffemodel", "--shape", "data=1,3,9,9")

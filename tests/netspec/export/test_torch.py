@@ -1,4 +1,4 @@
-"""PyTorch source: the same numbers without this project, formatted, and taken by torch.export and torch.compile."""
+"""Exported PyTorch source and .pt2 files: their results, the form of the source, and torch.compile."""
 
 import re
 import shutil
@@ -27,14 +27,14 @@ CASES = sorted((GOLDEN / "layers").iterdir())
 REFUSED = {"accuracy_topk_perclass": "without the accuracy of each class", "infogain": "infogain matrix"}
 
 
-def formatted(text: str) -> bool:
+def is_formatted(text: str) -> bool:
     ruff = shutil.which("ruff") or str(Path(sys.executable).with_name("ruff"))
     command = [ruff, "format", "--isolated", "--check", "--stdin-filename", "net.py", "-"]
     return subprocess.run(command, input=text, text=True, capture_output=True, check=False).returncode == 0
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda path: path.name)
-def test_golden_layer_computes_the_same(case: Path) -> None:
+def test_source_and_module_of_a_golden_layer_compute_the_same(case: Path) -> None:
     net, inputs = golden_net(case)
     if case.name in REFUSED:
         with pytest.raises(netspec.SpecError, match=REFUSED[case.name]):
@@ -44,27 +44,28 @@ def test_golden_layer_computes_the_same(case: Path) -> None:
     for module in modules:
         again, _ = golden_net(case)  # a recurrent net remembers what it saw
         assert_same(run_module(module, net, inputs), here(again, inputs))
-    assert formatted(torch_source(net)[0])
+    assert is_formatted(torch_source(net)[0])
     inputs = other_inputs(net, settled(net, lambda shapes: write_definition(net, shapes))[1], inputs)
     for module in modules:
         again, _ = golden_net(case)  # a recurrent net remembers what it saw
         assert_same(run_module(module, net, inputs), here(again, inputs))
 
 
-def test_the_module_runs_without_this_project(tmp_path: Path) -> None:
+def test_the_module_runs_without_netspec(tmp_path: Path) -> None:
     net = trained(netspec.load_net(ROOT / "prototxt" / "small" / "siamese_resnet27_256" / "deploy.prototxt", seed=0))
     inputs = random_inputs(net)
     export_torch(net, tmp_path / "net.py", "deploy.prototxt")
     np.save(tmp_path / "data.npy", inputs["data"])
     program = (
-        "import sys, numpy, torch, net\n"
+        "import runpy, sys, numpy, torch, net\n"
         "assert not any(name.startswith('netspec') for name in sys.modules)\n"
         "with torch.no_grad():\n"
         "    found = net.load()(torch.from_numpy(numpy.load('data.npy')))\n"
         "numpy.save('found.npy', found.numpy())\n"
+        "runpy.run_path('net.py', run_name='__main__')\n"
+        "assert not any(name.startswith('netspec') for name in sys.modules)\n"
     )
-    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True)
-    subprocess.run([sys.executable, "net.py"], cwd=tmp_path, check=True, capture_output=True)
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True, capture_output=True)
     assert_same({net.outputs[0]: np.load(tmp_path / "found.npy")}, here(net, inputs))
 
 
@@ -72,7 +73,7 @@ SMALL = (Path(__file__).parent / "nets" / "small.prototxt").read_text()
 PAIRS = (Path(__file__).parent / "nets" / "pairs.prototxt").read_text()
 
 
-def test_reads_as_a_person_would_have_written_it(net_of: Callable[..., Net]) -> None:
+def test_source_equals_the_expected_program(net_of: Callable[..., Net]) -> None:
     text, state, _ = torch_source(trained(net_of(SMALL)), "small.prototxt")
     assert text == (Path(__file__).parent / "programs" / "small.py").read_text()
     assert list(state)[:3] == ["conv1.weight", "conv1.bias", "bn1.running_mean"]
@@ -95,11 +96,11 @@ def test_towers_that_share_weights_are_one_module(net_of: Callable[..., Net]) ->
     net = trained(net_of(TOWERS))
     text, state, _ = torch_source(net)
     assert len(state) == 8
-    assert text.count("self.ip2(") == 2  # for one tower and for the other
+    assert text.count("self.ip2(") == 2  # once for each tower
     assert_same(run_module(source_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
 
 
-def test_a_deconvolution_longer_than_the_map(net_of: Callable[..., Net]) -> None:
+def test_deconvolution_with_a_filter_larger_than_the_map_computes_the_same(net_of: Callable[..., Net]) -> None:
     text = """layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 2 dim: 3 dim: 4 } } }
     layer { name: "up" type: "Deconvolution" bottom: "data" top: "up"
       convolution_param { num_output: 2 kernel_size: 5 stride: 2 } }"""
@@ -107,7 +108,7 @@ def test_a_deconvolution_longer_than_the_map(net_of: Callable[..., Net]) -> None
     assert_same(run_module(source_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
 
 
-def test_names_that_python_does_not_take(net_of: Callable[..., Net]) -> None:
+def test_names_that_are_invalid_in_python_compute_the_same(net_of: Callable[..., Net]) -> None:
     text = """name: "1x1 net" layer { name: "in" type: "Input" top: "in" input_param { shape { dim: 2 dim: 3 } } }
     layer { name: "class" type: "InnerProduct" bottom: "in" top: "self" inner_product_param { num_output: 2 } }
     layer { name: "forward" type: "InnerProduct" bottom: "self" top: "print" inner_product_param { num_output: 2 } }
@@ -116,7 +117,7 @@ def test_names_that_python_does_not_take(net_of: Callable[..., Net]) -> None:
     assert_same(run_module(source_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
 
 
-def test_torch_export_accepts_it_with_a_dynamic_batch_and_size(net_of: Callable[..., Net], tmp_path: Path) -> None:
+def test_pt2_file_computes_the_same_at_another_batch_and_size(net_of: Callable[..., Net], tmp_path: Path) -> None:
     net = trained(net_of(SMALL))
     assert export_pt2(net, tmp_path / "small.pt2") == []
     program = torch.export.load(tmp_path / "small.pt2").module()
@@ -143,8 +144,8 @@ def test_inputs_of_other_sizes_are_refused(net_of: Callable[..., Net], tmp_path:
         source_module(net)(image, torch.zeros(4, 1, 6, 6), label, other)
 
 
-@pytest.mark.parametrize("backend", ["eager", "aot_eager"])  # "inductor" makes of the latter's graph what torch can
-def test_torch_compile_takes_it(backend: str, net_of: Callable[..., Net]) -> None:
+@pytest.mark.parametrize("backend", ["eager", "aot_eager"])  # "inductor" compiles the graph of the latter
+def test_compiled_source_computes_the_same(backend: str, net_of: Callable[..., Net]) -> None:
     net = trained(net_of(SMALL))
     compiled: Any = torch.compile(source_module(net), backend=backend, fullgraph=True)
     assert_same(run_module(compiled, net, random_inputs(net)), here(net, random_inputs(net)))

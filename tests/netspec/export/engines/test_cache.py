@@ -1,4 +1,4 @@
-"""The cache of exported models: entries are complete or absent, and found by their content."""
+"""The cache of exported models: its entries, their keys, damage to them, and its folder."""
 
 import logging
 import os
@@ -13,7 +13,7 @@ from netspec.export.engines.choice import Choice, user_folder
 
 
 class Maker:
-    """Writes a file of some bytes, and counts how often it does."""
+    """Write a file of some bytes, and count the calls."""
 
     def __init__(self, size: int = 10) -> None:
         self.size, self.calls = size, 0
@@ -44,12 +44,11 @@ def test_a_failed_maker_leaves_no_files(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_other_files_in_the_folder_are_kept(tmp_path: Path) -> None:
-    """However large and old they are."""
+def test_large_and_old_files_of_others_in_the_folder_are_kept(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     with (photos / "large.jpg").open("wb") as file:
-        file.truncate(5 * 2**30)  # of holes
+        file.truncate(5 * 2**30)  # sparse
     for folder in (photos, tmp_path / ".unfinished-of-another"):
         folder.mkdir(exist_ok=True)
         os.utime(folder, (0, 0))
@@ -58,7 +57,7 @@ def test_other_files_in_the_folder_are_kept(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == [".unfinished-of-another", "key", "photos"]
 
 
-def test_an_entry_that_another_process_made_meanwhile_is_used(tmp_path: Path) -> None:
+def test_an_entry_that_another_process_makes_meanwhile_is_used(tmp_path: Path) -> None:
     def make(folder: Path) -> None:
         entry(tmp_path, "key", Maker(20))
         Maker(10)(folder)
@@ -71,10 +70,10 @@ def test_an_entry_that_another_process_made_meanwhile_is_used(tmp_path: Path) ->
 @pytest.mark.parametrize(
     "damage",
     [
-        pytest.param(lambda folder: (folder / "model").write_bytes(b"m" * 9), id="a file that was cut"),
+        pytest.param(lambda folder: (folder / "model").write_bytes(b"m" * 9), id="a shorter file"),
         pytest.param(lambda folder: (folder / "model").write_bytes(b"n" + b"m" * 9), id="a file of other bytes"),
-        pytest.param(lambda folder: (folder / "model").unlink(), id="a file that is gone"),
-        pytest.param(lambda folder: (folder / DIGESTS).write_bytes(b"\xff{"), id="no list of digests"),
+        pytest.param(lambda folder: (folder / "model").unlink(), id="a missing file"),
+        pytest.param(lambda folder: (folder / DIGESTS).write_bytes(b"\xff{"), id="an unreadable list of digests"),
     ],
 )
 def test_a_damaged_entry_is_made_again(
@@ -95,7 +94,7 @@ def test_a_damaged_entry_is_made_again(
     ]
 
 
-def test_no_entry_is_written_through_a_link(tmp_path: Path) -> None:
+def test_an_entry_that_is_a_symbolic_link_is_refused(tmp_path: Path) -> None:
     cache, elsewhere = tmp_path / "cache", tmp_path / "elsewhere"
     cache.mkdir()
     elsewhere.mkdir()
@@ -105,7 +104,7 @@ def test_no_entry_is_written_through_a_link(tmp_path: Path) -> None:
     assert list(elsewhere.iterdir()) == []
 
 
-def test_a_key_is_of_contents_and_options(tmp_path: Path) -> None:
+def test_a_key_depends_on_contents_and_options_only(tmp_path: Path) -> None:
     one, same, other = (tmp_path / name for name in ("one", "same", "other"))
     for path, text in ((one, "a"), (same, "a"), (other, "b")):
         path.write_text(text)
@@ -116,13 +115,13 @@ def test_a_key_is_of_contents_and_options(tmp_path: Path) -> None:
         key_of([tmp_path / "gone"], {})
 
 
-def test_where_the_cache_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_is_below_xdg_cache_home_or_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert user_folder() == tmp_path / "netspec"
     assert Choice.of("torch").cache == tmp_path / "netspec"
     assert Choice.of("torch", cache=False).cache is None
     assert Choice.of("torch", cache="here").cache == Path("here")
-    monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # which the standard has ignored
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # the XDG standard says to ignore it
     monkeypatch.setenv("HOME", str(tmp_path))
     assert user_folder() == tmp_path / ".cache" / "netspec"
 
@@ -138,8 +137,9 @@ def test_where_the_cache_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         ("tensorrt", "fp32", "found engine 'tensorrt', expected 'torch', 'onnxruntime', 'openvino'"),
         ("torch", "int8", "found precision 'int8', expected 'fp32', 'bf16'"),
     ],
+    ids=["misspelled_engine", "unknown_engine", "unknown_precision"],
 )
-def test_unknown_choices_are_refused(engine: str, precision: str, fault: str) -> None:
+def test_an_unknown_engine_or_precision_is_refused(engine: str, precision: str, fault: str) -> None:
     with pytest.raises(SpecError) as found:
         Choice.of(engine, precision)
     assert str(found.value) == fault

@@ -1,4 +1,4 @@
-"""Nets run by an engine give torch's results; torch runs what the engine cannot, with a message."""
+"""Nets run by onnxruntime and OpenVINO: torch's results, the cache, warnings where torch runs them, and commands."""
 
 import logging
 import shutil
@@ -57,7 +57,7 @@ def entries(folder: Path) -> list[Path]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
-def test_the_numbers_equal_torchs(engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
+def test_results_equal_torchs(engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
     net, expected = load(engine), load("torch")
     assert type(net) is netspec.Net
     net.load_state_dict(expected.state_dict())
@@ -74,7 +74,7 @@ def test_the_numbers_equal_torchs(engine: str, data: np.ndarray, caplog: pytest.
 
 
 @pytest.mark.slow
-def test_requested_blobs_are_kept(engine: str, files: Path, data: np.ndarray) -> None:
+def test_blobs_of_keep_are_stored_in_blobs(engine: str, files: Path, data: np.ndarray) -> None:
     net, expected = load(engine), load("torch")
     net.keep = expected.keep = ["conv"]
     net(data=data)
@@ -89,7 +89,7 @@ def test_requested_blobs_are_kept(engine: str, files: Path, data: np.ndarray) ->
 
 
 @pytest.mark.slow
-def test_the_model_is_kept_by_content(engine: str, files: Path, data: np.ndarray) -> None:
+def test_the_cache_finds_a_model_by_content(engine: str, files: Path, data: np.ndarray) -> None:
     first = load(engine)(data=data)["feat"]
     (entry,) = entries(files)
     made = entry.stat().st_mtime_ns
@@ -106,7 +106,7 @@ def test_the_model_is_kept_by_content(engine: str, files: Path, data: np.ndarray
 
 
 @pytest.mark.slow
-def test_changed_parameters_take_effect_and_are_not_kept(engine: str, files: Path, data: np.ndarray) -> None:
+def test_changed_parameters_take_effect_and_are_not_cached(engine: str, files: Path, data: np.ndarray) -> None:
     net, expected = load(engine), load("torch")
     net(data=data)
     for each in (net, expected):
@@ -147,7 +147,7 @@ def test_parameters_with_aliases_are_read_in_every_pass(
 
 
 @pytest.mark.slow
-def test_random_weights_are_not_kept(engine: str, files: Path, data: np.ndarray) -> None:
+def test_models_with_random_weights_are_not_cached(engine: str, files: Path, data: np.ndarray) -> None:
     found = netspec.load_net("net.prototxt", seed=3, engine=engine)(data=data)["feat"]
     expected = netspec.load_net("net.prototxt", seed=3)(data=data)["feat"].detach()
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
@@ -174,8 +174,9 @@ def test_torch_runs_passes_with_gradients(engine: str, data: np.ndarray) -> None
         ),
         ("", "TRAIN", "it runs nets in phase TEST, but this net is in phase TRAIN"),
     ],
+    ids=["layer", "phase"],
 )
-def test_torch_runs_what_the_engine_cannot(
+def test_torch_runs_nets_that_the_engine_cannot_run_with_a_warning(
     layer: str, phase: str, reason: str, engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture
 ) -> None:
     Path("net.prototxt").write_text(NET + (f"layer {{ {layer} }}" if layer else ""))
@@ -191,7 +192,7 @@ def test_torch_runs_what_the_engine_cannot(
 
 
 @pytest.mark.usefixtures("files")
-def test_torch_runs_layers_with_state(engine: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_torch_runs_nets_with_recurrent_state_with_a_warning(engine: str, caplog: pytest.LogCaptureFixture) -> None:
     Path("net.prototxt").write_text(
         """layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 3 dim: 2 dim: 4 } } }
         layer { name: "cont" type: "Input" top: "cont" input_param { shape { dim: 3 dim: 2 } } }
@@ -210,7 +211,7 @@ def test_torch_runs_layers_with_state(engine: str, caplog: pytest.LogCaptureFixt
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
-def test_a_library_that_fails_is_replaced(
+def test_torch_runs_the_net_if_the_library_fails(
     engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     net = load(engine)
@@ -227,7 +228,7 @@ def test_a_library_that_fails_is_replaced(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
-def test_a_cache_that_cannot_be_written_is_reported(
+def test_a_cache_that_cannot_be_written_gets_a_warning(
     engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture
 ) -> None:
     Path("file").write_text("")
@@ -252,20 +253,20 @@ def test_bf16_reports_its_difference_from_fp32(engine: str, data: np.ndarray, ca
 
 
 @pytest.mark.usefixtures("files")
-def test_torch_runs_in_fp32(caplog: pytest.LogCaptureFixture) -> None:
+def test_precision_bf16_with_torch_gets_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         load("torch", precision="bf16")
     assert caplog.messages == ["precision bf16: torch runs the net in fp32"]
 
 
-def test_an_engine_that_is_not_installed_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_engine_that_is_not_installed_is_refused_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(choice, "find_spec", lambda name: None if name == "openvino" else True)
     with pytest.raises(SpecError) as found:
         netspec.load_net("net.prototxt", engine="openvino")
     assert str(found.value) == "engine openvino needs the openvino library: pip install 'netspec-caffe[openvino]'"
 
 
-def test_as_many_threads_as_torch_has(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_engines_use_as_many_threads_as_torch(monkeypatch: pytest.MonkeyPatch) -> None:
     assert runners.threads() == torch.get_num_threads()
     monkeypatch.setattr(sys, "modules", {})
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
@@ -278,7 +279,7 @@ def test_as_many_threads_as_torch_has(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_net_that_reads_records_scores_and_extracts_the_same(
+def test_test_and_extract_with_an_engine_equal_torchs(
     engine: str, work_in: Callable[..., Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     work_in("snapshot", "sgd_step")
@@ -299,7 +300,9 @@ def test_a_net_that_reads_records_scores_and_extracts_the_same(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
-def test_time_is_of_the_whole_forward_pass(engine: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_time_with_an_engine_reports_the_whole_forward_pass_only(
+    engine: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ["time", "--model", "net.prototxt", "--phase", "TEST", "--iterations", "2", "--engine", engine]
     assert main(words) == 0
     reported = capsys.readouterr().err
@@ -314,7 +317,7 @@ def test_time_is_of_the_whole_forward_pass(engine: str, capsys: pytest.CaptureFi
     assert "Average Backward pass: " in reported
 
 
-def test_a_describer_takes_an_engine(engine: str, files: Path) -> None:
+def test_describer_with_an_engine_equals_torchs(engine: str, files: Path) -> None:
     image = np.random.default_rng(0).integers(0, 256, (40, 30, 3), np.uint8)
     expected = Describer("net.prototxt", "net.caffemodel", zooms="1,0.5")(image)
     found = Describer("net.prototxt", "net.caffemodel", zooms="1,0.5", engine=engine)(image)
@@ -323,7 +326,7 @@ def test_a_describer_takes_an_engine(engine: str, files: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_kept_net_describes_images_without_torch(engine: str, files: Path) -> None:
+def test_extract_of_a_cached_net_does_not_import_torch(engine: str, files: Path) -> None:
     (files / "images").mkdir()
     for k in range(17):  # more than a batch
         cv2.imwrite(f"images/{k}.png", np.random.default_rng(k).integers(0, 256, (20, 20, 3), np.uint8))
@@ -340,7 +343,7 @@ def test_a_kept_net_describes_images_without_torch(engine: str, files: Path) -> 
         np.testing.assert_array_equal(first["features"], second["features"])
 
 
-def test_warnings_of_the_files_are_given_at_every_start(
+def test_warnings_about_weights_are_given_with_a_cached_model_too(
     engine: str, files: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     Path("net.prototxt").write_text(NET.replace('name: "conv"', 'name: "conv_renamed"'))
@@ -384,7 +387,7 @@ def test_signals_are_handled_after_nets_of_openvino_are_gone(precision: str) -> 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("files")
-def test_a_size_that_does_not_fit_the_net_is_refused_by_all(engine: str) -> None:
+def test_an_invalid_input_size_is_refused_with_torchs_message(engine: str) -> None:
     odd = np.zeros((2, 3, 19, 12), np.float32)
     faults = []
     for net in (load("torch"), load(engine)):
