@@ -1,4 +1,4 @@
-"""Passes on text: which layers a state includes, and Caffe's names for split blobs."""
+"""Which layers a state includes, and the splits that are inserted under Caffe's names."""
 
 from pathlib import Path
 
@@ -22,8 +22,11 @@ RULES = (Path(__file__).parent / "nets" / "rules.prototxt").read_text()
         (1, 1, ("deploy",), "always test shallow no_val"),
         (1, 1, ("deploy", "fast"), "always test shallow deploy no_val"),
     ],
+    ids=["TRAIN", "TEST", "level_and_stage", "one_of_two_stages", "two_stages"],
 )
-def test_layers_that_a_state_includes(phase: PhaseValue, level: int, stages: tuple[str, ...], expected: str) -> None:
+def test_filter_net_keeps_the_layers_that_a_state_includes(
+    phase: PhaseValue, level: int, stages: tuple[str, ...], expected: str
+) -> None:
     net, source = parse_net_text(RULES, "net")
     filtered, places = filter_net(with_state(net, phase, level, stages), source)
     assert " ".join(layer.name for layer in filtered.layer) == expected
@@ -34,16 +37,14 @@ def test_layers_that_a_state_includes(phase: PhaseValue, level: int, stages: tup
 
 def test_include_and_exclude_together_are_refused_with_their_place() -> None:
     net, source = parse_net_text(
-        'layer { name: "a" type: "Silence"\n include { phase: TEST } exclude { level_: 1 } }'.replace(
-            "level_", "min_level"
-        ),
+        'layer { name: "a" type: "Silence"\n include { phase: TEST } exclude { min_level: 1 } }',
         "f",
     )
     with pytest.raises(SpecError, match=r"^f:2:\d+: layer \"a\" \(Silence\): found both include and exclude"):
         filter_net(net, source)
 
 
-def test_states_merge_as_the_solver_merges_them() -> None:
+def test_later_states_override_level_and_add_stages() -> None:
     net = NetParameter(state=NetState(level=7, stage=["own"]))
     state = in_state(net, NetState(phase=TRAIN, level=1), NetState(stage=["a"]), NetState(level=3, stage=["b"])).state
     assert (state.phase, state.level, list(state.stage)) == (0, 3, ["a", "b"])
@@ -96,7 +97,7 @@ def test_a_loss_weight_counts_as_a_use_and_moves_to_the_first_copy() -> None:
     assert split.layer[3].bottom[0] == "s_sum_0_split_1"
 
 
-def test_unknown_bottom_names_its_place_and_the_likely_blob() -> None:
+def test_an_unknown_bottom_is_reported_with_place_and_suggestion() -> None:
     text = (
         'layer { name: "data" type: "Input" top: "pool1" }\nlayer { name: "c" type: "ReLU"\n  bottom: "pol1" top: "c" }'
     )

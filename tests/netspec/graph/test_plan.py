@@ -1,4 +1,4 @@
-"""The Plan: values, owners, multipliers, outputs; and what needs backward computation."""
+"""The Plan of a net: blobs, owners of parameters, multipliers, outputs, errors, and which layers need backward."""
 
 import pytest
 
@@ -53,12 +53,12 @@ FAULTS = read_cases("netspec/graph/cases/faults.txt")
 
 
 @pytest.mark.parametrize("case", FAULTS.values(), ids=FAULTS)
-def test_errors_name_their_location(case: dict[str, str]) -> None:
+def test_errors_contain_their_place(case: dict[str, str]) -> None:
     with pytest.raises(SpecError, match=case["message"]):
         plan(case["net"])
 
 
-def test_all_errors_can_be_collected() -> None:
+def test_a_report_function_receives_all_errors() -> None:
     faults: list[SpecError] = []
     net, source = parse_net_text(
         'layer { name: "a" type: "ReLU" bottom: "no" top: "x" }\n'
@@ -90,7 +90,7 @@ def _needs(propagate: str, force: str = "") -> tuple[tuple[bool, ...], tuple[tup
     return tuple(by_name[name] for name in ("low", "high", "loss", "aside")), backward.bottoms
 
 
-def test_only_layers_below_a_loss_need_backward() -> None:
+def test_only_layers_that_a_loss_depends_on_need_backward() -> None:
     assert _needs("")[0] == (True, True, True, False)
 
 

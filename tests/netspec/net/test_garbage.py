@@ -1,4 +1,4 @@
-"""Python's garbage collector is paused while a net is built, and afterwards is as it was."""
+"""Python's garbage collector is disabled while a net is built, and restored afterwards."""
 
 import gc
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Fields without effect are named once; those that only say how to compute are not; all others are read by a layer."""
+"""Warnings about fields without effect, and which fields the layers read."""
 
 import inspect
 import re
@@ -50,8 +50,9 @@ def layer(kind: str, rest: str = "", name: str = "a") -> str:
             'bottom: "x" loss_param { normalization: NONE } }',
         ),
     ],
+    ids=["ReLU", "Convolution_filler", "Eltwise", "LRN", "DummyData_filler", "EuclideanLoss"],
 )
-def test_a_field_without_effect_is_named(net_of, warnings, text: str, said: str) -> None:
+def test_a_field_without_effect_gets_a_warning(net_of, warnings, text: str, said: str) -> None:
     net_of(INPUT + text)
     name = said.partition(" ")[0].split(".")[-1]
     place = re.search(rf"\b{name}(:| \{{)", text)
@@ -61,12 +62,12 @@ def test_a_field_without_effect_is_named(net_of, warnings, text: str, said: str)
     assert warnings() == [f"{where}: {said}"]
 
 
-def test_debug_info_of_a_net_is_named(net_of, warnings) -> None:
+def test_debug_info_of_a_net_gets_a_warning(net_of, warnings) -> None:
     net_of(INPUT + "debug_info: true")
     assert warnings() == ["net.prototxt:2:1: debug_info has no effect in a net; set it in the solver"]
 
 
-def test_the_same_field_of_many_layers_is_named_once(net_of, warnings) -> None:
+def test_the_same_field_of_several_layers_gets_one_warning(net_of, warnings) -> None:
     filler = 'inner_product_param { num_output: 1 weight_filler { type: "xavier" std: 0.01 } }'
     net_of(INPUT + "".join(layer("InnerProduct", filler, name) for name in "abc"))
     (found,) = warnings()
@@ -83,13 +84,14 @@ def test_the_same_field_of_many_layers_is_named_once(net_of, warnings) -> None:
         layer("Sigmoid", "sigmoid_param { engine: CUDNN }"),
         layer("Scale", "scale_param { filler { value: 2 } bias_term: true bias_filler { value: 2 } }"),
     ],
+    ids=["ReLU", "Convolution", "Eltwise", "Sigmoid", "Scale"],
 )
-def test_fields_that_change_no_result_are_not_reported(net_of, warnings, text: str) -> None:
+def test_fields_that_change_no_result_get_no_warning(net_of, warnings, text: str) -> None:
     net_of(INPUT + text)
     assert warnings() == []
 
 
-def test_old_transform_fields_have_no_effect_in_a_current_data_layer(net_of, warnings) -> None:
+def test_old_transform_fields_of_a_data_layer_get_a_warning(net_of, warnings) -> None:
     net_of(
         'layer { name: "d" type: "Data" top: "d" data_param { source: "no" batch_size: 2 scale: 0.5 mirror: true } }'
         'layer { name: "i" type: "ImageData" top: "i" top: "l" image_data_param { source: "no" crop_size: 4 } '
@@ -112,7 +114,7 @@ def test_old_transform_fields_have_no_effect_in_a_current_data_layer(net_of, war
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", layer_types())
 def test_a_layer_reads_the_fields_it_is_registered_for(kind: str) -> None:
-    """Where ``reads`` says less than the class, users are warned of what works; where more, not of what does not."""
+    """If ``reads`` lacks a field, users get a false warning; if it has too many, a warning is missing."""
     cls = layer_class(kind)
     assert cls is not None
     own = {field.name for field in LayerParameter.DESCRIPTOR.fields if field.name.endswith("_param")}

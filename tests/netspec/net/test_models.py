@@ -1,4 +1,4 @@
-"""Trained models that people use, against what real Caffe or OpenCV make of them."""
+"""Well-known trained models compared with the stored results of Caffe or OpenCV."""
 
 import itertools
 
@@ -23,7 +23,7 @@ MODELS = {
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_a_trained_model_gives_the_results_of_its_own_program(name: str):
+def test_trained_model_gives_the_results_of_caffe_or_opencv(name: str):
     for dialect in MODELS[name]:
         netspec.use_dialect(dialect)
     folder = shared("golden", "models", name)

@@ -1,4 +1,4 @@
-"""What is said where a program names a blob that a net does not have, or gives it what is no array."""
+"""Errors for names that a net does not have, and for inputs that are not arrays."""
 
 from pathlib import Path
 
@@ -44,7 +44,7 @@ def net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Net:
         ),
     ],
 )
-def test_an_unknown_name(net: Net, find, says: str) -> None:
+def test_an_unknown_name_is_a_key_error_with_known_names(net: Net, find, says: str) -> None:
     with pytest.raises(KeyError) as fault:
         find(net)
     assert says in fault.value.args[0]
@@ -58,6 +58,7 @@ def test_an_unknown_name(net: Net, find, says: str) -> None:
         (None, "found a NoneType for an input; expected an array of numbers or a tensor"),
         (["a", "b"], "found values of type <U1 for an input; expected an array of numbers or a tensor"),
     ],
+    ids=["str", "Path", "None", "list_of_str"],
 )
 def test_an_input_that_is_not_an_array_is_refused(net: Net, value: object, says: str) -> None:
     with pytest.raises(SpecError) as fault:

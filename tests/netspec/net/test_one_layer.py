@@ -1,4 +1,4 @@
-"""One layer, called without a net."""
+"""netspec.layer, one layer called without a net; and which nets can be copied and pickled."""
 
 import copy
 import pickle
@@ -16,7 +16,7 @@ from netspec.net.net import Net
 POOL = 'type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }'
 
 
-def test_a_layer_is_a_function_of_its_bottoms() -> None:
+def test_a_layer_computes_its_top_and_gradient_from_tensors_and_arrays() -> None:
     x = torch.arange(16.0).reshape(1, 1, 4, 4).requires_grad_()
     pool = netspec.layer(POOL)
     top = pool(x)
@@ -27,17 +27,17 @@ def test_a_layer_is_a_function_of_its_bottoms() -> None:
     assert pool(np.ones((2, 3, 6, 8))).shape == (2, 3, 3, 4)
 
 
-def test_several_tops_are_a_tuple() -> None:
+def test_several_tops_are_returned_as_a_tuple() -> None:
     first, second = netspec.layer('type: "Slice" slice_param { slice_point: 1 }', tops=2)(np.ones((1, 3, 2)))
     assert (first.shape, second.shape) == ((1, 1, 2), (1, 2, 2))
     named = 'type: "Slice" bottom: "x" top: "a" top: "b" slice_param { slice_point: 1 }'
     assert len(netspec.layer(named)(np.ones((1, 3, 2)))) == 2
-    relu = netspec.layer('type: "Split"', tops=3)
-    assert len(relu(np.ones(2))) == 3
+    split = netspec.layer('type: "Split"', tops=3)
+    assert len(split(np.ones(2))) == 3
     assert netspec.layer('type: "Silence"')(np.ones(2)) == ()
 
 
-def test_blobs_exist_immediately_if_shapes_are_given() -> None:
+def test_blobs_exist_before_the_first_call_if_shapes_are_given() -> None:
     text = 'type: "InnerProduct" inner_product_param { num_output: 2 weight_filler { type: "xavier" } }'
     product = netspec.layer(text, (1, 3))
     assert product.layer is not None
@@ -49,7 +49,7 @@ def test_blobs_exist_immediately_if_shapes_are_given() -> None:
     assert netspec.layer(text).layer is None
 
 
-def test_a_layer_without_bottoms_a_loss_and_the_training_phase() -> None:
+def test_layers_without_bottoms_losses_and_the_training_phase() -> None:
     made = netspec.layer('type: "DummyData" dummy_data_param { shape { dim: 2 } data_filler { value: 3 } }')()
     assert made.tolist() == [3, 3]
     assert netspec.layer('type: "EuclideanLoss"')(np.ones((1, 2)), np.zeros((1, 2))).item() == 1
@@ -75,20 +75,21 @@ def test_exact_selects_the_arithmetic() -> None:
         ('type: "Pooling"\npooling_param { pad: 1 }', r'^<layer>:2:1: layer "" \(Pooling\): '),
         ('type: "Concat"', r"found 0 bottom blob\(s\), expected at least 1"),
     ],
+    ids=["unknown_type", "unknown_field", "missing_kernel_size", "no_bottom"],
 )
-def test_errors_contain_their_location(text: str, message: str) -> None:
+def test_errors_contain_their_place(text: str, message: str) -> None:
     with pytest.raises(netspec.SpecError, match=message):
         netspec.layer(text)(*[] if "Concat" in text else [np.ones((1, 1, 4, 4))])
 
 
-def test_a_phase_has_a_name_in_any_case_or_a_number() -> None:
+def test_phase_is_given_by_name_in_any_case_or_number() -> None:
     for phase in ("TRAIN", "train", 0):
         assert 0 in netspec.layer('type: "Dropout"', phase=phase)(np.ones(1000))
     with pytest.raises(netspec.SpecError, match="found phase 'deploy', expected TRAIN or TEST"):
         netspec.layer('type: "Dropout"', phase="deploy")
 
 
-# Nets are copied and pickled; what reads open files says why it is not
+# Nets can be copied and pickled, unless they have open files
 TEXT = """
 layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 3 } } }
 layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip"
@@ -97,7 +98,7 @@ layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip"
 COPIES = [copy.copy, copy.deepcopy, lambda what: pickle.loads(pickle.dumps(what))]
 
 
-@pytest.mark.parametrize("copied", COPIES)
+@pytest.mark.parametrize("copied", COPIES, ids=["copy", "deepcopy", "pickle"])
 def test_a_net_is_copied_before_and_after_a_pass(net_of: Callable[..., Net], copied: Callable[[Net], Net]) -> None:
     net = net_of(TEXT)
     for _ in range(2):

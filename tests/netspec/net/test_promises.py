@@ -1,4 +1,4 @@
-"""A layer's first pass checks what its ``reshape`` promised; what is missing is one line."""
+"""A layer of the user: the shapes it returns are checked, missing methods reported; inputs by position and name."""
 
 from collections.abc import Callable, Sequence
 
@@ -58,7 +58,7 @@ class Many(Odd):
 
 
 @pytest.fixture
-def made(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Layer]], Net]:
+def net_with_layer(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Layer]], Net]:
     def make(cls: type[Layer]) -> Net:
         monkeypatch.setitem(registry._LAYERS, "Odd", cls)
         return net_of(TEXT)
@@ -66,9 +66,9 @@ def made(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> Callabl
     return make
 
 
-@pytest.mark.parametrize("gradients", [False, True])
-def test_a_top_with_an_undeclared_shape_is_refused(made: Callable[..., Net], gradients: bool) -> None:
-    net, whole = made(Odd), made(Whole)
+@pytest.mark.parametrize("gradients", [False, True], ids=["no_grad", "grad"])
+def test_a_top_with_an_undeclared_shape_is_refused(net_with_layer: Callable[..., Net], gradients: bool) -> None:
+    net, whole = net_with_layer(Odd), net_with_layer(Whole)
     with torch.set_grad_enabled(gradients):
         for _ in range(2):
             with pytest.raises(SpecError) as found:
@@ -87,15 +87,18 @@ def test_a_top_with_an_undeclared_shape_is_refused(made: Callable[..., Net], gra
         (Flat, "reshape returned (2, 3), expected one shape for each top, such as [(2, 3)]"),
         (Many, "reshape returned 2 shape(s), expected 1, one for each top"),
     ],
+    ids=["no_reshape", "not_a_list", "too_many"],
 )
-def test_a_class_without_top_shapes_is_refused(made: Callable[..., Net], cls: type[Layer], message: str) -> None:
+def test_a_class_without_top_shapes_is_refused(
+    net_with_layer: Callable[..., Net], cls: type[Layer], message: str
+) -> None:
     with pytest.raises(SpecError) as found:
-        made(cls)
+        net_with_layer(cls)
     assert found.value.message == message
 
 
-def test_a_class_without_forward_is_refused(made: Callable[..., Net]) -> None:
-    net = made(Idle)
+def test_a_class_without_forward_is_refused(net_with_layer: Callable[..., Net]) -> None:
+    net = net_with_layer(Idle)
     for gradients in (False, True):
         with torch.set_grad_enabled(gradients), pytest.raises(SpecError, match="Idle does not define forward"):
             net(data=torch.ones(2, 3))
@@ -117,7 +120,7 @@ def test_the_value_of_the_only_input_needs_no_name(net_of: Callable[..., Net]) -
         net_of(TWO)(values)
 
 
-def test_an_input_may_be_called_self(net_of: Callable[..., Net]) -> None:
+def test_an_input_can_be_named_self(net_of: Callable[..., Net]) -> None:
     net = net_of(TEXT.replace("Odd", "ReLU").replace('"data"', '"self"'))
     values = torch.randn(2, 3)
     expected = net(values)["odd"]

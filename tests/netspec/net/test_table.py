@@ -1,4 +1,4 @@
-"""A net printed: one row per layer, with what flows between them."""
+"""The table of a net, a row per layer, as text of any width and as JSON."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ layer {{ name: "hush" type: "Silence" bottom: "fb" }}
 """
 
 
-def test_a_net_prints_as_a_table(net_of: Callable[..., Net]) -> None:
+def test_str_of_a_net_is_its_table(net_of: Callable[..., Net]) -> None:
     net = net_of(NET)
     assert str(net) == repr(net)
     head, titles, *rows = str(net).splitlines()
@@ -36,7 +36,7 @@ def test_a_net_prints_as_a_table(net_of: Callable[..., Net]) -> None:
     )
 
 
-def test_a_table_fits_a_width(net_of: Callable[..., Net]) -> None:
+def test_a_narrow_table_fits_its_width_and_lists_the_missing_columns(net_of: Callable[..., Net]) -> None:
     net = net_of(NET)
     whole = table(net.plan, list(net.layers)).splitlines()
     assert table(net.plan, list(net.layers), 1000).splitlines() == whole
@@ -56,7 +56,7 @@ def test_long_names_are_shortened_in_the_middle_in_a_narrow_table(net_of: Callab
     assert any(line.startswith("inception") and "…" in line and "_reduce" in line for line in lines)
 
 
-def test_a_net_as_data(net_of: Callable[..., Net]) -> None:
+def test_as_json_contains_shapes_parameters_inputs_and_outputs(net_of: Callable[..., Net]) -> None:
     found = as_json(net_of(NET))
     assert found["params"] == {"left": [[4, 3]], "right": [[4, 3]]}
     assert found["blobs"]["fa"] == [2, 4]

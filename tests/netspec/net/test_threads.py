@@ -1,4 +1,4 @@
-"""One net, several threads: each gets its own numbers, by pycaffe too."""
+"""Threads that share a net, or a net of pycaffe, get their own results."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -31,7 +31,7 @@ def in_threads(run: Callable[[int], None]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gradients", [False, True])
+@pytest.mark.parametrize("gradients", [False, True], ids=["no_grad", "grad"])
 def test_threads_that_share_a_net_get_their_own_results(net_of: Callable[..., Net], gradients: bool) -> None:
     net = net_of(TEXT)
     net.keep = "conv"

@@ -1,3 +1,5 @@
+"""Files of weights: written and read, in Caffe's two formats and their older forms, missing layers and faults."""
+
 import logging
 import shutil
 from pathlib import Path
@@ -65,7 +67,6 @@ def golden_net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize("case", CASES)
 def test_rewriting_caffes_weights_gives_identical_bytes(case: str, golden_net, tmp_path: Path):
-    """Layer list, splits, phases, parameters, shapes, and shared blobs repeated by each sharer are Caffe's."""
     net = golden_net(f"train/{case}")
     load_weights(net, GOLDEN / "train" / case / "init.caffemodel")
     save_weights(net, tmp_path / "again.caffemodel")
@@ -73,8 +74,12 @@ def test_rewriting_caffes_weights_gives_identical_bytes(case: str, golden_net, t
     assert (tmp_path / "again.caffemodel").read_bytes() == (GOLDEN / "train" / case / "init.caffemodel").read_bytes()
 
 
-@pytest.mark.parametrize(("name", "ending", "warned"), [("a/b", ".h5", 1), ("a/b", "", 0), ("a", ".h5", 0)])
-def test_a_warning_for_hdf5_weights_that_caffe_cannot_load(
+@pytest.mark.parametrize(
+    ("name", "ending", "warned"),
+    [("a/b", ".h5", 1), ("a/b", "", 0), ("a", ".h5", 0)],
+    ids=["slash_in_hdf5", "slash_in_binary", "no_slash_in_hdf5"],
+)
+def test_layer_names_with_a_slash_get_a_warning_in_hdf5_only(
     name: str, ending: str, warned: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     net = net_of(
@@ -87,7 +92,7 @@ def test_a_warning_for_hdf5_weights_that_caffe_cannot_load(
     assert all("a/b" in text and "BINARYPROTO" in text for text in reported)
 
 
-def test_the_hdf5_form_has_caffes_structure(golden_net, tmp_path: Path):
+def test_hdf5_weights_have_the_structure_of_caffes(golden_net, tmp_path: Path):
     theirs = GOLDEN / "snapshot/h5_iter_10.caffemodel.h5"
     net = golden_net("snapshot")
     load_weights(net, theirs)
@@ -108,7 +113,7 @@ def test_the_hdf5_form_has_caffes_structure(golden_net, tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", ["w.caffemodel", "w.caffemodel.h5"])
-def test_written_files_can_be_read(name: str, tmp_path: Path):
+def test_written_weights_are_read_back(name: str, tmp_path: Path):
     net = net_of(TOWERS)
     fill(net)
     save_weights(net, tmp_path / name)
@@ -120,7 +125,7 @@ def test_written_files_can_be_read(name: str, tmp_path: Path):
     assert other.params["ip"][0] is other.params["ip/p"][0]
 
 
-def test_the_file_lists_the_layers_as_they_run():
+def test_net_to_proto_lists_the_layers_in_order_with_their_blobs():
     proto = net_to_proto(net_of(TOWERS))
     assert proto.name == "towers"
     assert [layer.name for layer in proto.layer] == ["in", "ip", "x_ip_0_split", "ip/p", "sum", "twice"]
@@ -180,7 +185,7 @@ def test_layers_missing_in_the_net_are_ignored_and_logged(tmp_path: Path, caplog
     assert "Ignoring source layer ip" not in caplog.text
 
 
-def test_layers_missing_in_the_file_are_unchanged(tmp_path: Path):
+def test_layers_missing_in_the_file_keep_their_values(tmp_path: Path):
     proto = net_to_proto(net_of(TOWERS))
     del proto.layer[1:]
     net = net_of(TOWERS)
@@ -189,7 +194,7 @@ def test_layers_missing_in_the_file_are_unchanged(tmp_path: Path):
     assert blobs_of(net)["ip"][0][0].tolist() == [0, 1, 2]
 
 
-def test_old_four_axis_shapes_fit(tmp_path: Path):
+def test_blobs_of_the_old_four_axes_are_loaded(tmp_path: Path):
     proto = NetParameter()
     layer = proto.layer.add(name="ip")
     layer.blobs.add(num=1, channels=1, height=4, width=3).data.extend(range(12))
@@ -222,8 +227,8 @@ def test_weights_of_v1_nets_are_upgraded(tmp_path: Path):
     assert blobs_of(net)["ip"][0][3].tolist() == [9, 10, 11]
 
 
-def wide(kind: str) -> bytes:
-    """A file of weights 0 to 1199 and biases 0 to 39, as long as those whose numbers are read where they lie."""
+def file_of_wide_net(kind: str) -> bytes:
+    """Return a file of weights 0 to 1199 and biases 0 to 39, long enough for numbers to be read without a copy."""
     weights, biases = np.arange(1200, dtype="<f4"), np.arange(40, dtype="<f4")
     new = [BlobProto(shape=BlobShape(dim=shape), data=data) for shape, data in (([40, 30], weights), ([40], biases))]
     old = [
@@ -245,7 +250,7 @@ def wide(kind: str) -> bytes:
             "floats with tags": b"".join(b"\x2d" + value.tobytes() for value in blob),
             "two runs": b"".join(field(5, part.tobytes()) for part in (blob[:20], blob[20:])),
             "numbers before the shape": field(5, blob.tobytes()),
-            "the field of a place": field(5, blob.tobytes()) + b"\xf8\xff\xff\xff\x0f\x05",
+            "an unknown field after them": field(5, blob.tobytes()) + b"\xf8\xff\xff\xff\x0f\x05",
         }.get(kind)
         if floats is not None:
             layer += field(7, floats + field(7, shape))
@@ -254,7 +259,7 @@ def wide(kind: str) -> bytes:
 
 
 def field(number: int, contents: bytes) -> bytes:
-    """A field of bytes on the wire."""
+    """Return a field of bytes in protobuf's wire format."""
     size, key = len(contents), number << 3 | 2
     return (
         b"".join(
@@ -270,17 +275,18 @@ def field(number: int, contents: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "kind", ["current", "V1", "V0", "floats with tags", "two runs", "numbers before the shape", "the field of a place"]
+    "kind",
+    ["current", "V1", "V0", "floats with tags", "two runs", "numbers before the shape", "an unknown field after them"],
 )
-@pytest.mark.parametrize("turned", [False, True])
-def test_numbers_are_read_directly_from_the_file(kind: str, turned: bool, tmp_path: Path) -> None:
-    (tmp_path / "w.caffemodel").write_bytes(wide(kind))
+@pytest.mark.parametrize("transposed", [False, True], ids=["in_order", "transposed"])
+def test_blobs_in_every_encoding_are_read(kind: str, transposed: bool, tmp_path: Path) -> None:
+    (tmp_path / "w.caffemodel").write_bytes(file_of_wide_net(kind))
     with net_without_numbers(tmp_path / "w.caffemodel") as (message, file):
         left = file is not None and not message.layer[0].blobs[0].data
         assert left == (kind in ("current", "V1", "V0", "numbers before the shape"))
     net = net_of(WIDE)
     blob = net.layers[1].blob(0)
-    if turned:  # its memory is not in the order of the numbers
+    if transposed:  # its memory is not in the order of the numbers
         blob.data = blob.data.t().contiguous().t()
     version = blob._version
     load_weights(net, tmp_path / "w.caffemodel")
@@ -291,8 +297,8 @@ def test_numbers_are_read_directly_from_the_file(kind: str, turned: bool, tmp_pa
     assert [blob.ravel().tolist() for blob in stored.blobs] == [list(range(1200)), list(range(40))]
 
 
-def test_truncated_and_incomplete_files_are_refused(tmp_path: Path) -> None:
-    whole = wide("current")
+def test_truncated_files_and_blobs_are_refused_and_change_nothing(tmp_path: Path) -> None:
+    whole = file_of_wide_net("current")
     net = net_of(WIDE)
     before = blobs_of(net)["ip"][0]
     for size in (len(whole) - 1, len(whole) // 2, 30):
@@ -329,7 +335,7 @@ def test_a_wrong_number_of_blobs_is_refused(tmp_path: Path):
         load_weights(net_of(TOWERS), written(tmp_path, proto))
 
 
-def test_hdf5_files_may_omit_shared_blobs_only(tmp_path: Path):
+def test_hdf5_files_with_missing_added_or_reshaped_blobs_are_refused(tmp_path: Path):
     path = tmp_path / "w.caffemodel.h5"
     net = net_of(TOWERS)
     save_weights(net, path)
@@ -374,14 +380,14 @@ def test_files_without_weights_are_refused(tmp_path: Path):
         load_weights(net, written(tmp_path, torn))
 
 
-def test_a_missing_folder_is_reported(tmp_path: Path):
+def test_saving_in_a_missing_folder_is_refused(tmp_path: Path):
     with pytest.raises(SpecError, match=r"gone/w\.caffemodel: cannot be written: No such file or directory"):
         save_weights(net_of(TOWERS), tmp_path / "gone" / "w.caffemodel")
     with pytest.raises(SpecError, match=r"gone/w\.h5: cannot be written: No such file or directory$"):
         save_weights(net_of(TOWERS), tmp_path / "gone" / "w.h5")
 
 
-def holding(tmp_path: Path, *layers: str, name: str = "w.caffemodel") -> Path:
+def file_with_layers(tmp_path: Path, *layers: str, name: str = "w.caffemodel") -> Path:
     """Write weights of the net TWO that have these layers only."""
     proto = net_to_proto(net_of(TWO))
     kept = [layer for layer in proto.layer if layer.name in layers]
@@ -394,7 +400,7 @@ def holding(tmp_path: Path, *layers: str, name: str = "w.caffemodel") -> Path:
 
 @pytest.mark.parametrize("ending", ["", ".h5"])
 def test_one_warning_names_all_layers_without_weights(tmp_path: Path, warnings, ending: str):
-    path = holding(tmp_path, "one")
+    path = file_with_layers(tmp_path, "one")
     if ending:
         save_weights(net_of(TWO), path)
         path = path.with_suffix(ending)
@@ -413,17 +419,20 @@ def test_one_warning_names_all_layers_without_weights(tmp_path: Path, warnings, 
 
 
 def test_weights_that_fit_no_layer_are_a_warning_or_an_error(tmp_path: Path, warnings):
-    path = holding(tmp_path, "in")
+    path = file_with_layers(tmp_path, "in")
     load_weights(net_of(TWO), path)
     (line,) = warnings()
     assert "contains weights for none of the net's 2 layers with weights: one, two; they keep" in line
     with pytest.raises(SpecError, match="none of the net's 2 layers with weights: one, two; is it the file of an"):
         load_weights(net_of(TWO), path, need_one=True)
-    load_weights(net_of(TWO), holding(tmp_path, "two"), need_one=True)
+    load_weights(net_of(TWO), file_with_layers(tmp_path, "two"), need_one=True)
 
 
-def test_several_files_can_together_have_all_layers(tmp_path: Path, warnings):
-    paths = [holding(tmp_path, "one", name="1.caffemodel"), holding(tmp_path, "two", name="2.caffemodel")]
+def test_several_files_together_have_all_layers_for_strict(tmp_path: Path, warnings):
+    paths = [
+        file_with_layers(tmp_path, "one", name="1.caffemodel"),
+        file_with_layers(tmp_path, "two", name="2.caffemodel"),
+    ]
     load_weights(net_of(TWO), paths, strict=True)
     assert warnings() == []
 
@@ -439,12 +448,12 @@ def test_layers_without_blobs_or_with_weights_in_the_prototxt_are_not_missing(tm
     text = TWO.replace('name: "two"', 'name: "two" blobs { shape { dim: 4 dim: 4 } %s } blobs { shape { dim: 4 } %s }')
     text %= ("data: [" + ", ".join("1" * 16) + "]", "data: [1, 2, 3, 4]")
     net = net_of(text + 'layer { name: "relu" type: "ReLU" bottom: "y" top: "y" }')
-    load_weights(net, holding(tmp_path, "one"), strict=True)
+    load_weights(net, file_with_layers(tmp_path, "one"), strict=True)
     assert warnings() == []
     assert blobs_of(net)["two"][1].tolist() == [1, 2, 3, 4]
 
 
-def test_load_net_accepts_several_weights_files(tmp_path: Path) -> None:
+def test_load_net_with_several_weights_files_uses_the_last_one(tmp_path: Path) -> None:
     (tmp_path / "net.prototxt").write_text(TOWERS)
     files = [tmp_path / f"{seed}.caffemodel" for seed in (2, 3)]
     for seed, file in zip((2, 3), files, strict=True):
@@ -462,8 +471,8 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("case", SHAPES)
-def test_equal_weights_give_equal_bytes(case: str, tmp_path: Path) -> None:
-    """Caffe notes a rate of 0 for BatchNorm's blobs, and no shape for blobs of no axes."""
+def test_weights_of_batch_norm_and_scalars_are_written_as_caffe_does(case: str, tmp_path: Path) -> None:
+    """Caffe writes lr_mult 0 for BatchNorm's blobs, and no shape for blobs without axes."""
     folder = GOLDEN / "caffemodel" / case
     param, source = parse_net(folder / "net.prototxt")
     options = BuildOptions(open_data=False, given_shapes=SHAPES[case])
@@ -473,7 +482,7 @@ def test_equal_weights_give_equal_bytes(case: str, tmp_path: Path) -> None:
     assert (tmp_path / "ours.caffemodel").read_bytes() == (folder / "caffe.caffemodel").read_bytes()
 
 
-def test_weights_of_another_net_are_reported(tmp_path: Path):
+def test_weights_of_another_net_are_refused_with_both_names(tmp_path: Path):
     text = """name: "NAME"
         layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 } } }
         layer { name: "ip" type: "InnerProduct" bottom: "data" top: "ip" inner_product_param { num_output: SIZE } }"""

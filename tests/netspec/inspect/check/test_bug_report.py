@@ -1,4 +1,4 @@
-"""``netspec bug-report``: what helps to find a fault is there, weights and images are not."""
+"""``netspec bug-report``: versions, the machine and files, without weights, images and the home folder."""
 
 import os
 from collections.abc import Callable
@@ -18,17 +18,17 @@ Run = Callable[..., Any]
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It takes seconds to ask the machine."""
+    """The real function takes seconds."""
     monkeypatch.setattr("torch.utils.collect_env.get_pretty_env_info", lambda: "PyTorch version: x\nCPU: y")
 
 
-def test_versions_and_the_machine() -> None:
+def test_the_report_contains_versions_and_the_machine() -> None:
     text = bug_report([])
     for said in (f"netspec-caffe: {netspec.__version__}", "BLAS kernels: ", "Memory: ", "PyTorch version: x"):
         assert f"\n{said}" in text
 
 
-@pytest.mark.parametrize("before", [None, "0"])
+@pytest.mark.parametrize("before", [None, "0"], ids=["unset", "set"])
 def test_torchs_environment_variable_is_removed(before: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     def torchs() -> str:
         os.environ["PIP_DISABLE_PIP_VERSION_CHECK"] = "1"
@@ -63,7 +63,7 @@ def test_other_kinds_of_files_are_described(tmp_path: Path) -> None:
     (tmp_path / "caf\udce9").write_bytes(b"\0")
     os.mkfifo(tmp_path / "pipe")
     with (tmp_path / "large.log").open("wb") as file:
-        file.truncate(3 * 2**30)  # of holes
+        file.truncate(3 * 2**30)  # sparse
     log, database = GOLDEN / "log" / "caffe_train.log", GOLDEN / "pairs" / "test_lmdb"
     files = [WEIGHTS, log, database, *(tmp_path / name for name in ("junk", "pipe", "large.log", "caf\udce9", "none"))]
     text = bug_report([str(file) for file in files])
@@ -83,7 +83,7 @@ def test_other_kinds_of_files_are_described(tmp_path: Path) -> None:
     text.encode()
 
 
-def test_the_command_prints_or_writes(run: Run) -> None:
+def test_bug_report_is_printed_or_written_with_out(run: Run) -> None:
     printed = run("bug-report", "sgd_step/solver.prototxt")
     assert (printed.status, printed.err) == (0, "")
     assert 'net: "sgd_step/train_val.prototxt"' in printed.out
@@ -92,7 +92,7 @@ def test_the_command_prints_or_writes(run: Run) -> None:
     assert 'net: "sgd_step/train_val.prototxt"' in Path("report.md").read_text()
 
 
-def test_the_version(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_version_is_that_of_the_package_or_unknown(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(distribution: str) -> str:
         raise metadata.PackageNotFoundError(distribution)
 

@@ -1,4 +1,4 @@
-"""``netspec diff``: what differs in meaning is said with both places; what is only written otherwise is not."""
+"""``netspec diff``: differences in meaning are reported with both places, other spellings are not."""
 
 from pathlib import Path
 
@@ -39,11 +39,11 @@ def diff(first: str, second: str) -> list[str]:
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_differences_have_both_locations_and_spellings_are_ignored(case: dict[str, str]) -> None:
+def test_differences_have_both_places_and_spellings_are_ignored(case: dict[str, str]) -> None:
     assert diff(NET, case["second"] + "\n") == case["lines"].splitlines()
 
 
-def test_old_formats_and_new_ones() -> None:
+def test_an_old_format_equals_its_current_form() -> None:
     old = """input: "x" input_dim: 1 input_dim: 3 input_dim: 8 input_dim: 8
     layers { name: "a" type: CONVOLUTION bottom: "x" top: "a" blobs_lr: 1 blobs_lr: 2
     convolution_param { num_output: 2 kernel_size: 3 } }"""
@@ -53,7 +53,7 @@ def test_old_formats_and_new_ones() -> None:
     assert diff(old, new) == []
 
 
-def test_absent_fields_can_be_differences() -> None:
+def test_an_absent_field_differs_if_its_default_means_something_else() -> None:
     norm = 'layer { name: "n" type: "BatchNorm" bottom: "a" top: "a" batch_norm_param { %s } }\n'
     assert diff(NET + norm % "", NET + norm % "eps: 1e-5") == []
     assert diff(NET + norm % "", NET + norm % "use_global_stats: false") == [
@@ -64,7 +64,7 @@ def test_absent_fields_can_be_differences() -> None:
     assert len(diff(NET + concat % "axis: 2", NET + concat % "concat_dim: 3")) == 1
 
 
-def test_loss_weights_of_losses() -> None:
+def test_loss_weight_is_compared_with_its_default_of_one() -> None:
     loss = 'layer { name: "l" type: "EuclideanLoss" bottom: "a" bottom: "b" top: "l" %s }\n'
     assert diff(NET + loss % "", NET + loss % "loss_weight: 1") == []
     assert diff(NET + loss % "", NET + loss % "loss_weight: 2") == [
@@ -72,7 +72,7 @@ def test_loss_weights_of_losses() -> None:
     ]
 
 
-def test_solvers_and_their_nets() -> None:
+def test_solvers_are_compared_with_their_nets() -> None:
     Path("net").write_text(NET)
     Path("same").write_text(format_text(NET, "net"))
     Path("other").write_text(NET.replace("num_output: 2", "num_output: 3", 1))
@@ -94,7 +94,7 @@ def write_weights(path: str, **layers: list[np.ndarray]) -> None:
     Path(path).write_bytes(net.SerializeToString())
 
 
-def test_weights() -> None:
+def test_weights_are_compared_blob_by_blob() -> None:
     values = np.arange(6, dtype=np.float32).reshape(2, 3)
     moved = values.copy()
     moved[0] += 0.25
@@ -109,7 +109,7 @@ def test_weights() -> None:
     assert len(list(compare_files("a.caffemodel", "b.caffemodel", tolerance=0.25))) == 2
 
 
-def test_weights_of_both_formats_and_odd_values() -> None:
+def test_weights_of_both_formats_nan_shapes_and_damaged_files() -> None:
     values = np.array([1, np.nan, np.inf], np.float32)
     write_weights("a.caffemodel", **{"x/y": [values]})
     with h5py.File("a.caffemodel.h5", "w") as file:
@@ -131,7 +131,7 @@ def test_weights_of_both_formats_and_odd_values() -> None:
         list(compare_files("a.caffemodel", "cut.caffemodel"))
 
 
-def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_diff_has_status_0_1_or_2(capsys: pytest.CaptureFixture[str]) -> None:
     Path("A").write_text(NET)
     Path("B").write_text(NET.replace('"n"', '"m"'))
     Path("S").write_text(SOLVER)

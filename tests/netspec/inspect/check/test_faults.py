@@ -1,4 +1,4 @@
-"""Whatever ``train`` refuses before its first iteration, ``check`` reports, all at once, in the same words."""
+"""``netspec check`` reports all errors at which ``netspec train`` stops before its first iteration, in its words."""
 
 import shutil
 from collections.abc import Callable
@@ -26,8 +26,7 @@ READS = """layer { name: "d" type: "Data" top: "data" top: "label"
   data_param { source: "%s" backend: LMDB batch_size: 2 } }
 layer { name: "hush" type: "Silence" bottom: "data" bottom: "label" }
 """
-#: A net that reads from the database ``%s``.
-# The files of each, where they are not the two above, and how each line begins that says what is wrong with them.
+# A case has the files that differ from the two above, and the beginnings of the lines that report their errors.
 CASES = read_cases("netspec/inspect/check/cases/faults.txt")
 FOUND_IN_DATA = read_cases("netspec/inspect/check/cases/faults_in_data.txt")
 
@@ -36,7 +35,7 @@ NAMED = read_cases("netspec/inspect/check/cases/named.txt")  # of a net in phase
 
 
 @pytest.mark.parametrize("case", NAMED.values(), ids=NAMED)
-def test_each_error_is_reported_once(run: Run, case: dict[str, str]) -> None:
+def test_check_reports_each_error_of_a_net_once(run: Run, case: dict[str, str]) -> None:
     faults = write_case(case)
     assert without_warnings(run("check", "net.prototxt").err) == faults
 
@@ -53,6 +52,7 @@ def test_each_error_is_reported_once(run: Run, case: dict[str, str]) -> None:
         (b"\x0a\x03net\xa8\x1f\xff\x7f cut", "found another kind of data, or a truncated file"),
         (b'layer { name: "a" }', "expected a binary NetParameter, found text"),
     ],
+    ids=["web_page", "empty", "truncated", "other_data", "text"],
 )
 def test_other_files_than_weights_are_described(run: Run, content: bytes, kind: str) -> None:
     Path("net.caffemodel").write_bytes(content)
@@ -63,7 +63,7 @@ def test_other_files_than_weights_are_described(run: Run, content: bytes, kind: 
 
 @pytest.fixture
 def files(run: Run) -> None:
-    """Small data, sound and unsound, in the working directory."""
+    """Write small data files, valid and invalid, into the working directory."""
     lmdb.open("empty_lmdb").close()
     with Writer("db") as writer:
         for i in range(3):
@@ -91,7 +91,7 @@ def write(**files: str) -> None:
 
 
 def write_case(case: dict[str, str]) -> list[str]:
-    """Write the files of a case; return how the lines begin that it gets."""
+    """Write the files of a case; return the beginnings of the lines expected for it."""
     write(**{name: text for name, text in case.items() if name != "faults"})
     return case["faults"].splitlines()
 
@@ -146,7 +146,7 @@ FILLED_BY_SCRIPT = {
 
 
 @pytest.mark.parametrize(("net", "message"), FILLED_BY_SCRIPT.values(), ids=FILLED_BY_SCRIPT)
-def test_a_net_with_inputs_gets_a_warning(run: Run, net: str, message: str) -> None:
+def test_a_training_net_with_inputs_gets_a_warning_and_is_refused_by_train(run: Run, net: str, message: str) -> None:
     """Scripts of Caffe train such nets; ``netspec train`` refuses them."""
     write(
         **{
@@ -161,7 +161,7 @@ def test_a_net_with_inputs_gets_a_warning(run: Run, net: str, message: str) -> N
     assert message in run("train", "s.prototxt").fault
 
 
-def test_a_test_net_of_other_shapes(run: Run) -> None:
+def test_a_test_net_of_other_shapes_is_reported(run: Run) -> None:
     test = NET.replace("num_output: 2", "num_output: 3")
     assert test != NET
     settings = 'test_net: "test.prototxt" test_iter: 1 test_interval: 1'
@@ -205,7 +205,7 @@ def test_a_given_shape_replaces_data(run: Run, files: None) -> None:
     assert run("check", "s.prototxt", "--data", "--shape", "data=2,3,6,8").status == 0
 
 
-def test_data_determines_shapes(run: Run, files: None) -> None:
+def test_shapes_are_read_from_data_with_data(run: Run, files: None) -> None:
     write(**{"net.prototxt": READS % "db"})
     result = run("check", "net.prototxt", "--data")
     assert result.status == 0

@@ -1,4 +1,4 @@
-"""All unknown fields of a file are reported at once: one line for each dialect, one for each field of no dialect."""
+"""Unknown fields, and fields of forks with errors, are reported all at once by `netspec check`."""
 
 from pathlib import Path
 
@@ -61,7 +61,7 @@ def test_errors_before_a_fatal_error_are_reported():
     assert lines("net.prototxt")[-1] == 'net.prototxt:1:14: expected ":" or "{" after "even", found "3"'
 
 
-def test_a_solver_and_its_nets_are_read_to_the_end():
+def test_all_errors_of_a_solver_and_its_nets_are_reported():
     Path("net.prototxt").write_text(INPUT + STRANGE)
     Path("solver.prototxt").write_text('net: "net.prototxt"\nbase_lr: 1\n')
     found = [line.partition(": ")[2] for line in lines("solver.prototxt")]
@@ -81,7 +81,7 @@ def test_a_solver_and_its_nets_are_read_to_the_end():
 
 
 def test_an_unknown_field_hides_no_other_errors():
-    """What may follow from it in its own layer is not said: here, that kernel_size is missing."""
+    """Errors in the same layer that may follow from it are not reported: here, that kernel_size is missing."""
     conv = (
         'layer { name: "c" type: "Convolution" bottom: "a" top: "c" convolution_param { num_output: 4 kernal: 3 } }\n'
     )
@@ -101,7 +101,7 @@ def test_an_unknown_field_hides_no_other_errors():
     assert set(found) <= set(messages)
 
 
-def test_differing_fields_decide_the_suggestion():
+def test_a_similar_field_is_suggested_only_if_the_message_fits():
     for field, meant in (("spatial_wta_param", ""), ("pooling_parm", "pooling_param"), ("pool_param", "pooling_param")):
         Path("net.prototxt").write_text(f'{INPUT}layer {{ name: "s" type: "ReLU" {field} {{ }} }}')
         assert ("did you mean" in lines("net.prototxt")[0], meant in lines("net.prototxt")[0]) == (bool(meant), True)

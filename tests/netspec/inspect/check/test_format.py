@@ -1,4 +1,4 @@
-"""``netspec fmt``: one form for a text; the comments stay, and what it means."""
+"""``netspec fmt``: the form of a text, whose meaning and comments it keeps."""
 
 import io
 from pathlib import Path
@@ -18,7 +18,7 @@ NETS = Path(__file__).parent / "nets"
 OWN = sorted((ROOT / "prototxt").rglob("*.prototxt"))
 
 
-def test_the_form() -> None:
+def test_an_unformatted_net_becomes_the_formatted_file() -> None:
     typed, formed = [(NETS / f"{name}.prototxt").read_text() for name in ("unformatted", "formatted")]
     assert format_text(typed, "f") == formed
 
@@ -39,8 +39,22 @@ def test_the_form() -> None:
         ("a { b { c: 1\n } d: 2 }", "a {\n  b {\n    c: 1\n  }\n  d: 2\n}\n"),
         ("a: 1 # é\udcff\n", "a: 1  # é\udcff\n"),
     ],
+    ids=[
+        "empty",
+        "comment_only",
+        "windows_lines",
+        "quotes",
+        "comment_in_a_number",
+        "comments_everywhere",
+        "comment_after_brace",
+        "list_of_messages",
+        "empty_list",
+        "empty_message",
+        "nested_messages",
+        "not_utf8",
+    ],
 )
-def test_small_texts(text: str, formed: str) -> None:
+def test_format_text_of_small_texts(text: str, formed: str) -> None:
     assert format_text(text, "f") == formed
     assert format_text(formed, "f") == formed
 
@@ -63,6 +77,7 @@ def test_long_lines_are_broken() -> None:
         ("}", "f:1:1: expected a field name, found '}'"),
         ("a {" * 101, "f:1:303: messages are nested more than 100 deep"),
     ],
+    ids=["no_colon", "no_closing_brace", "no_comma", "mixed_list", "closing_brace_only", "too_deep"],
 )
 def test_invalid_text_is_refused(text: str, message: str) -> None:
     with pytest.raises(SpecError) as raised:
@@ -71,7 +86,7 @@ def test_invalid_text_is_refused(text: str, message: str) -> None:
 
 
 def meaning(text: str) -> list[str]:
-    """Return the tokens that mean something, in order."""
+    """Return the tokens, strings unquoted, without punctuation."""
     tokens = [token for token in Lexer(text, "f") if token.kind != END]
     return [
         Lexer(t.text, "f").unquote(type(t)(STRING, t.text, 0)).decode() if t.kind == STRING else t.text
@@ -119,7 +134,7 @@ def comments(text: str) -> list[str]:
     [*nets_as_found(), *sorted(GOLDEN.rglob("*.prototxt")), *sorted(SHARED.glob("golden/**/*.prototxt"))],
     ids=last_parts,
 )
-def test_published_files_keep_their_meaning(path: Path) -> None:
+def test_published_files_keep_their_meaning_when_formatted(path: Path) -> None:
     text = text_of(path)
     formed = format_text(text, str(path))
     assert format_text(formed, str(path)) == formed
@@ -138,7 +153,9 @@ def test_the_projects_files_are_formatted(path: Path) -> None:
     assert format_text(text_of(path), str(path)) == text_of(path)
 
 
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fmt_formats_files_links_and_standard_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     Path("good").write_text('name: "x"\n')
     Path("other").write_text('name: "x"\nlayer{name:"y"}')

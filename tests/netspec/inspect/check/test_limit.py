@@ -1,4 +1,4 @@
-"""Nets that ask for too much: every command refuses them in one line, with the figure, the layer and the place."""
+"""The limit of memory: nets and files above it are refused in one line, with the size, the layer and the place."""
 
 import math
 from collections.abc import Callable
@@ -40,7 +40,7 @@ COMMANDS = {
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("none.caffemodel").touch()
     Path("solver.prototxt").write_text('net: "net.prototxt" base_lr: 1 lr_policy: "fixed" max_iter: 1 solver_mode: CPU')
@@ -48,7 +48,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def filled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The sizes of what is filled, in bytes."""
+    """Return the list of the sizes in bytes of all tensors filled from now on."""
     sizes: list[int] = []
     fill, constant = fillers.fill, fillers.constant
 
@@ -74,9 +74,9 @@ def filled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         (DUMMY, "100MiB", '1:1: layer "first" (DummyData): needs 244 MiB of memory, more than any other layer'),
         (HUGE, "100TiB", '2:1: layer "ip" (InnerProduct): found shape (4000000, 1000000), 4,000,000,000,000 numbers'),
     ],
-    ids=["parameters", "a blob", "more than Caffe counts"],
+    ids=["parameters", "a blob", "more than an int counts"],
 )
-def test_one_line(
+def test_nets_above_the_limit_are_refused_by_every_command(
     command: str, text: str, limit: str, said: str, filled: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("net.prototxt").write_text(text)
@@ -117,7 +117,7 @@ def test_data_layers_above_the_limit_are_refused(command: str, kind: str, capsys
     assert said in last
 
 
-def test_a_blob_of_too_many_axes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_blob_of_33_axes_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     Path("net.prototxt").write_text(
         f'layer {{ name: "data" type: "Input" top: "data" input_param {{ shape {{ {"dim: 1 " * 33} }} }} }}'
     )
@@ -126,7 +126,7 @@ def test_a_blob_of_too_many_axes(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == said
 
 
-def test_an_image_that_cannot_be_resized(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_that_cannot_be_resized_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def no_memory(*arguments: object, **named: object) -> None:
         raise cv2.error("Failed to allocate")
 
@@ -138,7 +138,7 @@ def test_an_image_that_cannot_be_resized(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.parametrize("text", ["pad: 2000000000 dilation: 2000000000", "pad: 40000000 dilation: 40000000"])
 def test_a_pass_above_the_limit_is_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """What a kernel needs for its work is counted nowhere."""
+    """The limit does not count the working memory of torch's kernels."""
     Path("net.prototxt").write_text(
         'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1 dim: 32 dim: 32 } } }\n'
         'layer { name: "conv" type: "Convolution" bottom: "data" top: "conv" '
@@ -149,15 +149,16 @@ def test_a_pass_above_the_limit_is_refused(text: str, capsys: pytest.CaptureFixt
     assert said.startswith('net.prototxt:2:1: layer "conv" (Convolution): its pass needs more memory than available; ')
 
 
-def test_the_memory_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limit_on_a_gpu_is_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1, 20 * MIB))
     assert limit_on(torch.device("cuda", 1)) == 20 * MIB
     assert limit_on(torch.device("cpu")) == limits.memory()
     assert limit_on(torch.device("cuda"), 3 * MIB) == 3 * MIB
 
 
-def test_a_net_on_a_gpu(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch, filled: list[int]) -> None:
-    """The device is the CPU, which says that it has what a GPU has."""
+def test_a_net_above_the_limit_of_its_device_is_refused_before_filling(
+    net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch, filled: list[int]
+) -> None:
     monkeypatch.setattr("netspec.net.assembly.limit_on", lambda device, limit: 20 * MIB)
     with pytest.raises(SpecError, match="the limit is 20 MiB"):
         net_of(DUMMY)
@@ -190,7 +191,7 @@ def test_the_message_lists_the_parts_of_the_sum(capsys: pytest.CaptureFixture[st
 
 
 def test_the_limit_is_checked_before_memory_is_filled(net_of: Callable[..., Net], filled: list[int]) -> None:
-    """Each layer is within the limit, their sum is not."""
+    """Each layer is below the limit, their sum is not."""
     layers = "".join(
         f'layer {{ name: "ip{i}" type: "InnerProduct" bottom: "data" top: "ip{i}" param {{ name: "w{i}" }} '
         "inner_product_param { num_output: 1024 bias_term: false } }\n"
@@ -228,7 +229,7 @@ def test_splits_need_no_memory(net_of: Callable[..., Net]) -> None:
 @pytest.mark.parametrize(
     ("text", "size"), [("1000", 1000), ("16GiB", 16 << 30), ("16G", 16 << 30), ("1.5 kb", 1536), ("2T", 2 << 40)]
 )
-def test_sizes(text: str, size: int) -> None:
+def test_sizes_are_read_with_their_units(text: str, size: int) -> None:
     assert limits.read_amount(text) == size
 
 
@@ -253,7 +254,7 @@ def test_a_training_within_the_limit_runs() -> None:
     assert load_solver("solver.prototxt", limit=600 * MIB).net.need.tops == 4 * 64_000_000 + 4
 
 
-# A text that describes too much, or is too long, is checked soon
+# Checking large nets takes little time
 INPUT = 'input: "data" input_dim: 1 input_dim: 3 input_dim: 8 input_dim: 8\n'
 
 

@@ -1,4 +1,4 @@
-"""What ``check`` warns of, rule by rule: said where it stands, and not said where all is well."""
+"""The findings that ``netspec check`` reports about nets and solvers, with their places."""
 
 import re
 from collections.abc import Callable
@@ -30,7 +30,7 @@ def siamese(params: tuple[str, ...] = SHARED, extra: str = "", source: str = "no
 
 
 def in_phases(net: str) -> str:
-    """A net with its data layer twice: one for TRAIN, from another database, and as it is for TEST."""
+    """Return the net with a data layer for TRAIN, of another database, and its own for TEST only."""
     data, cut, rest = net.partition('layer { name: "cut"')
     source = re.search('source: "(.*)"', data)
     other = data.replace(source[1], str(GOLDEN / "pairs" / "train_lmdb")) if source else data
@@ -42,7 +42,7 @@ def in_phases(net: str) -> str:
 
 @pytest.fixture
 def advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
-    """``advice(net, solver=None, phase=TRAIN)``: what is said of a net's text, or of a solver's that trains it.
+    """``advice(net, solver=None, phase=TRAIN)``: the findings of a net's text, or of a solver's that trains it.
 
     With ``open_data`` the data layers are opened, else their shapes are given.
     """
@@ -65,14 +65,14 @@ def test_a_correct_net_has_no_findings(advice: Callable[..., list[str]]) -> None
     assert advice(siamese()) == []
 
 
-def test_towers_that_share_only_some_of_their_parameters(advice: Callable[..., list[str]]) -> None:
+def test_towers_that_share_only_some_parameters_are_found(advice: Callable[..., list[str]]) -> None:
     assert advice(siamese(('param { name: "w" }', 'param { name: "w" }'))) == [
         'net.prototxt:6:1: layer "ip2" (InnerProduct): 1 of its 2 parameter blobs are not shared with the other branch '
         'of "loss"; give them the same param { name }'
     ]
 
 
-def test_a_loss_that_nothing_reaches(advice: Callable[..., list[str]]) -> None:
+def test_a_loss_without_learnable_parameters_is_found(advice: Callable[..., list[str]]) -> None:
     fixed = 'param { name: "w" lr_mult: 0 } param { name: "b" lr_mult: 0 }'
     assert advice(siamese((fixed, fixed))) == [
         'net.prototxt:8:1: layer "loss" (ContrastiveLoss): this loss depends on no learnable parameter; is lr_mult 0?'
@@ -80,7 +80,7 @@ def test_a_loss_that_nothing_reaches(advice: Callable[..., list[str]]) -> None:
     assert advice(siamese((fixed, fixed)), phase=1) == []
 
 
-def test_a_blob_used_by_nothing(advice: Callable[..., list[str]]) -> None:
+def test_an_unused_blob_is_found(advice: Callable[..., list[str]]) -> None:
     spare = 'layer { name: "spare" type: "ReLU" bottom: "f1" top: "spare" }\n'
     assert advice(siamese(extra=spare)) == [
         'net.prototxt:9:1: layer "spare" (ReLU): no layer uses blob "spare"; remove it, or add a Silence layer'
@@ -91,11 +91,11 @@ def test_a_blob_used_by_nothing(advice: Callable[..., list[str]]) -> None:
     assert advice(siamese(extra=spare + silent)) == []
 
 
-def test_outputs_of_a_net_without_a_loss_are_used(advice: Callable[..., list[str]]) -> None:
+def test_outputs_of_a_net_without_a_loss_are_not_found_as_unused(advice: Callable[..., list[str]]) -> None:
     assert advice('layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } }') == []
 
 
-def test_a_batch_norm_without_scale(advice: Callable[..., list[str]]) -> None:
+def test_a_batch_norm_without_scale_is_found(advice: Callable[..., list[str]]) -> None:
     norm = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 } } }\n'
     norm += 'layer { name: "bn" type: "BatchNorm" bottom: "x" top: "y" }\n'
     assert advice(norm) == [
@@ -105,7 +105,7 @@ def test_a_batch_norm_without_scale(advice: Callable[..., list[str]]) -> None:
     assert advice(norm + 'layer { name: "s" type: "Scale" bottom: "y" top: "y" }') == []
 
 
-def test_two_layers_of_one_name(advice: Callable[..., list[str]]) -> None:
+def test_two_layers_of_one_name_are_found(advice: Callable[..., list[str]]) -> None:
     said = advice(siamese().replace('"ip2"', '"ip1"'))
     assert said == [
         'net.prototxt:6:1: layer "ip1" (InnerProduct): an earlier layer has the same name; loaded weights go to that '
@@ -113,7 +113,7 @@ def test_two_layers_of_one_name(advice: Callable[..., list[str]]) -> None:
     ]
 
 
-def test_a_phase_without_its_data_layer(advice: Callable[..., list[str]], tmp_path: Path) -> None:
+def test_a_blob_of_another_phase_is_reported_with_its_phase(advice: Callable[..., list[str]], tmp_path: Path) -> None:
     net = (DATA % "nowhere").replace('top: "sim"', 'top: "sim" include { phase: TRAIN }')
     Path("net.prototxt").write_text(net)
     (checked,) = check_file("net.prototxt")

@@ -1,4 +1,4 @@
-"""``netspec lint``: each rule finds its mistake at its place, and keeps silent where a comment says so."""
+"""``netspec lint``: each rule, comments that ignore it, the command, and the project's own nets."""
 
 import json
 from dataclasses import replace
@@ -60,7 +60,7 @@ CASES = read_cases("netspec/inspect/check/cases/rules.txt")
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_rules_for_nets(case: dict[str, str]) -> None:
+def test_each_rule_for_nets_finds_its_mistake_and_is_ignored_by_comment(case: dict[str, str]) -> None:
     net, (name, place) = case["net"], case["found"].split()
     assert found(net) == [f"{name} {place}"]
     (first, *_) = lint(net).found
@@ -71,7 +71,7 @@ def test_rules_for_nets(case: dict[str, str]) -> None:
     assert ";" in first.message or "does not" in first.message
 
 
-def test_the_phases_of_a_net_see_the_same_images() -> None:
+def test_transform_param_that_differs_between_phases_is_found() -> None:
     data = 'layer {{ name: "d" type: "Data" top: "x" top: "t" include {{ phase: {} }}\n  transform_param {{ {} }}\n'
     data += '  data_param {{ source: "nowhere" batch_size: 2 backend: LMDB }} }}\n'
     train = data.format("TRAIN", "mirror: true crop_size: 4 scale: 0.5 mean_value: 1 mean_value: 2 mean_value: 3")
@@ -102,8 +102,18 @@ def test_a_net_of_one_phase_is_checked_in_that_phase() -> None:
         ('lr_policy: "fixed"\ngamma: 1  # lint: ignore=other, no-effect', ["unknown-rule 7:11"]),
         ('lr_policy: "fixed"\n# why\n# lint: ignore=no-effect\n\ngamma: 1', []),
     ],
+    ids=[
+        "step_at_the_end",
+        "step_before_the_end",
+        "multistep_at_the_end",
+        "no_effect",
+        "test_after_the_end",
+        "comment_at_the_wrong_line",
+        "comment_with_an_unknown_rule",
+        "comment_above",
+    ],
 )
-def test_rules_for_solvers(settings: str, lines: list[str]) -> None:
+def test_each_rule_for_solvers_finds_its_mistake_and_is_ignored_by_comment(settings: str, lines: list[str]) -> None:
     assert found(SOUND, settings) == lines
 
 
@@ -118,7 +128,7 @@ def test_findings_of_a_whole_file_are_ignored_on_its_first_line() -> None:
     assert said("# About it.\n# lint: ignore=no-snapshot\n") == []
 
 
-def test_a_layer_that_is_tested_with_random_weights() -> None:
+def test_a_layer_that_is_tested_with_random_weights_is_found() -> None:
     extra = IP.replace('"ip"', '"other"').replace('top: "f"', 'top: "g" include { phase: TEST }')
     extra += 'layer { name: "a" type: "Accuracy" bottom: "g" bottom: "t" top: "a" include { phase: TEST } }\n'
     settings = 'lr_policy: "fixed" test_iter: 1 test_interval: 10'
@@ -140,7 +150,7 @@ def test_every_rule_has_a_reason() -> None:
         assert rule.reason.endswith("."), rule.name
 
 
-def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_lint_has_status_0_1_or_2(capsys: pytest.CaptureFixture[str]) -> None:
     Path("good.prototxt").write_text(SOUND)
     Path("net.prototxt").write_text(DUMMY + CONV + NORM + IP + LOSS)
     assert main(["lint", "good.prototxt"]) == 0

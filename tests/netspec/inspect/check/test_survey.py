@@ -1,4 +1,4 @@
-"""``netspec data``: statistics of databases, what is wrong with them, and sheets of their records."""
+"""``netspec data``: statistics of databases, faulty and unusual records, and pictures of records."""
 
 import json
 from collections.abc import Callable
@@ -27,7 +27,7 @@ def image(seed: int, shape: tuple[int, ...] = (3, 6, 8)) -> np.ndarray:
 
 
 def write(path: Path, values: list[Any], backend: str = "lmdb") -> str:
-    """Write a database of arrays, of (array, label) or of what is no Datum."""
+    """Write a database of arrays, of (array, label), or of bytes as they are."""
     with Writer(str(path), backend) as writer:
         for number, value in enumerate(values):
             array, label = value if isinstance(value, tuple) else (value, number % 2)
@@ -58,7 +58,7 @@ def test_statistics_are_those_of_numpy(tmp_path: Path, backend: str) -> None:
     assert found.forms == {"raw bytes, 3 x 6 x 8": 9}
 
 
-def test_floats(tmp_path: Path) -> None:
+def test_statistics_of_floats_have_no_histogram(tmp_path: Path) -> None:
     values = [np.random.default_rng(k).normal(size=(4, 1, 1)).astype(np.float32) for k in range(5)]
     found = look(write(tmp_path / "db", values))
     np.testing.assert_allclose(found.channels.deviation, np.stack(values).std(axis=(0, 2, 3)), rtol=1e-6)
@@ -92,7 +92,7 @@ def test_unusual_records_are_noted(tmp_path: Path) -> None:
     assert look(write(tmp_path / "some", some)).notes == ["records without a label, which Caffe reads as 0: 2"]
 
 
-def test_rows_of_hdf5_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_records_of_a_list_of_hdf5_files_are_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name, start in (("a.h5", 0), ("b.h5", 4)):
         with h5py.File(name, "w") as file:
@@ -115,7 +115,7 @@ def test_other_files_than_databases_are_refused(tmp_path: Path, name: str) -> No
         open_records(tmp_path / name)
 
 
-def test_hdf5_files_of_texts(tmp_path: Path) -> None:
+def test_hdf5_labels_of_text_are_unlabeled_and_data_of_text_are_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file["data"], file["label"] = np.zeros((2, 3)), np.array([b"a", b"b"])
     assert look(str(tmp_path / "x.h5")).unlabeled == 2
@@ -133,7 +133,7 @@ def test_samples_are_even_and_reproducible() -> None:
     assert len({number % 2 for number in numbers}) == 2
 
 
-def test_pictures_of_records() -> None:
+def test_records_are_split_into_images_and_converted_to_pictures() -> None:
     pair = np.stack([image(1)[0], image(2)[0]])
     assert [images_in(values) for values in (pair, image(0), image(0, (6, 4, 4)), image(0, (6, 1, 1)))] == [2, 1, 2, 1]
     left, right = (as_picture(part) for part in split(pair, 2))
@@ -143,7 +143,7 @@ def test_pictures_of_records() -> None:
     assert as_picture(np.arange(5.0).reshape(5, 1, 1)).shape == (2, 3)
 
 
-def test_the_command_prints_statistics_and_has_status_1_for_errors(run: Run, tmp_path: Path) -> None:
+def test_data_stat_prints_statistics_and_has_status_1_for_errors(run: Run, tmp_path: Path) -> None:
     result = run("data", "stat", "pairs/train_lmdb")
     assert (result.status, result.err) == (0, "")
     assert "640 records" in result.out
@@ -157,7 +157,7 @@ def test_the_command_prints_statistics_and_has_status_1_for_errors(run: Run, tmp
 
 
 @pytest.mark.slow
-def test_the_command_draws_pairs_and_begins_with_errors(run: Run, tmp_path: Path) -> None:
+def test_data_show_draws_pairs_and_lists_errors_first(run: Run, tmp_path: Path) -> None:
     assert run("data", "show", "pairs/train_lmdb", "--out", "x.png", "--count", 6).status == 0
     assert cv2.imread("x.png") is not None
     path = write(tmp_path / "bad", [*(image(k) for k in range(30)), b"\xff"])
@@ -170,8 +170,12 @@ def test_the_command_draws_pairs_and_begins_with_errors(run: Run, tmp_path: Path
     assert "00000003" not in Path("y.svg").read_text()
 
 
-@pytest.mark.parametrize("words", [("show", "db"), ("stat", "db", "--out", "x.png"), ("draw", "db")])
-def test_wrong_usage(run: Run, words: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [("show", "db"), ("stat", "db", "--out", "x.png"), ("draw", "db")],
+    ids=["show_without_out", "stat_with_out", "unknown"],
+)
+def test_invalid_arguments_of_data_have_status_2(run: Run, words: tuple[str, ...]) -> None:
     assert run("data", *words).status == 2
 
 

@@ -1,4 +1,4 @@
-"""Pictures of nets: ``filters``, ``maps``, ``saliency``, ``embedding``, and what they are drawn from."""
+"""``netspec look``: filters, maps, saliency and embeddings, and what they are computed from."""
 
 import shutil
 from collections.abc import Callable
@@ -48,7 +48,7 @@ def linear(tmp_path: Path, channels: int = 3) -> tuple[ImageNet, np.ndarray]:
     return built, weights
 
 
-def test_weights_are_read_without_a_net() -> None:
+def test_stored_layers_reads_weights_without_a_net() -> None:
     layers = stored_layers(WEIGHTS)
     assert [layer.name for layer in layers][:3] == ["conv1", "conv2", "ip1"]
     assert [layer.has_filters for layer in layers[:3]] == [True, True, False]
@@ -59,7 +59,7 @@ def test_weights_are_read_without_a_net() -> None:
     }
 
 
-def test_the_saliency_of_a_linear_unit_is_its_greatest_weight_over_the_channels(tmp_path: Path) -> None:
+def test_saliency_of_a_linear_unit_is_its_largest_weight_over_the_channels(tmp_path: Path) -> None:
     net, weights = linear(tmp_path)
     for samples in (1, 4):
         found, unit, value = of_unit(net, image(), unit=1, samples=samples)
@@ -73,7 +73,7 @@ def test_the_saliency_of_a_linear_unit_is_its_greatest_weight_over_the_channels(
         of_unit(net, image(), unit=3)
 
 
-def test_the_saliency_of_a_distance_covers_both_images(tmp_path: Path) -> None:
+def test_saliency_of_a_distance_is_computed_for_both_images(tmp_path: Path) -> None:
     net, weights = linear(tmp_path, channels=1)
     a, b = (image(k, (4, 5)) for k in range(2))
     difference = weights.reshape(3, -1) @ (a.astype(float) - b).reshape(-1)
@@ -103,22 +103,24 @@ def test_tsne_separates_clusters_and_is_reproducible() -> None:
     np.testing.assert_array_equal(points, in_plane(values, "tsne")[0])
 
 
-def test_one_number_per_image_is_a_line() -> None:
+def test_descriptors_of_one_number_are_drawn_on_a_line() -> None:
     points, _ = in_plane(np.arange(4.0)[:, None])
     np.testing.assert_allclose(points[:, 0], [-1.5, -0.5, 0.5, 1.5])
     assert not points[:, 1].any()
 
 
 @pytest.mark.parametrize(
-    "shape", [(8, 3, 5, 5), (4, 1, 3, 3), (4, 6, 3, 3), (4, 2, 3, 3), (40, 40, 3, 3), (1, 1, 1, 1)]
+    "shape",
+    [(8, 3, 5, 5), (4, 1, 3, 3), (4, 6, 3, 3), (4, 2, 3, 3), (40, 40, 3, 3), (1, 1, 1, 1)],
+    ids=lambda shape: "x".join(map(str, shape)),
 )
-def test_filters_of_any_number_of_channels(shape: tuple[int, ...]) -> None:
+def test_filters_figure_draws_any_number_of_channels(shape: tuple[int, ...]) -> None:
     for of_images in (True, False):
         figure = filters_figure(np.random.default_rng(0).normal(size=shape), "t", of_images)
         assert figure.axes[0].images
 
 
-def test_zero_is_gray_in_color_and_the_first_channel_is_blue() -> None:
+def test_filters_figure_draws_zero_gray_and_the_first_channel_blue() -> None:
     filters = np.zeros((1, 3, 2, 2))
     filters[0, 0] = 1
     shown = np.asarray(filters_figure(filters, "t").axes[0].images[0].get_array())
@@ -127,7 +129,7 @@ def test_zero_is_gray_in_color_and_the_first_channel_is_blue() -> None:
     np.testing.assert_allclose(shown[0, 0], [1, 0.5, 0.5])
 
 
-def test_maps_and_numbers() -> None:
+def test_maps_figure_describes_maps_and_numbers_in_its_title() -> None:
     maps = np.random.default_rng(0).normal(size=(5, 4, 6))
     maps[2] = 0
     figure = maps_figure(maps, image(), "x")
@@ -136,23 +138,23 @@ def test_maps_and_numbers() -> None:
     assert "largest: 1 (7), 2 (2), 0 (1)" in figure.get_suptitle()
 
 
-def test_a_picture_of_saliency_has_a_row_per_image() -> None:
+def test_saliency_figure_has_a_row_of_three_axes_per_image() -> None:
     figure = saliency_figure([image(0), image(1)], [np.ones((4, 5)), np.zeros((4, 5))], "t")
     assert len(figure.axes) == 6
 
 
-def test_points_have_label_colors_and_thumbnails() -> None:
+def test_embedding_figure_has_a_legend_of_labels_and_thumbnails() -> None:
     points = np.array([[0.0, 0], [0, 1e-6], [1, 1]])
     figure = embedding_figure(points, "t", [0, 1, None], {k: image(k) for k in range(3)})
     legend = figure.axes[0].get_legend()
     assert legend is not None
     assert [text.get_text() for text in legend.get_texts()] == ["label 0", "label 1", "no label"]
     boxes = [artist for artist in figure.axes[0].artists if isinstance(artist, AnnotationBbox)]
-    assert len(boxes) == 2  # two of the images would lie on each other
+    assert len(boxes) == 2  # two of the three would overlap
     assert sum(len(np.atleast_1d(line.get_xdata())) for line in figure.axes[0].lines) == 3
 
 
-def test_thumbnails_by_name_and_by_key(tmp_path: Path) -> None:
+def test_thumbnails_are_found_by_name_in_folders_and_by_key_in_databases(tmp_path: Path) -> None:
     for k in range(3):
         cv2.imwrite(str(tmp_path / f"{k}.png"), image(k, (200, 100, 3)))
     found = thumbnails(tmp_path, ["2.png", "0.png"], 2)
@@ -171,7 +173,7 @@ NET = ("sgd_step/train_val.prototxt", "--weights", "sgd_step/init.caffemodel")
 
 
 @pytest.mark.slow
-def test_the_commands(run: Run) -> None:
+def test_look_filters_maps_and_saliency_write_pictures(run: Run) -> None:
     cv2.imwrite("a.png", image(0, (30, 40, 3)))
     cv2.imwrite("b.png", image(1, (30, 40, 3)))
     for words, said in (
@@ -196,7 +198,7 @@ def test_the_commands(run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_the_embedding_of_a_siamese_net(run: Run) -> None:
+def test_look_embedding_draws_descriptors_of_extract(run: Run) -> None:
     assert run("extract", *NET, "--blob", "feat", "--out", "f.npz").status == 0
     result = run("look", "embedding", "f.npz", "--images", "pairs/test_lmdb", "--out", "x.svg")
     assert (result.status, result.err) == (0, "")
@@ -229,8 +231,19 @@ def test_the_embedding_of_a_siamese_net(run: Run) -> None:
         ),
         (("look", "embedding", "f.npz", "--images", "pairs"), "pairs: contains no images"),
     ],
+    ids=[
+        "unknown_layer",
+        "missing_weights",
+        "unknown_blob",
+        "missing_image",
+        "not_an_npz",
+        "truncated_npz",
+        "missing_npz",
+        "unknown_array",
+        "no_images",
+    ],
 )
-def test_faults(run: Run, words: tuple[object, ...], said: str) -> None:
+def test_invalid_arguments_of_look_are_refused(run: Run, words: tuple[object, ...], said: str) -> None:
     cv2.imwrite("a.png", image(0, (30, 40, 3)))
     np.savez("f.npz", feat=np.zeros((3, 2), np.float32))
     Path("cut.npz").write_bytes(Path("f.npz").read_bytes()[:150])

@@ -1,4 +1,4 @@
-"""Pictures of nets: what the net has is in them."""
+"""Diagrams of nets: boxes, repeated blocks, settings, escaped names, and the formats of `netspec draw`."""
 
 import re
 from pathlib import Path
@@ -65,7 +65,7 @@ def words_in(svg: ElementTree.Element) -> set[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", nets_as_found(), ids=last_parts)
-def test_published_nets_can_be_drawn(path: Path) -> None:
+def test_every_layer_of_published_nets_is_drawn(path: Path) -> None:
     options = BuildOptions(open_data=False, given_shapes={"pair_data": (8, 6, 224, 224)})
     diagram = diagram_of(*parse_net(path), PHASES, options)
     assert boxes_in(svg_of(diagram, unfolded=True)) == list(range(len(diagram.boxes)))
@@ -125,7 +125,7 @@ def test_an_in_place_layer_on_a_shared_blob_has_its_own_box() -> None:
     assert diagram.reads == ((), ((0, 0),), ((1, 0),), ((1, 0),), ((3, 0),))
 
 
-def test_a_net_that_cannot_be_built_is_drawn_without_its_shapes() -> None:
+def test_a_net_that_cannot_be_built_is_drawn_without_shapes() -> None:
     diagram = read(conv("c", "data").replace("c", "c", 1) + conv("d", "c"))
     assert [box.name for box in diagram.boxes] == ["c", "d"]
     assert any('unknown bottom blob "data"' in str(fault) for fault in diagram.faults)
@@ -141,14 +141,15 @@ def test_a_net_that_cannot_be_built_is_drawn_without_its_shapes() -> None:
         ("pooling_param { pool: AVE global_pooling: true }", "AVE, global pooling"),
         ("lrn_param { local_size: 3 alpha: 0.1 engine: CAFFE }", "local size 3, alpha 0.1"),
     ],
+    ids=["convolution_param", "pooling_param", "lrn_param"],
 )
-def test_settings_in_a_few_words(param: str, words: str) -> None:
+def test_settings_text_abbreviates_the_fields(param: str, words: str) -> None:
     net, _ = parse_net_text(layer("x", "X", "a", "b", param), "f")
     assert settings_text(net.layer[0]) == words
 
 
 @pytest.mark.slow
-def test_files_of_all_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_draw_writes_svg_html_and_png(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     net = tmp_path / "net.prototxt"
     net.write_text('name: "a <b> & \\"c\\""\n' + residual(3).replace('"a0"', '"</script>"'))
     for suffix in ("svg", "html", "png"):
@@ -168,8 +169,8 @@ def test_files_of_all_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main(["draw", str(tmp_path / "none.prototxt"), "--out", str(tmp_path / "net.svg")]) == 1
 
 
-def test_text_can_be_read_on_a_phone() -> None:
-    """The page draws no smaller than 0.9 of the picture at first: no text is below 9 pixels."""
+def test_the_page_has_no_font_below_9_pixels_on_a_phone() -> None:
+    """At first the page shows the picture at 0.9 of its size or more, so that 10 pixels become 9 at least."""
     page = net_page(read(residual(3) + layer("only", "ReLU", "end", "only", "include { phase: TEST }")))
     sizes = [float(size) for size in re.findall(r'font-size="([\d.]+)"', page)]
     assert "TEST" in page
@@ -187,7 +188,7 @@ def test_a_solver_is_drawn_by_its_training_net(tmp_path: Path, monkeypatch: pyte
     assert "trained" in Path("net.svg").read_text()
 
 
-def test_the_net_in_a_file_of_weights_is_drawn(tmp_path: Path) -> None:
+def test_the_net_in_a_caffemodel_is_drawn(tmp_path: Path) -> None:
     net = tmp_path / "net.prototxt"
     net.write_text('name: "kept"\n' + INPUT + conv("conv", "data"))
     netspec.save_weights(netspec.load_net(net), tmp_path / "net.caffemodel")
@@ -211,7 +212,7 @@ def test_layers_of_equal_names_are_separate_nodes() -> None:
     assert boxes_in(svg_of(read(text))) == [0, 1, 2, 3]
 
 
-def test_without_graphviz_one_line_gives_advice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_graphviz_is_reported_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.which", lambda *words, **options: None)
     with pytest.raises(SpecError, match=r"^drawing a net needs Graphviz: pip install graphviz-pure$"):
         render("digraph {}", "svg")

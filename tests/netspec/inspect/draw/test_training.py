@@ -1,4 +1,4 @@
-"""Pictures of trainings: what is in them, and the three forms in which they are written."""
+"""Plots of trainings: panels, curves and ranges, and the three formats of `netspec plot`."""
 
 import json
 import re
@@ -22,7 +22,7 @@ def titles(figure: Any) -> list[str]:
     return [axis.get_title("left") for axis in figure.axes]
 
 
-def test_each_output_has_a_panel_and_each_training_its_curves() -> None:
+def test_figure_has_a_panel_per_output_and_curves_per_training() -> None:
     run, other = read_log(CAFFES), read_log(CAFFES)
     other.tests[0]["accuracy"] = Curve([0, 25], [0.5, 0.75])
     figure = training_figure([run, other])
@@ -35,7 +35,7 @@ def test_each_output_has_a_panel_and_each_training_its_curves() -> None:
     assert [line.get_gid() for line in figure.axes[1].lines] == ["run1-test"]
 
 
-def test_a_blob_of_many_numbers_gets_no_panels() -> None:
+def test_an_output_of_many_numbers_has_no_panel() -> None:
     run = TrainingLog("x", Curve([0], [1]))
     run.tests[0] = {f"p[{k}]": Curve([0], [1]) for k in range(100)}
     assert titles(training_figure([run])) == ["loss"]
@@ -47,19 +47,19 @@ def test_nan_losses_are_marked() -> None:
     assert list(marks.get_xdata()) == [1, 2]  # pyright: ignore[reportArgumentType]
 
 
-def test_a_few_large_losses_do_not_set_the_scale() -> None:
+def test_a_few_large_losses_do_not_determine_the_scale() -> None:
     curve = Curve(list(range(100)), [80.0] + [1 + 0.01 * (k % 10) for k in range(99)])
     assert training_figure([TrainingLog("x", curve)]).axes[0].get_ylim()[1] < 2
 
 
-def test_tests_far_above_the_training_are_in_the_picture() -> None:
+def test_test_losses_far_above_the_training_loss_are_in_the_range() -> None:
     run = TrainingLog("x", Curve(list(range(100)), [1 + 0.01 * (k % 10) for k in range(100)]), losses={"loss"})
     run.tests[0] = {"loss": Curve([50], [3.0])}
     assert training_figure([run]).axes[0].get_ylim()[1] > 3
 
 
 @pytest.mark.slow
-def test_the_command_writes_png_svg_and_html(run: Run_) -> None:
+def test_plot_writes_png_svg_and_html(run: Run_) -> None:
     for ending in ("png", "svg", "html"):
         result = run("plot", CAFFES, "--names", "<a> & $b_1$", "--out", f"x.{ending}")
         assert (result.status, result.err) == (0, "")
@@ -99,6 +99,7 @@ def test_equal_names_are_distinguished_by_their_folders(run: Run_) -> None:
         ((CAFFES, "--out", "no/x.png"), 1, "no/x.png: cannot be written: No such file or directory\n"),
         ((CAFFES, "--names", "a,b", "--out", "x.png"), 2, "found 2 --names and 1 logs"),
     ],
+    ids=["missing_log", "format", "missing_folder", "names"],
 )
 def test_logs_that_cannot_be_drawn_are_refused(run: Run_, words: tuple[object, ...], status: int, said: str) -> None:
     result = run("plot", *words)
@@ -107,7 +108,7 @@ def test_logs_that_cannot_be_drawn_are_refused(run: Run_, words: tuple[object, .
     assert not Path("x.png").exists()
 
 
-def test_a_logarithmic_axis_needs_losses_above_zero(run: Run_) -> None:
+def test_log_scale_without_a_positive_loss_gets_a_warning(run: Run_) -> None:
     Path("x.log").write_text("Iteration 0, loss = -1\nIteration 10, loss = -2\n")
     result = run("plot", "x.log", "--out", "x.svg", "--log_scale")
     assert (result.status, result.err) == (0, "warning: no loss is above 0: its axis is not logarithmic\n")

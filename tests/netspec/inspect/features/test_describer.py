@@ -1,4 +1,4 @@
-"""A net as the describe callable of a loop-closure detector."""
+"""Describer, which computes the descriptor of an image with a net, alone and in a loop-closure detector."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ def test_descriptors_equal_those_of_the_whole_net(describe: Describer) -> None:
         assert np.allclose(describe(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)), expected[k], atol=1e-2)
 
 
-def test_weights_come_from_several_files(describe: Describer) -> None:
+def test_describer_reads_weights_from_several_files(describe: Describer) -> None:
     image = np.random.default_rng(2).integers(0, 256, (28, 28), dtype=np.uint8)
     both = Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel,sgd_step/init.caffemodel")
     assert np.array_equal(both(image), describe(image))
@@ -43,7 +43,7 @@ def test_weights_come_from_several_files(describe: Describer) -> None:
         Describer("sgd_step/train_val.prototxt", "sgd_step/init.caffemodel, gone.caffemodel")
 
 
-def test_another_net_has_another_fingerprint(describe: Describer, tmp_path: Path) -> None:
+def test_fingerprint_depends_on_net_weights_and_scale_only(describe: Describer, tmp_path: Path) -> None:
     prototxt, weights = Path("sgd_step/train_val.prototxt"), Path("sgd_step/init.caffemodel")
     (tmp_path / "same.prototxt").write_text(f"# a comment\n{prototxt.read_text()}")
     assert Describer("same.prototxt", weights, engine="onnxruntime", cache=tmp_path).fingerprint == describe.fingerprint

@@ -1,4 +1,4 @@
-"""What is done to pixels before the net: in Caffe's order swap, raw_scale, mean, scale."""
+"""Preprocessing of pixels in Caffe's order: swap, raw_scale, mean, scale."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +22,7 @@ def scaled(steps: Steps, layer: LayerParameter | None = None) -> list[float]:
     return scaling_of(steps, layer, SHAPE, "net.prototxt")(PIXEL).ravel().tolist()
 
 
-def test_each_step_and_their_order():
+def test_steps_are_applied_in_caffes_order():
     assert scaled(Steps.of("1,2,3", 1, 1, False)) == [9, 18, 27]
     assert scaled(Steps.of("5", 0.5, 1, False)) == [2.5, 7.5, 12.5]
     assert scaled(Steps.of(None, 1, 1, True)) == [30, 20, 10]
@@ -50,6 +50,7 @@ def test_a_mean_image_is_cropped_at_its_center():
         (np.ones((1, 3, 3)), r"--mean: the mean has shape \(1, 3, 3\), expected at least \(3, 1, 1\)"),
         (np.ones((3, 0, 3)), "expected at least"),
     ],
+    ids=["two_values", "one_channel", "empty"],
 )
 def test_a_mean_of_a_wrong_shape_is_refused(mean: np.ndarray, fault: str):
     with pytest.raises(SpecError, match=fault):

@@ -1,4 +1,4 @@
-"""Logs of trainings: Caffe's own of several versions, and netspec's."""
+"""Logs of trainings, of several versions of Caffe and of netspec: what is read, smoothed and shown."""
 
 import os
 from pathlib import Path
@@ -31,7 +31,7 @@ def read(*messages: str) -> TrainingLog:
     return reader.log
 
 
-def test_a_log_of_caffe() -> None:
+def test_read_log_reads_a_log_of_caffe() -> None:
     run = read_log(CAFFES)
     assert run.loss.iterations == [0, 10, 20, 30, 40, 50, 60]
     assert run.loss.values[1] == 0.0442083
@@ -44,7 +44,7 @@ def test_a_log_of_caffe() -> None:
     assert summary(run)["least test loss"] == "0.0502543 at 50"
 
 
-def test_sentences_of_other_versions() -> None:
+def test_messages_of_other_versions_of_caffe_are_read() -> None:
     run = read(
         "Iteration 100, Testing net (#1)",
         "    Test net output #0: accuracy = 0.5",
@@ -59,7 +59,7 @@ def test_sentences_of_other_versions() -> None:
     assert run.loss == Curve([100, 200], [1.5, 1.25])
 
 
-def test_a_log_of_2014() -> None:
+def test_messages_of_2014_are_read() -> None:
     run = read(
         "Iteration 500, lr = 0.001",
         "Iteration 500, loss = 1.5",
@@ -73,7 +73,7 @@ def test_a_log_of_2014() -> None:
     assert (run.loss, run.rate) == (Curve([500], [1.5]), Curve([500], [0.001]))
 
 
-def test_a_log_without_prefixes_and_one_of_several_nodes() -> None:
+def test_logs_without_glog_prefixes_and_of_several_nodes_are_read() -> None:
     reader = LogReader("log")
     for line in ("Iteration 10, loss = 0.5", "    Train net output #0: loss: a = b = 0.25 (* 1 = 0.25 loss)",
                  "[n0.d0.r0] Iteration 20 (2.5 iter/s, 4s/10 iter), 0.1/90.1ep, loss = 0.75",
@@ -86,7 +86,7 @@ def test_a_log_without_prefixes_and_one_of_several_nodes() -> None:
 
 
 @pytest.mark.parametrize("text", ["nan", "-nan", "1.#QNAN", "-1.#IND"])
-def test_a_loss_that_is_no_number(text: str) -> None:
+def test_a_loss_of_nan_is_read_in_every_spelling(text: str) -> None:
     assert np.isnan(read("Iteration 1, loss = " + text).loss.values).all()
 
 
@@ -125,14 +125,19 @@ def test_times_continue_across_new_year() -> None:
         ("a b.prototxt:3:1: Iteration 500: the loss is nan; lower base_lr, or continue with --nan warn", "failed"),
         ("I0101 00:00:00.000000 1 net.cpp:1] something", "running"),
     ],
+    ids=["done", "stopped_early", "check_failed", "aborted", "nan_loss", "running"],
 )
-def test_the_end_of_a_training_is_recognized(line: str, state: str) -> None:
+def test_the_state_of_a_training_is_recognized(line: str, state: str) -> None:
     reader = LogReader("log")
     reader.feed(line)
     assert reader.log.state == state
 
 
-@pytest.mark.parametrize(("data", "what"), [(b"\xff\x00 no log", "contains no iteration"), (None, "cannot be read")])
+@pytest.mark.parametrize(
+    ("data", "what"),
+    [(b"\xff\x00 no log", "contains no iteration"), (None, "cannot be read")],
+    ids=["other_file", "missing_file"],
+)
 def test_other_files_than_logs_are_refused(tmp_path: Path, data: bytes | None, what: str) -> None:
     path = tmp_path / "x.log"
     if data is not None:
@@ -158,7 +163,7 @@ def test_thinning_keeps_extremes_and_ends() -> None:
     np.testing.assert_array_equal(kept, y[few.astype(int)])
 
 
-def test_the_drawn_range_contains_all_curves() -> None:
+def test_shown_range_ignores_early_outliers_and_contains_all_other_curves() -> None:
     loss = np.concatenate([[80.0], np.linspace(2, 1, 99)])
     low, high = shown_range([loss]) or (0, 0)
     assert (low, high) == (1, pytest.approx(2.6, abs=0.1))
@@ -168,7 +173,7 @@ def test_the_drawn_range_contains_all_curves() -> None:
 
 
 @pytest.mark.parametrize("digits", [11, 400, 5000])
-def test_impossible_numbers_are_not_read(digits: int) -> None:
+def test_numbers_beyond_32_bits_are_ignored(digits: int) -> None:
     """Caffe's counts are ints of 32 bits, its losses floats of 32 bits."""
     long = "9" * digits
     run = read(
@@ -192,5 +197,5 @@ def test_a_log_can_be_read_from_a_pipe(tmp_path: Path) -> None:
     assert run.loss.iterations[:2] == [0, 10]
 
 
-def test_a_window_can_be_larger_than_the_curve() -> None:
+def test_smoothing_window_can_be_larger_than_the_curve() -> None:
     assert smoothed(np.array([1.0, 3.0]), 10**30).tolist() == [2, 2]
