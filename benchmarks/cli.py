@@ -300,10 +300,10 @@ def _start(arguments: argparse.Namespace) -> None:
     from benchmarks.case import forward_case
     from benchmarks.compare import starts_of
 
-    def rows(yardsticks: str | None) -> Iterator[list[Row]]:
+    def rows(separate_python: str | None) -> Iterator[list[Row]]:
         for name in arguments.nets:
             with forward_case(name, 1, arguments.weights, onnx=False) as case:
-                yield starts_of(case, arguments.ways, yardsticks, arguments.rounds)
+                yield starts_of(case, arguments.ways, separate_python, arguments.rounds)
 
     _report(arguments, rows)
 
@@ -317,9 +317,9 @@ def _compare(
 ) -> list[Row]:
     from benchmarks.compare import Comparison, rows_of
 
-    def rows(yardsticks: str | None) -> Iterator[list[Row]]:
+    def rows(separate_python: str | None) -> Iterator[list[Row]]:
         how = Comparison(
-            arguments.ways, training, arguments.rounds, yardsticks, arguments.caffe, arguments.seconds, device
+            arguments.ways, training, arguments.rounds, separate_python, arguments.caffe, arguments.seconds, device
         )
         for name in arguments.nets:
             for batch in arguments.batch:
@@ -338,11 +338,11 @@ def _report(
     ``before``: rows that were measured earlier, for the same output files.
     """
     from benchmarks import environment, report, results
-    from benchmarks.compare import YARDSTICKS
+    from benchmarks.compare import IN_SEPARATE_ENVIRONMENT
 
-    yardsticks = environment.python() if set(arguments.ways) & set(YARDSTICKS) else None
-    described, rows = results.machine(yardsticks), list(before)
-    for found in rows_of(yardsticks):
+    separate_python = environment.python() if set(arguments.ways) & set(IN_SEPARATE_ENVIRONMENT) else None
+    described, rows = results.machine(separate_python), list(before)
+    for found in rows_of(separate_python):
         rows += found
         print(report.table(found), flush=True)
         for row in found:

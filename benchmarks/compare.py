@@ -14,24 +14,25 @@ from benchmarks.case import DECAY, MOMENTUM, RATE, Case
 from benchmarks.report import REFERENCES, Row
 from benchmarks.rounds import CaffeProgram, Contestant, Pass, Starter, Worker, difference, measure, ratio
 
-YARDSTICKS = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")  # these run in a separate environment
+IN_SEPARATE_ENVIRONMENT = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")  # these run in a separate environment
 
 
 @dataclass(frozen=True)
 class Comparison:
     """The ways to run a case, and the limits of the measurement.
 
-    training    a pass is a training iteration; otherwise a forward pass
-    yardsticks  the Python for the ways that need a separate environment
-    caffe       the caffe binary, if it is timed too
-    limit       the rounds take at most this many seconds, but there are at least three
-    device      the torch device for trainings of netspec and of the twin
+    ways             the programs and engines to compare, such as netspec-onnxruntime
+    training         whether a pass is a training iteration, and not a forward pass
+    separate_python  the Python of a separate environment, for the ways that need one
+    caffe            the caffe binary, if it is timed too
+    limit            the rounds take at most this many seconds, but there are at least three
+    device           the torch device for trainings by netspec and by PyTorch alone
     """
 
     ways: Sequence[str]
     training: bool
     rounds: int
-    yardsticks: str | None = None
+    separate_python: str | None = None
     caffe: str | None = None
     limit: float = math.inf
     device: str = "cpu"
@@ -41,7 +42,7 @@ def rows_of(case: Case, threads: int, how: Comparison) -> list[Row]:
     """Return a row for each way."""
     task = {**task_of(case, threads), "device": how.device}
     suffix = "_training" if how.training else ""
-    contestants = [_worker(case, way, task, suffix, how.yardsticks) for way in how.ways]
+    contestants = [_worker(case, way, task, suffix, how.separate_python) for way in how.ways]
     if how.caffe:
         contestants.append(CaffeProgram(how.caffe, task, training=how.training))
     return _rows(case, threads, contestants, how.rounds, "training" if how.training else "forward", how.limit)
@@ -52,11 +53,11 @@ def _rows(
 ) -> list[Row]:
     able = [one for one in contestants if not one.fault]
     try:
-        times = measure(able, rounds, lambda k: _tell(case, threads, k, rounds), limit)
+        times = measure(able, rounds, lambda k: _show_progress(case, threads, k, rounds), limit)
     finally:
         for one in contestants:
             one.close()
-    _tell(case, threads, rounds, rounds)
+    _show_progress(case, threads, rounds, rounds)
     expected = next((one.outputs for one in able if one.name == "netspec"), None)
     seconds = {name: [clock for clock, _ in passes] for name, passes in times.items()}
     rows = []
@@ -93,11 +94,11 @@ def task_of(case: Case, threads: int) -> dict[str, Any]:
     }
 
 
-def _worker(case: Case, way: str, task: dict[str, Any], suffix: str, yardsticks: str | None) -> Contestant:
+def _worker(case: Case, way: str, task: dict[str, Any], suffix: str, separate_python: str | None) -> Contestant:
     if way == "pytorch" and case.twin is None:
         return _Absent(way, "there is no twin of this net; --twin names one that fits")
     name, options = parts(way)
-    return Worker(way, python_of(way, yardsticks), {**task, **options, "runs": name + suffix})
+    return Worker(way, python_of(way, separate_python), {**task, **options, "runs": name + suffix})
 
 
 def parts(way: str) -> tuple[str, dict[str, str]]:
@@ -107,12 +108,12 @@ def parts(way: str) -> tuple[str, dict[str, str]]:
     return name, {"engine": rest[0] if rest else "torch", "precision": precision}
 
 
-def python_of(way: str, yardsticks: str | None) -> str:
-    """Return the Python with the library of a way."""
-    return yardsticks if yardsticks and way in YARDSTICKS else sys.executable
+def python_of(way: str, separate_python: str | None) -> str:
+    """Return the path of the Python that has the library which a way needs."""
+    return separate_python if separate_python and way in IN_SEPARATE_ENVIRONMENT else sys.executable
 
 
-def starts_of(case: Case, ways: Sequence[str], yardsticks: str | None, rounds: int) -> list[Row]:
+def starts_of(case: Case, ways: Sequence[str], separate_python: str | None, rounds: int) -> list[Row]:
     """Return a row for each way: the seconds of a process that loads the net and describes one image."""
     import cv2
 
@@ -124,7 +125,7 @@ def starts_of(case: Case, ways: Sequence[str], yardsticks: str | None, rounds: i
     contestants: list[Contestant] = []
     for way in ways:
         name, options = parts(way)
-        contestants.append(Starter(way, python_of(way, yardsticks), {**task, **options, "runs": name}))
+        contestants.append(Starter(way, python_of(way, separate_python), {**task, **options, "runs": name}))
     return _rows(case, 0, contestants, rounds, "start")
 
 
@@ -144,7 +145,7 @@ class _Absent:
         """Do nothing."""
 
 
-def _tell(case: Case, threads: int, done: int, rounds: int) -> None:
+def _show_progress(case: Case, threads: int, done: int, rounds: int) -> None:
     if sys.stderr.isatty():
         text = f"{case.name}, batch {case.batch}, threads {threads}: round {done + 1} of {rounds}"
         print(f"\r\033[K{text if done < rounds else ''}", end="", file=sys.stderr, flush=True)

@@ -63,7 +63,7 @@ def machine(python: str | None = None) -> dict[str, Any]:
         done = subprocess.run(
             [python, "-c", code], env={**os.environ, "PYTHONPATH": root}, capture_output=True, text=True, check=True
         )
-        described["yardsticks"] = json.loads(done.stdout)
+        described["separate_environment"] = json.loads(done.stdout)
     return described
 
 

@@ -1,6 +1,6 @@
 """Evaluates ``auto`` on drives with known loops: precision and recall of the matches that it accepts.
 
-Overlapping views are not a mistake.
+A match of views that overlap does not count as a mistake.
 """
 
 from __future__ import annotations
@@ -54,18 +54,18 @@ class Result:
 
 
 @dataclass
-class Kept:
-    """Results computed once for all drives of a family, and cached in a file."""
+class Cache:
+    """What is computed once for all drives of a family, and stored in a file: descriptors and verified pairs."""
 
     path: Path
     rows: dict[tuple[str, Path], np.ndarray] = field(default_factory=dict)  # by the net and the image
-    found: dict[Any, Agreement] = field(default_factory=dict)
+    agreements: dict[Any, Agreement] = field(default_factory=dict)
     describe: Callable[[np.ndarray], np.ndarray] | None = None
 
     def __post_init__(self) -> None:
-        if self.path.exists():  # written below
-            self.rows, self.found = pickle.loads(self.path.read_bytes())
-        self.pairs = Pairs(read_gray, _found=self.found)
+        if self.path.exists():  # pickle is safe here: save() wrote the file
+            self.rows, self.agreements = pickle.loads(self.path.read_bytes())
+        self.pairs = Pairs(read_gray, _found=self.agreements)
         net = shipped.folder(shipped.DEFAULT)
         weights = (net / f"{net.name}.caffemodel").read_bytes()
         self.net = hashlib.sha256((net / "deploy.prototxt").read_bytes() + weights).hexdigest()
@@ -82,7 +82,7 @@ class Kept:
         """Write the file."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(self.path) as unfinished:
-            unfinished.write_bytes(pickle.dumps((self.rows, self.found)))
+            unfinished.write_bytes(pickle.dumps((self.rows, self.agreements)))
 
 
 @dataclass
@@ -97,14 +97,14 @@ class Scored:
         return MethodResult(self.scores)
 
 
-def measure(drive: Drive, kept: Kept) -> Result:
-    """Run ``auto`` on one drive."""
+def measure(drive: Drive, cache: Cache) -> Result:
+    """Run ``auto`` on one drive. Descriptors and verified pairs are taken from ``cache`` and added to it."""
     data = drive.data
-    queries = kept.descriptors(data.queries.paths)
-    references = None if data.references is None else kept.descriptors(data.references.paths)
+    queries = cache.descriptors(data.queries.paths)
+    references = None if data.references is None else cache.descriptors(data.references.paths)
     scores = similarity_matrix(queries, references)
     truth = data.soft_truth or data.truth
-    auto = Auto(Scored(scores), exclude_frames=data.exclude_frames, pairs=kept.pairs)
+    auto = Auto(Scored(scores), exclude_frames=data.exclude_frames, pairs=cache.pairs)
     found = auto.score(Images(data.queries, data.references), silent)
     accepted = int(np.count_nonzero(np.isfinite(found.scores)))
     judged = Judgment.of(found.scores, truth).best
@@ -122,14 +122,14 @@ def measure(drive: Drive, kept: Kept) -> Result:
 def run(data: Path, work: Path, only: Sequence[str], say: Callable[[str], None]) -> list[Result]:
     """Measure all drives, or those of some families; results are added to ``work``/settings.json."""
     file = work / "settings.json"
-    kept: Kept | None = None
+    cache: Cache | None = None
     for drive in drives(data, work, only):
         path = work / "kept" / f"{drive.family}.pickle"
-        if kept is None or kept.path != path:
-            kept = Kept(path)
-        result = measure(drive, kept)
+        if cache is None or cache.path != path:
+            cache = Cache(path)
+        result = measure(drive, cache)
         say(line(result))
-        kept.save()
+        cache.save()
         results = {**_stored(file), drive.name: result}  # another process may have added to it
         with whole_file(file) as unfinished:
             unfinished.write_text(json.dumps([asdict(each) for each in results.values()], indent=1), encoding="utf-8")
@@ -158,7 +158,7 @@ def summary(results: Sequence[Result]) -> str:
 
 
 def halves(results: Sequence[Result]) -> str:
-    """Say how both halves of the roads and rooms did, and their families, in lines."""
+    """Return lines with the summary of each half of the drives, and of each family in it."""
     lines = []
     for name, first in (("first half", True), ("second half", False)):
         half = [result for result in results if (result.family in FIRST_HALF) == first]

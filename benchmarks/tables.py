@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks import results
 from benchmarks.drives import walked
 from benchmarks.pages import RESULTS
-from benchmarks.settings import Kept
+from benchmarks.settings import Cache
 from lmdb_build.walk.sequence import Walk
 from loopclosure.evaluate import Outcome, judge
 from loopclosure.methods.base import MethodContext
@@ -88,10 +88,10 @@ def measure(
     train = image_paths(data / "ie_tower")[::4] if words_needed else []
     for name in sets or SETS:
         held = data_set(name, data, work)
-        kept = Kept(work / "kept" / f"{name}.pickle")
+        cache = Cache(work / "kept" / f"{name}.pickle")
         images = [*held.queries.paths, *(() if held.references is None else held.references.paths)]
-        np.savez(work / f"{name}.npz", features=kept.descriptors(images), names=[str(image) for image in images])
-        context = MethodContext(held.exclude_frames, pairs=kept.pairs)
+        np.savez(work / f"{name}.npz", features=cache.descriptors(images), names=[str(image) for image in images])
+        context = MethodContext(held.exclude_frames, pairs=cache.pairs)
         for label in methods or METHODS:
             if name in PAIRS and (label not in TABLES["accuracy"] or "SeqSLAM" in label):
                 continue
@@ -101,7 +101,7 @@ def measure(
             for kind, value in _figures(label, outcome, name):
                 say(f"{name}, {label}, {kind}: {value}")
                 figures[kind][label][TITLES[name]] = value
-        kept.save()
+        cache.save()
         for kind, rows in figures.items():
             results.write(RESULTS / f"{kind}.json", list(rows.values()), words)
 

@@ -173,22 +173,18 @@ def _words(text: str) -> str:
 
 def _described(text: str) -> list[str]:
     """Return a layer's docstring as Markdown: the text before its blobs, a table of its blobs, the text after."""
-    lines, rows = [], []
+    before: list[str] = []
+    rows: list[list[str]] = []
+    after: list[str] = []
     for line in text.splitlines():
         if found := BLOB.match(line):
             rows.append([f"`{found[1]}`", _prose(found[2])])
-            if len(rows) == 1:
-                lines.append(rows)
         elif rows and line.startswith("  "):
             rows[-1][1] += f" {_prose(line.strip())}"
-        elif line.startswith("Caffe: "):
-            lines += ["", f"Caffe: {line.removeprefix('Caffe: ')}"]
         else:
-            lines.append(line)
-    done = []
-    for line in lines:
-        done += table(("blob", "meaning"), line) if isinstance(line, list) else [_prose(line)]
-    return done
+            lines = ["", line] if line.startswith("Caffe: ") else [line]
+            (after if rows else before).extend(map(_prose, lines))
+    return [*before, *table(("blob", "meaning"), rows), *after]
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -241,14 +237,15 @@ def _arguments_of(parser: argparse.ArgumentParser) -> list[argparse.Action]:
 
 def _usage(parser: argparse.ArgumentParser) -> str:
     """Return the positional arguments and the required options of a command."""
-    words = {True: [], False: []}
-    for action in (found := _arguments_of(parser)):
+    positional, required, more = [], [], []
+    for action in _arguments_of(parser):
         if not action.option_strings:
-            words[True].append(_value(action) if action.required else f"[{_value(action)}]")
+            positional.append(_value(action) if action.required else f"[{_value(action)}]")
         elif action.required:
-            words[False].append(f"{action.option_strings[-1]} {_value(action)}")
-    more = any(action.option_strings and not action.required for action in found)
-    return " ".join([*words[True], *words[False], *(["[options]"] if more else [])])
+            required.append(f"{action.option_strings[-1]} {_value(action)}")
+        else:
+            more = ["[options]"]
+    return " ".join([*positional, *required, *more])
 
 
 def _value(action: argparse.Action) -> str:

@@ -1,8 +1,9 @@
 """Makes two views of each place, in batches of different places, to train nets with an N-pair loss.
 
-Contrastive pairs have one negative for each positive. The N-pair loss compares every first image of a batch with every
-second one (Sohn, Improved Deep Metric Learning with Multi-class N-pair Loss, NIPS 2016), so a batch of N pairs has
-N (N - 1) negatives. Places of one run look similar and are hard negatives, so a batch has several places of few runs.
+The N-pair loss compares every first image of a batch with every second one (Sohn, Improved Deep Metric Learning with
+Multi-class N-pair Loss, NIPS 2016). A batch of N pairs therefore has N (N - 1) negatives, where contrastive pairs have
+one negative for each positive. Places of one run look similar, so they are hard negatives. A batch therefore has
+several places of few runs.
 """
 
 from __future__ import annotations
@@ -23,15 +24,15 @@ from loopclosure.places.frames import read_bgr
 from loopclosure.progress import Progress, silent
 from netspec.files.opencv import cv2
 
-# A batch has at most this many places of one run, and the times of these differ by more than this many seconds.
-PER_RUN, LEAST_GAP_S = 8, 4.0
-# In this share of the pairs, the second view is from another image within this many seconds of the first.
-OTHER, OTHER_S = 0.4, 1.0
+PER_RUN = 8  # the most places of one run in a batch
+LEAST_GAP_S = 4.0  # places of one run in a batch are more than this many seconds apart
+OTHER_IMAGE = 0.4  # share of the pairs whose second view is cut from another image than the first
+OTHER_IMAGE_S = 1.0  # the other image was taken within this many seconds
 # Random changes of each view.
 ZOOM = 2.0  # the visible part has 1 to 1/2 of the image's height
 SHIFT = 0.2  # each view is shifted from the center of its pair by up to this share of its margin
 STRETCH = 0.15  # the aspect ratio changes by a factor of up to e^0.15
-TURN_DEG = 4.0  # standard deviation
+TURN_DEG = 4.0  # standard deviation of the rotation
 CORNER = 0.08  # perspective: each corner is moved by up to this share of the part's size
 MOST_VIEWPOINT = 3  # the visible part is then down to 1/8 of the height; with more, views may not overlap
 SMOOTHING = 0.4  # standard deviation of the smoothing before reducing a part, in pixels of the view
@@ -120,7 +121,7 @@ def _part(stamps: NDArray[np.float64], images: Indices, window: float, rng: np.r
 
 
 def _different_places(stamps: NDArray[np.float64], images: Indices) -> list[int]:
-    """Return the first images that are more than LEAST_GAP_S from the ones chosen before."""
+    """Return up to PER_RUN images, chosen in order, that are more than LEAST_GAP_S from each other."""
     taken: list[int] = []
     for image in images.tolist():
         if len(taken) < PER_RUN and np.all(np.abs(stamps[taken] - stamps[image]) > LEAST_GAP_S):
@@ -129,8 +130,9 @@ def _different_places(stamps: NDArray[np.float64], images: Indices) -> list[int]
 
 
 def _partner(runs: Runs, image: int, rng: np.random.Generator) -> int:
-    if rng.random() < OTHER:
-        near = (runs.tracks == runs.tracks[image]) & (np.abs(runs.stamps - runs.stamps[image]) <= OTHER_S)
+    """Return the image of the second view: mostly the same image, sometimes one taken at nearly the same time."""
+    if rng.random() < OTHER_IMAGE:
+        near = (runs.tracks == runs.tracks[image]) & (np.abs(runs.stamps - runs.stamps[image]) <= OTHER_IMAGE_S)
         others = np.flatnonzero(near & (np.arange(len(near)) != image))
         if len(others):
             return int(rng.choice(others))
@@ -138,23 +140,29 @@ def _partner(runs: Runs, image: int, rng: np.random.Generator) -> int:
 
 
 def cut_view(
-    image: NDArray, size: tuple[int, int], about: NDArray[np.float64], rng: np.random.Generator, viewpoint: float = 1.0
+    image: NDArray,
+    size: tuple[int, int],
+    position: NDArray[np.float64],
+    rng: np.random.Generator,
+    viewpoint: float = 1.0,
 ) -> NDArray[np.uint8]:
     """Return a view of the image (H, W, 3) uint8 as a nearby camera might see it: (height, width, 3).
 
-    ``about`` (2,) is the position of the visible part: 0 at the left (the top), 1 at the right (the bottom). Views
-    with the same position overlap at any zoom. See :class:`Changes` for ``viewpoint``.
+    ``position`` (2,) is where the visible part is in the image: x from 0 (left) to 1 (right), y from 0 (top) to 1
+    (bottom). Views with the same position overlap at any zoom. See :class:`Changes` for ``viewpoint``.
     """
     width, height = size
     part_h = image.shape[0] * np.exp(rng.uniform(-np.log(ZOOM) * viewpoint, 0))
     part_w = min(image.shape[1], part_h * width / height * np.exp(rng.uniform(-STRETCH, STRETCH)))
     part = np.array([part_w, part_h])
     quad = (CORNERS - 0.5 + rng.uniform(-CORNER, CORNER, (4, 2)) * viewpoint) * part
-    cos, sin = np.cos(np.deg2rad(angle := rng.normal(0, TURN_DEG * viewpoint))), np.sin(np.deg2rad(angle))
+    angle = np.deg2rad(rng.normal(0, TURN_DEG * viewpoint))
+    cos, sin = np.cos(angle), np.sin(angle)
     quad = quad @ np.array([[cos, -sin], [sin, cos]]) + part / 2
-    quad += np.clip(about + rng.uniform(-SHIFT, SHIFT, 2), 0, 1) * (np.array(image.shape[1::-1]) - part)
-    if (shrinks := part_h / height) > 1.5:
-        image = cv2.GaussianBlur(image, (0, 0), SMOOTHING * shrinks)
+    quad += np.clip(position + rng.uniform(-SHIFT, SHIFT, 2), 0, 1) * (np.array(image.shape[1::-1]) - part)
+    reduction = part_h / height
+    if reduction > 1.5:
+        image = cv2.GaussianBlur(image, (0, 0), SMOOTHING * reduction)
     return seen_through(image, quad, CORNERS * size, size)
 
 
@@ -166,9 +174,9 @@ def write_views(
     folder: Path,
     progress: Progress = silent,
 ) -> Path:
-    """Write two views for each pair to ``folder``, and the list ``folder``.txt.
+    """Write two views for each pair to ``folder``, and the list ``folder``.txt. Return the path of the list.
 
-    Either both views of a pair are mirrored or none. Raises InputError if batches cannot be made, or an image cannot
+    If one view of a pair is mirrored, so is the other. Raises InputError if batches cannot be made, or an image cannot
     be read or written.
     """
     changes.check()
@@ -177,13 +185,13 @@ def write_views(
     listed = []
     for number, pair in enumerate(progress(zip(first, second, strict=True), "views", len(first))):
         rng = np.random.default_rng([batches.seed, 1, number])
-        mirrored, about = rng.random() < 0.5, rng.uniform(0, 1, 2)
+        mirrored, position = rng.random() < 0.5, rng.uniform(0, 1, 2)
         names = [f"{folder.name}/{number:06d}_{side}.jpg" for side in "ab"]
         for image, name in zip(pair, names, strict=True):
             picture = read_bgr(root / runs.names[image])
             if mirrored:
                 picture = np.ascontiguousarray(picture[:, ::-1])
-            view = cut_view(picture, changes.size, about, rng, changes.viewpoint)
+            view = cut_view(picture, changes.size, position, rng, changes.viewpoint)
             other = partial(read_bgr, root / runs.names[rng.integers(len(runs.names))])  # few views need it
             write_jpeg(folder.parent / name, change_light(view, other, rng, changes.calm))
         listed.append((*names, 1))

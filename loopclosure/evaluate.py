@@ -1,6 +1,7 @@
-"""Evaluates methods on a data set: scores, measures by both conventions and in both zones, and times.
+"""Evaluates methods on a data set: their scores, precision and recall, and times.
 
-In the rule zone, the truth of the data set decides. In the soft zone, available if the frames have poses, a match of
+Measures are computed by two conventions, over all pairs and over the best match of each query, and in two zones. In the
+rule zone, the truth of the data set decides what is a mistake. In the soft zone, which needs poses, a match of
 overlapping views is not a mistake either (:mod:`loopclosure.places.overlap`). The loops to find are the same in both.
 """
 
@@ -50,7 +51,7 @@ class Judgment:
         )
 
     def answered(self) -> str:
-        """Return the precision and the recall of all best matches that have a score, as text."""
+        """Return as text the precision and recall of a method that accepts every best match with a score."""
         if not len(self.best.recall):
             return "nothing accepted, recall 0"
         return f"precision {self.best.precision[-1]:.3f}, recall {self.best.recall[-1]:.3f}"
@@ -175,11 +176,11 @@ def judge(
     result = method.score(Images(data.queries, data.references, list(train_images)), progress)
     rule = Judgment.of(result.scores, data.truth)
     soft_truth = data.soft_truth
-    silent_pairs = int(np.count_nonzero(np.isnan(result.scores) & data.truth.judged))
+    unscored = int(np.count_nonzero(np.isnan(result.scores) & data.truth.judged))
     notes = list(result.notes)
-    if silent_pairs:
+    if unscored:
         judged = int(np.count_nonzero(data.truth.judged))
-        notes.append(f"no score for {silent_pairs} of {judged} judged pairs, which counts as no loop")
+        notes.append(f"no score for {unscored} of {judged} judged pairs, which counts as no loop")
     soft = None if soft_truth is None else Judgment.of(result.scores, soft_truth)
     answer = ""
     if result.answer:

@@ -47,10 +47,11 @@ NEEDED = {
     "folders": ("references",),
     "index": ("group", "track", "time"),
 }
+_LAYOUT_LINES = "\n".join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]...
 
 One or more sequences with poses (KIND may be omitted; it is then detected from the files):
-{chr(10).join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())}
+{_LAYOUT_LINES}
   with poses=FILE, {POSES_HELP},
   and pose-form: {POSE_FORM_HELP}; topic, pose-topic: the topics to read from a bag with several
 Or one source of another kind:

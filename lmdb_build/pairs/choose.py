@@ -129,8 +129,9 @@ def split_by_group(
             owner[owner < 0] = splits.index(rest[0])
     else:
         if count < len(splits):
+            groups = word if count == 1 else f"{word}s"
             raise InputError(
-                f"{count} {word}{'s'[count == 1 :]} cannot be split by {word} into {' and '.join(splits)}: "
+                f"{count} {groups} cannot be split by {word} into {' and '.join(splits)}: "
                 f"give more {word}s, split by time, or use fewer splits"
             )
         order = np.random.default_rng([seed, 0]).permutation(count)

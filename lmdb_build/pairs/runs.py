@@ -1,4 +1,4 @@
-"""Reads runs of a camera from tables of frames or from folders, and CSV tables with names of images."""
+"""Reads runs of a camera, from CSV tables of frames or from folders of images."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Indices = NDArray[np.intp]
 class Runs:
     """M images of several runs of a camera.
 
-    names   M names below the root folder
-    tracks  (M,) the number of the run
-    stamps  (M,) the position along the run: seconds, or the image's number
+    names   M paths, relative to the root folder
+    tracks  (M,) the number of the run that the image belongs to
+    stamps  (M,) the position of the image in its run: seconds, or its number
     """
 
     names: list[str]
@@ -33,7 +33,7 @@ class Runs:
 
 
 def index_runs(index: Path, root: Path, track: str, time: str) -> Runs:
-    """Read a CSV table of frames as runs: column ``track`` names the run, ``time`` is the position along it."""
+    """Read runs from a CSV table of frames. Column ``track`` names the run, column ``time`` the position in it."""
     rows, (column,) = read_table(index, 1)
     tracks = [cell(index, line, row, track) for line, row in rows]
     return Runs(
@@ -44,7 +44,7 @@ def index_runs(index: Path, root: Path, track: str, time: str) -> Runs:
 
 
 def folder_runs(folders: Sequence[Path], root: Path, step: float = 1.0) -> Runs:
-    """Make a run of each folder (or list) of images; ``step`` is the difference of stamps of two images."""
+    """Make a run from each folder or list of images. The stamps of successive images differ by ``step``."""
     runs = [[relative(path, root) for path in image_paths(folder)] for folder in folders]
     return Runs(
         names=[name for run in runs for name in run],
@@ -54,7 +54,7 @@ def folder_runs(folders: Sequence[Path], root: Path, step: float = 1.0) -> Runs:
 
 
 def join_runs(parts: Sequence[Runs]) -> Runs:
-    """Return the runs of all parts; their names are below the same root."""
+    """Return the runs of all parts. The names of all parts must be relative to the same root."""
     ends = np.cumsum([len(np.unique(part.tracks)) for part in parts])
     return Runs(
         names=[name for part in parts for name in part.names],
@@ -64,7 +64,10 @@ def join_runs(parts: Sequence[Runs]) -> Runs:
 
 
 def read_table(path: Path, images: int) -> tuple[list[tuple[int, dict[str, str]]], list[str]]:
-    """Read a CSV table: rows with their line numbers, and the names of the ``images`` columns with image names."""
+    """Return the rows of a CSV table with their line numbers, and the names of the columns that have image names.
+
+    There must be as many such columns as ``images`` says. Raises InputError.
+    """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.DictReader(stream, restval="")
@@ -77,18 +80,14 @@ def read_table(path: Path, images: int) -> tuple[list[tuple[int, dict[str, str]]
         raise InputError("has no row below its header line", path)
     columns = [name for name, text in rows[0][1].items() if str(text).lower().endswith(IMAGE_ENDINGS)]
     if len(columns) != images:
-        raise InputError(
-            f"has {len(columns)} column{'s'[len(columns) == 1 :]} of image names ({', '.join(columns) or 'none'}); "
-            f"expected {images}",
-            path,
-            1,
-            1,
-        )
+        found = f"{len(columns)} {'column' if len(columns) == 1 else 'columns'}"
+        message = f"has {found} of image names ({', '.join(columns) or 'none'}); expected {images}"
+        raise InputError(message, path, 1, 1)
     return rows, columns
 
 
 def cell(path: Path, line: int, row: dict[str, str], column: str) -> str:
-    """Return the text of a row in a column. Raises InputError if it is empty."""
+    """Return the text in a column of a row. Raises InputError if it is empty, or if there is no such column."""
     if column not in row:
         raise InputError(f'has no column "{column}"; there are: {", ".join(map(str, row))}', path, 1, 1)
     if not row[column]:
@@ -97,7 +96,7 @@ def cell(path: Path, line: int, row: dict[str, str], column: str) -> str:
 
 
 def as_number(path: Path, line: int, row: dict[str, str], column: str) -> float:
-    """Return the number of a row in a column. Raises InputError if it is not a number."""
+    """Return the number in a column of a row. Raises InputError if it is not a number."""
     text = cell(path, line, row, column)
     try:
         return float(text)

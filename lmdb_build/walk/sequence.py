@@ -3,7 +3,7 @@
 The quick start and the tests use it instead of a data set to download. The camera is carried around a house
 (:mod:`lmdb_build.walk.house`) several times, so that places are seen again: each lap at another time of day, with small
 changes of position and direction. Poses are exact and the geometry is correct, so the paper's rule of the same place
-means the same as with real images. Every picture follows from the seed.
+means the same as with real images. The same seed gives the same pictures.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ NOISE = 3.0  # standard deviation of the sensor's noise, in gray levels
 
 @dataclass(frozen=True)
 class Walk:
-    """A walk: ``frames`` pictures of ``width`` x ``height`` pixels over ``laps`` laps of a house.
+    """A walk of ``laps`` laps in a house of ``rooms`` rooms, with ``frames`` pictures of ``width`` x ``height`` pixels.
 
     ``start_s`` is the time of the first picture, in seconds. With ``depth``, each picture's depth is written too.
     """
@@ -83,19 +83,19 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
         raise InputError("holds a sequence already; give another folder or remove this one", folder)
     (folder / "rgb").mkdir(parents=True, exist_ok=True)
     house = build_house(walk.seed, walk.rooms)
-    carrier = _Carrier(house, walk)
-    step_s = float(carrier.duration_s) / walk.frames
+    motion = _Motion(house, walk)
+    step_s = float(motion.duration_s) / walk.frames
     times = step_s * np.arange(walk.frames, dtype=np.float64)
     # Poses are more frequent than pictures and never at the same time, as with motion capture.
     per_image = max(POSES_PER_IMAGE, math.ceil(step_s / POSE_STEP_S))
     pose_times = step_s * (np.arange(-per_image, (walk.frames + 1) * per_image) + 0.3) / per_image
-    poses = carrier.poses(pose_times)
+    poses = motion.poses(pose_times)
     stamps = [walk.start_s + time for time in times]
     frames = [(stamp, f"rgb/{stamp:.6f}.jpg") for stamp in stamps]
     depths = [(stamp, f"depth/{stamp:.6f}.png") for stamp in stamps] if walk.depth else []
     if depths:
         (folder / "depth").mkdir(exist_ok=True)
-    for number, (picture, depth) in enumerate(_pictures(house, walk, carrier, times)):
+    for number, (picture, depth) in enumerate(_pictures(house, walk, motion, times)):
         path = folder / frames[number][1]
         write_jpeg(path, picture)
         if depths:
@@ -113,13 +113,13 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     write_rgb_list(folder / "rgb.txt", frames)  # last: it makes the sequence complete
 
 
-def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iterator[tuple[Image, NDArray[np.float32]]]:
+def _pictures(house: House, walk: Walk, motion: _Motion, times: Array) -> Iterator[tuple[Image, NDArray[np.float32]]]:
     """Yield each picture (H, W, 3), and its depth (H, W) in meters."""
     rng = np.random.default_rng([walk.seed, 4])
     noise = rng.normal(0, NOISE, (walk.height + 64, walk.width + 64, 3)).astype(np.int8)
-    poses = carrier.poses(times)
+    poses = motion.poses(times)
     rotations = Rotation.from_quat(poses.quaternions).as_matrix()
-    laps = np.minimum(carrier.walked_m(times) // house.way_length_m, walk.laps - 1).astype(int)
+    laps = np.minimum(motion.walked_m(times) // house.way_length_m, walk.laps - 1).astype(int)
     renderer = Renderer(house, walk.camera, lap_light(walk, house, 0))
     for index, (position, rotation) in enumerate(zip(poses.positions, rotations, strict=True)):
         if index and laps[index] != laps[index - 1]:
@@ -130,7 +130,7 @@ def _pictures(house: House, walk: Walk, carrier: _Carrier, times: Array) -> Iter
 
 
 def lap_light(walk: Walk, house: House, lap: int) -> Light:
-    """Return the light of a lap: bright on the first; later another time of day, and a lamp elsewhere in each room."""
+    """Return the light of a lap. The first lap is bright; each later one has another time of day and other lamps."""
     rng = np.random.default_rng([walk.seed, 3, lap])
     day = 0.9 if lap == 0 else rng.uniform(0.25, 1.1)
     warmth = rng.uniform(-0.12, 0.12)  # blue sky or evening sun
@@ -141,7 +141,7 @@ def lap_light(walk: Walk, house: House, lap: int) -> Light:
     return Light(ambient, lamps, places)
 
 
-class _Carrier:
+class _Motion:
     """The motion of the camera: its position and direction at any time."""
 
     def __init__(self, house: House, walk: Walk) -> None:
@@ -154,7 +154,7 @@ class _Carrier:
         self._yaw = _smooth_angles(np.arctan2(step[:, 1], step[:, 0]), 0.35 / house.step_m)
 
     def walked_m(self, times: Array) -> Array:
-        """Path length (N,) walked at ``times`` (N,), with varying speed."""
+        """Return the distance (N,) walked at ``times`` (N,). The speed varies."""
         sway = 0.3 * np.sin(2 * np.pi * times / 11 + self._phases[0]) - 0.3 * np.sin(self._phases[0])
         return np.clip(SPEED_M_S * times + sway, 0, None)
 
@@ -164,9 +164,9 @@ class _Carrier:
         lap_m = self.house.way_length_m
         at = walked / self.house.step_m % len(self.house.way)
         x, y = _periodic(at, self.house.way[:, 0]), _periodic(at, self.house.way[:, 1])
-        # The direction of the path may make a full turn in a lap: interpolate it as a vector.
+        # Interpolate the direction as a vector, because the angle jumps from pi to -pi.
         along = np.arctan2(_periodic(at, np.sin(self._yaw)), _periodic(at, np.cos(self._yaw)))
-        # 0 on the first lap of all, 1 on the others.
+        # 0 on the first lap, and 1 on the others.
         later = np.clip(walked / lap_m - 0.9, 0, 0.1) / 0.1
         side = later * SIDE_STEP_M * _sway(walked, (7.3, 17.1), self._phases[1:3])
         turn = later * TURN_DEG * _sway(walked, (9.7, 23.9), self._phases[3:5])
@@ -177,10 +177,10 @@ class _Carrier:
             [x - side * np.sin(along), y + side * np.cos(along), EYE_HEIGHT_M + 0.02 * np.sin(stride)]
         )
         roll, pitch = np.radians(0.8 * np.sin(stride / 2)), np.radians(6 + 0.6 * np.sin(stride + 1))
-        return Poses(positions, Rotation.from_matrix(_look(yaw, pitch, roll)).as_quat(canonical=True))
+        return Poses(positions, Rotation.from_matrix(_rotations(yaw, pitch, roll)).as_quat(canonical=True))
 
 
-def _look(yaw: Array, pitch: Array, roll: Array) -> Array:
+def _rotations(yaw: Array, pitch: Array, roll: Array) -> Array:
     """Camera-to-world rotations (N, 3, 3): ``yaw`` from +x toward +y, ``pitch`` down, ``roll`` clockwise."""
     cos, sin, zero = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)
     ahead = np.stack([cos * np.cos(pitch), sin * np.cos(pitch), -np.sin(pitch)], axis=-1)
@@ -191,7 +191,10 @@ def _look(yaw: Array, pitch: Array, roll: Array) -> Array:
 
 
 def _sway(walked: Array, periods_m: tuple[float, float], phases: Array) -> Array:
-    """Return a variation between -1 and 1; a lap is no multiple of its periods, so that laps differ."""
+    """Return numbers (N,) from -1 to 1 that vary with the distance walked (N,).
+
+    A lap is not a multiple of the periods, so laps differ.
+    """
     return 0.6 * np.sin(2 * np.pi * walked / periods_m[0] + phases[0]) + 0.4 * np.sin(
         2 * np.pi * walked / periods_m[1] + phases[1]
     )

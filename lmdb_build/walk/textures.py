@@ -54,9 +54,9 @@ def courses(
 def bands(
     rng: np.random.Generator, width: float, height: float, colors: tuple[Color, Color], period: float, across: bool
 ) -> Image:
-    """Wallpaper with vertical stripes every ``period`` meters; or cloth, with stripes ``across`` it too.
+    """Wallpaper with vertical stripes every ``period`` meters; or cloth, which also has stripes ``across``.
 
-    ``colors`` are that of the ground and that of the stripes.
+    ``colors``: of the ground, and of the stripes.
     """
     base, accent = colors
     picture = plain(rng, width, height, base)
@@ -91,7 +91,7 @@ def paneled(
 
 
 def framed(rng: np.random.Generator, width: float, height: float) -> Image:
-    """A picture for the wall: a landscape, blocks, discs or letters, in a frame; all are different."""
+    """A picture for the wall in a frame: a landscape, blocks, discs or letters. No two are the same."""
     picture = (_landscape, _blocks, _discs, _letters)[rng.integers(4)](rng, width, height)
     rows, columns = picture.shape[:2]
     timber = color(rng.uniform(0.02, 0.12), rng.uniform(0.2, 0.9), rng.choice([0.15, 0.35, 0.6, 0.95]))

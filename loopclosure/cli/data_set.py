@@ -32,10 +32,11 @@ from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import above_zero
 
+_LAYOUT_LINES = "\n".join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]..., for example tum:desk,stop=50%,stride=2.
 
 Ground truth from poses (KIND may be omitted; it is then detected from the files):
-{chr(10).join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())}
+{_LAYOUT_LINES}
   images:     a folder or list of images, with poses=FILE, or with truth=MASK, which marks frames of the same place
 Other ground truth:
   fabmap:     FAB-MAP's New College or City Centre; truth=, coordinates=, camera={"|".join(CAMERAS)} (default: both)
@@ -111,7 +112,10 @@ def typed(text: str, kinds: Kinds) -> Source:
 
 
 def sequence(source: Source, out: str | Path, layout: str = "") -> ImageSequence:
-    """Read a sequence; the frames of a bag or video are extracted to ``out``/frames. ``layout`` "": find it."""
+    """Read a sequence. The frames of a bag or video are extracted to ``out``/frames.
+
+    ``layout`` is a key of LAYOUTS; "" means that it is detected from the files.
+    """
     poses, path = source.pose_choice(), source.path
     if layout in RECORDED or (not layout and is_recording(path)):
         topics = source.get("topic", str) or "", source.get("pose-topic", str) or ""

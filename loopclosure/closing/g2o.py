@@ -37,7 +37,7 @@ class PoseGraph:
 
     ids    (N,) ids of the vertices, ascending
     poses  (N, 7) poses of the vertices
-    held   fixed vertices, as indices into ids
+    held   indices into ids of the vertices that stay where they are (FIX)
     steps  edges between vertices with consecutive ids: odometry, which is trusted
     loops  all other edges
     flat   whether the file is a 2D graph
@@ -68,7 +68,7 @@ def read_pose_graph(path: Path) -> PoseGraph:
                     fixed.append((line, ids[0]))
                     continue
                 tags.add(tag.endswith("SE2"))
-                pose = _lifted(values[:3]) if tag.endswith("SE2") else _checked(values[:7], path, line)
+                pose = _in_space(values[:3]) if tag.endswith("SE2") else _with_quaternion(values[:7], path, line)
                 if tag in (EDGE, EDGE_2D):
                     edges.append((line, ids[0], ids[1], pose, _information(values, path, line)))
                 elif ids[0] in vertices:
@@ -86,9 +86,11 @@ def read_pose_graph(path: Path) -> PoseGraph:
     steps, loops = [], []
     for line, *ends, pose, information in edges:
         missing = [end for end in ends if end not in rows]
-        if missing or ends[0] == ends[1]:
-            what = f"ends at vertex {missing[0]}, which the file does not have" if missing else "joins it with itself"
-            raise InputError(f"the edge {ends[0]} {ends[1]} {what}", path, line, 1)
+        name = f"the edge {ends[0]} {ends[1]}"
+        if missing:
+            raise InputError(f"{name} ends at vertex {missing[0]}, which the file does not have", path, line, 1)
+        if ends[0] == ends[1]:
+            raise InputError(f"{name} joins a vertex with itself", path, line, 1)
         edge = Edge(rows[ends[0]], rows[ends[1]], pose, information)
         (steps if abs(edge.first - edge.second) == 1 else loops).append(edge)
     for line, number in fixed:
@@ -177,14 +179,17 @@ def _entry(words: list[str], path: Path, line: int) -> tuple[str, list[int], Arr
         raise InputError(text, path, line, 1) from None
 
 
-def _checked(pose: Array, path: Path, line: int) -> Array:
+def _with_quaternion(pose: Array, path: Path, line: int) -> Array:
+    """Return the pose. Raises InputError if its quaternion is 0."""
     if not np.any(pose[3:]):
         raise InputError("the quaternion is 0; expected x y z qx qy qz qw", path, line, 1)
     return pose
 
 
-def _lifted(flat: Array) -> Array:
-    return np.array([flat[0], flat[1], 0, 0, 0, np.sin(flat[2] / 2), np.cos(flat[2] / 2)])
+def _in_space(pose: Array) -> Array:
+    """Return a 2D pose (x, y, theta) as a pose (7,) in 3D."""
+    x, y, theta = pose
+    return np.array([x, y, 0, 0, 0, np.sin(theta / 2), np.cos(theta / 2)])
 
 
 def _information(values: Array, path: Path, line: int) -> Array:

@@ -25,7 +25,7 @@ CONFIDENCE = 0.999
 # SIFT points are accurate to about a pixel. If a rotation leaves a smaller residual, there is no usable translation.
 LEAST_PARALLAX_PX = 2.0
 SEED = 1
-# Neighboring pixels are on one surface if their depths differ by less than this factor.
+# Neighboring pixels are on the same surface if their depths differ by less than this factor.
 ONE_SURFACE = 1.05
 
 
@@ -55,15 +55,16 @@ class Relative:
 def relative_view(match: View, query: View, matches: np.ndarray) -> Relative | None:
     """Return the pose of ``query`` in the frame of ``match`` from matches (M, 2) of their points, or None.
 
-    None: fewer than 20 matches agree with one pose. Random draws are the same each time.
+    It is None if fewer than LEAST_INLIERS matches agree with one pose. Equal arguments give equal results, because the
+    random generator of RANSAC has a fixed seed.
     """
     if len(matches) < LEAST_INLIERS:
         return None
     pixels = match.local.points[matches[:, 0]], query.local.points[matches[:, 1]]
     in_match, in_query = match.camera.rays(pixels[0]), query.camera.rays(pixels[1])
     focal = np.sqrt(query.camera.fx * query.camera.fy)
-    sides = ((match, pixels[0], in_match, in_query), (query, pixels[1], in_query, in_match))
-    for view, points, rays, other in sides:
+    directions = ((match, pixels[0], in_match, in_query), (query, pixels[1], in_query, in_match))
+    for view, points, rays, other in directions:
         if view.depth is None:
             continue
         depths = _depth_at(view.depth, points)
@@ -94,14 +95,14 @@ def _from_depth(
     points = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
     cv2.setRNGSeed(SEED)
     error = MAX_ERROR_PX / focal
-    there, turn, step, inliers = cv2.solvePnPRansac(
+    solved, rotation, translation, inliers = cv2.solvePnPRansac(
         points, seen, np.eye(3), None, iterationsCount=500, reprojectionError=error, confidence=CONFIDENCE
     )
-    if not there or inliers is None or len(inliers) < LEAST_INLIERS:
+    if not solved or inliers is None or len(inliers) < LEAST_INLIERS:
         return None
     kept = inliers[:, 0].astype(np.intp)
-    turn, step = cv2.solvePnPRefineLM(points[kept], seen[kept], np.eye(3), None, turn, step)
-    return cv2.Rodrigues(turn)[0], step[:, 0], len(kept)
+    rotation, translation = cv2.solvePnPRefineLM(points[kept], seen[kept], np.eye(3), None, rotation, translation)
+    return cv2.Rodrigues(rotation)[0], translation[:, 0], len(kept)
 
 
 def _from_color(in_match: np.ndarray, in_query: np.ndarray, focal: float) -> Relative | None:
@@ -112,31 +113,35 @@ def _from_color(in_match: np.ndarray, in_query: np.ndarray, focal: float) -> Rel
     inliers = mask[:, 0] > 0
     if np.count_nonzero(inliers) < LEAST_INLIERS:
         return None
-    turned, parallax = _turned(in_match[inliers], in_query[inliers])
+    only_rotation, parallax = _best_rotation(in_match[inliers], in_query[inliers])
     if parallax * focal < LEAST_PARALLAX_PX:
-        return Relative(_pose(turned, np.zeros(3), inverse=True), ROTATION_ONLY, int(np.count_nonzero(inliers)))
-    count, rotation, step, _ = cv2.recoverPose(essential, in_match, in_query, np.eye(3), mask=mask.copy())
+        return Relative(_pose(only_rotation, np.zeros(3), inverse=True), ROTATION_ONLY, int(np.count_nonzero(inliers)))
+    count, rotation, translation, _ = cv2.recoverPose(essential, in_match, in_query, np.eye(3), mask=mask.copy())
     if count < LEAST_INLIERS:
         return None
-    return Relative(_pose(rotation, step[:, 0], inverse=True), UP_TO_SCALE, int(count))
+    return Relative(_pose(rotation, translation[:, 0], inverse=True), UP_TO_SCALE, int(count))
 
 
-def _turned(in_match: np.ndarray, in_query: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the rotation (3, 3) that aligns the rays (N, 2) best, and the median residual at depth 1."""
+def _best_rotation(in_match: np.ndarray, in_query: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the rotation (3, 3) that aligns the rays (N, 2) best, and the median of the remaining distances.
+
+    Distances are at depth 1. Outliers get small weights (iteratively reweighted least squares).
+    """
     a, b = (np.column_stack([rays, np.ones(len(rays))]) for rays in (in_match, in_query))
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
-    weights, left = np.ones(len(a)), np.zeros(len(a))
-    turn = Rotation.identity()
-    for _ in range(5):  # outliers lose their weight
-        turn = Rotation.align_vectors(b, a, weights=weights)[0]
-        left = np.linalg.norm(b - turn.apply(a), axis=1)
-        weights = 1 / (1 + (left / max(2 * float(np.median(left)), 1e-9)) ** 2) ** 2
-    return turn.as_matrix(), float(np.median(left))
+    weights, residuals = np.ones(len(a)), np.zeros(len(a))
+    rotation = Rotation.identity()
+    for _ in range(5):
+        rotation = Rotation.align_vectors(b, a, weights=weights)[0]
+        residuals = np.linalg.norm(b - rotation.apply(a), axis=1)
+        weights = 1 / (1 + (residuals / max(2 * float(np.median(residuals)), 1e-9)) ** 2) ** 2
+    return rotation.as_matrix(), float(np.median(residuals))
 
 
 def _pose(rotation: np.ndarray, translation: np.ndarray, inverse: bool) -> np.ndarray:
-    """Return x -> rotation x + translation, or its inverse, as a pose (7,) with w >= 0."""
+    """Return the motion x -> rotation x + translation, or its inverse, as a pose (7,) with qw >= 0."""
     turn = Rotation.from_matrix(rotation)
     if inverse:
-        turn, translation = turn.inv(), -turn.inv().apply(translation)
+        turn = turn.inv()
+        translation = -turn.apply(translation)
     return np.concatenate([translation, turn.as_quat(canonical=True)])

@@ -14,7 +14,7 @@ from netspec.files.arrays import read_npz
 
 # Arrays of the file that are not descriptors.
 NOT_FEATURES = ("names", "keys", "stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms")
-# The descriptors of an image by the same net on two machines differ by less than this share of their length.
+# Two machines compute descriptors of an image by the same net that differ by less than this share of their length.
 SAME_DESCRIPTOR = 1e-3
 
 
@@ -68,8 +68,8 @@ class Features:
         """Return a copy with whitened descriptors; each view is whitened separately."""
         return replace(self, features=whitening.of_views(self.features, self.views))
 
-    def described_too(self, images: Sequence[Path], rows: np.ndarray) -> list[Path]:
-        """Return the ``images``, with descriptors ``rows`` (len(images), D), that this file describes too.
+    def also_described(self, images: Sequence[Path], rows: np.ndarray) -> list[Path]:
+        """Return those of ``images`` that this file describes, too. ``rows`` (len(images), D) are their descriptors.
 
         Two images are the same if the last parts of their names and their descriptors are equal. The name alone is not
         enough, because many data sets have a 0001.jpg. If the file has no names, only the descriptors are compared.

@@ -40,7 +40,7 @@ class WhitenBy:
         whitening = learn_whitening(np.concatenate(views), self.components, self.power, self.whiten)
         for images, rows in tested:
             whitening.check(rows)
-            refuse_overlap(replace(training, features=views[0]).described_too(images, rows), images, self.whiten)
+            refuse_overlap(replace(training, features=views[0]).also_described(images, rows), images, self.whiten)
         return whitening
 
 

@@ -167,9 +167,10 @@ def doubts(poses: np.ndarray, stamps: np.ndarray | None, form: PoseForm = PoseFo
     jumps = np.flatnonzero((speeds > JUMP_FACTOR * usual) & (steps > JUMP_M))
     if len(jumps):
         at = int(jumps[np.argmax(steps[jumps])])
+        often = f"{len(jumps)} {'time' if len(jumps) == 1 else 'times'}"
         found.append(
-            f"the path jumps {len(jumps)} time{'s'[: len(jumps) > 1]}: by {steps[at]:.3g} m from pose {at + 1} to "
-            f"{at + 2}, where steps are mostly below {float(np.percentile(steps, 90)):.2g} m"
+            f"the path jumps {often}: by {steps[at]:.3g} m from pose {at + 1} to {at + 2}, "
+            f"where steps are mostly below {float(np.percentile(steps, 90)):.2g} m"
         )
     direction = DIRECTIONS[form.direction != DIRECTIONS[1]]
     back = inverse(poses)

@@ -45,7 +45,7 @@ class Exclusion:
     def __str__(self) -> str:
         parts = []
         if self.frames:
-            parts.append(f"at most {self.frames} frame{'s'[: self.frames > 1]} apart")
+            parts.append(f"at most {self.frames} {'frame' if self.frames == 1 else 'frames'} apart")
         if self.seconds:
             parts.append(f"less than {self.seconds:g} s apart")
         return f"pairs {' or '.join(parts)} excluded" if parts else "no pair excluded but each frame with itself"

@@ -1,11 +1,12 @@
 """Functions of the C library, which Caffe calls for each number.
 
-The vector functions of torch and numpy sometimes differ in the last bit. Functions of torch or numpy that call the C
-library's own function are used instead; they are as fast as a loop in C. For values that are not on the CPU, torch's
-functions are used.
+The vector functions of torch and numpy sometimes differ from it in the last bit. So functions of torch or numpy are
+used that call the C library's function for each number. They are as fast as a loop in C. For values that are not on the
+CPU, torch's usual functions are used.
 
-glibc 2.36, with which the golden files were computed, and 2.41 have the same expf, logf, powf and double tanh. Their
-tanhf differ in the last bit of many values: since 2.41 it is rounded correctly. It is computed here as before.
+The golden files were computed with glibc 2.36. glibc 2.41 and 2.43 have the same expf, logf, powf and double tanh, but
+another tanhf: since 2.41 it is rounded correctly, which changes the last bit of many values. So tanhf is computed here
+as in 2.36, on every system.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _LONGEST_STEP = 88  # cexpf computes exp(x) of a larger x as exp(88) exp(x - 88)
 
 
 def exp(values: torch.Tensor) -> torch.Tensor:
-    """Return exp(values) (caffe_exp), by way of the complex exponential: numpy calls the C library's."""
+    """Return exp(values) (caffe_exp), by numpy's complex exponential, which calls the C library's."""
     if not suits_blas(values):
         return values.exp()
     if values.dtype == torch.float32 and values.amax() > _LONGEST_STEP:
@@ -39,15 +40,15 @@ def log(values: torch.Tensor) -> torch.Tensor:
 
 
 def sqrt(values: torch.Tensor) -> torch.Tensor:
-    """Return square roots as C rounds them (caffe_sqrt); torch's of floats may be off by the last bit."""
+    """Return correctly rounded square roots (caffe_sqrt); torch's of floats may differ in the last bit."""
     return values.double().sqrt().to(values.dtype)
 
 
 def power(values: torch.Tensor, exponent: float) -> torch.Tensor:
     """Return values ** exponent (caffe_powx).
 
-    Torch's own loops square, take roots, or use a vector pow; where the operands have gaps between them, it calls the C
-    library's powf for each.
+    Torch squares, takes roots or uses a vector function, except for operands that are not contiguous in memory: for
+    these it calls the C library's powf for each number.
     """
     if not suits_blas(values):
         return values.pow(exponent)
@@ -57,7 +58,7 @@ def power(values: torch.Tensor, exponent: float) -> torch.Tensor:
 
 
 def tanh(values: torch.Tensor) -> torch.Tensor:
-    """Return hyperbolic tangents; of floats with the bits of glibc up to 2.40."""
+    """Return hyperbolic tangents, with the bits of glibc up to 2.40 for floats."""
     if not suits_blas(values):
         return values.tanh()
     if values.dtype == torch.float32:
@@ -71,7 +72,7 @@ def sigmoid(values: torch.Tensor) -> torch.Tensor:
 
 
 _FLOAT = np.float32
-_ONE_FROM = _FLOAT(10)  # from here on the hyperbolic tangent is rounded to 1
+_ONE_FROM = _FLOAT(10)  # from this value on, the hyperbolic tangent is rounded to 1
 _LN2_HIGH, _LN2_LOW = _FLOAT(6.9313812256e-01), _FLOAT(9.0580006145e-06)  # their sum is ln 2
 _INVERSE_LN2 = _FLOAT(1.4426950216)
 # The coefficients of the polynomial in r^2 / 2, from the highest power on; the last is 1.
@@ -96,7 +97,7 @@ def _tanhf(x: np.ndarray) -> np.ndarray:
 
 
 def _expm1f(x: np.ndarray) -> np.ndarray:
-    """Return exp(x) - 1 of floats (n,) from -2 to 20: of x = k ln 2 + r by a polynomial in r, then times 2^k.
+    """Return exp(x) - 1 of floats (n,) from -2 to 20, with x = k ln 2 + r: a polynomial in r gives exp(r) - 1.
 
     fdlibm, s_expm1.c, for floats: s_expm1f.c of glibc up to 2.40
     """

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from netspec.errors import SpecError
-from netspec.proto.schema import LayerParameter, NetParameter
+from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 
 AUTOMATIC = "(automatic)"  # the name of a loss's top without a name
@@ -66,16 +66,16 @@ def make_plan(net: NetParameter, source: SourceMap) -> Plan:
     owners: dict[str, tuple[int, int]] = {}
     multipliers = _shared_multipliers(net, source)
     nodes = []
+
+    def report(i: int, message: str, *path: str | int) -> None:
+        layer = net.layer[i]
+        source.report(SpecError(message, source.at(i, *path, layer=layer.name, type=layer.type)))
+
     for i, layer in enumerate(net.layer):
-
-        def fault(message: str, *path: str | int, i: int = i, layer: LayerParameter = layer) -> None:
-            source.report(SpecError(message, source.at(i, *path, layer=layer.name, type=layer.type)))
-
         propagate = list(layer.propagate_down) or [True] * len(layer.bottom)
         if len(propagate) != len(layer.bottom):
-            fault(
-                f"found {len(layer.propagate_down)} propagate_down, expected 0 or {len(layer.bottom)}", "propagate_down"
-            )
+            message = f"found {len(layer.propagate_down)} propagate_down, expected 0 or {len(layer.bottom)}"
+            report(i, message, "propagate_down")
             propagate = [True] * len(layer.bottom)
         bottoms = tuple(current.get(blob, -1) for blob in layer.bottom)
         available.difference_update(layer.bottom)
@@ -84,7 +84,8 @@ def make_plan(net: NetParameter, source: SourceMap) -> Plan:
             replaces = j < len(layer.bottom) and layer.bottom[j] == blob
             if blob in current and not replaces:
                 first = next(k for k, other in enumerate(net.layer) if blob in other.top)
-                fault(
+                report(
+                    i,
                     f'top blob "{blob}" is produced by multiple sources (first by layer "{net.layer[first].name}"); '
                     "rename one, or compute in place: same bottom and top, before its other uses",
                     "top",
@@ -141,9 +142,9 @@ def _shared_multipliers(net: NetParameter, source: SourceMap) -> dict[str, tuple
 
 @dataclass(frozen=True)
 class Backward:
-    """Where Caffe propagates backward, by layer and by layer and bottom.
+    """Where Caffe computes gradients: ``layers[i]``, whether layer i does, and ``bottoms[i][j]``, for which bottoms.
 
-    ``computed`` also has the bottoms that get a gradient because their layer ignores propagate_down.
+    ``computed`` is ``bottoms`` with those added that get a gradient because their layer ignores propagate_down.
     """
 
     layers: tuple[bool, ...]
@@ -200,10 +201,10 @@ def plan_backward(
         bottom_needs = [
             [need or j not in label_bottoms[i] for j, need in enumerate(needs)] for i, needs in enumerate(bottom_needs)
         ]
-    goes_on = {v: needs for node, needs in zip(plan.nodes, layer_needs, strict=True) for v in node.tops}
+    maker_needs = {v: needs for node, needs in zip(plan.nodes, layer_needs, strict=True) for v in node.tops}
     computed = tuple(
         tuple(
-            need or (layer_needs[i] and j in ignoring[i] and goes_on.get(node.bottoms[j], False))
+            need or (layer_needs[i] and j in ignoring[i] and maker_needs.get(node.bottoms[j], False))
             for j, need in enumerate(bottom_needs[i])
         )
         for i, node in enumerate(plan.nodes)
@@ -221,7 +222,10 @@ def unblocked(plan: Plan, backward: Backward) -> Plan:
 
 
 def origins(plan: Plan, passes_on: Sequence[bool]) -> tuple[int, ...]:
-    """Return, for each value, the one it equals: a top of a Split, or of a Dropout in phase TEST, equals its bottom."""
+    """Return, for each value v, the first value that equals it, which may be v itself.
+
+    ``passes_on[i]``: the tops of layer i equal its bottom, as those of a Split, or of a Dropout in phase TEST.
+    """
     found = list(range(len(plan.blobs)))
     for node, passes in zip(plan.nodes, passes_on, strict=True):
         if passes:

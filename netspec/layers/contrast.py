@@ -16,10 +16,10 @@ ACROSS_CHANNELS = 0  # caffe.proto: enum LRNParameter.NormRegion
 
 @register("LRN", "lrn_param")
 class LRN(Layer):
-    """Divide each value by a power of the squares of its neighbors: (k + alpha times their mean) ** beta.
+    """Divide each value by (k + alpha m) ** beta, where m is the mean of the squares of its neighbors.
 
-    The n = ``local_size`` neighbors are channels (ACROSS_CHANNELS), or n x n pixels (WITHIN_CHANNEL, where k is
-    1 and cannot be set); neighbors outside count as zeros.
+    With n = ``local_size``, the neighbors are n channels (ACROSS_CHANNELS), or n x n pixels (WITHIN_CHANNEL, where k is
+    1 and cannot be set). Neighbors outside the map count as zeros.
 
     bottom[0]  (N, C, H, W)
     top[0]     the same shape

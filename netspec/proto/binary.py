@@ -81,13 +81,13 @@ def read_net_binary(path: str | Path) -> NetParameter:
 def net_without_numbers(path: str | Path) -> Iterator[tuple[NetParameter, BinaryIO | None]]:
     """Yield the net of a .caffemodel without the numbers of its large blobs, and the open file that contains them.
 
-    See :func:`netspec.proto.wire.without_numbers`. If this fails, yield the complete net and None instead.
+    See :func:`netspec.proto.wire.without_numbers`. If that is not possible, yield the complete net, and None.
     Raises SpecError as :func:`read_net_binary`.
     """
     with ExitStack() as stack:
         try:
             if not os.path.isfile(path):
-                raise ValueError("a pipe, or nothing")
+                raise ValueError("not a file, so its parts cannot be read separately")
             file = stack.enter_context(open(path, "rb", buffering=0))
             message = without_numbers(_Slices(file), 0, os.fstat(file.fileno()).st_size, "NetParameter")
             found = _upgraded(parse_binary(message, str(path), NetParameter), path)[0], file
@@ -107,7 +107,7 @@ class _Slices:
         self._file.seek(part.start)
         data = self._file.read(part.stop - part.start)
         if len(data) < part.stop - part.start:
-            raise ValueError("is cut")
+            raise ValueError("the file is truncated")
         return data
 
 
@@ -128,7 +128,7 @@ def split_paths(paths: str | Path) -> list[str]:
 
 
 def check_readable(paths: Iterable[str]) -> None:
-    """Raise SpecError for the first path that cannot be opened, before a net is built that would read it."""
+    """Raise SpecError for the first path that cannot be opened. Call it before a net is built, which may take long."""
     for path in paths:
         try:
             open(path, "rb").close()
@@ -156,6 +156,7 @@ def _guess(data: bytes, message_class: type[Message]) -> str:
         return "text"
     known = message_class.DESCRIPTOR.fields_by_number
     with suppress(ValueError):
+        # A length that is too large for the file is not an error here: the file may be the first part of a larger one.
         for field in fields(data, 0, len(data) + MOST_BYTES):
             if field.number not in known:
                 break

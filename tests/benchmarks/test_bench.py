@@ -148,7 +148,7 @@ def test_an_environment_that_cannot_be_installed_is_a_fault(
 
     monkeypatch.setattr(environment.venv, "create", create)
     assert main(["forward", "lenet", "--with", "opencv4", "--rounds", "1"]) == 1
-    assert capsys.readouterr().err.endswith("bench: cannot install the yardsticks: no such package\n")
+    assert capsys.readouterr().err.endswith("bench: cannot install the libraries to compare with: no such package\n")
 
 
 @pytest.mark.slow

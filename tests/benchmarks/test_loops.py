@@ -49,7 +49,7 @@ def test_two_runs_in_one_folder_keep_the_results_of_both(tmp_path: Path, monkeyp
     def drives_of(data: Path, work: Path, only: list[str]) -> list[SimpleNamespace]:
         return [SimpleNamespace(family=name, kind="laps", name=f"{name}/laps") for name in only]
 
-    def measured(drive: SimpleNamespace, kept: settings.Kept) -> settings.Result:
+    def measured(drive: SimpleNamespace, cache: settings.Cache) -> settings.Result:
         if drive.family == "a":  # the other run ends meanwhile
             settings.run(tmp_path, tmp_path, ["b"], print)
         return settings.Result(drive.family, drive.kind, 9, 8, 1.0, 0.8, [])

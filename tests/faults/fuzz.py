@@ -3,7 +3,7 @@
     pip install -e ".[fuzz]"
     python tests/faults/fuzz.py FORMAT [libFuzzer's options, such as -runs=100000 or -max_total_time=60, and a corpus]
 
-mutate.py defines what counts as a fault; its input is written to ``crash-...`` in the working directory.
+mutate.py defines what counts as a fault. The input that causes one is written to ``crash-...`` in the current folder.
 """
 
 from __future__ import annotations

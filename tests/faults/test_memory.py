@@ -1,4 +1,4 @@
-"""More is asked for than there is memory: one line, with the layer that asks for it."""
+"""A net that needs more memory than there is: one line, which names the layer."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +20,7 @@ WIDE = """layer { name: "wide" type: "DummyData" top: "wide" dummy_data_param { 
 
 @contextmanager
 def little_memory() -> Iterator[None]:
-    """Leave 1 GiB beyond what is used."""
+    """Limit the process to 1 GiB more memory than it uses now."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30), before[1]))

@@ -1,4 +1,4 @@
-"""Names with escape sequences and newlines: nothing of them reaches a terminal, a log or an error raw."""
+"""Names with escape sequences and newlines are printed escaped: on a terminal, in a log and in an error."""
 
 import logging
 from pathlib import Path

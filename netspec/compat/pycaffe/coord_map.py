@@ -114,7 +114,9 @@ def _ancestors(top: Top) -> dict[Top, Mapping]:
     The second bottom of Crop is ignored, because it only gives a size. The search ends at layers without a mapping.
     """
     maps = {top: IDENTITY}
-    for reached in (pending := [top]):
+    pending = [top]
+    while pending:
+        reached = pending.pop(0)
         bottoms = reached.fn.inputs[:1] if reached.fn.type_name == "Crop" else reached.fn.inputs
         try:
             step = coord_map(reached.fn) if bottoms else IDENTITY

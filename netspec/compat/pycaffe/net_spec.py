@@ -38,9 +38,9 @@ class Top:
 class Function:
     """A layer: its type, the tops that it reads, and its parameters.
 
-    ``ntop`` (1) is the number of its tops; with ``in_place=True`` they are its bottoms. The other parameters are
-    fields of the message for its type (such as ``num_output`` in ``convolution_param``), or else of LayerParameter.
-    Raises TypeError for an input that is not a Top.
+    ``ntop`` is the number of its tops, by default 1. With ``in_place=True`` its tops have the names of its bottoms. The
+    other parameters are fields of the message for its type (such as ``num_output`` in ``convolution_param``), or of
+    LayerParameter. Raises TypeError for an input that is not a Top.
     """
 
     def __init__(self, type_name: str, inputs: Iterable[Any], params: Mapping[str, Any]) -> None:
@@ -179,7 +179,6 @@ def assign_proto(proto: Any, name: str, value: Any) -> None:
     """Set a field: a dict fills a message, a list a repeated field; a single value becomes a list of one.
 
     Raises AttributeError for an unknown field, TypeError or ValueError for a value of the wrong type.
-    suit it.
     """
     field = getattr(proto, name)
     repeated = hasattr(field, "extend")
@@ -205,7 +204,10 @@ def _fill(message: Any, values: Mapping[str, Any]) -> None:
 
 
 def param_name_dict() -> dict[str, str]:
-    """Return the fields of LayerParameter with a layer's parameters, without "_param", by layer type."""
+    """Return, for each layer type, the field of LayerParameter with its parameters: ``{"Pooling": "pooling", ...}``.
+
+    The ending "_param" is removed.
+    """
     return _param_names(caffe_pb2.LayerParameter.DESCRIPTOR)
 
 
@@ -232,7 +234,9 @@ class Layers:
 
         def layer(*bottoms: Any, **params: Any) -> Any:
             made = Function(name, bottoms, params)
-            return {0: made, 1: made.tops[0] if made.tops else None}.get(made.ntop, made.tops)
+            if made.ntop == 0:
+                return made
+            return made.tops[0] if made.ntop == 1 else made.tops
 
         return layer
 

@@ -122,7 +122,7 @@ class Reverse(Layer):
 
 @register("ReverseTime", "reverse_time_param")
 class ReverseTime(Layer):
-    """Reverse the first steps of each sequence; with copy_remaining, the other steps are copied, else they are 0.
+    """Reverse the first steps of each sequence. The other steps are copied with copy_remaining; otherwise they are 0.
 
     bottom[0]  sequences (T, N, ...)
     bottom[1]  the number of steps of each sequence (N,); gets no gradient
@@ -198,12 +198,12 @@ class Lstm(Layer):
         gates = data @ of_input.T + bias
         zeros = data.new_zeros(2, data.shape[1], self.size)
         h, c = self.state if begins and self.state and self.state[0].shape == zeros[0].shape else zeros.unbind()
-        goes_on = begins[0].detach().reshape(data.shape[:2]) != 0 if begins else None
+        continues = begins[0].detach().reshape(data.shape[:2]) != 0 if begins else None
         tops = []
         for t, gate in enumerate(gates.unbind()):
             before = c
-            if goes_on is not None:
-                kept = goes_on[t, :, None]
+            if continues is not None:
+                kept = continues[t, :, None]
                 gate, before = torch.where(kept, gate + h @ of_state.T, gate), torch.where(kept, c, 0)
             elif t > 0:
                 gate = gate + h @ of_state.T

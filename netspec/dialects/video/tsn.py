@@ -1,4 +1,4 @@
-"""Temporal segment networks: frames and flow of videos, windows of several sizes, databases in random order.
+"""Temporal segment networks: layers that read frames or optical flow of videos, and crop windows of several sizes.
 
 Fork: yjxiong/caffe (Wang et al., Temporal Segment Networks, ECCV 2016). The random numbers are the net's own.
 """
@@ -69,7 +69,7 @@ MORE_CORNERS = ((0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3))
 
 
 class Windows(Transformer):
-    """Caffe's Transformer with windows of several sizes and positions; mean values are repeated for all frames."""
+    """Caffe's Transformer with windows of several sizes and positions. Mean values are used again for each frame."""
 
     def __init__(self, param: Any, *arguments: Any) -> None:
         super().__init__(param, *arguments)
@@ -117,13 +117,13 @@ class Windows(Transformer):
             most = value(p, "max_distort")
             sizes = [(a, b) for i, a in enumerate(sides) for k, b in enumerate(sides) if abs(i - k) <= most]
         window = sizes[chosen % len(sizes)]
-        room = [whole - part for whole, part in zip(image.shape[1:], window, strict=True)]
+        free = [whole - part for whole, part in zip(image.shape[1:], window, strict=True)]
         if value(p, "fix_crop"):
             places = CORNERS + (MORE_CORNERS if value(p, "more_fix_crop") else ())
             place = places[h_off % len(places)]
-            corner = [quarters * (each // 4) for quarters, each in zip(place, room, strict=True)]
+            corner = [quarters * (size // 4) for quarters, size in zip(place, free, strict=True)]
         else:
-            corner = [draw % (each + 1) for draw, each in zip((h_off, w_off), room, strict=True)]
+            corner = [draw % (size + 1) for draw, size in zip((h_off, w_off), free, strict=True)]
         cut = _cut(image, corner, window)
         if window == (size, size):
             return cut
@@ -202,8 +202,8 @@ def read_videos(path: str, where: Where | None = None) -> list[Video]:
 class VideoSource:
     """Batches of videos: consecutive frames from each of ``num_segments`` equal parts, as channels.
 
-    They begin at a random position of the part in training, and at its center in testing. Raises SpecError for a frame
-    that cannot be read, and for videos of another size.
+    The frames of a part begin at a random position in training, and at its center in testing. Raises SpecError for a
+    frame that cannot be read, and for a video whose frames have another size than the first video's.
     """
 
     def __init__(
@@ -234,11 +234,13 @@ class VideoSource:
         """Return the concatenated frames of a video: (C, H, W)."""
         video, p = self._videos[record], self._param
         length = video.frames // p.num_segments
-        room, planes = length - p.new_length + 1, []
+        starts, planes = length - p.new_length + 1, []  # how many frames of a segment can be the first
         size = (p.new_height, p.new_width) if p.new_height else None
         for segment in range(p.num_segments):
             draw = int(self._draws(position * p.num_segments + segment, 1)[0, 0]) if self._training else 0
-            start = (draw % room if self._training else room // 2) + segment * length if room > 0 else 0
+            start = 0
+            if starts > 0:
+                start = segment * length + (draw % starts if self._training else starts // 2)
             for number in range(start + 1, start + p.new_length + 1):
                 names = [(number,)] if p.modality == RGB else [("x", number), ("y", number)]
                 for name in names:

@@ -14,7 +14,7 @@ import torch
 
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
-from netspec.export.formats.inputs import add_input, not_to_be_given
+from netspec.export.formats.inputs import add_input, wrong_given_shapes
 from netspec.files.whole_file import whole_file
 from netspec.graph.filter import filter_net
 from netspec.graph.options import BuildOptions
@@ -38,8 +38,8 @@ def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool
     SpecError for errors in the net, and for a given shape of a blob that no such layer makes.
     """
     filtered, source = filter_net(net, source)
-    for fault in not_to_be_given(options.given_shapes, [filtered], source.file):
-        raise fault
+    if faults := wrong_given_shapes(options.given_shapes, [filtered], source.file):
+        raise faults[0]
     probe = build_net(filtered, source, replace(options, device="meta", seed=0, open_data=False))
     built = {layer.param.name: layer for layer in probe.layers}
     result = copy_without(filtered, {"layer"})
@@ -61,23 +61,23 @@ def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool
 
 
 def fold(net: Net) -> NetParameter:
-    """Return the folded net with its weights, without Split, Dropout and other layers that return their bottom.
+    """Return the folded net with its weights. Layers that return their bottom, such as Split and Dropout, are removed.
 
-    See netspec/fast/fold.py for what is folded. The remaining blobs and all outputs keep their names. Layers that
-    share parameters still share them if they are equal after folding.
+    netspec/fast/fold.py says what is folded. The remaining blobs and all outputs keep their names. Layers that share
+    parameters still share them if the parameters are equal after folding.
     """
     folds = _found_folds(net)
     plan = net.plan
     passes = [passes_on(layer) for layer in net.layers]
     origin = origins(plan, passes)
     names = _names(net, origin)
-    gone = {i for each in folds for i in each.chain.folded}
+    folded = {i for each in folds for i in each.chain.folded}
     absorbed = {each.chain.keeper: each for each in folds}
     last = {each.chain.keeper: each.chain.last for each in folds}
     first = {each.chain.keeper: min(each.chain.keeper, *each.chain.folded) for each in folds}
     result = NetParameter(name=net.name)
     for i, layer in enumerate(net.layers):
-        if i in gone:
+        if i in folded:
             continue
         tops = [v for v in plan.nodes[last.get(i, i)].tops if not (passes[i] and v not in names)]
         if passes[i] and not tops:
@@ -106,8 +106,8 @@ def _found_folds(net: Net) -> list[Any]:
 def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
     """Return the names of the remaining values.
 
-    An output that a removed layer has renamed gets the new name. If other layers read the value too, it keeps its name,
-    and the layer that renames it stays.
+    An output of a layer that is removed keeps its name: the value that the layer copies gets this name. If other layers
+    read that value too, it keeps its own name, and the layer that copies it stays.
     """
     plan = net.plan
     names = {v: blob for v, blob in enumerate(plan.blobs) if origin[v] == v}
@@ -129,7 +129,7 @@ def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
 
 
 def _shared_names(net: Net, index: int, absorbed: Mapping[int, Any]) -> list[Any]:
-    """Return the ``param { name }`` of a layer that still shares its blobs, all of them or none."""
+    """Return the ``param { name }`` with which a layer shares its blobs; none if they differ after folding."""
     layer, node = net.layers[index], net.plan.nodes[index]
     named = [spec.name for spec in node.params]
     if not any(named):

@@ -65,7 +65,7 @@ def prune(
     return pruned, source.with_layers(places)
 
 
-def not_to_be_given(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
+def wrong_given_shapes(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
     """Return an error for each given shape of a blob that is not a top of a data layer (or Python layer)."""
     from netspec.layers import class_of  # imports torch, which a stored model of another engine does not need
     from netspec.layers.contract.reading import takes_shapes

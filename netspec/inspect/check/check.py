@@ -15,7 +15,7 @@ from typing import Any
 
 from netspec import log
 from netspec.errors import ForkFault, SpecError
-from netspec.export.formats.inputs import not_to_be_given
+from netspec.export.formats.inputs import wrong_given_shapes
 from netspec.export.formats.recovered import recover_net
 from netspec.files.limits import memory
 from netspec.graph.filter import with_state, with_train_state
@@ -82,7 +82,7 @@ def check_file(
     net = with_state(net, phase, options.level, options.stages)
     checked = _check_net(net, source, str(path), [] if unknown else given, options)
     checked.faults = gathered([*unknown, *others(checked.faults, unknown)])
-    checked.faults += not_to_be_given(options.given_shapes, [net], path)
+    checked.faults += wrong_given_shapes(options.given_shapes, [net], path)
     return [checked]
 
 
@@ -145,7 +145,7 @@ def _check_solver(
     if unknown:
         unknown += [fault for part in described for fault in _unknown_layers(part.net, part.source, options)]
         weights = []
-    faults += not_to_be_given(options.given_shapes, [part.net for part in described], path)
+    faults += wrong_given_shapes(options.given_shapes, [part.net for part in described], path)
     parts = [
         _check_net(part.net, part.source, part.label, weights, options, seed_of(max(solver.random_seed, 0), part.label))
         for part in described

@@ -183,7 +183,7 @@ def test_two_dimensions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     [
         (("FIX 7", "FIX 8"), ":9:1: fixes vertex 8, which the file does not have"),
         (("QUAT 40 7", "QUAT 40 8"), ":8:1: the edge 40 8 ends at vertex 8, which the file does not have"),
-        (("QUAT 40 7", "QUAT 40 40"), ":8:1: the edge 40 40 joins it with itself"),
+        (("QUAT 40 7", "QUAT 40 40"), ":8:1: the edge 40 40 joins a vertex with itself"),
         (("FIX 7", "VERTEX_XY 1 2 3"), ":9:1: found VERTEX_XY; expected VERTEX_SE3:QUAT, EDGE_SE3:QUAT"),
         (("FIX 7", "VERTEX_SE2 1 2 3 4"), ": has vertices or edges of two and of three dimensions"),
         (("40 0 0 0 0 0 0 1", "40 0 0 0 0 0 0 nan"), ":2:1: found 8 words after VERTEX_SE3:QUAT; expected 8 numbers"),
