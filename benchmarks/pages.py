@@ -22,8 +22,8 @@ PAGES = tuple(page for pattern in ("README.md", "*/README.md", "docs/*.md") for 
 MARKED = re.compile(r"(<!-- (table|figure): (.+?) -->)(.*?)<!-- end -->", re.DOTALL)
 
 
-def made(text: str, folder: Path = RESULTS) -> str:
-    """Return the text of a page with current figures. Raises SpecError for a marker that matches no figure."""
+def updated(text: str, folder: Path = RESULTS) -> str:
+    """Return the text of a page with the current figures. Raises SpecError for a marker that matches no figure."""
 
     def written(found: re.Match[str]) -> str:
         rows, columns = _chosen(found[3], folder)
@@ -42,7 +42,8 @@ def write(pages: Sequence[Path] = PAGES) -> list[Path]:
     changed = []
     for page in pages:
         old = page.read_text(encoding="utf-8")
-        if (new := made(old)) != old:
+        new = updated(old)
+        if new != old:
             page.write_text(new, encoding="utf-8")
             changed.append(page)
     return changed

@@ -83,7 +83,7 @@ def measure(
 ) -> None:
     """Measure methods on data sets and update the figures; ``words`` are the arguments of the command."""
     work.mkdir(parents=True, exist_ok=True)
-    figures = {kind: _kept(kind) for kind in TABLES}
+    figures = {kind: _stored_rows(kind) for kind in TABLES}
     words_needed = any(METHODS[name][-1] in "WV" for name in methods or METHODS)
     train = image_paths(data / "ie_tower")[::4] if words_needed else []
     for name in sets or SETS:
@@ -106,8 +106,8 @@ def measure(
             results.write(RESULTS / f"{kind}.json", list(rows.values()), words)
 
 
-def _kept(kind: str) -> dict[str, dict[str, Any]]:
-    """Return the rows of a table by method, in the order of ``TABLES``; None if never measured."""
+def _stored_rows(kind: str) -> dict[str, dict[str, Any]]:
+    """Return the stored rows of a table by method, in the order of ``TABLES``; a figure never measured is None."""
     path = RESULTS / f"{kind}.json"
     rows = json.loads(path.read_text(encoding="utf-8"))["rows"] if path.is_file() else []
     found = {row["method"]: row for row in rows}

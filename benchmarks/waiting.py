@@ -14,7 +14,10 @@ VARIABLES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")  # set how th
 
 
 def compare(name: str, waits: Sequence[str], batch: int, threads: int, rounds: int) -> None:
-    """Print for each setting (VARIABLE=VALUE; empty: the default) the time alone and of each of two trainings."""
+    """Print the time of one training alone, and of each of two at the same time, for each setting in ``waits``.
+
+    A setting is VARIABLE=VALUE; an empty one means the defaults of the runtime.
+    """
     with training_case(name, batch) as case:
         task = {**task_of(case, threads), "runs": "netspec_training", "torch_first": True}
         pairs = {}
@@ -29,10 +32,11 @@ def compare(name: str, waits: Sequence[str], batch: int, threads: int, rounds: i
                 for worker in pair:
                     worker.close()
     for wait in waits:
-        print(f"{name}, {wait or 'as the runtime waits by itself'}:")
-        print(f"  alone: {_told(alone[wait])}; {ratio(alone[wait], alone[waits[0]]):.2f} of the first way's time")
+        print(f"{name}, {wait or 'defaults of the runtime'}:")
+        share = ratio(alone[wait], alone[waits[0]])
+        print(f"  alone: {_times_text(alone[wait])}; {share:.2f} of the time with the first setting")
         print(
-            f"  each of two: {_told(paired[wait])}; {ratio(paired[wait], alone[wait]):.2f} of the time alone",
+            f"  each of two: {_times_text(paired[wait])}; {ratio(paired[wait], alone[wait]):.2f} of the time alone",
             flush=True,
         )
 
@@ -55,5 +59,5 @@ def _mean(passes: Sequence[Pass]) -> float:
     return statistics.mean(clock for clock, _ in passes)
 
 
-def _told(seconds: Sequence[float]) -> str:
+def _times_text(seconds: Sequence[float]) -> str:
     return f"{1e3 * statistics.median(seconds):.0f} ms per iteration, at best {1e3 * min(seconds):.0f}"

@@ -73,7 +73,7 @@ def trained(net: Net, seed: int = 1) -> Net:
 
 def calibrated(net: Net, inputs: Arrays) -> Net:
     """Set the statistics of BatchNorm layers to those of these inputs, so that deep nets do not saturate."""
-    values = net.given(inputs)
+    values = net.input_tensors(inputs)
 
     def visit(step: Step, bottoms: list[torch.Tensor]) -> Any:
         layer = net.layers[step.node]

@@ -116,7 +116,10 @@ def _add_detect(commands: Commands) -> None:
     )
     parser.add_argument("--top-k", type=int, metavar="K", help=f"number of candidates to examine (default: {OF.top_k})")
     parser.add_argument(
-        "--consistency", type=int, metavar="K", help="number of previous frames whose candidates must lead to this one"
+        "--consistency",
+        type=int,
+        metavar="K",
+        help="number of previous frames whose candidates must lead to that of this frame",
     )
     parser.add_argument(
         "--consistency-window",

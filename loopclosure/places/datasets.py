@@ -93,14 +93,17 @@ class PoseLimits:
     @property
     def hard(self) -> tuple[float, float]:
         """The limits, in meters and degrees."""
-        return _given(self.distance_m, MAX_DISTANCE_M), _given(self.angle_deg, MAX_ANGLE_DEG)
+        return _or_default(self.distance_m, MAX_DISTANCE_M), _or_default(self.angle_deg, MAX_ANGLE_DEG)
 
     @property
     def soft(self) -> tuple[float, float] | None:
         """The limits of soft truth, None if there is none. Raises InputError if they are narrower than hard ones."""
         if self.soft_distance_m is None and self.soft_angle_deg is None:
             return None
-        wide_m, wide_deg = _given(self.soft_distance_m, self.hard[0]), _given(self.soft_angle_deg, self.hard[1])
+        wide_m, wide_deg = (
+            _or_default(self.soft_distance_m, self.hard[0]),
+            _or_default(self.soft_angle_deg, self.hard[1]),
+        )
         if wide_m < self.hard[0] or wide_deg < self.hard[1]:
             raise InputError(f"soft truth ({wide_m:g} m, {wide_deg:g} degrees) is narrower than hard truth ({self})")
         return wide_m, wide_deg
@@ -164,8 +167,8 @@ def load_sequence(
     return _checked(data, hard)
 
 
-def _given(value: float | None, otherwise: float) -> float:
-    return otherwise if value is None else value
+def _or_default(value: float | None, default: float) -> float:
+    return default if value is None else value
 
 
 def _pose_notes(sequence: ImageSequence) -> list[str]:

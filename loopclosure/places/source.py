@@ -51,14 +51,14 @@ _KINDS: dict[str, tuple[Sequence[str] | None, Sequence[str] | None]] = {
 }
 EVALUATED = {kind: settings for kind, (settings, _) in _KINDS.items() if settings is not None}
 PAIRED = {kind: settings for kind, (_, settings) in _KINDS.items() if settings is not None}
-# The settings for detect and map, and for close. They take one sequence and find its kind from the files.
+# The settings for detect and map, and for close. These commands take one sequence and detect its kind from the files.
 DETECTED: Kinds = {"": (*FRAMES, *TOPICS)}
 CLOSED: Kinds = {"": (*FRAMES, *POSES, *TOPICS)}
 
 
 @dataclass(frozen=True)
 class Source:
-    """A folder or file. ``kind`` is "" if it is to be found from the files; ``settings`` are not parsed yet."""
+    """A folder or file. ``kind`` is "" if it must be detected from the files; ``settings`` are not parsed yet."""
 
     kind: str
     path: Path
@@ -124,7 +124,8 @@ LAYOUTS = {
 RECORDED = ("bag", "video")  # their frames are extracted first
 POSES_HELP = "camera poses in the format of TUM, KITTI or EuRoC, instead of the sequence's own"
 POSE_FORM_HELP = (
-    f"format of the poses, if not detected from the file: {', '.join((*FORMS, *ORDERS, *DIRECTIONS))}, with commas"
+    f"format of the poses, if not detected from the file: one or more of "
+    f"{', '.join((*FORMS, *ORDERS, *DIRECTIONS))}, separated by commas"
 )
 
 

@@ -75,7 +75,9 @@ def _path(poses: np.ndarray, results: Sequence[LoopResult]) -> Figure:
     positions = poses[:, :3]
     across = np.sort(np.argsort(np.nanmax(positions, axis=0) - np.nanmin(positions, axis=0), kind="stable")[1:])
     places = positions[:, across]
-    ends = np.array([pair for pair in _ends(results) if np.all(np.isfinite(places[list(pair)]))], int).reshape(-1, 2)
+    ends = np.array(
+        [pair for pair in _loops_in_drive(results) if np.all(np.isfinite(places[list(pair)]))], int
+    ).reshape(-1, 2)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6, 4), layout="constrained")
         axis = figure.subplots()
@@ -88,8 +90,8 @@ def _path(poses: np.ndarray, results: Sequence[LoopResult]) -> Figure:
         return figure
 
 
-def _ends(results: Sequence[LoopResult]) -> list[tuple[int, int]]:
-    """Return the loops as pairs of frames of this drive, without loops to frames of an earlier run."""
+def _loops_in_drive(results: Sequence[LoopResult]) -> list[tuple[int, int]]:
+    """Return the loops as pairs of frames (query, match) of this drive. Loops to frames of earlier runs are omitted."""
     first = results[0].query_id if results else 0
     ends = [(r.query_id - first, r.accepted - first) for r in results if r.accepted is not None]
     return [pair for pair in ends if pair[1] >= 0]

@@ -194,7 +194,9 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
         "--engine",
         default=TORCH,
         choices=[*ENGINES, f"{OPENVINO},{BF16}"],
-        help=f"engine that runs the net (default: %(default)s); {OPENVINO},{BF16} computes in bfloat16",
+        metavar="NAME",
+        help=f"engine that runs the net: {', '.join(ENGINES)} or {OPENVINO},{BF16}, which computes in bfloat16 "
+        "(default: %(default)s)",
     )
     parser.add_argument("--precision", choices=PRECISIONS, help=argparse.SUPPRESS)
     parser.add_argument(

@@ -51,7 +51,7 @@ class LmdbFile:
         self._lock = Lock()
         self._file = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         try:
-            self._stamp = self._seen()
+            self._stamp = self._size_and_time()
             self._read_meta()
         except BaseException:
             self.close()
@@ -94,9 +94,9 @@ class LmdbFile:
     @property
     def is_current(self) -> bool:
         """Whether the file has not changed since it was opened."""
-        return self._seen() == self._stamp
+        return self._size_and_time() == self._stamp
 
-    def _seen(self) -> tuple[int, int]:
+    def _size_and_time(self) -> tuple[int, int]:
         state = os.fstat(self._file)
         return state.st_size, state.st_mtime_ns
 

@@ -1,4 +1,4 @@
-"""Making batches in threads, ahead of the net."""
+"""Makes batches in threads, before the net needs them."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 Make = Callable[[int, int], Sequence[T]]
-Made = list[tuple[T | None, BaseException | None]]
+Outcomes = list[tuple[T | None, BaseException | None]]  # of each iteration: its batch, or the exception of ``make``
 
 
 class Feed(Generic[T]):
     """Returns the batches of iterations 0, 1, ... in order; ``workers`` threads make up to ``ahead`` in advance.
 
-    ``make(first, count)`` returns the batches of ``count`` iterations and depends only on their numbers, so batches
-    depend neither on the number of threads nor on timing. No thread runs before the first ``next()``, or if ``ahead``
-    is 0. ``next()`` raises the exception of ``make`` for its iteration. Threads make ``at_once`` iterations at a time,
-    since waking a thread takes longer than making a small batch.
+    ``make(first, count)`` returns the batches of ``count`` iterations. It must depend only on their numbers, so that
+    batches depend neither on the number of threads nor on timing. Threads start at the first ``next()``; with ``ahead``
+    0 there are none. ``next()`` raises the exception that ``make`` raised for its iteration. Threads make the batches
+    of ``at_once`` iterations at a time, since waking a thread takes longer than making a small batch.
     """
 
     def __init__(self, make: Make[T], ahead: int, workers: int, at_once: int = 1) -> None:
@@ -27,7 +27,7 @@ class Feed(Generic[T]):
         self._ahead = ahead
         self._workers, self._at_once = workers, at_once
         self._pool: ThreadPoolExecutor | None = None
-        self._pending: deque[Future[Made[T]]] = deque()
+        self._pending: deque[Future[Outcomes[T]]] = deque()
         self._made: deque[tuple[T | None, BaseException | None]] = deque()
         self.position = 0  #: the iteration of the next batch
         self.waited = 0.0  #: total seconds in calls of ``next``
@@ -47,8 +47,11 @@ class Feed(Generic[T]):
             return self._make(position, 1)[0]
         if self._pool is None:
             self._pool = ThreadPoolExecutor(self._workers, thread_name_prefix="prefetch")
-        while (coming := len(self._made) + self._at_once * len(self._pending)) <= self._ahead:
-            self._pending.append(self._pool.submit(_made, self._make, position + coming, self._at_once))
+        while True:
+            requested = len(self._made) + self._at_once * len(self._pending)
+            if requested > self._ahead:
+                break
+            self._pending.append(self._pool.submit(_try_make, self._make, position + requested, self._at_once))
         if not self._made:
             self._made.extend(self._pending.popleft().result())
         made, fault = self._made.popleft()
@@ -71,11 +74,11 @@ class Feed(Generic[T]):
             self._pool = None
 
 
-def _made(make: Make[T], first: int, count: int) -> Made[T]:
-    """Return the batches of iterations, or their exceptions; if making all at once fails, make them one by one."""
+def _try_make(make: Make[T], first: int, count: int) -> Outcomes[T]:
+    """Return the batches of iterations, or their exceptions. If making all at once fails, make them one by one."""
     try:
-        return [(made, None) for made in make(first, count)]
+        return [(batch, None) for batch in make(first, count)]
     except Exception as fault:
         if count == 1:
             return [(None, fault)]
-    return [each for i in range(first, first + count) for each in _made(make, i, 1)]
+    return [outcome for i in range(first, first + count) for outcome in _try_make(make, i, 1)]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from netspec.layers.contract.base import Layer
-from netspec.proto.schema import TRAIN, given, value
+from netspec.proto.schema import TRAIN, given_fields, value
 
 OTHERS = "several forks define this layer type, and the net does not show which one is meant; it is computed "
 
@@ -52,7 +52,7 @@ class Signature:
 
 def _has(layer: Layer, field: str) -> bool:
     outer, _, inner = field.partition(".")
-    return outer in given(layer.param) and (not inner or inner in given(value(layer.param, outer)))
+    return outer in given_fields(layer.param) and (not inner or inner in given_fields(value(layer.param, outer)))
 
 
 def _has_no_outside_weights(layer: Layer) -> bool:

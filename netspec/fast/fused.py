@@ -40,7 +40,7 @@ def convolution(
     """Return a convolution of maps (N, C, H, W) by fixed weights (num_output, C / group, kernel_h, kernel_w)."""
     geometry = [list(sliding.pad), list(sliding.stride), list(sliding.dilation), group]
     weight = _laid_out(_ops()._reorder_convolution_weight, weight, geometry, shape, how)
-    bias = _kept(bias, how)
+    bias = _bias_copy(bias, how)
     call, (operation, rest) = _ops()._convolution_pointwise.default, _within(how.activation)
     arguments = (*geometry, *operation, "")
 
@@ -60,7 +60,7 @@ def deconvolution(
     geometry = [list(sliding.pad), [0, 0], list(sliding.stride), list(sliding.dilation), 1]
     call = _ops()._convolution_transpose_pointwise.default
     weight = _laid_out(_ops()._reorder_convolution_transpose_weight, weight, geometry, shape, how)
-    bias = _kept(bias, how)
+    bias = _bias_copy(bias, how)
 
     def kernel(maps: torch.Tensor) -> torch.Tensor:
         return call(maps.contiguous(memory_format=torch.channels_last), weight, bias, *geometry, "none", [], "")
@@ -93,7 +93,7 @@ def spread_by_channel(
     return kernel
 
 
-def _kept(bias: torch.Tensor | None, how: Inference) -> torch.Tensor | None:
+def _bias_copy(bias: torch.Tensor | None, how: Inference) -> torch.Tensor | None:
     return None if bias is None else how.memo("bias", values_of(bias).clone)
 
 
@@ -117,7 +117,7 @@ def product(weight: torch.Tensor, bias: torch.Tensor | None, how: Inference) -> 
     """Return the product of vectors (M, K) with fixed weights (num_output, K)."""
     name = f"rows {tuple(weight.shape)} {weight.stride()}"  # layers may share a weight, one of them transposed
     weight = how.memo(name, lambda: _ops()._reorder_linear_weight(values_of(weight).contiguous()))
-    bias = _kept(bias, how)
+    bias = _bias_copy(bias, how)
     call, (operation, rest) = _ops()._linear_pointwise.default, _within(how.activation)
     return with_activation(lambda vectors: call(vectors, weight, bias, *operation, ""), rest)
 

@@ -165,7 +165,7 @@ class Net(torch.nn.Module):
     def forward_loss(self, /, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""
         with self._passes.lock:
-            given, kept = self.given(inputs), self._kept()
+            given, kept = self.input_tensors(inputs), self._values_to_keep()
             loss, values = next(found for runner in self.runners if (found := runner.run(given, kept)) is not None)
             blobs = self.plan.blobs
             self._passes.of_thread.blobs = self._passes.last = {blobs[v]: values[v] for v in sorted(kept)}
@@ -207,7 +207,7 @@ class Net(torch.nn.Module):
             return "without netspec/fast"
         return self.options.speed.trainer(self.eager, self.largest_trained)
 
-    def given(self, inputs: Mapping[str, Array]) -> dict[int, torch.Tensor]:
+    def input_tensors(self, inputs: Mapping[str, Array]) -> dict[int, torch.Tensor]:
         """Return the inputs as tensors, by value number. Raises SpecError for a missing or an unknown one."""
         unknown = sorted(set(inputs) - set(self.inputs))
         missing = [name for name in self.inputs if name not in inputs]
@@ -229,7 +229,7 @@ class Net(torch.nn.Module):
             raise SpecError(f"{message}; {advice}" if advice else message, Where(self.plan.source.file))
         return torch.as_tensor(array).to(self.device, dtype)
 
-    def _kept(self) -> frozenset[int]:
+    def _values_to_keep(self) -> frozenset[int]:
         """Return the numbers of the values to keep: the outputs, and what ``keep`` says."""
         keep = self.keep if isinstance(self.keep, str) else tuple(self.keep)
         if keep not in self._kept_values:

@@ -174,7 +174,7 @@ def value(message: Message, name: str) -> Any:
     return _field(message, name).get(message)
 
 
-def given(message: Message) -> set[str]:
+def given_fields(message: Message) -> set[str]:
     """Return the names of the fields that were given, including those of active dialects."""
     return {field.name for field, _ in message.ListFields()}
 

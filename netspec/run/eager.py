@@ -56,7 +56,7 @@ class Eager:
             if len(part.members) == 1:
                 steps += self._alone(part.first, kept)
                 continue
-            ends = self._ends(part.first, part.last, kept)
+            ends = self._ending_values(part.first, part.last, kept)
             steps.append(Step(part.last, part.run, nodes[part.first].bottoms, nodes[part.last].tops, ends=ends))
         return steps
 
@@ -67,7 +67,7 @@ class Eager:
     def _alone(self, i: int, kept: frozenset[int] = frozenset()) -> list[Step]:
         """Return the step that runs layer ``i`` alone. An input needs none, because its values are given."""
         node, layer = self.plan.nodes[i], self.layers[i]
-        losses, ends = self._losses[i], self._ends(i, i, kept)
+        losses, ends = self._losses[i], self._ending_values(i, i, kept)
         if not layer.is_input:
             return [Step(i, self._as_asked(i), node.bottoms, node.tops, losses, ends)]
         return [Step(i, lambda *tops: tops, node.tops, node.tops, losses, ends)] if losses or ends else []
@@ -86,7 +86,7 @@ class Eager:
 
         return run
 
-    def _ends(self, first: int, last: int, kept: frozenset[int]) -> tuple[int, ...]:
+    def _ending_values(self, first: int, last: int, kept: frozenset[int]) -> tuple[int, ...]:
         return tuple(v for i in range(first, last + 1) for v in self._last_uses[i] if v not in kept)
 
     def _must_run_alone(self) -> list[bool]:

@@ -210,15 +210,19 @@ class _Version(argparse.Action):
 
 
 class _Switch(argparse.Action):
-    """A Boolean flag: ``--flag`` and ``--noflag``; ``--no-flag`` and ``--flag``."""
+    """A Boolean flag ``--flag`` with the opposite ``--noflag``; the opposite of ``--no-flag`` is ``--flag``.
+
+    A flag of one letter, such as ``-v``, has no opposite.
+    """
 
     def __init__(
         self, option_strings: Sequence[str], dest: str, default: bool = False, help: str | None = None
     ) -> None:
         (self.on,) = option_strings
-        self.name = self.on[2:]
-        self.off = f"--{self.name[3:]}" if self.name.startswith("no-") else f"--no{self.name}"
-        super().__init__([self.on, self.off], dest, nargs=0, default=default, help=help)
+        self.name, self.off = self.on.lstrip("-"), self.on
+        if self.on.startswith("--"):
+            self.off = f"--{self.name[3:]}" if self.name.startswith("no-") else f"--no{self.name}"
+        super().__init__(list(dict.fromkeys([self.on, self.off])), dest, nargs=0, default=default, help=help)
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
         setattr(namespace, self.dest, option_string == self.on)

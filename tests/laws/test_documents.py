@@ -155,7 +155,7 @@ def test_links_lead_to_existing_files(document: str) -> None:
 @pytest.mark.parametrize("page", [path.relative_to(ROOT).as_posix() for path in benchmarks.pages.PAGES])
 def test_numbers_equal_their_result_files(page: str) -> None:
     text = (ROOT / page).read_text()
-    assert benchmarks.pages.made(text) == text, "tools/bench pages writes them"
+    assert benchmarks.pages.updated(text) == text, "tools/bench pages writes them"
 
 
 def test_the_counts_of_repeated_results_are_right() -> None:
@@ -186,7 +186,7 @@ ROWS = [
 def test_markers_become_numbers_or_are_refused(marker: str, shown: str, tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text(json.dumps({"rows": ROWS}))
     try:
-        text = benchmarks.pages.made(f"<!-- {marker} -->old<!-- end -->", tmp_path)
+        text = benchmarks.pages.updated(f"<!-- {marker} -->old<!-- end -->", tmp_path)
     except SpecError as fault:
         text = str(fault)
     assert shown in re.sub(r"\|( --- \|)+\n", "", text)

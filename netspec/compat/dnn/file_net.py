@@ -44,7 +44,9 @@ class FileNet:
             with as_dnn_error("readNetFromCaffe"):
                 _ = self.net
 
-    def asked(self, func: str, arguments: Sequence[Any], named: Mapping[str, Any]) -> tuple[CaffeNet, list[Entry]]:
+    def for_arguments(
+        self, func: str, arguments: Sequence[Any], named: Mapping[str, Any]
+    ) -> tuple[CaffeNet, list[Entry]]:
         """Return the net for the shapes in the arguments of a method, and the layer in them, or all layers."""
         shapes = named.get("netInputShapes", named.get("netInputShape", arguments[-1] if arguments else None))
         layer = named.get("layerId", arguments[0] if len(arguments) > 1 else None)

@@ -126,12 +126,12 @@ class Net:
 
     def getFLOPS(self, *arguments: Any, **named: Any) -> int:
         """Return the operations of a pass: ``getFLOPS(shapes)``, or of one layer: ``getFLOPS(number, shapes)``."""
-        net, entries = self._caffe.asked("getFLOPS", arguments, named)
+        net, entries = self._caffe.for_arguments("getFLOPS", arguments, named)
         return sum(self._caffe.operations(net, entry) for entry in entries)
 
     def getMemoryConsumption(self, *arguments: Any, **named: Any) -> tuple[int, int]:
         """Return the bytes of weights and of tops, of all layers or of one; arguments as for :meth:`getFLOPS`."""
-        net, entries = self._caffe.asked("getMemoryConsumption", arguments, named)
+        net, entries = self._caffe.for_arguments("getMemoryConsumption", arguments, named)
         owners = [entry for entry in entries if entry.name != INPUT and entry.top <= 0]
         weights = sum(blob.numel() for entry in owners for blob in self._caffe.layer(net, entry).blobs)
         tops = [shape for entry in entries for shape in self._caffe.shapes(net, entry)[1]]
@@ -297,7 +297,7 @@ class Net:
     def _walk(self, end: int, seconds: dict[int, float] | None = None) -> dict[int, torch.Tensor]:
         """Run the nodes up to ``end`` one by one; return all values, and store the time of each in ``seconds``."""
         net = self._caffe.net
-        values = net.given(self._caffe.values)
+        values = net.input_tensors(self._caffe.values)
 
         def visit(step: Step, bottoms: list[torch.Tensor]) -> Any:
             begin = time.perf_counter()

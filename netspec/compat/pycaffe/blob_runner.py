@@ -52,8 +52,8 @@ class BlobRunner:
             step.set_up()
         self._in_one_thread = any(step.has_kernels for step in self.steps)
         self._prepares = self._can_prepare()
-        self._given, self._results = self._ends()
-        self._final_values = frozenset(v for v, *_ in (*self._given, *self._results))
+        self._inputs, self._results = self._inputs_and_results()
+        self._final_values = frozenset(v for v, *_ in (*self._inputs, *self._results))
         self._hand_on = not all(fresh for *_, fresh in self._results)
         self._no_loss = torch.zeros((), device=net.device)
 
@@ -82,7 +82,7 @@ class BlobRunner:
         made = PythonStep if isinstance(layer, Python) else LayerStep
         return made(self.net, i, self.blobs, bottoms, tops)
 
-    def _ends(self) -> tuple[list[tuple[int, int]], list[tuple[int, Blob, bool, bool]]]:
+    def _inputs_and_results(self) -> tuple[list[tuple[int, int]], list[tuple[int, Blob, bool, bool]]]:
         """Return the inputs as pairs of value and blob, and the last value of every other blob.
 
         The latter also say whether the blob shares memory with another, and whether the value has memory of its own.
@@ -122,7 +122,7 @@ class BlobRunner:
 
     def _leave_views(self) -> None:
         """Leave the present memory to the views of it. Later passes use other memory."""
-        written = {id(self.blobs[b].data_memory) for _, b in self._given}
+        written = {id(self.blobs[b].data_memory) for _, b in self._inputs}
         written |= {id(self.blobs[self.names.index(name)].diff_memory) for name in self.net.outputs}
         memories = {id(each): each for blob in self.blobs for each in (blob.data_memory, blob.diff_memory)}
         fresh = {key: memory for key, memory in memories.items() if key not in written}
@@ -187,7 +187,7 @@ class BlobRunner:
     def _forward_prepared(self) -> torch.Tensor:
         """Run the whole net with prepared kernels (netspec/fast/prepared.py), and put the results into the blobs."""
         assert self.net.prepared is not None
-        given = {v: self.blobs[b].data_memory.tensor(self.blobs[b].shape) for v, b in self._given}
+        given = {v: self.blobs[b].data_memory.tensor(self.blobs[b].shape) for v, b in self._inputs}
         found = self.net.prepared.run(given, self._final_values)
         assert found is not None, "a pass of pycaffe records no gradients"
         loss, values = found

@@ -112,7 +112,7 @@ class file:
             raise AttributeError(name)
         return getattr(self.buffer, name)
 
-    def _given(self, data):
+    def _as_text_or_bytes(self, data):
         """Return data as text if the whole file is text, or else as bytes."""
         if self._form is None:
             head = data
@@ -126,15 +126,15 @@ class file:
 
     def read(self, size=-1):
         """Return the rest of the file, or at most ``size`` bytes of it."""
-        return self._given(self.buffer.read(-1 if size is None else size))
+        return self._as_text_or_bytes(self.buffer.read(-1 if size is None else size))
 
     def readline(self, size=-1):
         """Return the next line with its end."""
-        return self._given(self.buffer.readline(size))
+        return self._as_text_or_bytes(self.buffer.readline(size))
 
     def readlines(self, hint=-1):
         """Return the remaining lines."""
-        return [self._given(line) for line in self.buffer.readlines(hint)]
+        return [self._as_text_or_bytes(line) for line in self.buffer.readlines(hint)]
 
     def write(self, data):
         """Write text or bytes."""
@@ -153,7 +153,7 @@ class file:
     xreadlines = __iter__
 
     def __next__(self):
-        return self._given(next(self.buffer))
+        return self._as_text_or_bytes(next(self.buffer))
 
     next = __next__
 
@@ -175,7 +175,7 @@ class StringIO(file):
 
     def getvalue(self):
         """Return the whole content."""
-        return self._given(self.buffer.getvalue())
+        return self._as_text_or_bytes(self.buffer.getvalue())
 
 
 def open(name, mode="r", buffering=-1, *arguments, **named):

@@ -10,7 +10,7 @@ import torch
 from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
-from netspec.proto.schema import given, value
+from netspec.proto.schema import given_fields, value
 
 SSD, TSN, HAPPYNEAR = "ssd", "tsn", "happynear"
 HAPPYNEARS_EPS = 1e-6  # added to the sum
@@ -58,7 +58,7 @@ class Normalize(Layer):
     tops = (1, 2)
 
     def setup(self) -> None:
-        fields, shape = given(self.param), self.bottom_shapes[0]
+        fields, shape = given_fields(self.param), self.bottom_shapes[0]
         if len(shape) < 2:
             raise self.error(f"found a bottom of shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
         self.fork = fork_of(self)

@@ -55,7 +55,7 @@ RATE_FIELDS = frozenset({"stagelr", "stageiter", "min_lr", *(name for ramp in RA
 
 def policy_fault(param: Any) -> str:
     """Return what lr_policy "multifixed" lacks, "" for nothing."""
-    rates, ends = (len(_given(param, name, ())) for name in ("stagelr", "stageiter"))
+    rates, ends = (len(_added_value(param, name, ())) for name in ("stagelr", "stageiter"))
     if param.lr_policy != "multifixed" or rates == ends > 0:
         return ""
     return f'lr_policy "multifixed" needs as many stagelr as stageiter, found {rates} and {ends}'
@@ -63,23 +63,24 @@ def policy_fault(param: Any) -> str:
 
 def learning_rate(param: Any, iteration: int, caffes: Callable[[float], Any]) -> Any:
     """Return the rate of an iteration: of a ramp, at the start, or of the policy, at least min_lr."""
-    least = _given(param, "min_lr")
+    least = _added_value(param, "min_lr")
     return max(_above(param, iteration, least, caffes), least) if least else _above(param, iteration, 0.0, caffes)
 
 
 def _above(param: Any, iteration: int, least: float, caffes: Callable[[float], Any]) -> Any:
     for length, start, power in RAMPS:
-        if iteration < _given(param, length):
-            first = _given(param, start)
-            return first + (param.base_lr - first) * (iteration / _given(param, length)) ** power
+        if iteration < _added_value(param, length):
+            first = _added_value(param, start)
+            return first + (param.base_lr - first) * (iteration / _added_value(param, length)) ** power
     if param.lr_policy == "multifixed":
-        rates, ends = _given(param, "stagelr"), _given(param, "stageiter")
+        rates, ends = _added_value(param, "stagelr"), _added_value(param, "stageiter")
         return rates[min(bisect.bisect_left(ends, iteration), len(ends) - 1)]
     if param.lr_policy == "poly" and least:
         return caffes(param.base_lr - least) + least
     return caffes(param.base_lr)
 
 
-def _given(param: Any, name: str, otherwise: Any = 0) -> Any:
+def _added_value(param: Any, name: str, default: Any = 0) -> Any:
+    """Return the value of a field that the dialect added; ``default`` if the dialect is not active."""
     field = added_fields.get(param.DESCRIPTOR.full_name, {}).get(name)
-    return otherwise if field is None else field.get(param)
+    return default if field is None else field.get(param)

@@ -8,7 +8,7 @@ import torch
 
 from netspec.dialects.rcnn.regions import RegionPooling
 from netspec.layers.contract.base import Shape
-from netspec.proto.schema import given, has, value
+from netspec.proto.schema import given_fields, has, value
 
 CASCADE, ALIGN = "roi_pooling_param", "roi_align_param"
 
@@ -32,7 +32,7 @@ class ROIAlign(RegionPooling):
     not_exported = "PyTorch has no reading of regions; torchvision's roi_align is near to it"
 
     def setup(self) -> None:
-        group = CASCADE if CASCADE in given(self.param) else ALIGN
+        group = CASCADE if CASCADE in given_fields(self.param) else ALIGN
         param = value(self.param, group)
         for name in ("pooled_h", "pooled_w"):
             if getattr(param, name) < 1:

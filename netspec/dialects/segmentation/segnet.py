@@ -13,7 +13,7 @@ from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.normalization import as_before
-from netspec.proto.schema import TRAIN, given, value
+from netspec.proto.schema import TRAIN, given_fields, value
 
 INFERENCE = 1  # BNParameter.BNMode
 SEGNET_EPS = 1e-9  # added to the variance by SegNet's BN
@@ -54,7 +54,7 @@ class Upsample(Layer):
 
     def setup(self) -> None:
         param = value(self.param, "upsample_param")
-        fields = given(param)
+        fields = given_fields(param)
         masked = len(self.bottom_shapes) == 2
         if not masked and fields - {"scale"}:
             extra = min(fields - {"scale"})
@@ -119,7 +119,7 @@ class BN(NotLearned):
         param, shape = value(self.param, "bn_param"), self.bottom_shapes[0]
         if not 2 <= len(shape) <= 4:
             raise self.error(f"found a bottom of shape {shape}, expected (N, C, H, W), 2 to 4 axes", "bottom")
-        fields = given(param) - {"engine"}
+        fields = given_fields(param) - {"engine"}
         segnets = fields & {"scale_filler", "shift_filler", "bn_mode"}
         if segnets and fields - segnets:
             other = min(fields - segnets)

@@ -113,11 +113,11 @@ class Augmenter:
         if transform.mean_file:
             self._mean = read_mean(transform.mean_file, at("transform_param", "mean_file"))
 
-        def given(name: str) -> Any:
+        def value_if_given(name: str) -> Any:
             return value(transform, name) if has(transform, name) else None
 
-        self._distort, self._expand = given("distort_param"), given("expand_param")
-        self.resize, self._emit = resize, given("emit_constraint")
+        self._distort, self._expand = value_if_given("distort_param"), value_if_given("expand_param")
+        self.resize, self._emit = resize, value_if_given("emit_constraint")
 
     def __call__(self, image: Array, boxes: Array, draw: Random) -> tuple[Array, Array]:
         """Return an image as float32 (C, H', W') and its boxes; all random numbers come from ``draw``."""

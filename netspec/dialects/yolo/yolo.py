@@ -120,7 +120,7 @@ class _YoloOutput(Layer):
         rows = []
         for image in range(len(bottoms[0])):
             found = [self._detected(i, self._cells(bottom[image])) for i, bottom in enumerate(bottoms)]
-            rows.append(self._kept(image, np.concatenate(found), p.nms_threshold))
+            rows.append(self._suppressed(image, np.concatenate(found), p.nms_threshold))
         top = detections(rows, bottoms[0])
         self.top_shapes = [tuple(top.shape)]
         return top
@@ -142,16 +142,19 @@ class _YoloOutput(Layer):
         return (np.stack([x, y], -1)[:, :, None] + sigmoid(cells[..., :2])) / np.array([width, height], np.float32)
 
     @staticmethod
-    def _kept(image: int, found: Array, threshold: float) -> Array:
-        """Return the rows of SSD's DetectionOutput (k, 7), the most confident first."""
+    def _suppressed(image: int, found: Array, threshold: float) -> Array:
+        """Return the detections after non-maximum suppression, as rows of SSD's DetectionOutput (k, 7).
+
+        The most confident comes first.
+        """
         found = found[np.argsort(-found[:, 1], kind="stable")]
         corners = around(found[:, 2:4], found[:, 4:6])
         kept: list[int] = []
-        gone = np.zeros(len(found), bool)
+        removed = np.zeros(len(found), bool)
         for i in range(len(found)):
-            if not gone[i]:
+            if not removed[i]:
                 kept.append(i)
-                gone |= overlaps(corners[i], corners) >= np.float32(threshold)
+                removed |= overlaps(corners[i], corners) >= np.float32(threshold)
         numbers = np.full((len(kept), 1), image)
         return np.concatenate([numbers, found[kept, :2] + [1, 0], corners[kept]], axis=1, dtype=np.float32)
 

@@ -42,9 +42,9 @@ class Model:
 
     def __init__(self, choice: Choice, origin: Origin | None, export: Export) -> None:
         self.choice = choice
-        self._kept: tempfile.TemporaryDirectory[str] | None = None  # if it is not in the cache
-        self.folder = self._made(origin, export)
-        self._runner, precision = self._opened(choice.precision)
+        self._temporary: tempfile.TemporaryDirectory[str] | None = None  # if it is not in the cache
+        self.folder = self._make_folder(origin, export)
+        self._runner, precision = self._open(choice.precision)
         self._difference_shown = precision == FP32
 
     def run(self, inputs: Arrays) -> dict[str, np.ndarray]:
@@ -58,7 +58,8 @@ class Model:
             self._show_difference(inputs, found)
         return found
 
-    def _made(self, origin: Origin | None, export: Export) -> Path:
+    def _make_folder(self, origin: Origin | None, export: Export) -> Path:
+        """Return the folder with the exported model: from the cache if it is there, otherwise a new one."""
         runner = RUNNERS[self.choice.engine]
         given = {"engine": self.choice.engine, **runner.identity()}
 
@@ -82,12 +83,12 @@ class Model:
                 if not made:
                     _warn_again(folder / WARNINGS)
                 return folder
-        self._kept = tempfile.TemporaryDirectory(prefix="netspec-", ignore_cleanup_errors=True)
-        folder = Path(self._kept.name)
+        self._temporary = tempfile.TemporaryDirectory(prefix="netspec-", ignore_cleanup_errors=True)
+        folder = Path(self._temporary.name)
         make(folder)
         return folder
 
-    def _opened(self, precision: str) -> tuple[Runner, str]:
+    def _open(self, precision: str) -> tuple[Runner, str]:
         try:
             return open_runner(self.choice.engine, self.folder, precision), precision
         except Unable as fault:

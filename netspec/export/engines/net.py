@@ -99,7 +99,7 @@ class Engine:
         self._built = {blob: net.shapes[blob] for blob in self._ends.values()}
         self._model: Model | None = None
         self._opened_for: tuple[str, ...] = ()  # the blobs of the model
-        self._loaded = self._exported = self._seen()  # the state of the learnable blobs at that time
+        self._loaded = self._exported = self._blob_state()  # the state of the learnable blobs at that time
         self._unable, self._warned = False, False
         self._fits: tuple[dict[int, Shape], dict[int, Shape]] = {}, {}  # shapes of inputs and of all values
 
@@ -146,7 +146,7 @@ class Engine:
             self._fits = given, fitted(self._plan, self._layers, given)[1]
         return self._fits[1]
 
-    def _seen(self) -> Seen:
+    def _blob_state(self) -> Seen:
         return Seen(self._blobs(), values=True)
 
     def _current(self, blobs: tuple[str, ...]) -> Model:
@@ -155,7 +155,7 @@ class Engine:
             computed, as_loaded = [blob for blob in blobs if blob not in self._built], self._loaded.are(self._blobs())
             origin = self._origin(blobs) if as_loaded else None
             self._model = Model(self._choice, origin, lambda path: self._write(path, computed))
-            self._opened_for, self._exported = blobs, self._seen()  # after the export, which hands out aliases
+            self._opened_for, self._exported = blobs, self._blob_state()  # after the export, which hands out aliases
             if as_loaded:
                 self._loaded = self._exported
         return self._model

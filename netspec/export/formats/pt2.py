@@ -41,7 +41,7 @@ def export_pt2(net: Net, path: str | Path) -> list[str]:
     The sizes are dynamic as in the exported source if torch.export supports it, otherwise only the batch, or none.
     Raises SpecError if torch.export cannot export the net, or if the file cannot be written.
     """
-    module, shapes = _made(net)
+    module, shapes = _module_and_shapes(net)
     inputs = [v for node, layer in zip(net.plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops]
     notes = [*shapes.fixed, *layer_notes(net.layers)]
     every = [free.name for free in shapes.free if not free.counted]
@@ -73,10 +73,10 @@ def export_pt2(net: Net, path: str | Path) -> list[str]:
 
 def torch_module(net: Net) -> nn.Module:
     """Return a module for inference that computes the same as the exported source, with its weights."""
-    return _made(net)[0]
+    return _module_and_shapes(net)[0]
 
 
-def _made(net: Net) -> tuple[nn.Module, NetShapes]:
+def _module_and_shapes(net: Net) -> tuple[nn.Module, NetShapes]:
     definition, shapes = settled(net, lambda shapes: write_definition(net, shapes))
     return _Defined(definition, input_shapes(net, shapes)).eval(), shapes
 

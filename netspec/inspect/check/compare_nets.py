@@ -21,7 +21,7 @@ Key = tuple[str, int]  # the name of a layer, and its index among layers with th
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _PlannedNet:
     """A net in one NetState."""
 
     plan: Plan
@@ -45,7 +45,7 @@ def compare_in_state(first: tuple[NetParameter, SourceMap], second: tuple[NetPar
     """Yield the differences between two nets, each filtered by its ``state``."""
     (net, source), (other_net, other_source) = second, first
     yield from differences(other_net, net, source.net, other_source.net, _NOT_THE_NET)
-    old, new = (_seen(*each) for each in (first, second))
+    old, new = (_planned(*each) for each in (first, second))
     names = _matched(old, new)
     for key, i in old.keys.items():
         if key not in names:
@@ -60,13 +60,13 @@ def compare_in_state(first: tuple[NetParameter, SourceMap], second: tuple[NetPar
             yield Difference(where, "is only here, not in the first net")
 
 
-def _seen(net: NetParameter, source: SourceMap) -> _Seen:
+def _planned(net: NetParameter, source: SourceMap) -> _PlannedNet:
     with log.silent():
         filtered, placed = filter_net(net, source)
     plan = make_plan(filtered, placed.reporting_to(lambda fault: None))
     keys = _keys(node.name for node in plan.nodes)
     makers = {v: (key, j) for key, node in zip(keys, plan.nodes, strict=True) for j, v in enumerate(node.tops)}
-    return _Seen(plan, {key: i for i, key in enumerate(keys)}, makers)
+    return _PlannedNet(plan, {key: i for i, key in enumerate(keys)}, makers)
 
 
 def _keys(names: Iterable[str]) -> list[Key]:
@@ -78,7 +78,7 @@ def _keys(names: Iterable[str]) -> list[Key]:
     return keys
 
 
-def _matched(old: _Seen, new: _Seen) -> dict[Key, Key]:
+def _matched(old: _PlannedNet, new: _PlannedNet) -> dict[Key, Key]:
     """Match the layers of the second net to those of the first, by name, or by equal settings, in order."""
     names = {key: key for key in old.keys if key in new.keys}
     left = [key for key in new.keys if key not in names]
@@ -93,13 +93,13 @@ def _matched(old: _Seen, new: _Seen) -> dict[Key, Key]:
     return names
 
 
-def _alike(old: _Seen, i: int, new: _Seen, j: int) -> bool:
+def _alike(old: _PlannedNet, i: int, new: _PlannedNet, j: int) -> bool:
     one, other = old.plan.net.layer[i], new.plan.net.layer[j]
     place = old.plan.source.layers[i]
     return one.type == other.type and not any(differences(one, other, place, place, _WIRING))
 
 
-def _layers(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
+def _layers(old: _PlannedNet, new: _PlannedNet, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
     """Yield the differences between two matched layers."""
     one, other = old.plan.net.layer[i], new.plan.net.layer[j]
     there, here = old.plan.source.layers[i], new.plan.source.layers[j]
@@ -132,7 +132,7 @@ def _own(old: Node, new: Node, one: Any, other: Any, here: Any, there: Any) -> D
         )
 
 
-def _reads(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
+def _reads(old: _PlannedNet, new: _PlannedNet, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
     """Yield the bottoms that now come from a different layer or top."""
     before, after = old.plan.nodes[i], new.plan.nodes[j]
     there, here = old.plan.source.layers[i], new.plan.source.layers[j]
@@ -148,7 +148,7 @@ def _reads(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> 
             yield Difference(here.find("bottom", k), message, there.find("bottom", k))
 
 
-def _maker_text(seen: _Seen, maker: tuple[Key, int] | None) -> str:
+def _maker_text(seen: _PlannedNet, maker: tuple[Key, int] | None) -> str:
     if maker is None:
         return "a blob that no layer makes"
     (name, _), top = maker
@@ -156,7 +156,7 @@ def _maker_text(seen: _Seen, maker: tuple[Key, int] | None) -> str:
     return f'"{blob}" of layer "{name}"'
 
 
-def _params(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
+def _params(old: _PlannedNet, new: _PlannedNet, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
     """Yield changed multipliers, and parameters that are shared with different layers."""
     one, other = old.plan.net.layer[i], new.plan.net.layer[j]
     there, here = old.plan.source.layers[i], new.plan.source.layers[j]
@@ -171,7 +171,7 @@ def _params(old: _Seen, new: _Seen, i: int, j: int, names: Mapping[Key, Key]) ->
             yield Difference(places[0].where, message, places[1].where)
 
 
-def _owner(seen: _Seen, i: int, k: int) -> tuple[Key, int] | None:
+def _owner(seen: _PlannedNet, i: int, k: int) -> tuple[Key, int] | None:
     params = seen.plan.nodes[i].params
     owner = params[k].owner if k < len(params) else None
     if owner is None:

@@ -79,7 +79,12 @@ def _pass(net: Net, forward: list[float], backward: list[float]) -> float:
     """Run each layer forward, then each backward; add the seconds; return the loss. The inputs are zeros."""
     given = {name: torch.zeros(net.shapes[name], device=net.device) for name in net.inputs}
     loss = timed(
-        net.eager.one_by_one(), net.given(given), net.options.exact, net.backward_plan.bottoms, forward, backward
+        net.eager.one_by_one(),
+        net.input_tensors(given),
+        net.options.exact,
+        net.backward_plan.bottoms,
+        forward,
+        backward,
     )
     net.zero_grad()
     return loss

@@ -129,7 +129,7 @@ class Diagram:
 
 
 @dataclass
-class _Seen:
+class _NetInPhase:
     """A net in one phase. Layer ``i`` of the plan is layer ``numbers[i]`` of the file."""
 
     phase: str
@@ -147,13 +147,13 @@ def diagram_of(
     with log.silent():
         source = source.reporting_to(faults.append)
         seen = [
-            _look(with_state(net, phase, options.level, options.stages), source, PHASE_NAMES[phase], options)
+            _net_in_phase(with_state(net, phase, options.level, options.stages), source, PHASE_NAMES[phase], options)
             for phase in phases
         ]
     return _merged(net, source, seen, tuple({str(fault): fault for fault in faults}.values()))
 
 
-def _look(net: NetParameter, source: SourceMap, phase: str, options: BuildOptions) -> _Seen:
+def _net_in_phase(net: NetParameter, source: SourceMap, phase: str, options: BuildOptions) -> _NetInPhase:
     """Filter, plan and build a net in its state."""
     numbered = source.with_layers(Place(Where(str(k))) for k in range(len(net.layer)))
     filtered, numbers = filter_net(net, numbered)
@@ -173,10 +173,12 @@ def _look(net: NetParameter, source: SourceMap, phase: str, options: BuildOption
     for layer in built:
         if waiting.get(layer.param.name):  # the others are Split layers
             layers[waiting[layer.param.name].pop(0)] = layer
-    return _Seen(phase, plan, numbers, layers)
+    return _NetInPhase(phase, plan, numbers, layers)
 
 
-def _merged(net: NetParameter, source: SourceMap, seen: Sequence[_Seen], faults: tuple[SpecError, ...]) -> Diagram:
+def _merged(
+    net: NetParameter, source: SourceMap, seen: Sequence[_NetInPhase], faults: tuple[SpecError, ...]
+) -> Diagram:
     """Return one diagram of all phases."""
     phases_of: dict[int, list[str]] = {}
     boxed: set[int] = set()  # layers with a separate box in some phase
@@ -247,7 +249,7 @@ def _alone(plan: Plan) -> list[bool]:
     return alone
 
 
-def _with_costs(box: Box, numbers: Sequence[int], seen: Sequence[_Seen], tops: int) -> Box:
+def _with_costs(box: Box, numbers: Sequence[int], seen: Sequence[_NetInPhase], tops: int) -> Box:
     """Return the box with shapes, weights and work. If phases differ, the work is that of the first."""
     shapes: list[list[Shape]] = [[] for _ in range(tops)]
     work, weights, owner = 0, 0, ""

@@ -147,6 +147,19 @@ def test_commands_in_groups_have_their_own_options(capsys: pytest.CaptureFixture
     assert capsys.readouterr().err == "program look maps: -vmodule is a flag of Caffe or glog that has no effect here\n"
 
 
+def test_a_flag_of_one_letter_has_no_opposite(capsys: pytest.CaptureFixture[str]) -> None:
+    parser = Parser("program")
+    added = Commands(parser).add_parser("convert", help="a command")
+    found: list[argparse.Namespace] = []
+    added.set_defaults(function=found.append)
+    added.add_argument("-m", action="store_true", help="run a module")
+    assert run(parser, ["convert"]) == run(parser, ["convert", "-m"]) == 0
+    assert [arguments.m for arguments in found] == [False, True]
+    assert run(parser, ["convert", "--no"]) == 2
+    assert "unrecognized arguments: --no" in capsys.readouterr().err
+    assert "  -m          run a module\n" in added.format_help()
+
+
 # The log
 
 
