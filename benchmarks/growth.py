@@ -39,7 +39,7 @@ layer {{ name: "loss" type: "Reduction" bottom: "x{i}" top: "loss" loss_weight: 
 TRAINED = "small/siamese_resnet27_256"
 WALK = 300  # frames; more descriptors are made by perturbing theirs
 QUERIES, AT_ONCE = 50, 4096  # frames searched for, and added at a time
-AGAIN = 0.3  # distance of two descriptors of one place, as a share of that of two places
+SAME_PLACE = 0.3  # distance of two descriptors of one place, as a share of that of two places
 PAIRS = 2000  # converted with each number of workers
 
 
@@ -135,7 +135,7 @@ def frames(size: int) -> Found:
     base = described_walk(min(WALK, max(2, size)))
     random = np.random.default_rng(0)
     rows = np.concatenate([perturbed(base, min(AT_ONCE, size - k), random) for k in range(0, size, AT_ONCE)])
-    seen_again = rows[random.integers(0, size, QUERIES)] + AGAIN * _differences(base, QUERIES, random)
+    seen_again = rows[random.integers(0, size, QUERIES)] + SAME_PLACE * _differences(base, QUERIES, random)
     best: dict[str, list[list[int]]] = {}
     found: Found = {}
     for name in ("exact", "faiss") if find_spec("faiss") else ("exact",):

@@ -20,9 +20,9 @@ import numpy as np
 from netspec.errors import SpecError
 
 ROOT = Path(__file__).resolve().parents[1]
-TURN, MOST = 0.4, 50  # seconds of a turn, and its largest number of passes
-FEWEST = 3  # minimum number of rounds
-REST = 0.03  # seconds before a turn, in which threads of the previous contestant stop spinning
+TURN_S, MOST_PASSES = 0.4, 50  # seconds of a turn, and its largest number of passes
+FEWEST_ROUNDS = 3  # minimum number of rounds
+PAUSE_S = 0.03  # seconds before a turn, in which threads of the previous contestant stop spinning
 Pass = tuple[float, float]  # wall-clock seconds, and CPU seconds of all threads
 
 
@@ -209,15 +209,15 @@ def measure(
     end more than ``limit`` seconds after the start of the first.
     """
     times: dict[str, list[Pass]] = {one.name: [] for one in contestants}
-    passes = {one.name: max(1, min(MOST, int(TURN / one.turn(1)[0][0]))) for one in contestants}
+    passes = {one.name: max(1, min(MOST_PASSES, int(TURN_S / one.turn(1)[0][0]))) for one in contestants}
     began = time.monotonic()
     for k in range(rounds):
         passed = time.monotonic() - began
-        if k >= FEWEST and passed * (k + 1) / k > limit:
+        if k >= FEWEST_ROUNDS and passed * (k + 1) / k > limit:
             break
         tell(k)
         for one in contestants if k % 2 == 0 else reversed(contestants):
-            time.sleep(REST)
+            time.sleep(PAUSE_S)
             clock, computing = zip(*one.turn(passes[one.name]), strict=True)
             times[one.name].append((statistics.median(clock), statistics.median(computing)))
     return times

@@ -37,7 +37,7 @@ TITLES = {
     "ESSEX3IN1": "ESSEX3IN1",
     "SPED": "SPED",
 }
-# By the names in the tables; F is the file of descriptors of the included net, W a file of words.
+# By the names in the tables. F is the file of the included net's descriptors, W the file of words, V that of VLAD.
 METHODS = {
     "gray thumbnails, 32x24": "thumbnails",
     "bag of SIFT words, tf-idf": "bow:model=W",

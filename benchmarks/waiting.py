@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from benchmarks.case import training_case
 from benchmarks.compare import task_of
-from benchmarks.rounds import TURN, Pass, Worker, ratio
+from benchmarks.rounds import TURN_S, Pass, Worker, ratio
 
 VARIABLES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")  # set how threads of OpenMP runtimes wait
 
@@ -44,7 +44,7 @@ def compare(name: str, waits: Sequence[str], batch: int, threads: int, rounds: i
 def _measure(pairs: dict[str, list[Worker]], rounds: int) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
     alone: dict[str, list[float]] = {wait: [] for wait in pairs}
     paired: dict[str, list[float]] = {wait: [] for wait in pairs}
-    passes = max(1, int(4 * TURN / next(iter(pairs.values()))[0].turn(1)[0][0]))
+    passes = max(1, int(4 * TURN_S / next(iter(pairs.values()))[0].turn(1)[0][0]))
     for _ in range(rounds):
         for wait, (worker, _) in pairs.items():
             alone[wait].append(_mean(worker.turn(passes)))

@@ -53,7 +53,7 @@ COMMENTED = re.compile(r"^([^\s#].*?) +(# .*)$", re.M)
 
 
 class CommandLexer(RegexLexer):
-    """Commands of a shell: an option is a token, so that no line breaks within it; so is a comment."""
+    """Commands of a shell. An option is one token, so that no line is broken inside it. So is a comment."""
 
     name = "commands"
     tokens: ClassVar = {"root": [(r"(?<!\S)#.*", Comment), (r"(?<!\S)--?\w[\w-]*", Name.Attribute), (r"\s+|\S+", Text)]}
@@ -78,7 +78,7 @@ class PrototxtLexer(RegexLexer):
 
 
 def rewrite(text: str, folder: Path) -> str:
-    """Return the text of a file of ``folder`` as the site has it.
+    """Return the text of a page in ``folder`` as the site shows it.
 
     Links lead to pages; links to other files become text. A comment on a command is moved above it, to fit on a phone.
     """
@@ -102,16 +102,16 @@ def rewrite(text: str, folder: Path) -> str:
     return LINK.sub(replaced, text)
 
 
-def _page(app: Any, docname: str, source: list[str]) -> None:
+def _rewrite_page(app: Any, docname: str, source: list[str]) -> None:
     source[0] = rewrite(source[0], (HERE / docname).parent)
 
 
-def _included(app: Any, relative_path: Path, parent: str, content: list[str]) -> None:
+def _rewrite_included(app: Any, relative_path: Path, parent: str, content: list[str]) -> None:
     content[0] = rewrite(content[0], (HERE / relative_path).resolve().parent)
 
 
-def _captioned(app: Any, doctree: nodes.document) -> None:
-    """Show what the text of a picture says below it; a click opens the picture in its own size."""
+def _add_captions(app: Any, doctree: nodes.document) -> None:
+    """Show the description of a picture below it. A click opens the picture in its full size."""
     for number, paragraph in enumerate(list(doctree.findall(nodes.paragraph))):
         if len(paragraph) == 1 and isinstance(picture := paragraph[0], nodes.image):
             picture["scale"] = 100
@@ -119,15 +119,15 @@ def _captioned(app: Any, doctree: nodes.document) -> None:
             paragraph.replace_self(nodes.figure("", picture, caption, ids=[f"picture-{number}"]))
 
 
-def _searched(app: Any, exception: Exception | None) -> None:
-    """Write what the search shows of each page where it cannot ask for the page: read from a disk (search.js)."""
+def _write_search_texts(app: Any, exception: Exception | None) -> None:
+    """Write the text of all pages for the search (search.js), which cannot load pages that are opened from a disk."""
     if exception is None and app.builder.format == "html":
         texts = {name: app.env.get_doctree(name).astext() for name in sorted(app.env.found_docs)}
         made = Path(app.outdir, "_static", "texts.js")
         made.write_text(f"const TEXTS = {json.dumps(texts)};\n")
 
 
-def _on_search_page(app: Any, pagename: str, *_: object) -> None:
+def _add_search_scripts(app: Any, pagename: str, *_: object) -> None:
     if pagename == "search":
         for name in ("texts.js", "search.js"):
             app.add_js_file(name)
@@ -137,8 +137,8 @@ def setup(app: Any) -> None:
     """Have pages rewritten, code in colors, captions below pictures, and a search that shows text."""
     app.add_lexer("commands", CommandLexer)
     app.add_lexer("prototxt", PrototxtLexer)
-    app.connect("doctree-read", _captioned)
-    app.connect("html-page-context", _on_search_page)
-    app.connect("build-finished", _searched)
-    app.connect("source-read", _page)
-    app.connect("include-read", _included)
+    app.connect("doctree-read", _add_captions)
+    app.connect("html-page-context", _add_search_scripts)
+    app.connect("build-finished", _write_search_texts)
+    app.connect("source-read", _rewrite_page)
+    app.connect("include-read", _rewrite_included)

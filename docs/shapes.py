@@ -71,7 +71,7 @@ def _dims(shape: Shape) -> str:
     return " ".join(f"dim: {size}" for size in shape)
 
 
-def words(shape: Shape) -> str:
+def shape_text(shape: Shape) -> str:
     """Return a shape as it is read: ``1 x 3 x 227 x 227`` with signs of multiplication; of no axes, ``one number``."""
     return " \N{MULTIPLICATION SIGN} ".join(map(str, shape)) or "one number"
 
@@ -79,17 +79,17 @@ def words(shape: Shape) -> str:
 def caption(kind: str, example: Example) -> str:
     """Return the text that says what the picture shows."""
     bottoms, tops = (
-        ", ".join(f"{name} {words(shape)}" for name, shape in blobs.items()) or "no blob"
+        ", ".join(f"{name} {shape_text(shape)}" for name, shape in blobs.items()) or "no blob"
         for blobs in (example.bottoms, example.tops)
     )
-    learned = "; learned: " + ", ".join(map(words, example.learned)) if example.learned else ""
+    learned = "; learned: " + ", ".join(map(shape_text, example.learned)) if example.learned else ""
     return f"{kind} reads {bottoms} and gives {tops}{learned}"
 
 
 def picture(kind: str, example: Example) -> str:
     """Return an SVG element of one line; its colors are those of the page's theme (site.css)."""
     label = _lines(kind)
-    learned = [words(shape) for shape in example.learned]
+    learned = [shape_text(shape) for shape in example.learned]
     left, right = (_Column(list(blobs.items())) for blobs in (example.bottoms, example.tops))
     box = LINE * len(label) + 16
     middle = box + (LINE * (len(learned) + 1) + 4 if learned else 0)
@@ -124,7 +124,7 @@ class _Column:
     """Blobs in a column: each with its name and its shape below it."""
 
     def __init__(self, blobs: Sequence[tuple[str, Shape]]) -> None:
-        self._blobs = [(name, shape, _solid(shape)) for name, shape in blobs]
+        self._blobs = [(name, shape, _size_in_picture(shape)) for name, shape in blobs]
         self.height = sum(h + LEAN * d + 2 * LINE + 14 for *_, (_, h, d) in self._blobs)
 
     def drawn(self, x: float, height: float) -> str:
@@ -140,13 +140,13 @@ class _Column:
                 _rectangle(left, top, w, h, "blob"),
                 f'<path class="blob" d="M{left + w:g} {top:g}l{lean:g} {-lean:g}"/>' if d else "",
                 _text(x, top + h + LINE, name, "name"),
-                _text(x, top + h + 2 * LINE, words(shape)),
+                _text(x, top + h + 2 * LINE, shape_text(shape)),
             ]
             y = top + h + 2 * LINE + 10
         return "".join(parts)
 
 
-def _solid(shape: Shape) -> tuple[float, float, float]:
+def _size_in_picture(shape: Shape) -> tuple[float, float, float]:
     """Return width, height and depth of a blob's picture: the last two axes, and the numbers before the batch's.
 
     Lengths grow with the logarithm of the sizes, so that 3 channels and 4096 fit beside each other.

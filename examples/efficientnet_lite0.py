@@ -20,7 +20,10 @@ n, blobs = caffe.NetSpec(), {}
 
 
 def conv(name, bottom, theirs, bn, halves=False, clip=True):
-    """Append Convolution, BatchNorm, Scale and Clip, and note their weights: ``theirs`` and ``bn`` in PyTorch."""
+    """Append Convolution, BatchNorm, Scale and Clip, and store their weights in ``blobs``.
+
+    ``theirs`` and ``bn`` are the names of the convolution and of the normalization in the PyTorch model.
+    """
     filters = weights[f"{theirs}.weight"][:, :: -1 if name == "stem" else 1]  # PyTorch's net takes RGB, Caffe's BGR
     shape = {"kernel_size": filters.shape[2] + halves, "pad": filters.shape[2] // 2, "stride": 1 + halves}
     # With stride 2, TensorFlow pads one more row below and column right: use a larger filter, first row and column 0.
@@ -38,11 +41,13 @@ def conv(name, bottom, theirs, bn, halves=False, clip=True):
 
 n.data = L.Input(shape={"dim": [1, 3, SIZE, SIZE]})
 x = conv("stem", L.Power(n.data, scale=1 / 128, shift=-127 / 128), "_conv_stem", "_bn0", halves=True)
-for k, of in enumerate(f"_blocks.{k}." for k in range(16)):
-    before, x = x, conv(f"expand{k}", x, f"{of}_expand_conv", f"{of}_bn0") if k else x
-    x = conv(f"depthwise{k}", x, f"{of}_depthwise_conv", f"{of}_bn1", halves=k in HALVING)
-    x = conv(f"project{k}", x, f"{of}_project_conv", f"{of}_bn2", clip=False)
-    if k and weights[f"{of}_expand_conv.weight"].shape[1] == len(weights[f"{of}_project_conv.weight"]):
+for k in range(16):
+    block, before = f"_blocks.{k}.", x
+    if k:
+        x = conv(f"expand{k}", x, f"{block}_expand_conv", f"{block}_bn0")
+    x = conv(f"depthwise{k}", x, f"{block}_depthwise_conv", f"{block}_bn1", halves=k in HALVING)
+    x = conv(f"project{k}", x, f"{block}_project_conv", f"{block}_bn2", clip=False)
+    if k and weights[f"{block}_expand_conv.weight"].shape[1] == len(weights[f"{block}_project_conv.weight"]):
         n[f"block{k}"] = x = L.Eltwise(before, x)
 n.pool = L.Pooling(conv("head", x, "_conv_head", "_bn1"), pool=P.Pooling.AVE, global_pooling=True)
 n.fc, blobs["fc"] = L.InnerProduct(n.pool, num_output=1000), [weights["_fc.weight"], weights["_fc.bias"]]

@@ -29,7 +29,7 @@ from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.progress import Progress, silent
 from netspec import log
 from netspec.data.database import Writer
-from netspec.data.datum import array_to_datum, decode_image, encoded_datum, times
+from netspec.data.datum import array_to_datum, decode_image, encoded_datum, shape_text
 from netspec.data.images import read_image, read_image_list
 from netspec.data.random_words import permutation
 from netspec.errors import SpecError, Where
@@ -130,7 +130,7 @@ def write_databases(
             records, shape = result
             first = first or shape
             if options.check_size and shape != first:
-                message = f"gives {times(shape)}, but the first line gives {times(first)} (-check_size)"
+                message = f"gives {shape_text(shape)}, but the first line gives {shape_text(first)} (-check_size)"
                 raise SpecError(f'"{entry.images[0]}" {message}', entry.where)
             for writer, record in zip(writers, records, strict=True):
                 writer.put(key(number, entry).encode(), record)
@@ -167,7 +167,7 @@ def _records(entry: Entry, root: str, options: Options) -> tuple[list[bytes], tu
         raise SpecError(str(fault), entry.where) from None
     shapes = [image.shape for image in images]
     if shapes[0] != shapes[-1]:
-        message = f'"{paths[0]}" is {times(shapes[0])}, but its partner "{paths[1]}" is {times(shapes[1])}'
+        message = f'"{paths[0]}" is {shape_text(shapes[0])}, but its partner "{paths[1]}" is {shape_text(shapes[1])}'
         raise SpecError(f"{message}; set -resize_width and -resize_height", entry.where)
     stacked = np.concatenate(images)
     return [array_to_datum(stacked, entry.label).SerializeToString()], stacked.shape

@@ -9,7 +9,7 @@ import numpy as np
 
 from netspec import log
 from netspec.data.database import Reader
-from netspec.data.datum import datum_to_array, parse_datum, times
+from netspec.data.datum import datum_to_array, parse_datum, shape_text
 from netspec.errors import SpecError, Where
 from netspec.files.whole_file import write_whole
 from netspec.proto.schema import BlobProto
@@ -35,7 +35,9 @@ def compute_mean(reader: Reader, where: Where) -> np.ndarray:
             log.info("compute_image_mean.cpp:70", "Starting iteration")
             first, total = name, np.zeros(image.shape)
         if image.shape != total.shape:
-            message = f'record "{name}" is {times(image.shape)}, but the first, "{first}", is {times(total.shape)}'
+            message = (
+                f'record "{name}" is {shape_text(image.shape)}, but the first, "{first}", is {shape_text(total.shape)}'
+            )
             raise SpecError(f"{message}; all images must have the same size", where)
         total += image
         if (i + 1) % 10000 == 0:

@@ -15,7 +15,7 @@ from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.trajectory import Poses
 from netspec.files.image_list import ImageList
 
-NAMED = 10  # unreadable images listed in a message
+MOST_NAMES = 10  # of unreadable images in a message
 
 
 @dataclass(frozen=True)
@@ -146,8 +146,8 @@ class ImageSequence(ImageList):
     def left_out(self) -> str:
         """Return a sentence that lists the images that could not be read; empty if all could."""
         names = [self.names[i] for i in self.unreadable]
-        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-        listed = ", ".join(names[:NAMED])
+        more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+        listed = ", ".join(names[:MOST_NAMES])
         text = f"{len(names)} of {len(self)} images cannot be read and are left out: {listed}{more}"
         return text if names else ""
 

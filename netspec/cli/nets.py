@@ -73,7 +73,7 @@ def _add_check(commands: Commands) -> None:
 @no_collection()  # of the whole command: of the text and the table too
 def _check(arguments: argparse.Namespace) -> int:
     from netspec.inspect.check.check import as_json, check_file
-    from netspec.inspect.check.findings import said_as_json, said_once
+    from netspec.inspect.check.findings import finding_lines, findings_as_json
     from netspec.inspect.check.plan import plan_text
     from netspec.net.table import table
 
@@ -95,13 +95,13 @@ def _check(arguments: argparse.Namespace) -> int:
     elif checked[0].net is not None and not arguments.weights:
         refuse(arguments, ("strict",), "needs --weights")
     advice = {str(found): found for part in checked for found in part.advice}
-    for line in said_once(advice.values()):
+    for line in finding_lines(advice.values()):
         print(f"warning: {line}", file=sys.stderr)
     faults = {str(fault): fault for part in checked for fault in part.faults}
     if faults:
         print("\n".join(faults), file=sys.stderr)
         if arguments.json:
-            print(json.dumps(said_as_json(faults.values(), advice.values())))
+            print(json.dumps(findings_as_json(faults.values(), advice.values())))
         return 1
     nets = [(part.label, part.net) for part in checked if part.net is not None]
     if arguments.json:
@@ -139,7 +139,7 @@ def _lint(arguments: argparse.Namespace) -> int:
         refuse(
             arguments, ("json", "level", "stage", "shape", "data", "allow_python_layers"), "is for files, not --rules"
         )
-    from netspec.inspect.check.findings import RULES, said_as_json, said_once
+    from netspec.inspect.check.findings import RULES, finding_lines, findings_as_json
     from netspec.inspect.check.lint import lint_file
 
     for rule in sorted(RULES.values(), key=lambda rule: rule.name) if arguments.rules else ():
@@ -151,8 +151,8 @@ def _lint(arguments: argparse.Namespace) -> int:
         for fault in linted.unknown:
             print(f"warning: {fault}; rules that need shapes are not applied", file=sys.stderr)
         if arguments.json:
-            print(json.dumps({"file": path, **said_as_json(linted.faults, linted.found)}))
-        for line in [*linted.faults, *said_once(linted.found)] if not arguments.json else ():
+            print(json.dumps({"file": path, **findings_as_json(linted.faults, linted.found)}))
+        for line in [*linted.faults, *finding_lines(linted.found)] if not arguments.json else ():
             print(line, file=sys.stdout if linted.readable else sys.stderr)
         found = SOMETHING if linted.faults or linted.found else DONE
         status = max(status, found if linted.readable else UNREADABLE)

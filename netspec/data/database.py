@@ -32,7 +32,7 @@ from netspec.files.whole_file import whole_folder
 
 BACKENDS = ("lmdb", "leveldb")
 _SCAN = 4096  # number of keys to list beyond the requested one
-LITTLE = 1 << 16  # free bytes below which a disk is considered full
+LEAST_FREE_BYTES = 1 << 16  # a disk with fewer is considered full
 _FIRST_MAP_SIZE = 1 << 20  # Caffe's
 _COMMIT_RECORDS, _COMMIT_BYTES = 1000, 64 << 20  # a batch stays in memory until it is committed
 
@@ -327,7 +327,7 @@ class Writer:
     def _why(self, fault: Exception) -> str:
         """Return why writing failed. On a full disk, LMDB's error is "Input/output error"."""
         free = shutil.disk_usage(Path(self.path).absolute().parent).free
-        return f"the disk is full: {amount(free)} left" if free < LITTLE else str(fault)
+        return f"the disk is full: {amount(free)} left" if free < LEAST_FREE_BYTES else str(fault)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -78,7 +78,7 @@ def datum_to_array(datum: Any, color: bool | None = None, warn: Callable[[str], 
     count = math.prod(shape)
     if len(values) != count or not count:
         field = "data" if data else "float_data"
-        fault = f"contains {len(values)} values in {field}, but channels x height x width is {times(shape)}"
+        fault = f"contains {len(values)} values in {field}, but channels x height x width is {shape_text(shape)}"
         if warn is None or not 0 < count < len(values) or min(shape) < 0:
             raise ValueError(fault)
         warn(fault)
@@ -109,6 +109,6 @@ def planar(pixels: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1))
 
 
-def times(shape: tuple[int, ...]) -> str:
+def shape_text(shape: tuple[int, ...]) -> str:
     """Return a shape as ``3 x 48 x 64``."""
     return " x ".join(map(str, shape))

@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from netspec.data.database import Reader
-from netspec.data.datum import parse_datum, times
+from netspec.data.datum import parse_datum, shape_text
 from netspec.data.images import ListedImage, read_image
 from netspec.data.random_words import permutation, words
 from netspec.data.transformer import Shape, Transformer
@@ -166,9 +166,9 @@ class _ImageSource:
     def _check_shape(self, item: _Item) -> None:
         shape = self._transform.output_shape(item.image.shape)
         if shape != self._shape:
-            first = f'the first record, "{self._first_name}", gives {times(self._shape)}'
+            first = f'the first record, "{self._first_name}", gives {shape_text(self._shape)}'
             advice = "all records must have the same size (or set batch_size: 1)"
-            raise SpecError(f'record "{item.name}" gives {times(shape)}, but {first}; {advice}', item.where)
+            raise SpecError(f'record "{item.name}" gives {shape_text(shape)}, but {first}; {advice}', item.where)
 
 
 class DatabaseSource(_ImageSource):

@@ -12,7 +12,7 @@ import numpy as np
 
 from netspec import log
 from netspec.data.blobs import Shape
-from netspec.data.datum import datum_to_array, times
+from netspec.data.datum import datum_to_array, shape_text
 from netspec.data.mean import read_mean
 from netspec.data.random_words import WORDS, words_at
 from netspec.errors import SpecError, Where
@@ -76,10 +76,10 @@ class Transformer:
         """
         channels, height, width = shape
         if self.crop_size > min(height, width):
-            raise self._error(f"crop_size {self.crop_size} is larger than the image, {times(shape)}", "crop_size")
+            raise self._error(f"crop_size {self.crop_size} is larger than the image, {shape_text(shape)}", "crop_size")
         if self._mean is not None and self._mean.shape != shape:
-            mean = f'the mean of "{self._mean_file}" has shape {times(self._mean.shape)}'
-            raise self._error(f"{mean}, the image before cropping {times(shape)}; they must be equal", "mean_file")
+            mean = f'the mean of "{self._mean_file}" has shape {shape_text(self._mean.shape)}'
+            raise self._error(f"{mean}, the image before cropping {shape_text(shape)}; they must be equal", "mean_file")
         if len(self.mean_values) not in (0, 1, channels):
             message = f"found {len(self.mean_values)} mean_value for {channels} channels, expected 1 or {channels}"
             raise self._error(message, "mean_value")

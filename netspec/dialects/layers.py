@@ -22,14 +22,14 @@ from netspec.layers.contract.registry import layer_class, registered
 from netspec.proto.schema import PACKAGE, LayerParameter, NetParameter
 
 _owners: dict[str, str] = {}  # layer type -> the dialect that defines it, without Caffe's types
-Wants = Callable[[LayerParameter], bool]
-_replacing: dict[str, dict[str, tuple[type[Layer], Wants]]] = {}  # type -> dialect -> class, condition
+Condition = Callable[[LayerParameter], bool]
+_replacing: dict[str, dict[str, tuple[type[Layer], Condition]]] = {}  # type -> dialect -> class, condition
 _everywhere: set[str] = set()  # dialects that a user requested for every net of the process
 _loading = ""  # the dialect being loaded
 L = TypeVar("L", bound=type[Layer])
 
 
-def replace(type_name: str, *reads: str, where: Wants = lambda param: True) -> Callable[[L], L]:
+def replace(type_name: str, *reads: str, where: Condition = lambda param: True) -> Callable[[L], L]:
     """Class decorator: let a subclass of one of Caffe's layers replace it in nets that use the dialect.
 
     It replaces only the layers for which ``where(LayerParameter)`` is true. ``reads`` are as for
@@ -96,8 +96,8 @@ def class_of(param: LayerParameter, options: BuildOptions | None = None) -> type
     """
     run_dialects()
     for dialect in options.dialects if options else ():
-        cls, wants = _replacing.get(param.type, {}).get(dialect, (None, bool))
-        if cls and wants(param):
+        cls, condition = _replacing.get(param.type, {}).get(dialect, (None, bool))
+        if cls and condition(param):
             return cls
     if param.type != "Python":
         return None

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from netspec.exact.accumulate import ParameterSums
 from netspec.exact.blas import add_sums, gemm, one_thread
 
-FEW = 64  # vectors: for fewer, the product takes less time than rounding the weights to another precision
+FEWEST_VECTORS = 64  # for fewer, the product takes less time than rounding the weights to another precision
 
 
 class VectorProducts(ParameterSums):
@@ -81,7 +81,7 @@ class SummedProducts(ParameterSums):
         in_place: bool,
     ) -> torch.Tensor:
         """Return the product. For few vectors it has the precision of the weights, even with autocast."""
-        few, ctx.kind = len(vectors) < FEW, vectors.dtype
+        few, ctx.kind = len(vectors) < FEWEST_VECTORS, vectors.dtype
         vectors = vectors.to(weight.dtype) if few else vectors
         ParameterSums.keep(ctx, vectors, (weight, bias), in_place)
         ctx.transposed = transposed

@@ -23,7 +23,7 @@ from h5py import h5o, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import head_of, pointer_fault
-from netspec.files.limits import ALWAYS, amount, bomb
+from netspec.files.limits import ALWAYS_ALLOWED, amount, bomb
 from netspec.files.whole_file import whole_file
 
 _MOST_LINKS = 16  # of consecutive links
@@ -130,7 +130,7 @@ def _wrong_chunks(dataset: h5py.Dataset, shape: tuple[int, ...]) -> str:
     for place, packed in stored:
         if packed > size + size // 8 + 4096:  # compression adds a few bytes to incompressible data
             return f"has a chunk of {amount(packed)}, and its chunks hold {amount(size)}"
-        if h5z.FILTER_DEFLATE in filters and packed * _MOST_DEFLATED > ALWAYS:
+        if h5z.FILTER_DEFLATE in filters and packed * _MOST_DEFLATED > ALWAYS_ALLOWED:
             mask, data = dataset.id.read_direct_chunk(place)
             if not mask and len(zlib.decompressobj().decompress(data, size + _SUM + 1)) > size + _SUM:
                 return f"has a chunk that decompresses to more than its {amount(size)}"

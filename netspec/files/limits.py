@@ -11,7 +11,7 @@ import stat
 import zlib
 from pathlib import Path
 
-ALWAYS = 1 << 28  # bytes that any file may declare
+ALWAYS_ALLOWED = 1 << 28  # bytes that a file of any size may declare
 MOST_PACKED = 100  # times a file's size: real data is compressed 2 to 20 times, a malicious file 1000 times
 
 _UNITS = {"": 0, "k": 10, "m": 20, "g": 30, "t": 40}
@@ -54,7 +54,7 @@ def read_bytes(path: str | Path) -> bytes:
     if not str(path).endswith(".gz") or not data.startswith(b"\x1f\x8b"):
         return data
     try:
-        unpacked = gzip.GzipFile(fileobj=io.BytesIO(data)).read(max(ALWAYS, MOST_PACKED * len(data)) + 1)
+        unpacked = gzip.GzipFile(fileobj=io.BytesIO(data)).read(max(ALWAYS_ALLOWED, MOST_PACKED * len(data)) + 1)
     except (EOFError, zlib.error) as fault:
         raise OSError(errno.EINVAL, f"a damaged gzip file: {fault}", str(path)) from None
     if fault := bomb(len(unpacked), len(data)):
@@ -64,7 +64,7 @@ def read_bytes(path: str | Path) -> bytes:
 
 def bomb(size: int, stored: int) -> str:
     """Return an error if ``size`` bytes of data in a file of ``stored`` bytes are implausible, or ""."""
-    if size <= ALWAYS or (size <= MOST_PACKED * stored and size <= memory()):
+    if size <= ALWAYS_ALLOWED or (size <= MOST_PACKED * stored and size <= memory()):
         return ""
     return f"would take {amount(size)} of memory, but the file has only {amount(stored)}; it was not read"
 

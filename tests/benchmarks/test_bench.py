@@ -175,7 +175,7 @@ def test_each_kind_of_growth_has_its_figures(kind: str, size: int, monkeypatch: 
 
 
 @pytest.mark.slow
-def test_what_keeps_growth_from_being_measured_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_reason_why_growth_cannot_be_measured_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["growth", "pairs", "0"]) == 1
     assert "pairs 0: " in capsys.readouterr().err
 

@@ -240,7 +240,7 @@ def test_a_png_part_that_announces_too_much(size: int, tmp_path: Path) -> None:
         read_truth_matrix(path)
 
 
-def test_a_truth_that_is_no_image(tmp_path: Path) -> None:
+def test_a_truth_that_is_not_an_image_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.png").write_bytes(bomb(20_000))
     with pytest.raises(InputError, match="is not a readable image; expected"):
         read_truth_matrix(tmp_path / "x.png")
@@ -346,7 +346,7 @@ def test_a_database_that_is_changed_while_it_is_read(change: str, database: Path
 
 
 @pytest.mark.parametrize("backend", ["lmdb", "leveldb"])
-def test_a_database_that_was_written_to_is_opened_anew(backend: str, tmp_path: Path) -> None:
+def test_a_database_that_was_written_to_is_opened_again(backend: str, tmp_path: Path) -> None:
     """A notebook continues: only databases that were opened earlier have old contents."""
     library = leveldb() if backend == "leveldb" else None
     path = str(tmp_path / "db")

@@ -64,7 +64,7 @@ def test_it_ends_with_five_lines_and_starts_all_in_one_folder(project: Path) -> 
 
 
 @pytest.mark.slow
-def test_started_again_it_deletes_nothing(project: Path, tmp_path: Path) -> None:
+def test_a_second_run_deletes_nothing(project: Path, tmp_path: Path) -> None:
     start(project, project)
     trained = project / "out" / "quickstart" / "mine.caffemodel"
     trained.write_bytes(b"weights")

@@ -12,7 +12,7 @@ import torch
 from typing_extensions import override
 
 from netspec.compat.pycaffe.tapes import (
-    Bound,
+    LayerKernels,
     Tape,
     by_autograd,
     gradient_of,
@@ -55,7 +55,7 @@ class LayerStep:
         self.has_kernels = self._can_bind()
         self._bottom: torch.Tensor | None = None  # what it read in its last pass, where it keeps that
         self._tape: Tape | None = None
-        self._bound: Bound | None = None
+        self._layer_kernels: LayerKernels | None = None
 
     def set_up(self) -> None:
         """Write the data that Caffe writes when it creates the layer."""
@@ -71,7 +71,7 @@ class LayerStep:
 
     def forget_kernels(self) -> None:
         """Forget the kernels; the next run makes new ones."""
-        self._bound = None
+        self._layer_kernels = None
 
     @property
     def is_fresh(self) -> bool:
@@ -120,26 +120,26 @@ class LayerStep:
     def _compute(self) -> None:
         if self.records:
             tape = self._tape = self._record()
-            values, made = tape.leaves, tape.made
+            values, tops = tape.leaves, tape.tops
         else:
             values = [blob.data_memory.tensor(blob.shape) for blob in self.bottoms]
             if self.keeps_bottom:
                 self._bottom = values[0].clone()
-            made = self.layer.run(*values)
-        constants = self.constants or [None] * len(made)
+            tops = self.layer.run(*values)
+        constants = self.constants or [None] * len(tops)
         taken = storages(values or list(self.layer.blobs))
-        for top, tensor, constant in zip(self.tops, made, constants, strict=True):
+        for top, tensor, constant in zip(self.tops, tops, constants, strict=True):
             if constant is None:
                 top.put_data(not_shared(tensor.detach(), taken))
 
     def _record(self) -> Tape:
         """Run the layer by its kernels, or with autograd."""
-        if bound := self._kernels():
-            forward, backward = bound.kernels
+        if prepared := self._kernels():
+            forward, backward = prepared.kernels
             values = [blob.data_memory.tensor(blob.shape) for blob in self.bottoms]
             holders = [blob.data_memory.holder(blob.count) for blob in self.bottoms]
-            made = forward(*values)
-            return Tape(values, holders, (made,) if isinstance(made, torch.Tensor) else made, backward)
+            tops = forward(*values)
+            return Tape(values, holders, (tops,) if isinstance(tops, torch.Tensor) else tops, backward)
         leaves, holders = [], []
         for blob, wanted in zip(self.bottoms, self.wanted, strict=True):
             memory = blob.data_memory
@@ -148,22 +148,22 @@ class LayerStep:
             leaves.append((value.clone() if overwritten else value.detach()).requires_grad_(wanted))
             holders.append(memory.holder(blob.count))
         with torch.enable_grad():
-            made = self.layer.run(*leaves)
-        return Tape(leaves, holders, made, partial(by_autograd, leaves, made))
+            tops = self.layer.run(*leaves)
+        return Tape(leaves, holders, tops, partial(by_autograd, leaves, tops))
 
-    def _kernels(self) -> Bound | None:
+    def _kernels(self) -> LayerKernels | None:
         """Return the layer's kernels for its present shapes, or None if autograd must record it."""
         if not self.has_kernels:
             return None
-        layer, bound = self.layer, self._bound
+        layer, prepared = self.layer, self._layer_kernels
         shapes, blobs = [blob.shape for blob in self.bottoms], list(layer.blobs)
         learn = [blob.requires_grad for blob in blobs]
-        if bound is None or (bound.shapes, bound.learn) != (shapes, learn) or not bound.seen.are(blobs):
+        if prepared is None or (prepared.shapes, prepared.learn) != (shapes, learn) or not prepared.seen.are(blobs):
             layer.fit(shapes)
             sums = tuple(gradient_of(blob) if blob.requires_grad else None for blob in blobs)
-            made = self._speed.kernels(layer, self.wanted, sums) or recorded(layer.run, self.wanted, blobs)
-            bound = self._bound = Bound(shapes, learn, Seen(blobs), made)
-        return bound
+            kernels = self._speed.kernels(layer, self.wanted, sums) or recorded(layer.run, self.wanted, blobs)
+            prepared = self._layer_kernels = LayerKernels(shapes, learn, Seen(blobs), kernels)
+        return prepared
 
     def backward(self) -> None:
         """Write the diffs of the bottoms that need one from those of the tops, and add to those of learned blobs."""

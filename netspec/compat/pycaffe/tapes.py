@@ -20,20 +20,23 @@ from netspec.run.recorded import Kernels
 
 @dataclass(frozen=True)
 class Tape:
-    """The record of one run of a layer: its inputs, the tensors that hold them, its outputs, and its backward function.
+    """The record of one run of a layer, for its backward pass.
 
-    With autograd the inputs are copies. With kernels they are the tensors themselves.
+    - ``leaves``: the inputs. With autograd they are copies, with kernels the tensors themselves.
+    - ``holders``: tensors that keep the memory of the inputs alive.
+    - ``tops``: the outputs.
+    - ``backward``: the function that computes the gradients.
     """
 
     leaves: list[torch.Tensor]
     holders: list[torch.Tensor]
-    made: Sequence[torch.Tensor]
+    tops: Sequence[torch.Tensor]
     backward: Callable[..., Any]
 
 
 @dataclass(frozen=True)
-class Bound:
-    """The kernels of a layer for bottoms of these shapes, and the learnable blobs that they were made for.
+class LayerKernels:
+    """The training kernels of a layer for bottoms of these shapes, and the state of the blobs they were made for.
 
     ``learn[j]`` says whether the gradient of blob j is computed.
     """
@@ -45,10 +48,10 @@ class Bound:
 
 
 def by_autograd(
-    leaves: Sequence[torch.Tensor], made: Sequence[torch.Tensor], *diffs: torch.Tensor
+    leaves: Sequence[torch.Tensor], tops: Sequence[torch.Tensor], *diffs: torch.Tensor
 ) -> list[torch.Tensor | None]:
     """Return the gradients of a layer's inputs by autograd, from the gradients of its outputs."""
-    ends = [(top, diff) for top, diff in zip(made, diffs, strict=True) if top.requires_grad]
+    ends = [(top, diff) for top, diff in zip(tops, diffs, strict=True) if top.requires_grad]
     if ends:
         torch.autograd.backward([top for top, _ in ends], [diff for _, diff in ends], retain_graph=True)
     found = [leaf.grad for leaf in leaves]

@@ -86,7 +86,7 @@ class Convolution(convolution.Convolution):
             if self.spatial_axes != 2:
                 raise self.error(f"{first} is for 2 spatial axes, the bottom has {self.spatial_axes}", GROUP, first)
 
-    def _framed(self, shape: Shape) -> Shape:
+    def _padded_shape(self, shape: Shape) -> Shape:
         """Return a bottom's shape including the pads of its sides."""
         left, right, top, bottom = self.sides
         if not any(self.sides) or len(shape) < 2:
@@ -94,11 +94,11 @@ class Convolution(convolution.Convolution):
         return (*shape[:-2], shape[-2] + top + bottom, shape[-1] + left + right)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return super().reshape([self._framed(shape) for shape in bottom_shapes])
+        return super().reshape([self._padded_shape(shape) for shape in bottom_shapes])
 
     @override
     def overhang(self, shape: Shape) -> list[int]:
-        return super().overhang(self._framed(shape))
+        return super().overhang(self._padded_shape(shape))
 
     def forward(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         if any(self.sides):
@@ -154,8 +154,8 @@ class Pooling(pooling.Pooling):
         for size, kernel, stride, (before, after) in zip(shape[2:], self.kernel, self.stride, self.sides, strict=True):
             if max(before, after) >= kernel > 1 or (kernel == 1 and before + after):
                 raise self.error(f"a pad of {max(before, after)} must be less than the kernel {kernel}", POOLING)
-            room = size + before + after - kernel
-            count = (room // stride if param.round_mode == windows.FLOOR else -(-room // stride)) + 1
+            free = size + before + after - kernel
+            count = (free // stride if param.round_mode == windows.FLOOR else -(-free // stride)) + 1
             count -= any(map(any, self.sides)) and (count - 1) * stride >= size + before
             if count < 1:
                 raise self.error(f"no window of {kernel} at stride {stride} fits {size} pixels", POOLING)

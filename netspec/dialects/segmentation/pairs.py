@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netspec.data.datum import times
+from netspec.data.datum import shape_text
 from netspec.data.images import list_lines, read_image
 from netspec.data.sources import Arrays, Cursor
 from netspec.data.transformer import Transformer
@@ -86,7 +86,7 @@ class PairSource:
             image, label = self._cut(*self._read(record), position)
             found = [self._transform.output_shape(image.shape), label.shape]
             if found != self._found and self.cursor.batch_size > 1:
-                sizes = " and ".join(map(times, found)), " and ".join(map(times, self._found))
+                sizes = " and ".join(map(shape_text, found)), " and ".join(map(shape_text, self._found))
                 message = f"image and labels have sizes {sizes[0]}, the first {sizes[1]}; all must be alike"
                 raise SpecError(f"{message} (or set batch_size: 1)", self._pairs[record].where)
             images.append(image)

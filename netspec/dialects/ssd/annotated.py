@@ -13,7 +13,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from netspec.data.database import Reader
-from netspec.data.datum import datum_to_array, times
+from netspec.data.datum import datum_to_array, shape_text
 from netspec.data.random_words import derived
 from netspec.data.sources import Arrays, Cursor, Draws, Source
 from netspec.dialects.ssd.augment import COLUMNS, FIT_SMALL_SIZE, Augmenter, fixed_size, wrong_settings
@@ -81,7 +81,7 @@ class AnnotatedSource:
             image, boxes = augment(pixels, self._boxes(datum), draw)
             if self.cursor.batch_size > 1 and image.shape != shape:
                 advice = "all must have the same size: give resize_param, or batch_size: 1"
-                found = f'record "{self._name(record)}" gives {times(image.shape)}, the first {times(shape)}'
+                found = f'record "{self._name(record)}" gives {shape_text(image.shape)}, the first {shape_text(shape)}'
                 raise SpecError(f"{found}; {advice}", self._where)
             images.append(image)
             rows.append(np.insert(boxes, 0, item, axis=1))

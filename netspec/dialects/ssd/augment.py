@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from netspec.data.datum import planar, times
+from netspec.data.datum import planar, shape_text
 from netspec.data.mean import read_mean
 from netspec.data.transformer import contradictions
 from netspec.dialects.boxes import Array, coverage, overlaps, sizes
@@ -37,7 +37,7 @@ INTERPOLATION = {
     5: cv2.INTER_LANCZOS4,
 }
 CENTER = 0
-ABOUT = 0.01  # maximum difference from 1 of the sum of the probabilities of several resize_param
+SUM_TOLERANCE = 0.01  # maximum difference from 1 of the sum of the probabilities of several resize_param
 
 
 def wrong_settings(transform: Any, samplers: Sequence[Any], at: Callable[..., Where]) -> Iterator[SpecError]:
@@ -51,7 +51,7 @@ def wrong_settings(transform: Any, samplers: Sequence[Any], at: Callable[..., Wh
     for i, resize in enumerate(resizes):
         if not (resize.height and resize.width):
             yield fault("height and width must both be above 0", "transform_param", "resize_param", i)
-    if len(resizes) > 1 and abs(sum(resize.prob for resize in resizes) - 1) > ABOUT:
+    if len(resizes) > 1 and abs(sum(resize.prob for resize in resizes) - 1) > SUM_TOLERANCE:
         total = sum(resize.prob for resize in resizes)
         message = f"found {len(resizes)} resize_param with a sum of prob of {total:g}, expected 1"
         yield fault(message, "transform_param", "resize_param")
@@ -237,10 +237,8 @@ class Augmenter:
     def _normalized(self, pixels: Array) -> Array:
         mean = self._means(len(pixels))[:, None, None] if self._mean is None else self._mean
         if self._mean is not None and self._mean.shape != pixels.shape:
-            message = (
-                f"the mean has shape {times(self._mean.shape)}, the image {times(pixels.shape)}; expected the same"
-            )
-            raise self._error(message, "mean_file")
+            found = f"the mean has shape {shape_text(self._mean.shape)}, the image {shape_text(pixels.shape)}"
+            raise self._error(f"{found}; expected the same", "mean_file")
         return (pixels.astype(np.float32) - mean) * self._scale
 
     def _resized_to(self, height: int, width: int) -> tuple[int, int]:

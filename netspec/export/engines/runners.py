@@ -22,7 +22,7 @@ from netspec.export.engines.cache import processor
 from netspec.export.engines.choice import Choice
 from netspec.graph.options import BF16, FP32, ONNXRUNTIME, OPENVINO
 
-_ENOUGH = 64  # bytes: a stack_t has 24
+_STACK_T_BYTES = 64  # at least the size of the structure stack_t, which is 24
 
 
 @contextmanager
@@ -37,7 +37,7 @@ def signal_stack_kept() -> Iterator[None]:
         yield
         return
     library = ctypes.CDLL(None)
-    before = ctypes.create_string_buffer(_ENOUGH)
+    before = ctypes.create_string_buffer(_STACK_T_BYTES)
     library.sigaltstack(None, before)
     try:
         yield

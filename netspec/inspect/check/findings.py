@@ -1,8 +1,8 @@
 """Rules that find probable mistakes in a legal file. Each rule has a name, so that a comment can disable it.
 
-The comment ``# lint: ignore=NAME`` (several names with commas) applies to its line, or to the next line if it stands
-alone. On the first line of a layer it applies to the whole layer. On the first line of a file it applies to findings
-about the whole file.
+The comment ``# lint: ignore=NAME`` (or several names, separated by commas) applies to its line. If it is alone on its
+line, it applies to the next one. On the first line of a layer it applies to the whole layer. On the first line of a
+file it applies to findings about the whole file.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ UNKNOWN_RULE = "unknown-rule"
 
 _COMMENT = re.compile(r"#\s*lint:\s*ignore\s*=\s*([\w-]+(?:\s*,\s*[\w-]+)*)")
 
-Said = Iterator[tuple[Where, str]]  # the place, and the message: what was found and what to do
-F = TypeVar("F", bound=Callable[..., Said])
+Findings = Iterator[tuple[Where, str]]  # places, and messages: what was found and what to do
+F = TypeVar("F", bound=Callable[..., Findings])
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Rule:
     name: str
     reason: str
     looks_at: str
-    find: Callable[..., Said]
+    find: Callable[..., Findings]
 
 
 RULES: dict[str, Rule] = {}
@@ -77,7 +77,7 @@ def findings(looks_at: str, *subject: object) -> list[Finding]:
     ]
 
 
-def said_once(found: Iterable[Finding]) -> list[str]:
+def finding_lines(found: Iterable[Finding]) -> list[str]:
     """Return a line for each finding. Equal findings in one file become one, which lists the lines of all."""
     places: dict[tuple[str, str, str], list[Finding]] = {}
     for each in found:
@@ -86,13 +86,13 @@ def said_once(found: Iterable[Finding]) -> list[str]:
             alike.append(each)
     lines = []
     for first, *others in places.values():
-        also = ", ".join(str(each.where.line) for each in others if each.where.line)  # a binary file has no lines
-        more = f" (also in {len(others)} more places{also and f', lines {also}'})" if others else ""
+        numbers = ", ".join(str(each.where.line) for each in others if each.where.line)  # a binary file has no lines
+        more = f" (also in {len(others)} more places{f', lines {numbers}' if numbers else ''})" if others else ""
         lines.append(f"{first}{more}")
     return lines
 
 
-def said_as_json(faults: Iterable[SpecError], found: Iterable[Finding]) -> dict[str, list[dict[str, Any]]]:
+def findings_as_json(faults: Iterable[SpecError], found: Iterable[Finding]) -> dict[str, list[dict[str, Any]]]:
     """Return ``faults`` and ``warnings``, each a list of file, line, column, layer, type, message; and the rule.
 
     Lines and columns start at 1; 0 means unknown.

@@ -7,7 +7,7 @@ from typing import Any
 
 from netspec.errors import Where
 from netspec.graph.plan import Plan
-from netspec.inspect.check.findings import NET, PLAN, TEXT, Said, rule
+from netspec.inspect.check.findings import NET, PLAN, TEXT, Findings, rule
 from netspec.layers import layer_class
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN, NetParameter, fields_of
@@ -29,7 +29,7 @@ BEFORE_NET = ("mean_value", "mean_file", "scale")  # fields of transform_param t
 
 
 @rule("transform-differs", TEXT)
-def _transforms(net: NetParameter, source: SourceMap) -> Said:
+def _transforms(net: NetParameter, source: SourceMap) -> Findings:
     """A net should be tested with the preprocessing it is trained with.
 
     The layers that make a blob in the two phases should subtract the same mean and multiply by the same scale.
@@ -51,7 +51,7 @@ def _transforms(net: NetParameter, source: SourceMap) -> Said:
 
 
 @rule("unused-blob", PLAN)
-def _unused(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+def _unused(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
     """In a net with a loss, an unused blob costs time, and a layer that should read it may be missing.
 
     Losses and scores are printed, so they count as used. Use ``Silence`` for unwanted blobs.
@@ -70,7 +70,7 @@ def _unused(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 
 @rule("loss-without-weight", PLAN)
-def _weightless(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+def _weightless(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
     """A loss with weight 0 is computed and printed, but has no effect on the training."""
     for i, weights in enumerate(_loss_weights(plan) if _is_training(plan) else ()):
         cls = layer_class(plan.nodes[i].type)
@@ -79,7 +79,7 @@ def _weightless(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 
 @rule("batchnorm-without-scale", PLAN)
-def _bare_batch_norms(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+def _bare_batch_norms(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
     """Caffe's BatchNorm only normalizes, while in other frameworks it also scales and shifts."""
     readers: dict[int, set[str]] = {}
     for node in plan.nodes:
@@ -91,7 +91,7 @@ def _bare_batch_norms(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 
 @rule("bias-before-batchnorm", PLAN)
-def _lost_biases(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+def _lost_biases(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
     """BatchNorm subtracts the mean, including any bias that was added before, so such a bias has no effect."""
     makers = {v: i for i, node in enumerate(plan.nodes) for v in node.tops}
     for node in plan.nodes if _is_training(plan) else ():
@@ -104,7 +104,7 @@ def _lost_biases(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 
 @rule("global-stats-in-training", PLAN)
-def _global_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+def _global_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
     """With use_global_stats: true, a training neither uses the statistics of its batches nor updates the stored ones.
 
     A net that is trained from scratch then has no normalization. For fine-tuning with fixed statistics, it is correct.
@@ -116,7 +116,7 @@ def _global_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said
 
 
 @rule("batch-stats-in-test", PLAN)
-def _batch_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+def _batch_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
     """With use_global_stats: false, the result of a test depends on which images are in the same batch."""
     for i, node in enumerate(plan.nodes if plan.net.state.phase == TEST else ()):
         param = plan.net.layer[i].batch_norm_param
@@ -126,7 +126,7 @@ def _batch_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 
 @rule("zero-weights", PLAN)
-def _zero_weights(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+def _zero_weights(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
     """Without a weight_filler, all initial weights are 0 and propagate no gradient.
 
     A training that starts from trained weights needs no filler.
@@ -144,7 +144,7 @@ def _zero_weights(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 
 @rule("softmax-twice", PLAN)
-def _softmax_twice(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
+def _softmax_twice(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
     """SoftmaxWithLoss computes a softmax of its bottom, so a Softmax layer before it makes the gradient too small."""
     makers = {v: i for i, node in enumerate(plan.nodes) for v in node.tops}
     for i, node in enumerate(plan.nodes):
@@ -158,7 +158,7 @@ def _softmax_twice(net: NetParameter, source: SourceMap, plan: Plan) -> Said:
 
 
 @rule("towers-not-shared", NET)
-def _towers(net: Net) -> Said:
+def _towers(net: Net) -> Findings:
     """The branches that a ContrastiveLoss compares should share all their parameters."""
     producer = {v: i for i, node in enumerate(net.plan.nodes) for v in node.tops}
 
@@ -189,7 +189,7 @@ def _towers(net: Net) -> Said:
 
 
 @rule("loss-learns-nothing", NET)
-def _losses(net: Net) -> Said:
+def _losses(net: Net) -> Findings:
     """A loss that depends on no learnable parameter has no effect on the training."""
     for i, weights in enumerate(net.loss_weights if net.phase == TRAIN else ()):
         if any(weights) and not net.backward_plan.layers[i]:
@@ -197,7 +197,7 @@ def _losses(net: Net) -> Said:
 
 
 @rule("caffe-stops", NET)
-def _caffe_stops(net: Net) -> Said:
+def _caffe_stops(net: Net) -> Findings:
     """Caffe ends the program if a blob has more axes than a layer supports, or if a gradient is needed that
     a layer does not compute.
 
@@ -220,7 +220,7 @@ def _caffe_stops(net: Net) -> Said:
 
 
 @rule("never-learns", NET)
-def _never_learns(net: Net) -> Said:
+def _never_learns(net: Net) -> Findings:
     """If no loss depends on a layer, its weights never change, although it has a learning rate."""
     if net.phase != TRAIN or not any(map(any, net.loss_weights)):
         return
@@ -231,7 +231,7 @@ def _never_learns(net: Net) -> Said:
 
 
 @rule("same-name", NET)
-def _namesakes(net: Net) -> Said:
+def _namesakes(net: Net) -> Findings:
     """Saved weights are assigned to layers by name."""
     names: set[str] = set()
     for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):

@@ -6,12 +6,12 @@ import os
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from netspec.inspect.check.findings import SETTINGS, SOLVER, Said, rule
+from netspec.inspect.check.findings import SETTINGS, SOLVER, Findings, rule
 from netspec.inspect.check.net_rules import own_settings
 from netspec.net.net import Net
 from netspec.proto.source_map import Place
 
-FAR = 0.1  # share of the records that a test may skip or read twice
+TOLERANCE = 0.1  # share of the records that a test may skip or read twice
 #: The settings that each rate policy, and each update rule, reads.
 POLICY_SETTINGS = {
     "step": ("gamma", "stepsize"),
@@ -30,7 +30,7 @@ RULE_SETTINGS = {
 
 
 @rule("no-snapshot", SETTINGS)
-def _snapshots(solver: Any, node: Place) -> Said:
+def _snapshots(solver: Any, node: Place) -> Findings:
     """Without a snapshot, the trained weights are lost."""
     if solver.snapshot > solver.max_iter:
         message = f"snapshot {solver.snapshot} is more than max_iter {solver.max_iter}, so it has no effect; lower it"
@@ -40,7 +40,7 @@ def _snapshots(solver: Any, node: Place) -> Said:
 
 
 @rule("no-effect", SETTINGS)
-def _settings(solver: Any, node: Place) -> Said:
+def _settings(solver: Any, node: Place) -> Findings:
     """A setting that the chosen policy or rule ignores may be meant for another one."""
     for name in settings_without_effect(solver):
         message = f"{name} has no effect with type {solver.type} and lr_policy {solver.lr_policy}; remove it"
@@ -48,7 +48,7 @@ def _settings(solver: Any, node: Place) -> Said:
 
 
 @rule("step-after-end", SETTINGS)
-def _steps(solver: Any, node: Place) -> Said:
+def _steps(solver: Any, node: Place) -> Findings:
     """A step of the learning rate after the last iteration has no effect."""
     steps = {"step": ("stepsize", [solver.stepsize]), "multistep": ("stepvalue", solver.stepvalue)}
     name, values = steps.get(solver.lr_policy, ("", []))
@@ -59,7 +59,7 @@ def _steps(solver: Any, node: Place) -> Said:
 
 
 @rule("test-after-end", SETTINGS)
-def _tests(solver: Any, node: Place) -> Said:
+def _tests(solver: Any, node: Place) -> Findings:
     """If the test interval is longer than the training, tests run only at the start, if at all."""
     if solver.test_iter and solver.test_interval > solver.max_iter:
         message = f"test_interval {solver.test_interval} is more than max_iter {solver.max_iter}; lower it"
@@ -67,7 +67,7 @@ def _tests(solver: Any, node: Place) -> Said:
 
 
 @rule("test-size", SOLVER)
-def _test_sizes(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
+def _test_sizes(solver: Any, node: Place, nets: Sequence[Net]) -> Findings:
     """A test should read each record of its data once.
 
     This rule needs the data (``--data``). It allows a tenth more or less.
@@ -78,7 +78,7 @@ def _test_sizes(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
             if records:
                 batch, iterations = layer.top_shapes[0][0], solver.test_iter[k]
                 read = iterations * batch
-                if abs(read - records) > FAR * records:
+                if abs(read - records) > TOLERANCE * records:
                     found = f'test_iter {iterations} x batch {batch} = {read}, but layer "{layer.param.name}" has'
                     message = f"{found} {records} records; set test_iter: {-(-records // batch)}"
                     yield node.find("test_iter", k), message
@@ -86,7 +86,7 @@ def _test_sizes(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
 
 
 @rule("tested-on-training-data", SOLVER)
-def _same_data(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
+def _same_data(solver: Any, node: Place, nets: Sequence[Net]) -> Findings:
     """A test on the training data does not show how good the net is on other data.
 
     A data layer without a phase is also used in phase TEST, by `netspec test` or `lmdb-build compare`.
@@ -116,7 +116,7 @@ def _sources(net: Net) -> Iterator[tuple[int, Any, str, str]]:
 
 
 @rule("filled-by-script", SOLVER)
-def _filled_by_script(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
+def _filled_by_script(solver: Any, node: Place, nets: Sequence[Net]) -> Findings:
     """A net with inputs that no layer fills can only be trained by a script; ``netspec train`` refuses it."""
     for net in nets:
         for fault in net.missing_inputs():
@@ -125,7 +125,7 @@ def _filled_by_script(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
 
 
 @rule("untrained-in-test", SOLVER)
-def _untrained(solver: Any, node: Place, nets: Sequence[Net]) -> Said:
+def _untrained(solver: Any, node: Place, nets: Sequence[Net]) -> Findings:
     """A test net gets its weights from the training net, layer by layer, by name.
 
     A layer that the training net does not have is tested with random weights.

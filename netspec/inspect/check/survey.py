@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from netspec.data.datum import times
+from netspec.data.datum import shape_text
 from netspec.files.limits import amount
 from netspec.inspect.records import Record, Records
 
@@ -129,8 +129,8 @@ class _Watch:
             self._first = record
         assert self._first.values is not None
         if values.shape != self._first.values.shape:
-            first = f'the first record, "{self._first.key}", {times(self._first.values.shape)}'
-            return f"is {times(values.shape)}, {first}"
+            first = f'the first record, "{self._first.key}", {shape_text(self._first.values.shape)}'
+            return f"is {shape_text(values.shape)}, {first}"
         if values.dtype != np.uint8 and not np.isfinite(values).all():
             return "contains a NaN or an infinity"
         return ""
@@ -141,7 +141,7 @@ class _Watch:
         if values is None:
             self._found.forms[record.kind] += 1
             return
-        self._found.forms[f"{record.kind}, {times(values.shape)}"] += 1
+        self._found.forms[f"{record.kind}, {shape_text(values.shape)}"] += 1
         self._flat += bool(values.size > 1 and (values == values.flat[0]).all())
         if sound:
             self._found.channels.add(values)

@@ -26,13 +26,13 @@ from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import write_text
 from netspec.proto.writer import scalar_text
 
-MOST = 6  # number of settings to show
+MOST_SETTINGS = 6  # number of settings to show
 OWN = "_param"  # endings of fields with a layer's own settings
 COMMON = ("loss_param", "transform_param")  # fields with these endings that many layers have
-SILENT = ("engine", "bias_term", "axis", "source", "backend", "root_folder", "mean_file", "prefetch", "rand_skip")
+NOT_SHOWN = ("engine", "bias_term", "axis", "source", "backend", "root_folder", "mean_file", "prefetch", "rand_skip")
 WINDOWS = {"kernel_size": ("kernel_h", "kernel_w"), "stride": ("stride_h", "stride_w"), "pad": ("pad_h", "pad_w")}
 DEFAULTS = {"kernel_size": "0", "stride": "1", "pad": "0"}
-USUAL = (("group", "1"), ("dilation", "1"))
+NOT_SHOWN_VALUES = (("group", "1"), ("dilation", "1"))
 
 
 def settings_text(layer: Any) -> str:
@@ -41,14 +41,14 @@ def settings_text(layer: Any) -> str:
     for name, field in fields_of(layer.DESCRIPTOR).items():
         if name.endswith(OWN) and name not in COMMON and not field.repeated and field.present(layer):
             words += _words(field.get(layer))
-    return ", ".join(words[:MOST])
+    return ", ".join(words[:MOST_SETTINGS])
 
 
 def _words(param: Any) -> Iterator[str]:
     given: dict[str, Any] = {}
     for field in fields_of(param.DESCRIPTOR).values():
         name = field.name
-        if field.type != Declared.TYPE_MESSAGE and field.present(param) and name not in SILENT:
+        if field.type != Declared.TYPE_MESSAGE and field.present(param) and name not in NOT_SHOWN:
             given[name] = _value(field, field.get(param))
     for name, (high, wide) in WINDOWS.items():
         sizes = given[name].split("×") if name in given else [given.pop(side, DEFAULTS[name]) for side in (high, wide)]
@@ -65,7 +65,7 @@ def _words(param: Any) -> Iterator[str]:
     for name, value in given.items():
         if value == "true":
             yield name.replace("_", " ")
-        elif (name, value) not in USUAL:
+        elif (name, value) not in NOT_SHOWN_VALUES:
             yield f"{name.replace('_', ' ')} {value}" if not value.isupper() else value
 
 

@@ -20,7 +20,7 @@ from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.nets import solver_nets
 
-MANY = 5000  # boxes; drawing them takes about half a minute
+SLOW_TO_DRAW = 5000  # boxes; drawing them takes about half a minute
 
 
 def write_picture(
@@ -32,7 +32,7 @@ def write_picture(
     not be built and have no shapes. Raises SpecError for a file that cannot be read, or if Graphviz is missing.
     """
     diagram = diagram_of(*_net_of(path, options), phases, options)
-    if len(diagram.boxes) > MANY:
+    if len(diagram.boxes) > SLOW_TO_DRAW:
         log.warning(
             "draw_net.py:1",
             f"drawing {len(diagram.boxes)} boxes takes minutes, since Graphviz's time grows with their square",

@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnnotationBbox, OffsetImage
 
-from netspec.data.datum import times
+from netspec.data.datum import shape_text
 from netspec.files.figures import COLORS
 from netspec.files.opencv import cv2
 from netspec.inspect.draw.style import PALE, STYLE, split
@@ -44,9 +44,9 @@ def filters_figure(filters: np.ndarray, title: str, of_images: bool = True, rgb:
         shown = filters[:MOST_CHANNELS, :MOST_CHANNELS]
         tiles = [part for each in shown for part in each]
         columns = shown.shape[1]
-    words = f"{title}: {times(filters.shape)}"
+    words = f"{title}: {shape_text(filters.shape)}"
     if len(shown) < len(filters) or shown.shape[1] < filters.shape[1]:
-        words += f" ({times(shown.shape[:2])} of them shown)"
+        words += f" ({shape_text(shown.shape[:2])} of them shown)"
     if not in_color and filters.shape[1] > images:
         words += "; a row is a filter, a column an input channel"
     scale = None if in_color else ("RdBu_r", -limit, limit)
@@ -63,7 +63,7 @@ def maps_figure(maps: np.ndarray, image: np.ndarray, title: str) -> Figure:
     shown = maps.reshape(-1, *maps.shape[-2:])[:MOST_MAPS]
     finite = shown[np.isfinite(shown)]
     low, high = np.percentile(finite, [0.5, 99.5]) if finite.size else (0.0, 1.0)
-    words = f"{title}: {times(maps.shape)}"
+    words = f"{title}: {shape_text(maps.shape)}"
     count = int(np.prod(maps.shape[:-2]))
     words += f" ({len(shown)} of them shown)" if count > len(shown) else ""
     still = int((np.ptp(maps.reshape(count, -1), axis=1) == 0).sum())

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from netspec.data.datum import times
+from netspec.data.datum import shape_text
 from netspec.errors import SpecError, Where
 from netspec.files import figures
 from netspec.files.whole_file import why_unwritable, write_whole
@@ -107,7 +107,7 @@ def what_is_shown(values: np.ndarray) -> str:
     """Return a note if a drawing of values (C, H, W) cannot show the channels themselves, else ""."""
     if values.shape[1:] == (1, 1) and len(values) > 4:
         return f"vectors of {len(values)} numbers as blocks"
-    return f"{times(values.shape)}, mean of the channels" if len(values) not in (1, 3, 4) else ""
+    return f"{shape_text(values.shape)}, mean of the channels" if len(values) not in (1, 3, 4) else ""
 
 
 def draw_tile(axis: Axes, picture: np.ndarray, left: float, bottom: float, width: float, height: float) -> None:

@@ -16,7 +16,7 @@ from netspec.inspect.features.images import read_pixels
 from netspec.inspect.records import open_records
 
 PCA, TSNE = "pca", "tsne"
-_BESIDE = ("stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms", "names", "keys")
+_NOT_DESCRIPTORS = ("stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms", "names", "keys")
 _PERPLEXITY = 30.0  # perplexity of t-SNE: the approximate number of neighbors of a point
 
 
@@ -33,7 +33,7 @@ def read_features(path: str | Path, array: str = "") -> Features:
     """Return the descriptors of a features.npz (docs/features.md); ``array`` names one of several. Raises SpecError."""
     where = Where(str(path))
     arrays = read_npz(path, "a features.npz written by netspec extract")
-    found = {name: values for name, values in arrays.items() if name not in _BESIDE and values.ndim == 2}
+    found = {name: values for name, values in arrays.items() if name not in _NOT_DESCRIPTORS and values.ndim == 2}
     chosen = array or next(iter(found), "")
     if chosen not in found:
         hint = did_you_mean(array, list(found)) or ";"

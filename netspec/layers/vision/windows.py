@@ -39,8 +39,8 @@ class Windows:
         """
         counts = []
         for size, kernel, stride, pad in self.axes():
-            room = size + 2 * pad - kernel
-            count = (room // stride if self.round_mode == FLOOR else -(-room // stride)) + 1
+            free = size + 2 * pad - kernel
+            count = (free // stride if self.round_mode == FLOOR else -(-free // stride)) + 1
             if any(self.pad) and (count - 1) * stride >= size + pad:
                 count -= 1
             counts.append(count)

@@ -138,7 +138,7 @@ def test_one_cluster_where_all_are_near() -> None:
     np.testing.assert_allclose(sequential_clusters(descriptors, 0.1), descriptors[:1], atol=1e-6)
 
 
-def test_nothing_to_cluster() -> None:
+def test_clustering_without_descriptors_is_refused() -> None:
     with pytest.raises(InputError, match="no descriptors to cluster"):
         sequential_clusters(np.zeros((0, 128), np.float32), 0.6)
     with pytest.raises(InputError, match="must be positive"):

@@ -296,7 +296,7 @@ def test_a_deploy_file_without_the_scale_of_the_training_gets_a_warning(run: Run
     assert not np.allclose(found, conv1_of(run, NET)[0], atol=0.1)
 
 
-def test_a_deploy_file_that_scales_by_itself_gets_no_warning(run: Run, images: Path) -> None:
+def test_a_deploy_file_with_its_own_scaling_gets_no_warning(run: Run, images: Path) -> None:
     Path("deploy.prototxt").write_text(INPUT + OWN_SCALE + CONV)
     found, result = conv1_of(run, "deploy.prototxt")
     assert result.err == ""

@@ -58,7 +58,7 @@ def test_another_word_is_refused(net_of) -> None:
         net_of(CONVOLUTION, exact="some")
 
 
-def test_no_image_is_no_fault(net_of) -> None:
+def test_a_batch_without_images_is_accepted(net_of) -> None:
     assert net_of(CONVOLUTION, exact="all").layers[2].run(torch.zeros(0, 2, 2, 2))[0].shape == (0, 3)
 
 

@@ -103,7 +103,7 @@ def test_wrong_files_are_reported(name: str, data: bytes, said: str, tmp_path: P
     assert "\n" not in str(caught.value)
 
 
-def test_a_web_address_is_no_file() -> None:
+def test_a_web_address_is_not_a_file() -> None:
     for read in (read_net, lambda path: load_weights(EMPTY, path)):
         with pytest.raises(SpecError, match=r"^https://example\.org/x\.prototxt: is a web address; download the file"):
             read("https://example.org/x.prototxt")

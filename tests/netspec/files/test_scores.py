@@ -25,7 +25,7 @@ def test_values_that_are_no_numbers_are_kept(tmp_path: Path) -> None:
     assert [str(value) for value in test.outputs["loss"]] == ["inf", "nan"]
 
 
-def test_a_training_that_goes_on_keeps_what_was_before() -> None:
+def test_a_resumed_training_keeps_the_earlier_scores() -> None:
     assert SCORES.before(5) == Scores(SCORES.tests[:1], SCORES.snapshots[:1])  # it will test at 5 once more
     assert SCORES.before(6) == Scores(SCORES.tests, SCORES.snapshots[:1])
     assert SCORES.before(0) == Scores([], [])

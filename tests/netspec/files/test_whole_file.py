@@ -27,7 +27,7 @@ def test_why_no_file_can_be_written(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
 
 
-def test_a_folder_without_leave_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_why_a_file_in_a_read_only_folder_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)  # root may write everywhere
     assert package.why_unwritable(tmp_path / "new") == "Permission denied"
     (tmp_path / "old").touch()
@@ -65,7 +65,7 @@ def test_the_file_and_its_folder_are_on_disk_before_the_block_ends(
     assert synced == [(False, [unfinished.name]), (True, ["file"])]
 
 
-def test_a_folder_that_cannot_be_synced_is_no_fault_and_said_once(
+def test_a_folder_that_cannot_be_synced_gives_one_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def refuse(path: Path) -> None:
@@ -94,7 +94,7 @@ def test_where_files_have_no_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
 
 
-def test_why_unwritable_where_file_systems_tell_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_why_unwritable_without_statvfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "statvfs")  # as on Windows
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert package.why_unwritable(tmp_path / "file") == os.strerror(errno.EACCES)
@@ -192,7 +192,7 @@ def test_a_lock_that_a_killed_run_left_is_taken(tmp_path: Path) -> None:
     assert not (tmp_path / "x").exists()
 
 
-def test_what_is_named_like_a_leftover_and_is_none_neither_blocks_nor_goes(
+def test_pipes_and_links_named_like_unfinished_files_are_not_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(package, "_swept", set())

@@ -94,7 +94,7 @@ def test_ceil_mode_of_forks_is_round_mode() -> None:
     assert str(source.at(0, "pooling_param", "round_mode")) == "f:2:2"
 
 
-def test_byte_order_mark_is_no_fault(tmp_path: Path) -> None:
+def test_a_byte_order_mark_is_accepted(tmp_path: Path) -> None:
     path = tmp_path / "net.prototxt"
     path.write_bytes(b'\xef\xbb\xbfname: "n"\nforce_backward: 2')
     with pytest.raises(SpecError, match=r"net.prototxt:2:17: expected true or false"):
@@ -238,7 +238,7 @@ def outcome(text: str) -> Any:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(300))
-def test_damaged_text_is_refused_or_read_alike(seed: int) -> None:
+def test_damaged_text_is_refused_or_read_as_by_protobuf(seed: int) -> None:
     """Whatever is done to a text: it is a SpecError, or the message that protobuf reads from it."""
     draw = random.Random(seed)
     text = (GOLDEN / "layers" / "net_residual_block_train" / "net.prototxt").read_text(encoding="utf-8")[:1500]

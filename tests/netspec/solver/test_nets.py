@@ -28,7 +28,7 @@ def named(found: list[SolverNet]) -> list[tuple[str, str, str]]:
     return [(part.label, part.net.name, part.origin) for part in found]
 
 
-def test_one_net_for_everything():
+def test_one_net_for_training_and_tests():
     found = nets('net: "a.prototxt" test_iter: 1 test_interval: 1')
     assert named(found) == [("train net", "a", "net file: a.prototxt"), ("test net #0", "a", "net file: a.prototxt")]
     assert [part.net.state.phase for part in found] == [0, 1]

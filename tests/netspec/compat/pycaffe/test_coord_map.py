@@ -86,7 +86,7 @@ def test_a_crop_of_a_crop() -> None:
     assert coord_map_from_to(n.crop, n.data) == (axis, scale, shift + 3)
 
 
-def test_a_crop_of_other_axes_does_not_go_with_a_convolution() -> None:
+def test_a_crop_of_other_axes_than_a_convolution_is_refused() -> None:
     n = spec()
     n.crop = L.Crop(n.deconv, n.data, axis=3, offset=3)
     with pytest.raises(AxisMismatchException, match="after 2, the other for the axes after 1"):

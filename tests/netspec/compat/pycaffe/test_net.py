@@ -98,7 +98,7 @@ def ruled(name: str, rule: str) -> str:
       inner_product_param {{ num_output: 1 }} }}"""
 
 
-def made(net: caffe.Net) -> list[str]:
+def blobs_made(net: caffe.Net) -> list[str]:
     """Return the blobs besides the input and its copies."""
     return [name for name in net.blobs if "data" not in name]
 
@@ -121,9 +121,9 @@ def test_levels(write: Callable[..., str], level: int | None, expected: list[str
         + ruled("from 1", "include { min_level: 1 }")
     )
     net = caffe.Net(path, caffe.TEST) if level is None else caffe.Net(path, caffe.TEST, level=level)
-    assert made(net) == expected
+    assert blobs_made(net) == expected
     if level is not None:
-        assert made(caffe.Net(path, caffe.TEST, level)) == expected
+        assert blobs_made(caffe.Net(path, caffe.TEST, level)) == expected
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_stages(write: Callable[..., str], stages: list[str] | None, expected: l
         + ruled("B", 'include { stage: "B" }')
         + ruled("A and B", 'include { stage: "A" stage: "B" }')
     )
-    assert made(caffe.Net(path, caffe.TEST, stages=stages)) == expected
+    assert blobs_made(caffe.Net(path, caffe.TEST, stages=stages)) == expected
 
 
 def test_train_test_and_deploy_in_one_file(write: Callable[..., str]) -> None:
@@ -163,7 +163,7 @@ def test_train_test_and_deploy_in_one_file(write: Callable[..., str]) -> None:
         assert net.outputs == outputs
         assert list(net.forward()) == outputs
     assert net.inputs == ["data"]
-    assert made(net) == ["ip", "pred"]
+    assert blobs_made(net) == ["ip", "pred"]
 
 
 def test_a_loss_without_a_top_has_an_automatic_one(net_of: Callable[..., caffe.Net]) -> None:

@@ -70,7 +70,7 @@ def test_layers_without_tops() -> None:
     assert len(built(proto)()) == 0
 
 
-def test_an_input_that_is_no_top_is_a_type_error() -> None:
+def test_an_input_that_is_not_a_top_is_a_type_error() -> None:
     data = L.DummyData(ntop=2)
     with pytest.raises(TypeError, match=r"^Silence input 0 is not a Top \(type is <class 'tuple'>\)$"):
         L.Silence(data, ntop=0)
