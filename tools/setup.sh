@@ -23,16 +23,16 @@ if [ ! -x "$VENV/bin/netspec" ] || [ ! -e "$INSTALLED" ] || [ "$ROOT/pyproject.t
   fi
   mkdir -p "$VENV/tmp"
   if "$VENV/bin/python" -c 'import torch' 2>/dev/null; then
-    echo "Installing into $VENV, once; its PyTorch stays" >&2
+    echo "Installing into $VENV, once. The PyTorch in it is kept" >&2
   else
-    echo "Installing into $VENV, once: on Linux 6 GB, most of it PyTorch for NVIDIA GPUs; some minutes." >&2
-    echo "With PyTorch for the CPU alone 2 GB: docs/start.md says how" >&2
+    echo "Installing into $VENV, once. This takes minutes and, on Linux, 5.2 GB, most of it for NVIDIA GPUs." >&2
+    echo "With PyTorch for the CPU alone it takes 1.5 GB: see docs/start.md" >&2
     install -c "$ROOT/constraints.txt" torch
   fi
   echo "Installing everything else" >&2
   install -e "$ROOT${NEEDS:+[$NEEDS]}"
   rm -r "$VENV/tmp"
-  # pip would compile on one core. Some packages have templates that are not Python: it says so by its status.
+  # pip would compile on one core. Some packages contain templates that are not valid Python, so errors are ignored.
   "$VENV/bin/python" -m compileall -q -j 0 "$VENV"/lib/python*/site-packages >"$VENV/compiled.log" 2>&1 || true
   touch "$VENV/installed" "$INSTALLED"
 fi

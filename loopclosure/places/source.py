@@ -150,7 +150,7 @@ def extract(
     if folder.exists():
         if (folder / MADE_FROM).is_file() and (folder / MADE_FROM).read_text(encoding="utf-8") == made_from:
             return folder, f"{source}: its frames are in {folder} already"
-        raise InputError(f"is there already, and not made from {source}; remove it, or give another --out", folder)
+        raise InputError(f"already exists, and was not made from {source}; remove it, or give another --out", folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with whole_folder(folder) as unfinished:
         (unfinished / "rgb").mkdir()

@@ -191,7 +191,8 @@ def newest_pair(prefix: str) -> Path | None:
             log.logger.warning(f"skipped: {fault}")
             passed += 1
     if passed:
-        message = f'none of the {passed} snapshots with the prefix "{prefix}" is complete; move them away to start anew'
+        found = f'none of the {passed} snapshots with the prefix "{prefix}" is complete'
+        message = f"{found}; move them away to start from the beginning"
         raise SpecError(f"{message}, or give one with --snapshot", Where(prefix))
     return None
 

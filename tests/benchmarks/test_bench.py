@@ -100,13 +100,13 @@ def test_forward_passes_are_compared(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(["forward", "lenet", *ways, "--rounds", "1", "--json", str(out), "--plot", str(plot)]) == 0
     assert "lenet, batch 1" in plot.read_text()
     assert "| lenet | 1 | 1 | pytorch |" in capsys.readouterr().out
-    told = json.loads(out.read_text())
-    assert [row["run by"] for row in told["rows"]] == ["netspec", "pytorch", "pycaffe"]
-    assert all(row["what"] == "forward" and row["ms"] > 0 for row in told["rows"])
-    assert told["rows"][1]["off by"] < 1e-5
-    assert told["machine"]["cores"] > 0
-    assert told["date"] > "2026"
-    assert told["command"].startswith("tools/bench forward lenet --with netspec")
+    written = json.loads(out.read_text())
+    assert [row["run by"] for row in written["rows"]] == ["netspec", "pytorch", "pycaffe"]
+    assert all(row["what"] == "forward" and row["ms"] > 0 for row in written["rows"])
+    assert written["rows"][1]["off by"] < 1e-5
+    assert written["machine"]["cores"] > 0
+    assert written["date"] > "2026"
+    assert written["command"].startswith("tools/bench forward lenet --with netspec")
 
 
 @pytest.mark.slow
@@ -129,8 +129,8 @@ def test_what_cannot_run_is_reported_in_a_line(tmp_path: Path, capsys: pytest.Ca
     net = tmp_path / "net.prototxt"
     net.write_text('layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 2 } } }')
     assert main(["forward", str(net), "--with", "pytorch", "--rounds", "1"]) == 0
-    told = capsys.readouterr()
-    assert told.err.splitlines()[-1].startswith("pytorch: there is no twin of this net")
+    captured = capsys.readouterr()
+    assert captured.err.splitlines()[-1].startswith("pytorch: there is no twin of this net")
     assert main(["train", "resnet51"]) == 1
     assert 'no training of "resnet51"' in capsys.readouterr().err
 
@@ -155,8 +155,8 @@ def test_an_environment_that_cannot_be_installed_is_a_fault(
 def test_growth_is_measured_kept_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plot, out = tmp_path / "growth.png", tmp_path / "growth.json"
     assert main(["growth", "pairs", "1", "3000", "--plot", str(plot), "--json", str(out)]) == 0
-    told = [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()]
-    assert told == ["| pairs in an LMDB", "| ---", "| 1", "| 3,000"]
+    cells = [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()]
+    assert cells == ["| pairs in an LMDB", "| ---", "| 1", "| 3,000"]
     assert plot.stat().st_size > 1000
     rows = json.loads(out.read_text())["rows"]
     assert [row["pairs in an LMDB"] for row in rows] == [1, 3000]

@@ -24,7 +24,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-import matplotlib.pyplot  # noqa: E402, F401  each run would import it anew
+import matplotlib.pyplot  # noqa: E402, F401  each run would import it again
 import torch  # noqa: E402
 
 import lmdb_build.cli  # noqa: E402

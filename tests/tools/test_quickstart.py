@@ -52,11 +52,11 @@ def start(project: Path, folder: Path) -> list[str]:
 def test_it_ends_with_five_lines_and_starts_all_in_one_folder(project: Path) -> None:
     out = "out/quickstart"
     assert start(project, project) == [
-        f"A small net, trained here, judges 73 of 100 pairs of a new house rightly: {out}/compare/distances.png",
-        f"The loops bring the path through that house from 0.51 m to 0.03 m off the truth: {out}/closed/paths.png",
+        f"A small net, trained here, labels 73 of 100 pairs of a new house correctly: {out}/compare/distances.png",
+        f"The loops reduce the error of the path through that house from 0.51 m to 0.03 m: {out}/closed/paths.png",
         f"More pictures: {out}/pairs.png, {out}/compare/losses.png and the report {out}/report/report.html",
         f"What each command printed: {out}/quickstart.log",
-        f"To go on there: source .venv/bin/activate && cd {out}",
+        f"To continue there: source .venv/bin/activate && cd {out}",
     ]
     started = (project / "started").read_text().splitlines()
     assert len(started) == 10
@@ -70,7 +70,7 @@ def test_a_second_run_deletes_nothing(project: Path, tmp_path: Path) -> None:
     trained.write_bytes(b"weights")
     lines = start(project, tmp_path)
     assert trained.read_bytes() == b"weights"
-    assert lines[-1] == "To go on there: source clone/.venv/bin/activate && cd clone/out/quickstart-2"
+    assert lines[-1] == "To continue there: source clone/.venv/bin/activate && cd clone/out/quickstart-2"
     assert "clone/out/quickstart-3" in start(project, tmp_path)[-1]
 
 

@@ -22,7 +22,7 @@ from types import ModuleType
 from typing import Any
 
 from netspec.compat.scripts.as_python2 import py2_bytes
-from netspec.compat.scripts.mended import TRANSLATED
+from netspec.compat.scripts.operations import TRANSLATED
 from netspec.log import VARIABLE
 
 

@@ -22,8 +22,8 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
 
-from netspec.compat.scripts import mended, old_names, python2
-from netspec.compat.scripts.mended import MENDED
+from netspec.compat.scripts import old_names, operations, python2
+from netspec.compat.scripts.operations import REPLACEMENT
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
 from netspec.files.whole_file import write_whole
@@ -73,8 +73,8 @@ class Reader(importlib.abc.MetaPathFinder):
         ours = Path(__file__).parents[3]
         others = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
         self._others = (*others, *(str(ours / name) for name in ("netspec", "loopclosure", "lmdb_build")))
-        for name, function in mended.BUILTINS.items():
-            setattr(builtins, MENDED.format(name), function)
+        for name, function in operations.BUILTINS.items():
+            setattr(builtins, REPLACEMENT.format(name), function)
         sys.meta_path.insert(0, self)
 
     def main_code(self, data: bytes, path: str) -> CodeType:
@@ -105,7 +105,7 @@ class Reader(importlib.abc.MetaPathFinder):
             return _compiled(data, path)
         if not self.quiet:
             print(f"netspec run: {path} {said}", file=sys.stderr)
-        mended.TRANSLATED.add(path)
+        operations.TRANSLATED.add(path)
         return _compiled(python2.translated(data, path), path, is_python2=True)
 
     def _is_neighbor(self, path: str) -> bool:
@@ -156,7 +156,7 @@ def _is_in(name: str, folder: Path) -> bool:
 
 def builtins_for(path: str) -> Any:
     """Return the builtins of a module. In Python 2 an import searches the package of the module first."""
-    return {**vars(builtins), "__import__": _import} if path in mended.TRANSLATED else builtins
+    return {**vars(builtins), "__import__": _import} if path in operations.TRANSLATED else builtins
 
 
 def _import(name: str, names: Any = None, own: Any = None, wanted: Sequence[str] = (), level: int = 0) -> Any:
@@ -224,7 +224,7 @@ _WITH_SIZES = ("empty", "ones", "reshape", "resize", "zeros")  # functions that 
 
 
 class _Mending(ast.NodeTransformer):
-    """Replaces what Python 3 or NumPy refuses, or does differently, by calls of netspec/compat/scripts/mended.py.
+    """Replaces what Python 3 or NumPy refuses, or does differently, by calls of netspec/compat/scripts/operations.py.
 
     These are ``a.tostring()``, ``"%f" % a`` and ``float(a)`` for one element; in Python 2 also text instead of bytes,
     comparisons of different types, ``sort(cmp)``, and floats as sizes and in slices.
@@ -292,5 +292,5 @@ class _Mending(ast.NodeTransformer):
 
 
 def _calling(name: str, *arguments: ast.expr, keywords: Sequence[ast.keyword] = ()) -> ast.Call:
-    """Return a call of one of the functions of netspec/compat/scripts/mended.py."""
-    return ast.Call(ast.Name(MENDED.format(name), ast.Load()), list(arguments), list(keywords))
+    """Return a call of one of the functions of netspec/compat/scripts/operations.py."""
+    return ast.Call(ast.Name(REPLACEMENT.format(name), ast.Load()), list(arguments), list(keywords))

@@ -142,7 +142,7 @@ def test_a_video_is_extracted_once(tmp_path: Path) -> None:
     again, said = extract(video, tmp_path / "frames")
     assert (again, said) == (folder, f"{video}: its frames are in {folder} already")
     other = write_video(tmp_path / "other.avi")
-    with pytest.raises(InputError, match="is there already, and not made from"):
+    with pytest.raises(InputError, match="already exists, and was not made from"):
         extract(other, folder)
 
 

@@ -1,8 +1,8 @@
-"""Functions that replace operations with another meaning in Python 2, or in NumPy before 2.4.
+"""Operations as they are in Python 2, or in NumPy before 2.4, where Python 3 or a newer NumPy refuses or changes them.
 
-netspec/compat/scripts/sources.py writes these calls into a program. Each function changes what it is given and then
-calls once: text where bytes are due becomes the bytes of the file that it came from, an array of one element a number,
-and 2.0 an integer where an index or a size is due.
+netspec/compat/scripts/sources.py replaces operations in a program by calls of these functions. Each function converts
+its arguments and then runs the operation once. It converts text to bytes where bytes are needed (the bytes of the file
+that the text was read from), an array of one element to a number, and 2.0 to 2 where an index or a size is needed.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from typing import Any
 
 from netspec.compat.scripts.as_python2 import Py2Bytes, py2_bytes, py2_text
 
-MENDED = "__netspec_{}__"  # the names of the builtins below
-TRANSLATED: set[str] = set()  # the files of Python 2 in this process
+REPLACEMENT = "__netspec_{}__"  # the name under which a program calls one of BUILTINS
+TRANSLATED: set[str] = set()  # the files that were translated from Python 2 in this process
 _OF_BYTES = ("hex", "base64", "zlib", "bz2", "quopri", "uu")  # codecs from bytes to bytes
 _CONVERSION = re.compile(r"%(?:\((?P<name>.*?)\))?[-#0 +]*(?P<width>\*|\d*)(?:\.(?P<digits>\*|\d*))?[hlL]?(?P<kind>.)")
 
@@ -70,17 +70,17 @@ class _Sliced:
         self._bound = _integer if is_array else _number
 
     def __getitem__(self, key: Any) -> Any:
-        return self._whole[self._mended(key)]
+        return self._whole[self._converted(key)]
 
     def __setitem__(self, key: Any, value: Any) -> None:
-        self._whole[self._mended(key)] = value
+        self._whole[self._converted(key)] = value
 
     def __delitem__(self, key: Any) -> None:
-        del self._whole[self._mended(key)]
+        del self._whole[self._converted(key)]
 
-    def _mended(self, key: Any) -> Any:
+    def _converted(self, key: Any) -> Any:
         if isinstance(key, tuple):
-            return tuple(map(self._mended, key))
+            return tuple(map(self._converted, key))
         return slice(*map(self._bound, (key.start, key.stop, key.step))) if isinstance(key, slice) else key
 
 
@@ -99,7 +99,7 @@ def _percent(text: str, values: Any) -> str:
 
 
 class _Formatter(string.Formatter):
-    """Formats like str.format. Objects without a format of their own, such as None or a list, become their text."""
+    """Formats like str.format. Objects that define no format, such as None or a list, are formatted as their text."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         return format(str(value) if type(value).__format__ is object.__format__ else value, format_spec)
@@ -113,13 +113,13 @@ def _format(text: Any, *arguments: Any, **named: Any) -> Any:
 
 
 def _with_bytes(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Return function(...), which takes bytes; text among its arguments is that of a file or literal of Python 2."""
+    """Return function(...), where function takes bytes. Text in the arguments becomes the bytes it was in Python 2."""
     result = function(*map(py2_bytes, arguments), **{name: py2_bytes(value) for name, value in named.items()})
     return py2_text(result) if type(result) is bytes else result
 
 
 def _sort(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Return function(...), the method sort of a list or sorted(list, ...); a comparison becomes a key."""
+    """Return function(...), where function is list.sort or sorted. A comparison function becomes a key."""
     if arguments and callable(arguments[-1]):
         arguments, named = arguments[:-1], {**named, "cmp": arguments[-1]}
     compare = named.pop("cmp", None)
@@ -129,14 +129,14 @@ def _sort(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
 
 
 def _decode(value: Any, *codec: Any) -> Any:
-    """Return value.decode(...); text from a file is decoded already."""
+    """Return value.decode(...). Text from a file is already decoded, and is returned unchanged."""
     if codec and isinstance(value, (str, bytes)) and codec[0] in _OF_BYTES:
         return Py2Bytes(codecs.decode(py2_bytes(value), *codec))
     return value if isinstance(value, str) else value.decode(*codec)
 
 
 def _encode(value: Any, *codec: Any) -> Any:
-    """Return value.encode(...), as bytes that are shown as text."""
+    """Return value.encode(...), as bytes that print like text."""
     if codec and isinstance(value, (str, bytes)) and codec[0] in _OF_BYTES:
         value, codec = codecs.encode(py2_bytes(value), *codec), ()
     encoded = value if isinstance(value, bytes) else value.encode(*codec)
