@@ -1,5 +1,6 @@
 """Every layer can be exported with the same results, or gives a reason why not."""
 
+import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -80,6 +81,20 @@ def test_a_class_outside_netspec_defines_its_own_export() -> None:
     assert exported(layer, "torch_call") == "2 * {x}"
     assert exported(layer, "to_onnx") is exported(layer, "onnx_op") is None
     assert str(refusal(layer, "ONNX")).endswith("cannot be exported to ONNX: its class does not support it")
+
+
+@pytest.mark.parametrize(("shift", "power"), [(3, 2), (0, -1), (-2, 0.5)], ids=["finite", "infinite", "NaN"])
+def test_a_power_that_does_not_depend_on_its_bottom_is_exported(shift: float, power: float) -> None:
+    text = f"""layer {{ name: "x" type: "Input" top: "x" input_param {{ shape {{ dim: 2 dim: 3 }} }} }}
+layer {{ name: "y" type: "Power" bottom: "x" top: "y" power_param {{ scale: 0 shift: {shift} power: {power} }} }}"""
+    net = build_net(*parse_net_text(text, "net.prototxt"))
+    inputs = {"x": np.ones((2, 3), np.float32)}
+    expected = here(net, inputs)["y"]
+    found = [run_module(module, net, inputs)["y"] for module in (source_module(net), torch_module(net))]
+    if importlib.util.find_spec("onnxruntime"):
+        found.append(in_onnxruntime(onnx_model(net)[0], inputs)["y"])
+    for y in found:
+        np.testing.assert_allclose(y, expected, rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import torch
+
 from netspec.export.exporter import Exporter, exports
 from netspec.export.layers.activation import scaled_and_shifted, torch_scaled_and_shifted
 from netspec.export.targets import OnnxGraph, TorchCode
@@ -18,14 +20,16 @@ class PowerExport(Exporter):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         layer = self.layer
         if layer.power * layer.scale == 0:
-            return graph.node("Expand", graph.constant(layer.shift**layer.power), graph.shape_of(bottoms[0]))
+            constant = torch.tensor(layer.shift).pow(layer.power)  # Python's ** raises for inf, and NaN is complex
+            return graph.node("Expand", graph.constant(constant), graph.shape_of(bottoms[0]))
         value = scaled_and_shifted(graph, bottoms[0], layer.scale, layer.shift)
         return value if layer.power == 1 else graph.node("Pow", value, graph.constant(layer.power))
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
         layer = self.layer
         if layer.power * layer.scale == 0:
-            return code.call("torch.full_like({x}, {value})", x=bottoms[0], value=layer.shift**layer.power)
+            template = "torch.full_like({x}, {shift}).pow({power})"
+            return code.call(template, x=bottoms[0], shift=layer.shift, power=layer.power)
         value = torch_scaled_and_shifted(code, bottoms[0], layer.scale, layer.shift)
         return value if layer.power == 1 else code.call("torch.pow({x}, {power})", x=value, power=layer.power)
 
