@@ -1,4 +1,4 @@
-"""``python core_program.py COUNT`` prints a hash of the results of each net; tests/laws/test_wings.py compares them.
+"""Print a hash of the results of each net: ``python core_program.py COUNT``, for laws/test_optional_packages.py.
 
 The nets are golden cases of layers, forward and backward; golden trainings; and COUNT random nets, in phase TEST and in
 training, and with pycaffe if it is there. Nothing else that it imports needs an optional package.

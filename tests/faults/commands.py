@@ -1,4 +1,4 @@
-"""Commands that write files, with inputs, and checks of what they wrote."""
+"""Commands that write files, with their inputs and checks of their outputs."""
 
 from __future__ import annotations
 

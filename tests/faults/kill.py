@@ -1,4 +1,4 @@
-"""Kills commands again and again, and checks that files are complete, no process is left, and nothing else remains.
+"""Kill commands repeatedly; check that files are complete and that no process and no other file is left.
 
     python tests/faults/kill.py [--kills 200] [--seed 0] [COMMAND ...]
 

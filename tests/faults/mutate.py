@@ -1,4 +1,4 @@
-"""Damages files at random, and checks that every reader ends with its own error, soon, and with little memory.
+"""Damage files at random; check that every reader ends with its own error, within seconds and with little memory.
 
     python tests/faults/mutate.py [--tries 1000] [--seed 0] [--keep FOLDER] [FORMAT ...]
 

@@ -1,4 +1,4 @@
-"""A full disk, or no permission to write: one line of message, and the old file is unchanged."""
+"""Commands on a full disk, without their folder or beside another training: one line, and old files are unchanged."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ MOST = 1500  # bytes of a file; all that the commands write is larger
 
 @contextmanager
 def full_disk() -> Iterator[None]:
-    """Limit files to a few bytes; the error differs from that of a full disk, but is handled in the same way."""
+    """Limit the size of files; the error differs from that of a full disk, but is handled in the same way."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (MOST, before[1]))
     try:
@@ -46,7 +46,9 @@ def contents() -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_full_disk(name: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_on_a_full_disk_reports_one_line_and_keeps_old_files(
+    name: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     case = CASES[name]
     case.prepare()
     assert case.main(case.words) == 0
@@ -65,7 +67,9 @@ def sheet() -> int:
     return lmdb_build.cli.main(["sheet", "pairs.txt", "out/sheet.png"])
 
 
-def test_a_picture_of_pairs_on_a_full_disk(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sheet_on_a_full_disk_reports_one_line_and_keeps_the_old_file(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     CASES["convert"].prepare()
     assert sheet() == 0
     before = contents()
@@ -84,7 +88,9 @@ WRITERS = {
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_what_else_netspec_writes_on_a_full_disk(name: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_upgrade_fold_and_export_on_a_full_disk_report_one_line_and_keep_old_files(
+    name: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     CASES["extract"].prepare()
     save_weights(load_net("net.prototxt", seed=0), "w.caffemodel")
     layers = [f'layers {{ name: "l{i}" type: RELU bottom: "data" top: "{i}" }}' for i in range(60)]
@@ -99,7 +105,7 @@ def test_what_else_netspec_writes_on_a_full_disk(name: str, here: Path, capsys: 
 
 
 @pytest.mark.parametrize("name", ["extract", "similarity", "detect"])
-def test_a_folder_that_vanished(name: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_output_folder_is_reported(name: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     case = CASES[name]
     case.prepare()
     Path("out").rmdir()
@@ -110,7 +116,7 @@ def test_a_folder_that_vanished(name: str, here: Path, capsys: pytest.CaptureFix
     assert "No such file or directory" in line
 
 
-def test_a_detector_resumed_and_saved_under_one_name(here: Path) -> None:
+def test_detect_on_a_full_disk_keeps_the_state_that_it_resumed(here: Path) -> None:
     case: Case = CASES["detect"]
     case.prepare()
     assert case.main(case.words) == 0
@@ -137,7 +143,9 @@ def output_net(here: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int
     return lambda command: main(f"{command} --model net.prototxt --iterations 3".split())
 
 
-def test_results_in_hdf5_on_a_full_disk(output_net: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
+def test_hdf5_output_on_a_full_disk_reports_one_line_and_keeps_the_old_file(
+    output_net: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
     before = contents()
     with full_disk():
         assert output_net("test --weights w.caffemodel") == 1
@@ -148,14 +156,16 @@ def test_results_in_hdf5_on_a_full_disk(output_net: Callable[..., int], capsys: 
         assert {name: np.asarray(file[name]).shape for name in file} == {"data": (24, 90, 1, 1), "label": (24, 1, 1, 1)}
 
 
-def test_nothing_is_written_by_a_net_that_is_only_timed_or_checked(output_net: Callable[..., int]) -> None:
+def test_time_and_check_do_not_write_the_file_of_hdf5_output(output_net: Callable[..., int]) -> None:
     before = contents()
     assert output_net("time") == 0
     assert main(["check", "net.prototxt", "--data"]) == 0
     assert contents() == before
 
 
-def test_two_trainings_on_one_prefix(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_second_training_with_the_same_snapshot_prefix_is_refused(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     case = CASES["train"]
     case.prepare()
     with whole_file.only_one("out/.x.lock", ""):

@@ -1,4 +1,4 @@
-"""Files with false sizes, false offsets, or a false format."""
+"""Files that were truncated, changed or made to harm a reader: false sizes, links, and contents that decompress."""
 
 import io
 import os
@@ -36,39 +36,46 @@ from paths import ROOT
 HUGE = (1 << 20, 1 << 20)
 
 
-def lying_header() -> bytes:
-    """An .npy file that announces terabytes."""
+def false_header() -> bytes:
+    """Return an .npy file whose header gives a size of terabytes."""
     stream = io.BytesIO()
     np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": HUGE})
     return stream.getvalue() + bytes(100)
 
 
-def test_an_npy_that_announces_too_much(tmp_path: Path) -> None:
-    (tmp_path / "x.npy").write_bytes(lying_header())
+def test_an_npy_with_a_false_size_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.npy").write_bytes(false_header())
     with pytest.raises(InputError, match=r"shape \(1048576, 1048576\), float32, in"):
         read_truth_matrix(tmp_path / "x.npy")
     with pytest.raises(SpecError, match="cannot be read as an array"):
         read_mean_option(str(tmp_path / "x.npy"))
 
 
-@pytest.mark.parametrize("read", [read_features, embedding.read_features])
-def test_an_npz_that_announces_too_much(read: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("read", [read_features, embedding.read_features], ids=["loopclosure", "netspec"])
+def test_an_npz_with_a_false_size_is_refused(read: Any, tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
-        archive.writestr("features.npy", lying_header())
+        archive.writestr("features.npy", false_header())
     with pytest.raises(InputError, match=r"shape \(1048576, 1048576\), float32, in"):
         read(tmp_path / "x.npz")
 
 
+@pytest.fixture(scope="module")
+def large_npz(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a small .npz file whose array takes 280 MiB of memory."""
+    path = tmp_path_factory.mktemp("large") / "x.npz"
+    np.savez_compressed(path, features=np.zeros((70, 1 << 20), np.float32))
+    return path
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("read", [read_features, embedding.read_features])
-def test_an_npz_that_unpacks_to_too_much(read: Any, tmp_path: Path) -> None:
-    np.savez_compressed(tmp_path / "x.npz", features=np.zeros((70, 1 << 20), np.float32))
+@pytest.mark.parametrize("read", [read_features, embedding.read_features], ids=["loopclosure", "netspec"])
+def test_an_npz_that_decompresses_to_too_much_is_refused(read: Any, large_npz: Path) -> None:
     with pytest.raises(InputError, match=r"would take 280 MiB of memory, in a file of \d+ bytes"):
-        read(tmp_path / "x.npz")
+        read(large_npz)
 
 
-@pytest.mark.parametrize("kind", ["<U4", ">U4"])
-def test_an_npz_with_text_that_is_none(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["<U4", ">U4"], ids=["little_endian", "big_endian"])
+def test_an_npz_with_invalid_unicode_is_refused(kind: str, tmp_path: Path) -> None:
     names = np.array(["a.png", "b.png"], kind)
     names.view(np.uint8)[1:3] = 0xEE
     np.savez(tmp_path / "x.npz", features=np.ones((2, 3)), names=names)
@@ -76,13 +83,13 @@ def test_an_npz_with_text_that_is_none(kind: str, tmp_path: Path) -> None:
         read_features(tmp_path / "x.npz")
 
 
-def test_an_npz_with_python_objects(tmp_path: Path) -> None:
+def test_an_npz_with_python_objects_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", features=np.array([{"a": 1}], object))
     with pytest.raises(InputError, match="Python objects"):
         read_features(tmp_path / "x.npz")
 
 
-def test_an_hdf5_file_that_announces_too_much(tmp_path: Path) -> None:
+def test_an_hdf5_file_with_a_false_size_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file.create_dataset("data", HUGE, np.float32, chunks=(1024, 1024), compression="gzip")
         file["label"] = np.zeros(3)
@@ -93,7 +100,7 @@ def test_an_hdf5_file_that_announces_too_much(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["link", "soft link", "stored", "virtual"])
-def test_an_hdf5_file_that_shows_what_lies_in_another(kind: str, tmp_path: Path) -> None:
+def test_an_hdf5_file_with_data_in_another_file_is_refused(kind: str, tmp_path: Path) -> None:
     """The other file is not read; otherwise its contents would be in the output of ``extract`` or in a snapshot."""
     secret = tmp_path / "secret"
     with h5py.File(secret, "w") as file:
@@ -115,7 +122,7 @@ def test_an_hdf5_file_that_shows_what_lies_in_another(kind: str, tmp_path: Path)
         all_rows(tmp_path / "x.h5")
 
 
-def test_weights_and_states_that_link_elsewhere(tmp_path: Path) -> None:
+def test_weights_and_states_with_links_to_another_file_are_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "secret", "w") as file:
         file["0"] = np.zeros((3, 2, 3, 3), np.float32)
     with h5py.File(tmp_path / "w.caffemodel.h5", "w") as file:
@@ -129,7 +136,7 @@ def test_weights_and_states_that_link_elsewhere(tmp_path: Path) -> None:
         read_state(tmp_path / "x.solverstate.h5")
 
 
-def test_a_group_that_contains_itself(tmp_path: Path) -> None:
+def test_an_hdf5_group_that_contains_itself_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "w.caffemodel.h5", "w") as file:
         file.create_group("data/a")
         file["data/a/b"] = file["data"]
@@ -137,7 +144,7 @@ def test_a_group_that_contains_itself(tmp_path: Path) -> None:
         load_weights(net(), tmp_path / "w.caffemodel.h5")
 
 
-def test_links_within_a_file_are_followed(tmp_path: Path) -> None:
+def test_links_within_an_hdf5_file_are_followed(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file["rows/data"], file["label"], file["packed"] = np.ones((5, 2, 3)), np.zeros(5), np.zeros((5, 4))
         file["data"] = h5py.SoftLink("/rows/data")
@@ -154,7 +161,7 @@ SETTINGS = (
 
 
 @pytest.mark.parametrize("name", [r"a\000b", "n" * 5000], ids=["NUL", "long"])
-def test_a_name_that_no_file_has(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_that_no_file_can_have_are_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("list.txt").write_text(name.replace(r"\000", "\0") + "\n")
     for text in (HDF5_DATA.replace("SOURCE", name), HDF5_DATA.replace("SOURCE", "list.txt"), HDF5_OUTPUT):
@@ -168,8 +175,8 @@ def test_a_name_that_no_file_has(name: str, tmp_path: Path, monkeypatch: pytest.
             load_solver("solver.prototxt")
 
 
-def bomb(side: int) -> bytes:
-    """A black PNG of 1 bit per pixel, compressed a thousand times; in color it has 24 times as many bytes."""
+def compressed_png(side: int) -> bytes:
+    """Return a black PNG of 1 bit per pixel, compressed to a thousandth; in color it takes 24 times the memory."""
     header = b"IHDR" + side.to_bytes(4, "big") * 2 + b"\x01\x00\x00\x00\x00"
     body = b"IDAT" + zlib.compress(bytes(side * (side // 8 + 1)))
     parts = (header, body, b"IEND")
@@ -193,8 +200,10 @@ except ValueError as fault:
 @pytest.mark.parametrize(
     ("module", "function"), [("netspec.data.images", "read_image"), ("loopclosure.places.frames", "read_bgr")]
 )
-def test_an_image_that_unpacks_to_too_much(module: str, function: str, tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_bytes(bomb(20_000))
+def test_an_image_that_decompresses_to_too_much_is_refused_without_using_memory(
+    module: str, function: str, tmp_path: Path
+) -> None:
+    (tmp_path / "x.png").write_bytes(compressed_png(20_000))
     code = READ.format(module=module, function=function)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     environment.pop("OPENCV_IO_MAX_IMAGE_PIXELS", None)
@@ -205,7 +214,7 @@ def test_an_image_that_unpacks_to_too_much(module: str, function: str, tmp_path:
     assert "image" in said
 
 
-def test_a_cut_jpeg_is_accepted_by_nobody(tmp_path: Path) -> None:
+def test_a_truncated_jpeg_is_refused_by_every_reader(tmp_path: Path) -> None:
     picture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (60, 80, 3)).astype(np.uint8), (5, 5), 2)
     data = cv2.imencode(".jpg", picture)[1].tobytes()
     path = tmp_path / "x.jpg"
@@ -219,19 +228,19 @@ def test_a_cut_jpeg_is_accepted_by_nobody(tmp_path: Path) -> None:
             read_bgr(path)
 
 
-def part(name: bytes, body: bytes, size: int | None = None) -> bytes:
-    """A chunk of a PNG file, which may declare a false size."""
+def png_chunk(name: bytes, body: bytes, size: int | None = None) -> bytes:
+    """Return a chunk of a PNG file, optionally with a false size."""
     length = len(body) if size is None else size
     return length.to_bytes(4, "big") + name + body + zlib.crc32(name + body).to_bytes(4, "big")
 
 
 @pytest.mark.parametrize("size", [5_000, (1 << 32) - 1])
-def test_a_png_part_that_announces_too_much(size: int, tmp_path: Path) -> None:
-    """OpenCV allocates memory for it first: 4 GiB."""
-    header = part(b"IHDR", (24).to_bytes(4, "big") * 2 + b"\x08\x00\x00\x00\x00")
-    body = part(b"IDAT", zlib.compress(bytes(24 * 25)), size)
+def test_a_png_chunk_with_a_false_size_is_refused(size: int, tmp_path: Path) -> None:
+    """OpenCV would first allocate that much memory, 4 GiB."""
+    header = png_chunk(b"IHDR", (24).to_bytes(4, "big") * 2 + b"\x08\x00\x00\x00\x00")
+    body = png_chunk(b"IDAT", zlib.compress(bytes(24 * 25)), size)
     path = tmp_path / "x.png"
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + body + part(b"IEND", b""))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + body + png_chunk(b"IEND", b""))
     with pytest.raises(ValueError, match="image"):
         read_image(str(path))
     with pytest.raises(InputError, match="image"):
@@ -240,14 +249,14 @@ def test_a_png_part_that_announces_too_much(size: int, tmp_path: Path) -> None:
         read_truth_matrix(path)
 
 
-def test_a_truth_that_is_not_an_image_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_bytes(bomb(20_000))
+def test_a_truth_matrix_in_a_too_large_image_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_bytes(compressed_png(20_000))
     with pytest.raises(InputError, match="is not a readable image; expected"):
         read_truth_matrix(tmp_path / "x.png")
 
 
 def packed_rows(path: Path, chunk: bytes, rows: int = 40) -> None:
-    """An HDF5 file whose dataset of one chunk is stored as these bytes."""
+    """Write an HDF5 file with a dataset of one chunk, which is stored as these bytes."""
     with h5py.File(path, "w") as file:
         file["data"], file["label"] = np.zeros((rows, 2)), np.zeros(rows)
         file.create_dataset("packed", (rows, 4), np.float32, chunks=(rows, 4), compression="gzip")
@@ -255,7 +264,7 @@ def packed_rows(path: Path, chunk: bytes, rows: int = 40) -> None:
 
 
 @pytest.mark.slow
-def test_an_hdf5_chunk_that_unpacks_to_too_much(tmp_path: Path) -> None:
+def test_an_hdf5_chunk_that_decompresses_to_too_much_is_refused(tmp_path: Path) -> None:
     packed_rows(tmp_path / "x.h5", zlib.compress(bytes(640)))
     all_rows(tmp_path / "x.h5")
     packed_rows(tmp_path / "x.h5", zlib.compress(bytes(300 << 20)), 40_000)
@@ -264,13 +273,13 @@ def test_an_hdf5_chunk_that_unpacks_to_too_much(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_hdf5_chunk_that_is_too_large(tmp_path: Path) -> None:
+def test_an_hdf5_chunk_that_is_too_large_is_refused(tmp_path: Path) -> None:
     packed_rows(tmp_path / "x.h5", zlib.compress(bytes(300 << 20)))
     with pytest.raises(SpecError, match=r"packed has a chunk of \d+ KiB, and its chunks hold 640 bytes"):
         all_rows(tmp_path / "x.h5")
 
 
-def test_hdf5_data_in_another_packing(tmp_path: Path) -> None:
+def test_hdf5_data_in_an_unsupported_compression_are_refused(tmp_path: Path) -> None:
     packed_rows(tmp_path / "x.h5", zlib.compress(bytes(640)))
     with h5py.File(tmp_path / "x.h5", "r+") as file:
         del file["packed"]
@@ -280,9 +289,11 @@ def test_hdf5_data_in_another_packing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "packing", [{"compression": "lzf"}, {"compression": "gzip", "shuffle": True, "fletcher32": True}]
+    "packing",
+    [{"compression": "lzf"}, {"compression": "gzip", "shuffle": True, "fletcher32": True}],
+    ids=["lzf", "gzip_shuffle_fletcher32"],
 )
-def test_hdf5_data_in_usual_packings(packing: dict[str, Any], tmp_path: Path) -> None:
+def test_hdf5_data_in_usual_compressions_are_read(packing: dict[str, Any], tmp_path: Path) -> None:
     noise = np.random.default_rng(0).random((40_000, 4)).astype(np.float32)
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file["data"], file["label"] = np.zeros((40_000, 2)), np.zeros(40_000)
@@ -294,8 +305,8 @@ def test_hdf5_data_in_usual_packings(packing: dict[str, Any], tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_any_lmdb_is_read_as_the_library_reads_it(seed: int, tmp_path: Path) -> None:
-    """Records of all sizes, overwritten and deleted in several transactions."""
+def test_open_reader_reads_a_random_lmdb_as_the_library_does(seed: int, tmp_path: Path) -> None:
+    """The records have many sizes and are overwritten and deleted in several transactions."""
     draw = np.random.default_rng(seed)
     with lmdb.open(str(tmp_path / "db"), map_size=1 << 26, lock=False) as env:
         for _ in range(6):
@@ -321,7 +332,7 @@ def database(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_a_database_that_was_cut(database: Path, tmp_path: Path) -> None:
+def test_a_truncated_database_is_refused(database: Path, tmp_path: Path) -> None:
     data = (database / "data.mdb").read_bytes()
     (tmp_path / "cut").mkdir()
     for size in range(len(data) - 1, 0, -4099):
@@ -331,7 +342,7 @@ def test_a_database_that_was_cut(database: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("change", ["cut", "emptied", "rewritten"])
-def test_a_database_that_is_changed_while_it_is_read(change: str, database: Path) -> None:
+def test_a_database_that_is_changed_while_it_is_read_is_refused(change: str, database: Path) -> None:
     reader = open_reader(str(database))
     reader.record(0)
     data = database / "data.mdb"
@@ -347,7 +358,7 @@ def test_a_database_that_is_changed_while_it_is_read(change: str, database: Path
 
 @pytest.mark.parametrize("backend", ["lmdb", "leveldb"])
 def test_a_database_that_was_written_to_is_opened_again(backend: str, tmp_path: Path) -> None:
-    """A notebook continues: only databases that were opened earlier have old contents."""
+    """A reader that was opened before keeps the old contents."""
     library = leveldb() if backend == "leveldb" else None
     path = str(tmp_path / "db")
     with Writer(path, backend) as writer:

@@ -1,4 +1,4 @@
-"""The script that kills commands, in small."""
+"""kill.py, which kills commands while they write, with few kills."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
-def test_nothing_is_lost_by_killing(tmp_path: Path) -> None:
+def test_killed_commands_leave_complete_files_and_no_process(tmp_path: Path) -> None:
     kills = "2"  # one at any time, one while a file is written
     command = [sys.executable, Path(__file__).with_name("kill.py"), "--kills", kills]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)

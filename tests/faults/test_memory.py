@@ -1,4 +1,4 @@
-"""A net that needs more memory than there is: one line, which names the layer."""
+"""Nets that need more memory than there is: one line that names the layer."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +20,7 @@ WIDE = """layer { name: "wide" type: "DummyData" top: "wide" dummy_data_param { 
 
 @contextmanager
 def little_memory() -> Iterator[None]:
-    """Limit the process to 1 GiB more memory than it uses now."""
+    """Limit the memory of the process to 1 GiB more than it uses."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30), before[1]))
@@ -39,7 +39,9 @@ def little_memory() -> Iterator[None]:
     ],
     ids=["a parameter", "a blob"],
 )
-def test_too_little_memory(text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_layer_that_needs_too_much_memory_is_reported_in_one_line(
+    text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "net.prototxt").write_text(text)
     with little_memory():
         status = main(["time", "--model", str(tmp_path / "net.prototxt"), "--iterations", "1", "--limit", "1TiB"])
@@ -47,7 +49,7 @@ def test_too_little_memory(text: str, said: str, tmp_path: Path, capsys: pytest.
     assert said in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_check_needs_no_memory_for_what_it_describes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_allocates_no_memory_for_blobs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "net.prototxt").write_text(NET + WIDE)
     with little_memory():
         assert main(["check", str(tmp_path / "net.prototxt"), "--limit", "1TiB"]) == 0

@@ -1,4 +1,4 @@
-"""The script that damages files, in small."""
+"""mutate.py and texts.py, which damage files and texts at random, with few tries."""
 
 import subprocess
 import sys
@@ -14,16 +14,18 @@ SLOW = ("truth.mat", "exported net", "drawn net")  # each read takes a while
 
 
 @pytest.mark.parametrize(
-    ("tries", "formats"), [("80", [name for name in FORMATS if name not in SLOW]), ("6", list(SLOW))]
+    ("tries", "formats"),
+    [("80", [name for name in FORMATS if name not in SLOW]), ("6", list(SLOW))],
+    ids=["fast_formats", "slow_formats"],
 )
-def test_a_damaged_file_is_refused_in_one_line(tries: str, formats: list[str], tmp_path: Path) -> None:
+def test_randomly_damaged_files_are_refused_in_one_line(tries: str, formats: list[str], tmp_path: Path) -> None:
     command = [sys.executable, Path(__file__).with_name("mutate.py"), "--tries", tries, *formats]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count(f": 0 of {tries}\n") == len(formats)
 
 
-def test_a_text_of_odd_pieces_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_texts_with_randomly_replaced_words_are_refused_in_one_line(tmp_path: Path) -> None:
     pytest.importorskip("hypothesis")
     command = [sys.executable, Path(__file__).with_name("texts.py"), "--tries", "50"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)

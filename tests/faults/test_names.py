@@ -1,4 +1,4 @@
-"""Names with escape sequences and newlines are printed escaped: on a terminal, in a log and in an error."""
+"""Control characters in names are escaped in terminals, logs and errors."""
 
 import logging
 from pathlib import Path
@@ -25,8 +25,9 @@ SOLVER = (
 @pytest.mark.parametrize(
     "words",
     ["train solver.prototxt", "time --model net.prototxt --iterations 1", "check net.prototxt", "check odd.prototxt"],
+    ids=["train", "time", "check", "check_invalid"],
 )
-def test_names_move_no_cursor_and_forge_no_line(
+def test_control_characters_in_names_are_escaped_in_the_output_of_commands(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -40,12 +41,16 @@ def test_names_move_no_cursor_and_forge_no_line(
     assert not [line for line in said.splitlines() if line.startswith("I1122 10:00:00")]
 
 
-@pytest.mark.parametrize("error", [SpecError("x\x1b[0m\ny", Where("f\n")), InputError("x\x1b[0m\ny", "f\n")])
-def test_errors_are_one_line(error: Exception) -> None:
+@pytest.mark.parametrize(
+    "error",
+    [SpecError("x\x1b[0m\ny", Where("f\n")), InputError("x\x1b[0m\ny", "f\n")],
+    ids=["SpecError", "InputError"],
+)
+def test_control_characters_in_errors_are_escaped(error: Exception) -> None:
     assert str(error) == r"f\n: x\x1b[0m\ny"
 
 
-def test_a_text_of_several_lines_follows_its_title(caplog: pytest.LogCaptureFixture) -> None:
+def test_log_dump_keeps_the_lines_of_a_text_and_log_info_escapes_them(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "netspec")
     log.dump("net.cpp:53", "title\n", "a: 1\nb: 2")
     log.info("net.cpp:53", "one\nline")

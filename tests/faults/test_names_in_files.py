@@ -18,7 +18,7 @@ import netspec
 from netspec.cli import main
 from netspec.errors import printable
 
-TRAP = Path("PWNED")  # what each of these would make, were it run
+TRAP = Path("PWNED")  # the file that each of these names would write if it were executed
 RUN = f"open('{TRAP}', 'w')"
 NAMES = [
     f'x"""\n{RUN}\n"""',
@@ -85,7 +85,7 @@ layer {{ name: "split" type: "Slice" bottom: {ip} top: {quoted("tops" + "'" * 3)
 
 
 def nets() -> Iterator[str]:
-    """Yield nets that use each name in several places."""
+    """Yield nets that together use each name in several places."""
     shuffled = random.Random(0)
     for start in range(0, len(NAMES), 9):
         names = NAMES[start:] + NAMES[:start]
@@ -127,9 +127,14 @@ def inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     assert not TRAP.exists()
 
 
+NETS = [pytest.param(text, id=f"net_{i}") for i, text in enumerate(nets())]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("text", list(nets()))
-def test_exports_parse_and_compute_the_same(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("text", NETS)
+def test_exports_of_nets_with_hostile_names_parse_and_compute_the_same(
+    text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     onnx = pytest.importorskip("onnx")
     safetensors = pytest.importorskip("safetensors.torch")
     Path("net.prototxt").write_text(text)
@@ -157,8 +162,8 @@ def test_exports_parse_and_compute_the_same(text: str, capsys: pytest.CaptureFix
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("text", list(nets()))
-def test_drawings_parse(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("text", NETS)
+def test_drawings_of_nets_with_hostile_names_parse(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("net.prototxt").write_text(text)
     for ending in ("svg", "html"):
         assert main(["draw", "net.prototxt", "--out", f"out.{ending}"]) == 0, capsys.readouterr().err
@@ -171,7 +176,7 @@ def test_drawings_parse(text: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.slow
-def test_a_drawing_for_printing_takes_any_name(capsys: pytest.CaptureFixture[str]) -> None:
+def test_png_drawings_of_nets_with_hostile_names_are_written(capsys: pytest.CaptureFixture[str]) -> None:
     for text in list(nets())[::4]:
         Path("net.prototxt").write_text(text)
         assert main(["draw", "net.prototxt", "--out", "out.png"]) == 0, capsys.readouterr().err
@@ -179,7 +184,7 @@ def test_a_drawing_for_printing_takes_any_name(capsys: pytest.CaptureFixture[str
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first", range(0, len(NAMES), 10))
-def test_curves_of_trainings_parse(first: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plots_of_logs_with_hostile_names_parse(first: int, capsys: pytest.CaptureFixture[str]) -> None:
     wanted = [name.replace(",", ";") for name in NAMES[first : first + 10]]
     start = "I1121 00:36:27.939015 12135 solver.cpp:239] "
     for k, name in enumerate(wanted):

@@ -1,4 +1,4 @@
-"""What SIGTERM and a second signal do to any command."""
+"""SIGINT, SIGTERM and a second signal: a command ends with one line and the status 128 + the number."""
 
 import os
 import signal
@@ -74,7 +74,7 @@ def line_of(process: subprocess.Popen[str]) -> str:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_one_line_and_its_status(number: int) -> None:
+def test_a_signal_ends_a_command_with_one_line_and_its_status(number: int) -> None:
     process = start(CODE.format(cleaning=0))
     process.send_signal(number)
     _, said = process.communicate(timeout=300)
@@ -83,7 +83,7 @@ def test_one_line_and_its_status(number: int) -> None:
 
 @pytest.mark.parametrize("package", ["netspec", "loopclosure", "lmdb_build"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_one_line_while_modules_are_imported(package: str, number: int) -> None:
+def test_a_signal_during_imports_ends_with_one_line_and_its_status(package: str, number: int) -> None:
     process = start(IMPORTED.format(package=package))
     process.send_signal(number)
     _, said = process.communicate(timeout=300)
@@ -91,9 +91,9 @@ def test_one_line_while_modules_are_imported(package: str, number: int) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_status_where_c_code_runs_python(
+def test_a_signal_in_python_code_run_by_c_code_has_its_status(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:  # of a program started by -m
+) -> None:
     monkeypatch.chdir(tmp_path)
     Path("through_c.py").write_text(THROUGH_C)
     process = start("-m", "through_c")
@@ -102,8 +102,8 @@ def test_the_status_where_c_code_runs_python(
     assert (process.returncode, said) == (128 + number, "interrupted\n")
 
 
-def test_one_line_where_an_import_makes_another_error_of_it() -> None:
-    """Modules in C do: they know only that they could not be loaded."""
+def test_a_signal_that_an_import_replaces_by_another_error_ends_with_one_line() -> None:
+    """Modules in C replace it by an ImportError."""
     process = start(MANGLED)
     process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=300)
@@ -111,8 +111,8 @@ def test_one_line_where_an_import_makes_another_error_of_it() -> None:
 
 
 @pytest.mark.parametrize("package", ["netspec", "loopclosure", "lmdb_build"])
-def test_one_line_from_the_first_line_of_the_program(package: str) -> None:
-    """Whenever it comes, once Python runs the program: also where the arguments are read, and after the command."""
+def test_a_signal_at_any_time_ends_with_one_line_or_success(package: str) -> None:
+    """Also while the arguments are read and after the command, as soon as Python runs the program."""
     code = (
         f"import atexit, os, signal, sys\nfrom {package}.__main__ import main\n"
         "atexit.register(signal.setitimer, signal.ITIMER_REAL, 0)\n"  # Python's end forgets the handler
@@ -131,12 +131,14 @@ def test_one_line_from_the_first_line_of_the_program(package: str) -> None:
     ("before", "after", "says"),
     [
         pytest.param("", "kill()", "interrupted\n", id="after the command"),
-        pytest.param("", "atexit.register(kill)", "interrupted\n", id="among what is to be done at the end"),
-        pytest.param("atexit.register(kill)", "", "", id="after that"),
+        pytest.param("", "atexit.register(kill)", "interrupted\n", id="at exit"),
+        pytest.param("atexit.register(kill)", "", "", id="at exit, after the handler"),
     ],
 )
-def test_a_signal_at_the_end(before: str, after: str, says: str, number: int) -> None:
-    """A scheduler sees the command's status, or that of one that was interrupted, and no death by a signal."""
+def test_a_signal_after_the_command_has_its_status_until_python_exits(
+    before: str, after: str, says: str, number: int
+) -> None:
+    """A scheduler sees the command's status or that of an interrupted one, never a death by a signal."""
     code = LATE.format(before=before, after=after, number=int(number))
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, env=environment)
@@ -144,7 +146,7 @@ def test_a_signal_at_the_end(before: str, after: str, says: str, number: int) ->
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_second_one_ends_at_once(number: int) -> None:
+def test_a_second_signal_ends_a_command_at_once(number: int) -> None:
     process = start(CODE.format(cleaning=60))
     process.send_signal(signal.SIGINT)
     assert line_of(process) == "ending"
@@ -153,7 +155,7 @@ def test_a_second_one_ends_at_once(number: int) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks for processes in /proc")
-def test_the_processes_that_read_images_end_with_a_killed_writer(tmp_path: Path) -> None:
+def test_worker_processes_end_with_their_killed_parent(tmp_path: Path) -> None:
     code = (
         "import os, sys, time\n"
         "from lmdb_build.databases import _Workers\n"

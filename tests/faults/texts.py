@@ -1,9 +1,9 @@
-"""Texts put together from odd pieces: does every reader of text end with one error of its own kind?
+"""Texts with randomly replaced words: every reader of text must end with one error of its own kind.
 
     python tests/faults/texts.py [--tries 1000] [FORMAT ...]
 
-mutate.py damages the bytes of good files; here, whole words and signs of a good text are replaced by others, by odd
-numbers and by any characters. Hypothesis chooses them, and reduces a text that is a fault to the shortest.
+mutate.py damages the bytes of good files; here, whole words and signs of a good text are replaced by others, by unusual
+numbers and by any characters. Hypothesis chooses them, and shortens a text that is a fault.
 """
 
 from __future__ import annotations

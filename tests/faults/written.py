@@ -1,4 +1,4 @@
-"""What is written about a damaged net: for formats.py."""
+"""Exports and drawings of damaged nets, for formats.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One example of each layer type, in ``docs/reference/layers.prototxt``: what its bottoms hold, and where it is odd."""
+"""One example of each layer type, read from ``docs/reference/layers.prototxt``, with values for its bottoms."""
 
 import re
 from collections.abc import Callable

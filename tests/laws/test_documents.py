@@ -1,4 +1,4 @@
-"""The pages and the metadata of a release: parsers accept every command, links lead to files, versions agree."""
+"""The pages and the metadata of a release: commands, links, numbers, named tests, versions."""
 
 import argparse
 import ast
@@ -76,7 +76,7 @@ def unknown_words(line: str) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("document", DOCUMENTS)
-def test_commands_in_sentences_have_commands_and_options_that_exist(document: str) -> None:
+def test_commands_in_sentences_use_existing_commands_and_options(document: str) -> None:
     text = re.sub(r"^```.*?^```$", "", (ROOT / document).read_text(), flags=re.M | re.S)
     for line in re.findall(r"`([^`]+)`", text):
         if line.partition(" ")[0] in PARSERS:
@@ -92,8 +92,9 @@ def test_commands_in_sentences_have_commands_and_options_that_exist(document: st
         ("netspec run x.py --any", []),
         ("lmdb-build walk walk --seed=1", []),
     ],
+    ids=["program_only", "unknown_command", "unknown_option", "options_of_a_script", "known_option"],
 )
-def test_wrong_words_in_sentences_are_found(line: str, unknown: list[str]) -> None:
+def test_unknown_words_finds_unknown_commands_and_options(line: str, unknown: list[str]) -> None:
     assert unknown_words(line) == unknown
 
 
@@ -108,8 +109,12 @@ def test_every_block_has_a_known_language(document: str) -> None:
             assert not PROGRAMS.keys() & set(first), f"{block.where}: commands stand in a block without a language"
 
 
-@pytest.mark.parametrize("words", [["netspec", "chekc"], ["loopclosure", "detect"], ["tools/bench", "--no-such-flag"]])
-def test_a_wrong_command_is_found(words: list[str]) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [["netspec", "chekc"], ["loopclosure", "detect"], ["tools/bench", "--no-such-flag"]],
+    ids=["command", "missing_argument", "option"],
+)
+def test_parse_refuses_a_wrong_command(words: list[str]) -> None:
     with pytest.raises(SystemExit):
         parse(words)
 
@@ -126,8 +131,10 @@ def test_shell_blocks_are_parsed_like_a_shell(tmp_path: Path) -> None:
     assert [command.folder for command in found] == [tmp_path, tmp_path, tmp_path / "d"]
 
 
-@pytest.mark.parametrize("text", ["netspec check $NOT_SET", "netspce check", "netspec check 'a"])
-def test_invalid_shell_syntax_is_found(text: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "text", ["netspec check $NOT_SET", "netspce check", "netspec check 'a"], ids=["variable", "program", "quote"]
+)
+def test_invalid_shell_blocks_are_refused(text: str, tmp_path: Path) -> None:
     with pytest.raises(AssertionError):
         commands(text, tmp_path)
 
@@ -153,12 +160,12 @@ def test_links_lead_to_existing_files(document: str) -> None:
 
 
 @pytest.mark.parametrize("page", [path.relative_to(ROOT).as_posix() for path in benchmarks.pages.PAGES])
-def test_numbers_equal_their_result_files(page: str) -> None:
+def test_numbers_on_pages_equal_the_result_files(page: str) -> None:
     text = (ROOT / page).read_text()
     assert benchmarks.pages.updated(text) == text, "tools/bench pages writes them"
 
 
-def test_the_counts_of_repeated_results_are_right() -> None:
+def test_the_counts_of_faithful_json_equal_the_golden_folders() -> None:
     rows = json.loads((benchmarks.pages.RESULTS / "faithful.json").read_text())["rows"]
     folders = {"layers": "layers", "trainings": "train", "examples": "examples/runs"}
     counts = {what: len(list((GOLDEN / folder).iterdir())) for what, folder in folders.items()}
@@ -182,6 +189,7 @@ ROWS = [
         ("table: x; speed", "no column 'speed'"),
         ("table: y", "there is no"),
     ],
+    ids=["row_of_a_table", "columns_by_value", "integers", "figure", "several_rows", "unknown_column", "unknown_file"],
 )
 def test_markers_become_numbers_or_are_refused(marker: str, shown: str, tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text(json.dumps({"rows": ROWS}))
@@ -192,7 +200,7 @@ def test_markers_become_numbers_or_are_refused(marker: str, shown: str, tmp_path
     assert shown in re.sub(r"\|( --- \|)+\n", "", text)
 
 
-# Every difference from Caffe that the documentation names is shown by a test that is there
+# Every difference from Caffe in the documentation names tests that exist
 CAFFE_PAGE = ROOT / "docs" / "coming-from-caffe.md"
 DIFFERENCES = [
     line for line in CAFFE_PAGE.read_text().splitlines() if line.startswith("| ") and not line.startswith("| Caffe ")
@@ -205,18 +213,18 @@ TESTS = {
 
 
 @pytest.mark.parametrize("row", DIFFERENCES, ids=lambda row: row.split("|")[1].strip()[:50])
-def test_each_difference_has_a_test(row: str) -> None:
+def test_each_difference_from_caffe_names_existing_tests(row: str) -> None:
     assert len(re.findall(r"(?<!\\)\|", row)) == 4, "expected three columns"
     named = re.findall(r"\btest_\w+", row[row.index("<!--") :])
     assert named
     assert set(named) <= TESTS
 
 
-def test_the_readme_links_to_the_page() -> None:
+def test_the_readme_links_to_coming_from_caffe() -> None:
     assert "docs/coming-from-caffe.md" in (ROOT / "README.md").read_text()
 
 
-# What a release says of itself agrees: version, changelog, citation, the form for faults
+# The version, changelog, citation and issue template of a release
 VERSION = re.search(r'^version = "(.+?)"', (ROOT / "pyproject.toml").read_text(), re.M)
 
 
@@ -231,7 +239,7 @@ def test_changelog_and_citation_have_this_version() -> None:
     assert f'\ndate-released: "{newest[2]}"\n' in citation
 
 
-def test_the_paper_is_cited() -> None:
+def test_the_citation_names_the_authors() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
     assert re.findall(r"family-names: (\w+)", citation) == ["Qiu", "Ai", "Tian", "Wang", "Cao"]
 

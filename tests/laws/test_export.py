@@ -1,4 +1,4 @@
-"""Every layer can be exported with the same results, or gives a reason why not."""
+"""Every layer type can be exported with the same results, or is refused with a reason."""
 
 import importlib.util
 from collections.abc import Sequence
@@ -100,7 +100,7 @@ layer {{ name: "y" type: "Power" bottom: "x" top: "y" power_param {{ scale: 0 sh
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TYPES)
 @pytest.mark.parametrize("target", ["ONNX", "PyTorch"])
-def test_exported_layers_compute_the_same_or_give_a_reason(
+def test_exported_layer_computes_the_same_or_is_refused_with_a_reason(
     name: str,
     target: str,
     folder: Path,  # noqa: F811

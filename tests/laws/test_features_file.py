@@ -1,4 +1,4 @@
-"""features.npz, as netspec writes it and loopclosure reads it, agrees with docs/features.md."""
+"""features.npz: netspec writes it and loopclosure reads it as docs/features.md says."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ from loopclosure.descriptors.feature_file import NOT_FEATURES, read_features
 from netspec.cli import main
 from paths import GOLDEN, ROOT
 
-#: Of each documented array: its shape and type.
+# The shape and type of each documented array.
 TABLE = {
     name: (shape, kind)
     for name, shape, kind in re.findall(

@@ -1,4 +1,4 @@
-"""Images of folders and lists are read by one rule: docs/images.md."""
+"""list_images, which reads folders and lists of images as docs/images.md says."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pytest
 from netspec.files.image_list import IMAGE_ENDINGS, SUBFOLDERS, list_images
 from paths import ROOT
 
-#: Each: files (text where it matters), what is read, and the names that come out, with stamps where there are any.
+# Files with their texts, the source that is read, and the names and stamps expected of it.
 FOUND: dict[str, tuple[dict[str, str], str, list[str], list[float] | None]] = {
     "numbers are compared as numbers": (
         {"10.png": "", "9.jpg": "", "1.png": "", "x2y10.png": "", "x2y9.png": ""},
@@ -102,7 +102,7 @@ def write(files: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize("case", FOUND)
-def test_names_order_stamps_and_paths(here: Path, case: str) -> None:
+def test_list_images_returns_names_stamps_and_paths(here: Path, case: str) -> None:
     files, source, names, stamps = FOUND[case]
     write(files)
     for given in (source, Path(source), here / source):
@@ -115,7 +115,7 @@ def test_names_order_stamps_and_paths(here: Path, case: str) -> None:
 
 @pytest.mark.parametrize("case", REFUSED)
 @pytest.mark.usefixtures("here")
-def test_invalid_sources_are_refused_with_a_message(case: str) -> None:
+def test_invalid_sources_are_refused(case: str) -> None:
     files, source, message = REFUSED[case]
     write(files)
     with pytest.raises(ValueError, match=r"\A[^\n]+\Z") as fault:
@@ -123,6 +123,6 @@ def test_invalid_sources_are_refused_with_a_message(case: str) -> None:
     assert str(fault.value).startswith(message)
 
 
-def test_the_rule_is_documented() -> None:
+def test_docs_images_md_lists_endings_and_subfolders() -> None:
     text = (ROOT / "docs" / "images.md").read_text()
     assert all(f"`{word}`" in text for word in (*IMAGE_ENDINGS, *SUBFOLDERS))

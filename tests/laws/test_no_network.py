@@ -34,7 +34,7 @@ ENGINE = (Path(__file__).parent / "programs" / "engine.py").read_text()
 
 
 @pytest.mark.parametrize("engine", ["onnxruntime", "openvino"])
-def test_an_engine_uses_no_network_and_writes_nothing_into_the_home_folder(engine: str, tmp_path: Path) -> None:
+def test_an_engine_opens_no_connection_and_writes_no_file_in_the_home_folder(engine: str, tmp_path: Path) -> None:
     pytest.importorskip(engine)
     net, home = tmp_path / "net.prototxt", tmp_path / "home"
     net.write_text(

@@ -1,4 +1,4 @@
-"""No option is ignored: every option of every command is read, or refused by name."""
+"""The options of all commands: each is read or refused by name, and tests/laws/options.txt lists them."""
 
 import argparse
 import ast
@@ -22,7 +22,7 @@ from paths import GOLDEN, ROOT
 
 NET, SOLVER, WEIGHTS = "train_val.prototxt", "solver.prototxt", "init.caffemodel"
 THUMBNAILS = "loopclosure.descriptors.thumbnails:Thumbnailer"
-# A command line of each way in which a command works; those of one command have the same options.
+# Command lines that together use every way in which a command works.
 WAYS = {
     "netspec": [
         "check train_val.prototxt",
@@ -110,7 +110,7 @@ VALUES = {"shape": "data=1,1,28,28", "source": "pair_data=pairs/test_lmdb", "siz
 
 
 class Watched(argparse.Namespace):
-    """A namespace that notes which of its names a command reads."""
+    """A namespace that records which of its names a command reads."""
 
     read: ClassVar[set[str]] = set()
 
@@ -144,7 +144,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="session")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What loopclosure reads and writes: a walk, its features, a report of it, its loops as a list and as a graph."""
+    """Return a folder with a walk, its features, a report of it, and its loops as a list and as a graph."""
     folder = tmp_path_factory.mktemp("drive")
     before = Path.cwd()
     os.chdir(folder)
@@ -168,7 +168,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def commands(parser: argparse.ArgumentParser, words: str = "") -> Iterator[tuple[str, list[argparse.Action]]]:
-    """Each command of a parser, as it is typed, and its arguments."""
+    """Yield each command of a parser, as it is typed, and its arguments."""
     groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
     if not groups:
         yield words.strip(), parser._actions
@@ -178,7 +178,7 @@ def commands(parser: argparse.ArgumentParser, words: str = "") -> Iterator[tuple
 
 
 def options(program: str) -> dict[str, list[argparse.Action]]:
-    """The options of each command of a program that its help shows, but for ``--help`` itself."""
+    """Return the options of each command of a program that its help shows, except ``--help`` itself."""
     found = commands(import_module(f"{program}.cli").parser())
     return {
         name: [a for a in actions if a.option_strings and a.dest != "help" and a.help != HIDDEN]
@@ -186,12 +186,12 @@ def options(program: str) -> dict[str, list[argparse.Action]]:
     }
 
 
-def ways() -> list[tuple[str, str]]:
+def command_lines() -> list[tuple[str, str]]:
     return [(program, line) for program, lines in WAYS.items() for line in lines]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("program", "line"), ways(), ids=lambda value: value.replace(" ", "_"))
+@pytest.mark.parametrize(("program", "line"), command_lines(), ids=lambda value: value.replace(" ", "_"))
 def test_every_option_is_read_or_refused(
     folder: Path, program: str, line: str, capfd: pytest.CaptureFixture[str], drive: Path
 ) -> None:
@@ -230,8 +230,8 @@ def test_every_command_is_tested(program: str) -> None:
     assert {name for name in names if not any(f"{line} ".startswith(f"{name} ") for line in WAYS[program])} == set()
 
 
-def test_the_list_of_options_is_frozen() -> None:
-    """A new option changes the list, for all to see: PYTHONPATH=.:tests python tests/laws/test_options.py writes it."""
+def test_the_list_of_options_is_current() -> None:
+    """``PYTHONPATH=.:tests python tests/laws/test_options.py`` writes the list."""
     assert FROZEN.read_text() == frozen()
 
 
@@ -257,7 +257,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def test_options_in_messages_exist() -> None:
-    """Each ``--word`` of a text in the programs, but those of docstrings, is an option of some command."""
+    """Each ``--word`` of a string in the programs, except docstrings, is an option of some command."""
     known = set(re.findall(r"--[a-z0-9_-]+", FROZEN.read_text())) | OTHERS | OF_GLOG | OF_OTHER_PROGRAMS
     found, gone = set(), []
     for path in [path for room in PROGRAMS for path in (ROOT / room).rglob("*.py")]:

@@ -1,4 +1,4 @@
-"""A library leaves its process as it is: importing, building and running change no setting of it."""
+"""Importing the packages, building and running nets change no setting of the process; what is not imported."""
 
 import os
 import subprocess

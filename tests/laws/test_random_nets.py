@@ -1,8 +1,8 @@
-"""Random nets that train: autograd, prepared kernels and pycaffe compute the same losses and gradients.
+"""Random nets in training: autograd, prepared kernels and pycaffe compute the same losses and gradients.
 
     NETSPEC_RANDOM_NETS=SEED:COUNT python -m pytest tests/laws/test_random_nets.py
 
-draws others. A net that fails is printed whole, with its seed.
+uses other nets. A net that fails is printed with its seed.
 """
 
 import os
@@ -29,7 +29,7 @@ def _found(loss: float, blobs: Sequence[torch.Tensor], learned: Sequence[bool]) 
 
 
 def _native(path: str, exact: str, prepared: bool) -> list[np.ndarray]:
-    """Return what netspec's passes compute, the second of two, by prepared kernels or by autograd."""
+    """Return the results of netspec's second pass, by prepared kernels or by autograd."""
     net = load_net(path, phase="TRAIN", seed=SEED, exact=exact)
     blobs = [blob for layer in net.layers for blob in layer.blobs]
     for _ in range(2):
@@ -42,7 +42,7 @@ def _native(path: str, exact: str, prepared: bool) -> list[np.ndarray]:
 
 
 def _pycaffe(path: str) -> list[np.ndarray]:
-    """Return what the passes of pycaffe compute through the memory of blobs, one of them seen by a view."""
+    """Return the results of pycaffe's second pass, while views of every second blob exist."""
     caffe.set_random_seed(SEED)
     net = caffe.Net(path, caffe.TRAIN)
     views = [blob.data for blob in list(net.blobs.values())[::2]]
@@ -96,7 +96,9 @@ def _faults(seed: int) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_random_nets_learn_the_same_with_all_runners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_losses_and_gradients_of_random_nets_agree_in_all_runners(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     found = [reported for seed in range(SEED, SEED + COUNT) for reported in _faults(seed)]
     faults = [reported for reported in found if not reported.startswith("refused")]

@@ -38,7 +38,7 @@ def layer_text(name: str, batch: int) -> str:
 
 @pytest.fixture(autouse=True)
 def _data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seven images, in a list, in a window file and as the rows of an HDF5 file."""
+    """Write seven images, a list and a window file of them, and an HDF5 file of seven rows."""
     monkeypatch.chdir(tmp_path)
     random = np.random.default_rng(0)
     lines, windows = [], []
@@ -83,14 +83,14 @@ def test_ranks_together_read_the_records_of_one_reader(name: str, ranks: int, se
         layer.close()
 
 
-def test_a_solver_gives_its_replicas_one_order_of_the_data() -> None:
+def test_replicas_of_a_solver_together_read_the_records_in_order() -> None:
     solver = training(ranks=3)
     keys = [net.layers[0].keys(0) for net in (solver.net, *solver.replicas.nets)]
     alone = training(ranks=1, batch=3 * BATCH)
     assert interleaved(keys) == alone.net.layers[0].keys(0)
 
 
-def test_no_two_nets_of_a_solver_share_a_seed() -> None:
+def test_the_nets_of_a_solver_have_different_seeds() -> None:
     solver = training(ranks=3)
     nets = [solver.net, *solver.replicas.nets, *solver.test_nets]
     assert len(nets) == 5

@@ -1,4 +1,4 @@
-"""Every layer has a description, the declared shapes, a correct gradient, and a message for misuse."""
+"""Every layer type: its docstring, shapes, gradient, results on a GPU, and error for a wrong number of bottoms."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,7 @@ TYPES = [name for name in layer_types() if getattr(layer_class(name), "__module_
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of small data for the layers that read any, and a module for the one that runs code."""
+    """Return a folder of small data for the layers that read files, and a module for layer Python."""
     folder = tmp_path_factory.mktemp("registry")
     cv2.imwrite(str(folder / "a.png"), np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8))
     (folder / "train_lmdb").symlink_to(GOLDEN / "pairs" / "train_lmdb")
@@ -61,7 +61,7 @@ def build(name: str, folder: Path, shapes: Sequence[Shape], device: str = "cpu",
 
 @pytest.fixture
 def layer(request: pytest.FixtureRequest, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Layer]:
-    """The example of a layer type, in double precision; the parameter is the type and whose sums are Caffe's."""
+    """Return the example of a layer type in double precision; the parameter is the type and its ``exact``."""
     name, exact = request.param
     monkeypatch.chdir(folder)
     made = build(name, folder, EXAMPLES[name].shapes, exact=exact)
@@ -100,7 +100,7 @@ def _in_a_range(k: int, named: set[str]) -> bool:
 
 
 @every_type
-def test_declared_shapes_are_the_real_ones(layer: Layer) -> None:
+def test_tops_and_blobs_have_the_declared_shapes(layer: Layer) -> None:
     example = EXAMPLES[layer.type]
     for times in (1, 3, 1) if example.batch is not None else (1,):
         tops = layer.run(*example.bottoms(times))
@@ -115,7 +115,7 @@ IN_TORCHS_ORDER = [pytest.param((name, "none"), id=f"{name}-none", marks=pytest.
 
 
 @pytest.mark.parametrize("layer", [*IN_CAFFES_ORDER, *IN_TORCHS_ORDER], indirect=True)
-def test_the_gradient_fits_the_result(layer: Layer) -> None:
+def test_the_gradient_is_the_derivative(layer: Layer) -> None:
     bottoms = EXAMPLES[layer.type].bottoms()
     for i, bottom in enumerate(bottoms):
         whole_numbers = bool((bottom == bottom.round()).all())

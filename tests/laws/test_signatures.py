@@ -1,4 +1,4 @@
-"""Public functions accept a single text in place of a list of one, and refuse unknown choices.
+"""Public functions accept a single string in place of a list of one, and refuse unknown choices.
 
 No function has more than six parameters, except those listed here with a reason.
 """
@@ -123,7 +123,7 @@ def with_many_parameters(path: Path) -> Iterator[str]:
                 yield f"{path.relative_to(ROOT).as_posix()}: {class_of.get(id(node), '')}{node.name}"
 
 
-def test_functions_have_few_parameters() -> None:
+def test_functions_have_at_most_six_parameters() -> None:
     paths = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
     found = {name for path in paths for name in with_many_parameters(path)}
     assert found == DOORS

@@ -1,4 +1,4 @@
-"""Types: pyright finds nothing. As a test, it runs in parallel with the others."""
+"""pyright, as a test, so that it runs in parallel with the others."""
 
 import subprocess
 import sys
@@ -9,7 +9,7 @@ from paths import ROOT
 
 
 @pytest.mark.slow
-def test_pyright_finds_nothing() -> None:
+def test_pyright_finds_no_error() -> None:
     words = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable]
     found = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     assert found.returncode == 0, found.stdout + found.stderr

@@ -1,210 +1,223 @@
-"""The findings that ``netspec check`` reports about nets and solvers, with their places."""
+"""``netspec lint``: each rule, comments that ignore it, the command, and the project's own nets."""
 
-import re
-from collections.abc import Callable
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from case_files import read_cases
 from netspec.cli import main
-from netspec.inspect.check.check import ON_META, check_file
-from netspec.inspect.check.lint import lint_file
-from netspec.proto.schema import TRAIN, PhaseValue
-from paths import GOLDEN
+from netspec.inspect.check.check import ON_META
+from netspec.inspect.check.findings import RULES
+from netspec.inspect.check.lint import Linted, lint_file
+from netspec.proto.text import parse_net
+from paths import ROOT
 
-DATA = """layer { name: "d" type: "Data" top: "pair" top: "sim"
-  data_param { source: "%s" batch_size: 10 backend: LMDB } }
-layer { name: "cut" type: "Slice" bottom: "pair" top: "a" top: "b" }
+DUMMY = """layer { name: "d" type: "DummyData" top: "x" top: "t"
+  dummy_data_param { shape { dim: 2 dim: 3 dim: 4 dim: 4 } shape { dim: 2 } } }
 """
-TOWER = """layer { name: "ip%(k)s" type: "InnerProduct" bottom: "%(in)s" top: "f%(k)s" %(param)s
-  inner_product_param { num_output: 2 weight_filler { type: "xavier" } } }
+FILLED = 'weight_filler { type: "xavier" }'
+CONV = f"""layer {{ name: "c" type: "Convolution" bottom: "x" top: "c"
+  convolution_param {{ num_output: 2 kernel_size: 1 {FILLED} }} }}
 """
-LOSS = 'layer { name: "loss" type: "ContrastiveLoss" bottom: "f1" bottom: "f2" bottom: "sim" top: "loss" }\n'
-SHARED = ('param { name: "w" } param { name: "b" }',) * 2
+NORM = """layer { name: "n" type: "BatchNorm" bottom: "c" top: "c" }
+layer { name: "s" type: "Scale" bottom: "c" top: "c" }
+"""
+IP = f"""layer {{ name: "ip" type: "InnerProduct" bottom: "c" top: "f"
+  inner_product_param {{ num_output: 5 {FILLED} }} }}
+"""
+LOSS = 'layer { name: "l" type: "SoftmaxWithLoss" bottom: "f" bottom: "t" top: "l" }\n'
+SOUND = DUMMY + CONV + IP + LOSS
+SOLVER = 'net: "net.prototxt"\nbase_lr: 1\nmax_iter: 100\nsnapshot: 50\nsnapshot_prefix: "s"\n'
 
 
-def siamese(params: tuple[str, ...] = SHARED, extra: str = "", source: str = "nowhere") -> str:
-    towers = "".join(TOWER % {"k": k, "in": blob, "param": p} for k, blob, p in zip("12", "ab", params, strict=True))
-    return DATA % source + towers + LOSS + extra
-
-
-def in_phases(net: str) -> str:
-    """Return the net with a data layer for TRAIN, of another database, and its own for TEST only."""
-    data, cut, rest = net.partition('layer { name: "cut"')
-    source = re.search('source: "(.*)"', data)
-    other = data.replace(source[1], str(GOLDEN / "pairs" / "train_lmdb")) if source else data
-    both = (
-        f"{each.rstrip()[:-1]}include {{ phase: {phase} }} }}" for each, phase in ((data, "TEST"), (other, "TRAIN"))
-    )
-    return " ".join(both).replace("\n", " ") + f"\n\n{cut}{rest}"
-
-
-@pytest.fixture
-def advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
-    """``advice(net, solver=None, phase=TRAIN)``: the findings of a net's text, or of a solver's that trains it.
-
-    With ``open_data`` the data layers are opened, else their shapes are given.
-    """
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
-    def check(net: str, solver: str | None = None, phase: PhaseValue = TRAIN, open_data: bool = False) -> list[str]:
-        Path("net.prototxt").write_text(net)
-        if solver is not None:
-            Path("solver.prototxt").write_text('net: "net.prototxt"\n' + solver)
-        path = "net.prototxt" if solver is None else "solver.prototxt"
-        shapes = {"pair": (10, 2, 4, 4), "sim": (10,)} if "pair" in net and not open_data else {}
-        checked = check_file(path, phase, replace(ON_META, given_shapes=shapes, open_data=open_data))
-        assert not [fault for part in checked for fault in part.faults]
-        return [f"{found.where}: {found.message}" for part in checked for found in part.advice]
 
-    return check
-
-
-def test_a_correct_net_has_no_findings(advice: Callable[..., list[str]]) -> None:
-    assert advice(siamese()) == []
-
-
-def test_towers_that_share_only_some_parameters_are_found(advice: Callable[..., list[str]]) -> None:
-    assert advice(siamese(('param { name: "w" }', 'param { name: "w" }'))) == [
-        'net.prototxt:6:1: layer "ip2" (InnerProduct): 1 of its 2 parameter blobs are not shared with the other branch '
-        'of "loss"; give them the same param { name }'
-    ]
-
-
-def test_a_loss_without_learnable_parameters_is_found(advice: Callable[..., list[str]]) -> None:
-    fixed = 'param { name: "w" lr_mult: 0 } param { name: "b" lr_mult: 0 }'
-    assert advice(siamese((fixed, fixed))) == [
-        'net.prototxt:8:1: layer "loss" (ContrastiveLoss): this loss depends on no learnable parameter; is lr_mult 0?'
-    ]
-    assert advice(siamese((fixed, fixed)), phase=1) == []
-
-
-def test_an_unused_blob_is_found(advice: Callable[..., list[str]]) -> None:
-    spare = 'layer { name: "spare" type: "ReLU" bottom: "f1" top: "spare" }\n'
-    assert advice(siamese(extra=spare)) == [
-        'net.prototxt:9:1: layer "spare" (ReLU): no layer uses blob "spare"; remove it, or add a Silence layer'
-    ]
-    score = 'layer { name: "score" type: "Accuracy" bottom: "f1" bottom: "sim" top: "score" }\n'
-    assert advice(siamese(extra=score)) == []
-    silent = 'layer { name: "hush" type: "Silence" bottom: "spare" }\n'
-    assert advice(siamese(extra=spare + silent)) == []
-
-
-def test_outputs_of_a_net_without_a_loss_are_not_found_as_unused(advice: Callable[..., list[str]]) -> None:
-    assert advice('layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } }') == []
-
-
-def test_a_batch_norm_without_scale_is_found(advice: Callable[..., list[str]]) -> None:
-    norm = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 } } }\n'
-    norm += 'layer { name: "bn" type: "BatchNorm" bottom: "x" top: "y" }\n'
-    assert advice(norm) == [
-        'net.prototxt:2:1: layer "bn" (BatchNorm): no Scale layer follows; Caffe\'s BatchNorm itself does not scale '
-        "and shift"
-    ]
-    assert advice(norm + 'layer { name: "s" type: "Scale" bottom: "y" top: "y" }') == []
-
-
-def test_two_layers_of_one_name_are_found(advice: Callable[..., list[str]]) -> None:
-    said = advice(siamese().replace('"ip2"', '"ip1"'))
-    assert said == [
-        'net.prototxt:6:1: layer "ip1" (InnerProduct): an earlier layer has the same name; loaded weights go to that '
-        "layer only; rename one"
-    ]
-
-
-def test_a_blob_of_another_phase_is_reported_with_its_phase(advice: Callable[..., list[str]], tmp_path: Path) -> None:
-    net = (DATA % "nowhere").replace('top: "sim"', 'top: "sim" include { phase: TRAIN }')
+def lint(net: str, solver: str | None = None) -> Linted:
     Path("net.prototxt").write_text(net)
-    (checked,) = check_file("net.prototxt")
-    assert [str(fault) for fault in checked.faults] == [
-        'net.prototxt:3:35: layer "cut" (Slice): unknown bottom blob "pair": layer "d" of line 1 makes it '
-        "in phase TRAIN; use --phase TRAIN, or add such a layer for phase TEST"
+    if solver is not None:
+        Path("solver.prototxt").write_text(SOLVER + solver)
+    linted = lint_file("net.prototxt" if solver is None else "solver.prototxt")
+    assert not linted.faults
+    return linted
+
+
+def found(net: str, solver: str | None = None) -> list[str]:
+    return [f"{each.rule} {each.where.line}:{each.where.column}" for each in lint(net, solver).found]
+
+
+def test_correct_nets_and_solvers_have_no_findings() -> None:
+    assert found(SOUND) == []
+    assert found(SOUND, 'lr_policy: "fixed"') == []
+    assert found(DUMMY + CONV.replace("num_output", "bias_term: false num_output") + NORM + IP + LOSS) == []
+
+
+CASES = read_cases("netspec/inspect/check/cases/rules.txt")
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_each_rule_for_nets_finds_its_mistake_and_is_ignored_by_comment(case: dict[str, str]) -> None:
+    net, (name, place) = case["net"], case["found"].split()
+    assert found(net) == [f"{name} {place}"]
+    (first, *_) = lint(net).found
+    with_comment = net.split("\n")
+    with_comment.insert(int(place.split(":")[0]) - 1, f"# lint: ignore={name}")
+    assert found("\n".join(with_comment)) == []
+    assert first.rule in RULES
+    assert ";" in first.message or "does not" in first.message
+
+
+def test_transform_param_that_differs_between_phases_is_found() -> None:
+    data = 'layer {{ name: "d" type: "Data" top: "x" top: "t" include {{ phase: {} }}\n  transform_param {{ {} }}\n'
+    data += '  data_param {{ source: "nowhere" batch_size: 2 backend: LMDB }} }}\n'
+    train = data.format("TRAIN", "mirror: true crop_size: 4 scale: 0.5 mean_value: 1 mean_value: 2 mean_value: 3")
+    test = data.format("TEST", "crop_size: 4 scale: 0.25")
+    linted = lint(train + test)
+    assert [str(each) for each in linted.found] == [
+        'net.prototxt:5:3: layer "d" (Data): mean_value is absent here, and 1 2 3 in line 1, where "x" of the '
+        "other phase is read; use the same value in both [transform-differs]",
+        'net.prototxt:5:34: layer "d" (Data): scale is 0.25 here, and 0.5 in line 1, where "x" of the other phase is '
+        "read; use the same value in both [transform-differs]",
     ]
-    assert lint_file("net.prototxt", replace(ON_META, given_shapes={"pair": (2, 6, 8, 8)})).faults == []
+    assert len(linted.unknown) == 1  # three means tell the channels
 
 
-SOLVER = 'base_lr: 0.1 lr_policy: "fixed" max_iter: 100 snapshot_prefix: "s"\n'
-
-
-def test_a_correct_solver_has_no_findings(advice: Callable[..., list[str]]) -> None:
-    assert advice(in_phases(siamese()), SOLVER + "snapshot: 50") == []
-
-
-def test_a_test_on_training_data_is_found(advice: Callable[..., list[str]]) -> None:
-    source = str(GOLDEN / "pairs" / "train_lmdb")
-    tested = SOLVER + "test_interval: 10\ntest_iter: 30\n"
-    reported = 'layer "d" (Data): the test reads "%s", which the net is trained on; use another database'
-    assert [line.partition(": ")[2] for line in advice(in_phases(siamese(source=source)), tested)] == [
-        reported % source
-    ]
-    same = siamese(source=source)
-    assert f"net.prototxt:2:16: {reported % source}" in advice(same, tested, open_data=True)
-    assert advice(same, SOLVER) == [
-        f'net.prototxt:2:16: layer "d" (Data): a test would also read "{source}", which the net is trained on; '
-        "add a data layer for phase TEST"
-    ]
-
-
-def test_a_training_without_snapshots_is_found(advice: Callable[..., list[str]]) -> None:
-    without = SOLVER + "snapshot_after_train: false\n"
-    assert advice(in_phases(siamese()), without + "snapshot: 101") == [
-        "solver.prototxt:4:1: snapshot 101 is more than max_iter 100, so it has no effect; lower it"
-    ]
-    assert advice(in_phases(siamese()), SOLVER + "snapshot: 101") == [
-        "solver.prototxt:3:1: snapshot 101 is more than max_iter 100, so it has no effect; lower it"
-    ]
-    assert advice(in_phases(siamese()), without) == [
-        "solver.prototxt: no snapshot is taken; set snapshot, or snapshot_after_train: true"
-    ]
-    assert advice(in_phases(siamese()), without + "snapshot: 100") == []
+def test_a_net_of_one_phase_is_checked_in_that_phase() -> None:
+    assert found(DUMMY.replace('top: "t"', 'top: "t" include { phase: TRAIN }') + CONV + IP + LOSS) == []
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "lines"),
     [
-        ("gamma: 0.1", ["3:1: gamma has no effect with type SGD and lr_policy fixed; remove it"]),
-        ("stepvalue: 10 stepvalue: 20", ["3:1: stepvalue has no effect with type SGD and lr_policy fixed; remove it"]),
-        ('type: "Adam" momentum2: 0.9 delta: 1e-8', []),
-        ('type: "adagrad" delta: 1e-8', []),
-        ('type: "RMSProp" rms_decay: 0.9 momentum2: 0.9',
-         ["3:32: momentum2 has no effect with type RMSProp and lr_policy fixed; remove it"]),
+        ('lr_policy: "step" stepsize: 100 gamma: 0.1', ["step-after-end 6:19"]),
+        ('lr_policy: "step" stepsize: 99 gamma: 0.1', []),
+        ('lr_policy: "multistep" stepvalue: 9 stepvalue: 100 gamma: 0.1', ["step-after-end 6:37"]),
+        ('lr_policy: "fixed" gamma: 1', ["no-effect 6:20"]),
+        ('lr_policy: "fixed" test_iter: 1 test_interval: 101', ["test-after-end 6:33"]),
+        ('lr_policy: "fixed" # lint: ignore=no-effect\ngamma: 1', ["no-effect 7:1"]),
+        ('lr_policy: "fixed"\ngamma: 1  # lint: ignore=other, no-effect', ["unknown-rule 7:11"]),
+        ('lr_policy: "fixed"\n# why\n# lint: ignore=no-effect\n\ngamma: 1', []),
     ],
-)  # fmt: skip
-def test_settings_that_the_policy_and_the_rule_do_not_read(
-    advice: Callable[..., list[str]], settings: str, said: list[str]
-) -> None:
-    assert advice(in_phases(siamese()), SOLVER + settings) == [f"solver.prototxt:{line}" for line in said]
+    ids=[
+        "step_at_the_end",
+        "step_before_the_end",
+        "multistep_at_the_end",
+        "no_effect",
+        "test_after_the_end",
+        "comment_at_the_wrong_line",
+        "comment_with_an_unknown_rule",
+        "comment_above",
+    ],
+)
+def test_each_rule_for_solvers_finds_its_mistake_and_is_ignored_by_comment(settings: str, lines: list[str]) -> None:
+    assert found(SOUND, settings) == lines
 
 
-def test_settings_of_each_policy_and_rule_have_no_findings(advice: Callable[..., list[str]]) -> None:
-    for policy in (
-        'lr_policy: "step" gamma: 0.1 stepsize: 10', 'lr_policy: "exp" gamma: 0.9', 'lr_policy: "poly" power: 2',
-        'lr_policy: "inv" gamma: 0.1 power: 1', 'lr_policy: "multistep" gamma: 0.1 stepvalue: 9',
-        'lr_policy: "sigmoid" gamma: 0.1 stepsize: 50',
-    ):  # fmt: skip
-        assert advice(in_phases(siamese()), SOLVER.replace('lr_policy: "fixed"', policy)) == []
+def test_findings_of_a_whole_file_are_ignored_on_its_first_line() -> None:
+    def said(first: str) -> list[str]:
+        Path("net.prototxt").write_text(SOUND)
+        text = SOLVER.replace("snapshot: 50", "snapshot_after_train: false") + 'lr_policy: "fixed"'
+        Path("solver.prototxt").write_text(first + text)
+        return [each.rule for each in lint_file("solver.prototxt").found]
+
+    assert said("") == ["no-snapshot"]
+    assert said("# About it.\n# lint: ignore=no-snapshot\n") == []
 
 
-@pytest.mark.parametrize(("iterations", "far"), [(20, False), (19, False), (22, False), (4, True), (64, True)])
-def test_a_test_of_a_wrong_size_is_found(advice: Callable[..., list[str]], iterations: int, far: bool) -> None:
-    source = str(GOLDEN / "pairs" / "test_lmdb")
-    solver = SOLVER + f"test_interval: 10\ntest_iter: {iterations}"
-    read = f"test_iter {iterations} x batch 10 = {10 * iterations}"
-    expected = [f'solver.prototxt:4:1: {read}, but layer "d" has 200 records; set test_iter: 20'] if far else []
-    assert advice(in_phases(siamese(source=source)), solver, open_data=True) == expected
-    assert advice(in_phases(siamese(source=source)), solver) == []
+def test_a_layer_that_is_tested_with_random_weights_is_found() -> None:
+    extra = IP.replace('"ip"', '"other"').replace('top: "f"', 'top: "g" include { phase: TEST }')
+    extra += 'layer { name: "a" type: "Accuracy" bottom: "g" bottom: "t" top: "a" include { phase: TEST } }\n'
+    settings = 'lr_policy: "fixed" test_iter: 1 test_interval: 10'
+    assert found(SOUND + extra, settings) == ["untrained-in-test 8:1"]
+    assert found(SOUND.replace('"ip"', '"other"') + extra.replace("other", "ip"), settings) == ["untrained-in-test 8:1"]
 
 
-def test_equal_findings_are_one_line(advice: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]) -> None:
-    text = 'layer { name: "x" type: "Input" top: "t0" input_param { shape { dim: 1 dim: 4 } } }\n' + "".join(
-        f'layer {{ name: "ip{k}" type: "InnerProduct" bottom: "t{k}" top: "t{k + 1}" '
-        "inner_product_param { num_output: 4 } }\n"
-        for k in range(16)
+def test_rules_that_need_no_shapes_are_applied_without_them() -> None:
+    data = (
+        'layer { name: "d" type: "Data" top: "x" top: "t" data_param { source: "no" batch_size: 2 backend: LMDB } }\n'
     )
-    text += 'layer { name: "loss" type: "EuclideanLoss" bottom: "t16" bottom: "t0" top: "loss" }'
-    Path("many.prototxt").write_text(text)
-    for words, stream in ((["check", "--phase", "TRAIN"], "err"), (["lint"], "out")):
-        main([*words, "many.prototxt"])
-        (line,) = [line for line in getattr(capsys.readouterr(), stream).splitlines() if "zero-weights" in line]
-        assert "(also in 15 more places, lines 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17)" in line
+    linted = lint(data + CONV + NORM + IP + LOSS)
+    assert [each.rule for each in linted.found] == ["bias-before-batchnorm"]
+    assert "give --shape x=2,C,H,W" in str(linted.unknown[0])
+
+
+def test_every_rule_has_a_reason() -> None:
+    for rule in RULES.values():
+        assert rule.reason.endswith("."), rule.name
+
+
+def test_lint_has_status_0_1_or_2(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("good.prototxt").write_text(SOUND)
+    Path("net.prototxt").write_text(DUMMY + CONV + NORM + IP + LOSS)
+    assert main(["lint", "good.prototxt"]) == 0
+    assert main(["lint", "good.prototxt", "net.prototxt"]) == 1
+    said = (
+        'net.prototxt:4:3: layer "c" (Convolution): its bias is subtracted again by BatchNorm "n"; set bias_term: false'
+    )
+    assert capsys.readouterr() == (f"{said} [bias-before-batchnorm]\n", "")
+    Path("faulty.prototxt").write_text(SOUND.replace('bottom: "c"', 'bottom: "cc"'))
+    assert main(["lint", "faulty.prototxt"]) == 1
+    assert 'unknown bottom blob "cc"' in capsys.readouterr().out
+    Path("bad.prototxt").write_text("layer {")
+    assert main(["lint", "bad.prototxt", "none.prototxt", "good.prototxt"]) == 2
+    out, err = capsys.readouterr()
+    assert (out, len(err.splitlines())) == ("", 2)
+    assert main(["lint", "--rules"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == len(RULES)
+    assert main(["lint"]) == 2
+
+
+def test_errors_and_findings_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("net.prototxt").write_text(DUMMY + CONV + NORM + IP + LOSS)
+    Path("faulty.prototxt").write_text(SOUND.replace('bottom: "c"', 'bottom: "cc"'))
+    assert main(["lint", "--json", "net.prototxt", "faulty.prototxt"]) == 1
+    found, faulty = map(json.loads, capsys.readouterr().out.splitlines())
+    place = {"file": "net.prototxt", "line": 4, "column": 3, "layer": "c", "type": "Convolution"}
+    message = 'its bias is subtracted again by BatchNorm "n"; set bias_term: false'
+    rule = "bias-before-batchnorm"
+    assert found == {
+        "file": "net.prototxt", "faults": [], "warnings": [{**place, "message": message, "rule": rule}]
+    }  # fmt: skip
+    assert [(each["line"], each["layer"]) for each in faulty["faults"]] == [(5, "ip")]
+    assert main(["check", "--json", "faulty.prototxt"]) == 1
+    out, err = capsys.readouterr()
+    assert json.loads(out)["faults"] == faulty["faults"]
+    assert "\nfaulty.prototxt:5:41: " in err
+    Path("bad.prototxt").write_text("layer {")
+    assert main(["check", "--json", "bad.prototxt"]) == 1
+    (fault,) = json.loads(capsys.readouterr().out)["faults"]
+    assert (fault["line"], fault["column"]) == (1, 8)
+
+
+def pair_shape(path: Path) -> dict[str, tuple[int, ...]]:
+    nets = [*path.parent.glob("train_val*.prototxt"), path]
+    layers = [layer for net in nets for layer in parse_net(net)[0].layer if layer.data_param.batch_size]
+    return {"pair_data": (layers[0].data_param.batch_size, 6, 128, 128)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "path",
+    [path for path in sorted((ROOT / "prototxt").rglob("*.prototxt")) if "solver" not in path.name],
+    ids=lambda path: "/".join(path.parts[-3:]),
+)
+def test_the_projects_nets_have_no_findings(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    shapes = pair_shape(path) if "train" in path.name else {}
+    linted = lint_file(path.relative_to(ROOT), replace(ON_META, given_shapes=shapes))
+    assert [*map(str, linted.found), *map(str, linted.faults)] == []
+    assert linted.readable
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "prototxt").rglob("solver*.prototxt")), ids=lambda path: "/".join(path.parts[-3:])
+)
+def test_the_projects_solvers_have_no_findings(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    linted = lint_file(path.relative_to(ROOT))
+    assert [*map(str, linted.found), *map(str, linted.faults)] == []

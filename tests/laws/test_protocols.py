@@ -1,4 +1,4 @@
-"""Optional methods of layers are described once, by protocols; the class Layer has none of them."""
+"""Optional methods of layers are documented once, by protocols; the class Layer has none of them."""
 
 import ast
 import inspect

@@ -1,4 +1,4 @@
-"""The rules for imports between packages, and modules that must not import torch."""
+"""Which packages import which, and modules that must not import torch."""
 
 import ast
 import re
@@ -12,7 +12,7 @@ from paths import ROOT
 
 
 @pytest.mark.slow
-def test_import_contracts_hold() -> None:
+def test_lint_imports_finds_no_violation() -> None:
     program = Path(sys.executable).with_name("lint-imports")
     done = subprocess.run([program, "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
@@ -31,7 +31,7 @@ def test_import_contracts_hold() -> None:
         "loopclosure.cli",
     ],
 )
-def test_importing_needs_no_torch(module: str) -> None:
+def test_importing_does_not_import_torch(module: str) -> None:
     code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
@@ -43,7 +43,7 @@ LIBRARIES = {"cv2": "OpenCV", "google": "protobuf", "sklearn": "scikit-learn", "
 
 
 def package_of(module: str) -> str:
-    """The row of the table that a module belongs to."""
+    """Return the row of the table that a module belongs to."""
     top, *inside = module.split(".")
     if top != "netspec" or not inside:
         return top
@@ -51,7 +51,7 @@ def package_of(module: str) -> str:
 
 
 def imported() -> dict[str, set[str]]:
-    """What each package imports directly, also in functions and for type checkers: packages and libraries by name."""
+    """Return the packages and libraries that each package imports directly, also in functions and for type checkers."""
     found: dict[str, set[str]] = {}
     for path in (path for top in OURS for path in (ROOT / top).rglob("*.py")):
         package = package_of(".".join(path.relative_to(ROOT).with_suffix("").parts))
@@ -69,7 +69,7 @@ def imported() -> dict[str, set[str]]:
     return found
 
 
-def test_the_table_of_imports_is_true() -> None:
+def test_the_table_of_imports_in_architecture_md_is_current() -> None:
     page = (ROOT / "ARCHITECTURE.md").read_text()
     table = re.findall(
         r"^\| `([\w/]+)` \| ([^|]*) \| ([^|]*) \|$", page.partition("## Imports between")[2], re.MULTILINE

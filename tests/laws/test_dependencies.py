@@ -1,4 +1,4 @@
-"""The packages of an installation: compatible versions and permissive licenses."""
+"""The packages that this project needs: permissive licenses and compatible versions."""
 
 import re
 import subprocess
@@ -63,12 +63,12 @@ def test_dependencies_have_permissive_licenses() -> None:
 
 
 @pytest.mark.parametrize("said", ["GPL-3.0-only", "GNU General Public License", "MIT AND AGPL-3.0", "", "Proprietary"])
-def test_other_licenses_are_noticed(said: str) -> None:
+def test_restrictive_and_missing_licenses_are_not_permissive(said: str) -> None:
     assert not is_permissive(said)
 
 
 @pytest.mark.slow
-def test_installed_packages_fit_together() -> None:
+def test_pip_check_finds_no_conflict_of_our_dependencies() -> None:
     done = subprocess.run([sys.executable, "-m", "pip", "check"], capture_output=True, text=True)
     if "No module named pip" in done.stderr:
         pytest.skip("installed without pip")
