@@ -1,6 +1,6 @@
 """Pictures of what layers do to shapes: bottoms on the left, the layer, its learned arrays below it, tops on the right.
 
-The examples are those of ``reference/layers.prototxt``; all shapes are what netspec finds for them.
+The examples are in ``reference/layers.prototxt``. netspec computes their shapes.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ EXAMPLES = Path(__file__).parent / "reference" / "layers.prototxt"
 EXAMPLE = re.compile(
     r"^# (?P<bottoms>[^\n]*?) ?(?:->(?P<tops>[^\n]*))?\n(?P<text>layer \{.*?\}\n)(?=\n|\Z)", re.M | re.S
 )
-WIDTH, BOX, COLUMN, LINE = 400, 104, 134, 15  # of the picture, of the layer's box, of a column of blobs, of a text
-LEAN = 0.4  # of the edges that lead away from the reader
+WIDTH, BOX, COLUMN = 400, 104, 134  # widths of the picture, of the layer's box, and of a column of blobs
+LINE = 15  # height of a line of text
+LEAN = 0.4  # how much the edges that show depth are shifted, per length
 
 Shape = tuple[int, ...]
 
@@ -72,12 +73,12 @@ def _dims(shape: Shape) -> str:
 
 
 def shape_text(shape: Shape) -> str:
-    """Return a shape as it is read: ``1 x 3 x 227 x 227`` with signs of multiplication; of no axes, ``one number``."""
+    """Return a shape as text: the sizes with multiplication signs between them, or "one number" without axes."""
     return " \N{MULTIPLICATION SIGN} ".join(map(str, shape)) or "one number"
 
 
 def caption(kind: str, example: Example) -> str:
-    """Return the text that says what the picture shows."""
+    """Return a description of the picture."""
     bottoms, tops = (
         ", ".join(f"{name} {shape_text(shape)}" for name, shape in blobs.items()) or "no blob"
         for blobs in (example.bottoms, example.tops)
@@ -147,9 +148,9 @@ class _Column:
 
 
 def _size_in_picture(shape: Shape) -> tuple[float, float, float]:
-    """Return width, height and depth of a blob's picture: the last two axes, and the numbers before the batch's.
+    """Return width, height and depth of a blob in the picture, from the sizes of its axes without the batch.
 
-    Lengths grow with the logarithm of the sizes, so that 3 channels and 4096 fit beside each other.
+    Lengths grow with the logarithm of the sizes, so that both 3 and 4096 channels fit into the picture.
     """
     axes = (1, *shape) if len(shape) == 3 else shape
     height, width = axes[-2:] if len(axes) > 1 else (math.prod(axes), 1)

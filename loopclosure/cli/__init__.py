@@ -11,7 +11,7 @@ from netspec.terminal.parser import QUIET, Commands, Parser, program
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; return 0: done, 1: a fault of the user's files, 2: wrong usage, 128 + N: signal N."""
+    """Run one command; return 0: done, 1: an error in the user's files, 2: wrong usage, 128 + N: signal N."""
     return run(parser(), list(sys.argv[1:] if argv is None else argv))
 
 

@@ -25,9 +25,9 @@ class ExactIndex:
         """See :class:`~loopclosure.index.index.Index`."""
         end = self._count + len(rows)
         if end > len(self._rows):
-            room = np.empty((max(FIRST_CAPACITY, end - len(self._rows), len(self._rows)), rows.shape[1]), np.float32)
-            self._rows = np.concatenate([self._rows, room]) if self._count else room
-            self._squares = np.append(self._squares, room[:, 0])
+            added = np.empty((max(FIRST_CAPACITY, end - len(self._rows), len(self._rows)), rows.shape[1]), np.float32)
+            self._rows = np.concatenate([self._rows, added]) if self._count else added
+            self._squares = np.append(self._squares, added[:, 0])
         self._rows[self._count : end] = rows
         self._squares[self._count : end] = np.square(rows).sum(axis=1)
         self._count = end

@@ -1,4 +1,4 @@
-"""The command line: a module for each group of commands; it computes nothing."""
+"""The command ``netspec``. Each module has a group of commands, which parse arguments and call the library."""
 
 from __future__ import annotations
 

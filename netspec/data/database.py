@@ -236,9 +236,9 @@ def _ends_within_a_record(log: Path) -> bool:
     place, kind = 0, full
     with log.open("rb") as file:
         while place < size:
-            room = block - place % block
-            if room < header:  # zeros up to the end of the block
-                place += room
+            left = block - place % block
+            if left < header:  # zeros up to the end of the block
+                place += left
                 continue
             file.seek(place)
             _, length, kind = struct.unpack("<IHB", file.read(header).ljust(header, b"\0"))

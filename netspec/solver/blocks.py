@@ -63,14 +63,14 @@ class Blocks:
     def _put_together(self, indices: Sequence[int]) -> None:
         """Pack blobs with the same multipliers into pieces of memory of at most ``BLOCK`` numbers."""
         piece: list[int] = []
-        room = update.BLOCK
+        free = update.BLOCK
         for i in indices:
             size = _lines(self._learnable[i].parameter)
-            if piece and size > room:
+            if piece and size > free:
                 self._move(piece)
-                piece, room = [], update.BLOCK
+                piece, free = [], update.BLOCK
             piece.append(i)
-            room -= size
+            free -= size
         self._move(piece)
 
     def _move(self, piece: Sequence[int]) -> None:

@@ -136,16 +136,16 @@ def _blocks(tensors: Tensors) -> Iterator[list[tuple[int, slice]]]:
     On a GPU, all tensors form one block, since every kernel has a fixed cost.
     """
     block: list[tuple[int, slice]] = []
-    room = BLOCK
+    free = BLOCK
     for i, tensor in enumerate(tensors):
         longest = BLOCK if tensor.device.type == "cpu" else max(1, tensor.numel())
         for start in range(0, tensor.numel(), longest):
             part = slice(start, min(start + longest, tensor.numel()))
-            if block and tensor.device.type == "cpu" and part.stop - part.start > room:
+            if block and tensor.device.type == "cpu" and part.stop - part.start > free:
                 yield block
-                block, room = [], BLOCK
+                block, free = [], BLOCK
             block.append((i, part))
-            room -= part.stop - part.start
+            free -= part.stop - part.start
     if block:
         yield block
 

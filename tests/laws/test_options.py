@@ -260,7 +260,7 @@ def test_options_in_messages_exist() -> None:
     """Each ``--word`` of a string in the programs, except docstrings, is an option of some command."""
     known = set(re.findall(r"--[a-z0-9_-]+", FROZEN.read_text())) | OTHERS | OF_GLOG | OF_OTHER_PROGRAMS
     found, gone = set(), []
-    for path in [path for room in PROGRAMS for path in (ROOT / room).rglob("*.py")]:
+    for path in [path for package in PROGRAMS for path in (ROOT / package).rglob("*.py")]:
         tree = ast.parse(path.read_text())
         bodies = [node.body[0] for node in ast.walk(tree) if isinstance(node, DOCUMENTED) and node.body]
         docstrings = {id(first.value) for first in bodies if isinstance(first, ast.Expr)}

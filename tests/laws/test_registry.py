@@ -125,7 +125,7 @@ def test_the_gradient_is_the_derivative(layer: Layer) -> None:
     def compute(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return tuple(top for top in layer.run(*tensors[: len(bottoms)]) if top.requires_grad)
 
-    rtol = 1e-4 if layer.type == "ContrastiveLoss" else 1e-7  # its 1e-4 beside the distance has no gradient
+    rtol = 1e-4 if layer.type == "ContrastiveLoss" else 1e-7  # its gradient ignores the 1e-4 added to the distance
     check_gradients(compute, (*bottoms, *learned), rtol)
 
 

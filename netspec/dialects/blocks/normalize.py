@@ -85,7 +85,9 @@ class Normalize(Layer):
         shape = bottom_shapes[0]
         if self.blobs and self.blob_shapes[0] not in ((), shape[1:2]):
             raise self.error(f"bottom of shape {shape} does not have the {self.blob_shapes[0][0]} channels", "bottom")
-        return [shape, (*shape[:1], 1, *shape[2:], 1, 1)[: max(4, len(shape))]][: self.num_tops]
+        lengths = (shape[0], 1, *shape[2:])
+        lengths = (*lengths, *(1,) * (4 - len(lengths)))  # at least 4 axes
+        return [shape, lengths][: self.num_tops]
 
     def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
         axes = tuple(range(1, data.dim())) if self.across else (1,)
@@ -94,10 +96,10 @@ class Normalize(Layer):
             scale = scale if scale.dim() == 0 else scale.reshape(-1, *(1,) * (data.dim() - 2))
             return _Normalized.apply(data, scale, axes, self.eps)
         size = length(data, axes, self.eps, self.squares)
-        lengths = size if self.num_tops == 1 or self.passes_length else size.detach()
-        return (
-            (data / size, lengths.reshape(self.top_shapes[-1]))[: self.num_tops] if self.num_tops > 1 else data / size
-        )
+        if self.num_tops == 1:
+            return data / size
+        lengths = size if self.passes_length else size.detach()
+        return data / size, lengths.reshape(self.top_shapes[1])
 
 
 def length(x, axes, eps, squares):

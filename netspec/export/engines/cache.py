@@ -61,8 +61,8 @@ def _code() -> str:
     """Return a digest of the source of netspec that exports."""
     folder = Path(__file__).parents[2]
     found = hashlib.sha256()
-    for room in _EXPORTING:
-        for path in sorted((folder / room).rglob("*.py")):
+    for package in _EXPORTING:
+        for path in sorted((folder / package).rglob("*.py")):
             found.update(f"{path.relative_to(folder)}\0".encode())
             found.update(path.read_bytes())
     return found.hexdigest()

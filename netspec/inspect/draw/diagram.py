@@ -1,7 +1,7 @@
 """Computes the diagram of a net: layers as boxes, blobs as lines, with shapes and costs.
 
-Both phases are in one diagram. An in-place layer is in the box of the layer that computed
-the blob, if no other layer reads the blob before.
+Both phases are in one diagram. An in-place layer is drawn in the box of the layer that computed the blob, unless
+another layer reads the blob before.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from netspec.proto.source_map import Place, SourceMap
 from netspec.proto.text import write_text
 from netspec.proto.writer import scalar_text
 
-MOST_SETTINGS = 6  # number of settings to show
-OWN = "_param"  # endings of fields with a layer's own settings
-COMMON = ("loss_param", "transform_param")  # fields with these endings that many layers have
+MOST_SETTINGS = 6  # that are shown
+OWN = "_param"  # the ending of fields with a layer's own settings
+COMMON = ("loss_param", "transform_param")  # fields with this ending that many layers have
 NOT_SHOWN = ("engine", "bias_term", "axis", "source", "backend", "root_folder", "mean_file", "prefetch", "rand_skip")
 WINDOWS = {"kernel_size": ("kernel_h", "kernel_w"), "stride": ("stride_h", "stride_w"), "pad": ("pad_h", "pad_w")}
 DEFAULTS = {"kernel_size": "0", "stride": "1", "pad": "0"}
@@ -55,10 +55,10 @@ def _words(param: Any) -> Iterator[str]:
         given.pop(name, None)
         if set(sizes) == {DEFAULTS[name]}:
             continue
-        same = len(set(sizes)) == 1
-        given[name] = (
-            f"{sizes[0]}×{sizes[0]}" if same and name == "kernel_size" else sizes[0] if same else "×".join(sizes)
-        )
+        if len(set(sizes)) > 1:
+            given[name] = "×".join(sizes)
+        else:
+            given[name] = f"{sizes[0]}×{sizes[0]}" if name == "kernel_size" else sizes[0]
     for name in ("kernel_size", "num_output", "pool"):
         if name in given:
             yield given.pop(name)
@@ -289,8 +289,8 @@ def kind_of(type_name: str) -> str:
     cls = layer_class(type_name)
     if cls is None:
         return ""
-    package, _, room = cls.__module__.removeprefix("netspec.").partition(".")
-    return room if package == "layers" else "dialect"
+    package, _, module = cls.__module__.removeprefix("netspec.").partition(".")
+    return module if package == "layers" else "dialect"
 
 
 def _text(layer: Any) -> str:

@@ -190,7 +190,7 @@ def _text(text: str, size: int, color: str, bold: bool = False) -> str:
 
 def color_of(kind: str) -> tuple[str, str]:
     """Return the name of a kind of layers, and its color."""
-    return next(COLORS[room] for room in COLORS if not room or kind == room or kind.startswith(f"{room}."))
+    return next(COLORS[prefix] for prefix in COLORS if not prefix or kind == prefix or kind.startswith(f"{prefix}."))
 
 
 def amount_text(number: int) -> str:
