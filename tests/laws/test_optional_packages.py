@@ -21,7 +21,7 @@ NOT_CORE = (*OPTIONAL, "cli", "terminal", "pycaffe.py", "dnn.py")
 
 
 def copy_without(missing: Sequence[str], folder: Path) -> Path:
-    shutil.copytree(ROOT / "netspec", folder / "netspec", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "netspec", folder / "netspec")  # with __pycache__: compiling takes seconds
     for package in missing:
         shutil.rmtree(folder / "netspec" / package)
     return folder

@@ -14,7 +14,7 @@ TYPES = [torch.float32, torch.float64]
 SIZES = [(2, 3, 4), (1, 1, 1), (5, 1, 7), (1, 6, 1), (40, 300, 50)]
 
 
-@pytest.mark.parametrize(("dtype", "a_t", "b_t", "sizes"), product(TYPES, (False, True), (False, True), SIZES))
+@pytest.mark.parametrize(("dtype", "a_t", "b_t", "sizes"), [*product(TYPES, (False, True), (False, True), SIZES)])
 def test_gemm_multiplies_and_adds_in_place(
     dtype: torch.dtype, a_t: bool, b_t: bool, sizes: tuple[int, int, int]
 ) -> None:

@@ -170,14 +170,15 @@ def test_a_training_without_snapshots_is_found(advice: Callable[..., list[str]])
         ('type: "RMSProp" rms_decay: 0.9 momentum2: 0.9',
          ["3:32: momentum2 has no effect with type RMSProp and lr_policy fixed; remove it"]),
     ],
+    ids=["gamma", "stepvalue", "Adam", "AdaGrad", "RMSProp"],
 )  # fmt: skip
-def test_settings_that_the_policy_and_the_rule_do_not_read(
+def test_settings_that_the_policy_and_the_type_do_not_read_are_found(
     advice: Callable[..., list[str]], settings: str, said: list[str]
 ) -> None:
     assert advice(in_phases(siamese()), SOLVER + settings) == [f"solver.prototxt:{line}" for line in said]
 
 
-def test_settings_of_each_policy_and_rule_have_no_findings(advice: Callable[..., list[str]]) -> None:
+def test_settings_that_each_policy_reads_have_no_findings(advice: Callable[..., list[str]]) -> None:
     for policy in (
         'lr_policy: "step" gamma: 0.1 stepsize: 10', 'lr_policy: "exp" gamma: 0.9', 'lr_policy: "poly" power: 2',
         'lr_policy: "inv" gamma: 0.1 power: 1', 'lr_policy: "multistep" gamma: 0.1 stepvalue: 9',
@@ -187,7 +188,9 @@ def test_settings_of_each_policy_and_rule_have_no_findings(advice: Callable[...,
 
 
 @pytest.mark.parametrize(("iterations", "far"), [(20, False), (19, False), (22, False), (4, True), (64, True)])
-def test_a_test_of_a_wrong_size_is_found(advice: Callable[..., list[str]], iterations: int, far: bool) -> None:
+def test_a_test_iter_far_from_the_size_of_the_database_is_found(
+    advice: Callable[..., list[str]], iterations: int, far: bool
+) -> None:
     source = str(GOLDEN / "pairs" / "test_lmdb")
     solver = SOLVER + f"test_interval: 10\ntest_iter: {iterations}"
     read = f"test_iter {iterations} x batch 10 = {10 * iterations}"
