@@ -118,10 +118,12 @@ def _hdf5(net: Any, folder: Path, shape: Any, count: int) -> None:
     from netspec.files.hdf5 import new_hdf5
 
     (channels, height, width), classes = shape
+    tops = next(list(layer.top) for layer in net.layer if layer.type == "Data")
     with new_hdf5(folder / "rows.h5") as file:
         values = np.random.default_rng(0).standard_normal((count, channels, height, width), np.float32)
-        file.create_dataset("data", data=values)
-        file.create_dataset("label", data=(np.arange(count) % classes).astype(np.float32))
+        labels = (np.arange(count) % classes).astype(np.float32)
+        for top, rows in zip(tops, (values, labels), strict=False):  # a layer may have no top for the labels
+            file.create_dataset(top, data=rows)
     (folder / "files.txt").write_text(f"{folder / 'rows.h5'}\n")
     for layer in net.layer:
         if layer.type == "Data":

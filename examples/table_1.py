@@ -17,8 +17,8 @@ import json
 import os
 import re
 import shlex
-import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from statistics import mean
 
@@ -49,14 +49,19 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--min-gap", default="1", help="minimum seconds between the images of a pair (default: 1)")
     parser.add_argument("--gpu", help="number of the GPU (default: the CPU)")
+    parser.add_argument(
+        "--precision",
+        default="fp32",
+        help="precision of the trainings: fp32, or bf16 where the CPU or GPU has it (default: fp32)",
+    )
     return parser.parse_args()
 
 
 def run(*words: object) -> None:
-    """Print a command and run it; exit with its status if it fails."""
-    command = [str(word) for word in words]
-    print("$", shlex.join(command), flush=True)
-    status = subprocess.run([sys.executable, "-m", command[0].replace("-", "_"), *command[1:]], check=False).returncode
+    """Print a command of netspec, lmdb-build or loopclosure, and run it here; exit with its status if it fails."""
+    program, *rest = (str(word) for word in words)
+    print("$", shlex.join([program, *rest]), flush=True)
+    status = import_module(f"{program.replace('-', '_')}.cli").main(rest)
     if status:
         sys.exit(status)
 
@@ -131,6 +136,7 @@ def train(arguments: argparse.Namespace, pairs: Path, test: Path, out: Path) -> 
             if not (folder / "runs.json").exists():
                 solver = write_net(arguments, net, pairs, folder, seed)
                 on = () if arguments.gpu is None else ("--gpu", arguments.gpu)
+                on += ("--precision", arguments.precision)
                 run("lmdb-build", "compare", solver, "--resume", "--test", test, *on, "--out", folder)
 
 

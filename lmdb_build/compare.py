@@ -116,16 +116,18 @@ def read_entry(path: str) -> Entry:
 class Choices:
     """What ``compare`` does besides its default.
 
-    train   False: evaluate the snapshots of earlier trainings
-    resume  resume each training from its newest snapshot
-    test    databases of test pairs, one for each data layer of a net; () for none
-    gpu     netspec's ``--gpu``
+    train      False: evaluate the snapshots of earlier trainings
+    resume     resume each training from its newest snapshot
+    test       databases of test pairs, one for each data layer of a net; () for none
+    gpu        netspec's ``--gpu``
+    precision  of the trainings, netspec's ``--precision``
     """
 
     train: bool = True
     resume: bool = False
     test: tuple[str, ...] = ()
     gpu: str = ""
+    precision: str = "fp32"
 
 
 def compare(
@@ -150,7 +152,7 @@ def compare(
         if choices.train:
             say(f"Training {entry.name} ({entry.solver})")
             words = ["train", "--solver", entry.solver, "--scores", str(out / f"{entry.stem}.scores.json")]
-            words += ["--resume"] if choices.resume else []
+            words += ["--precision", choices.precision, *(["--resume"] if choices.resume else [])]
             _netspec([*words, *_on(choices.gpu)], out / f"{entry.stem}.log", say, step, entry.length)
         runs.append(_judged(entry, out, choices, say))
     file = out / "runs.json"

@@ -1,14 +1,12 @@
 """From sequences of two rooms to the paper's Table I and its Figure 5: examples/table_1.py and figure_5.py."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+import forked
 from lmdb_build.walk.sequence import Walk, write_walk
 from paths import ROOT
 
@@ -33,9 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(folder: Path, script: str, *words: str) -> str:
     """Run an example in a folder; return what it prints."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, str(ROOT / "examples" / script), *words]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    done = forked.run(forked.script, ROOT / "examples" / script, words, folder=folder, PYTHONPATH=str(ROOT))
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -3,10 +3,12 @@
 import os
 import sys
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"  # made by tools/setup.sh
+REQUIRED = ("torch", "google.protobuf", "lmdb", "cv2")  # commands import some of these late, or in another process
 
 
 def run(module: str, *words: str) -> int:
@@ -19,6 +21,9 @@ def run(module: str, *words: str) -> int:
     typed = sys.argv
     try:
         sys.argv = [typed[0], *words, *typed[1:]]
+        for name in REQUIRED:
+            if find_spec(name) is None:
+                raise ModuleNotFoundError(f"No module named '{name}'", name=name)
         return import_module("netspec.terminal.main").program(module)
     except ModuleNotFoundError as fault:
         python = VENV / "bin" / "python"

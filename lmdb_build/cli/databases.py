@@ -251,6 +251,12 @@ def _add_compare(commands: Commands) -> None:
         help="also evaluate the nets on the pairs of this database; give it once for each data layer of the nets",
     )
     parser.add_argument("--gpu", default="", metavar="N", help="number of the GPU to use (default: the CPU)")
+    parser.add_argument(
+        "--precision",
+        default="fp32",
+        choices=["fp32", "tf32", "bf16", "fp16"],
+        help="precision of the trainings; the nets are evaluated in fp32 (default: %(default)s)",
+    )
 
 
 def _left(done: int, to_do: int, seconds: float) -> str:
@@ -286,7 +292,8 @@ def _compare(arguments: argparse.Namespace) -> None:
         if done == total:
             shown.close()
 
-    choices = Choices(arguments.train, arguments.resume, tuple(arguments.test), arguments.gpu)
+    databases = tuple(arguments.test)
+    choices = Choices(arguments.train, arguments.resume, databases, arguments.gpu, arguments.precision)
     tables, files = compare(arguments.solver, arguments.out, choices, say, step)
     print(tables)
     for path in files:

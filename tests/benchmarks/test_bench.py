@@ -187,9 +187,9 @@ def test_waiting_for_data_is_reported_for_each_source(
     leveldb()
     monkeypatch.setattr(feeding, "SECONDS", 0.0)
     words = ["--batch", "1", "--threads", "1", "--json", str(tmp_path / "feeding.json")]
-    assert main(["feeding", "tiny", "squeezenet", *words]) == 0
+    assert main(["feeding", "small/siamese_8", "squeezenet", *words]) == 0
     rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
-    sources = [("tiny", source) for source in feeding.SOURCES if source not in feeding.IMAGES]
+    sources = [("small/siamese_8", source) for source in feeding.SOURCES if source not in feeding.IMAGES]
     sources += [("squeezenet", source) for source in feeding.SOURCES]
     assert [tuple(row[:2]) for row in rows] == sources
     assert all(0 <= float(row[4].removesuffix(" %")) <= 100 for row in rows)

@@ -139,6 +139,23 @@ def test_a_training_resumes(edited: Callable[..., None]) -> None:
     assert {**row("out"), "ms/image": ""} == {**before, "ms/image": ""}
 
 
+def test_trainings_in_another_precision(edited: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+    started = []
+
+    class Listed(Forked):
+        def __init__(self, command: list[str], **_: object) -> None:
+            started.append(" ".join(command[3:]))
+            super().__init__(command)
+
+    monkeypatch.setattr("lmdb_build.compare.subprocess", SimpleNamespace(Popen=Listed, PIPE=subprocess.PIPE))
+    assert main(["compare", SOLVER, "--out", "out", "--precision", "tf32"]) == 0
+    training, *others = started
+    assert training.startswith("train")
+    assert "--precision tf32" in training
+    assert others
+    assert not any("--precision" in command for command in others)
+
+
 def test_each_training_has_its_own_time_left(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
