@@ -29,6 +29,13 @@ LOGGERS = [logging.getLogger(name) for name in ("", "netspec", "loopclosure", "l
 SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)]  # Windows has no SIGHUP
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Refuse a path that does not exist; pytest-xdist would run no test and not say why."""
+    for argument in config.args:
+        if not (config.invocation_params.dir / argument.partition("::")[0]).exists():
+            raise pytest.UsageError(f"file or directory not found: {argument}")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Pyright takes the longest and comes first, then tests of pages, site, wheel and examples.
 
