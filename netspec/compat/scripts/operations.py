@@ -119,13 +119,16 @@ def _with_bytes(function: Callable[..., Any], *arguments: Any, **named: Any) -> 
 
 
 def _sort(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Return function(...), where function is list.sort or sorted. A comparison function becomes a key."""
-    if arguments and callable(arguments[-1]):
-        arguments, named = arguments[:-1], {**named, "cmp": arguments[-1]}
-    compare = named.pop("cmp", None)
+    """Return function(...). For sorted and list.sort, cmp, key and reverse may be positional, and cmp becomes a key."""
+    first = 1 if function is sorted else 0
+    if not first and not isinstance(getattr(function, "__self__", None), list):
+        return function(*arguments, **named)  # the sort of NumPy, for example
+    named.update(zip(("cmp", "key", "reverse"), arguments[first:], strict=False))
+    compare, key = named.pop("cmp", None), named.get("key")
     if compare is not None:
-        named["key"] = functools.cmp_to_key(compare)
-    return function(*arguments, **named)
+        compared = functools.cmp_to_key(compare)
+        named["key"] = compared if key is None else lambda value: compared(key(value))
+    return function(*arguments[:first], **named)
 
 
 def _decode(value: Any, *codec: Any) -> Any:

@@ -17,6 +17,7 @@ import io
 import re
 import tokenize
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 from netspec.compat.scripts import as_python2
@@ -204,13 +205,22 @@ def _tool(package: str, home: str) -> Any:
     """Return 2to3, which takes files in memory from the module ``home``."""
     refactor = importlib.import_module(f"{package}.refactor")
     fixers = refactor.get_fixers_from_package(f"{package}.fixes")
-    without = ["import"] if home == _ALONE else ["import", "reduce", "intern", "reload"]  # these three insert a line
+    without = ["import"]
+    if home == _HOME:  # these insert a line; "sorted" is done by netspec/compat/scripts/operations.py
+        without += ["reduce", "intern", "reload", "sorted"]
     without = [f"{package}.fixes.fix_{name}" for name in without]
     tool = refactor.RefactoringTool([name for name in fixers if name not in without])
     for fixer in (*tool.pre_order, *tool.post_order):
         if type(fixer).__name__ == "FixImports":
             fixer.mapping = {**fixer.mapping, "StringIO": home, "cStringIO": home}
+        if type(fixer).__name__ == "FixSorted":
+            fixer.match = functools.partial(_sorts_a_list, fixer.match)
     return tool
+
+
+def _sorts_a_list(match: Callable[[Any], Any], node: Any) -> Any:
+    """Return what ``match`` returns for a call of sort, but False for NumPy's: ``np.sort(a)`` and ``a.sort(0)``."""
+    return match(node) if not re.search(r"^(np|numpy)\b|\.sort\(\s*-?\d", str(node).strip()) else False
 
 
 def _encoding(data: bytes) -> str:

@@ -263,3 +263,10 @@ def test_a_translation_keeps_its_files_and_needs_no_netspec(python: Run) -> None
     text = translated(f"{source}print 7 / 2, len(open('o').read())\n".encode(), "s.py", alone=True)
     assert python("new.py", files={"new.py": text}).stdout == "3 2\n"
     assert "netspec" not in text
+
+
+def test_a_translation_without_netspec_sorts_lists_and_arrays(python: Run) -> None:
+    sorts = "a = [3, 1, 2]; a.sort(lambda x, y: y - x)\nb = np.array([[3], [1]]); b.sort(0)\n"
+    source = f"import numpy as np\n{sorts}print a, b.tolist(), np.sort(-np.array([1, 2])).tolist()\n"
+    text = translated(source.encode(), "s.py", alone=True)
+    assert python("new.py", files={"new.py": text}).stdout == "[3, 2, 1] [[1], [3]] [-2, -1]\n"
