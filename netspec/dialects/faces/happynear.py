@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from typing_extensions import override
@@ -169,7 +170,8 @@ class LabelSpecificAdd(Layer):
         p, top = self.settings, scores
         if self.phase != TEST:
             if p.HasField("bias_base"):
-                bias = p.bias_base + (1 + p.bias_gamma * self.passes) ** p.bias_power - 1
+                with np.errstate(all="ignore"):  # NaN or infinity, as in C; Python raises an error
+                    bias = p.bias_base + float(np.float64(1 + p.bias_gamma * self.passes) ** p.bias_power) - 1
                 self.bias = min(max(bias, p.bias_min), p.bias_max)
                 self.passes += 1
             flat, labels = scores.detach().flatten(1), labels.reshape(-1, 1).long()

@@ -146,7 +146,7 @@ class ReverseTime(Layer):
         extra = (1,) * (data.dim() - 2)
         top = data.gather(0, source.reshape(*source.shape, *extra).expand_as(data))
         copies = value(self.param, "reverse_time_param").copy_remaining
-        return top if copies else top * inside.reshape(*inside.shape, *extra)
+        return top if copies else top.masked_fill(~inside.reshape(*inside.shape, *extra), 0)  # also where it is NaN
 
 
 @register("Lstm", "lstm_param")

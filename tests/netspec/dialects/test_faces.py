@@ -119,6 +119,24 @@ def test_label_specific_add_adds_a_growing_bias_to_the_labels_score() -> None:
         layer(scores, torch.tensor([2.0, 0]))
 
 
+@pytest.mark.parametrize(
+    ("fields", "bias"),
+    [
+        ("iteration: 2 bias_gamma: -1 bias_power: 0.5", math.nan),
+        ("iteration: 1 bias_gamma: -1 bias_power: -1", math.inf),
+        ("iteration: 1 bias_gamma: 1e30 bias_power: 20", math.inf),
+    ],
+    ids=["root_of_a_negative_number", "inverse_of_zero", "overflow"],
+)
+def test_label_specific_adds_bias_is_that_of_cs_pow(fields: str, bias: float) -> None:
+    given = f"label_specific_add_param {{ bias_base: 0 bias_max: inf {fields} }}"
+    layer = netspec.layer(f'type: "LabelSpecificAdd" top: "y" top: "bias" phase: TRAIN {given}')
+    scores = torch.tensor([[1.0, 2]])
+    top, found = layer(scores, torch.tensor([1.0]))
+    torch.testing.assert_close(found, torch.tensor([bias]), equal_nan=True)
+    torch.testing.assert_close(top, torch.tensor([[1.0, 2.0 if math.isnan(bias) else bias]]))  # NaN is not added
+
+
 def test_focal_loss_of_both_types_computes_its_formula() -> None:
     scores, labels = torch.randn(3, 4), torch.tensor([0.0, 3, 1])
     p = scores.softmax(1)[range(3), labels.long()]

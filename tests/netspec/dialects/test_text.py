@@ -87,6 +87,15 @@ def test_reverse_time_reverses_the_first_steps_of_each_sequence(build: Build, co
     assert top[2:, 1, 0].tolist() == rest
 
 
+def test_reverse_time_sets_nan_and_infinity_behind_a_sequence_to_zero(build: Build) -> None:
+    data = torch.tensor([1.0, 2, torch.nan, torch.inf]).reshape(4, 1, 1).requires_grad_()
+    layer = build("text", "type: 'ReverseTime'", data.shape, (1,))
+    (top,) = layer.run(data, torch.tensor([2.0]))
+    assert top.flatten().tolist() == [2, 1, 0, 0]
+    (gradient,) = torch.autograd.grad(top, data, torch.tensor([3.0, 4, torch.nan, torch.inf]).reshape(4, 1, 1))
+    assert gradient.flatten().tolist() == [4, 3, 0, 0]
+
+
 LSTM = "type: 'Lstm' lstm_param { num_output: 3 weight_filler { type: 'uniform' min: -1 max: 1 } %s }"
 
 
