@@ -10,7 +10,8 @@ INSTALLED="$VENV/installed${NEEDS:+-$NEEDS}"
 if [ ! -x "$VENV/bin/netspec" ] || [ ! -e "$INSTALLED" ] || [ "$ROOT/pyproject.toml" -nt "$INSTALLED" ]; then
   quiet=--quiet
   if [ -t 2 ]; then quiet=; fi  # on a terminal pip shows how long a download takes
-  # pip unpacks gigabytes into TMPDIR, and /tmp may be in memory.
+  # pip unpacks gigabytes into TMPDIR, and /tmp may be in memory. It compiles nothing: Python does so at a
+  # module's first import, and most of the 14,000 modules are never imported.
   install() {
     TMPDIR="$VENV/tmp" "$VENV/bin/python" -m pip install $quiet --no-compile --disable-pip-version-check "$@" >&2
   }
@@ -32,8 +33,6 @@ if [ ! -x "$VENV/bin/netspec" ] || [ ! -e "$INSTALLED" ] || [ "$ROOT/pyproject.t
   echo "Installing everything else" >&2
   install -e "$ROOT${NEEDS:+[$NEEDS]}"
   rm -r "$VENV/tmp"
-  # pip would compile on one core. Some packages contain templates that are not valid Python, so errors are ignored.
-  "$VENV/bin/python" -m compileall -q -j 0 "$VENV"/lib/python*/site-packages >"$VENV/compiled.log" 2>&1 || true
   touch "$VENV/installed" "$INSTALLED"
 fi
 "$PYTHON" "$ROOT/prototxt/variants.py"
