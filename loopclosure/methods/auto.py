@@ -57,36 +57,69 @@ class Answer:
         return np.array([bool(result) for result in self.results], bool)
 
 
+@dataclass(frozen=True)
+class Searched:
+    """What the scores of compared frames tell, before any pair is verified: steps 1 to 3.
+
+    age_said  a sentence about which pairs show different places; empty for two traverses
+    """
+
+    compared: Compared
+    given: Candidates
+    lines: Lines | None
+    matches: Matches
+    age_said: str
+
+    @property
+    def line_scores(self) -> np.ndarray:
+        """The score of the best line of each query (N,), -inf without one."""
+        none = np.full(len(self.given.queries), -np.inf)
+        return (none if self.lines is None else self.lines.targets)[self.given.stands]
+
+    @property
+    def image_scores(self) -> np.ndarray:
+        """The score of the best single candidate of each query (N,), -inf without one."""
+        return self.given.known().max(axis=1, initial=-np.inf)[self.given.stands]
+
+
+def search(compared: Compared, precision: float = PRECISION) -> Searched:
+    """Find the best match of each query by the scores alone, at this ``precision`` of what is accepted."""
+    if not 0 < precision < 1:
+        raise InputError(f"precision is {precision:g}; expected more than 0 and less than 1")
+    given = candidates(compared)
+    decoys, age_said = elsewhere(given)
+    lines = best_lines(given, pool(given, decoys), precision)
+    return Searched(compared, given, lines, Matches.of(given, lines, precision), age_said)
+
+
 def answer(
-    compared: Compared,
+    searched: Searched,
     check: GeometricCheck | None = None,
     agree: Agree | None = None,
-    precision: float = PRECISION,
+    worth: np.ndarray | None = None,
     progress: Progress = silent,
 ) -> Answer:
     """Decide which best matches are loops.
 
     check, agree  verification of a query and a reference, by number; None: there are no images. A
                   :class:`~loopclosure.detector.verification.Between` leaves out what is fixed in the images
-    precision     the share of what is accepted that should be right
+    worth         the queries (N,) bool whose matches are verified; None: all
     """
-    if not 0 < precision < 1:
-        raise InputError(f"precision is {precision:g}; expected more than 0 and less than 1")
-    given = candidates(compared)
-    decoys, age_said = elsewhere(given)
-    lines = best_lines(given, pool(given, decoys), precision)
-    matches = Matches.of(given, lines, precision)
+    given, lines, matches = searched.given, searched.lines, searched.matches
     said = "verification: not tried, there are no images"
     if check is not None and agree is not None:
-        geometry = Geometry.of(given, check, agree)
-        verify(given, lines, matches, geometry, progress)
+        rows = np.ones(len(given.queries), bool)
+        if worth is not None:
+            rows = np.bincount(given.stands, worth, len(rows)) > 0
+        geometry = Geometry.of(given, check, agree, rows)
+        verify(given, lines, matches, rows, geometry, progress)
         said = _verified_said(matches, geometry)
     loops = decide(matches, lines)
     rejected = np.where(matches.inliers >= 0, "not verified", "below threshold")
     verdicts = np.where(loops, "accepted", np.where(matches.there, rejected, "no candidate"))
-    results = _results(given, matches, loops, verdicts.tolist(), compared.stamps)
+    results = _results(given, matches, loops, verdicts.tolist(), searched.compared.stamps)
     reasons = [
-        *filter(None, [given.said, age_said]),
+        *filter(None, [given.said, searched.age_said]),
         _sequences_said(lines if matches.by_lines else None, given.far),
         said,
     ]
@@ -212,7 +245,7 @@ class Auto:
         visit = None if self.visit < 0 else self.visit
         with timed(seconds, "choice and verification"):
             compared = Compared(found.scores, allowed, two, far, visit)
-            decided = answer(compared, self.check, agree, self.precision, progress)
+            decided = answer(search(compared, self.precision), self.check, agree, progress=progress)
         scores = np.full(found.scores.shape, np.nan)
         loops = np.flatnonzero(decided.accepted)
         scores[loops, decided.match[loops]] = [decided.results[query].score for query in loops]

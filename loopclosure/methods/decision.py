@@ -30,7 +30,7 @@ def decide(matches: Matches, lines: Lines | None) -> np.ndarray:
     seeds = matches.line & (many | (np.bincount(label, verified & matches.line)[label] > 0))
     of_line = matches.match == lines.match
     by_line = grown(seeds, lines.above_decoys & of_line, pairs)
-    loops = by_line & ~contradicted(by_line, verified, pairs, lines.sequence.length)
+    loops = by_line & ~contradicted(by_line, verified, matches.inliers >= 0, pairs, lines.sequence.length)
     loops |= between(loops, lines.match, lines.sequence) & of_line
     # From afar a place is seen before the camera is there: other queries fit it better.
     loops |= lines.near & (matches.evidence >= DOUBTLESS)
@@ -51,25 +51,29 @@ def grown(loops: np.ndarray, possible: np.ndarray, pairs: np.ndarray) -> np.ndar
         loops |= more
 
 
-def contradicted(loops: np.ndarray, verified: np.ndarray, pairs: np.ndarray, length: int) -> np.ndarray:
+def contradicted(
+    loops: np.ndarray, verified: np.ndarray, tried: np.ndarray, pairs: np.ndarray, length: int
+) -> np.ndarray:
     """Return the loops (Q,) of lines that their points contradict.
 
     These are runs of matches, at an end of a stretch or all of it, of which none is verified though so many should be:
     at the share of the stretch that is, or of all stretches where none is. A run longer than a line is several
-    lines, which tell enough; a shorter one may be the end of the line through the last place of a loop.
+    lines, which tell enough; a shorter one may be the end of the line through the last place of a loop. Matches whose
+    verification was not ``tried`` count neither for nor against.
     """
     stretch = stretches(loops, pairs)
     against = np.zeros_like(loops)
-    overall = np.mean(verified[loops]) if loops.any() else 0.0
+    overall = np.mean(verified[loops & tried]) if np.any(loops & tried) else 0.0
     for number in np.unique(stretch[loops]):
         queries = np.flatnonzero(loops & (stretch == number))
         found = np.flatnonzero(verified[queries])
         if len(found):
-            share, runs = len(found) / (found[-1] - found[0] + 1), (queries[: found[0]], queries[found[-1] + 1 :])
+            within = queries[found[0] : found[-1] + 1]
+            share, runs = len(found) / np.count_nonzero(tried[within]), (queries[: found[0]], queries[found[-1] + 1 :])
         else:
             share, runs = overall, (queries,)
         for run in runs:
-            if len(run) <= length and (1 - share) ** len(run) < UNLIKELY:
+            if len(run) <= length and (1 - share) ** np.count_nonzero(tried[run]) < UNLIKELY:
                 against[run] = True
     return against
 

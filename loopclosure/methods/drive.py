@@ -15,7 +15,7 @@ from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import remember_all
 from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
-from loopclosure.methods.auto import PRECISION, Answer, answer
+from loopclosure.methods.auto import PRECISION, Answer, Searched, answer, search
 from loopclosure.methods.base import BLOCK
 from loopclosure.methods.candidates import Compared, far_apart
 from loopclosure.places.frames import gray, read_gray
@@ -69,7 +69,7 @@ def whole_drive(
         frames = progress(recording.frames(), "local features", len(recording))
         pairs = Pairs({number: check.describe(gray(image)) for number, image, _ in frames}.__getitem__)
     request = replace(request, seconds=detector.settings.exclude_seconds, odometry=odometry)
-    found = _among(detector, (0, len(detector)), Between(check, pairs, (), ()), request, progress)
+    found = _Comparison.of(detector, (0, len(detector)), request).decided(check, pairs, progress=progress)
     detector.decided([result for result in found.results if result], None)
     return replace(found, reasons=[*found.limits, *found.reasons])
 
@@ -104,10 +104,11 @@ def last_session(
 ) -> Answer:
     """Decide on the last session of a detector with a geometric check, from all of its frames.
 
-    It is compared with each earlier session as two traverses and, if ``own``, with itself as one drive. If there are
-    too many earlier sessions, it is compared with those that contain the best candidate of most frames; in the others,
-    each frame is looked up by itself. ``results`` are the results of the frames when they were added; None: they were
-    only remembered.
+    It is compared with each earlier session as two traverses and, if ``own``, with itself as one drive. A frame is
+    verified only in the session with its best line and in the one with its best image. If there are too many earlier
+    sessions, it is compared with those that contain the best candidate of most frames; in the others, each frame is
+    looked up by itself. ``results`` are the results of the frames when they were added; None: they were only
+    remembered.
     """
     *earlier, (begin, count) = pairwise([*detector.sessions, len(detector)])
     together = detector.check is not None and bool(earlier or own)
@@ -123,10 +124,12 @@ def last_session(
         pairs = np.cumsum([0, *((end - first) * (count - begin) for first, end in earlier)])
         many = np.count_nonzero(pairs[:-1] < MOST_PAIRS)
         compared, left = earlier[:many], earlier[many:]
-    between = Between(detector.check, Pairs(detector.local_features), (), ())
+    pairs_of = Pairs(detector.local_features)
     found, limits, reasons = list[list[LoopResult]](), list[str](), list[str]()
-    for first, end in [*compared, (begin, count)][: None if own else -1]:
-        answered = _among(detector, (first, end), between, request, progress)
+    spans = [*compared, (begin, count)][: None if own else -1]
+    comparisons = [_Comparison.of(detector, span, request) for span in spans]
+    for comparison, worth in zip(comparisons, _worth(comparisons), strict=True):
+        answered = comparison.decided(detector.check, pairs_of, worth, progress)
         found, limits, reasons = [*found, answered.results], [*limits, *answered.limits], answered.reasons
     if results is not None and left:
         elsewhere = [any(first <= (result.accepted or 0) < end for first, end in left) for result in results]
@@ -137,41 +140,73 @@ def last_session(
     return Answer(best or results or [], [*limits, *reasons], limits)
 
 
-def _among(
-    detector: LoopDetector, span: tuple[int, int], between: Between, request: Request, progress: Progress
-) -> Answer:
-    """Decide on the last session among the frames of a ``span``, which is another session or this one.
+@dataclass(frozen=True)
+class _Comparison:
+    """The last session, compared with the frames of another session or with itself.
 
-    If there are more than ``MOST_PAIRS`` pairs, only every second or third frame is compared, and its result also
-    applies to the frames after it.
+    count    the frames of the last session
+    queries, references  the frames that are compared: all, or every second or third one if there are more than
+             ``MOST_PAIRS`` pairs; their results also apply to the frames after them
+    stamps   (count,) of the last session
     """
-    first, end = span
-    begin, two = detector.sessions[-1], first != detector.sessions[-1]
-    count = len(detector) - begin
-    step = math.isqrt(max(0, count * (end - first) - 1) // MOST_PAIRS) + 1
-    queries, references = range(begin, len(detector), step), range(first, end, step)
-    stamps = detector.stamps[begin:]
-    agree = replace(between, queries=queries, references=references)
-    far = None if request.odometry is None else far_apart(request.odometry[::step])
-    visit = None if request.visit is None else request.visit // step
-    allowed = np.ones((len(queries), len(references)), bool) if two else _earlier(stamps[::step], request.seconds)
-    compared = Compared(_compared(detector, queries, references), allowed, two, far, visit, stamps[::step])
-    answered = answer(compared, between.check, agree, request.precision, progress)
-    results = []
-    for number in range(count):
-        result = answered.results[number // step]
-        results.append(
-            replace(
-                result,
-                query_id=begin + number,
-                candidates=[(references[match], score) for match, score in result.candidates],
-                accepted=None if result.accepted is None else references[result.accepted],
-                inliers=None if number % step else result.inliers,
-                stamp=None if np.isnan(stamps[number]) else float(stamps[number]),
+
+    count: int
+    queries: range
+    references: range
+    stamps: np.ndarray
+    searched: Searched
+
+    @classmethod
+    def of(cls, detector: LoopDetector, span: tuple[int, int], request: Request) -> _Comparison:
+        """Compare with the frames of a ``span`` (first, end)."""
+        first, end = span
+        begin, two = detector.sessions[-1], first != detector.sessions[-1]
+        count = len(detector) - begin
+        step = math.isqrt(max(0, count * (end - first) - 1) // MOST_PAIRS) + 1
+        queries, references = range(begin, len(detector), step), range(first, end, step)
+        stamps = detector.stamps[begin:]
+        far = None if request.odometry is None else far_apart(request.odometry[::step])
+        visit = None if request.visit is None else request.visit // step
+        allowed = np.ones((len(queries), len(references)), bool) if two else _earlier(stamps[::step], request.seconds)
+        compared = Compared(_compared(detector, queries, references), allowed, two, far, visit, stamps[::step])
+        return cls(count, queries, references, stamps, search(compared, request.precision))
+
+    def decided(
+        self, check: GeometricCheck, pairs: Pairs, worth: np.ndarray | None = None, progress: Progress = silent
+    ) -> Answer:
+        """Decide for each frame; ``worth`` (count,) bool: the frames whose matches are verified, None: all."""
+        step = self.queries.step
+        worth = None if worth is None else worth[::step]
+        between = Between(check, pairs, self.queries, self.references)
+        answered = answer(self.searched, check, between, worth, progress)
+        results = []
+        for number, stamp in enumerate(self.stamps.tolist()):
+            result = answered.results[number // step]
+            results.append(
+                replace(
+                    result,
+                    query_id=self.queries.start + number,
+                    candidates=[(self.references[match], score) for match, score in result.candidates],
+                    accepted=None if result.accepted is None else self.references[result.accepted],
+                    inliers=None if number % step else result.inliers,
+                    stamp=None if np.isnan(stamp) else stamp,
+                )
             )
-        )
-    thinned = f"{count} frames {TOO_MANY}: one of {step} is compared, and decides for the frames after it"
-    return Answer(results, answered.reasons, [thinned] if step > 1 else [])
+        thinned = f"{self.count} frames {TOO_MANY}: one of {step} is compared, and decides for the frames after it"
+        return Answer(results, answered.reasons, [thinned] if step > 1 else [])
+
+
+def _worth(comparisons: list[_Comparison]) -> np.ndarray:
+    """Return for each comparison (C, N) the frames of the last session whose matches are worth verifying in it.
+
+    Each frame is verified in two comparisons at most: the one with its best line, and the one with its best image.
+    """
+    worth = np.zeros((len(comparisons), comparisons[0].count if comparisons else 0), bool)
+    for name in ("line_scores", "image_scores") if comparisons else ():
+        scores = [np.repeat(getattr(each.searched, name), each.queries.step)[: each.count] for each in comparisons]
+        there = np.flatnonzero(np.isfinite(np.max(scores, axis=0)))
+        worth[np.argmax(scores, axis=0)[there], there] = True
+    return worth
 
 
 def _compared(detector: LoopDetector, queries: range, references: range) -> np.ndarray:

@@ -83,11 +83,14 @@ class Geometry:
     hidden: float = 0.0
 
     @classmethod
-    def of(cls, given: Candidates, check: GeometricCheck, agree: Agree) -> Geometry:
-        """Examine dissimilar pairs, and ignore parts that are the same in many images: a clock, the hood of the car."""
-        unlike = _unlike(given)
+    def of(cls, given: Candidates, check: GeometricCheck, agree: Agree, rows: np.ndarray) -> Geometry:
+        """Examine dissimilar pairs, and ignore parts that are the same in many images: a clock, the hood of the car.
+
+        rows  (Q,) bool: the queries to verify
+        """
+        unlike = _unlike(given, rows)
         if isinstance(agree, Between) and unlike:
-            pairs = unlike + _left(given)
+            pairs = unlike + _left(given, rows)
             agree = agree.without_fixed([(int(given.queries[q]), int(given.references[r])) for q, r in pairs])
 
         def of_rows(query: int, reference: int) -> Agreement:
@@ -110,10 +113,10 @@ def _sample(numbers: np.ndarray) -> np.ndarray:
     return numbers[np.unique(np.linspace(0, len(numbers) - 1, SAMPLE).round().astype(int))]
 
 
-def _unlike(given: Candidates) -> list[tuple[int, int]]:
+def _unlike(given: Candidates, rows: np.ndarray) -> list[tuple[int, int]]:
     """Return pairs that are dissimilar by their scores."""
     known, pairs = given.known(), []
-    for query in _sample(np.flatnonzero(np.count_nonzero(np.isfinite(known), axis=1) >= 8)):
+    for query in _sample(np.flatnonzero(rows & (np.count_nonzero(np.isfinite(known), axis=1) >= 8))):
         order = np.argsort(known[query], kind="stable")
         candidates = order[np.isfinite(known[query, order])]
         # A pair from the least similar quarter of the query, of another rank for each query.
@@ -121,17 +124,22 @@ def _unlike(given: Candidates) -> list[tuple[int, int]]:
     return pairs
 
 
-def _left(given: Candidates) -> list[tuple[int, int]]:
+def _left(given: Candidates, rows: np.ndarray) -> list[tuple[int, int]]:
     """Return queries of one drive, each with its newest candidate: most likely another place in the same light."""
     if given.two:
         return []
-    queries = _sample(np.flatnonzero(given.there))
+    queries = _sample(np.flatnonzero(given.there & rows))
     return [(int(query), int(np.flatnonzero(given.allowed[query])[-1])) for query in queries]
 
 
-def verify(given: Candidates, lines: Lines | None, matches: Matches, geometry: Geometry, progress: Progress) -> None:
-    """Verify the match of each query, or else its best single image or line, which then becomes its match."""
-    there, instead, alone = np.flatnonzero(matches.there), given.single, None
+def verify(
+    given: Candidates, lines: Lines | None, matches: Matches, rows: np.ndarray, geometry: Geometry, progress: Progress
+) -> None:
+    """Verify the match of each query, or else its best single image or line, which then becomes its match.
+
+    rows  (Q,) bool: the queries to verify
+    """
+    there, instead, alone = np.flatnonzero(matches.there & rows), given.single, None
     if lines is not None and matches.by_lines:
         alone = lines.alone
     elif lines is not None:

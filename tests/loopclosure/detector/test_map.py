@@ -21,9 +21,11 @@ from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.detector import LoopDetector
 from loopclosure.detector import map as maps
 from loopclosure.detector.map import Map
-from loopclosure.detector.run import run_detector
+from loopclosure.detector.run import remember_all, run_detector
+from loopclosure.detector.verification import GeometricCheck
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
+from loopclosure.methods.drive import last_session
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.sequences import read_sequence
 from netspec.errors import SpecError
@@ -104,6 +106,22 @@ def test_build_add_and_query(
     assert [(query, match.partition("/")[2]) for query, match in found] == [
         (f"{i:03d}.png", f"{i + 5:03d}.png") for i in range(5)
     ]
+
+
+@pytest.mark.slow
+def test_each_frame_is_verified_in_the_most_similar_session_only(
+    a_map: Map, drives: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time of a query does not grow with the number of sessions: a match and an unlike pair for each frame."""
+    for _ in range(3):
+        a_map.add(read_sequence(drives / "b"), Thumbnailer())
+    verified, agreement = [], GeometricCheck.agreement
+    monkeypatch.setattr(GeometricCheck, "agreement", lambda *given: verified.append(1) or agreement(*given))
+    detector = a_map.detector(Thumbnailer())
+    remember_all(detector, read_sequence(drives / "c"))
+    found = [result.accepted for result in last_session(detector, own=False).results]
+    assert [None if match is None else match % PLACES for match in found] == [5, 6, 7, 8, 9] + [None] * PLACES
+    assert len(verified) <= 2 * len(found)
 
 
 @pytest.mark.slow
