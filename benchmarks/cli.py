@@ -17,7 +17,7 @@ from netspec.terminal.parser import Commands, Parser
 
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
 FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
-SMALL, WAYS_OF_SMALL = ("tiny", "lenet", "cifar10_quick", "pnet"), ("netspec", "pycaffe", "pytorch")
+SMALL, PROGRAMS_FOR_SMALL = ("tiny", "lenet", "cifar10_quick", "pnet"), ("netspec", "pycaffe", "pytorch")
 TRAINING = ("netspec", "netspec-bf16", "pytorch", "pycaffe")
 
 
@@ -48,7 +48,7 @@ def parser() -> Parser:
 
 
 def _add_common(parser: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
-    _add_ways(parser, known, default)
+    _add_programs(parser, known, default)
     parser.add_argument("--caffe", metavar="BINARY", help="also time this caffe binary")
     parser.add_argument("--batch", type=int, nargs="+", default=[1], help="one or several batch sizes (default: 1)")
     parser.add_argument(
@@ -62,10 +62,25 @@ def _add_common(parser: argparse.ArgumentParser, known: Sequence[str], default: 
     )
 
 
-def _add_ways(parser: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
+def _add_nets(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list)")
+
+
+def _add_nets_or_prototxts(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list), or a prototxt")
+    parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
+
+
+def _add_plot(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--plot", metavar="FILE", help="draw the ratios of netspec's times to the others', as .png or .svg"
+    )
+
+
+def _add_programs(parser: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
     parser.add_argument(
         "--with",
-        dest="ways",
+        dest="programs",
         nargs="+",
         choices=known,
         default=list(default),
@@ -161,20 +176,17 @@ def _list(arguments: argparse.Namespace) -> None:
 def _add_forward(commands: Commands) -> None:
     parser = commands.add_parser("forward", help="compare the time of forward passes with other programs")
     parser.set_defaults(function=_forward)
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list), or a prototxt")
-    parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
+    _add_nets_or_prototxts(parser)
     parser.add_argument("--twin", help="net of the catalog whose PyTorch version the prototxt equals")
     _add_common(parser, FORWARD, (*ENGINES, "pytorch", "opencv4"))
-    parser.add_argument(
-        "--plot", metavar="FILE", help="draw the ratios of netspec's times to the others', as .png or .svg"
-    )
+    _add_plot(parser)
 
 
 def _forward(arguments: argparse.Namespace) -> None:
     from benchmarks.case import forward_case
 
     def case(name: str, batch: int) -> Any:
-        needs_onnx = any(way.startswith(("onnxruntime", "openvino")) for way in arguments.ways)
+        needs_onnx = any(program.startswith(("onnxruntime", "openvino")) for program in arguments.programs)
         return forward_case(name, batch, arguments.weights, arguments.twin, needs_onnx)
 
     _compare(arguments, case, training=False)
@@ -183,18 +195,16 @@ def _forward(arguments: argparse.Namespace) -> None:
 def _add_train(commands: Commands) -> None:
     parser = commands.add_parser("train", help="time training iterations: forward, backward, update")
     parser.set_defaults(function=_train)
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list)")
+    _add_nets(parser)
     _add_common(parser, TRAINING, ("netspec", "pytorch"))
-    parser.add_argument(
-        "--plot", metavar="FILE", help="draw the ratios of netspec's times to the others', as .png or .svg"
-    )
+    _add_plot(parser)
     parser.add_argument("--device", default="cpu", help="torch device for netspec and pytorch (default: cpu)")
 
 
 def _train(arguments: argparse.Namespace) -> None:
     from benchmarks.case import training_case
 
-    if arguments.device != "cpu" and ("pycaffe" in arguments.ways or arguments.caffe):
+    if arguments.device != "cpu" and ("pycaffe" in arguments.programs or arguments.caffe):
         raise WrongUsage("only netspec and pytorch can be timed on a device other than the CPU")
     _compare(arguments, training_case, training=True, device=arguments.device)
 
@@ -207,7 +217,7 @@ def _add_small(commands: Commands) -> None:
     parser.add_argument(
         "nets", nargs="*", metavar="NET", default=SMALL, help=f"nets of the catalog (default: {' '.join(SMALL)})"
     )
-    _add_common(parser, WAYS_OF_SMALL, WAYS_OF_SMALL)
+    _add_common(parser, PROGRAMS_FOR_SMALL, PROGRAMS_FOR_SMALL)
     parser.set_defaults(batch=[1, 4, 16, 64])
 
 
@@ -223,7 +233,7 @@ def _small(arguments: argparse.Namespace) -> None:
 def _add_waiting(commands: Commands) -> None:
     parser = commands.add_parser("waiting", help="time two simultaneous trainings under several OpenMP wait settings")
     parser.set_defaults(function=_waiting)
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list)")
+    _add_nets(parser)
     parser.add_argument(
         "--waits",
         nargs="+",
@@ -248,7 +258,7 @@ def _add_feeding(commands: Commands) -> None:
         "feeding", help="measure how long trainings wait for data from databases and image files"
     )
     parser.set_defaults(function=_feeding)
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list)")
+    _add_nets(parser)
     parser.add_argument("--batch", type=int, default=4, help="batch size (default: 4)")
     parser.add_argument("--threads", type=int, default=2, help="threads of the training (default: 2)")
     _add_json(parser)
@@ -291,9 +301,8 @@ def _keep(arguments: argparse.Namespace, rows: Sequence[Any], described: Any = N
 def _add_start(commands: Commands) -> None:
     parser = commands.add_parser("start", help="time processes that load a net and describe one image")
     parser.set_defaults(function=_start)
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list), or a prototxt")
-    parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
-    _add_ways(parser, (*ENGINES, "opencv4"), (*ENGINES[:3], "opencv4"))
+    _add_nets_or_prototxts(parser)
+    _add_programs(parser, (*ENGINES, "opencv4"), (*ENGINES[:3], "opencv4"))
 
 
 def _start(arguments: argparse.Namespace) -> None:
@@ -303,7 +312,7 @@ def _start(arguments: argparse.Namespace) -> None:
     def rows(separate_python: str | None) -> Iterator[list[Row]]:
         for name in arguments.nets:
             with forward_case(name, 1, arguments.weights, onnx=False) as case:
-                yield starts_of(case, arguments.ways, separate_python, arguments.rounds)
+                yield starts_of(case, arguments.programs, separate_python, arguments.rounds)
 
     _report(arguments, rows)
 
@@ -319,7 +328,7 @@ def _compare(
 
     def rows(separate_python: str | None) -> Iterator[list[Row]]:
         how = Comparison(
-            arguments.ways, training, arguments.rounds, separate_python, arguments.caffe, arguments.seconds, device
+            arguments.programs, training, arguments.rounds, separate_python, arguments.caffe, arguments.seconds, device
         )
         for name in arguments.nets:
             for batch in arguments.batch:
@@ -340,7 +349,7 @@ def _report(
     from benchmarks import environment, report, results
     from benchmarks.compare import IN_SEPARATE_ENVIRONMENT
 
-    separate_python = environment.python() if set(arguments.ways) & set(IN_SEPARATE_ENVIRONMENT) else None
+    separate_python = environment.python() if set(arguments.programs) & set(IN_SEPARATE_ENVIRONMENT) else None
     described, rows = results.machine(separate_python), list(before)
     for found in rows_of(separate_python):
         rows += found

@@ -1,4 +1,4 @@
-"""Runs a case in all ways, in rounds."""
+"""Runs a case with all programs, in rounds."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ IN_SEPARATE_ENVIRONMENT = ("opencv4", "onnxruntime", "openvino", "openvino-bf16"
 
 @dataclass(frozen=True)
 class Comparison:
-    """The ways to run a case, and the limits of the measurement.
+    """The programs that run a case, and the limits of the measurement.
 
-    ways             the programs and engines to compare, such as netspec-onnxruntime
+    programs             the programs and engines to compare, such as netspec-onnxruntime
     training         whether a pass is a training iteration, and not a forward pass
-    separate_python  the Python of a separate environment, for the ways that need one
+    separate_python  the Python of a separate environment, for the programs that need it
     caffe            the caffe binary, if it is timed too
     limit            the rounds take at most this many seconds, but there are at least three
     device           the torch device for trainings by netspec and by PyTorch alone
     """
 
-    ways: Sequence[str]
+    programs: Sequence[str]
     training: bool
     rounds: int
     separate_python: str | None = None
@@ -39,10 +39,10 @@ class Comparison:
 
 
 def rows_of(case: Case, threads: int, how: Comparison) -> list[Row]:
-    """Return a row for each way."""
+    """Return a row for each program."""
     task = {**task_of(case, threads), "device": how.device}
     suffix = "_training" if how.training else ""
-    contestants = [_worker(case, way, task, suffix, how.separate_python) for way in how.ways]
+    contestants = [_worker(case, program, task, suffix, how.separate_python) for program in how.programs]
     if how.caffe:
         contestants.append(CaffeProgram(how.caffe, task, training=how.training))
     return _rows(case, threads, contestants, how.rounds, "training" if how.training else "forward", how.limit)
@@ -94,27 +94,27 @@ def task_of(case: Case, threads: int) -> dict[str, Any]:
     }
 
 
-def _worker(case: Case, way: str, task: dict[str, Any], suffix: str, separate_python: str | None) -> Contestant:
-    if way == "pytorch" and case.twin is None:
-        return _Absent(way, "there is no twin of this net; --twin names one that fits")
-    name, options = parts(way)
-    return Worker(way, python_of(way, separate_python), {**task, **options, "runs": name + suffix})
+def _worker(case: Case, program: str, task: dict[str, Any], suffix: str, separate_python: str | None) -> Contestant:
+    if program == "pytorch" and case.twin is None:
+        return _Absent(program, "there is no twin of this net; --twin names one that fits")
+    name, options = parts(program)
+    return Worker(program, python_of(program, separate_python), {**task, **options, "program": name + suffix})
 
 
-def parts(way: str) -> tuple[str, dict[str, str]]:
+def parts(program: str) -> tuple[str, dict[str, str]]:
     """Split a name such as ``netspec-openvino-bf16`` into program, engine and precision."""
-    name, *rest = way.split("-")
+    name, *rest = program.split("-")
     precision = rest.pop() if rest[-1:] == ["bf16"] else "fp32"
     return name, {"engine": rest[0] if rest else "torch", "precision": precision}
 
 
-def python_of(way: str, separate_python: str | None) -> str:
-    """Return the path of the Python that has the library which a way needs."""
-    return separate_python if separate_python and way in IN_SEPARATE_ENVIRONMENT else sys.executable
+def python_of(program: str, separate_python: str | None) -> str:
+    """Return the path of the Python that has the library that a program needs."""
+    return separate_python if separate_python and program in IN_SEPARATE_ENVIRONMENT else sys.executable
 
 
-def starts_of(case: Case, ways: Sequence[str], separate_python: str | None, rounds: int) -> list[Row]:
-    """Return a row for each way: the seconds of a process that loads the net and describes one image."""
+def starts_of(case: Case, programs: Sequence[str], separate_python: str | None, rounds: int) -> list[Row]:
+    """Return a row for each program: the seconds of a process that loads the net and describes one image."""
     import cv2
 
     image = case.folder / "image.png"
@@ -123,14 +123,14 @@ def starts_of(case: Case, ways: Sequence[str], separate_python: str | None, roun
     cv2.imwrite(str(image), np.random.default_rng(0).integers(0, 256, (*shape[2:], 3), np.uint8))
     task = {**task_of(case, 0), "image": str(image), "shape": shape}
     contestants: list[Contestant] = []
-    for way in ways:
-        name, options = parts(way)
-        contestants.append(Starter(way, python_of(way, separate_python), {**task, **options, "runs": name}))
+    for program in programs:
+        name, options = parts(program)
+        contestants.append(Starter(program, python_of(program, separate_python), {**task, **options, "program": name}))
     return _rows(case, 0, contestants, rounds, "start")
 
 
 class _Absent:
-    """A way that is not available for this net."""
+    """A program that cannot run this net."""
 
     peak: float | None = None
 

@@ -62,7 +62,10 @@ def _chosen(words: str, folder: Path) -> tuple[list[list[str]], list[str]]:
         if ": " in columns[-1]:
             rows = _spread(rows, columns[:-1], *columns.pop().split(": "))
             columns = list(rows[0])
-        titles = dict((column.split(" as ", 1) * 2)[:2] for column in columns)
+        titles = {}
+        for column in columns:
+            name, _, title = column.partition(" as ")
+            titles[name] = title or name
         decimals = {column: max(_decimals(row[column]) for row in rows) for column in titles}
         cells = [[_cell(row[column], column, decimals[column]) for column in titles] for row in rows]
     except KeyError as missing:

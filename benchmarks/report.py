@@ -14,7 +14,7 @@ REFERENCES = ("pytorch", "opencv4", "caffe")
 
 @dataclass(frozen=True)
 class Row:
-    """How one way ran one net.
+    """How one program ran one net.
 
     ``seconds`` (wall clock) and ``computing`` (CPU time of all threads) are times of a pass, one per round. ``ratios``
     and ``spent`` are their ratios to the references. ``peak`` is the peak memory of the process in MB. ``what`` was
@@ -69,17 +69,17 @@ def _cell(name: str, value: Any) -> str:
     return f"{value:{form}}" if isinstance(value, float) else str(value)
 
 
-def draw(path: str | Path, rows: Sequence[Row], way: str = "netspec") -> None:
-    """Draw the CPU time of one way of running, divided by that of each reference: a row for each net and batch.
+def draw(path: str | Path, rows: Sequence[Row], program: str = "netspec") -> None:
+    """Draw the CPU time of one program, divided by that of each reference: a row for each net and batch.
 
     The suffix of the name is .png or .svg. Rows without a ratio are left out.
     """
     from matplotlib.figure import Figure
 
-    from netspec.files.figures import COLORS
-    from netspec.inspect.draw.style import GRID, PALE, write_figure
+    from netspec.files.figures import COLORS, GRID, PALE
+    from netspec.inspect.draw.style import write_figure
 
-    shown = [row for row in rows if row.name == way and row.spent]
+    shown = [row for row in rows if row.name == program and row.spent]
     figure = Figure(figsize=(7.2, 1.0 + 0.21 * max(1, len(shown))), layout="constrained")
     axis = figure.add_subplot()
     for name, color, mark in zip(REFERENCES, COLORS, "oD^", strict=False):
@@ -96,6 +96,6 @@ def draw(path: str | Path, rows: Sequence[Row], way: str = "netspec") -> None:
     axis.minorticks_off()
     axis.grid(axis="y", color=GRID)
     axis.set_axisbelow(True)
-    axis.set_title(f"{way}: left of 1 is faster", fontsize=9, loc="left")
+    axis.set_title(f"{program}: left of 1 is faster", fontsize=9, loc="left")
     figure.legend(fontsize=8, frameon=False, loc="outside lower center", ncols=3)
     write_figure(figure, path)

@@ -27,7 +27,7 @@ Pass = tuple[float, float]  # wall-clock seconds, and CPU seconds of all threads
 
 
 class Contestant(Protocol):
-    """A way of running a case.
+    """A program that runs a case.
 
     fault    why it cannot run; empty if it can
     outputs  outputs of its first pass

@@ -49,7 +49,7 @@ def opencv4(task: Task) -> tuple[Seconds, Any]:
     return (0.0, 0.0), net.forward()
 
 
-WAYS: dict[str, Callable[[Task], tuple[Seconds, Any]]] = {"netspec": netspec, "opencv4": opencv4}
+PROGRAMS: dict[str, Callable[[Task], tuple[Seconds, Any]]] = {"netspec": netspec, "opencv4": opencv4}
 
 
 def _import_torch() -> Seconds:
@@ -64,7 +64,7 @@ def main() -> None:
     import numpy as np
 
     task = json.loads(sys.argv[1])
-    seconds, values = WAYS[task["runs"]](task)
+    seconds, values = PROGRAMS[task["program"]](task)
     np.savez(task["result"], allow_pickle=False, **{task["outputs"][0]: np.asarray(values)})
     print(json.dumps({"torch": seconds[0], "computing": time.process_time() - seconds[1]}))
 

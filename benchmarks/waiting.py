@@ -19,7 +19,7 @@ def compare(name: str, waits: Sequence[str], batch: int, threads: int, rounds: i
     A setting is VARIABLE=VALUE; an empty one means the defaults of the runtime.
     """
     with training_case(name, batch) as case:
-        task = {**task_of(case, threads), "runs": "netspec_training", "torch_first": True}
+        task = {**task_of(case, threads), "program": "netspec_training", "torch_first": True}
         pairs = {}
         for wait in waits:
             variables = dict([wait.split("=", 1)] if wait else [])

@@ -1,9 +1,9 @@
-"""A process that runs one net in one way on request: ``python -m benchmarks.worker TASK``.
+"""A process that runs one net with one program on request: ``python -m benchmarks.worker TASK``.
 
-TASK is JSON: ``runs`` names the way, the other keys are its settings. The process answers with lines of JSON on stdout:
-first {} or {"fault": ...}; then, for each line with a number n on stdin, the times of n passes, after one pass that is
-not counted. The times of a pass are the wall-clock seconds and the CPU seconds of all threads.
-Every way imports its own library, because the environment may not have the others.
+TASK is JSON: ``program`` is one of PROGRAMS, the other keys are its settings. The process answers with lines of JSON on
+stdout: first {} or {"fault": ...}; then, for each line with a number n on stdin, the times of n passes, after one pass
+that is not counted. The times of a pass are the wall-clock seconds and the CPU seconds of all threads. Every program
+imports its own library, because the environment may not have the others.
 """
 
 from __future__ import annotations
@@ -200,11 +200,19 @@ def pytorch_training(task: Task) -> Run:
     return run
 
 
-WAYS: dict[str, Callable[[Task], Run]] = {
-    way.__name__: way
-    for way in (
-        *(netspec, pycaffe, pytorch, opencv4, onnxruntime, openvino, memory),
-        *(netspec_training, pycaffe_training, pytorch_training),
+PROGRAMS: dict[str, Callable[[Task], Run]] = {
+    program.__name__: program
+    for program in (
+        netspec,
+        pycaffe,
+        pytorch,
+        opencv4,
+        onnxruntime,
+        openvino,
+        memory,
+        netspec_training,
+        pycaffe_training,
+        pytorch_training,
     )
 }
 
@@ -228,7 +236,7 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # output of libraries goes to stderr
     try:
-        run = WAYS[task["runs"]](task)
+        run = PROGRAMS[task["program"]](task)
         np.savez(task["result"], allow_pickle=False, **{name: np.array(value) for name, value in run().items()})
     except Exception as fault:
         print(json.dumps({"fault": f"{type(fault).__name__}: {' '.join(str(fault).split())}"}), file=answers)

@@ -52,7 +52,7 @@ def _find_forks() -> "_forks.Forks | None":
 
     if importlib.util.find_spec("netspec.dialects") is None:
         return None
-    from netspec.dialects.answers import Dialects
+    from netspec.dialects.forks import Dialects
 
     return Dialects()
 

@@ -10,9 +10,9 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)  # a large net has millions
 class Where:
-    """A place in a file: ``file:line:column``, or only the file if no line is known (line 0).
+    """A position in a file: ``file:line:column``, or only the file if no line is known (line 0).
 
-    ``layer`` and ``type`` name the layer that the place belongs to, if any.
+    ``layer`` and ``type`` name the layer that the position belongs to, if any.
     """
 
     file: str
@@ -22,11 +22,11 @@ class Where:
     type: str = ""
 
     def __str__(self) -> str:
-        place = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+        position = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
         if self.layer or self.type:
             kind = f" ({self.type})" if self.type else ""
-            return f'{place}: layer "{self.layer}"{kind}'
-        return place
+            return f'{position}: layer "{self.layer}"{kind}'
+        return position
 
 
 def printable(text: str) -> str:

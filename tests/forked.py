@@ -13,8 +13,18 @@ from subprocess import CompletedProcess
 import pytest
 
 PRELOADED = [
-    *("torch", "cv2", "scipy.optimize", "scipy.stats", "matplotlib.pyplot", "sklearn.cluster", "torch.distributed.run"),
-    *("netspec", "netspec.cli", "netspec.cli.caffe", "lmdb_build.cli", "loopclosure.cli"),
+    "torch",
+    "cv2",
+    "scipy.optimize",
+    "scipy.stats",
+    "matplotlib.pyplot",
+    "sklearn.cluster",
+    "torch.distributed.run",
+    "netspec",
+    "netspec.cli",
+    "netspec.cli.caffe",
+    "lmdb_build.cli",
+    "loopclosure.cli",
 ]
 
 

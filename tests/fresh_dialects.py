@@ -28,7 +28,7 @@ def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     keep_registry(monkeypatch)
     before = set(sys.modules)
     yield
-    files.waiting.clear()  # switched on, never run
+    files.waiting.clear()  # activated, but their layers were never used
     for name in dialect.active():
         dialect.deactivate(name)
     own = {file.module for file in files.known_files().values()} & sys.modules.keys()
@@ -36,7 +36,7 @@ def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         del sys.modules[name]
 
 
-def switched_on_by(text: str) -> list[str]:
+def activated_by(text: str) -> list[str]:
     """Read a net, where unknown fields are left out, and look its layers up; return the dialects that are then active.
 
     The first are those of fields, in the order of the text.

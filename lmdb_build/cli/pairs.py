@@ -65,8 +65,15 @@ Or one source of another kind:
   singles:    a folder in which each image shows a different place; positive pairs are an image and a warped copy"""
 # Options for sequences with poses only.
 POSED = (
-    *("max_distance", "max_angle", "negatives", "clear_distance", "clear_view_angle", "same_scene", "same_frame"),
-    *("different_scenes", "max_difference"),
+    "max_distance",
+    "max_angle",
+    "negatives",
+    "clear_distance",
+    "clear_view_angle",
+    "same_scene",
+    "same_frame",
+    "different_scenes",
+    "max_difference",
 )
 
 

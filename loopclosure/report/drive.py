@@ -14,7 +14,7 @@ from loopclosure.detector.decision import LoopResult
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.report.page import Kind, Pair, rendered, side_by_side, spread
 from loopclosure.report.plots import AXES, FOUND, MISSED, STYLE
-from netspec.files.figures import COLORS, png
+from netspec.files.figures import COLORS, GRID, png
 from netspec.files.whole_file import write_whole
 
 BEST, WORST, REJECTED = 4, 3, 3  # number of pairs shown
@@ -66,7 +66,7 @@ def _dots(results: Sequence[LoopResult]) -> Figure:
         first, last = (results[0].query_id, results[-1].query_id) if results else (0, 1)
         axis.set_xlim(first - 0.5, last + 0.5)
         axis.set_ylim(-0.5, last + 0.5)
-        axis.grid(color="#e6e6e6", linewidth=0.5)
+        axis.grid(color=GRID, linewidth=0.5)
         return figure
 
 

@@ -231,7 +231,13 @@ def rendered(template: str, **values: object) -> str:
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
     )
     environment.filters |= {"share": share, "significant": _significant, "base64": _in_base64}
-    return environment.get_template(template).render(**values)
+    colors = {
+        "found": plots.FOUND,
+        "false": plots.FALSE,
+        "missed": plots.MISSED,
+        "overlapping": plots.OVERLAPPING,
+    }
+    return environment.get_template(template).render(**values, colors=colors)
 
 
 def _in_base64(data: bytes) -> str:

@@ -58,7 +58,7 @@ def matrices(evaluation: Evaluation) -> Figure:
         soft = (evaluation.data.soft_truth or truth).soft
         shown = np.where(truth.hard, 2.0, np.where(soft, 1.0, 0.0))
         _draw_matrix(
-            axes[0], np.where(truth.judged, shown, np.nan), ListedColormap(["white", "#f4a582", "black"]), 0, 2
+            axes[0], np.where(truth.judged, shown, np.nan), ListedColormap(["white", OVERLAPPING, "black"]), 0, 2
         )
         axes[0].set_title("ground truth")
         for axis, outcome in zip(axes[1:], evaluation.outcomes, strict=True):
@@ -109,7 +109,7 @@ def frame_curves(axis: Axes, title: str) -> None:
     axis.set_ylabel("precision")
     axis.set_xlim(-0.01, 1.01)
     axis.set_ylim(0, 1.03)
-    axis.grid(color="#e6e6e6", linewidth=0.5)
+    axis.grid(color=figures.GRID, linewidth=0.5)
 
 
 def matches(evaluation: Evaluation) -> Figure:
@@ -285,7 +285,7 @@ def _state_truth(figure: Figure, evaluation: Evaluation, convention: str = "") -
     text = f"{evaluation.data.name}. {convention + '; ' if convention else ''}{evaluation.data.truth.description}"
     text = printable(text)
     width = int(figure.get_figwidth() * 22)  # characters of this size that fit into the width
-    figure.supxlabel(textwrap.fill(text, width), fontsize=6.5, color="#777777", parse_math=False)
+    figure.supxlabel(textwrap.fill(text, width), fontsize=6.5, color=figures.PALE, parse_math=False)
 
 
 def _grid(panels: int, ratio: float) -> tuple[Figure, list[Axes]]:
@@ -339,7 +339,7 @@ def draw_paths(path: Path, closed: Closed, names: tuple[str, str] = ("odometry",
         ):
             poses = paths[name][:, across]
             if "true" in paths:
-                axis.plot(*paths["true"][:, across].T, color="#9e9e9e", lw=2.2, label="true path")
+                axis.plot(*paths["true"][:, across].T, color=MISSED, lw=2.2, label="true path")
             ends = np.array([(edge.first, edge.second) for edge in closed.edges], int).reshape(-1, 2)
             colors = [FOUND if accepted else FALSE for accepted in closed.accepted]
             axis.add_collection(LineCollection(list(poses[ends]), colors=colors, linewidths=0.6, alpha=0.6))

@@ -29,8 +29,16 @@ PAPER = (
     ("Siamese + ResNet (512)", 0.877),
 )
 COLUMNS = (
-    *("net", "precision", "recall", "accuracy", "F1", "ROC AUC"),
-    *("threshold", "ms/image", "parameters", "iteration"),
+    "net",
+    "precision",
+    "recall",
+    "accuracy",
+    "F1",
+    "ROC AUC",
+    "threshold",
+    "ms/image",
+    "parameters",
+    "iteration",
 )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from netspec.proto.schema import BlobProto, BlobShape
-from netspec.proto.wire import PLACE, fields
+from netspec.proto.wire import POSITION, fields
 
 Shape = tuple[int, ...]
 LEGACY_AXES = ("num", "channels", "height", "width")
@@ -122,10 +122,10 @@ def in_file(proto: Any, file: BinaryIO | None) -> InFile | None:
 
     Raises ValueError as :func:`to_array`.
     """
-    place = _Runs.FromString(proto.SerializeToString()).place if file and not proto.data else ()
-    if not file or not place:
+    position = _Runs.FromString(proto.SerializeToString()).position if file and not proto.data else ()
+    if not file or not position:
         return None
-    start, size = place
+    start, size = position
     _check_count(size // 4, "data", shape_of(proto))
     return InFile(file, start, shape_of(proto))
 
@@ -160,7 +160,7 @@ def _runs_message() -> Any:
     kinds = ((*_RAW_TYPE, field.TYPE_INT32), (*_RAW_DATA, field.TYPE_BYTES))
     for name, number, kind in kinds:
         message.field.add(name=name, number=number, type=kind, label=field.LABEL_OPTIONAL)
-    message.field.add(name="place", number=PLACE, type=field.TYPE_UINT64, label=field.LABEL_REPEATED)
+    message.field.add(name="position", number=POSITION, type=field.TYPE_UINT64, label=field.LABEL_REPEATED)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("netspec.BlobRuns"))

@@ -71,7 +71,7 @@ _open_lock = threading.Lock()
 def open_reader(source: str, backend: str = "lmdb", where: Where | None = None) -> Reader:
     """Open a database for reading; it is closed when the last reference to the reader is deleted.
 
-    ``where`` is the place in the prototxt. Raises SpecError for a database that is missing, empty, damaged, or has
+    ``where`` is the position in the prototxt. Raises SpecError for a database that is missing, empty, damaged, or has
     the other backend.
     """
     try:
@@ -233,19 +233,19 @@ def _ends_within_a_record(log: Path) -> bool:
     """
     size, block, header = log.stat().st_size, 32768, 7
     full, last = 1, 4  # types of parts; a record has one part, or several parts in several blocks
-    place, kind = 0, full
+    position, kind = 0, full
     with log.open("rb") as file:
-        while place < size:
-            left = block - place % block
+        while position < size:
+            left = block - position % block
             if left < header:  # zeros up to the end of the block
-                place += left
+                position += left
                 continue
-            file.seek(place)
+            file.seek(position)
             _, length, kind = struct.unpack("<IHB", file.read(header).ljust(header, b"\0"))
             if kind == 0:  # unused reserved space
                 return False
-            place += header + length
-    return place > size or kind not in (full, last)
+            position += header + length
+    return position > size or kind not in (full, last)
 
 
 def _contents(folder: str) -> dict[str, tuple[int, int]]:

@@ -45,9 +45,9 @@ class Hdf5Source:
         named = _listed(files, where) if isinstance(files, str) else [(name, Where(name)) for name in files]
         self._tops = tuple(tops)
         self._files = [name for name, _ in named]
-        self._places = [place for _, place in named]
+        self._wheres = [where for _, where in named]
         self._row_shapes = _row_shapes(*named[0], self._tops)[1]
-        counts = [self._rows_of(name, place) for name, place in named]
+        counts = [self._rows_of(name, where) for name, where in named]
         self._starts = np.cumsum([0, *counts])
         self.cursor = Cursor(int(self._starts[-1]), batch_size, draws=draws)
         self._shuffle, self._draws = shuffle, draws
@@ -86,10 +86,10 @@ class Hdf5Source:
     def _rows(self, iteration: int, count: int = 1) -> np.ndarray:
         """Return the indices of the rows of iterations, counted through all files."""
         rows = self.cursor.count
-        places = np.array(self.cursor.positions(iteration, count))
+        positions = np.array(self.cursor.positions(iteration, count))
         if not self._shuffle:
-            return places % rows
-        return np.array([self._order(epoch)[i] for epoch, i in zip(places // rows, places % rows, strict=True)])
+            return positions % rows
+        return np.array([self._order(epoch)[i] for epoch, i in zip(positions // rows, positions % rows, strict=True)])
 
     def _order_of(self, epoch: int) -> np.ndarray:
         seed, stream = self._draws.seed, f"{self._draws.stream}/shuffle/{epoch}"
@@ -100,34 +100,34 @@ class Hdf5Source:
         return np.concatenate(rows)
 
     def _load_file(self, file: int) -> Arrays:
-        with open_hdf5(self._files[file], self._places[file]) as opened:
+        with open_hdf5(self._files[file], self._wheres[file]) as opened:
             arrays = tuple(opened.values(top).astype(np.float32) for top in self._tops)
             rows = int(self._starts[file + 1] - self._starts[file])
             if any(array.shape != (rows, *shape) for array, shape in zip(arrays, self._row_shapes, strict=True)):
                 raise SpecError("was changed by another program while it was being read")
             return arrays
 
-    def _rows_of(self, name: str, place: Where) -> int:
-        count, shapes = _row_shapes(name, place, self._tops)
+    def _rows_of(self, name: str, where: Where) -> int:
+        count, shapes = _row_shapes(name, where, self._tops)
         if shapes != self._row_shapes:
             message = f'rows of "{name}" have shapes {shapes}, those of "{self._files[0]}" have {self._row_shapes}'
-            raise SpecError(f"{message}; all files must agree", place)
+            raise SpecError(f"{message}; all files must agree", where)
         return count
 
 
 def _listed(path: str, where: Where | None) -> list[tuple[str, Where]]:
-    """Return the files in a list, and their places in it. Raises SpecError if there are none."""
+    """Return the files in a list, and their positions in it. Raises SpecError if there are none."""
     log.info("hdf5_data_layer.cpp:80", f"Loading list of HDF5 filenames from: {path}")
-    named = [(name, place) for line, place in list_lines(path, where) for name in line.split()]
+    named = [(name, position) for line, position in list_lines(path, where) for name in line.split()]
     log.info("hdf5_data_layer.cpp:94", f"Number of HDF5 files: {len(named)}")
     if not named:
         raise SpecError(f'the list "{path}" names no HDF5 file', where or Where(path))
     return named
 
 
-def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list[Shape]]:
+def _row_shapes(name: str, where: Where, tops: Sequence[str]) -> tuple[int, list[Shape]]:
     """Return the number of rows and the shape of a row of each dataset."""
-    with open_hdf5(name, place) as file:
+    with open_hdf5(name, where) as file:
         datasets: list[h5py.Dataset] = []
         for top in tops:
             dataset = file.dataset(top)
@@ -136,10 +136,10 @@ def _row_shapes(name: str, place: Where, tops: Sequence[str]) -> tuple[int, list
                 raise SpecError(f'has no dataset "{top}", the name of a top; it has {found}')
             datasets.append(dataset)
             if dataset.ndim == 0 or dataset.dtype.kind not in "fiu":
-                raise SpecError(f'dataset "{top}" of "{name}" contains no rows of numbers', place)
+                raise SpecError(f'dataset "{top}" of "{name}" contains no rows of numbers', where)
         counts = [len(dataset) for dataset in datasets]
         if min(counts) != max(counts) or not counts[0]:
-            raise SpecError(f'datasets of "{name}" have {counts} rows; expected equal numbers, above 0', place)
+            raise SpecError(f'datasets of "{name}" have {counts} rows; expected equal numbers, above 0', where)
         return counts[0], [tuple(dataset.shape[1:]) for dataset in datasets]
 
 
@@ -177,7 +177,7 @@ class Hdf5Sink:
 
     def _open(self) -> None:
         writing = new_hdf5(self._path)
-        with self._said_here():
+        with self._with_position():
             self._file = writing.__enter__()
         self._writing = writing
         self._unused = weakref.finalize(self, _end_unused, writing)
@@ -199,12 +199,12 @@ class Hdf5Sink:
         writing, self._writing = self._writing, None
         if writing is not None:
             self._unused.detach()
-            with self._said_here():
+            with self._with_position():
                 writing.__exit__(None if fault is None else type(fault), fault, None)
 
     @contextmanager
-    def _said_here(self) -> Iterator[None]:
-        """Return an error with the place in the prototxt that names the file."""
+    def _with_position(self) -> Iterator[None]:
+        """Raise an error with the position in the prototxt that names the file."""
         try:
             yield
         except SpecError as fault:

@@ -19,7 +19,7 @@ from netspec.files.opencv import cv2
 
 @dataclass(frozen=True)
 class ListedImage:
-    """One line of an image list; ``where`` is its place in the list file."""
+    """One line of an image list; ``where`` is its position in the list file."""
 
     name: str
     label: int
@@ -48,9 +48,9 @@ def read_image(path: str, color: bool = True, size: tuple[int, int] | None = Non
 
 
 def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Where]]:
-    """Yield the lines of a list file with their places, except blank lines and lines that begin with ``#``.
+    """Yield the lines of a list file with their positions, except blank lines and lines that begin with ``#``.
 
-    ``where`` is the place in the prototxt. Raises SpecError if the file cannot be read.
+    ``where`` is the position in the prototxt. Raises SpecError if the file cannot be read.
     """
     try:
         lines = read_bytes(path).decode("utf-8-sig").splitlines()
@@ -72,14 +72,14 @@ def read_image_list(path: str, where: Where | None = None) -> list[ListedImage]:
     a number as 0.)
     """
     images = []
-    for line, place in list_lines(path, where):
+    for line, position in list_lines(path, where):
         name, _, label = line.rpartition(" ") if " " in line else line.rpartition("\t")
         try:
-            images.append(ListedImage(name.rstrip(), int(label), place))
+            images.append(ListedImage(name.rstrip(), int(label), position))
         except ValueError:
             name = ""
         if not name:
-            raise SpecError(f'found "{line}", expected an image name, a space and an integer label', place)
+            raise SpecError(f'found "{line}", expected an image name, a space and an integer label', position)
     if not images:
         raise SpecError(f'the image list "{path}" is empty', where or Where(path))
     return images

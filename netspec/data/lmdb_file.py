@@ -30,7 +30,7 @@ _PAGE_SIZES = [1 << k for k in range(8, 17)]
 _DEEPEST = 32  # CURSOR_STACK
 _SMALLEST = 11  # minimum bytes of a record: a node with a key of one byte, and its pointer
 _AT_ONCE = 1 << 22  # maximum bytes to read for several values; their copies need the same amount
-_NOWHERE = (1 << 64) - 1
+_NOWHERE = (1 << 64) - 1  # P_INVALID: the root of an empty database
 
 
 class Record(NamedTuple):
@@ -88,7 +88,8 @@ class LmdbFile:
         size = max(record.offset + record.size for record in records) - start
         if len(records) > 1 and size <= min(_AT_ONCE, self._page_size + 2 * sum(record.size for record in records)):
             data = self._bytes(start, size)
-            return [data[offset - start : offset - start + size] for _, offset, size in records]
+            offsets = [record.offset - start for record in records]
+            return [data[offset : offset + record.size] for offset, record in zip(offsets, records, strict=True)]
         return [self._bytes(record.offset, record.size) for record in records]
 
     @property

@@ -19,7 +19,7 @@ from netspec.proto.schema import BlobProto
 def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     """Return the mean image of a .binaryproto file: float32 (C, H, W).
 
-    ``where`` is the place in the prototxt. Raises SpecError if the file cannot be read or is not an image.
+    ``where`` is the position in the prototxt. Raises SpecError if the file cannot be read or is not an image.
     """
     log.info("data_transformer.cpp:25", f"Loading mean file from: {path}")
     try:

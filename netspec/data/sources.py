@@ -203,12 +203,12 @@ class DatabaseSource(_ImageSource):
             found = self._at_once(self._reader.records(self.cursor.records(iteration, count)))
         except SpecError:
             return None  # reading one by one gives an error that names the record
-        alike = found and (
-            self.cursor.batch_size == 1 or self._transform.output_shape(found[0].shape[1:]) == self._shape
-        )
-        return (
-            (self._transform(found[0], self.cursor.positions(iteration, count)), found[1]) if found and alike else None
-        )
+        if found is None:
+            return None
+        images, labels = found
+        if self.cursor.batch_size > 1 and self._transform.output_shape(images.shape[1:]) != self._shape:
+            return None
+        return self._transform(images, self.cursor.positions(iteration, count)), labels
 
     def keys(self, iteration: int) -> list[str]:
         """Return the keys of the records of an iteration."""

@@ -36,8 +36,8 @@ class Transformer:
     """Applies a ``transform_param``: (x - mean) * scale of a window of each image, mirrored or not.
 
     The window is random in TRAIN and central in TEST. The random numbers of record k, for mirror, h_off and w_off in
-    Caffe's order, depend only on ``seed``, ``stream`` and k. ``at(*path)`` is the place of a field of the layer. Raises
-    SpecError for contradictory settings and for a mean file that cannot be read.
+    Caffe's order, depend only on ``seed``, ``stream`` and k. ``at(*path)`` is the position of a field of the layer.
+    Raises SpecError for contradictory settings and for a mean file that cannot be read.
     """
 
     def __init__(self, param: Any, phase: int, at: Callable[..., Where], seed: int = 0, stream: str = "") -> None:

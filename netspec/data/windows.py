@@ -61,25 +61,25 @@ def read_window_file(param: Any, where: Where | None) -> WindowFile:
     except (OSError, UnicodeDecodeError) as fault:
         raise SpecError(f'window file "{path}" cannot be read: {fault}', where) from None
     remaining = iter([(number, line) for number, line in lines if line])
-    place = Where(path)
+    position = Where(path)
 
     def numbers(count: int, what: str) -> list[float]:
-        nonlocal place
+        nonlocal position
         number, line = next(remaining, (len(lines), ""))
-        place = Where(path, number, 1)
+        position = Where(path, number, 1)
         try:
             values = [float(word) for word in line.split()]
         except ValueError:
             values = []
         if len(values) != count or not all(map(math.isfinite, values)):
-            raise SpecError(f'found "{line}", expected {what}', place)
+            raise SpecError(f'found "{line}", expected {what}', position)
         return values
 
     found = WindowFile([], [], [])
     for number, line in remaining:
-        place = Where(path, number, 1)
+        position = Where(path, number, 1)
         if line.split() != ["#", str(len(found.images))]:
-            raise SpecError(f'found "{line}", expected "# {len(found.images)}", the number of the next image', place)
+            raise SpecError(f'found "{line}", expected "# {len(found.images)}", the number of the next image', position)
         image = len(found.images)
         found.images.append(param.root_folder + next(remaining, (number, ""))[1])
         for what in ("the image's channels", "its height", "its width"):
@@ -89,7 +89,9 @@ def read_window_file(param: Any, where: Where | None) -> WindowFile:
             x1, y1, x2, y2 = map(int, corners)
             if overlap >= param.fg_threshold:
                 if label <= 0:
-                    raise SpecError(f"found label {label:g} for a foreground window, expected a label above 0", place)
+                    raise SpecError(
+                        f"found label {label:g} for a foreground window, expected a label above 0", position
+                    )
                 found.foreground.append(Window(image, int(label), x1, y1, x2, y2))
             elif overlap < param.bg_threshold:
                 found.background.append(Window(image, 0, x1, y1, x2, y2))

@@ -53,7 +53,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from netspec.dialects.files import find_file, switch_on
+from netspec.dialects.files import activate_file, find_file
 
 
 def use_dialect(name: str | Path) -> None:
@@ -65,5 +65,5 @@ def use_dialect(name: str | Path) -> None:
     from netspec.dialects.layers import use_everywhere  # imported here, since it needs torch
 
     file = find_file(name)
-    switch_on(file)
+    activate_file(file)
     use_everywhere(file.name)

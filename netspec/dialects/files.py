@@ -74,14 +74,14 @@ def read_dialect(file: DialectFile) -> Dialect:
     except (OSError, UnicodeDecodeError) as fault:
         raise SpecError(unreadable(file.path, fault), Where(str(file.path))) from None
     except SyntaxError as fault:
-        place = Where(str(file.path), fault.lineno or 0, fault.offset or 0)
-        raise SpecError(f"this is not valid Python: {fault.msg}", place) from None
+        where = Where(str(file.path), fault.lineno or 0, fault.offset or 0)
+        raise SpecError(f"this is not valid Python: {fault.msg}", where) from None
     source = ""
     for node in tree.body:
         if isinstance(node, ast.Assign) and any(_name(target) == "DECLARATIONS" for target in node.targets):
             if not (isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)):
-                place = Where(str(file.path), node.lineno, node.col_offset + 1)
-                raise SpecError("DECLARATIONS must be one plain string: it is read without running the file", place)
+                where = Where(str(file.path), node.lineno, node.col_offset + 1)
+                raise SpecError("DECLARATIONS must be one plain string: it is read without running the file", where)
             # Prepend blank lines, so that errors have the line numbers of the file.
             source = "\n" * (node.value.lineno - 1) + node.value.value
     types = list(_registered_types(tree))
@@ -107,7 +107,7 @@ def _name(node: ast.expr) -> str:
 waiting: list[tuple[DialectFile, Dialect]] = []  # active dialects whose layers are not registered yet
 
 
-def switch_on(file: DialectFile) -> None:
+def activate_file(file: DialectFile) -> None:
     """Add the fields of a dialect to the schema. Its layers are registered when the next layer is looked up.
 
     Raises SpecError if its file has an error, or Caffe or another dialect has one of its fields.

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from google.protobuf.message import Message
 
-from netspec.dialects.files import DialectFile, announce_known, find_file, known_files, switch_on, waiting
+from netspec.dialects.files import DialectFile, activate_file, announce_known, find_file, known_files, waiting
 from netspec.dialects.registry import active, deactivate, dialects_with_type
 from netspec.dialects.signatures import has_several
 from netspec.errors import SpecError, Where
@@ -84,7 +84,7 @@ def register_type(layer_type: str) -> None:
         announce_known()
         dialects = [name for name in dialects_with_type(layer_type) if name in known_files()]
         if len(dialects) == 1:
-            switch_on(find_file(dialects[0]))
+            activate_file(find_file(dialects[0]))
             run_dialects()
 
 
@@ -147,5 +147,5 @@ def _run(file: DialectFile, name: str) -> None:
         frames, own = traceback.extract_tb(fault.__traceback__), str(Path(file.path).absolute())
         lines = [frame.lineno or 0 for frame in frames if frame.filename == own]
         text = " ".join(str(fault).split())
-        place = Where(str(file.path), lines[-1] if lines else 0, 1)
-        raise SpecError(f"cannot be loaded: {type(fault).__name__}: {text}", place) from fault
+        where = Where(str(file.path), lines[-1] if lines else 0, 1)
+        raise SpecError(f"cannot be loaded: {type(fault).__name__}: {text}", where) from fault

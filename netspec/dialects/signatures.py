@@ -22,12 +22,12 @@ class Fork:
     """One fork's definition of a layer type.
 
     ``fields`` are fields that only this fork has, in the layer (``norm_param``) or in one of its messages
-    (``bn_param.bn_mode``). ``shows`` checks for anything else that only this fork's layers have. ``numbers`` describes
+    (``bn_param.bn_mode``). ``shows`` checks for anything else that only this fork's layers have. ``computes`` describes
     what the layer computes; it is "" if an earlier fork in the list computes the same.
     """
 
     dialect: str
-    numbers: str = ""
+    computes: str = ""
     fields: tuple[str, ...] = ()
     shows: Callable[[Layer], bool] = never
 
@@ -41,13 +41,14 @@ class Signature:
     """The forks that define a layer type. The first one is the default.
 
     ``alike`` returns whether all forks compute the same for a layer. ``advice`` is the end of the warning, if it is
-    not the usual one that names dialects. ``loose``: in the files of some forks the blobs have other axes of size 1.
+    not the usual one that names dialects. ``ignores_unit_axes``: the files of some forks have blobs
+    with more or fewer axes of size 1.
     """
 
     forks: tuple[Fork, ...]
     alike: Callable[[Layer], bool] = never
     advice: str = ""
-    loose: bool = False
+    ignores_unit_axes: bool = False
 
 
 def _has(layer: Layer, field: str) -> bool:
@@ -74,7 +75,7 @@ SIGNATURES = {
             Fork("segmentation", fields=("bn_param.scale_filler", "bn_param.shift_filler", "bn_param.bn_mode")),
             Fork("happynear", "of happynear, L-Softmax, domain-guided dropout: 1 / std is there"),
         ),
-        loose=True,  # TSN's and happynear's files have (1, C)
+        ignores_unit_axes=True,  # TSN's and happynear's files have (1, C)
     ),
     "CenterLoss": Signature(
         (
@@ -158,9 +159,9 @@ def has_several(layer_type: str) -> bool:
     return layer_type in SIGNATURES and len(SIGNATURES[layer_type].forks) > 1
 
 
-def is_loose(layer: Layer) -> bool:
+def ignores_unit_axes(layer: Layer) -> bool:
     """Return whether the blobs of a layer have different axes of size 1 in the files of some forks."""
-    return layer.type in SIGNATURES and SIGNATURES[layer.type].loose
+    return layer.type in SIGNATURES and SIGNATURES[layer.type].ignores_unit_axes
 
 
 def fork_of(layer: Layer) -> str:
@@ -176,10 +177,10 @@ def doubt(layer: Layer) -> str:
     signature = SIGNATURES[layer.type]
     if signature.advice:
         return f"{OTHERS}{signature.advice}"
-    forks = [fork for fork in signature.forks if fork.numbers]
+    forks = [fork for fork in signature.forks if fork.computes]
     if not forks:
         return ""
-    first, *others = (f'"{fork.dialect}" ({fork.numbers})' for fork in forks)
+    first, *others = (f'"{fork.dialect}" ({fork.computes})' for fork in forks)
     last = forks[-1].dialect
     return (
         f"{OTHERS}as that of {first}, not of {' or '.join(others)}; to choose, write a line "

@@ -68,10 +68,10 @@ def response_base(maps: torch.Tensor, settings: Settings) -> torch.Tensor:
 def window_sums(maps: torch.Tensor, size: int) -> torch.Tensor:
     """Return the sums over the ``size`` channels around each."""
     channels = maps.shape[1]
-    framed = F.pad(maps, (0, 0, 0, 0, size // 2, size // 2))
-    total = framed[:, :channels]
+    padded = F.pad(maps, (0, 0, 0, 0, size // 2, size // 2))
+    total = padded[:, :channels]
     for shift in range(1, size):
-        total = total + framed[:, shift : shift + channels]
+        total = total + padded[:, shift : shift + channels]
     return total
 
 

@@ -82,35 +82,35 @@ def across_channels_gradient(
     return torch.add(diff * libm.power(base, -beta), maps * sums, alpha=-2 * alpha * beta / size)
 
 
-def _framed(maps: torch.Tensor, size: int) -> torch.Tensor:
+def _padded(maps: torch.Tensor, size: int) -> torch.Tensor:
     """Pad the channels with zeros, so that there is a window of ``size`` channels around each."""
     return F.pad(maps, (0, 0, 0, 0, size // 2, size // 2))
 
 
 def _forward_sums(squares: torch.Tensor, size: int, factor: float, start: float) -> torch.Tensor:
     """Return start + factor * sum for each window. Between windows, one channel is added and one subtracted."""
-    framed = _framed(squares, size)
+    padded = _padded(squares, size)
     sums = torch.empty_like(squares)
     running = torch.full_like(squares[:, 0], start)
     for channel in range(size):
-        running = torch.add(running, framed[:, channel], alpha=factor)
+        running = torch.add(running, padded[:, channel], alpha=factor)
     sums[:, 0] = running
     for channel in range(1, squares.shape[1]):
-        running = torch.add(running, framed[:, channel + size - 1], alpha=factor)
-        running = torch.add(running, framed[:, channel - 1], alpha=-factor)
+        running = torch.add(running, padded[:, channel + size - 1], alpha=factor)
+        running = torch.add(running, padded[:, channel - 1], alpha=-factor)
         sums[:, channel] = running
     return sums
 
 
 def _backward_sums(ratios: torch.Tensor, size: int) -> torch.Tensor:
     """Return the sum of each window of channels. Each channel is added once, and subtracted after its last window."""
-    framed = _framed(ratios, size)
+    padded = _padded(ratios, size)
     sums = torch.empty_like(ratios)
     running = torch.zeros_like(ratios[:, 0])
     for channel in range(size - 1):
-        running = running + framed[:, channel]
+        running = running + padded[:, channel]
     for channel in range(ratios.shape[1]):
-        running = running + framed[:, channel + size - 1]
+        running = running + padded[:, channel + size - 1]
         sums[:, channel] = running
-        running = running - framed[:, channel]
+        running = running - padded[:, channel]
     return sums

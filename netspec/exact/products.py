@@ -69,13 +69,13 @@ class Filter:
             return F.fold(columns, size, self.kernel, self.dilation, self.pad, self.stride)
         count, positions = len(columns), self.fits(size)
         pixels = columns.view(count, -1, *self.kernel, *positions)
-        framed = columns.new_zeros(count, pixels.shape[1], *(n + 2 * p for n, p in zip(size, self.pad, strict=True)))
+        padded = columns.new_zeros(count, pixels.shape[1], *(n + 2 * p for n, p in zip(size, self.pad, strict=True)))
         every = (slice(None), slice(None))
         for pixel in product(*map(range, self.kernel)):
             axes = zip(pixel, self.dilation, self.stride, positions, strict=True)
             under = tuple(slice(k * d, k * d + s * (count - 1) + 1, s) for k, d, s, count in axes)
-            framed[(*every, *under)] += pixels[(*every, *pixel)]
-        return framed[(*every, *(slice(p, p + n) for n, p in zip(size, self.pad, strict=True)))]
+            padded[(*every, *under)] += pixels[(*every, *pixel)]
+        return padded[(*every, *(slice(p, p + n) for n, p in zip(size, self.pad, strict=True)))]
 
     def images_at_once(self, channels: int, size: Axes) -> int:
         """Return the number of maps (channels, size) with columns of at most ``COLUMNS`` numbers together."""

@@ -111,9 +111,11 @@ class Product(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         top, *bottoms = ctx.saved_tensors
-        asked = ctx.needs_input_grad[1:]
-        found = [product_gradient(ctx.stable, bottoms, i, top, diff) if asked[i] else None for i in range(len(bottoms))]
-        return None, *found
+        diffs = [
+            product_gradient(ctx.stable, bottoms, i, top, diff) if is_needed else None
+            for i, is_needed in enumerate(ctx.needs_input_grad[1:])
+        ]
+        return None, *diffs
 
 
 def product_gradient(

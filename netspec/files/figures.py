@@ -7,6 +7,7 @@ from typing import Any
 
 # Distinguishable for color-blind readers (Okabe and Ito).
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
+GRID, PALE = "#e6e6e6", "#777777"  # lines of a grid, and less important text
 STYLE: dict[Any, Any] = {  # for matplotlib.rc_context
     "axes.spines.top": False,
     "axes.spines.right": False,

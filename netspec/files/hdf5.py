@@ -39,16 +39,16 @@ def open_hdf5(path: str | Path, where: Where | None = None) -> Iterator[Hdf5Grou
 
     Links to other files, and datasets stored in other files, are refused.
     """
-    place = where or Where(str(path))
+    where = where or Where(str(path))
     named = f'HDF5 file "{path}" ' if where else ""
     try:
         with h5py.File(path, "r") as file:
             yield Hdf5Group(file, os.path.getsize(path))
     except SpecError as fault:
-        raise fault if fault.where else SpecError(named + fault.message, place) from None
+        raise fault if fault.where else SpecError(named + fault.message, where) from None
     except LIBRARY_FAULTS as fault:
         reason = pointer_fault(head_of(path)) or f"cannot be read: {_one_line(fault)}"
-        raise SpecError(named + reason, place) from None
+        raise SpecError(named + reason, where) from None
 
 
 class Hdf5Group:

@@ -24,12 +24,12 @@ def insert_splits(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
     """Return the net with Split layers inserted."""
     producer, uses, weights = _count_uses(net, source)
     split = copy_without(net, {"layer"})
-    places = []
+    positions = []
     used: Counter[Top] = Counter()
     for i, layer in enumerate(net.layer):
         copy = split.layer.add()
         copy.CopyFrom(layer)
-        places.append(source.layers[i])
+        positions.append(source.layers[i])
         for j, blob in enumerate(layer.bottom):
             top = producer.get((i, j))
             if top is not None and uses[top] > 1:
@@ -39,7 +39,7 @@ def insert_splits(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
             top = (i, j)
             if uses[top] > 1:
                 added = split.layer.add()
-                places.append(source.layers[i])
+                positions.append(source.layers[i])
                 added.name = f"{blob}_{layer.name}_{j}_split"
                 added.type = SPLIT
                 added.bottom.append(blob)
@@ -48,7 +48,7 @@ def insert_splits(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
                     copy.ClearField("loss_weight")
                     added.loss_weight.extend([weights[top]] + [0.0] * (uses[top] - 1))
                     used[top] += 1
-    return split, source.with_layers(places)
+    return split, source.with_layers(positions)
 
 
 def is_split(name: str, kind: str) -> bool:

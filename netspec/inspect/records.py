@@ -114,8 +114,8 @@ class _RowRecords:
         return Record(f"{self._files[file][0]}:{row}", str(data.dtype), data[row].nbytes, values, label)
 
     def _load_file(self, number: int) -> tuple[np.ndarray, np.ndarray | None]:
-        name, place = self._files[number]
-        with open_hdf5(name, place) as file:
+        name, where = self._files[number]
+        with open_hdf5(name, where) as file:
             names = [each for each in file.names() if (found := file.dataset(each)) is not None and found.ndim]
             if not names:
                 raise SpecError("contains no dataset with rows")
@@ -131,7 +131,7 @@ class _RowRecords:
 
 
 def _files_of_list(path: str) -> Iterator[tuple[str, Where]]:
-    found = [(name, place) for line, place in list_lines(path, Where(path)) for name in line.split()]
+    found = [(name, where) for line, where in list_lines(path, Where(path)) for name in line.split()]
     if not found:
         raise SpecError("is empty; expected a database, an HDF5 file, or a list of HDF5 files", Where(path))
     yield from found

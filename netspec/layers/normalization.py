@@ -65,7 +65,7 @@ class BatchNorm(Layer):
         """Return the normalized values; in training also add the batch's statistics to the sums."""
         arithmetic = self.arithmetic(data)
         if self.use_global_stats:
-            return self.by_past(arithmetic)(data)
+            return self.by_stored_statistics(arithmetic)(data)
         top, mean, variance, unbiased = arithmetic.normalized_batch(data, self.eps, *self.factors())
         self.add(mean, variance, unbiased)
         return top.relu_() if self.rectifies else top
@@ -75,14 +75,14 @@ class BatchNorm(Layer):
         """The constant added to the variance."""
         return self.param.batch_norm_param.eps
 
-    def past(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def stored_statistics(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the stored mean and variance of each channel, (C,)."""
         with torch.no_grad():
             return means(*(self.blob(i) for i in range(3)))
 
-    def by_past(self, arithmetic: AsTorch) -> Function:
+    def by_stored_statistics(self, arithmetic: AsTorch) -> Function:
         """Return a function that normalizes a bottom by the present stored statistics."""
-        return arithmetic.normalizes(*self.past(), self.eps)
+        return arithmetic.normalizes(*self.stored_statistics(), self.eps)
 
     def joined_with(self, after: Layer) -> Layer | None:
         """Return this layer joined with a Scale of its channels or a ReLU after it, for one kernel of torch."""

@@ -1,6 +1,6 @@
 """Makes the layers of a plan in order, connects shared parameters, and determines which layers run backward.
 
-Caffe: Net::Init (src/caffe/net.cpp). The places in the log calls, such as net.cpp:124, are the lines of that file that
+Caffe: Net::Init (src/caffe/net.cpp). Names such as net.cpp:124 in the log calls are the lines of that file that
 print the same.
 """
 
@@ -203,8 +203,8 @@ class Assembly:
                 self._report(layer.error(message, "param", j))
                 continue
             layer.blobs[j] = owner.blobs[owner_blob]
-            place = f"owned by layer '{owner_name}', param index {owner_blob}"
-            log.info("net.cpp:467", f"Sharing parameters '{spec.name}' {place}")
+            owner = f"owned by layer '{owner_name}', param index {owner_blob}"
+            log.info("net.cpp:467", f"Sharing parameters '{spec.name}' {owner}")
 
     def _finish(self, layers: list[Layer]) -> Backward:
         """Return which layers need backward computation, by Caffe's rules. Log the end of Caffe's Net::Init."""
@@ -229,7 +229,7 @@ class Assembly:
 
 
 class _LayerInNet:
-    """What layer ``i`` must know about its net: its place in the file, and its blobs for the log.
+    """What layer ``i`` must know about its net: its position in the file, and its blobs for the log.
 
     ``take_from`` is called with the bytes that the layer takes. The class has slots and no reference to the Assembly,
     because a net may have very many layers.
@@ -241,7 +241,7 @@ class _LayerInNet:
         self._plan, self._i, self.take_from = plan, i, take_from
 
     def at(self, *path: str | int) -> Where:
-        """Return the place in the prototxt of a field of the layer."""
+        """Return the position in the prototxt of a field of the layer."""
         node = self._plan.nodes[self._i]
         return self._plan.source.at(self._i, *path, layer=node.name, type=node.type)
 
@@ -365,15 +365,15 @@ def limit_text(limit: int) -> str:
 
 
 def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
-    """Yield a warning for each field that has no effect: its first place in the file, and how many more there are."""
+    """Yield a warning for each field that has no effect: its first position in the file, and the number of others."""
     found: dict[tuple[str, _FieldPath, str], list[int]] = {}
     for i, layer in enumerate(layers):
         for path, reason in _unused(layer):
             found.setdefault((layer.type, path, reason), []).append(i)
-    for (kind, path, reason), places in found.items():
-        first = places[0]
+    for (kind, path, reason), positions in found.items():
+        first = positions[0]
         where = plan.source.at(first, *path, layer=plan.nodes[first].name, type=kind)
-        others = f" (also in {len(places) - 1} more of these layers)" if len(places) > 1 else ""
+        others = f" (also in {len(positions) - 1} more of these layers)" if len(positions) > 1 else ""
         yield f"{where}: {'.'.join(path)} has no effect: {reason}{others}"
     for field, _ in plan.net.ListFields():
         if field.is_extension or field.name == "debug_info":

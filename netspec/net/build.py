@@ -41,7 +41,7 @@ def load_net(
 
 
 def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None = None) -> Net:
-    """Build a net; only the layers of its ``state`` are kept. ``source`` has the places of its parts in the file."""
+    """Build a net; only the layers of its ``state`` are kept. ``source`` has the positions of its parts in the file."""
     options = options or BuildOptions()
     return build_filtered(*filter_net(net, source), options)
 

@@ -21,7 +21,7 @@ from netspec.net.net import Array
 from netspec.proto.forks import forks
 from netspec.proto.reader import read_text
 from netspec.proto.schema import LayerParameter, NetParameter, phase_of
-from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.upgrade.current import upgrade_net
 
 FILE = "<layer>"  # the file name in errors
@@ -76,8 +76,8 @@ def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int |
     Errors name a line of ``text``, unless ``context`` has another ``at``.
     """
     param = LayerParameter()
-    place = read_text(text, FILE, param)
-    net, source = upgrade_net(NetParameter(layer=[param]), SourceMap(FILE, Place(place.where), (place,)))
+    position = read_text(text, FILE, param)
+    net, source = upgrade_net(NetParameter(layer=[param]), SourceMap(FILE, Position(position.where), (position,)))
     (param,) = net.layer
     at = partial(source.at, 0, layer=param.name, type=param.type)
     options = replace(context.options, dialects=tuple(sorted(forks().dialects_of(net))))

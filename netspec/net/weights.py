@@ -345,7 +345,8 @@ def _wrong_count(path: str, name: str, found: int, expected: int) -> SpecError:
 
 def _fits_loosely(layer: Layer, j: int, shape: tuple[int, ...]) -> bool:
     """Return whether a file's blob differs only in axes of size 1, in which forks differ for this layer type."""
-    return [n for n in shape if n != 1] == [n for n in layer.blob_shapes[j] if n != 1] and forks().is_loose(layer)
+    same = [n for n in shape if n != 1] == [n for n in layer.blob_shapes[j] if n != 1]
+    return same and forks().ignores_unit_axes(layer)
 
 
 def _wrong_shape(path: str, name: str, j: int, found: tuple[int, ...], expected: tuple[int, ...]) -> SpecError:

@@ -106,7 +106,7 @@ class Forks:
         """Return the dialects whose fields and layer types a NetParameter uses, and those that apply to every net."""
         return set()
 
-    def is_loose(self, layer: "Any") -> bool:
+    def ignores_unit_axes(self, layer: "Any") -> bool:
         """Return whether weights of forks may store a layer's blobs with different axes of size 1."""
         return False
 

@@ -48,7 +48,7 @@ class Lexer:
     """
 
     def __init__(self, text: str, file: str) -> None:
-        """``file`` is the file name for the places of tokens and for errors."""
+        """``file`` is the file name for the positions of tokens and for errors."""
         self.text = text
         self.file = file
         self._long_strings: list[Token] = []
@@ -71,7 +71,7 @@ class Lexer:
         yield Token(END, "", position)
 
     def where(self, start: int) -> Where:
-        """Return the place of a character."""
+        """Return the position of a character."""
         line = bisect_right(self._lines, start)
         return Where(self.file, line, start - self._lines[line - 1] + 1)
 

@@ -1,6 +1,6 @@
-"""Reads protobuf's text format into a message, by reflection, with the place of every part.
+"""Reads protobuf's text format into a message, by reflection, with the position of every part.
 
-It accepts the files that Caffe's C++ parser accepts, and refuses others with one line that gives the place and the
+It accepts the files that Caffe's C++ parser accepts, and refuses others with one line that gives the position and the
 reason. It also accepts ``ceil_mode: true`` in a pooling_param, which many forks use for ``round_mode: CEIL``. If Caffe
 lacks a field or value and exactly one known fork has it, it is added to the schema (netspec/proto/forks.py).
 """
@@ -19,7 +19,7 @@ from netspec.errors import ForkFault, SpecError, Where, did_you_mean
 from netspec.proto.forks import forks
 from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer, Token
 from netspec.proto.schema import MORE, Field, NetParameter, SolverParameter, V1LayerParameter, fields_of
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 
 _RANGES: dict[int, tuple[int, int]] = {
     Declared.TYPE_INT32: (-(1 << 31), (1 << 31) - 1),
@@ -45,11 +45,11 @@ _LABEL_MAP = "item"  # the only field of SSD's LabelMap
 
 _CLOSING = {"{": "}", "<": ">", "[": "]"}
 
-Children = dict[str, list[Place]]
+Children = dict[str, list[Position]]
 
 
-def read_text(text: str, file: str, message: Message, report: Callable[[SpecError], None] | None = None) -> Place:
-    """Read a text into an empty ``message``; return the places of its parts.
+def read_text(text: str, file: str, message: Message, report: Callable[[SpecError], None] | None = None) -> Position:
+    """Read a text into an empty ``message``; return the positions of its parts.
 
     ``report``, if given, gets a ForkFault for each unknown field, which is then left out with its contents.
 
@@ -69,13 +69,13 @@ class _Reader:
         self._open: list[tuple[Message, Token]] = []  # the messages being read, each with the token that named it
         self.token = next(self._tokens)
 
-    def read(self, message: Message) -> Place:
+    def read(self, message: Message) -> Position:
         children: Children = {}
         self._open.append((message, self.token))
         while self.token.kind != END:
             self._field(message, children)
         self._check_required(message)
-        return Place(Where(self.lexer.file), _frozen(children))
+        return Position(Where(self.lexer.file), _frozen(children))
 
     # ---- Grammar ----
 
@@ -110,7 +110,7 @@ class _Reader:
             field = self._with_value(message, field, self.token.text)
         if meaning is not None:
             field.set(message, field.descriptor.enum_type.values_by_name[meaning[self._boolean()]].number)
-            nodes.append(Place(self.lexer.where(name.start)))
+            nodes.append(Position(self.lexer.where(name.start)))
         elif self._at("[") and (field.repeated or key == _DEVICES):
             self._list(field, message, nodes)
             if key == _DEVICES:
@@ -163,7 +163,7 @@ class _Reader:
         if self._at(",") or self._at(";"):
             self._next()
 
-    def _list(self, field: Field, message: Message, nodes: list[Place]) -> None:
+    def _list(self, field: Field, message: Message, nodes: list[Position]) -> None:
         self._next()
         if self._at("]"):
             self._next()
@@ -178,29 +178,29 @@ class _Reader:
                 raise self._expected('"," or "]"', f'in the list of "{field.name}"')
             self._next()
 
-    def _value(self, field: Field, message: Message, place: Token) -> Place:
-        where = self.lexer.where(place.start)
+    def _value(self, field: Field, message: Message, token: Token) -> Position:
+        where = self.lexer.where(token.start)
         if field.type == Declared.TYPE_MESSAGE:
             inner = field.get(message)
             inner = inner.add() if field.repeated else inner
             inner.SetInParent()
-            return Place(where, self._message(inner, place, field.name))
+            return Position(where, self._message(inner, token, field.name))
         value = self._scalar(field)
         if field.repeated:
             field.get(message).append(value)
         else:
             field.set(message, value)
-        return Place(where)
+        return Position(where)
 
-    def _message(self, message: Message, place: Token, name: str) -> dict[str, tuple[Place, ...]]:
+    def _message(self, message: Message, token: Token, name: str) -> dict[str, tuple[Position, ...]]:
         if not (self._at("{") or self._at("<")):
             raise self._expected('"{"', f'after "{name}"')
         closing = "}" if self._next().text == "{" else ">"
         children: Children = {}
-        self._open.append((message, place))
+        self._open.append((message, token))
         while not self._at(closing):
             if self.token.kind == END:
-                raise self._unclosed(name, place, closing)
+                raise self._unclosed(name, token, closing)
             self._field(message, children)
         self._check_required(message)
         self._open.pop()
@@ -336,11 +336,11 @@ class _Reader:
             return
         for field in fields_of(message.DESCRIPTOR).values():
             if field.required and not field.present(message):
-                place = self._open[-1][1]
-                raise self._error(f'{message.DESCRIPTOR.name} lacks the required field "{field.name}"', place)
+                token = self._open[-1][1]
+                raise self._error(f'{message.DESCRIPTOR.name} lacks the required field "{field.name}"', token)
 
-    def _unclosed(self, name: str, place: Token, closing: str) -> SpecError:
-        line = self.lexer.where(place.start).line
+    def _unclosed(self, name: str, token: Token, closing: str) -> SpecError:
+        line = self.lexer.where(token.start).line
         return self._error(f'the file ends inside "{name}" of line {line}; is a "{closing}" missing?')
 
     def _expected(self, what: str, where: str = "", token: Token | None = None, advice: str = "") -> SpecError:
@@ -355,16 +355,16 @@ class _Reader:
         return self._error(f"expected {what}{' ' + where if where else ''}, found {found}{advice}", token)
 
     def _error(self, message: str, token: Token | None = None) -> SpecError:
-        place = self.lexer.where((token or self.token).start)
+        position = self.lexer.where((token or self.token).start)
         message += self.lexer.suspicion((token or self.token).start)
         for open_message, _ in reversed(self._open):
             if open_message.DESCRIPTOR.full_name in _LAYERS:
                 layer: Any = open_message
                 name, kind = layer.name, layer.type if isinstance(layer.type, str) else ""
                 if (name + kind).isprintable():  # with a missing quote, they extend over several lines
-                    place = replace(place, layer=name, type=kind)
+                    position = replace(position, layer=name, type=kind)
                 break
-        return SpecError(message, place)
+        return SpecError(message, position)
 
     def _unknown_field(self, message: Message, token: Token) -> SpecError:
         """Return the error for an unknown field, with a suggestion if possible.
@@ -411,5 +411,5 @@ class _Reader:
         return ""
 
 
-def _frozen(children: Children) -> dict[str, tuple[Place, ...]]:
+def _frozen(children: Children) -> dict[str, tuple[Position, ...]]:
     return {name: tuple(nodes) for name, nodes in children.items()}

@@ -1,4 +1,4 @@
-"""Reading text files into upgraded messages, with the places of their parts, and writing text."""
+"""Reading text files into upgraded messages, with the positions of their parts, and writing text."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from netspec.files.limits import read_bytes
 from netspec.proto.forks import forks
 from netspec.proto.reader import read_text
 from netspec.proto.schema import NetParameter, SolverParameter
-from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.upgrade import current as upgrades
 from netspec.proto.writer import write_text
 
@@ -33,7 +33,7 @@ def read_solver(path: str | Path) -> SolverParameter:
 
 
 def parse_net(path: str | Path, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
-    """Return the net of a .prototxt, and the places of its parts. Raises SpecError.
+    """Return the net of a .prototxt, and the positions of its parts. Raises SpecError.
 
     ``report``, if given, gets a ForkFault for each unknown field, which is then left out. If one known fork has the
     field, it is added to the schema instead (netspec/proto/forks.py).
@@ -42,15 +42,15 @@ def parse_net(path: str | Path, upgrade: bool = True, report: Report = None) -> 
 
 
 def parse_net_text(text: str, file: str, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
-    """Return the net in a text, and the places of its parts; ``file`` is its name in errors."""
+    """Return the net in a text, and the positions of its parts; ``file`` is its name in errors."""
     net = NetParameter()
     named = forks().named_in(text, file)
     source = replace(SourceMap.of(read_text(text, file, net, report)), dialects=named)
     return upgrades.upgrade_net(net, source) if upgrade else (net, source)
 
 
-def parse_solver(path: str | Path, upgrade: bool = True, report: Report = None) -> tuple[SolverParameter, Place]:
-    """Return the solver of a .prototxt, and the places of its parts. Raises SpecError.
+def parse_solver(path: str | Path, upgrade: bool = True, report: Report = None) -> tuple[SolverParameter, Position]:
+    """Return the solver of a .prototxt, and the positions of its parts. Raises SpecError.
 
     The nets in it are upgraded too; ``SourceMap.of(node.fields["net_param"][0])`` is the map of one. For ``report``
     see :func:`parse_net`.
@@ -60,8 +60,8 @@ def parse_solver(path: str | Path, upgrade: bool = True, report: Report = None) 
 
 def parse_solver_text(
     text: str, file: str, upgrade: bool = True, report: Report = None
-) -> tuple[SolverParameter, Place]:
-    """Return the solver in a text, and the places of its parts; ``file`` is its name in errors."""
+) -> tuple[SolverParameter, Position]:
+    """Return the solver in a text, and the positions of its parts; ``file`` is its name in errors."""
     solver = SolverParameter()
     node = read_text(text, file, solver, report)
     if upgrade:

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 from netspec.proto.schema import PACKAGE, BlobProto, pool
 
 VARINT, EIGHT, BYTES, FOUR = 0, 1, 2, 5  # wire types: how a field's contents are stored
-PLACE = (1 << 29) - 1  # the largest field number; see without_numbers
+POSITION = (1 << 29) - 1  # the largest field number; see without_numbers
 _LEAST = 256  # bytes: smaller blobs are copied
 _HEAD = 20  # bytes: a tag and a size take at most 10 each
 _WITH_BLOBS = ("BlobProto", "LayerParameter", "V1LayerParameter", "V0LayerParameter")
@@ -60,10 +60,10 @@ def fields(data: Data, start: int, end: int) -> Iterator[Field]:
         start = after
 
 
-def _varint(head: bytes, place: int) -> tuple[int, int]:
+def _varint(head: bytes, position: int) -> tuple[int, int]:
     """Return a number of one or more bytes, and where it ends."""
     found = shift = 0
-    for end in range(place, len(head)):
+    for end in range(position, len(head)):
         found |= (head[end] & 127) << shift
         if head[end] < 128:
             return found, end + 1
@@ -74,7 +74,7 @@ def _varint(head: bytes, place: int) -> tuple[int, int]:
 def without_numbers(data: Data, start: int, end: int, message: str) -> bytes:
     """Return a serialized message of Caffe without the numbers of its large blobs.
 
-    Such a blob has the field PLACE twice instead: the offset of its numbers (little-endian float32) in ``data``, and
+    Such a blob has the field POSITION twice instead: the offset of its numbers (little-endian float32) in ``data``, and
     their size in bytes. Raises ValueError if the data is not such a message.
     """
     if message == "BlobProto":
@@ -90,7 +90,7 @@ def without_numbers(data: Data, start: int, end: int, message: str) -> bytes:
 
 def _blob_without_numbers(data: Data, start: int, end: int) -> bytes:
     found = list(fields(data, start, end))
-    if any(field.number == PLACE for field in found):
+    if any(field.number == POSITION for field in found):
         raise ValueError("uses a field number that is reserved for numbers")
     runs = [field for field in found if field.number in (_DATA, _DOUBLE)]
     if len(runs) != 1 or runs[0].number != _DATA or runs[0].kind != BYTES:
@@ -98,8 +98,8 @@ def _blob_without_numbers(data: Data, start: int, end: int) -> bytes:
     _, _, tag, contents, after = runs[0]
     if after - contents < _LEAST or (after - contents) % 4:
         return data[start:end]
-    place = [_tag(PLACE, VARINT) + _as_varint(number) for number in (contents, after - contents)]
-    return b"".join([data[start:tag], data[after:end], *place])
+    position = [_tag(POSITION, VARINT) + _as_varint(number) for number in (contents, after - contents)]
+    return b"".join([data[start:tag], data[after:end], *position])
 
 
 @cache

@@ -19,7 +19,7 @@ from netspec.graph.plan import Node
 from netspec.layers.contract.reading import resume, running_state
 from netspec.net.net import Net
 from netspec.proto.schema import added_fields
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 from netspec.solver.lr_policy import policy_faults
 from netspec.solver.update import rule_faults
 
@@ -28,7 +28,7 @@ _AT_LEAST_ONE = ("average_loss", "iter_size")
 _NOT_NEGATIVE = ("max_iter", "display", "test_interval", "snapshot")
 
 
-def check_settings(param: Any, node: Place, report: Report = raise_fault) -> None:
+def check_settings(param: Any, node: Position, report: Report = raise_fault) -> None:
     """Report all errors in the solver's own settings; its nets are checked separately."""
     for fault in (*rule_faults(param, node), *policy_faults(param, node)):
         report(fault)
@@ -46,14 +46,14 @@ def check_settings(param: Any, node: Place, report: Report = raise_fault) -> Non
         report(SpecError("snapshot is given but snapshot_prefix is not", node.find("snapshot")))
 
 
-def fields_without_effect(param: Any, node: Place, read: frozenset[str] = frozenset()) -> Iterator[str]:
+def fields_without_effect(param: Any, node: Position, read: frozenset[str] = frozenset()) -> Iterator[str]:
     """Yield a line for each field of a fork without effect; ``read`` are those that layers of the test nets read."""
     for name, field in added_fields.get(param.DESCRIPTOR.full_name, {}).items():
         if field.present(param) and name not in read:
             yield f"{node.find(name)}: {name} has no effect: it is a fork's field, and nothing in these nets reads it"
 
 
-def check_prefix(param: Any, node: Place, report: Report = raise_fault, *, try_it: bool = True) -> None:
+def check_prefix(param: Any, node: Position, report: Report = raise_fault, *, try_it: bool = True) -> None:
     """Report a snapshot_prefix that is not writable.
 
     The permissions are checked; with ``try_it``, a file is also written (Caffe: CheckSnapshotWritePermissions).

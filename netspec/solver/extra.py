@@ -31,38 +31,68 @@ from netspec.solver.snapshot import find_learned_net, read_state
 Settings = dict[str, dict[str, Any]]  # for the solver and for each net: name -> JSON value
 MOST_LISTED = 6
 
-_SOLVER_ASIDE = frozenset(  # settings of the log and of output files, and settings that are compared elsewhere
+# Settings of the log and of output files, and settings that are compared elsewhere.
+_IGNORED_IN_SOLVERS = frozenset(
     {
-        *("net", "net_param", "train_net", "train_net_param", "test_net", "test_net_param"),
-        *("train_state", "test_state", "weights", "random_seed", "solver_mode", "device_id"),
-        *("display", "average_loss", "debug_info", "test_initialization", "test_compute_loss", "layer_wise_reduce"),
-        *("snapshot", "snapshot_prefix", "snapshot_diff", "snapshot_format", "snapshot_after_train"),
+        "net",
+        "net_param",
+        "train_net",
+        "train_net_param",
+        "test_net",
+        "test_net_param",
+        "train_state",
+        "test_state",
+        "weights",
+        "random_seed",
+        "solver_mode",
+        "device_id",
+        "display",
+        "average_loss",
+        "debug_info",
+        "test_initialization",
+        "test_compute_loss",
+        "layer_wise_reduce",
+        "snapshot",
+        "snapshot_prefix",
+        "snapshot_diff",
+        "snapshot_format",
+        "snapshot_after_train",
     }
 )
-_LAYER_ASIDE = WITHOUT_EFFECT | {
-    *("name", "bottom", "top", "blobs", "include", "exclude", "phase", "prefetch"),
-    *("weight_filler", "bias_filler", "filler"),  # they no longer have an effect
+_IGNORED_IN_LAYERS = WITHOUT_EFFECT | {
+    "name",
+    "bottom",
+    "top",
+    "blobs",
+    "include",
+    "exclude",
+    "phase",
+    "prefetch",
+    # Fillers no longer have an effect.
+    "weight_filler",
+    "bias_filler",
+    "filler",
 }
 
 
-def settings_of(param: Any, nets: Mapping[str, Net], manner: Mapping[str, Any]) -> Settings:
-    """Return the settings of a solver, of its nets by name, and of ``manner``, how they are run."""
-    aside = _SOLVER_ASIDE if param.lr_policy == "poly" else _SOLVER_ASIDE | {"max_iter"}
-    found: Settings = {"solver": {**manner, **dict(_fields(param, aside))}}
+def settings_of(param: Any, nets: Mapping[str, Net], run_settings: Mapping[str, Any]) -> Settings:
+    """Return the settings of a solver, of its nets by name, and ``run_settings``, which say how they are run."""
+    ignored = _IGNORED_IN_SOLVERS if param.lr_policy == "poly" else _IGNORED_IN_SOLVERS | {"max_iter"}
+    found: Settings = {"solver": {**run_settings, **dict(_fields(param, ignored))}}
     for name, net in nets.items():
         found[name] = {}
         for layer in net.layers:
-            for field, value in _fields(layer.param, _LAYER_ASIDE):
+            for field, value in _fields(layer.param, _IGNORED_IN_LAYERS):
                 found[name][f'layer "{layer.param.name}" {field}'] = value
             if records := getattr(layer, "num_records", 0):
                 found[name][f'layer "{layer.param.name}" number of records'] = records
     return found
 
 
-def _fields(message: Any, aside: frozenset[str] | set[str]) -> Iterator[tuple[str, Any]]:
+def _fields(message: Any, ignored: frozenset[str] | set[str]) -> Iterator[tuple[str, Any]]:
     """Yield the fields whose value is not the default; fields of inner messages have a path."""
     for name, field in fields_of(message.DESCRIPTOR).items():
-        if name in aside or not field.present(message):
+        if name in ignored or not field.present(message):
             continue
         value = field.get(message)
         if field.descriptor.message_type is None:
@@ -74,7 +104,7 @@ def _fields(message: Any, aside: frozenset[str] | set[str]) -> Iterator[tuple[st
             continue
         for i, part in enumerate(value if field.repeated else [value]):
             here = f"{name}[{i}]" if i else name
-            for inner, found in _fields(part, aside):
+            for inner, found in _fields(part, ignored):
                 yield f"{here}.{inner}", found
 
 
@@ -121,7 +151,7 @@ class Extra:
     state: Digest
 
 
-def path_beside(state: str | Path) -> Path:
+def extra_path(state: str | Path) -> Path:
     """Return the path of the file that belongs to a .solverstate or .solverstate.h5."""
     return Path(f"{state}.extra")
 
@@ -147,7 +177,7 @@ def write_extra(path: str | Path, extra: Extra) -> None:
 
 def read_extra(state: str | Path) -> Extra | None:
     """Return the Extra of a state; None if there is no such file, as for Caffe's states. Raises SpecError."""
-    path = path_beside(state)
+    path = extra_path(state)
     try:
         found = read_content(path)
         return Extra(
@@ -170,7 +200,7 @@ def check_pair(state: str | Path, weights: Path | None, extra: Extra) -> None:
     """Raise SpecError if the weights or the state were not written together with the file."""
     for path, stamp in ((weights, extra.weights), (Path(state), extra.state)):
         if path is not None:
-            stamp.check(path, path_beside(state))
+            stamp.check(path, extra_path(state))
 
 
 def newest_pair(prefix: str) -> Path | None:

@@ -16,7 +16,7 @@ import torch
 from netspec.errors import SpecError, did_you_mean
 from netspec.exact.libm import exp, power
 from netspec.proto.forks import forks
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 
 Rate = Callable[[float, Any, int, int], Any]
 
@@ -59,7 +59,7 @@ POLICIES: dict[str, Policy] = {
 }
 
 
-def policy_faults(param: Any, node: Place) -> Iterator[SpecError]:
+def policy_faults(param: Any, node: Position) -> Iterator[SpecError]:
     """Yield a SpecError for an unknown policy, or for each required field that is missing.
 
     Caffe detects a stepsize of 0 and a negative gamma only when it uses them. With a missing gamma or max_iter, its

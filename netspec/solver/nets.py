@@ -12,7 +12,7 @@ from netspec.errors import Report, SpecError, raise_fault
 from netspec.files.kinds import nearest_existing
 from netspec.graph.filter import in_state
 from netspec.proto.schema import TEST, TRAIN, NetParameter, NetState, SolverParameter
-from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.text import parse_net
 
 TRAIN_NET = "train net"
@@ -38,7 +38,7 @@ def seed_of(seed: int, label: str) -> int:
     return seed if label == TRAIN_NET else derived(seed, label)
 
 
-def solver_nets(param: SolverParameter, node: Place, report: Report = raise_fault) -> list[SolverNet]:
+def solver_nets(param: SolverParameter, node: Position, report: Report = raise_fault) -> list[SolverNet]:
     """Return the training net and the test nets. A file is read once, even if several nets use it.
 
     The test nets are in Caffe's order: each test_net_param, each test_net, then the general net for every remaining
@@ -67,7 +67,7 @@ def solver_nets(param: SolverParameter, node: Place, report: Report = raise_faul
     return described
 
 
-def _test_nets(param: SolverParameter, node: Place, read: _Reader, report: Report) -> list[_Read | None]:
+def _test_nets(param: SolverParameter, node: Position, read: _Reader, report: Report) -> list[_Read | None]:
     found = [read(name, i) for name in ("test_net_param", "test_net") for i in range(len(getattr(param, name)))]
     general = next((name for name in _GENERIC if param.HasField(name)), None)
     missing = len(param.test_iter) - len(found)
@@ -92,7 +92,7 @@ class _Reader:
     None if it cannot be read, which is reported once.
     """
 
-    def __init__(self, param: SolverParameter, node: Place, report: Report) -> None:
+    def __init__(self, param: SolverParameter, node: Position, report: Report) -> None:
         self._param, self._node, self._report = param, node, report
         self._files: dict[str, tuple[NetParameter, SourceMap] | None] = {}
 

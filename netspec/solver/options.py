@@ -14,7 +14,7 @@ from netspec.errors import SpecError, check_choice
 from netspec.exact import NONE
 from netspec.graph.options import BuildOptions
 from netspec.proto.schema import SolverParameter
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 from netspec.solver.precision import FP32, PRECISIONS
 from netspec.solver.processes import Processes
 
@@ -54,14 +54,14 @@ class TrainingOptions:
         return self.build.exact if self.precision == FP32 else NONE
 
 
-def choose_device(param: Any, node: Place) -> torch.device:
+def choose_device(param: Any, node: Position) -> torch.device:
     """Return the device set by solver_mode and device_id; the CPU, with a warning, if there is no GPU."""
     if param.solver_mode == SolverParameter.SolverMode.Value("CPU"):
         return torch.device("cpu")
     count = torch.cuda.device_count()
     if not count:
-        place = node.find("solver_mode")
-        log.warning("caffe.cpp:197", f"{place}: solver_mode GPU, but torch finds no GPU; running on the CPU")
+        position = node.find("solver_mode")
+        log.warning("caffe.cpp:197", f"{position}: solver_mode GPU, but torch finds no GPU; running on the CPU")
         return torch.device("cpu")
     if not 0 <= param.device_id < count:
         raise SpecError(

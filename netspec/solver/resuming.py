@@ -23,7 +23,7 @@ from netspec.solver.extra import (
     Settings,
     changes,
     check_pair,
-    path_beside,
+    extra_path,
     read_extra,
     resume,
     running_state,
@@ -49,7 +49,7 @@ class Snapshots:
         """
         training = self._training
         if training.options.nan == "stop" and bad_parameter(training.net):
-            training.tell_nan("the weights cannot be saved")
+            training.report_nan("the weights cannot be saved")
         hdf5 = training.param.snapshot_format == SolverParameter.SnapshotFormat.Value("HDF5")
         form, ending = ("HDF5", ".h5") if hdf5 else ("binary proto", "")
         stem = f"{training.param.snapshot_prefix}_iter_{training.iteration}"
@@ -68,7 +68,7 @@ class Snapshots:
             state,
             State(training.iteration, model, training.current_step, history),
             before=lambda unfinished: write_extra(
-                path_beside(state),
+                extra_path(state),
                 Extra(training.seed, list(training.losses), states, settings, weights, Digest.of(unfinished)),
             ),
         )
@@ -118,7 +118,7 @@ class Snapshots:
         if extra is None:
             log.logger.info(f"{path} is from Caffe: the data starts at its first record, with different random numbers")
         else:
-            self._resume_data(extra, Where(str(path_beside(path))))
+            self._resume_data(extra, Where(str(extra_path(path))))
 
     def _resume_data(self, extra: Extra, where: Where) -> None:
         """Restore the position in the data and the losses of the average."""

@@ -19,7 +19,7 @@ from netspec import log
 from netspec.errors import SpecError, several
 from netspec.graph.filter import with_train_state
 from netspec.proto.schema import SolverParameter
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 from netspec.solver import update
 from netspec.solver.extra import read_extra
 from netspec.solver.interrupts import waiting_interrupts
@@ -33,7 +33,7 @@ from netspec.solver.training import Blobs, Training
 
 def make_solver(
     param: SolverParameter,
-    node: Place,
+    node: Position,
     options: TrainingOptions,
     weights: str | Path | Iterable[str | Path] | None = None,
     snapshot: str | Path | None = None,
@@ -127,7 +127,7 @@ class Solver(Training):
         loss, outputs = self._accumulate()
         self.losses.append(loss)
         if not math.isfinite(loss):
-            self.tell_nan(f"the loss is {loss}")
+            self.report_nan(f"the loss is {loss}")
         if self.is_due(self.param.display):
             self._display.show(outputs)
         self.on_gradients()
@@ -172,7 +172,7 @@ class Solver(Training):
             factor = log.number(self.scale.factor)
             log.info("sgd_solver.cpp:99", f"Iteration {self.iteration}: float16 overflowed; loss scale {factor}")
             if self.scale.factor < 1:
-                self.tell_nan("the gradients overflow float16")
+                self.report_nan("the gradients overflow float16")
 
     def apply_update(self) -> None:
         """Update the weights and count the iteration. The gradients then contain the subtracted values, as in Caffe.

@@ -105,10 +105,9 @@ class Tests:
         net.share_weights_with(training.net)
         net.random.begin(f"test at iteration {training.iteration}")
         tally = Tally(scorers(net, param))
+        is_alone = training.options.processes.count == 1  # several processes agree after an iteration
         for _ in range(batches):
-            while training.options.processes.count == 1 and (
-                request := training.options.action()
-            ):  # several processes agree after an iteration
+            while is_alone and (request := training.options.action()):
                 if request == "snapshot":
                     snapshot()
                 training.stopped |= request == "stop"

@@ -24,7 +24,7 @@ from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_larg
 from netspec.proto.binary import check_readable, split_paths
 from netspec.proto.forks import forks
 from netspec.proto.schema import SolverParameter
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 from netspec.proto.text import write_text
 from netspec.solver import nets, update
 from netspec.solver.blocks import Blocks
@@ -64,7 +64,7 @@ class Training:
     """
 
     param: Any
-    node: Place
+    node: Position
     options: TrainingOptions
     on_start: Callable[[], object] = staticmethod(lambda: None)
     on_gradients: Callable[[], object] = staticmethod(lambda: None)
@@ -84,12 +84,12 @@ class Training:
     last_snapshot = ""
     losses: deque[float]
     losses_before: tuple[float, ...] = ()  # from before a training was resumed
-    _told_nan = False
+    _reported_nan = False
     _prefix_is_checked = False
 
-    def __init__(self, param: Any, node: Place | None = None, options: TrainingOptions | None = None) -> None:
+    def __init__(self, param: Any, node: Position | None = None, options: TrainingOptions | None = None) -> None:
         """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError."""
-        self.param, self.node, self.options = param, node or Place(Where("<solver>")), options or TrainingOptions()
+        self.param, self.node, self.options = param, node or Position(Where("<solver>")), options or TrainingOptions()
         check_settings(param, self.node)
         if param.snapshot:
             self.check_prefix()
@@ -251,7 +251,7 @@ class Training:
         """Return whether the iteration is a multiple of ``interval``; False for 0."""
         return interval > 0 and self.iteration % interval == 0
 
-    def tell_nan(self, what: str) -> None:
+    def report_nan(self, what: str) -> None:
         """Raise SpecError or warn, with the location of the NaN or infinity."""
         found = bad_parameter(self.net)
         if not found and self.options.nan == "stop":
@@ -261,9 +261,9 @@ class Training:
         if self.options.nan == "stop":
             kept = f"; the last good snapshot is {self.last_snapshot}" if self.last_snapshot else ""
             raise SpecError(f"{message}{kept}; lower base_lr, or continue with --nan warn", self.node.where)
-        if not self._told_nan:
+        if not self._reported_nan:
             log.logger.warning(f"{message}; the training continues")
-        self._told_nan = True
+        self._reported_nan = True
 
     def close(self) -> None:
         """Close the files and stop the threads of all nets."""

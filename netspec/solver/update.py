@@ -22,7 +22,7 @@ import torch
 from netspec.errors import SpecError, did_you_mean
 from netspec.exact.blas import sum_of_squares
 from netspec.exact.libm import power
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 
 Tensors = list[torch.Tensor] | tuple[torch.Tensor, ...]
 BLOCK = 2**18  # numbers; with gradients and history, 3 MB or 4 MB
@@ -219,7 +219,7 @@ def find_rule(type_name: str) -> Rule | None:
     return {name.lower(): rule for name, rule in RULES.items()}.get(type_name.lower())
 
 
-def rule_faults(param: Any, node: Place) -> Iterator[SpecError]:
+def rule_faults(param: Any, node: Position) -> Iterator[SpecError]:
     """Yield the errors that the constructors of Caffe's solvers detect."""
     rule = find_rule(param.type)
     if rule is None:

@@ -60,7 +60,12 @@ def start(case: Case, slowly: bool = False) -> int:
     netspec.files.whole_file._swept.clear()  # in this process, but not in new ones
     sync, status = os.fsync, 1
     if slowly:
-        os.fsync = lambda descriptor: (time.sleep(0.01), sync(descriptor))[1]
+
+        def slow_sync(descriptor: int) -> None:
+            time.sleep(0.01)
+            sync(descriptor)
+
+        os.fsync = slow_sync
     try:
         status = case.main(list(case.words))
     finally:
@@ -75,21 +80,21 @@ def unfinished() -> list[str]:
     return [path.name for path in Path("out").glob(".*.unfinished")]
 
 
-def orphans(session: int, patience: float = 60.0) -> int:
-    """Count the processes that are left of a session after a while."""
+def has_orphans(session: int, patience: float = 60.0) -> bool:
+    """Return whether a session still has processes after ``patience`` seconds, and kill them."""
     end = time.monotonic() + patience
     while True:
         try:
             os.killpg(session, 0)
         except ProcessLookupError:
-            return 0
+            return False
         if time.monotonic() > end:
             os.killpg(session, signal.SIGKILL)
-            return 1
+            return True
         time.sleep(0.02)
 
 
-def kill_again_and_again(case: Case, kills: int, draw: random.Random) -> Tally:
+def kill_repeatedly(case: Case, kills: int, draw: random.Random) -> Tally:
     """Run and kill the command in the working directory; return what was lost."""
     Path("out").mkdir()
     case.prepare()
@@ -101,33 +106,33 @@ def kill_again_and_again(case: Case, kills: int, draw: random.Random) -> Tally:
     left = {path.name for path in Path("out").iterdir()}
     shutil.rmtree("out")
     Path("out").mkdir()
-    tally, there = Tally(), False
+    tally, was_written = Tally(), False
     while tally.kills < kills:
         remove_database()  # an existing database is never overwritten
         before = set(unfinished())
-        wait = tally.kills % 2 == 1
-        process = start(case, slowly=wait)
-        end = time.monotonic() + (length * 1.5 if wait else draw.uniform(0, length))
+        in_a_write = tally.kills % 2 == 1
+        process = start(case, slowly=in_a_write)
+        end = time.monotonic() + (length * 1.5 if in_a_write else draw.uniform(0, length))
         over = False
-        while time.monotonic() < end and not over and not (wait and set(unfinished()) - before):
+        while time.monotonic() < end and not over and not (in_a_write and set(unfinished()) - before):
             time.sleep(0.0003)
             over = is_over(process)
-        if wait and not over:
+        if in_a_write and not over:
             time.sleep(draw.uniform(0, 0.01))
         tally.while_writing += bool(set(unfinished()) - before)
         if over or is_over(process):
             tally.finished += 1
-            there = True
+            was_written = True
         else:
             os.kill(process, signal.SIGKILL)
             os.waitpid(process, 0)
         tally.kills += 1
-        tally.orphans += orphans(process)
+        tally.orphans += has_orphans(process)
         try:
             found = case.check()
-            there = there and case.main is not lmdb_build.cli.main
-            assert found == expected or (found is None and not there), "not what an undisturbed run writes"
-            there = there or found is not None
+            was_written = was_written and case.main is not lmdb_build.cli.main
+            assert found == expected or (found is None and not was_written), "not what an undisturbed run writes"
+            was_written = was_written or found is not None
         except Exception as fault:  # any error from reading a broken file
             tally.broken.append(f"{type(fault).__name__}: {fault}")
     remove_database()
@@ -149,7 +154,7 @@ def main(words: list[str]) -> int:
         with tempfile.TemporaryDirectory() as folder:
             os.chdir(folder)
             try:
-                tally = kill_again_and_again(CASES[name], a.kills, random.Random(a.seed))
+                tally = kill_repeatedly(CASES[name], a.kills, random.Random(a.seed))
             finally:
                 os.chdir(home)
         print(f"{name}: {tally}", *tally.broken[:3], *tally.leftovers[:3], sep="\n  ", flush=True)

@@ -136,10 +136,20 @@ def test_an_invalid_line_of_groundtruth_is_reported(
 @pytest.mark.parametrize(
     "line",
     [
-        *("", "pairs --out x", "pairs a folders:b,references=c --out x", "pairs images:m --out x"),
-        *("walk x --size 320", "walk x --sequences 0", "walk x --seed -1", "views a --out x --seed -1"),
-        *("pairs a --out x --shares 1,2", "pairs a --out x --max-distance nan", "pairs a --out x --max-angle -1"),
-        *("pairs a --out x --seed -1", "join x a --seed -1", "sheet a x.png --seed -1"),
+        "",
+        "pairs --out x",
+        "pairs a folders:b,references=c --out x",
+        "pairs images:m --out x",
+        "walk x --size 320",
+        "walk x --sequences 0",
+        "walk x --seed -1",
+        "views a --out x --seed -1",
+        "pairs a --out x --shares 1,2",
+        "pairs a --out x --max-distance nan",
+        "pairs a --out x --max-angle -1",
+        "pairs a --out x --seed -1",
+        "join x a --seed -1",
+        "sheet a x.png --seed -1",
     ],
 )
 def test_wrong_usage_is_status_2(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

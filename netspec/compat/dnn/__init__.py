@@ -43,9 +43,9 @@ for _kind, _names in _CONSTANTS.items():
 
 
 def __getattr__(name: str) -> Any:
-    place = cv2 if name.startswith("DNN_LAYOUT_") else _opencv  # OpenCV 5 moved these
+    module = cv2 if name.startswith("DNN_LAYOUT_") else _opencv  # OpenCV 5 moved these
     try:
-        return getattr(place, name)
+        return getattr(module, name)
     except AttributeError:
         message = f"module 'netspec.dnn' has no attribute {name!r}, nor has cv2.dnn of OpenCV {cv2.__version__}"
         raise AttributeError(message) from None

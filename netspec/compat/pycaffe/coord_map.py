@@ -17,8 +17,25 @@ Mapping = tuple[Any, Any, Any]
 
 IDENTITY: Mapping = (None, 1, 0)
 PASS_THROUGH_LAYERS = (
-    *("AbsVal", "BatchNorm", "Bias", "BNLL", "Dropout", "Eltwise", "ELU", "Exp", "Log", "LRN", "MVN", "Power"),
-    *("PReLU", "ReLU", "Scale", "Sigmoid", "Split", "TanH", "Threshold"),
+    "AbsVal",
+    "BatchNorm",
+    "Bias",
+    "BNLL",
+    "Dropout",
+    "Eltwise",
+    "ELU",
+    "Exp",
+    "Log",
+    "LRN",
+    "MVN",
+    "Power",
+    "PReLU",
+    "ReLU",
+    "Scale",
+    "Sigmoid",
+    "Split",
+    "TanH",
+    "Threshold",
 )
 _TWO_DIMENSIONAL = frozenset(f"{what}_{axis}" for what in ("kernel", "stride", "pad") for axis in "hw")
 

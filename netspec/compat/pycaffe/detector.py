@@ -48,10 +48,10 @@ class Detector(Net):
             given += [self.transformer.preprocess(in_, self.crop(image, np.array(window))) for window in windows]
         blobs: dict[str, Any] = {in_: np.stack(given)}
         predictions = self.forward_all(**blobs)[self.outputs[0]]
-        places = ((name, window) for name, windows in images_windows for window in windows)
+        crops = ((name, window) for name, windows in images_windows for window in windows)
         return [
             {"window": window, "prediction": prediction, "filename": name}
-            for (name, window), prediction in zip(places, predictions, strict=True)
+            for (name, window), prediction in zip(crops, predictions, strict=True)
         ]
 
     def detect_selective_search(self, image_fnames: Sequence[str]) -> list[dict[str, Any]]:
@@ -66,7 +66,7 @@ class Detector(Net):
 
     def crop(self, im: np.ndarray, window: np.ndarray) -> np.ndarray:
         """Return the part of an image (H, W, K) in a window, with the context around it if that is set."""
-        top, left, bottom, right = (int(place) for place in window)
+        top, left, bottom, right = (int(edge) for edge in window)
         cropped = im[top:bottom, left:right]
         if not self.context_pad:
             return cropped

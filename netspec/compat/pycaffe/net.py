@@ -37,14 +37,14 @@ Arrays = dict[str, np.ndarray]
 
 
 class Layer(pycaffe_shim.Layer):
-    """A layer that netspec has: its type and its learnable blobs. (Those written in Python are their ``code``.)"""
+    """The type and the learnable blobs of a layer. For a Python layer, the user's own object is shown instead."""
 
     def __init__(self, type_name: str, blobs: BlobVec) -> None:
         self.type = type_name
         self.blobs = blobs
 
 
-def _adding(which: str) -> Callable[[Net, Callable[[int], object]], None]:
+def _hook_adder(which: str) -> Callable[[Net, Callable[[int], object]], None]:
     """Return a method that adds a function, to be called with each layer's number before or after it ran."""
 
     def add(self: Net, hook: Callable[[int], object]) -> None:
@@ -57,9 +57,9 @@ class Net:
     """A net and its blobs in memory.
 
     ``Net(file, phase, level=0, stages=None, weights=None)`` builds the net of a prototxt for a phase (TRAIN or TEST),
-    ``Net(file, weights, phase)`` is the older form. The dialects that the prototxt needs are switched on. Raises
-    RuntimeError for a file that is not there, SpecError (a ValueError) for every other fault of the files; what the
-    code of a Python layer raises passes through.
+    ``Net(file, weights, phase)`` is the older form. The dialects that the prototxt needs are activated. Raises
+    RuntimeError for a missing file, SpecError (a ValueError) for every other fault of the files, and any exception of
+    the code of a Python layer.
 
     ``blobs`` maps names to blobs, ``params`` layer names to learnable blobs, both in the order of the layers. The
     arrays ``data`` and ``diff`` of a blob are its memory: what is written to them counts in the next pass.
@@ -79,20 +79,19 @@ class Net:
         weights = None if weights is None else file_of(weights)
         with caffes_errors():
             net, source = parse_net(network_file)
-            self._hold(
-                build_net(with_state(net, PhaseValue(phase), level or 0, stages or ()), source, mode.build_options())
-            )
+            net = with_state(net, PhaseValue(phase), level or 0, stages or ())
+            self._set_net(build_net(net, source, mode.build_options()))
         if weights is not None:
             self.copy_from(weights)
 
     @classmethod
-    def around(cls, net: core.Net) -> Net:
-        """Return a Net around one of netspec's, such as a solver has."""
+    def of(cls, net: core.Net) -> Net:
+        """Return a Net for one of netspec's nets, such as a solver has."""
         made = cls.__new__(cls)
-        made._hold(net)
+        made._set_net(net)
         return made
 
-    def _hold(self, net: core.Net) -> None:
+    def _set_net(self, net: core.Net) -> None:
         mode.follow_seed(net.random)
         self.runner = runner = BlobRunner(net)
         names = [node.name for node in net.plan.nodes]
@@ -293,8 +292,8 @@ class Net:
         """Set the gradients of the learnable blobs to 0; :meth:`backward` adds to them."""
         self.runner.clear_param_diffs()
 
-    before_forward, after_forward = _adding("before_forward"), _adding("after_forward")
-    before_backward, after_backward = _adding("before_backward"), _adding("after_backward")
+    before_forward, after_forward = _hook_adder("before_forward"), _hook_adder("after_forward")
+    before_backward, after_backward = _hook_adder("before_backward"), _hook_adder("after_backward")
 
     # Data and weights
 

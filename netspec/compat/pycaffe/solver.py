@@ -43,7 +43,7 @@ class _Training(core_solver.Solver):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.shown = {net: Net.around(net) for net in (self.net, *self.test_nets)}
+        self.shown = {net: Net.of(net) for net in (self.net, *self.test_nets)}
         self.net.largest_trained = math.inf  # blobs keep all tops anyway
         self._whole: WholeRun | None = None  # set after the first pass, if it is possible
         self.is_watched = bool(self.net.inputs) or any(
@@ -72,9 +72,15 @@ class _Training(core_solver.Solver):
     @override
     def forward_backward(self) -> tuple[torch.Tensor, Outputs]:
         """Run forward and backward. The blobs are filled in the last pass of several, and if ``is_watched``."""
-        seen, runner = self.is_watched or self.param.debug_info, self.shown[self.net].runner
-        if not seen and (passed := self._whole.run() if self._whole else self.to_come and self.net.forward_backward()):
-            return passed
+        runner = self.shown[self.net].runner
+        if not self.is_watched and not self.param.debug_info:
+            passed = None
+            if self._whole:
+                passed = self._whole.run()
+            elif self.to_come:  # other passes of this call of step() follow
+                passed = self.net.forward_backward()
+            if passed:
+                return passed
         loss, outputs = self.forward(self.net)
         runner.backward(len(self.net.layers) - 1, 0)
         self._whole = WholeRun(runner) if WholeRun.suits(runner) else None

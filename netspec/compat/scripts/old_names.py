@@ -140,10 +140,11 @@ def _warn_if_too_new(np: Any) -> None:
 def remedy(fault: BaseException) -> str:
     """Return advice for an error that is typical of old programs, or an empty string."""
     text = str(fault)
-    place = next((f for f in reversed(traceback.extract_tb(fault.__traceback__)) if f.filename in TRANSLATED), None)
-    if place and isinstance(fault, (TypeError, UnicodeError)):
+    frames = reversed(traceback.extract_tb(fault.__traceback__))
+    frame = next((each for each in frames if each.filename in TRANSLATED), None)
+    if frame and isinstance(fault, (TypeError, UnicodeError)):
         return (
-            f"{place.filename}:{place.lineno} is Python 2 code, which does not distinguish text from bytes, or 2.0 "
+            f"{frame.filename}:{frame.lineno} is Python 2 code, which does not distinguish text from bytes, or 2.0 "
             "from 2; convert explicitly, for example with text.encode(), data.decode() or int(x)"
         )
     np = sys.modules.get("numpy")

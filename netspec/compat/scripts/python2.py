@@ -30,8 +30,23 @@ _BUILTINS = frozenset(
 )
 _MODULES = frozenset(
     (
-        *("ConfigParser", "HTMLParser", "Queue", "SocketServer", "StringIO", "Tkinter", "__builtin__", "cPickle"),
-        *("cStringIO", "commands", "cookielib", "copy_reg", "httplib", "thread", "urllib2", "urlparse", "xmlrpclib"),
+        "ConfigParser",
+        "HTMLParser",
+        "Queue",
+        "SocketServer",
+        "StringIO",
+        "Tkinter",
+        "__builtin__",
+        "cPickle",
+        "cStringIO",
+        "commands",
+        "cookielib",
+        "copy_reg",
+        "httplib",
+        "thread",
+        "urllib2",
+        "urlparse",
+        "xmlrpclib",
     )
 )
 _METHODS = frozenset(("has_key", "iteritems", "iterkeys", "itervalues"))

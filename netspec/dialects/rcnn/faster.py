@@ -24,11 +24,12 @@ from netspec.files.opencv import cv2
 from netspec.layers.contract.base import Layer, Shape
 
 RATIOS, SCALES = (0.5, 1, 2), (8, 16, 32)
-ANCHORS, OBJECTS = 256, 0.5  # a minibatch of the region proposals, and its maximum share of objects
-OBJECT, BACKGROUND = 0.7, 0.3  # overlaps of an object (at least) and of background (below)
-REGIONS, FOREGROUND = 128, 0.25  # a minibatch of the classifier, and its maximum share of objects
-ATTRIBUTES, OF_ATTRIBUTES, WITH_ATTRIBUTES = 16, 64, 0.5  # their number; REGIONS and FOREGROUND with them
-OVERLAP = 0.5  # minimum overlap of an object
+# The minibatch of anchors: its size, its maximum share of objects, and the overlaps of an object and of background.
+ANCHORS, ANCHOR_SHARE, ANCHOR_OBJECT, ANCHOR_BACKGROUND = 256, 0.5, 0.7, 0.3
+# The minibatch of regions: its size, its maximum share of objects, and the minimum overlap of an object.
+REGIONS, REGION_SHARE, REGION_OBJECT = 128, 0.25, 0.5
+ATTRIBUTES = 16  # number of attributes of an object (bottom-up attention)
+REGIONS_WITH_ATTRIBUTES, SHARE_WITH_ATTRIBUTES = 64, 0.5  # instead of REGIONS and REGION_SHARE
 DEVIATIONS = np.array([0.1, 0.1, 0.2, 0.2], np.float32)  # divisors of the classifier's targets
 SHORTEST, LONGEST = 600, 1000  # short and long side of scaled images
 MEANS = np.array([102.9801, 115.9465, 122.7717], np.float32)  # blue, green, red
@@ -38,23 +39,22 @@ OWN_CODE = "--allow-python-layers runs the fork's own code"
 _SETTING = r"""(\w+)['"]?\s*:\s*(?:[^\s\[(]*\s*[\[(]([^\])]*)[\])]|([-+.\w]+))"""  # a name; a list or a number
 
 
-def settings(layer: Layer, *others: str, **least: int | None) -> dict[str, Any]:
+def settings(layer: Layer, required: str, *optional: str) -> dict[str, Any]:
     """Return the numbers and lists of numbers in ``param_str``, one per line in YAML: ``'feat_stride': 16``.
 
-    ``least`` maps integers to their minimum, or to None if they may be missing.
-    ``others`` are other names to read. Raises SpecError for any other name.
+    Raises SpecError if ``required`` is missing or below 1, and for a name that is neither it nor in ``optional``.
     """
     text = layer.param.python_param.param_str
     found: dict[str, Any] = {}
     for name, listed, single in re.findall(_SETTING, text):
         numbers = [float(word) for word in re.findall(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?", listed or single)]
         found[name] = numbers if listed else numbers[0] if numbers else single
-    for name, minimum in least.items():
-        if minimum is not None and not (isinstance(found.get(name), float) and found[name] >= minimum):
-            message = f"param_str has no {name} of at least {minimum}; found {text!r}"
-            raise layer.error(message, "python_param", "param_str")
-    if unknown := found.keys() - {*others, *least}:
-        message = f"param_str has {min(unknown)}, which is not read here; it may have {', '.join((*least, *others))}"
+    if not (isinstance(found.get(required), float) and found[required] >= 1):
+        message = f"param_str has no {required} of at least 1; found {text!r}"
+        raise layer.error(message, "python_param", "param_str")
+    known = (required, *optional)
+    if unknown := found.keys() - {*known}:
+        message = f"param_str has {min(unknown)}, which is not read here; it may have {', '.join(known)}"
         raise layer.error(message, "python_param", "param_str")
     return found
 
@@ -120,7 +120,7 @@ class AnchorTarget(_Sampling):
     label_bottoms = frozenset(range(4))
 
     def setup(self) -> None:
-        found = settings(self, "scales", "ratios", "allowed_border", feat_stride=1)
+        found = settings(self, "feat_stride", "scales", "ratios", "allowed_border")
         self.stride, self.border = int(found["feat_stride"]), found.get("allowed_border", 0)
         self.anchors = anchors_of(found)
 
@@ -143,12 +143,12 @@ class AnchorTarget(_Sampling):
         if len(inside) and len(truth):
             table = overlaps(anchors[inside].astype(np.float64), truth[:, :4].astype(np.float64))
             most = table.max(axis=1)
-            labels[inside[most < BACKGROUND]] = 0
-            labels[inside[(table == table.max(axis=0)).any(axis=1) | (most >= OBJECT)]] = 1
+            labels[inside[most < ANCHOR_BACKGROUND]] = 0
+            labels[inside[(table == table.max(axis=0)).any(axis=1) | (most >= ANCHOR_OBJECT)]] = 1
             moves[inside] = targets(anchors[inside], truth[table.argmax(axis=1), :4])
         elif len(inside):
             labels[inside] = 0
-        objects = self.choose(np.flatnonzero(labels == 1), int(OBJECTS * ANCHORS))
+        objects = self.choose(np.flatnonzero(labels == 1), int(ANCHOR_SHARE * ANCHORS))
         others = self.choose(np.flatnonzero(labels == 0), ANCHORS - len(objects))
         labels[:] = -1
         labels[objects], labels[others] = 1, 0
@@ -182,7 +182,7 @@ class ProposalTarget(_Sampling):
     counted_axis = 0
 
     def setup(self) -> None:
-        found = settings(self, "num_attr_classes", "num_rel_classes", "ignore_label", num_classes=1)
+        found = settings(self, "num_classes", "num_attr_classes", "num_rel_classes", "ignore_label")
         self.classes, self.nothing = int(found["num_classes"]), float(found.get("ignore_label", -1))
         self.attributes = bool(found.get("num_attr_classes"))
         if found.get("num_rel_classes"):
@@ -190,7 +190,9 @@ class ProposalTarget(_Sampling):
         if self.num_tops != 5 + self.attributes:
             expected = "6, the last for attributes" if self.attributes else "5, or num_attr_classes in param_str"
             raise self.error(f"found {self.num_tops} tops, expected {expected}; {OWN_CODE}", "top")
-        self.regions, share = (OF_ATTRIBUTES, WITH_ATTRIBUTES) if self.attributes else (REGIONS, FOREGROUND)
+        self.regions, share = REGIONS, REGION_SHARE
+        if self.attributes:
+            self.regions, share = REGIONS_WITH_ATTRIBUTES, SHARE_WITH_ATTRIBUTES
         self.objects = round(share * self.regions)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
@@ -216,7 +218,9 @@ class ProposalTarget(_Sampling):
 
     def forward(self, proposals: torch.Tensor, boxes: torch.Tensor) -> tuple[torch.Tensor, ...]:
         if self.is_rfcn:
-            raise self.error(f"how R-FCN chooses regions stands in its configuration, not here; {OWN_CODE}")
+            raise self.error(
+                f"R-FCN's choice of regions depends on its configuration file, which netspec does not read; {OWN_CODE}"
+            )
         truth = as_array(boxes)
         if truth.shape[1] != self.columns:
             raise self._wrong(truth.shape)
@@ -226,8 +230,8 @@ class ProposalTarget(_Sampling):
         if len(truth):
             table = overlaps(regions[:, 1:].astype(np.float64), truth[:, :4].astype(np.float64))
             best, which = table.max(axis=1), table.argmax(axis=1)
-        objects = self.choose(np.flatnonzero(best >= OVERLAP), self.objects)
-        others = self.choose(np.flatnonzero(best < OVERLAP), self.regions - len(objects))
+        objects = self.choose(np.flatnonzero(best >= REGION_OBJECT), self.objects)
+        others = self.choose(np.flatnonzero(best < REGION_OBJECT), self.regions - len(objects))
         regions, which = regions[[*objects, *others]], which[[*objects, *others]]
         labels = np.zeros(len(regions), int)
         rows = np.arange(len(objects))

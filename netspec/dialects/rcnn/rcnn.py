@@ -105,9 +105,9 @@ class ROIPooling(RegionPooling):
                 pixel[own] = _first_maxima(maps[i], windows[own].reshape(-1, 4)).reshape(-1, *pixel.shape[1:])
             pixel = pixel.permute(0, 3, 1, 2)
             plane = image[:, None] * channels + torch.arange(channels, device=maps.device)
-            place = plane[:, :, None, None] * (height * width) + pixel.clamp(min=0)
+            index = plane[:, :, None, None] * (height * width) + pixel.clamp(min=0)
             inverted = (corners[:, 2:] < corners[:, :2]).any(1)[:, None, None, None]
-        top = maps.reshape(-1)[place].where(pixel >= 0, 0)
+        top = maps.reshape(-1)[index].where(pixel >= 0, 0)
         return torch.where(inverted, top.detach(), top)
 
     @staticmethod
@@ -242,7 +242,7 @@ class ProposalLayer(Proposal):
     """
 
     def setup(self) -> None:
-        found = settings(self, "scales", "ratios", feat_stride=1)
+        found = settings(self, "feat_stride", "scales", "ratios")
         self.settings = param = copy.deepcopy(value(self.param, "proposal_param"))
         param.feat_stride = int(found["feat_stride"])
         param.pre_nms_topn, param.post_nms_topn = (12000, 2000) if self.phase == TRAIN else (6000, 300)

@@ -51,7 +51,9 @@ ALIGNED = (
     "without crop_param it aligns its bottoms as HED's branch does, by {by}, since a convolution before it pads with "
     "more than its kernel; Caffe cuts from the corner: for that write crop_param {{ axis: 2 offset: 0 }}"
 )
-EDGES = "; SigmoidCrossEntropyLoss is computed as Caffe's: HED's and RCF's, which weigh edges, have to be named"
+EDGES = (
+    "; SigmoidCrossEntropyLoss is computed as in Caffe; for that of HED or RCF, which weights edges, name the dialect"
+)
 
 
 def align_crops(plan: Plan, dialects: Collection[str]) -> Iterator[str]:

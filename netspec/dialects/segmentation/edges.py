@@ -33,7 +33,7 @@ class EdgeMaps(ImageData):
 
     def open(self) -> Source | None:
         p, draws = self.param.image_data_param, self.draws
-        pairs = self.attempt(read_pairs, p.source, self.place)
+        pairs = self.attempt(read_pairs, p.source, self.where)
         transformer = self.attempt(self.transformer)
         if pairs is None or transformer is None:
             return None

@@ -23,7 +23,7 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class Pair:
-    """A line of the list: the names of an image and of its labels, and its place."""
+    """A line of the list: the names of an image and of its labels, and its position."""
 
     image: str
     labels: str
@@ -33,11 +33,11 @@ class Pair:
 def read_pairs(path: str, where: Where | None = None) -> list[Pair]:
     """Read lines of two names. Raises SpecError for another line, and for a list without lines."""
     pairs = []
-    for line, place in list_lines(path, where):
+    for line, position in list_lines(path, where):
         names = line.split()
         if len(names) != 2:
-            raise SpecError(f'found "{line}", expected the names of an image and of its labels', place)
-        pairs.append(Pair(names[0], names[1], place))
+            raise SpecError(f'found "{line}", expected the names of an image and of its labels', position)
+        pairs.append(Pair(names[0], names[1], position))
     if not pairs:
         raise SpecError(f'the list "{path}" is empty', where or Where(path))
     return pairs

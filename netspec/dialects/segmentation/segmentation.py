@@ -84,7 +84,7 @@ class DenseImageData(ReadingLayer):
 
     def open(self) -> Source | None:
         p, draws = value(self.param, GROUP), self.draws
-        pairs = self.attempt(read_pairs, p.source, self.place)
+        pairs = self.attempt(read_pairs, p.source, self.where)
         transformer = self.attempt(self.transformer)
         if pairs is None or transformer is None:
             return None
@@ -103,7 +103,7 @@ class DenseImageData(ReadingLayer):
             if not crop[0]:
                 return image, labels
             if any(size < part for size, part in zip(image.shape[1:], crop, strict=True)):
-                raise SpecError(f"an image of {image.shape[1]} x {image.shape[2]} is smaller than the crop", self.place)
+                raise SpecError(f"an image of {image.shape[1]} x {image.shape[2]} is smaller than the crop", self.where)
             top, left = down % (image.shape[1] - crop[0] + 1), across % (image.shape[2] - crop[1] + 1)
             window = (slice(None), slice(top, top + crop[0]), slice(left, left + crop[1]))
             return image[window], labels[window]

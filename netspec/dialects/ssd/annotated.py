@@ -56,14 +56,12 @@ class AnnotatedSource:
         self._shapes = [(image.shape[2], *augment.size(image.shape)) for augment in augments]
         count = sum(len(group.annotation) for group in first.annotation_group)
         batch = cursor.batch_size
-        self.shapes: Sequence[Shape] = (
-            (batch, *self._shapes[0]),
-            (batch, 1, MOST_BOXES, 5)
-            if centered
-            else (1, 1, max(count, 1), COLUMNS + 1)
-            if self._has_boxes
-            else (batch, 1, 1, 1),
-        )
+        second: Shape = (batch, 1, 1, 1)
+        if centered:
+            second = (batch, 1, MOST_BOXES, 5)
+        elif self._has_boxes:
+            second = (1, 1, max(count, 1), COLUMNS + 1)
+        self.shapes: Sequence[Shape] = ((batch, *self._shapes[0]), second)
 
     def keys(self, iteration: int) -> list[str]:
         """Return the keys of the records of an iteration."""
@@ -74,8 +72,8 @@ class AnnotatedSource:
         images, rows, labels = [], [], []
         chosen = self._chosen(iteration)
         augment, shape = self._augments[chosen], self._shapes[chosen]
-        places = zip(self.cursor.records(iteration), self.cursor.positions(iteration), strict=True)
-        for item, (record, position) in enumerate(places):
+        numbered = zip(self.cursor.records(iteration), self.cursor.positions(iteration), strict=True)
+        for item, (record, position) in enumerate(numbered):
             pixels, datum = self._read(record)
             draw = Random(derived(self._draws.seed, f"{self._draws.stream}/{position}"))
             image, boxes = augment(pixels, self._boxes(datum), draw)
@@ -149,9 +147,9 @@ class AnnotatedData(Data):
     emit_constraint determines which are kept.
 
     top[0]  images (batch_size, C, H, W)
-    top[1]  a row for each box (1, 1, n, 8): image, label, instance, xmin, ymin, xmax, ymax, difficult; corners in
+    top[1]  a row for each box (1, 1, n, 8): image, label, instance, xmin, ymin, xmax, ymax, difficult; corners
             relative to the image; one row of -1 if there is none. Records without a type have labels instead
-            (batch_size, 1, 1, 1). May be left out. With yolo_data_type: 1 (batch_size, 1, 300, 5): class from 0, x, y,
+            (batch_size, 1, 1, 1). May be left out. With yolo_data_type 1, (batch_size, 1, 300, 5): class from 0, x, y,
             width, height; zeros after the last box.
     Fork: src/caffe/layers/annotated_data_layer.cpp; one of several resize_param is drawn by prob for 10 iterations
     each: eric612/MobileNet-YOLO
@@ -196,7 +194,7 @@ class AnnotatedData(Data):
             for augment in augments:
                 augment.color = True
         cursor = self.cursor(len(reader), p.data_param.rand_skip)
-        source = AnnotatedSource(reader, cursor, augments, settings, self.draws, self.place)
+        source = AnnotatedSource(reader, cursor, augments, settings, self.draws, self.where)
         self.log_size(source, "annotated_data_layer.cpp:62")
         return source
 

@@ -68,12 +68,12 @@ def wrong_settings(transform: Any, samplers: Sequence[Any], at: Callable[..., Wh
             message = f"found {name} from {low:g} to {high:g}, expected 0 <= {name}_lower <= {name}_upper"
             yield fault(message, "transform_param", "distort_param")
     for i, sampler in enumerate(samplers):
-        s, place = sampler.sampler, ("annotated_data_param", "batch_sampler", i, "sampler")
+        s, field = sampler.sampler, ("annotated_data_param", "batch_sampler", i, "sampler")
         if not 0 < s.min_scale <= s.max_scale <= 1:
-            yield fault(f"found scales {s.min_scale:g} to {s.max_scale:g}, expected 0 < min <= max <= 1", *place)
+            yield fault(f"found scales {s.min_scale:g} to {s.max_scale:g}, expected 0 < min <= max <= 1", *field)
         if not 0 < s.min_aspect_ratio <= s.max_aspect_ratio:
             ratios = f"{s.min_aspect_ratio:g} to {s.max_aspect_ratio:g}"
-            yield fault(f"found aspect ratios {ratios}, expected 0 < min <= max", *place)
+            yield fault(f"found aspect ratios {ratios}, expected 0 < min <= max", *field)
 
 
 def fixed_size(transform: Any) -> tuple[int, int] | None:
@@ -87,7 +87,7 @@ def fixed_size(transform: Any) -> tuple[int, int] | None:
 
 
 class Augmenter:
-    """Applies a ``transform_param`` with SSD's fields, after the batch samplers. ``at(*path)`` is a field's place.
+    """Applies a ``transform_param`` with SSD's fields, after the batch samplers. ``at(*path)`` is a field's position.
 
     ``resize`` is its resize_param, or one of them, or None. With ``jitter``, one window is drawn without the
     samplers. Raises SpecError for a mean file that cannot be read.

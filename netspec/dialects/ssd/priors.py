@@ -77,8 +77,8 @@ class PriorBox(Layer):
             sizes = getattr(param, name)
             cut = [f"{size:g} to {self.pixels(size):g}" for size in sizes if self.pixels(size) != size]
             if cut:
-                place = self.context.at("prior_box_param", name, 0)
-                found = f"{place}: {name} is cut to whole pixels, as in SSD: {', '.join(cut)}"
+                where = self.context.at("prior_box_param", name, 0)
+                found = f"{where}: {name} is cut to whole pixels, as in SSD: {', '.join(cut)}"
                 log.logger.warning(f"{found}; OpenCV and some forks keep it, so a net trained there gives other boxes")
 
     def pixels(self, size: float) -> float:

@@ -64,7 +64,7 @@ extend LayerParameter {
 SHAPES = ("kernel_shape", "stride_shape", "pad_shape")
 
 
-def _in_caffes_words(layer: Layer) -> LayerParameter:
+def _copied_param(layer: Layer) -> LayerParameter:
     """Return a copy of the layer's parameters with the fork's fields converted to Caffe's."""
     param = LayerParameter()
     param.CopyFrom(layer.param)
@@ -92,7 +92,7 @@ class Convolution3D(Convolution):
             raise self.error(f"found a bottom of shape {self.bottom_shapes[0]}, expected (N, C, L, H, W)", "bottom", 0)
         if min(given.kernel_size, given.kernel_depth) < 1:
             raise self.error("kernel_size and kernel_depth must be given", "convolution3d_param")
-        self.param = _in_caffes_words(self)
+        self.param = _copied_param(self)
         param = self.param.convolution_param
         param.num_output, param.bias_term = given.num_output, given.bias_term
         param.kernel_size.extend((given.kernel_depth, given.kernel_size, given.kernel_size))
@@ -119,7 +119,7 @@ class NdConvolution(Convolution):
         kernel, stride, pad = _shapes(self, "convolution_param")
         if not kernel:
             raise self.error("kernel_shape is missing", "convolution_param")
-        self.param = _in_caffes_words(self)
+        self.param = _copied_param(self)
         param = self.param.convolution_param
         for name, numbers in (("kernel_size", kernel), ("stride", stride), ("pad", pad)):
             getattr(param, name)[:] = numbers
@@ -183,8 +183,8 @@ class _VolumePooling(Layer):
         return [(*shape[:2], *counts)]
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        framed = F.pad(data, self.frame, value=LOWEST if self.method == MAX else 0.0)
-        volume = framed.reshape(*data.shape[:2], *[1] * (5 - data.dim()), *framed.shape[2:])
+        padded = F.pad(data, self.frame, value=LOWEST if self.method == MAX else 0.0)
+        volume = padded.reshape(*data.shape[:2], *[1] * (5 - data.dim()), *padded.shape[2:])
         if self.method == MAX:
             return self.largest(volume).reshape(self.top_shapes[0])
         kernel, stride = self.windows
@@ -213,8 +213,8 @@ class _AllLargest(torch.autograd.Function):
         diff = torch.zeros_like(volume)
         counts = top.shape[2:]
         for offset in torch.cartesian_prod(*map(torch.arange, ctx.kernel)).tolist():
-            place = [slice(o, o + (n - 1) * s + 1, s) for o, n, s in zip(offset, counts, ctx.stride, strict=True)]
-            at = (slice(None), slice(None), *place)
+            pixels = [slice(o, o + (n - 1) * s + 1, s) for o, n, s in zip(offset, counts, ctx.stride, strict=True)]
+            at = (slice(None), slice(None), *pixels)
             diff[at] += grads[0] * (volume[at] == top)
         return diff, None, None
 

@@ -119,9 +119,9 @@ class Windows(Transformer):
         window = sizes[chosen % len(sizes)]
         free = [whole - part for whole, part in zip(image.shape[1:], window, strict=True)]
         if value(p, "fix_crop"):
-            places = CORNERS + (MORE_CORNERS if value(p, "more_fix_crop") else ())
-            place = places[h_off % len(places)]
-            corner = [quarters * (size // 4) for quarters, size in zip(place, free, strict=True)]
+            corners = CORNERS + (MORE_CORNERS if value(p, "more_fix_crop") else ())
+            multiples = corners[h_off % len(corners)]
+            corner = [quarters * (size // 4) for quarters, size in zip(multiples, free, strict=True)]
         else:
             corner = [draw % (size + 1) for draw, size in zip((h_off, w_off), free, strict=True)]
         cut = _cut(image, corner, window)
@@ -178,7 +178,7 @@ class Data(files.Data):
 
 @dataclass(frozen=True)
 class Video:
-    """A line of the list: the folder of a video's frames, their number, its label, and the place of the line."""
+    """A line of the list: the folder of a video's frames, their number, its label, and the position of the line."""
 
     folder: str
     frames: int
@@ -189,11 +189,13 @@ class Video:
 def read_videos(path: str, where: Where | None = None) -> list[Video]:
     """Read lines ``folder frames label``. Raises SpecError for another line, and for a list without lines."""
     videos = []
-    for line, place in list_lines(path, where):
+    for line, position in list_lines(path, where):
         found = re.fullmatch(r"(.+?)\s+(\d+)\s+(\d+)", line)
         if not found:
-            raise SpecError(f'found "{line}", expected the folder of a video, how many frames it has, its label', place)
-        videos.append(Video(found[1], int(found[2]), int(found[3]), place))
+            raise SpecError(
+                f'found "{line}", expected the folder of a video, how many frames it has, its label', position
+            )
+        videos.append(Video(found[1], int(found[2]), int(found[3]), position))
     if not videos:
         raise SpecError(f'the list "{path}" is empty', where or Where(path))
     return videos
@@ -287,7 +289,7 @@ class VideoData(files.ReadingLayer):
 
     def open(self) -> Source | None:
         p, draws = value(self.param, GROUP), self.draws
-        videos = self.attempt(read_videos, p.source, self.place)
+        videos = self.attempt(read_videos, p.source, self.where)
         transformer = self.attempt(self.transformer, Windows)
         if videos is None or transformer is None:
             return None

@@ -117,8 +117,8 @@ class RegionLoss(_DarknetLoss):
         if len(known):
             best = overlaps(found[..., None, :], around(known[:, 1:3], known[:, 3:5])).max(axis=-1)
             moves[:, OBJECT][best > np.float32(p.thresh)] = 0
-        for label, *place in truth[: _until(truth[:, 3])]:
-            center, extent = np.array(place[:2], np.float32), np.array(place[2:], np.float32)
+        for label, *box in truth[: _until(truth[:, 3])]:
+            center, extent = np.array(box[:2], np.float32), np.array(box[2:], np.float32)
             column, row = (center * side).astype(int)
             like = self.anchors / side if p.bias_match else extents[:, row, column]
             zero = np.zeros_like(like)
@@ -181,11 +181,11 @@ class Yolov3(_DarknetLoss):
             best = overlaps(found, around(known[:, 1:3], known[:, 3:5])).max(axis=-1)
             moves[:, OBJECT][best > np.float32(p.thresh)] = 0
         zero = np.zeros_like(self.anchors)
-        for label, *place in truth[: _until(truth[:, 3])]:
-            extent = np.array(place[2:], np.float32)
+        for label, *box in truth[: _until(truth[:, 3])]:
+            extent = np.array(box[2:], np.float32)
             like = overlaps(around(zero, self.anchors / image), around(zero[:1], extent[None]))
             for n in self._like(like):
-                self._move(moves, cells, shares, n, int(label), np.array(place, np.float32))
+                self._move(moves, cells, shares, n, int(label), np.array(box, np.float32))
         return moves
 
     def _like(self, like: Array) -> list[int]:
@@ -198,15 +198,15 @@ class Yolov3(_DarknetLoss):
         near = np.flatnonzero(like > np.float32(self.settings.iou_thresh)).tolist()
         return first + [self.mask.index(n) for n in near if n in self.mask and n != left_out]
 
-    def _move(self, moves: Array, cells: Array, shares: Array, n: int, label: int, place: Array) -> None:
+    def _move(self, moves: Array, cells: Array, shares: Array, n: int, label: int, box: Array) -> None:
         """Set the desired values of anchor ``n`` of the mask in the cell of a true box."""
         p, map_size = self.settings, np.array(cells.shape[:1:-1], np.float32)
-        column, row = (place[:2] * map_size).astype(int)
+        column, row = (box[:2] * map_size).astype(int)
         at = (n, slice(None), row, column)
         number, share, move = cells[at], shares[at], moves[at]
-        scale = np.float32(p.coord_scale * (2 - place[2] * place[3]))
-        goal = np.log(place[2:] * map_size * np.float32(p.anchors_scale) / self.anchors[self.mask[n]])
-        move[:2] = -scale * (place[:2] * map_size - [column, row] - share[:2])
+        scale = np.float32(p.coord_scale * (2 - box[2] * box[3]))
+        goal = np.log(box[2:] * map_size * np.float32(p.anchors_scale) / self.anchors[self.mask[n]])
+        move[:2] = -scale * (box[:2] * map_size - [column, row] - share[:2])
         move[2:4] = -scale * (goal - number[2:4])
         move[OBJECT] = -(1 - share[OBJECT]) * np.float32(p.object_scale if p.use_logic_gradient else 1)
         wanted, classes, eps = np.zeros(p.num_class, np.float32), share[CLASSES:], p.label_smooth_eps

@@ -43,8 +43,8 @@ class ShuffleChannelExport(Exporter):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         layer = self.layer
         channels = layer.bottom_shapes[0][1]
-        dealt = graph.reshape(bottoms[0], [0, layer.group, channels // layer.group, -1])
-        return graph.reshape_to_top(graph.node("Transpose", dealt, perm=[0, 2, 1, 3]))
+        grouped = graph.reshape(bottoms[0], [0, layer.group, channels // layer.group, -1])
+        return graph.reshape_to_top(graph.node("Transpose", grouped, perm=[0, 2, 1, 3]))
 
 
 @exports("netspec.dialects.blocks.blocks.Interp")
@@ -105,7 +105,7 @@ class DeephiResizeExport(Exporter):
 
 
 @exports("netspec.dialects.blocks.filters.Convolution")
-class FramedConvolutionExport(ConvolutionExport):
+class PaddedConvolutionExport(ConvolutionExport):
     @override
     def onnx_geometry(self) -> dict[str, Any]:
         geometry = super().onnx_geometry()
@@ -126,7 +126,7 @@ class FramedConvolutionExport(ConvolutionExport):
 
 
 @exports("netspec.dialects.blocks.filters.Pooling")
-class FramedPoolingExport(Exporter):
+class PaddedPoolingExport(Exporter):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         layer = self.layer
         for axis in (2, 3):
@@ -135,14 +135,14 @@ class FramedPoolingExport(Exporter):
         if min(layer.frame) < 0:
             raise self.refusal("ONNX", "its windows leave out the map's end")
         value = graph.constant(windows.LOWEST if layer.method == pooling.MAX else 0.0)
-        framed = graph.node(
+        padded = graph.node(
             "Pad", *bottoms, graph.constant([0, 0, up, left, 0, 0, down, right]), value, mode="constant"
         )
         geometry = {"kernel_shape": list(layer.kernel), "strides": list(layer.stride)}
         if layer.method == pooling.MAX:
-            return graph.node("MaxPool", framed, **geometry)
+            return graph.node("MaxPool", padded, **geometry)
         shares = (layer.areas() / math.prod(layer.kernel)).float()
-        return graph.node("Div", graph.node("AveragePool", framed, **geometry), graph.constant(shares[None, None]))
+        return graph.node("Div", graph.node("AveragePool", padded, **geometry), graph.constant(shares[None, None]))
 
 
 @exports("netspec.dialects.blocks.filters.Dropout")

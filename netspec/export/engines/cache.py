@@ -22,15 +22,8 @@ from netspec.files.own_folder import inside
 from netspec.files.whole_file import whole_folder
 from netspec.proto.forks import forks
 
-_EXPORTING = (
-    "dialects",
-    "exact",
-    "export",
-    "graph",
-    "layers",
-    "net",
-    "proto",
-)  # the packages that determine an exported model
+# The packages that determine an exported model.
+_PACKAGES = ("dialects", "exact", "export", "graph", "layers", "net", "proto")
 DIGESTS = "digests.json"  # of the files of an entry, by name
 
 
@@ -41,8 +34,8 @@ def key_of(files: Sequence[str | Path], options: Mapping[str, Any]) -> str:
     """
     digests = [_digest(path) for path in files]
     dialects = [[name, _digest(file) if file else source] for name, file, source in forks().active()]
-    said = {"code": _code(), "files": digests, "dialects": dialects, "options": options}
-    return hashlib.sha256(json.dumps(said, sort_keys=True, default=str).encode()).hexdigest()
+    parts = {"code": _code(), "files": digests, "dialects": dialects, "options": options}
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
 @cache
@@ -61,7 +54,7 @@ def _code() -> str:
     """Return a digest of the source of netspec that exports."""
     folder = Path(__file__).parents[2]
     found = hashlib.sha256()
-    for package in _EXPORTING:
+    for package in _PACKAGES:
         for path in sorted((folder / package).rglob("*.py")):
             found.update(f"{path.relative_to(folder)}\0".encode())
             found.update(path.read_bytes())
@@ -85,30 +78,30 @@ def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, b
     An entry with damaged files is renamed, with a warning, and created again. Raises OSError if the folder
     cannot be written, and SpecError if the entry is a link.
     """
-    place = inside(folder, key)
-    if place.is_dir():
-        if _is_whole(place):
-            return place, False
+    path = inside(folder, key)
+    if path.is_dir():
+        if _is_whole(path):
+            return path, False
         aside = Path(tempfile.mkdtemp(prefix=".damaged-", dir=folder))
-        log.logger.warning(f"{place}: was damaged and is being recreated; the damaged one was renamed to {aside.name}")
+        log.logger.warning(f"{path}: was damaged and is being recreated; the damaged one was renamed to {aside.name}")
         with suppress(FileNotFoundError):  # another process moved it
-            place.rename(aside)
+            path.rename(aside)
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with whole_folder(place) as unfinished:
+        with whole_folder(path) as unfinished:
             make(unfinished)
-            digests = {path.name: _digest(path) for path in unfinished.iterdir()}
+            digests = {file.name: _digest(file) for file in unfinished.iterdir()}
             (unfinished / DIGESTS).write_text(json.dumps(digests))
     except OSError:
-        if not place.is_dir():  # another process may have made the same entry
+        if not path.is_dir():  # another process may have made the same entry
             raise
-    return place, True
+    return path, True
 
 
-def _is_whole(place: Path) -> bool:
+def _is_whole(path: Path) -> bool:
     """Return whether the files of an entry are unchanged. Files that were added later are ignored."""
     try:
-        digests = json.loads((place / DIGESTS).read_bytes())
-        return all(_digest(place / name) == digest for name, digest in digests.items())
+        digests = json.loads((path / DIGESTS).read_bytes())
+        return all(_digest(path / name) == digest for name, digest in digests.items())
     except (OSError, ValueError, AttributeError, SpecError):
         return False

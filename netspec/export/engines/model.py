@@ -99,9 +99,9 @@ class Model:
 
     def _show_difference(self, inputs: Arrays, found: Arrays) -> None:
         """Log the difference of bf16 from fp32. It is measured once, on the first inputs, and kept with the model."""
-        place = self.folder / DIFFERENCE
-        if place.exists():
-            return _warn_again(place)
+        path = self.folder / DIFFERENCE
+        if path.exists():
+            return _warn_again(path)
         exact = _run(open_runner(self.choice.engine, self.folder, FP32), inputs)
         lines = [
             f"precision bf16: {name} differs from fp32 by {_difference(found[name], value):.1e} of its largest value"

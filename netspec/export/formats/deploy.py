@@ -43,7 +43,7 @@ def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool
     probe = build_net(filtered, source, replace(options, device="meta", seed=0, open_data=False))
     built = {layer.param.name: layer for layer in probe.layers}
     result = copy_without(filtered, {"layer"})
-    places, missing = [], set()
+    positions, missing = [], set()
     for i, layer in enumerate(filtered.layer):
         if missing & set(layer.bottom):
             missing.update(layer.top)
@@ -51,13 +51,13 @@ def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool
         missing.difference_update(layer.top)
         if not reads_data(built[layer.name]):
             result.layer.add().CopyFrom(layer)
-            places.append(source.layers[i])
+            positions.append(source.layers[i])
             continue
         kept = list(layer.top) if labels else list(layer.top)[:1]
         missing.update(list(layer.top)[len(kept) :])
         add_input(result, layer.name, dict(zip(kept, built[layer.name].top_shapes, strict=False)))
-        places.append(source.layers[i])
-    return result, source.with_layers(places)
+        positions.append(source.layers[i])
+    return result, source.with_layers(positions)
 
 
 def fold(net: Net) -> NetParameter:

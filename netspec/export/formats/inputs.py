@@ -55,14 +55,14 @@ def prune(
         needed -= fresh - set(given)
         needed.update(layer.bottom)
     pruned = copy_without(net, {"layer"})
-    places = []
+    positions = []
     for name, shape in given.items():
         add_input(pruned, name, {name: shape})
-        places.append(source.net)
+        positions.append(source.net)
     for i in reversed(kept):
         pruned.layer.add().CopyFrom(net.layer[i])
-        places.append(source.layers[i])
-    return pruned, source.with_layers(places)
+        positions.append(source.layers[i])
+    return pruned, source.with_layers(positions)
 
 
 def wrong_given_shapes(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:

@@ -100,9 +100,9 @@ class _DataFile:
     def write(self, array: np.ndarray) -> dict[str, str]:
         """Append an array; return its location in ONNX's format."""
         self.file.seek(-(-self.file.tell() // PAGE) * PAGE)
-        place = {"location": self.name, "offset": str(self.file.tell()), "length": str(array.nbytes)}
+        found = {"location": self.name, "offset": str(self.file.tell()), "length": str(array.nbytes)}
         self.file.write(array.data)
-        return place
+        return found
 
 
 class _Writer:

@@ -17,7 +17,7 @@ class BatchNormExport(Exporter):
         if not layer.use_global_stats:
             return onnx_normalized(graph, bottoms[0], len(layer.bottom_shapes[0]), eps)
         ones, zeros = torch.ones(layer.channels), torch.zeros(layer.channels)
-        constants = [graph.constant(values) for values in (ones, zeros, *layer.past())]
+        constants = [graph.constant(values) for values in (ones, zeros, *layer.stored_statistics())]
         return graph.node("BatchNormalization", *bottoms, *constants, epsilon=eps)
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str:
@@ -25,7 +25,7 @@ class BatchNormExport(Exporter):
         eps = rounded(layer.param.batch_norm_param.eps)
         if not layer.use_global_stats:
             return code.call("F.batch_norm({x}, None, None, training=True, eps={eps})", x=bottoms[0], eps=eps)
-        mean, variance = layer.past()
+        mean, variance = layer.stored_statistics()
         norm = torch_batch_norm(code, len(layer.bottom_shapes[0]), mean, variance, eps)
         return code.call("{norm}({x})", norm=norm, x=bottoms[0])
 

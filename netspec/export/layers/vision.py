@@ -189,9 +189,9 @@ class PoolingBaseExport(Exporter):
             return graph.node("Div", means, graph.constant(areas[None, None]))
         ones = graph.node("Expand", graph.constant(1.0), graph.shape_of(data))
         frame = graph.constant([0, 0, *windows.pad, 0, 0, *windows.pad])
-        framed = graph.node("Pad", ones, frame, graph.constant(1.0), mode="constant")
+        padded = graph.node("Pad", ones, frame, graph.constant(1.0), mode="constant")
         counts = dict(geometry, pads=[0, 0, *beyond])
-        return graph.node("Div", means, graph.node("AveragePool", framed, count_include_pad=1, **counts))
+        return graph.node("Div", means, graph.node("AveragePool", padded, count_include_pad=1, **counts))
 
     def torch_pool(self, code: TorchCode, x: str, windows: Windows, method: int, mask: bool = False) -> str:
         """Return the expression of the pooled maps; with ``mask``, of the maps and the mask."""

@@ -16,11 +16,11 @@ def _capped_folds(layer: Any) -> Folds:
     return Folds(activation=None if layer.slope else clip(0, 6))
 
 
-def _framed(layer: Any, how: Inference) -> Kernel | None:
+def _padded(layer: Any, how: Inference) -> Kernel | None:
     return None if any(layer.sides) else convolution(layer, how)
 
 
-def _learn_framed(layer: Any, how: Learning) -> Kernels | None:
+def _learn_padded(layer: Any, how: Learning) -> Kernels | None:
     return None if any(layer.sides) else learn_convolution(layer, how)
 
 
@@ -53,7 +53,7 @@ ENTRIES = {
     "netspec.dialects.blocks.blocks.DepthwiseConvolution": CONVOLUTION,
     "netspec.dialects.blocks.blocks.ReLU6": _CAPPED,
     "netspec.dialects.blocks.filters.Convolution": Entry(
-        _framed, _learn_framed, convolution_folds, fresh=True, any_layout=True
+        _padded, _learn_padded, convolution_folds, fresh=True, any_layout=True
     ),
     "netspec.dialects.blocks.filters.ReLU": _CAPPED,
     "netspec.dialects.blocks.nvidia.BatchNorm": Entry(folds=_nvidia_folds),

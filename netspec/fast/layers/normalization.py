@@ -26,17 +26,17 @@ def _folds(layer: BatchNorm) -> Folds:
     return Folds(affine=(lambda: affine(layer)) if layer.use_global_stats else None)
 
 
-def _by_past(layer: BatchNorm, how: Inference) -> Kernel | None:
+def _by_stored_statistics(layer: BatchNorm, how: Inference) -> Kernel | None:
     if not layer.use_global_stats:
         return None
-    return with_activation(layer.by_past(layer.arithmetic(layer.blob(0))), how.activation)
+    return with_activation(layer.by_stored_statistics(layer.arithmetic(layer.blob(0))), how.activation)
 
 
 def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
     if layer.use_global_stats or math.prod(layer.top_shapes[0]) == 0 or layer.arithmetic(layer.blob(0)).is_caffes:
         return None
     buffer, rectifies, sums = Buffer(), layer.rectifies, [*how.sums[3:], None, None][:2]
-    asked = [how.wanted[0], *(total is not None for total in sums)]
+    needed = [how.wanted[0], *(total is not None for total in sums)]
     gradients, rectified = torch.ops.aten.native_batch_norm_backward, torch.ops.aten.threshold_backward.grad_input
     given = top = mean = deviation = torch.empty(0)
 
@@ -51,7 +51,7 @@ def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
         if rectifies:
             diff = rectified(diff, top, 0, grad_input=buffer.like(top))
         factors = layer.factors()[0]
-        found, *learned = gradients(diff, given, factors, None, None, mean, deviation, True, layer.eps, asked)
+        found, *learned = gradients(diff, given, factors, None, None, mean, deviation, True, layer.eps, needed)
         for total, gradient in zip(sums, learned, strict=True):
             if total is not None:
                 total.add_(gradient)
@@ -60,4 +60,4 @@ def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
     return Kernels(forward, backward)
 
 
-ENTRIES = {BatchNorm: Entry(_by_past, _learn, _folds, fresh=True, any_layout=True)}
+ENTRIES = {BatchNorm: Entry(_by_stored_statistics, _learn, _folds, fresh=True, any_layout=True)}

@@ -78,7 +78,7 @@ def _convolutions(
     """
     weight, bias, *sums = weights
     geometry = (sliding.stride, sliding.pad, sliding.dilation)
-    asked = (wanted, *(total is not None for total in sums))
+    needed = (wanted, *(total is not None for total in sums))
     bias_shape = None if bias is None else list(bias.shape)
     # The reshapes below are those of autograd. They set the strides of a single image, on which the rounding of
     # BatchNorm depends.
@@ -94,7 +94,7 @@ def _convolutions(
 
     def backward(diff: torch.Tensor) -> torch.Tensor | None:
         maps_diff, *found = gradients(
-            diff.reshape(top_shape), laid_out, weight, bias_shape, *geometry, False, [0, 0], group, asked
+            diff.reshape(top_shape), laid_out, weight, bias_shape, *geometry, False, [0, 0], group, needed
         )
         for total, gradient in zip(sums, found, strict=True):
             if total is not None:

@@ -28,7 +28,7 @@ from netspec.net.net import Net
 from netspec.net.weights import load_weights
 from netspec.proto.binary import is_net_binary, split_paths
 from netspec.proto.schema import TEST, NetParameter, PhaseValue, SolverParameter
-from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.checks import check_prefix, check_settings
 from netspec.solver.nets import TRAIN_NET, seed_of, solver_nets
@@ -125,7 +125,7 @@ def _check_net(
 
 def _check_solver(
     solver: SolverParameter,
-    node: Place,
+    node: Position,
     path: str | Path,
     weights: Iterable[str],
     options: BuildOptions,

@@ -11,7 +11,7 @@ from netspec.files.kinds import HDF5, head_of
 from netspec.inspect.check.compare_nets import compare_in_state, compare_nets
 from netspec.inspect.check.difference import Difference, Differences, differences
 from netspec.proto.binary import is_net_binary
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.nets import SolverNet, solver_nets
 
@@ -37,7 +37,7 @@ def compare_files(first: str | Path, second: str | Path, tolerance: float = 0.0)
 
 
 def _read(path: str | Path) -> tuple[Any, ...]:
-    """Return the kind of a file, and for a net or a solver also the message and its places."""
+    """Return the kind of a file, and for a net or a solver also the message and its positions."""
     named = Path(path).suffix in (".caffemodel", ".h5")  # also if damaged; its reader reports the damage
     if Path(path).is_file() and (named or is_net_binary(path) or head_of(path).startswith(HDF5)):
         return (WEIGHTS,)
@@ -50,7 +50,7 @@ def _read(path: str | Path) -> tuple[Any, ...]:
             raise max(as_net, as_solver, key=lambda fault: fault.where.line if fault.where else 0) from None
 
 
-def _compare_solvers(first: tuple[Any, Place], second: tuple[Any, Place]) -> Differences:
+def _compare_solvers(first: tuple[Any, Position], second: tuple[Any, Position]) -> Differences:
     """Yield the differences between the settings and between the nets. Paths of readable nets are not compared."""
     (one, there), (other, here) = first, second
     yield from differences(one, other, here, there, _NETS)

@@ -95,8 +95,8 @@ def _matched(old: _PlannedNet, new: _PlannedNet) -> dict[Key, Key]:
 
 def _alike(old: _PlannedNet, i: int, new: _PlannedNet, j: int) -> bool:
     one, other = old.plan.net.layer[i], new.plan.net.layer[j]
-    place = old.plan.source.layers[i]
-    return one.type == other.type and not any(differences(one, other, place, place, _WIRING))
+    position = old.plan.source.layers[i]
+    return one.type == other.type and not any(differences(one, other, position, position, _WIRING))
 
 
 def _layers(old: _PlannedNet, new: _PlannedNet, i: int, j: int, names: Mapping[Key, Key]) -> Differences:
@@ -162,13 +162,13 @@ def _params(old: _PlannedNet, new: _PlannedNet, i: int, j: int, names: Mapping[K
     there, here = old.plan.source.layers[i], new.plan.source.layers[j]
     for k in range(max(len(one.param), len(other.param))):
         specs = [layer.param[k] if k < len(layer.param) else ParamSpec() for layer in (one, other)]
-        places = child(here, "param", k), child(there, "param", k)
-        for each in differences(specs[0], specs[1], *places, ignored=("name",)):
+        positions = child(here, "param", k), child(there, "param", k)
+        for each in differences(specs[0], specs[1], *positions, ignored=("name",)):
             yield replace(each, message=f"param {k}: {each.message}")
         was, now = _owner(old, i, k), _owner(new, j, k)
         if (was and (names.get(was[0], was[0]), was[1])) != now:
             message = f"param {k} is {_shared(now)}, was {_shared(was)}"
-            yield Difference(places[0].where, message, places[1].where)
+            yield Difference(positions[0].where, message, positions[1].where)
 
 
 def _owner(seen: _PlannedNet, i: int, k: int) -> tuple[Key, int] | None:

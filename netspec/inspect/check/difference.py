@@ -10,7 +10,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
 
 from netspec.errors import Where, printable
 from netspec.proto.schema import Field, fields_of
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 from netspec.proto.writer import scalar_text
 
 #: Fields whose absence has a different meaning than their default.
@@ -38,8 +38,8 @@ ABSENT = "absent"
 class Difference:
     """One difference between two files, as a line of text.
 
-    ``where`` is its place in the second file, or in the first if it has none there. ``other`` is the place in the first
-    file, if there is one in both.
+    ``where`` is its position in the second file, or in the first if it has none there. ``other`` is the position in
+    the first file, if there is one in both.
     """
 
     where: Where
@@ -47,8 +47,8 @@ class Difference:
     other: Where | None = None
 
     def __str__(self) -> str:
-        place = f" ({_short(self.other)})" if self.other else ""
-        return printable(f"{self.where}: {self.message}{place}")
+        other = f" ({_short(self.other)})" if self.other else ""
+        return printable(f"{self.where}: {self.message}{other}")
 
 
 def _short(where: Where) -> str:
@@ -58,8 +58,8 @@ def _short(where: Where) -> str:
 Differences = Iterator[Difference]
 
 
-def differences(first: Any, second: Any, here: Place, there: Place, ignored: Collection[str] = ()) -> Differences:
-    """Yield the differences of ``second`` from ``first``; ``here`` is the place of ``second``, ``there`` of ``first``.
+def differences(first: Any, second: Any, here: Position, there: Position, ignored: Collection[str] = ()) -> Differences:
+    """Yield the differences of ``second`` from ``first``; their positions are ``here`` and ``there``.
 
     The fields ``ignored`` are fields of the outermost message. Spellings with the same meaning are equal: ``kernel_h``
     and ``kernel_w`` for ``kernel_size``, one number for several equal ones, ``concat_dim`` for ``axis``.
@@ -88,17 +88,17 @@ def differences(first: Any, second: Any, here: Place, there: Place, ignored: Col
             yield from _in_field(first, second, here, there, field)
 
 
-def _in_field(first: Any, second: Any, here: Place, there: Place, field: Field) -> Differences:
+def _in_field(first: Any, second: Any, here: Position, there: Position, field: Field) -> Differences:
     name = field.name
-    places = here.find(name), there.find(name)
+    positions = here.find(name), there.find(name)
     one, other = field.get(first), field.get(second)
     by_presence = (first.DESCRIPTOR.full_name, name) in PRESENCE_MATTERS
     if by_presence and field.present(first) != field.present(second):
         shown = [_value_text(field, m) if field.present(m) else ABSENT for m in (first, second)]
-        yield Difference(places[0], f"{name} is {shown[1]}, was {shown[0]}", places[1])
+        yield Difference(positions[0], f"{name} is {shown[1]}, was {shown[0]}", positions[1])
     elif field.type == Declared.TYPE_MESSAGE and field.repeated:
         if len(one) != len(other):
-            yield Difference(places[0], f"{len(other)} {name} {{ }}, were {len(one)}", places[1])
+            yield Difference(positions[0], f"{len(other)} {name} {{ }}, were {len(one)}", positions[1])
         for k, (a, b) in enumerate(zip(one, other, strict=False)):
             yield from differences(a, b, child(here, name, k), child(there, name, k))
     elif field.type == Declared.TYPE_MESSAGE:
@@ -106,14 +106,14 @@ def _in_field(first: Any, second: Any, here: Place, there: Place, field: Field) 
             yield from differences(one, other, child(here, name), child(there, name))
     elif list(one) != list(other) if field.repeated else one != other and not (one != one and other != other):
         yield Difference(
-            places[0], f"{name} is {_value_text(field, second)}, was {_value_text(field, first)}", places[1]
+            positions[0], f"{name} is {_value_text(field, second)}, was {_value_text(field, first)}", positions[1]
         )
 
 
-def child(place: Place, name: str, index: int = 0) -> Place:
-    """Return the place of a message in a field, or the place of the outer message if it is absent."""
-    children = place.fields.get(name, ())
-    return children[index] if index < len(children) else Place(place.where)
+def child(outer: Position, name: str, index: int = 0) -> Position:
+    """Return the position of a message in a field, or that of the outer message if it is absent."""
+    children = outer.fields.get(name, ())
+    return children[index] if index < len(children) else Position(outer.where)
 
 
 def _window(message: Any, fields: dict[str, Field], name: str, sides: list[str], default: int) -> tuple[int, ...]:
@@ -138,6 +138,6 @@ def _value_text(field: Field, message: Any) -> str:
 
 
 def labeled(difference: Difference, layer: Any) -> Difference:
-    """Return the difference with the layer's name and type added to its place."""
+    """Return the difference with the layer's name and type added to its position."""
     where = Where(difference.where.file, difference.where.line, difference.where.column, layer.name, layer.type)
     return Difference(where, difference.message, difference.other)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from netspec.errors import SpecError, Where, did_you_mean, printable
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 
 # Kinds of input for rules, see Rule.
 TEXT, PLAN, NET, SETTINGS, SOLVER = "text", "plan", "net", "settings", "solver"
@@ -23,13 +23,13 @@ UNKNOWN_RULE = "unknown-rule"
 
 _COMMENT = re.compile(r"#\s*lint:\s*ignore\s*=\s*([\w-]+(?:\s*,\s*[\w-]+)*)")
 
-Findings = Iterator[tuple[Where, str]]  # places, and messages: what was found and what to do
+Findings = Iterator[tuple[Where, str]]  # positions, and messages: what was found and what to do
 F = TypeVar("F", bound=Callable[..., Findings])
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of advice: the rule, the place, what was found and what to do."""
+    """One line of advice: the rule, the position, what was found and what to do."""
 
     rule: str
     where: Where
@@ -98,22 +98,22 @@ def findings_as_json(faults: Iterable[SpecError], found: Iterable[Finding]) -> d
     Lines and columns start at 1; 0 means unknown.
     """
     return {
-        "faults": [{**_place(fault.where or Where("")), "message": fault.message} for fault in faults],
-        "warnings": [{**_place(each.where), "message": each.message, "rule": each.rule} for each in found],
+        "faults": [{**_fields(fault.where or Where("")), "message": fault.message} for fault in faults],
+        "warnings": [{**_fields(each.where), "message": each.message, "rule": each.rule} for each in found],
     }
 
 
-def _place(where: Where) -> dict[str, Any]:
+def _fields(where: Where) -> dict[str, Any]:
     return {"file": where.file, "line": where.line, "column": where.column, "layer": where.layer, "type": where.type}
 
 
-def not_ignored(found: Iterable[Finding], file: str, layers: Sequence[Place] = ()) -> list[Finding]:
+def not_ignored(found: Iterable[Finding], file: str, layers: Sequence[Position] = ()) -> list[Finding]:
     """Return the findings that no comment in the file disables, and findings about such comments.
 
-    ``layers`` are the places of the net's layers.
+    ``layers`` are the positions of the net's layers.
     """
     ignored = _ignored(file)
-    starts = sorted(place.where.line for place in layers)
+    starts = sorted(layer.where.line for layer in layers)
     kept = []
     for each in found:
         lines = {each.where.line or _first_line(file)}
@@ -130,7 +130,7 @@ def not_ignored(found: Iterable[Finding], file: str, layers: Sequence[Place] = (
 
 
 def _ignored(file: str) -> dict[int, dict[str, Where]]:
-    """Return the names of rules that are ignored by line, each with the place of its comment."""
+    """Return the names of rules that are ignored by line, each with the position of its comment."""
     ignored: dict[int, dict[str, Where]] = {}
     waiting: dict[str, Where] = {}
     for number, line in enumerate(_lines(file), 1):

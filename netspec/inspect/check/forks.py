@@ -30,7 +30,7 @@ def python_layers(net: NetParameter, source: SourceMap) -> Iterator[SpecError]:
 
 
 def gathered(faults: Sequence[SpecError]) -> list[SpecError]:
-    """Return the faults with those of the same unknown field or layer type joined, at the place of the first.
+    """Return the faults with those of the same unknown field or layer type joined, at the position of the first.
 
     An error in several nets of a solver counts once.
     """
@@ -44,8 +44,8 @@ def gathered(faults: Sequence[SpecError]) -> list[SpecError]:
 
 def others(faults: Sequence[SpecError], unknown: Sequence[SpecError]) -> list[SpecError]:
     """Return the faults without those that an unknown field or type in the same layer may have caused."""
-    places = {(fault.where.file, fault.where.layer) for fault in unknown if fault.where and fault.where.layer}
-    own = [fault for fault in faults if fault.where and (fault.where.file, fault.where.layer) in places]
+    positions = {(fault.where.file, fault.where.layer) for fault in unknown if fault.where and fault.where.layer}
+    own = [fault for fault in faults if fault.where and (fault.where.file, fault.where.layer) in positions]
     return [fault for fault in faults if fault not in own or fault.message.startswith("unknown bottom blob")]
 
 

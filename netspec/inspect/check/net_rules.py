@@ -66,7 +66,7 @@ def _unused(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
         for j, v in enumerate(node.tops):
             name = plan.blobs[v]
             if plan.outputs.get(name) == v and not any(weights[i][j : j + 1]):
-                yield _place(plan, i), f'no layer uses blob "{name}"; remove it, or add a Silence layer'
+                yield _where(plan, i), f'no layer uses blob "{name}"; remove it, or add a Silence layer'
 
 
 @rule("loss-without-weight", PLAN)
@@ -75,7 +75,7 @@ def _weightless(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
     for i, weights in enumerate(_loss_weights(plan) if _is_training(plan) else ()):
         cls = layer_class(plan.nodes[i].type)
         if cls is not None and cls.is_loss and not any(weights):
-            yield _place(plan, i, "loss_weight"), "a loss of weight 0 trains nothing; set another loss_weight"
+            yield _where(plan, i, "loss_weight"), "a loss of weight 0 trains nothing; set another loss_weight"
 
 
 @rule("batchnorm-without-scale", PLAN)
@@ -87,7 +87,7 @@ def _bare_batch_norms(net: NetParameter, source: SourceMap, plan: Plan) -> Findi
             readers.setdefault(v, set()).add(node.type)
     for i, node in enumerate(plan.nodes):
         if node.type == "BatchNorm" and node.tops and "Scale" not in readers.get(node.tops[0], set()):
-            yield _place(plan, i), "no Scale layer follows; Caffe's BatchNorm itself does not scale and shift"
+            yield _where(plan, i), "no Scale layer follows; Caffe's BatchNorm itself does not scale and shift"
 
 
 @rule("bias-before-batchnorm", PLAN)
@@ -100,7 +100,7 @@ def _lost_biases(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
             fields = fields_of(param.DESCRIPTOR)
             if "weight_filler" in fields and "bias_term" in fields and param.bias_term:
                 message = f'its bias is subtracted again by BatchNorm "{node.name}"; set bias_term: false'
-                yield _place(plan, i, name), message
+                yield _where(plan, i, name), message
 
 
 @rule("global-stats-in-training", PLAN)
@@ -111,8 +111,8 @@ def _global_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Find
     """
     for i, node in enumerate(plan.nodes if _is_training(plan) else ()):
         if node.type == "BatchNorm" and plan.net.layer[i].batch_norm_param.use_global_stats:
-            place = _place(plan, i, "batch_norm_param", "use_global_stats")
-            yield place, "use_global_stats is true in phase TRAIN; remove it, so that each phase uses its default"
+            where = _where(plan, i, "batch_norm_param", "use_global_stats")
+            yield where, "use_global_stats is true in phase TRAIN; remove it, so that each phase uses its default"
 
 
 @rule("batch-stats-in-test", PLAN)
@@ -121,8 +121,8 @@ def _batch_statistics(net: NetParameter, source: SourceMap, plan: Plan) -> Findi
     for i, node in enumerate(plan.nodes if plan.net.state.phase == TEST else ()):
         param = plan.net.layer[i].batch_norm_param
         if node.type == "BatchNorm" and param.HasField("use_global_stats") and not param.use_global_stats:
-            place = _place(plan, i, "batch_norm_param", "use_global_stats")
-            yield place, "use_global_stats is false in phase TEST; remove it, so that each phase uses its default"
+            where = _where(plan, i, "batch_norm_param", "use_global_stats")
+            yield where, "use_global_stats is false in phase TEST; remove it, so that each phase uses its default"
 
 
 @rule("zero-weights", PLAN)
@@ -138,7 +138,7 @@ def _zero_weights(net: NetParameter, source: SourceMap, plan: Plan) -> Findings:
             fields = fields_of(param.DESCRIPTOR)
             if "weight_filler" in fields and not fields["weight_filler"].present(param):
                 yield (
-                    _place(plan, i, name),
+                    _where(plan, i, name),
                     'its initial weights are all 0; add weight_filler { type: "xavier" } or another',
                 )
 
@@ -152,7 +152,7 @@ def _softmax_twice(net: NetParameter, source: SourceMap, plan: Plan) -> Findings
         if maker >= 0 and plan.nodes[maker].type == "Softmax":
             name = plan.nodes[maker].name
             yield (
-                _place(plan, i),
+                _where(plan, i),
                 f'its bottom is Softmax "{name}", but it computes a softmax itself; use the bottom of "{name}"',
             )
 
@@ -182,7 +182,7 @@ def _towers(net: Net) -> Findings:
             if count:
                 total = len(net.layers[i].blobs)
                 yield (
-                    _place(net.plan, i),
+                    _where(net.plan, i),
                     f"{count} of its {total} parameter blobs are not shared with the other branch of "
                     f'"{node.name}"; give them the same param {{ name }}',
                 )
@@ -193,7 +193,7 @@ def _losses(net: Net) -> Findings:
     """A loss that depends on no learnable parameter has no effect on the training."""
     for i, weights in enumerate(net.loss_weights if net.phase == TRAIN else ()):
         if any(weights) and not net.backward_plan.layers[i]:
-            yield (_place(net.plan, i), "this loss depends on no learnable parameter; is lr_mult 0?")
+            yield (_where(net.plan, i), "this loss depends on no learnable parameter; is lr_mult 0?")
 
 
 @rule("caffe-stops", NET)
@@ -208,15 +208,15 @@ def _caffe_stops(net: Net) -> Findings:
             fewest, most = AXES.get(node.type, (0, 32))
             if not fewest <= len(shape) <= most:
                 message = f"Caffe stops here: {node.type} takes {fewest} to {most} axes, bottom {j} has {len(shape)}"
-                yield _place(net.plan, i, "bottom", j), f"{message}; put a Reshape before it"
+                yield _where(net.plan, i, "bottom", j), f"{message}; put a Reshape before it"
         if node.type == "Pooling" and net.plan.net.layer[i].pooling_param.pool == STOCHASTIC:
             message = "Caffe stops here without a GPU: it has STOCHASTIC pooling only for CUDA; set another pool"
-            yield _place(net.plan, i, "pooling_param", "pool"), message
+            yield _where(net.plan, i, "pooling_param", "pool"), message
         asked = net.backward_plan.bottoms[i] if net.phase == TRAIN and net.backward_plan.layers[i] else ()
         for j, wanted in enumerate(asked):
             if wanted and (node.type in WITHOUT_GRADIENT or j in layer.label_bottoms):
                 message = f"Caffe stops in the backward pass: {node.type} has no gradient for bottom {j}"
-                yield _place(net.plan, i, "bottom", j), f"{message}; set propagate_down: false"
+                yield _where(net.plan, i, "bottom", j), f"{message}; set propagate_down: false"
 
 
 @rule("never-learns", NET)
@@ -227,7 +227,7 @@ def _never_learns(net: Net) -> Findings:
     learned = {item.layer for item in net.learnable if item.lr_mult}
     for i, node in enumerate(net.plan.nodes):
         if node.name in learned and not net.backward_plan.layers[i] and net.layers[i].blob_shapes:
-            yield _place(net.plan, i), "no loss depends on it, so it learns nothing; set lr_mult: 0, or use its blob"
+            yield _where(net.plan, i), "no loss depends on it, so it learns nothing; set lr_mult: 0, or use its blob"
 
 
 @rule("same-name", NET)
@@ -237,7 +237,7 @@ def _namesakes(net: Net) -> Findings:
     for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
         if node.name in names and layer.blob_shapes:
             yield (
-                _place(net.plan, i),
+                _where(net.plan, i),
                 "an earlier layer has the same name; loaded weights go to that layer only; rename one",
             )
         names.add(node.name)
@@ -267,7 +267,7 @@ def own_settings(layer: Any) -> Iterator[tuple[str, Any]]:
             yield name, field.get(layer)
 
 
-def _place(plan: Plan, i: int, *path: str | int) -> Where:
+def _where(plan: Plan, i: int, *path: str | int) -> Where:
     return plan.source.at(i, *path, layer=plan.nodes[i].name, type=plan.nodes[i].type)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from netspec.inspect.check.findings import SETTINGS, SOLVER, Findings, rule
 from netspec.inspect.check.net_rules import own_settings
 from netspec.net.net import Net
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 
 TOLERANCE = 0.1  # share of the records that a test may skip or read twice
 #: The settings that each rate policy, and each update rule, reads.
@@ -30,7 +30,7 @@ RULE_SETTINGS = {
 
 
 @rule("no-snapshot", SETTINGS)
-def _snapshots(solver: Any, node: Place) -> Findings:
+def _snapshots(solver: Any, node: Position) -> Findings:
     """Without a snapshot, the trained weights are lost."""
     if solver.snapshot > solver.max_iter:
         message = f"snapshot {solver.snapshot} is more than max_iter {solver.max_iter}, so it has no effect; lower it"
@@ -40,7 +40,7 @@ def _snapshots(solver: Any, node: Place) -> Findings:
 
 
 @rule("no-effect", SETTINGS)
-def _settings(solver: Any, node: Place) -> Findings:
+def _settings(solver: Any, node: Position) -> Findings:
     """A setting that the chosen policy or rule ignores may be meant for another one."""
     for name in settings_without_effect(solver):
         message = f"{name} has no effect with type {solver.type} and lr_policy {solver.lr_policy}; remove it"
@@ -48,7 +48,7 @@ def _settings(solver: Any, node: Place) -> Findings:
 
 
 @rule("step-after-end", SETTINGS)
-def _steps(solver: Any, node: Place) -> Findings:
+def _steps(solver: Any, node: Position) -> Findings:
     """A step of the learning rate after the last iteration has no effect."""
     steps = {"step": ("stepsize", [solver.stepsize]), "multistep": ("stepvalue", solver.stepvalue)}
     name, values = steps.get(solver.lr_policy, ("", []))
@@ -59,7 +59,7 @@ def _steps(solver: Any, node: Place) -> Findings:
 
 
 @rule("test-after-end", SETTINGS)
-def _tests(solver: Any, node: Place) -> Findings:
+def _tests(solver: Any, node: Position) -> Findings:
     """If the test interval is longer than the training, tests run only at the start, if at all."""
     if solver.test_iter and solver.test_interval > solver.max_iter:
         message = f"test_interval {solver.test_interval} is more than max_iter {solver.max_iter}; lower it"
@@ -67,7 +67,7 @@ def _tests(solver: Any, node: Place) -> Findings:
 
 
 @rule("test-size", SOLVER)
-def _test_sizes(solver: Any, node: Place, nets: Sequence[Net]) -> Findings:
+def _test_sizes(solver: Any, node: Position, nets: Sequence[Net]) -> Findings:
     """A test should read each record of its data once.
 
     This rule needs the data (``--data``). It allows a tenth more or less.
@@ -86,7 +86,7 @@ def _test_sizes(solver: Any, node: Place, nets: Sequence[Net]) -> Findings:
 
 
 @rule("tested-on-training-data", SOLVER)
-def _same_data(solver: Any, node: Place, nets: Sequence[Net]) -> Findings:
+def _same_data(solver: Any, node: Position, nets: Sequence[Net]) -> Findings:
     """A test on the training data does not show how good the net is on other data.
 
     A data layer without a phase is also used in phase TEST, by `netspec test` or `lmdb-build compare`.
@@ -95,16 +95,16 @@ def _same_data(solver: Any, node: Place, nets: Sequence[Net]) -> Findings:
     for net in nets[1:]:
         for i, layer, field, source in _sources(net):
             if os.path.realpath(source) in trained:
-                place = net.plan.source.at(i, field, "source", layer=layer.name, type=layer.type)
-                yield place, f'the test reads "{source}", which the net is trained on; use another database'
+                position = net.plan.source.at(i, field, "source", layer=layer.name, type=layer.type)
+                yield position, f'the test reads "{source}", which the net is trained on; use another database'
     if len(nets) == 1 and (solver.net or solver.HasField("net_param")):
         for i, layer, field, source in _sources(nets[0]):
             if not layer.include and not layer.exclude:
-                place = nets[0].plan.source.at(i, field, "source", layer=layer.name, type=layer.type)
+                position = nets[0].plan.source.at(i, field, "source", layer=layer.name, type=layer.type)
                 message = (
                     f'a test would also read "{source}", which the net is trained on; add a data layer for phase TEST'
                 )
-                yield place, message
+                yield position, message
 
 
 def _sources(net: Net) -> Iterator[tuple[int, Any, str, str]]:
@@ -116,7 +116,7 @@ def _sources(net: Net) -> Iterator[tuple[int, Any, str, str]]:
 
 
 @rule("filled-by-script", SOLVER)
-def _filled_by_script(solver: Any, node: Place, nets: Sequence[Net]) -> Findings:
+def _filled_by_script(solver: Any, node: Position, nets: Sequence[Net]) -> Findings:
     """A net with inputs that no layer fills can only be trained by a script; ``netspec train`` refuses it."""
     for net in nets:
         for fault in net.missing_inputs():
@@ -125,7 +125,7 @@ def _filled_by_script(solver: Any, node: Place, nets: Sequence[Net]) -> Findings
 
 
 @rule("untrained-in-test", SOLVER)
-def _untrained(solver: Any, node: Place, nets: Sequence[Net]) -> Findings:
+def _untrained(solver: Any, node: Position, nets: Sequence[Net]) -> Findings:
     """A test net gets its weights from the training net, layer by layer, by name.
 
     A layer that the training net does not have is tested with random weights.

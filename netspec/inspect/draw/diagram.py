@@ -22,7 +22,7 @@ from netspec.graph.plan import Node, Plan, make_plan
 from netspec.layers import Layer, layer_class
 from netspec.net.build import build_filtered
 from netspec.proto.schema import PHASE_NAMES, NetParameter, PhaseValue, fields_of
-from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.text import write_text
 from netspec.proto.writer import scalar_text
 
@@ -155,9 +155,9 @@ def diagram_of(
 
 def _net_in_phase(net: NetParameter, source: SourceMap, phase: str, options: BuildOptions) -> _NetInPhase:
     """Filter, plan and build a net in its state."""
-    numbered = source.with_layers(Place(Where(str(k))) for k in range(len(net.layer)))
+    numbered = source.with_layers(Position(Where(str(k))) for k in range(len(net.layer)))
     filtered, numbers = filter_net(net, numbered)
-    numbers = [int(place.where.file) for place in numbers.layers]
+    numbers = [int(layer.where.file) for layer in numbers.layers]
     placed = source.with_layers(source.layers[k] for k in numbers)
     # The build, which plans again with splits, reports errors in the connections.
     plan = make_plan(filtered, placed.reporting_to(lambda fault: None))

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnnotationBbox, OffsetImage
 
 from netspec.data.datum import shape_text
-from netspec.files.figures import COLORS
+from netspec.files.figures import COLORS, PALE
 from netspec.files.opencv import cv2
-from netspec.inspect.draw.style import PALE, STYLE, split
+from netspec.inspect.draw.style import STYLE, split
 from netspec.log import number
 
 WIDTH = 9.0  # inches

@@ -13,11 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from netspec.files.figures import COLORS
+from netspec.files.figures import COLORS, PALE
 from netspec.inspect.check.survey import Survey, as_lines
 from netspec.inspect.draw.style import (
     FAULT,
-    PALE,
     STYLE,
     as_picture,
     draw_tile,

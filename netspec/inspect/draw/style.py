@@ -17,7 +17,7 @@ from netspec.errors import SpecError, Where
 from netspec.files import figures
 from netspec.files.whole_file import why_unwritable, write_whole
 
-GRID, PALE, FAULT = "#e6e6e6", "#777777", "#c62828"
+FAULT = "#c62828"
 DPI = 144
 ENDINGS = ("png", "svg", "html")
 

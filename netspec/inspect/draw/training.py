@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
-from netspec.files.figures import COLORS
-from netspec.inspect.draw.style import FAULT, GRID, STYLE
+from netspec.files.figures import COLORS, GRID
+from netspec.inspect.draw.style import FAULT, STYLE
 from netspec.inspect.logs.training_log import Curve, TrainingLog, shown_range, smoothed, thinned
 from netspec.log import logger
 

@@ -30,7 +30,7 @@ def device_of(name: str | torch.device) -> torch.device:
 
 
 def nowhere(*path: str | int) -> Where:
-    """Return the place of a layer that is not in a file."""
+    """Return the position of a layer that is not in a file."""
     return Where("<layer>")
 
 
@@ -85,8 +85,8 @@ class Context:
 
     If ``options.open_data`` is false, a layer must not open its files. The shapes of its tops are then in
     ``options.given_shapes`` (by blob name), or it raises a SpecError that asks for ``--shape``.
-    ``at(*path)`` is the place in the prototxt of a field of this layer. ``report`` is called with each error that does
-    not stop the building of the net; by default it raises the error.
+    ``at(*path)`` is the position in the prototxt of a field of this layer. ``report`` is called with each error that
+    does not stop the building of the net; by default it raises the error.
     """
 
     phase: int = TEST

@@ -201,8 +201,8 @@ class ReadingLayer(Layer):
         return kind(self.param.transform_param, self.phase, self.context.at, draws.seed, draws.stream)
 
     @property
-    def place(self) -> Where:
-        """The place in the prototxt that names the data."""
+    def where(self) -> Where:
+        """The position in the prototxt that names the data."""
         return self.context.at(self.group, "source")
 
     def cursor(self, count: int, rand_skip: int = 0, shuffle: bool = False, kind: type[Cursor] = Cursor) -> Cursor:
@@ -253,7 +253,7 @@ class Data(ReadingLayer):
         super().construct()
         if self.opens_data and self._sound:
             p = self.param.data_param
-            self._reader = self.attempt(open_reader, p.source, BACKENDS[p.backend], self.place)
+            self._reader = self.attempt(open_reader, p.source, BACKENDS[p.backend], self.where)
 
     def open(self) -> Source | None:
         p, reader = self.param.data_param, self._reader
@@ -264,7 +264,7 @@ class Data(ReadingLayer):
             transformer.color = True
         speed, cursor = self.context.options.speed, self.cursor(len(reader), p.rand_skip)
         at_once = None if speed is None else speed.reads_at_once(transformer.decode)
-        source = DatabaseSource(reader, cursor, transformer, self.place, at_once)
+        source = DatabaseSource(reader, cursor, transformer, self.where, at_once)
         self.log_size(source, "data_layer.cpp:45")
         return source
 
@@ -302,7 +302,7 @@ class ImageData(ReadingLayer):
         """Read the list; its first image sets the shape."""
         p = self.param.image_data_param
         log.info("image_data_layer.cpp:38", f"Opening file {p.source}")
-        images = self.attempt(read_image_list, p.source, self.place)
+        images = self.attempt(read_image_list, p.source, self.where)
         transformer = self.attempt(self.transformer)
         if images is None or transformer is None:
             return None
@@ -357,7 +357,7 @@ class WindowData(ReadingLayer):
         from netspec.data.windows import WindowSource, read_window_file, window_mean
 
         p, transform, context = self.param.window_data_param, self.param.transform_param, self.context
-        file = self.attempt(read_window_file, p, self.place)
+        file = self.attempt(read_window_file, p, self.where)
         mean = self.attempt(window_mean, transform, context.at)
         if file is None or mean is None:
             return None

@@ -35,7 +35,7 @@ class HDF5Data(ReadingLayer):
         from netspec.data.hdf5 import Hdf5Source
 
         p = self.param.hdf5_data_param
-        return Hdf5Source(p.source, self.param.top, p.batch_size, p.shuffle, self.draws, self.place)
+        return Hdf5Source(p.source, self.param.top, p.batch_size, p.shuffle, self.draws, self.where)
 
     def shapes_without_data(self) -> list[Shape]:
         """Return the shapes given by the caller; the prototxt does not contain them."""
@@ -58,16 +58,16 @@ class HDF5Output(Layer):
 
     def setup(self) -> None:
         name = self.param.hdf5_output_param.file_name
-        place = ("hdf5_output_param", "file_name")
+        field = ("hdf5_output_param", "file_name")
         if not name:
-            raise self.error("file_name is missing; set it to the path of the results", *place)
+            raise self.error("file_name is missing; set it to the path of the results", *field)
         if reason := why_unwritable(name):
-            raise self.error(f'HDF5 file "{name}" cannot be written: {reason}', *place)
+            raise self.error(f'HDF5 file "{name}" cannot be written: {reason}', *field)
         self._sink = None
         if self.context.options.write_files and self.context.device.type != "meta":
             from netspec.data.hdf5 import Hdf5Sink
 
-            self._sink = Hdf5Sink(name, self.context.at(*place))
+            self._sink = Hdf5Sink(name, self.context.at(*field))
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         data, label = bottom_shapes

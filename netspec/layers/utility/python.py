@@ -186,14 +186,14 @@ class Python(Layer):
 
 
 def _describe(fault: Exception) -> str:
-    """Return the exception's class, text and place in one line."""
+    """Return the exception's class, text and position in one line."""
     if isinstance(fault, SyntaxError):
         remedy = "if it is Python 2, translate it with `netspec run --python2 -m netspec train ...`"
         return f"{type(fault).__name__}: {fault.msg} ({fault.filename}:{fault.lineno}); {remedy}"
     frames = traceback.extract_tb(fault.__traceback__)
     of_user = [frame for frame in frames if not frame.filename.startswith(_not_of_user())]
-    place = "".join(f" ({frame.filename}:{frame.lineno})" for frame in (of_user or frames)[-1:])
-    return f"{type(fault).__name__}: {' '.join(str(fault).split())}{place}"
+    position = "".join(f" ({frame.filename}:{frame.lineno})" for frame in (of_user or frames)[-1:])
+    return f"{type(fault).__name__}: {' '.join(str(fault).split())}{position}"
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Upgrades Caffe's nets and solvers from all older formats to the current one, with the places of their parts.
+"""Upgrades Caffe's nets and solvers from all older formats to the current one, with the positions of their parts.
 
 Each pass takes a net and its map and returns new ones, or the same ones if nothing changes. The passes run in Caffe's
 order, for text and for weights. Caffe silently drops some fields (in a net that is partly V0: its V1 layers, its
@@ -19,7 +19,7 @@ from google.protobuf.message import Message
 from netspec import log
 from netspec.errors import SpecError
 from netspec.proto.schema import BlobShape, LayerParameter, NetParameter, SolverParameter, V1LayerParameter, fields_of
-from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.upgrade.rewrite import Draft, copy_without
 from netspec.proto.upgrade.v0 import needs_v0_upgrade, upgrade_v0
 
@@ -89,21 +89,21 @@ def upgrade_data(net: NetParameter, source: SourceMap) -> Upgraded:
     if not needs_data_upgrade(net):
         return net, source
     result = copy_without(net, {"layers"})
-    places = []
-    for layer, place in zip(net.layers, source.layers, strict=True):
+    positions = []
+    for layer, position in zip(net.layers, source.layers, strict=True):
         moved = _own_transform(layer)
         name = _data_parameters(layer)
-        draft = Draft(result.layers.add(), place.where)
-        draft.copy(layer, place, {name} if moved else ())
+        draft = Draft(result.layers.add(), position.where)
+        draft.copy(layer, position, {name} if moved else ())
         if moved:
             parameters = getattr(layer, name)
-            old = (place.fields.get(name) or (Place(place.where),))[0]
+            old = (position.fields.get(name) or (Position(position.where),))[0]
             draft.inner(name, old.where).copy(parameters, old, moved)
             transform = draft.inner("transform_param", old.where)
             for field in moved:
                 transform.put(field, getattr(parameters, field), old.fields.get(field, ()))
-        places.append(draft.place())
-    return result, source.with_layers(places)
+        positions.append(draft.position())
+    return result, source.with_layers(positions)
 
 
 def _data_parameters(layer: V1LayerParameter) -> str:
@@ -127,29 +127,29 @@ def upgrade_v1(net: NetParameter, source: SourceMap) -> Upgraded:
     assert not net.layer, "upgrade_net refuses such a net"
     assert not needs_v0_upgrade(net), "upgrade_v0 goes first"
     result = copy_without(net, {"layers"})
-    places = []
-    for layer, place in zip(net.layers, source.layers, strict=True):
-        draft = Draft(result.layer.add(), place.where)
-        draft.copy(layer, place, {"type", *_PARAM_SPEC})
+    positions = []
+    for layer, position in zip(net.layers, source.layers, strict=True):
+        draft = Draft(result.layer.add(), position.where)
+        draft.copy(layer, position, {"type", *_PARAM_SPEC})
         if layer.HasField("type"):
             name = _V1_TYPES[V1LayerParameter.LayerType.Name(layer.type).replace("_", "")]
-            draft.put("type", name, place.fields.get("type", ()))
-        _upgrade_param_specs(layer, place, draft)
-        places.append(draft.place())
-    return result, source.with_layers(places)
+            draft.put("type", name, position.fields.get("type", ()))
+        _upgrade_param_specs(layer, position, draft)
+        positions.append(draft.position())
+    return result, source.with_layers(positions)
 
 
-def _upgrade_param_specs(layer: V1LayerParameter, place: Place, draft: Draft) -> None:
+def _upgrade_param_specs(layer: V1LayerParameter, position: Position, draft: Draft) -> None:
     specs: list[Draft] = []
     for old_name, name in _PARAM_SPEC.items():
-        places = place.fields.get(old_name, ())
+        positions = position.fields.get(old_name, ())
         for index, value in enumerate(getattr(layer, old_name)):
-            at = places[index : index + 1]
+            at = positions[index : index + 1]
             if index == len(specs):
-                specs.append(Draft(draft.message.param.add(), at[0].where if at else place.where))
+                specs.append(Draft(draft.message.param.add(), at[0].where if at else position.where))
             specs[index].put(name, value, at)
     if specs:
-        draft.places["param"] = tuple(spec.place() for spec in specs)
+        draft.positions["param"] = tuple(spec.position() for spec in specs)
 
 
 def needs_input_upgrade(net: NetParameter) -> bool:
@@ -168,7 +168,7 @@ def upgrade_input(net: NetParameter, source: SourceMap) -> Upgraded:
     names = ("input", "input_shape", "input_dim")
     result = copy_without(net, {*names, "layer"})
     kept = {name: nodes for name, nodes in source.net.fields.items() if name not in names}
-    places = list(source.layers)
+    positions = list(source.layers)
     if len(net.input_shape) or len(net.input_dim):
         inputs = source.net.fields.get("input", ())
         draft = Draft(result.layer.add(name="input", type="Input"), source.net.find("input"))
@@ -176,40 +176,40 @@ def upgrade_input(net: NetParameter, source: SourceMap) -> Upgraded:
         shapes = draft.inner("input_param", draft.where)
         for index in range(len(net.input)):
             shapes.put("shape", *_input_shape(net, source.net, index))
-        places.insert(0, draft.place())
+        positions.insert(0, draft.position())
     for surplus in _surplus(net, source.net):
         log.warning("upgrade_proto.cpp:977", f"{surplus} is not used")
     result.layer.extend(net.layer)
-    return result, replace(source, net=replace(source.net, fields=kept), layers=tuple(places))
+    return result, replace(source, net=replace(source.net, fields=kept), layers=tuple(positions))
 
 
-def _surplus(net: NetParameter, place: Place) -> list[str]:
+def _surplus(net: NetParameter, position: Position) -> list[str]:
     """Return the parts of the input fields that do not fit into the Input layer."""
     if not len(net.input_shape) and not len(net.input_dim):
-        where = place.find("input")
+        where = position.find("input")
         return [f"{where}: input without input_shape or input_dim"] if where.line else []
     inputs, found = len(net.input), []
     if len(net.input_shape) > inputs:
-        found.append(f"{place.find('input_shape', inputs)}: input_shape beyond the {inputs} inputs")
+        found.append(f"{position.find('input_shape', inputs)}: input_shape beyond the {inputs} inputs")
     used = 0 if len(net.input_shape) else 4 * inputs
     if len(net.input_dim) > used:
         beyond = f"beyond four each of {inputs} inputs" if used else "together with input_shape"
-        found.append(f"{place.find('input_dim', used)}: input_dim {beyond}")
+        found.append(f"{position.find('input_dim', used)}: input_dim {beyond}")
     return found
 
 
-def _input_shape(net: NetParameter, place: Place, index: int) -> tuple[Message, tuple[Place, ...]]:
+def _input_shape(net: NetParameter, position: Position, index: int) -> tuple[Message, tuple[Position, ...]]:
     if len(net.input_shape):
         if index >= len(net.input_shape):
             fault = f"found {len(net.input_shape)} input_shape for {len(net.input)} inputs, expected one each"
-            raise SpecError(fault, place.find("input", index))
-        return net.input_shape[index], place.fields.get("input_shape", ())[index : index + 1]
+            raise SpecError(fault, position.find("input", index))
+        return net.input_shape[index], position.fields.get("input_shape", ())[index : index + 1]
     values = slice(4 * index, 4 * index + 4)
     if len(net.input_dim[values]) < 4:
         fault = f"found {len(net.input_dim)} input_dim for {len(net.input)} inputs, expected four each"
-        raise SpecError(fault, place.find("input", index))
-    dims = place.fields.get("input_dim", ())[values]
-    return BlobShape(dim=net.input_dim[values]), tuple(Place(d.where, {"dim": dims}) for d in dims[:1])
+        raise SpecError(fault, position.find("input", index))
+    dims = position.fields.get("input_dim", ())[values]
+    return BlobShape(dim=net.input_dim[values]), tuple(Position(d.where, {"dim": dims}) for d in dims[:1])
 
 
 def needs_batch_norm_upgrade(net: NetParameter) -> bool:
@@ -282,32 +282,34 @@ _PASSES = (
 # ---- Solvers ----
 
 
-def upgrade_solver(solver: SolverParameter, place: Place) -> tuple[SolverParameter, Place]:
-    """Return a solver with ``type`` instead of ``solver_type`` and upgraded nets, and the places of its parts.
+def upgrade_solver(solver: SolverParameter, position: Position) -> tuple[SolverParameter, Position]:
+    """Return a solver with ``type`` instead of ``solver_type`` and upgraded nets, and the positions of its parts.
 
     Raises SpecError if both are given.
     """
-    file = place.where.file
+    file = position.where.file
     nets = [name for name in _SOLVER_NETS if fields_of(solver.DESCRIPTOR)[name].present(solver)]
-    draft = Draft(SolverParameter(), place.where)
-    draft.copy(solver, place, {"solver_type", *nets})
+    draft = Draft(SolverParameter(), position.where)
+    draft.copy(solver, position, {"solver_type", *nets})
     for name in nets:
         value = getattr(solver, name)
         several = list(value) if name == "test_net_param" else [value]
         for index, net in enumerate(several):
-            at = place.fields.get(name, ())[index : index + 1]
+            at = position.fields.get(name, ())[index : index + 1]
             source = SourceMap.of(at[0]) if at else SourceMap.unknown(file, len(net.layer) + len(net.layers))
             net, source = upgrade_net(net, source)
             draft.put(name, net, (source.as_net(),) if at else ())
     if solver.HasField("solver_type"):
         if solver.HasField("type"):
-            raise SpecError('both "type" and the older "solver_type" are given; keep "type"', place.find("solver_type"))
+            raise SpecError(
+                'both "type" and the older "solver_type" are given; keep "type"', position.find("solver_type")
+            )
         log.info(
             "upgrade_proto.cpp:1084",
             f"Attempting to upgrade input file specified using deprecated 'solver_type' field (enum)': {file}",
         )
         old = SolverParameter.SolverType.Name(solver.solver_type)
-        draft.put("type", _SOLVER_TYPES[old], place.fields.get("solver_type", ()))
+        draft.put("type", _SOLVER_TYPES[old], position.fields.get("solver_type", ()))
         log.info(
             "upgrade_proto.cpp:1091",
             "Successfully upgraded file specified using deprecated 'solver_type' field (enum) to 'type' field "
@@ -317,7 +319,7 @@ def upgrade_solver(solver: SolverParameter, place: Place) -> tuple[SolverParamet
             "upgrade_proto.cpp:1093",
             "Note that future Caffe releases will only support 'type' field (string) for a solver's type.",
         )
-    return draft.message, draft.place()
+    return draft.message, draft.position()
 
 
 def upgrade_snapshot_prefix(solver: SolverParameter, path: str | Path) -> SolverParameter:

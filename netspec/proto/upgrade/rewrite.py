@@ -1,4 +1,4 @@
-"""Functions for the upgrade passes: building messages from parts of others, which keep their original places."""
+"""Functions for the upgrade passes: building messages from parts of others, which keep their original positions."""
 
 from __future__ import annotations
 
@@ -9,47 +9,47 @@ from google.protobuf.message import Message
 
 from netspec.errors import Where
 from netspec.proto.schema import Field, fields_of
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 
 M = TypeVar("M", bound=Message)
 
 
 class Draft:
-    """A message under construction, and the places of its parts."""
+    """A message under construction, and the positions of its parts."""
 
     def __init__(self, message: Message, where: Where) -> None:
-        """``message`` is the message to fill; ``where`` is the place of the whole message."""
+        """``message`` is the message to fill; ``where`` is the position of the whole message."""
         self.message: Any = message
         self.where = where
-        self.places: dict[str, tuple[Place, ...]] = {}
+        self.positions: dict[str, tuple[Position, ...]] = {}
         self._inner: dict[str, Draft] = {}
 
-    def copy(self, message: Message, places: Place, leave_out: Collection[str] = ()) -> None:
+    def copy(self, message: Message, positions: Position, leave_out: Collection[str] = ()) -> None:
         """Copy all fields of a message that this one also has, except those to omit."""
         for name, field in fields_of(message.DESCRIPTOR).items():
             if name not in leave_out and name in fields_of(self.message.DESCRIPTOR) and field.present(message):
-                self.put(name, field.get(message), places.fields.get(field.name, ()))
+                self.put(name, field.get(message), positions.fields.get(field.name, ()))
 
-    def put(self, name: str, value: Any, places: tuple[Place, ...]) -> None:
+    def put(self, name: str, value: Any, positions: tuple[Position, ...]) -> None:
         """Set a field, or add one or several values to a repeated one."""
         field = fields_of(self.message.DESCRIPTOR)[name]
         _put(self.message, field, value)
-        before = self.places.get(name, ()) if field.repeated else ()
-        self.places[field.name] = (*before, *places)
+        before = self.positions.get(name, ()) if field.repeated else ()
+        self.positions[field.name] = (*before, *positions)
 
     def inner(self, name: str, where: Where) -> Draft:
-        """Return the draft of a singular message field; a new draft is empty and has the place ``where``."""
+        """Return the draft of a singular message field; a new draft is empty and has the position ``where``."""
         if name not in self._inner:
-            places = self.places.pop(name, ())
-            self._inner[name] = draft = Draft(getattr(self.message, name), places[0].where if places else where)
+            positions = self.positions.pop(name, ())
+            self._inner[name] = draft = Draft(getattr(self.message, name), positions[0].where if positions else where)
             draft.message.SetInParent()
-            draft.places = dict(places[0].fields) if places else {}
+            draft.positions = dict(positions[0].fields) if positions else {}
         return self._inner[name]
 
-    def place(self) -> Place:
-        """Return the places of all parts."""
-        inner = {name: (draft.place(),) for name, draft in self._inner.items()}
-        return Place(self.where, {**self.places, **inner})
+    def position(self) -> Position:
+        """Return the positions of all parts."""
+        inner = {name: (draft.position(),) for name, draft in self._inner.items()}
+        return Position(self.where, {**self.positions, **inner})
 
 
 def _put(message: Message, field: Field, value: Any) -> None:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from netspec import log
 from netspec.errors import SpecError, did_you_mean
 from netspec.proto.schema import NetParameter, V0LayerParameter, V1LayerParameter, fields_of
-from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.upgrade.rewrite import Draft, copy_without
 
 # V0's names of types are mostly V1's in lower case; a type's own parameters are named after V1's.
@@ -67,14 +67,14 @@ def upgrade_v0(net: NetParameter, source: SourceMap) -> tuple[NetParameter, Sour
         return net, source
     net, source = merge_padding(net, source)
     result = copy_without(net, {"layers"})
-    places = []
-    for layer, place in zip(net.layers, source.layers, strict=True):
-        draft = Draft(result.layers.add(), place.where)
-        draft.copy(layer, place, {"layer"})
+    positions = []
+    for layer, position in zip(net.layers, source.layers, strict=True):
+        draft = Draft(result.layers.add(), position.where)
+        draft.copy(layer, position, {"layer"})
         if layer.HasField("layer"):
-            _upgrade_layer(layer.layer, _inner(place), draft)
-        places.append(draft.place())
-    return result, source.with_layers(places)
+            _upgrade_layer(layer.layer, _inner(position), draft)
+        positions.append(draft.position())
+    return result, source.with_layers(positions)
 
 
 def merge_padding(net: NetParameter, source: SourceMap) -> tuple[NetParameter, SourceMap]:
@@ -83,71 +83,76 @@ def merge_padding(net: NetParameter, source: SourceMap) -> tuple[NetParameter, S
     Raises SpecError if a padding layer feeds any other layer, or does not have one bottom and one top.
     """
     result = copy_without(net, {"layers"})
-    places: list[Place] = []
-    producers: dict[str, tuple[V1LayerParameter, Place] | None] = dict.fromkeys(net.input)
-    for layer, place in zip(net.layers, source.layers, strict=True):
+    positions: list[Position] = []
+    producers: dict[str, tuple[V1LayerParameter, Position] | None] = dict.fromkeys(net.input)
+    for layer, position in zip(net.layers, source.layers, strict=True):
         if layer.layer.type == "padding":
             for what in ("bottom", "top"):
                 if len(getattr(layer, what)) != 1:
                     raise _error(
-                        f"a padding layer must have one {what}, found {len(getattr(layer, what))}", layer, place, what
+                        f"a padding layer must have one {what}, found {len(getattr(layer, what))}",
+                        layer,
+                        position,
+                        what,
                     )
         else:
-            draft = Draft(result.layers.add(), place.where)
-            draft.copy(layer, place)
+            draft = Draft(result.layers.add(), position.where)
+            draft.copy(layer, position)
             for index, bottom in enumerate(layer.bottom):
                 if bottom not in producers:
                     known = did_you_mean(bottom, list(producers))
-                    raise _error(f'unknown bottom blob "{bottom}"{known}', layer, place, "bottom", index)
+                    raise _error(f'unknown bottom blob "{bottom}"{known}', layer, position, "bottom", index)
                 producer = producers[bottom]
                 if producer is not None and producer[0].layer.type == "padding":
-                    _merge(producer, layer, place, draft)
-            places.append(draft.place())
-        producers |= dict.fromkeys(layer.top, (layer, place))
-    return result, source.with_layers(places)
+                    _merge(producer, layer, position, draft)
+            positions.append(draft.position())
+        producers |= dict.fromkeys(layer.top, (layer, position))
+    return result, source.with_layers(positions)
 
 
-def _merge(producer: tuple[V1LayerParameter, Place], layer: V1LayerParameter, place: Place, draft: Draft) -> None:
-    padding, padding_place = producer
+def _merge(
+    producer: tuple[V1LayerParameter, Position], layer: V1LayerParameter, position: Position, draft: Draft
+) -> None:
+    padding, padding_position = producer
     if layer.layer.type not in ("conv", "pool") or len(layer.bottom) != 1:
         fault = f'padding layer "{padding.layer.name}" feeds it; only a conv or pool with one bottom can be padded'
-        raise _error(fault, layer, place, "bottom")
+        raise _error(fault, layer, position, "bottom")
     draft.message.ClearField("bottom")
-    draft.places.pop("bottom", None)
-    draft.put("bottom", padding.bottom, padding_place.fields.get("bottom", ()))
-    inner = draft.inner("layer", place.where)
-    inner.put("pad", padding.layer.pad, _inner(padding_place).fields.get("pad", ()))
+    draft.positions.pop("bottom", None)
+    draft.put("bottom", padding.bottom, padding_position.fields.get("bottom", ()))
+    inner = draft.inner("layer", position.where)
+    inner.put("pad", padding.layer.pad, _inner(padding_position).fields.get("pad", ()))
 
 
-def _upgrade_layer(old: V0LayerParameter, place: Place, draft: Draft) -> None:
+def _upgrade_layer(old: V0LayerParameter, position: Position, draft: Draft) -> None:
     """Copy the fields of a V0LayerParameter into the draft of a V1 layer."""
-    draft.copy(old, place, {n for n in fields_of(old.DESCRIPTOR) if n not in _UNCHANGED})
+    draft.copy(old, position, {n for n in fields_of(old.DESCRIPTOR) if n not in _UNCHANGED})
     if old.HasField("type"):
         if old.type not in _TYPES:
-            where = replace(place.find("type"), layer=old.name)
+            where = replace(position.find("type"), layer=old.name)
             raise SpecError(f'unknown V0 layer type "{old.type}"{did_you_mean(old.type, list(_TYPES))}', where)
-        draft.put("type", V1LayerParameter.LayerType.Value(_TYPES[old.type]), place.fields.get("type", ()))
+        draft.put("type", V1LayerParameter.LayerType.Value(_TYPES[old.type]), position.fields.get("type", ()))
     for name, field in fields_of(old.DESCRIPTOR).items():
         if name in _UNCHANGED or name == "type" or not field.present(old):
             continue
-        value, places = field.get(old), place.fields.get(name, ())
+        value, positions = field.get(old), position.fields.get(name, ())
         new_name, types = _FIELDS.get(name, ("", ()))
         if name in _TRANSFORMS:
-            draft.inner("transform_param", place.where).put(_TRANSFORMS[name], value, places)
+            draft.inner("transform_param", position.where).put(_TRANSFORMS[name], value, positions)
         elif old.type in types:
-            draft.inner(f"{_TYPES[old.type].lower()}_param", place.where).put(new_name, value, places)
+            draft.inner(f"{_TYPES[old.type].lower()}_param", position.where).put(new_name, value, positions)
         elif name == "hdf5_output_param" and old.type == "hdf5_output":
-            draft.put(name, value, places)
+            draft.put(name, value, positions)
         else:
-            where = place.find(name)
+            where = position.find(name)
             log.warning("upgrade_proto.cpp:230", f"{where}: Unknown parameter {name} for layer type {old.type}")
 
 
-def _inner(place: Place) -> Place:
-    """Return the places of the V0 part of a layer, or of the layer itself if they are unknown."""
-    inner = place.fields.get("layer", ())
-    return inner[0] if inner else Place(place.where)
+def _inner(position: Position) -> Position:
+    """Return the positions of the V0 part of a layer, or of the layer itself if they are unknown."""
+    inner = position.fields.get("layer", ())
+    return inner[0] if inner else Position(position.where)
 
 
-def _error(message: str, layer: V1LayerParameter, place: Place, *path: str | int) -> SpecError:
-    return SpecError(message, replace(place.find(*path), layer=layer.layer.name, type=layer.layer.type))
+def _error(message: str, layer: V1LayerParameter, position: Position, *path: str | int) -> SpecError:
+    return SpecError(message, replace(position.find(*path), layer=layer.layer.name, type=layer.layer.type))

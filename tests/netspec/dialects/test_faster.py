@@ -152,7 +152,7 @@ def test_proposal_targets_of_rfcn_have_four_axes_and_need_the_forks_code() -> No
         layer {{ name: "sum" type: "Eltwise" bottom: "l" bottom: "each" top: "sum" }}"""
     net = build_net(*parse_net_text(text, "n.prototxt"))
     assert (net.shapes["r"], net.shapes["sum"]) == ((1, 5, 1, 1), (1, 1, 1, 1))
-    with pytest.raises(SpecError, match=r"how R-FCN chooses .* --allow-python-layers runs the fork's own code"):
+    with pytest.raises(SpecError, match=r"R-FCN's choice of regions .* --allow-python-layers runs the fork's own code"):
         net(p=TRUTH[:1], t=TRUTH[:1])
 
 

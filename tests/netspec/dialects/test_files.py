@@ -12,7 +12,7 @@ import pytest
 
 import netspec
 import netspec.dialects
-from fresh_dialects import switched_on_by
+from fresh_dialects import activated_by
 from netspec.cli import main
 from netspec.dialects import files as dialect_files
 from netspec.dialects import registry as dialect
@@ -271,31 +271,31 @@ def test_an_entry_point_of_a_package_is_used_and_invalid_ones_are_reported(
 
 def test_a_prototxt_activates_the_dialects_it_needs(fresh_files: None) -> None:
     text = 'layer { name: "n" type: "Normalize" bottom: "x" top: "n" norm_param { across_spatial: false } }'
-    assert switched_on_by(text) == ["ssd"]
+    assert activated_by(text) == ["ssd"]
     assert layer_class("Normalize") is not None
 
 
 def test_a_prototxt_of_caffes_layers_activates_no_dialect(fresh_files: None) -> None:
     text = 'layer { name: "Normalize" type: "ReLU" bottom: "Permute" top: "Swish" }'  # names, not types
-    assert switched_on_by(text) == []
+    assert activated_by(text) == []
 
 
 def test_a_field_that_caffe_has_in_another_message_activates_its_dialect(fresh_files: None) -> None:
     before = layer_class("BatchNorm")
     text = 'layer { type: "Convolution" convolution_param { num_output: 1 bias_filler { type: "constant" } } }'
-    assert switched_on_by(text) == []
-    assert switched_on_by('layer { type: "BatchNorm" batch_norm_param { bias_filler { } } }') == ["nvidia"]
+    assert activated_by(text) == []
+    assert activated_by('layer { type: "BatchNorm" batch_norm_param { bias_filler { } } }') == ["nvidia"]
     assert layer_class("BatchNorm") is before
 
 
 @pytest.mark.slow
 def test_a_prototxt_of_two_dialects_activates_both(fresh_files: None) -> None:
     text = 'layer { type: "Permute" permute_param { order: 0 } } layer { type: "Axpy" } layer { type: "Normalize" }'
-    assert switched_on_by(text) == ["ssd", "blocks"]
+    assert activated_by(text) == ["ssd", "blocks"]
 
 
 def test_unknown_fields_and_types_activate_no_dialect(fresh_files: None) -> None:
-    assert switched_on_by('layer { type: "NoSuchType" no_such_param { } }') == []
+    assert activated_by('layer { type: "NoSuchType" no_such_param { } }') == []
 
 
 def test_docs_netspec_md_lists_every_dialect() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
-from fresh_dialects import switched_on_by
+from fresh_dialects import activated_by
 from netspec.cli import main
 from netspec.errors import SpecError
 from netspec.net.net import Net
@@ -147,7 +147,7 @@ def test_fields_of_video_data_param_activate_their_dialect(
     net_of: Callable[..., Net], given: str, dialects: list[str]
 ) -> None:
     net = LAYER % (given, 1, 4, "")
-    assert switched_on_by(net) == dialects
+    assert activated_by(net) == dialects
     if not dialects:
         with pytest.raises(SpecError, match='dialects "ssd_video" and "tsn" have "video_data_param"; add --plugin ssd'):
             net_of(net)

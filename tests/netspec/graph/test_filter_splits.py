@@ -28,9 +28,9 @@ def test_filter_net_keeps_the_layers_that_a_state_includes(
     phase: PhaseValue, level: int, stages: tuple[str, ...], expected: str
 ) -> None:
     net, source = parse_net_text(RULES, "net")
-    filtered, places = filter_net(with_state(net, phase, level, stages), source)
+    filtered, positions = filter_net(with_state(net, phase, level, stages), source)
     assert " ".join(layer.name for layer in filtered.layer) == expected
-    lines = [RULES.splitlines()[place.where.line - 1] for place in places.layers]
+    lines = [RULES.splitlines()[position.where.line - 1] for position in positions.layers]
     assert [line.split('"')[1] for line in lines] == expected.split()
     assert len(net.layer) == 9  # the argument is as it was
 
@@ -53,9 +53,9 @@ def test_later_states_override_level_and_add_stages() -> None:
 
 def _split(text: str) -> list[str]:
     net, source = parse_net_text(text, "net")
-    split, places = insert_splits(net, source)
-    assert len(places.layers) == len(split.layer)
-    again, _ = insert_splits(split, places)
+    split, positions = insert_splits(net, source)
+    assert len(positions.layers) == len(split.layer)
+    again, _ = insert_splits(split, positions)
     assert again == split  # nothing is left to split
     return [f"{layer.name}: {','.join(layer.bottom)} -> {','.join(layer.top)}" for layer in split.layer]
 

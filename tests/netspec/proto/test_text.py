@@ -120,8 +120,8 @@ def test_everything_read_has_its_place() -> None:
     assert str(source.net.find("name")) == "f:1:1"
     assert str(source.at(0)) == "f:2:1"
     assert str(source.at(0, "convolution_param")) == "f:4:3"
-    places = [str(source.at(0, "convolution_param", "pad", i)) for i in range(3)]
-    assert places == ["f:4:29", "f:5:5", "f:6:3"]
+    positions = [str(source.at(0, "convolution_param", "pad", i)) for i in range(3)]
+    assert positions == ["f:4:29", "f:5:5", "f:6:3"]
     assert str(source.at(1, "top", layer="b", type="T")) == 'f:8:11: layer "b" (T)'
     assert str(source.at(1, "pooling_param", "pad")) == "f:8:3"
 

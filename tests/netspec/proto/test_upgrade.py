@@ -1,4 +1,4 @@
-"""Older formats are upgraded to the current one, and every part keeps its place in the file."""
+"""Older formats are upgraded to the current one, and every part keeps its position in the file."""
 
 import logging
 import re
@@ -12,7 +12,7 @@ from google.protobuf import text_format
 from case_files import read_cases
 from netspec.errors import SpecError
 from netspec.proto.schema import NetParameter, SolverParameter, V1LayerParameter
-from netspec.proto.source_map import Place, SourceMap
+from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.text import parse_net_text, parse_solver, parse_solver_text, read_solver, write_text
 from netspec.proto.upgrade import current as upgrade
 from netspec.proto.upgrade.v0 import merge_padding, upgrade_v0
@@ -35,8 +35,8 @@ def net_of(text: str) -> NetParameter:
     return text_format.Parse(text, NetParameter())
 
 
-def leaves(node: Place) -> list[Place]:
-    """Return the places of all parts, whole messages included."""
+def leaves(node: Position) -> list[Position]:
+    """Return the positions of all parts, whole messages included."""
     return [node, *(leaf for nodes in node.fields.values() for inner in nodes for leaf in leaves(inner))]
 
 
@@ -67,11 +67,11 @@ def test_passes_do_not_change_their_arguments_and_are_idempotent(case: dict[str,
 def test_the_place_of_every_part_is_the_line_with_its_value(case: dict[str, str]) -> None:
     net, source = parse_net_text(case["old"], "f")
     lines = case["old"].splitlines()
-    for layer, place in zip(net.layer, source.layers, strict=True):
+    for layer, position in zip(net.layer, source.layers, strict=True):
         for name in ("name", "bottom", "top"):
-            for node, value in zip(place.fields.get(name, ()), _values(layer, name), strict=False):
+            for node, value in zip(position.fields.get(name, ()), _values(layer, name), strict=False):
                 assert f'"{value}"' in lines[node.where.line - 1]
-        for node in leaves(place):
+        for node in leaves(position):
             assert 0 < node.where.line <= len(lines)
 
 
@@ -325,7 +325,7 @@ def test_nets_in_a_solver_are_upgraded_in_place() -> None:
     source = SourceMap.of(node.fields["test_net_param"][1])
     assert str(source.at(0, "input_param", "shape", 0, "dim", 3)) == "s:7:2"
     raw, _ = parse_solver_text(text, "s", upgrade=False)
-    assert upgrade.upgrade_solver(raw, Place(node.where))[0].net_param == solver.net_param
+    assert upgrade.upgrade_solver(raw, Position(node.where))[0].net_param == solver.net_param
 
 
 def test_upgrading_a_solver_is_pure_and_idempotent() -> None:

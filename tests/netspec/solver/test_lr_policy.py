@@ -4,16 +4,16 @@ import pytest
 
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import SolverParameter
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 from netspec.proto.text import parse_solver_text
 from netspec.solver.lr_policy import learning_rate, next_step, policy_faults
 
-NODE = Place(
+NODE = Position(
     Where("s.prototxt"),
     {
-        "lr_policy": (Place(Where("s.prototxt", 3, 1)),),
-        "stepsize": (Place(Where("s.prototxt", 4, 1)),),
-        "gamma": (Place(Where("s.prototxt", 5, 1)),),
+        "lr_policy": (Position(Where("s.prototxt", 3, 1)),),
+        "stepsize": (Position(Where("s.prototxt", 4, 1)),),
+        "gamma": (Position(Where("s.prototxt", 5, 1)),),
     },
 )
 

@@ -8,7 +8,7 @@ from case_files import read_cases
 from netspec.errors import SpecError
 from netspec.graph.filter import with_train_state
 from netspec.proto.reader import read_text
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 from netspec.proto.text import parse_solver_text
 from netspec.solver.nets import SolverNet, solver_nets
 
@@ -97,7 +97,7 @@ def test_settings_that_caffe_refuses_are_refused(case: dict[str, str]):
 def test_a_file_of_several_nets_is_read_once(monkeypatch: pytest.MonkeyPatch):
     read: list[str] = []
 
-    def noted(text: str, file: str, message: Message, *report: Any) -> Place:
+    def noted(text: str, file: str, message: Message, *report: Any) -> Position:
         read.append(file)
         return read_text(text, file, message, *report)
 

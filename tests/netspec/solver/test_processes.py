@@ -37,7 +37,7 @@ layer {{ name: "relu" type: "ReLU" bottom: "conv" top: "conv" }}
 layer {{ name: "ip" type: "InnerProduct" bottom: "conv" top: "ip"
   inner_product_param {{ num_output: 2 weight_filler {{ type: "xavier" }} }} }}
 layer {{ name: "loss" type: "SoftmaxWithLoss" bottom: "ip" bottom: "sim" top: "loss" }}"""
-OWN = """layer { name: "bn" type: "BatchNorm" bottom: "conv" top: "conv" }
+LAYERS_WITH_STATE = """layer { name: "bn" type: "BatchNorm" bottom: "conv" top: "conv" }
 layer { name: "drop" type: "Dropout" bottom: "conv" top: "conv" }"""
 
 
@@ -79,8 +79,8 @@ def process_of_rank(rank: int, parent: int) -> int:
     """Return the process id of a rank, by the environment that torchrun gives it."""
     for folder in Path("/proc").glob("[0-9]*"):
         try:
-            of = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            if of == parent and f"RANK={rank}".encode() in (folder / "environ").read_bytes().split(b"\0"):
+            its_parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            if its_parent == parent and f"RANK={rank}".encode() in (folder / "environ").read_bytes().split(b"\0"):
                 return int(folder.name)
         except OSError:
             continue
@@ -128,7 +128,7 @@ def test_two_processes_follow_one_with_twice_the_batch() -> None:
 
 def test_processes_have_their_own_statistics_and_resume_bit_identically() -> None:
     """As the replicas of one process, to the bit: also where batches of half the size are not one of the whole."""
-    write(batch=8, iterations=20, middle=OWN, snapshot=10)
+    write(batch=8, iterations=20, middle=LAYERS_WITH_STATE, snapshot=10)
     train()
     together = load_solver("solver.prototxt", device=[CPU, CPU])
     together.step(10)

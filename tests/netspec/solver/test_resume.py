@@ -19,7 +19,7 @@ from netspec.data.datum import array_to_datum
 from netspec.errors import SpecError
 from netspec.load import load_solver
 from netspec.net.extra_file import extra_text
-from netspec.solver.extra import changes, newest_pair, path_beside, read_extra
+from netspec.solver.extra import changes, extra_path, newest_pair, read_extra
 from netspec.solver.snapshot import State, read_state, write_state
 from netspec.solver.solver import Solver
 from netspec.solver.update import RULES
@@ -185,7 +185,7 @@ def test_without_the_extra_file_a_state_resumes_like_caffe(caplog: pytest.LogCap
     solver = load_solver("solver.prototxt")
     solver.step(2)
     _, state = solver.snapshot()
-    path_beside(state).unlink()
+    extra_path(state).unlink()
     caplog.set_level(logging.INFO, "netspec")
     resumed = load_solver("solver.prototxt", snapshot=state)
     assert "is from Caffe: the data starts at its first record" in caplog.text
@@ -318,7 +318,7 @@ def refused(state: Path, message: str) -> None:
 )
 def test_an_impossible_state_is_refused(state: Path, change: dict, message: str) -> None:
     whole = read_state(state)
-    path_beside(state).unlink()
+    extra_path(state).unlink()
     write_state(state, State(**{**vars(whole), **change}))
     refused(state, message)
 
@@ -353,14 +353,14 @@ def test_every_command_checks_the_hash_of_weights(form: str, capsys: pytest.Capt
         assert main(command) == 1
         (line,) = [line for line in capsys.readouterr().err.splitlines() if "truncated or replaced" in line]
         assert line.startswith(f"{weights}: is not the file that was written with x_iter_0.solverstate")
-        assert line.endswith("; if you replaced it intentionally, remove " + path_beside(state_of(weights)).name)
-    path_beside(state_of(weights)).write_text("{}")
+        assert line.endswith("; if you replaced it intentionally, remove " + extra_path(state_of(weights)).name)
+    extra_path(state_of(weights)).write_text("{}")
     assert main(commands[0]) == 0
     assert f"{weights.name} was not checked against it" in capsys.readouterr().err
 
 
 def test_weights_of_another_net_are_refused(state: Path) -> None:
-    path_beside(state).unlink()
+    extra_path(state).unlink()
     write(NETS["batches of 8 of 37"].replace('"ip"', '"other"'))
     refused(state, r"x_iter_1.caffemodel: contains weights for none of the net's 1 layers")
 
@@ -370,25 +370,25 @@ DAMAGED = r"x_iter_1.solverstate.extra: is damaged .*; if you remove it, the tra
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": 2}', '{"format": 1, "seed": "x"}', "[" * 5000])
 def test_a_damaged_extra_file_is_refused(state: Path, text: str) -> None:
-    path_beside(state).write_text(text)
+    extra_path(state).write_text(text)
     refused(state, DAMAGED)
 
 
 def test_one_changed_digit_in_the_extra_file_is_refused(state: Path) -> None:
-    path = path_beside(state)
+    path = extra_path(state)
     path.write_text(path.read_text().replace('"iteration": 1', '"iteration": 7'))
     refused(state, r"x_iter_1.solverstate.extra: is damaged \(its hash does not match\)")
 
 
 def forged(state: Path, *path: str | int, value: object) -> None:
     """Write another value beside a state, with a hash that is right."""
-    content = json.loads(path_beside(state).read_text())
+    content = json.loads(extra_path(state).read_text())
     inside = content
     for step in path[:-1]:
         inside = inside[step]
     inside[path[-1]] = value
     del content["hash"], content["format"]
-    path_beside(state).write_text(extra_text(content))
+    extra_path(state).write_text(extra_text(content))
 
 
 @pytest.mark.parametrize("value", [True, -1, 1.0, 10**300, None, [{"shape": [-1], "float32": "AACAPw=="}], [{}], {}])

@@ -6,11 +6,11 @@ import torch
 
 from netspec.errors import Where
 from netspec.proto.schema import SolverParameter
-from netspec.proto.source_map import Place
+from netspec.proto.source_map import Position
 from netspec.solver import update
 from netspec.solver.update import RULES, Piece, Tensors, clip, cut, find_rule, move, normalize, regularize, rule_faults
 
-NOWHERE = Place(Where("s.prototxt"))
+NOWHERE = Position(Where("s.prototxt"))
 SHAPES = [(3, 2), (4,)]
 
 

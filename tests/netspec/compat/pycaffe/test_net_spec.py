@@ -47,7 +47,11 @@ def test_without_names_layers_are_numbered_by_type() -> None:
     loss = L.SoftmaxWithLoss(L.InnerProduct(first, num_output=3, weight_filler={"type": "xavier"}), label)
     proto = loss.to_proto()
     assert [layer.name for layer in proto.layer] == [
-        *("DummyData1", "InnerProduct1", "ReLU1", "InnerProduct2", "SoftmaxWithLoss1")
+        "DummyData1",
+        "InnerProduct1",
+        "ReLU1",
+        "InnerProduct2",
+        "SoftmaxWithLoss1",
     ]
     assert proto.layer[0].top == ["DummyData1", "DummyData2"]
     assert proto == to_proto(loss)

@@ -13,8 +13,13 @@ from paths import ROOT
 pytestmark = pytest.mark.slow
 
 COMMANDS = (
-    *("caffe", "convert_imageset", "compute_image_mean", "extract_features"),
-    *("upgrade_net_proto_text", "upgrade_net_proto_binary", "upgrade_solver_proto_text"),
+    "caffe",
+    "convert_imageset",
+    "compute_image_mean",
+    "extract_features",
+    "upgrade_net_proto_text",
+    "upgrade_net_proto_binary",
+    "upgrade_solver_proto_text",
 )
 
 

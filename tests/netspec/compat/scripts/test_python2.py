@@ -54,7 +54,7 @@ ALSO_PYTHON_3 = [
     "from __future__ import print_function\nprint('x', file=f)",
     "x = 7 / 2",
 ]
-CASES = read_cases("netspec/compat/scripts/python2.txt")
+CASES = read_cases("netspec/compat/scripts/cases/python2.txt")
 
 
 @pytest.mark.parametrize("source", ONLY_PYTHON_2)
@@ -89,8 +89,11 @@ def test_a_whole_script(run: Run, python: Run, tmp_path: Path) -> None:
     source = CASES["a whole script"]["program"].replace("→", "\t")  # tabs and blanks in one block
     done = run("old.py", files={"old.py": source})
     assert done.stdout.splitlines() == [
-        *("3 3.5 1.5 4", "[0, 0, 1, 1, 2] [0, 0, 0, 0, 1] [0.0, 0.0, 0.5, 0.5, 1.0]"),
-        *("3.0 ['a', 'b'] [1]", "3 -4 500.0 0.25 -1 2", "1"),
+        "3 3.5 1.5 4",
+        "[0, 0, 1, 1, 2] [0, 0, 0, 0, 1] [0.0, 0.0, 0.5, 0.5, 1.0]",
+        "3.0 ['a', 'b'] [1]",
+        "3 -4 500.0 0.25 -1 2",
+        "1",
     ]
     said = "old.py is Python 2 and was translated to Python 3 to run; --write-py3 FILE writes the translation"
     assert said in done.stderr

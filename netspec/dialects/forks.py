@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from netspec import log
 from netspec.dialects import registry, use_dialect
-from netspec.dialects.files import announce_known, find_file, known_files, switch_on
+from netspec.dialects.files import activate_file, announce_known, find_file, known_files
 from netspec.errors import SpecError, Where
 from netspec.proto.forks import Forks
 
@@ -37,7 +37,7 @@ class Dialects(Forks):
                 dialect = find_file(found[1])
             except SpecError as fault:
                 raise SpecError(fault.message, Where(file, line, 1)) from None
-            switch_on(dialect)
+            activate_file(dialect)
             names.append(dialect.name)
         return tuple(names)
 
@@ -144,10 +144,10 @@ class Dialects(Forks):
         return list(align_crops(plan, dialects))
 
     @override
-    def is_loose(self, layer: Any) -> bool:
-        from netspec.dialects.signatures import is_loose
+    def ignores_unit_axes(self, layer: Any) -> bool:
+        from netspec.dialects.signatures import ignores_unit_axes
 
-        return is_loose(layer)
+        return ignores_unit_axes(layer)
 
     @override
     def doubts(self, layers: Any) -> dict[str, int]:
@@ -165,6 +165,6 @@ def _activated(dialects: Collection[str], file: str) -> bool:
     own = [name for name in dialects if name in known_files()]
     if len(own) != 1:
         return False
-    switch_on(find_file(own[0]))
+    activate_file(find_file(own[0]))
     log.logger.info(f"{file}: switched on the layers and fields of {own[0]}")
     return True
