@@ -31,6 +31,7 @@ from loopclosure.progress import Progress, silent, timed
 
 PRECISION = 0.99
 NEAR_A_STOP = 2  # frames, of those in which the camera moves
+DOUBTFUL = 0.1  # a smaller share of verified loops is rare where light and season are the same
 TRIED = 10  # matches that a user who wants more may look at first
 
 
@@ -122,6 +123,7 @@ def answer(
         *filter(None, [given.said, searched.age_said]),
         _sequences_said(lines if matches.by_lines else None, given.far),
         said,
+        *_doubtful_said(matches, loops),
     ]
     there = sum(bool(result.candidates) for result in results)
     reasons.append(_total_said(sum(map(bool, results)), there, given))
@@ -181,6 +183,17 @@ def _verified_said(matches: Matches, geometry: Geometry) -> str:
     unlike = f"{round(geometry.common * geometry.tried)} of {geometry.tried} unlike pairs"
     hidden = f" ({100 * geometry.hidden:.1f} % of the image never changes, and is left out)" if geometry.hidden else ""
     return f"verification: {same} of {tried} matches and {unlike} show the same points{hidden}{unknown}"
+
+
+def _doubtful_said(matches: Matches, loops: np.ndarray) -> list[str]:
+    tried = loops & (matches.inliers >= 0) & ~matches.few
+    same, total = np.count_nonzero(matches.inliers[tried] > 0), np.count_nonzero(tried)
+    if not total or same >= DOUBTFUL * total:
+        return []
+    return [
+        f"only {same} of {total} accepted matches show the same points: if light and season are the same, look at "
+        "them; --odometry tells places that look alike apart"
+    ]
 
 
 def _sequences_said(lines: Lines | None, far: np.ndarray | None) -> str:

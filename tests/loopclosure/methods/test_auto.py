@@ -131,6 +131,7 @@ def test_a_long_sequence_counts_if_any_part_is_verified(kind):
     found = answer(search(Compared(scores, everything(scores), True)), GeometricCheck(), agree)
     assert np.count_nonzero(found.accepted) > 0.9 * 150
     assert f"{40 * (kind == 'all')} of 40 unlike pairs show the same points" in found.reasons[1]
+    assert ("only 0 of 150 accepted matches" in " ".join(found.reasons)) == (kind == "none")
 
 
 @pytest.mark.parametrize(
