@@ -119,7 +119,9 @@ def _sequences(folder: Path) -> None:
     first, second = sorted(tum.iterdir(), reverse=True)
     for name in ("FOLDER", "SEQUENCE", "photos"):
         (folder / name).symlink_to(first)
-    (folder / "OTHER_IMAGES").symlink_to(second)
+    (folder / "OTHER_IMAGES").mkdir()
+    for image in sorted((second / "rgb").iterdir())[::3]:  # enough features for 2,000 words
+        shutil.copy(image, folder / "OTHER_IMAGES")
     shutil.copy(first / "groundtruth.txt", folder / "odometry.txt")
     images = sorted((first / "rgb").iterdir())
     for name, image in (("a.png", images[0]), ("b.png", images[20])):
