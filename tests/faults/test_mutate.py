@@ -1,11 +1,11 @@
 """mutate.py and texts.py, which damage files and texts at random, with few tries."""
 
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import forked
 from faults.formats import FORMATS
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks; reads /proc")]
@@ -19,15 +19,14 @@ SLOW = ("truth.mat", "exported net", "drawn net")  # each read takes a while
     ids=["fast_formats", "slow_formats"],
 )
 def test_randomly_damaged_files_are_refused_in_one_line(tries: str, formats: list[str], tmp_path: Path) -> None:
-    command = [sys.executable, Path(__file__).with_name("mutate.py"), "--tries", tries, *formats]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    program = Path(__file__).with_name("mutate.py")
+    done = forked.run(forked.script, program, ["--tries", tries, *formats], folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count(f": 0 of {tries}\n") == len(formats)
 
 
 def test_texts_with_randomly_replaced_words_are_refused_in_one_line(tmp_path: Path) -> None:
     pytest.importorskip("hypothesis")
-    command = [sys.executable, Path(__file__).with_name("texts.py"), "--tries", "50"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = forked.run(forked.script, Path(__file__).with_name("texts.py"), ["--tries", "50"], folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count(": 50 texts, no fault\n") > 8
