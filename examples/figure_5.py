@@ -71,16 +71,13 @@ def main() -> None:
     join(arguments.sequence, walk)
     net = Path("prototxt", "normalized", arguments.net, "deploy.prototxt")
     shape = f"data=1,3,{arguments.size},{arguments.size}"
-    prepared = ("--mean", "128,128,128", "--scale", 1 / 128)
-    run(
-        *("netspec", "extract", net, "--weights", arguments.weights, "--blob", "feat", "--shape", shape),
-        *(*prepared, "--images", walk / "rgb.txt", "--out", features),
-    )
-    methods = [f"features:{features}", "fabmap", "thumbnails"]
-    run(
-        *("loopclosure", "evaluate", walk, *(word for method in methods for word in ("--method", method))),
-        *("--train", arguments.vocabulary, "--out", arguments.out / "report"),
-    )
+    extract = ["netspec", "extract", net, "--weights", arguments.weights, "--blob", "feat", "--shape", shape]
+    extract += ["--mean", "128,128,128", "--scale", 1 / 128, "--images", walk / "rgb.txt", "--out", features]
+    run(*extract)
+    evaluate = ["loopclosure", "evaluate", walk, "--train", arguments.vocabulary, "--out", arguments.out / "report"]
+    for method in (f"features:{features}", "fabmap", "thumbnails"):
+        evaluate += ["--method", method]
+    run(*evaluate)
     show_times(arguments.out / "report" / "times.csv")
 
 

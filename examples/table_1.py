@@ -73,18 +73,18 @@ def make_pairs(arguments: argparse.Namespace, rooms: list[list[Path]], out: Path
     time: 0.6 for training, 0.2 for validation, 0.2 for testing; test pairs alone are from the whole room.
     """
     root = os.path.commonpath([sequence.resolve().parent for room in arguments.room for sequence in room])
-    frames = [("--same-frame", ",".join(sequence.name for sequence in room)) for room in rooms if len(room) > 1]
     shares = "0.6,0.2,0.2" if counts[0] else "0,0,1"
     names = ("train", "val", "test")
     if not all((out / f"{name}.txt").exists() for name, count in zip(names, counts, strict=True) if count):
-        chosen = [word for name, count in zip(names, counts, strict=True) for word in (f"--{name}", count)]
-        run(
-            *("lmdb-build", "pairs", *(sequence for room in rooms for sequence in room), "--root", root),
-            *("--split", "time", "--shares", shares, "--min-gap", arguments.min_gap, "--different-scenes"),
-            "--at-most",
-            *(word for frame in frames for word in frame),
-            *(*chosen, "--out", out),
-        )
+        command = ["lmdb-build", "pairs", *(sequence for room in rooms for sequence in room), "--root", root]
+        command += ["--split", "time", "--shares", shares, "--min-gap", arguments.min_gap, "--different-scenes"]
+        command += ["--at-most", "--out", out]
+        for room in rooms:
+            if len(room) > 1:
+                command += ["--same-frame", ",".join(sequence.name for sequence in room)]
+        for name, count in zip(names, counts, strict=True):
+            command += [f"--{name}", count]
+        run(*command)
     for name, count in zip(names, counts, strict=True):
         if count and not (out / f"{name}_lmdb").exists():
             size = ("-resize_width", arguments.size, "-resize_height", arguments.size)

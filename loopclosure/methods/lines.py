@@ -18,7 +18,7 @@ from loopclosure.methods.seqslam import SequenceSettings, standardize, trajector
 
 LENGTHS = (10, 30)  # steps of a line
 VELOCITIES = (0.8, 1.2, 0.1)  # least, greatest and step, as shares of the ratio of the lengths of the traverses
-ROOM = 5  # lengths of a line that a drive must have, to show what chance does
+LEAST_LENGTHS = 5  # lengths of a line that a drive must have, to show what chance does
 TAIL = 0.1  # share of the decoys that the tail is fitted to, and at least so many:
 LEAST_TAIL = 5
 LEAST_ACCEPTED = 10  # fewer matches than this cannot be told from one chance line
@@ -129,7 +129,7 @@ def sequences(among: Pool, two: bool) -> Iterator[SequenceSettings]:
     slowest, fastest, step = (ratio * velocity for velocity in VELOCITIES)
     judged = min(np.count_nonzero(among.decoys.any(axis=1)), references / ratio)
     for length in LENGTHS:
-        if judged >= ROOM * length:
+        if judged >= LEAST_LENGTHS * length:
             yield SequenceSettings(length, slowest, fastest, step, contrast=0)
 
 

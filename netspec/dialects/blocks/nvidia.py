@@ -24,7 +24,9 @@ SLOPES, BIASES = 3, 4
 @replace(
     "BatchNorm",
     GROUP,
-    *(f"{GROUP}.{name}" for name in ("scale_filler", "bias_filler", "scale_bias")),
+    f"{GROUP}.scale_filler",
+    f"{GROUP}.bias_filler",
+    f"{GROUP}.scale_bias",
 )
 class BatchNorm(NotLearned, normalization.BatchNorm):
     """Caffe's BatchNorm; with scale_bias, the top is multiplied by learnable slopes, and learnable biases are added.
