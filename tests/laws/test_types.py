@@ -1,5 +1,6 @@
 """pyright, as a test, so that it runs in parallel with the others."""
 
+import os
 import subprocess
 import sys
 
@@ -11,5 +12,7 @@ from paths import ROOT
 @pytest.mark.slow
 def test_pyright_finds_no_error() -> None:
     words = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable]
-    found = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    # More memory for new objects: fewer collections of garbage, a seventh of the CPU time.
+    environment = {**os.environ, "NODE_OPTIONS": "--max-semi-space-size=128"}
+    found = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert found.returncode == 0, found.stdout + found.stderr
