@@ -51,7 +51,7 @@ def start(
     return process
 
 
-def wait(process: BaseProcess, limit_s: float = 300) -> int | None:
+def wait(process: BaseProcess, limit_s: float = 900) -> int | None:
     """Return the exit status of a process, below 0 for a signal; None, and it is ended, if it does not end."""
     process.join(limit_s)
     if process.exitcode is None:
