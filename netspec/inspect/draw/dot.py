@@ -112,7 +112,10 @@ def _header(diagram: Diagram) -> str:
 
 
 def _table(diagram: Diagram, k: int, most: int) -> str:
-    """Return the label of a box: its lines, and below them a cell for each top, where the edges begin."""
+    """Return the label of a box: its lines, and below them a cell for each top, where the edges begin.
+
+    The edges of a single top without a text begin at the box itself.
+    """
     box = diagram.boxes[k]
     lines = list(_lines(box))
     if box.work:
@@ -122,9 +125,12 @@ def _table(diagram: Diagram, k: int, most: int) -> str:
     side = f'SIDES="L" BORDER="5" COLOR="{color_of(box.kind)[1]}"'  # the color of its kind
     body = f'<TABLE BORDER="1" COLOR="{EDGE}" CELLBORDER="0" CELLSPACING="0" CELLPADDING="5" BGCOLOR="white">'
     body += f'<TR><TD {side} ALIGN="LEFT">{inner}</TD></TR></TABLE>'
+    labels = _tops(diagram, k)
+    if labels == [""]:
+        return f'<{BARE_TABLE}<TR><TD PORT="t0">{body}</TD></TR></TABLE>>'
     tops = "".join(
         f'<TD PORT="t{j}" CELLPADDING="2">{_text(label, SMALL, PALE) if label else " "}</TD>'
-        for j, label in enumerate(_tops(diagram, k))
+        for j, label in enumerate(labels)
     )
     span = max(1, len(diagram.tops[k]))
     below = f"<TR>{tops}</TR>" if tops else ""
