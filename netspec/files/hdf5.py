@@ -39,8 +39,8 @@ def open_hdf5(path: str | Path, where: Where | None = None) -> Iterator[Hdf5Grou
 
     Links to other files, and datasets stored in other files, are refused.
     """
-    where = where or Where(str(path))
     named = f'HDF5 file "{path}" ' if where else ""
+    where = where or Where(str(path))
     try:
         with h5py.File(path, "r") as file:
             yield Hdf5Group(file, os.path.getsize(path))
