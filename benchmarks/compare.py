@@ -14,14 +14,14 @@ from benchmarks.case import DECAY, MOMENTUM, RATE, Case
 from benchmarks.report import REFERENCES, Row
 from benchmarks.rounds import CaffeProgram, Contestant, Pass, Starter, Worker, difference, measure, ratio
 
-IN_SEPARATE_ENVIRONMENT = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")  # these run in a separate environment
+IN_SEPARATE_ENVIRONMENT = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")
 
 
 @dataclass(frozen=True)
 class Comparison:
     """The programs that run a case, and the limits of the measurement.
 
-    programs             the programs and engines to compare, such as netspec-onnxruntime
+    programs         the programs and engines to compare, such as netspec-onnxruntime
     training         whether a pass is a training iteration, and not a forward pass
     separate_python  the Python of a separate environment, for the programs that need it
     caffe            the caffe binary, if it is timed too

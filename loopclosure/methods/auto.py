@@ -62,10 +62,11 @@ class Answer:
 class Searched:
     """What the scores of compared frames tell, before any pair is verified: steps 1 to 3.
 
+    stamps    (N,) seconds of the queries of the whole drive, NaN or None where not known
     age_said  a sentence about which pairs show different places; empty for two traverses
     """
 
-    compared: Compared
+    stamps: np.ndarray | None
     given: Candidates
     lines: Lines | None
     matches: Matches
@@ -80,17 +81,17 @@ class Searched:
     @property
     def image_scores(self) -> np.ndarray:
         """The score of the best single candidate of each query (N,), -inf without one."""
-        return self.given.known().max(axis=1, initial=-np.inf)[self.given.stands]
+        return self.given.best[self.given.stands]
 
 
-def search(compared: Compared, precision: float = PRECISION) -> Searched:
+def find_matches(compared: Compared, precision: float = PRECISION) -> Searched:
     """Find the best match of each query by the scores alone, at this ``precision`` of what is accepted."""
     if not 0 < precision < 1:
         raise InputError(f"precision is {precision:g}; expected more than 0 and less than 1")
     given = candidates(compared)
     decoys, age_said = elsewhere(given)
     lines = best_lines(given, pool(given, decoys), precision)
-    return Searched(compared, given, lines, Matches.of(given, lines, precision), age_said)
+    return Searched(compared.stamps, given, lines, Matches.of(given, lines, precision), age_said)
 
 
 def answer(
@@ -118,7 +119,7 @@ def answer(
     loops = decide(matches, lines)
     rejected = np.where(matches.inliers >= 0, "not verified", "below threshold")
     verdicts = np.where(loops, "accepted", np.where(matches.there, rejected, "no candidate"))
-    results = _results(given, matches, loops, verdicts.tolist(), searched.compared.stamps)
+    results = _results(given, matches, loops, verdicts.tolist(), searched.stamps)
     reasons = [
         *filter(None, [given.said, searched.age_said]),
         _sequences_said(lines if matches.by_lines else None, given.far),
@@ -208,10 +209,9 @@ def _total_said(loops: int, queries: int, given: Candidates) -> str:
         return f"{loops} of the {queries} frames that have a candidate close a loop"
     if not queries:
         return "no frame has a candidate: the camera did not come back, or the drive is too short to tell"
-    known = given.known()
-    alike = np.argsort(-known.max(axis=1), kind="stable")[:TRIED]
-    alike = alike[np.isfinite(known[alike].max(axis=1))]  # fewer where few frames have a candidate
-    least, ages = known[alike].max(axis=1).min(), given.queries[alike] - given.references[known[alike].argmax(axis=1)]
+    alike = np.argsort(-given.best, kind="stable")[:TRIED]
+    alike = alike[given.there[alike]]  # fewer where few frames have a candidate
+    least, ages = given.best[alike].min(), given.queries[alike] - given.references[given.single[alike]]
     recent = "" if given.two else f" --exclude-recent {max(0, ages.min() - 1)}"
     tried = f"detect --threshold {np.floor(1e3 * least) / 1e3:g}{recent} accepts the most alike, to be looked at"
     return f"nothing here tells loops from chance: none is accepted ({tried})"
@@ -258,7 +258,7 @@ class Auto:
         visit = None if self.visit < 0 else self.visit
         with timed(seconds, "choice and verification"):
             compared = Compared(found.scores, allowed, two, far, visit)
-            decided = answer(search(compared, self.precision), self.check, agree, progress=progress)
+            decided = answer(find_matches(compared, self.precision), self.check, agree, progress=progress)
         scores = np.full(found.scores.shape, np.nan)
         loops = np.flatnonzero(decided.accepted)
         scores[loops, decided.match[loops]] = [decided.results[query].score for query in loops]

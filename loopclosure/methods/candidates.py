@@ -80,6 +80,13 @@ class Candidates:
         blocks = (slice(first, first + BLOCK) for first in range(0, len(self.queries) or 1, BLOCK))
         return np.concatenate([self.known(block).argmax(axis=1) for block in blocks])
 
+    @cached_property
+    def best(self) -> np.ndarray:
+        """The score (Q,) of ``single``; -inf for a query that has no candidate."""
+        if not self.scores.size:
+            return np.full(len(self.queries), -np.inf)
+        return np.where(self.there, self.scores[np.arange(len(self.scores)), self.single], -np.inf)
+
 
 def candidates(compared: Compared) -> Candidates:
     """Return the pairs that can be loops."""

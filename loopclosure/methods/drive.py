@@ -15,7 +15,7 @@ from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import remember_all
 from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
-from loopclosure.methods.auto import PRECISION, Answer, Searched, answer, search
+from loopclosure.methods.auto import PRECISION, Answer, Searched, answer, find_matches
 from loopclosure.methods.base import BLOCK
 from loopclosure.methods.candidates import Compared, far_apart
 from loopclosure.places.frames import gray, read_gray
@@ -144,13 +144,11 @@ def last_session(
 class _Comparison:
     """The last session, compared with the frames of another session or with itself.
 
-    count    the frames of the last session
     queries, references  the frames that are compared: all, or every second or third one if there are more than
              ``MOST_PAIRS`` pairs; their results also apply to the frames after them
-    stamps   (count,) of the last session
+    stamps   (N,) of all frames of the last session, NaN where not known
     """
 
-    count: int
     queries: range
     references: range
     stamps: np.ndarray
@@ -169,12 +167,12 @@ class _Comparison:
         visit = None if request.visit is None else request.visit // step
         allowed = np.ones((len(queries), len(references)), bool) if two else _earlier(stamps[::step], request.seconds)
         compared = Compared(_compared(detector, queries, references), allowed, two, far, visit, stamps[::step])
-        return cls(count, queries, references, stamps, search(compared, request.precision))
+        return cls(queries, references, stamps, find_matches(compared, request.precision))
 
     def decided(
         self, check: GeometricCheck, pairs: Pairs, worth: np.ndarray | None = None, progress: Progress = silent
     ) -> Answer:
-        """Decide for each frame; ``worth`` (count,) bool: the frames whose matches are verified, None: all."""
+        """Decide for each frame; ``worth`` (N,) bool: the frames whose matches are verified, None: all."""
         step = self.queries.step
         worth = None if worth is None else worth[::step]
         between = Between(check, pairs, self.queries, self.references)
@@ -192,7 +190,9 @@ class _Comparison:
                     stamp=None if np.isnan(stamp) else stamp,
                 )
             )
-        thinned = f"{self.count} frames {TOO_MANY}: one of {step} is compared, and decides for the frames after it"
+        thinned = (
+            f"{len(self.stamps)} frames {TOO_MANY}: one of {step} is compared, and decides for the frames after it"
+        )
         return Answer(results, answered.reasons, [thinned] if step > 1 else [])
 
 
@@ -201,9 +201,11 @@ def _worth(comparisons: list[_Comparison]) -> np.ndarray:
 
     Each frame is verified in two comparisons at most: the one with its best line, and the one with its best image.
     """
-    worth = np.zeros((len(comparisons), comparisons[0].count if comparisons else 0), bool)
+    worth = np.zeros((len(comparisons), len(comparisons[0].stamps) if comparisons else 0), bool)
     for name in ("line_scores", "image_scores") if comparisons else ():
-        scores = [np.repeat(getattr(each.searched, name), each.queries.step)[: each.count] for each in comparisons]
+        scores = [
+            np.repeat(getattr(each.searched, name), each.queries.step)[: len(each.stamps)] for each in comparisons
+        ]
         there = np.flatnonzero(np.isfinite(np.max(scores, axis=0)))
         worth[np.argmax(scores, axis=0)[there], there] = True
     return worth

@@ -44,8 +44,7 @@ class Matches:
     def of(cls, given: Candidates, lines: Lines | None, precision: float) -> Matches:
         """Return the match of each query by its line, or, where lines tell nothing, its best candidate."""
         count = len(given.queries)
-        known = given.known().max(axis=1) if given.scores.size else np.full(count, -np.inf)
-        match, score, line = np.where(np.isfinite(known), given.single, -1), known, np.zeros(count, bool)
+        match, score, line = np.where(given.there, given.single, -1), given.best, np.zeros(count, bool)
         if lines is not None and np.any(accepted := lines.accepted(precision)):
             there = lines.match >= 0
             match = np.where(there, lines.match, match)

@@ -15,7 +15,7 @@ from loopclosure.detector.verification import Agreement, Between, GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.methods import drive as whole
 from loopclosure.methods import lines
-from loopclosure.methods.auto import answer, places, search
+from loopclosure.methods.auto import answer, find_matches, places
 from loopclosure.methods.base import Images, MethodContext, MethodResult
 from loopclosure.methods.candidates import Candidates, Compared, candidates, far_apart, moved
 from loopclosure.methods.decision import between, contradicted, neighbors
@@ -56,7 +56,7 @@ def everything(scores):
 def test_two_traverses_of_one_road_are_matched(seed):
     road = drive(150, seed)
     scores = alike(again(road, 1.5, seed + 50), road)
-    found = answer(search(Compared(scores, everything(scores), True)))
+    found = answer(find_matches(Compared(scores, everything(scores), True)))
     assert np.count_nonzero(found.accepted) > 0.9 * 150
     assert np.all(np.abs(found.match - np.arange(150))[found.accepted] <= 3)
     assert len(found.reasons) == 3
@@ -69,7 +69,7 @@ def test_two_traverses_of_one_road_are_matched(seed):
 @pytest.mark.parametrize("seed", range(10))
 def test_roads_without_common_places_have_no_loops(seed):
     scores = alike(drive(150, seed), drive(120, seed + 100))
-    found = answer(search(Compared(scores, everything(scores), True)))
+    found = answer(find_matches(Compared(scores, everything(scores), True)))
     assert not found.accepted.any()
     assert "none is accepted" in found.reasons[2]
     assert verdicts_said(found.results).startswith("frames: 150 below threshold; best score ")
@@ -78,7 +78,7 @@ def test_roads_without_common_places_have_no_loops(seed):
 def test_a_drive_against_keyframes():
     road = drive(200, 1)
     scores = alike(again(road, 1.0, 2), road[::4])
-    found = answer(search(Compared(scores, everything(scores), True)))
+    found = answer(find_matches(Compared(scores, everything(scores), True)))
     assert np.count_nonzero(found.accepted) > 0.9 * 200
     assert np.all(np.abs(4 * found.match - np.arange(200))[found.accepted] <= 8)
 
@@ -89,7 +89,7 @@ def test_one_drive_with_one_revisit():
     rows = np.concatenate([road, again(road[100:180], 1.0, 4), drive(100, 5)])
     scores = alike(rows, rows)
     allowed = np.tri(len(rows), k=-31, dtype=bool)
-    found = answer(search(Compared(scores, allowed, False)))
+    found = answer(find_matches(Compared(scores, allowed, False)))
     loops = np.zeros(len(rows), bool)
     loops[400:480] = True
     assert np.count_nonzero(found.accepted & loops) > 0.8 * 80
@@ -104,7 +104,7 @@ def test_frames_around_a_loop_are_not_part_of_it(after, seed):
     road, elsewhere = (np.sum([of[k : k + 120] for k in range(6)], axis=0) for of in (steps, other))
     rows = np.concatenate([road, 0.8 * road[20:100], elsewhere[:after]])
     scores = -np.linalg.norm(rows[:, None] - rows, axis=2)
-    found = answer(search(Compared(scores, np.tri(len(rows), k=-1, dtype=bool), False)))
+    found = answer(find_matches(Compared(scores, np.tri(len(rows), k=-1, dtype=bool), False)))
     loops = np.flatnonzero(found.accepted)
     assert len(loops) > 75
     assert np.all((loops >= 120) & (loops < 200))
@@ -114,7 +114,7 @@ def test_frames_around_a_loop_are_not_part_of_it(after, seed):
 @pytest.mark.parametrize("frames", [1, 2, 12])
 def test_too_few_frames_give_no_decision(frames):
     scores = alike(drive(frames, 1), drive(frames, 1))
-    assert not answer(search(Compared(scores, everything(scores), True))).accepted.any()
+    assert not answer(find_matches(Compared(scores, everything(scores), True))).accepted.any()
 
 
 @pytest.mark.parametrize("kind", ["none", "half", "all"])
@@ -128,7 +128,7 @@ def test_a_long_sequence_counts_if_any_part_is_verified(kind):
         same = query < 75 and abs(query - reference) <= 3
         return good if kind == "all" or (kind == "half" and same) else bad
 
-    found = answer(search(Compared(scores, everything(scores), True)), GeometricCheck(), agree)
+    found = answer(find_matches(Compared(scores, everything(scores), True)), GeometricCheck(), agree)
     assert np.count_nonzero(found.accepted) > 0.9 * 150
     assert f"{40 * (kind == 'all')} of 40 unlike pairs show the same points" in found.reasons[1]
     assert ("only 0 of 150 accepted matches" in " ".join(found.reasons)) == (kind == "none")
@@ -151,7 +151,7 @@ def test_a_loop_ends_with_its_last_verified_match(elsewhere):
     def agree(q, r):
         return Agreement(60, 50 if q < 90 and abs(q - r) <= 3 else elsewhere(q, r, best[q]), 20)
 
-    found = answer(search(Compared(scores, everything(scores), True)), GeometricCheck(), agree)
+    found = answer(find_matches(Compared(scores, everything(scores), True)), GeometricCheck(), agree)
     assert np.count_nonzero(found.accepted[:90]) > 80
     assert not found.accepted[90:].any()
 
@@ -218,7 +218,7 @@ def test_one_repeated_image_does_not_override_a_sequence():
     scores[lamps, lamps + 6] = 1
     good, bad = Agreement(60, 50, 20), Agreement(40, 9, 20)
     found = answer(
-        search(Compared(scores, everything(scores), True)),
+        find_matches(Compared(scores, everything(scores), True)),
         GeometricCheck(),
         lambda q, r: good if r - q == 6 * (q in lamps) else bad,
     )
@@ -230,7 +230,7 @@ def test_one_repeated_image_does_not_override_a_sequence():
 def test_a_repetitive_facade_is_not_a_loop(inliers):
     scores = alike(drive(150, 1), drive(120, 101))
     found = answer(
-        search(Compared(scores, everything(scores), True)),
+        find_matches(Compared(scores, everything(scores), True)),
         GeometricCheck(),
         lambda q, r: Agreement(40, inliers * (q % 2), 20),
     )
@@ -242,7 +242,7 @@ def test_loops_on_a_desk_need_three_times_the_points_of_unlike_pairs():
     rng = np.random.default_rng(3)
     rows = again(drive(5, 9)[rng.integers(0, 5, 200)], 0.3, 10)
     found = answer(
-        search(Compared(alike(rows, rows), np.tri(200, k=-6, dtype=bool), False)),
+        find_matches(Compared(alike(rows, rows), np.tri(200, k=-6, dtype=bool), False)),
         GeometricCheck(),
         lambda q, r: Agreement(90, 70 if rows[q] @ rows[r] > 0.7 else 25, 20),
     )
@@ -274,7 +274,7 @@ def test_a_camera_that_moves_slowly_closes_no_loop():
     rows = np.cumsum(steps, axis=0)
     rows = rows[100:] - rows[:-100]
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    assert not answer(search(Compared(alike(rows, rows), np.tri(400, k=-31, dtype=bool), False))).accepted.any()
+    assert not answer(find_matches(Compared(alike(rows, rows), np.tri(400, k=-31, dtype=bool), False))).accepted.any()
 
 
 @pytest.mark.slow
@@ -283,7 +283,7 @@ def test_a_second_pass_with_an_offset_is_found_from_consecutive_frames():
     rows = np.concatenate([road, again(road[100:180], 1.0, 4), drive(100, 5)])
     points = Agreement(80, 60, 20), Agreement(80, 9, 20)
     found = answer(
-        search(Compared(alike(rows, rows), np.tri(len(rows), k=-31, dtype=bool), False)),
+        find_matches(Compared(alike(rows, rows), np.tri(len(rows), k=-31, dtype=bool), False)),
         GeometricCheck(),
         lambda q, r: points[q - r != 1],
     )
@@ -314,7 +314,7 @@ def test_a_stopped_robot_adds_no_frames_to_a_sequence(stands, times, noise):
     still, moving = again(again(road, 0.8, 7)[places], noise, 8), np.arange(150)
     there, here = (places, moving) if stands == "query" else (moving, places)
     scores = alike(still, road) if stands == "query" else alike(road, still)
-    found = answer(search(Compared(scores, everything(scores), True)))
+    found = answer(find_matches(Compared(scores, everything(scores), True)))
     assert np.count_nonzero(found.accepted) > 0.95 * len(there)
     assert np.all(np.abs(here[found.match] - there)[found.accepted] <= 1)
 
@@ -331,7 +331,7 @@ def test_a_loop_does_not_cross_a_cut():
     """The second pass begins where the first one did, and not where it ended."""
     road = drive(150, 6)
     rows = np.concatenate([road, again(road, 0.8, 7)])
-    found = answer(search(Compared(alike(rows, rows), np.tri(300, k=-11, dtype=bool), False)))
+    found = answer(find_matches(Compared(alike(rows, rows), np.tri(300, k=-11, dtype=bool), False)))
     assert np.count_nonzero(found.accepted[150:]) > 130
     assert np.count_nonzero(found.accepted[:150]) <= 1
     assert np.all(np.abs(found.match - np.arange(300) + 150)[found.accepted] <= 3)
@@ -363,7 +363,7 @@ def test_with_odometry_single_images_are_distinguished_from_chance():
     rows = np.concatenate([again(places, 0.5, 3), places])
     scores, allowed = alike(rows, rows), np.tri(200, k=-6, dtype=bool)
     far = far_apart(round_and_round(200))
-    found = answer(search(Compared(scores, allowed, False, far)))
+    found = answer(find_matches(Compared(scores, allowed, False, far)))
     wrong = np.abs(found.match - np.arange(200) + 100) > 2
     assert "far apart in the odometry" in found.reasons[2]
     assert np.count_nonzero(found.accepted) > 50
@@ -378,7 +378,7 @@ def test_single_images_are_verified_if_sequences_are_inconclusive():
     scores = alike(rows, rows)
     points = Agreement(60, 50, 20), Agreement(3, 0, 20)
     found = answer(
-        search(Compared(scores, np.tri(200, k=-6, dtype=bool), False)),
+        find_matches(Compared(scores, np.tri(200, k=-6, dtype=bool), False)),
         GeometricCheck(),
         lambda a, b: points[0] if seen[a] == seen[b] and a % 10 else points[1],
     )
@@ -446,15 +446,15 @@ def test_invalid_settings_are_refused(spec, message):
 
 def test_a_precision_that_makes_no_sense():
     with pytest.raises(InputError, match="precision is 2"):
-        search(Compared(np.eye(3), np.ones((3, 3), bool), True), precision=2.0)
+        find_matches(Compared(np.eye(3), np.ones((3, 3), bool), True), precision=2.0)
 
 
 def test_results_do_not_depend_on_blocks_of_queries(monkeypatch):
     road = drive(120, 5)
     scores = alike(again(road, 1.0, 6), road)
-    at_once = answer(search(Compared(scores, everything(scores), True)))
+    at_once = answer(find_matches(Compared(scores, everything(scores), True)))
     monkeypatch.setattr(lines, "BLOCK", 7)
-    assert answer(search(Compared(scores, everything(scores), True))) == at_once
+    assert answer(find_matches(Compared(scores, everything(scores), True))) == at_once
     assert np.count_nonzero(at_once.accepted) > 100
 
 
@@ -494,5 +494,5 @@ def test_the_advised_threshold_is_accepted_by_the_parser() -> None:
     scores = np.random.default_rng(0).normal(size=(30, 30)) - 5
     allowed = np.zeros((30, 30), bool)
     allowed[:3] = True
-    *_, total = answer(search(Compared(scores, allowed, True))).reasons
+    *_, total = answer(find_matches(Compared(scores, allowed, True))).reasons
     assert re.search(r"--threshold -\d+(\.\d+)? accepts", total), total
