@@ -32,14 +32,20 @@ def run(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    source = folder / "source"
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clone by the name that `git clone` gives it, alone in a folder."""
+    source = tmp_path_factory.mktemp("projects") / "netspec"
     for package in PACKAGES:
         shutil.copytree(ROOT / package, source / package, ignore=shutil.ignore_patterns("__pycache__"))
     for name in FILES:
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, source / name)
+    return source
+
+
+@pytest.fixture(scope="module")
+def wheel(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
     run(*PIP, "wheel", "--no-deps", "--no-build-isolation", "--no-index", "-w", folder, source, cwd=folder)
     (built,) = folder.glob("*.whl")
     return built
@@ -126,8 +132,9 @@ def test_detect_works_without_options(commands: Path, tmp_path: Path) -> None:
     assert (paper / "train_val.prototxt").read_bytes() == (ROOT / "prototxt/siamese_8/train_val.prototxt").read_bytes()
 
 
-def test_an_editable_installation_has_the_nets(wheel: Path, tmp_path: Path) -> None:
-    source, site = wheel.parent / "source", tmp_path / "site"
+def test_an_editable_installation_has_the_nets_also_in_the_folder_of_the_clone(source: Path, tmp_path: Path) -> None:
+    """In the folder that holds a clone, Python finds the clone first: a package of this name without any file."""
+    site = tmp_path / "site"
     venv.create(site, symlinks=True)
     editable = ("install", "--no-deps", "--no-index", "--no-build-isolation", "-e", source)
     (packages,) = site.glob("lib/python*/site-packages")
@@ -136,9 +143,10 @@ def test_an_editable_installation_has_the_nets(wheel: Path, tmp_path: Path) -> N
     )
     run(*PIP, "--python", site / "bin" / "python", *editable, cwd=tmp_path)
     code = "from loopclosure.detector.run import load_describe; import netspec; print(netspec.__file__, load_describe"
-    said = run(site / "bin" / "python", "-c", f"{code}('small', {{}}).views)", cwd=tmp_path).stdout.split()
-    assert Path(said[0]).is_relative_to(source)
-    assert said[1] == "1"
+    for folder in (tmp_path, source.parent):
+        said = run(site / "bin" / "python", "-c", f"{code}('small', {{}}).views)", cwd=folder).stdout.split()
+        assert said == [str(source / "netspec" / "__init__.py"), "1"]
+    assert "usage: netspec" in run(site / "bin" / "python", "-m", "netspec", "--help", cwd=source.parent).stdout
 
 
 def test_every_weight_has_its_source_and_license() -> None:
