@@ -61,11 +61,9 @@ def walk(steps: Iterable[Step], values: Values, exact: str, visit: Visit | None 
         _, run, bottoms, tops, losses, ends = step
         given = [values[v] for v in bottoms]
         made = run(*given) if visit is None else visit(step, given)
-        if isinstance(made, tuple):
-            values.update(zip(tops, made, strict=False))
-        elif tops:
-            values[tops[0]] = made
+        if not isinstance(made, tuple):
             made = (made,)
+        values.update(zip(tops, made, strict=False))  # a loss may have no top
         for j, weight in losses:
             term = weighted_sum(made[j], weight, exact)
             loss = term if loss is None else loss + term

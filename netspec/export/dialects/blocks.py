@@ -77,7 +77,7 @@ class InterpExport(Exporter):
             return code.call(template.replace("{size}", "{y}.shape[2:]"), x=x, y=like[0])
         if None not in code.sizes(0)[2:] or param.HasField("height"):
             return code.call(template, x=x, size=tuple(self.layer.top_shapes[0][2:]))
-        size = "[(n - 1) // {shrink} * {zoom} + 1 for n in {x}.shape[2:]]"
+        size = f"{code.function(zoomed_size)}({{x}}, {{shrink}}, {{zoom}})"
         return code.call(template.replace("{size}", size), x=x, shrink=param.shrink_factor, zoom=param.zoom_factor)
 
 
@@ -246,6 +246,11 @@ class CappedExport(Exporter):
         if self.layer.slope == 0:
             return code.call("F.relu6({x})", x=bottoms[0])
         return code.call("F.leaky_relu({x}, {slope}).clamp(max=6)", x=bottoms[0], slope=self.layer.slope)
+
+
+def zoomed_size(x, shrink, zoom):
+    """Return the height and width of a map of which every shrink-th pixel is kept and the steps are zoomed."""
+    return [(n - 1) // shrink * zoom + 1 for n in x.shape[2:]]
 
 
 def normalize(x, scale, axes, eps):

@@ -260,9 +260,9 @@ def detection_output(
     scores = conf.reshape(images, -1, classes).transpose(1, 2)
     scores, order = scores.sort(dim=2, descending=True, stable=True)
     scores, order = scores[..., :candidates], order[..., :candidates]
-    boxes = boxes[torch.arange(images)[:, None, None], order]
+    boxes = boxes[torch.arange(images, device=loc.device)[:, None, None], order]
     kept = (scores > confidence) & ~suppressed(boxes, overlap)
-    kept = kept & (torch.arange(classes) != background)[:, None]
+    kept = kept & (torch.arange(classes, device=loc.device) != background)[:, None]
     if most is not None:
         ranked = torch.where(kept, scores, -torch.inf).flatten(1)
         best = ranked.argsort(dim=1, descending=True, stable=True)[:, :most]
@@ -270,8 +270,8 @@ def detection_output(
         kept = kept & chosen.reshape(kept.shape)
     image, label, _ = kept.nonzero(as_tuple=True)
     found = [image[:, None], label[:, None], scores[kept][:, None], boxes[kept]]
-    nothing = torch.full((images, 7), -1.0)
-    nothing[:, 0] = torch.arange(images)
+    nothing = loc.new_full((images, 7), -1.0)
+    nothing[:, 0] = torch.arange(images, device=loc.device)
     rows = torch.cat([torch.cat(found, 1), nothing])
     counted = torch.cat([kept[kept], (~kept.any()).expand(images)])
     return rows[counted][None, None]

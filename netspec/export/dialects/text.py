@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from netspec.export.exporter import Exporter, exports
-from netspec.export.targets import OnnxGraph
+from netspec.export.targets import OnnxGraph, TorchCode
 
 
 @exports("netspec.dialects.text.text.ContinuationIndicator")
 class ContinuationIndicatorExport(Exporter):
-    torch_call = "torch.ones({size}).index_fill(0, torch.tensor([0]), 0)"
-
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.constant(self.layer.forward().cpu())
+
+    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+        return code.buffer(self.layer.forward())
 
 
 @exports("netspec.dialects.text.text.Reverse")

@@ -18,7 +18,9 @@ from netspec.export.formats.convert import Source
 from netspec.export.formats.onnx import export_onnx
 from netspec.export.table import layer_notes
 from netspec.graph.options import TORCH, BuildOptions
+from netspec.graph.plan import origins
 from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias
+from netspec.layers.contract.offers import passes_on
 from netspec.layers.contract.reading import reads_data
 from netspec.net.net import Net
 from netspec.proto.schema import PHASE_NAMES, TEST
@@ -87,9 +89,14 @@ class Engine:
         self._plan, self._layers, self._exact = net.plan, list(net.layers), net.options.exact
         self._choice, self._from, self._write = choice, origin, write
         self._blobs = blobs_of(net.layers)
-        losses = zip(net.plan.nodes, losses_of(net.loss_weights), strict=True)
+        losses = list(zip(net.plan.nodes, losses_of(net.loss_weights), strict=True))
         # The values of named losses, and their weights.
         self._weighted = [(node.tops[j], w) for node, own in losses for j, w in own if j < len(node.tops)]
+        # A loss without a top is no value of the model: torch computes it from its bottoms.
+        unnamed = {i for i, (node, own) in enumerate(losses) if any(j >= len(node.tops) for j, _ in own)}
+        self._unnamed = [step for step in net.eager.one_by_one() if step.node in unnamed]
+        first = origins(net.plan, [passes_on(layer) for layer in net.layers])
+        self._read = {v: first[v] for step in self._unnamed for v in step.bottoms}
         self._readers = [step for step in net.eager.one_by_one() if reads_data(self._layers[step.node])]
         layers = zip(net.plan.nodes, net.layers, strict=True)
         ends = [node for node, layer in layers if layer.is_input or reads_data(layer)]
@@ -124,7 +131,9 @@ class Engine:
 
     def _pass(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
         names = self._plan.blobs
-        wanted = (*sorted(kept), *(v for v, _ in self._weighted))
+        if any(names[v] in names[v + 1 :] for v in self._read.values()):
+            raise Unable("a loss without a top reads a blob that is changed afterwards")
+        wanted = (*sorted(kept), *(v for v, _ in self._weighted), *self._read.values())
         model = self._current(tuple(dict.fromkeys(names[v] for v in wanted)))
         values = dict(given)
         walk(self._readers, values, self._exact)
@@ -138,6 +147,9 @@ class Engine:
         loss = torch.zeros(())
         for v, weight in self._weighted:
             loss = loss + weighted_sum(values[v], weight, self._exact)
+        if self._unnamed:
+            read = {v: values[first] for v, first in self._read.items()}
+            loss = loss + (walk(self._unnamed, read, self._exact) or 0)
         return loss, values
 
     def _shapes(self, given: dict[int, Shape]) -> dict[int, Shape]:

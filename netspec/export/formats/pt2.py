@@ -24,6 +24,7 @@ from netspec.export.formats.torch_code import MARK, Definition, check_shapes, le
 from netspec.export.table import layer_notes
 from netspec.files.whole_file import whole_file
 from netspec.net.net import Net
+from netspec.proto.schema import TRAIN
 
 OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Add: operator.add,
@@ -42,6 +43,7 @@ def export_pt2(net: Net, path: str | Path) -> list[str]:
     Raises SpecError if torch.export cannot export the net, or if the file cannot be written.
     """
     module, shapes = _module_and_shapes(net)
+    module.training = net.phase == TRAIN  # Dropout drops; modules such as BatchNorm2d keep what they learned
     inputs = [v for node, layer in zip(net.plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops]
     notes = [*shapes.fixed, *layer_notes(net.layers)]
     every = [free.name for free in shapes.free if not free.counted]

@@ -59,7 +59,8 @@ class Module:
 
     def tensors(self, prefix: str) -> dict[str, torch.Tensor]:
         """Return all tensors by their names in a state_dict, for the attribute ``prefix``."""
-        return {f"{prefix}.{name}" if name else prefix: tensor for name, tensor in self.state.items()}
+        state = _copies(self.state)
+        return {f"{prefix}.{name}" if name else prefix: tensor for name, tensor in state.items()}
 
 
 @dataclass(eq=False)
@@ -241,14 +242,16 @@ class _Collector:
         for v in net.plan.outputs.values():
             self.readers[origin[v]] += 1
         self.made_by: dict[int, Statement] = {}
-        self.modules_of: list[tuple[frozenset[int], int]] = []  # the learnable blobs of a module, and its number
+        self.modules_of: list[tuple[tuple[int, ...], int]] = []  # the learnable blobs of a module, and its number
 
     def add(self, targets: Sequence[int], tops: str | Sequence[str]) -> None:
         """Add the statements of a layer."""
-        if isinstance(tops, str):
+        if not targets:
+            groups = []
+        elif isinstance(tops, str):
             groups = [(tuple(targets), tops)]
         else:
-            groups = [((v,), top) for v, top in zip(targets, tops, strict=True)]
+            groups = [((v,), top) for v, top in zip(targets, tops, strict=False)]  # a loss may have no top
         for values, expression in groups:
             passed_on = _ONE_MARK.match(expression)
             if passed_on and passed_on[1] == "v" and len(values) == 1:
@@ -277,33 +280,34 @@ class _LayerCode:
     def module(
         self, template: str, state: Mapping[str, torch.Tensor], usual: Mapping[str, Any] | None = None, **values: Any
     ) -> str:
-        own = frozenset(id(blob) for blob in self.layer.blobs)
+        own = tuple(id(blob) for blob in self.layer.blobs)
         for blobs, known in self.collector.modules_of:
             module = self.made.modules[known]
-            if own and own == blobs and (module.template, module.numbers) == (template, values):
+            same = own and own == blobs and (module.template, module.numbers) == (template, values)
+            if same and _same(module.state, state):
                 return mark("m", known)
-        return self._add(Module(self.plan_node.name, template, values, _copies(state), usual=dict(usual or {})), own)
+        return self._add(Module(self.plan_node.name, template, values, dict(state), usual=dict(usual or {})), own)
 
     def parameter(self, index: int, shape: Sequence[int] | None = None, name: str = "") -> str:
         values = self.layer.blob(index)
         shaped = values if shape is None else values.reshape(tuple(shape))
-        own = frozenset([id(self.layer.blobs[index])])
+        own = (id(self.layer.blobs[index]),)
         for blobs, known in self.collector.modules_of:
             if own == blobs and self.made.modules[known].numbers == {"shape": tuple(shaped.shape)}:
                 return mark("m", known)
         return self._stored("nn.Parameter(torch.zeros({shape}))", shaped, own, name)
 
     def buffer(self, values: torch.Tensor) -> str:
-        return self._stored("torch.zeros({shape})", values, frozenset(), kind="buffer")
+        return self._stored("torch.zeros({shape})", values, (), kind="buffer")
 
     def _stored(
-        self, template: str, values: torch.Tensor, blobs: frozenset[int], name: str = "", kind: str = "module"
+        self, template: str, values: torch.Tensor, blobs: tuple[int, ...], name: str = "", kind: str = "module"
     ) -> str:
         layer = " ".join([self.plan_node.name, *([name] if name else [])])
         numbers = {"shape": tuple(values.shape)}
-        return self._add(Module(layer, template, numbers, _copies({"": values}), kind), blobs)
+        return self._add(Module(layer, template, numbers, {"": values}, kind), blobs)
 
-    def _add(self, module: Module, blobs: frozenset[int]) -> str:
+    def _add(self, module: Module, blobs: tuple[int, ...]) -> str:
         self.made.modules.append(module)
         self.collector.modules_of.append((blobs, len(self.made.modules) - 1))
         return mark("m", len(self.made.modules) - 1)
@@ -328,7 +332,7 @@ class _LayerCode:
         if ", affine=False" not in module.template or uses > 1:
             return False
         module.template = module.template.replace(", affine=False", "")
-        module.state.update(_copies(affine))
+        module.state.update(affine)
         return True
 
     def sizes(self, bottom: int) -> Sizes:
@@ -370,6 +374,13 @@ class _LayerCode:
         value = self.plan_node.tops[top]
         self.made.inputs.append(value)
         return mark("v", value)
+
+
+def _same(first: Mapping[str, torch.Tensor], second: Mapping[str, torch.Tensor]) -> bool:
+    """Return whether two states have the same tensors in the same roles; a transposed one is another tensor."""
+    return first.keys() == second.keys() and all(
+        a.stride() == b.stride() and torch.equal(a, b) for a, b in zip(first.values(), second.values(), strict=True)
+    )
 
 
 def _copies(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

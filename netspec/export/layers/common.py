@@ -43,7 +43,7 @@ class DropoutExport(Exporter):
         layer = self.layer
         if layer.phase != TRAIN:
             return bottoms[0]
-        return code.call("F.dropout({x}, {ratio}, layer.training)", x=bottoms[0], ratio=layer.ratio)
+        return code.call("F.dropout({x}, {ratio}, self.training)", x=bottoms[0], ratio=layer.ratio)
 
 
 @exports(Embed)

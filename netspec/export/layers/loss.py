@@ -45,6 +45,23 @@ class ClassifiedExport(Exporter):
         valid = graph.cast(graph.node("Not", graph.node("Equal", labels, graph.constant(ignore_label))), "int64")
         return graph.cast(valid, "float32"), graph.node("Mul", labels, valid)
 
+    def torch_scores_and_labels(self, code: TorchCode, bottoms: Sequence[str], axis: int) -> tuple[str, str]:
+        """Return scores (outer, classes, ...) and labels (outer, ...), from scores with the classes on ``axis``."""
+        x, y = bottoms
+        scores, labels = self.layer.bottom_shapes
+        axis %= len(scores)
+        items = (*scores[:axis], *scores[axis + 1 :])
+        if labels == (*scores[:axis], 1, *scores[axis + 1 :]):
+            y = code.call("{y}.squeeze({axis})", y=y, axis=axis)
+        elif labels != items:
+            y = code.call("{y}.reshape({x}.select({axis}, 0).shape)", x=x, y=y, axis=axis)
+        if axis == 0:
+            return code.call("{x}[None]", x=x), code.call("{y}[None]", y=y)
+        if axis > 1:
+            flat = "{x}.flatten(0, {last})"
+            return code.call(flat, x=x, last=axis - 1), code.call(flat, x=y, last=axis - 1)
+        return x, y
+
 
 def onnx_normalized_sum(graph: OnnxGraph, losses: str, valid: str, mode: int) -> str:
     """Write the sum of losses (outer, ...), divided as :func:`normalizer` says; an empty ``valid``: all count."""
@@ -165,18 +182,18 @@ class SoftmaxWithLossExport(ClassifiedExport):
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
         layer = self.layer
-        scores, labels = layer.bottom_shapes
-        y = bottoms[1] if labels == (scores[0], *scores[2:]) else code.call("{y}.squeeze(1)", y=bottoms[1])
-        if scores[1] != layer.classes or labels not in ((scores[0], *scores[2:]), (scores[0], 1, *scores[2:])):
-            raise self.refusal("PyTorch", "it is exported for scores (N, C, ...) and labels (N, ...) or (N, 1, ...)")
+        axis = layer.param.softmax_param.axis % len(layer.bottom_shapes[0])
+        x, y = self.torch_scores_and_labels(code, bottoms, axis)
         if layer.ignore_label is None and layer.normalization in (FULL, VALID):
-            loss = code.call("F.cross_entropy({x}, {y}.long())", x=bottoms[0], y=y)
+            loss = code.call("F.cross_entropy({x}, {y}.long())", x=x, y=y)
         else:
             divisor = {FULL: "all", VALID: "counted", BATCH_SIZE: "items", NONE: "none"}[layer.normalization]
             options = {} if layer.ignore_label is None else {"ignore": layer.ignore_label}
             given = ", ".join([f'divide_by="{divisor}"', *(f"{name}={{{name}}}" for name in options)])
-            loss = code.call(f"{code.function(softmax_loss)}({{x}}, {{y}}, {given})", x=bottoms[0], y=y, **options)
-        return (loss,) if layer.num_tops == 1 else (loss, code.call("F.softmax({x}, dim=1)", x=bottoms[0]))
+            loss = code.call(f"{code.function(softmax_loss)}({{x}}, {{y}}, {given})", x=x, y=y, **options)
+        return (
+            (loss,) if layer.num_tops == 1 else (loss, code.call("F.softmax({x}, dim={axis})", x=bottoms[0], axis=axis))
+        )
 
 
 @exports(InfogainLoss)
@@ -235,8 +252,9 @@ class AccuracyExport(ClassifiedExport):
 
     def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
         layer = self.layer
-        if layer.num_tops > 1 or layer.inner != math.prod(layer.bottom_shapes[0][2:]):
-            raise self.refusal("PyTorch", "it is exported for scores (N, C, ...), without the accuracy of each class")
+        if layer.num_tops > 1:
+            raise self.refusal("PyTorch", "it is exported without the accuracy of each class")
+        bottoms = self.torch_scores_and_labels(code, bottoms, layer.param.accuracy_param.axis)
         function = code.function(accuracy)
         template = f"{function}({', '.join(bottoms)}, top_k={{top_k}}, ignore_label={{ignore}})"
         return code.call(template, top_k=layer.top_k, ignore=layer.ignore_label)

@@ -206,6 +206,10 @@ class PoolingBaseExport(Exporter):
             options.append("stride={stride}")
         if any(2 * p > k for k, _, p, _ in geometry):
             frame = (windows.pad[1], windows.reach[1], windows.pad[0], windows.reach[0])
+            if mask:
+                template = f"{code.function(max_pool_of_padded)}({{x}}, {{frame}}, {', '.join(options)})"
+                numbers = {name: pair[0] if pair[0] == pair[1] else pair for name, pair in numbers.items()}
+                return code.call(template, x=x, frame=frame, **numbers)
             x = code.call("F.pad({x}, {frame}, value=-torch.inf)", x=x, frame=frame)
         else:
             options += ["padding={padding}"] if any(windows.pad) else []
@@ -259,6 +263,15 @@ class SPPExport(PoolingBaseExport):
         if len(levels) == 1:
             return levels[0]
         return f"torch.cat([{', '.join(f'{level}.flatten(1)' for level in levels)}], dim=1)"
+
+
+def max_pool_of_padded(x, frame, kernel_size, stride=None):
+    """Return the maxima of a padded map, and the pixels of the map itself that have them."""
+    left, _, above, _ = frame
+    padded = F.pad(x, frame, value=-torch.inf)
+    top, pixels = F.max_pool2d(padded, kernel_size, stride, return_indices=True)
+    row = torch.div(pixels, padded.shape[3], rounding_mode="floor") - above
+    return top, row * x.shape[3] + pixels % padded.shape[3] - left
 
 
 def lay_out_windows(x, rows, **geometry):
