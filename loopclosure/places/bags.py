@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
 from loopclosure.places.intrinsics import Intrinsics
+from loopclosure.places.messages import camera_of, image_of, pose_of, seconds
 from loopclosure.places.pose_files import moved
 from netspec.errors import SpecError
-from netspec.files.opencv import cv2
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 POSES = (
@@ -24,14 +24,6 @@ POSES = (
     "geometry_msgs/msg/TransformStamped",
 )
 CAMERA_INFO, TREE = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
-BAYER = {
-    "bayer_rggb8": cv2.COLOR_BayerBG2BGR,
-    "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
-    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR,
-    "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
-}
-TO_BGR = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGR, "bgra8": cv2.COLOR_BGRA2BGR, **BAYER}
-CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, **dict.fromkeys(BAYER, 1)}
 
 
 def is_bag(path: Path) -> bool:
@@ -57,7 +49,7 @@ class Bag:
         with _reading(self.path):
             for message in self._messages(self.topic):
                 self.frame = message.header.frame_id
-                yield _seconds(message.header.stamp), self._image(message)
+                yield seconds(message.header.stamp), self._image(message)
 
     def poses(self) -> tuple[np.ndarray, np.ndarray, str]:
         """Return stamps (N,), poses (N, 7) of the camera, and a sentence about how the poses were converted.
@@ -71,12 +63,8 @@ class Bag:
         stamps, rows, child = [], [], ""
         for message in self._messages(self.pose_topic):
             child = getattr(message, "child_frame_id", "")
-            inner = getattr(message, "transform", None) or message.pose
-            inner = getattr(inner, "pose", inner)  # with covariance
-            place = getattr(inner, "translation", None) or inner.position
-            turn = getattr(inner, "rotation", None) or inner.orientation
-            stamps.append(_seconds(message.header.stamp))
-            rows.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
+            stamps.append(seconds(message.header.stamp))
+            rows.append(pose_of(message))
         poses = np.array(rows).reshape(-1, 7)
         mount = self._mount(child) if child and self.frame else None
         if mount is None:
@@ -93,13 +81,7 @@ class Bag:
         for connection in self._reader.connections:
             if connection.msgtype == CAMERA_INFO and connection.topic == f"{namespace}/camera_info":
                 for message in self._messages(connection.topic):
-                    k, d = (message.K, message.D) if hasattr(message, "K") else (message.k, message.d)  # ROS 1, 2
-                    pinhole = message.distortion_model in ("plumb_bob", "") and len(d) in (0, 4, 5)
-                    if not (k[0] > 0 and pinhole):
-                        return None
-                    bent = tuple(float(value) for value in d) if np.any(d) else ()
-                    size = (int(message.width), int(message.height))
-                    return Intrinsics(float(k[0]), float(k[4]), float(k[2]), float(k[5]), bent, size)
+                    return camera_of(message)
         return None
 
     def _messages(self, topic: str) -> Iterator[Any]:
@@ -121,20 +103,10 @@ class Bag:
         return ""
 
     def _image(self, message: Any) -> np.ndarray:
-        if not hasattr(message, "encoding"):
-            image = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR)
-            if image is None:
-                raise InputError(f"{self.topic} has a compressed image that cannot be read", self.path)
-            return image
-        channels = CHANNELS.get(message.encoding)
-        if channels is None:
-            known = ", ".join(CHANNELS)
-            raise InputError(f'{self.topic} has images in "{message.encoding}"; known: {known}', self.path)
-        rows = np.asarray(message.data, np.uint8)[: message.height * message.step].reshape(message.height, message.step)
-        image = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
-        if message.encoding in TO_BGR:
-            return cv2.cvtColor(image, TO_BGR[message.encoding])
-        return np.repeat(image, 3, axis=2) if channels == 1 else image
+        try:
+            return image_of(message)
+        except InputError as fault:
+            raise InputError(f"{self.topic} has {fault.message}", self.path) from None
 
     def _mount(self, body: str) -> np.ndarray | None:
         """Return the pose (4, 4) of the camera in the frame ``body`` from static transforms; None if not known."""
@@ -193,7 +165,3 @@ def _reading(path: Path) -> Iterator[None]:
     except Exception as fault:
         reason = " ".join(str(fault).split()) or type(fault).__name__
         raise InputError(f"cannot be read as a ROS bag ({reason})", path) from None
-
-
-def _seconds(stamp: Any) -> float:
-    return stamp.sec + 1e-9 * stamp.nanosec
