@@ -58,7 +58,8 @@ class Filter:
             extent = self.dilation[axis] * (self.kernel[axis] - 1) + 1
             windows = windows.unfold(2 + axis, extent, self.stride[axis])[..., :: self.dilation[axis]]
         columns = windows.permute(0, 1, *range(2 + axes, 2 + 2 * axes), *range(2, 2 + axes))
-        return columns.reshape(len(maps), maps.shape[1] * math.prod(self.kernel), -1).contiguous()
+        pixels, positions = math.prod(self.kernel), math.prod(self.fits(maps.shape[2:]))
+        return columns.reshape(len(maps), maps.shape[1] * pixels, positions).contiguous()
 
     def spread(self, columns: torch.Tensor, size: Axes) -> torch.Tensor:
         """Add columns up to maps (N, C, size), one pixel of the filter at a time (col2im).

@@ -212,12 +212,13 @@ class Prepared:
             return lambda *bottoms: layer.run(*(bottom.contiguous() for bottom in bottoms)), "by value"
         members = (step.node, *(step.chain.folded if step.chain else ()))
         blobs = [blob for i in members for blob in layers[i].blobs]
+        own_shapes = [shape for i in members for shape in layers[i].blob_shapes]  # differ with share_mode: PERMISSIVE
         uses: list[str] = []
 
         def memo(name: str, make: Callable[[], Any]) -> Any:
             uses.append(name)
-            # Layers that share blobs share their memos too, unless other layers are folded into them.
-            key = (name, step.node if step.chain else -1, *map(id, blobs))
+            # Layers that share blobs in one shape share their memos too, unless other layers are folded into them.
+            key = (name, step.node if step.chain else -1, *map(id, blobs), *own_shapes)
             memos.add(key)
             kept = self.memos.get(key)
             if kept is None or not kept[0].are(blobs):

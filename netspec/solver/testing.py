@@ -32,13 +32,13 @@ def scorers(net: Net, solver: Any = None) -> dict[str, Scorer]:
 class Tally:
     """Sums the losses and outputs of batches; ``loss`` and ``scores`` are their means so far.
 
-    Outputs in ``scorers`` are kept instead, and scored together.
+    Outputs in ``scorers`` are kept instead, and scored together. An output whose size changes has no mean.
     """
 
     def __init__(self, scorers: Mapping[str, Scorer] | None = None) -> None:
         self.batches = 0
         self._loss = 0.0
-        self._sums: Outputs = {}
+        self._sums: dict[str, list[float] | None] = {}  # None: its size has changed
         self._scorers = dict(scorers or {})
         self._gathered: dict[str, list[torch.Tensor]] = {name: [] for name in self._scorers}
 
@@ -51,7 +51,12 @@ class Tally:
         batch = as_scores({name: blob for name, blob in outputs.items() if name not in self._scorers})
         for name, values in batch.items():
             sums = self._sums.setdefault(name, [0.0] * len(values))
-            self._sums[name] = [a + b for a, b in zip(sums, values, strict=True)]
+            if sums is None or len(sums) == len(values):
+                self._sums[name] = sums and [a + b for a, b in zip(sums, values, strict=True)]
+            else:
+                self._sums[name] = None
+                sizes = f"{len(values):,} values in batch {self.batches}, and {len(sums):,} before"
+                log.warning("solver.cpp:414", f'output "{name}" has {sizes}; its mean is not computed')
         return batch
 
     @property
@@ -62,7 +67,11 @@ class Tally:
     @property
     def scores(self) -> Outputs:
         """The mean of each element of each output blob, then the scores of outputs in ``scorers``."""
-        means = {name: [value / self.batches for value in values] for name, values in self._sums.items()}
+        means = {
+            name: [value / self.batches for value in values]
+            for name, values in self._sums.items()
+            if values is not None
+        }
         return means | {name: score(self._gathered[name]) for name, score in self._scorers.items()}
 
 

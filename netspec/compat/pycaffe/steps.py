@@ -5,6 +5,7 @@ Caffe: include/caffe/layer.hpp, Net::ForwardFromTo, Net::BackwardFromTo (src/caf
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 
@@ -98,6 +99,13 @@ class LayerStep:
         """Return whether the layer overwrites a bottom. It has then kept what its gradient needs."""
         return any(top is blob for top in self.tops)
 
+    def _is_shaped_like(self, blob: Blob, read: torch.Tensor) -> bool:
+        """Return whether a bottom has the shape that it had when the layer read it.
+
+        A layer in place may have given it its own shape since: MVN makes four axes.
+        """
+        return read.numel() == blob.count if self._is_in_place(blob) else read.shape == blob.shape
+
     # Running
 
     def reshape(self) -> None:
@@ -169,7 +177,8 @@ class LayerStep:
         """Write the diffs of the bottoms that need one from those of the tops, and add to those of learned blobs."""
         if not self.reached or "diff" in self.layer.shares:
             return
-        diffs = [top.diff_memory.tensor(top.shape) for top in self.tops]
+        tops = zip(self.tops, self.layer.top_shapes, strict=True)
+        diffs = [top.diff_memory.tensor(_shape_of(top, made)) for top, made in tops]
         if self.reads:
             self._backward_from_memory(diffs[0])
         elif self._is_asked():
@@ -188,9 +197,9 @@ class LayerStep:
         if not any(self.wanted):
             return
         first = self.tops[0]
-        top = first.data_memory.tensor(first.shape)
+        top = first.data_memory.tensor(diff.shape)
         values = [top if blob is first else blob.data_memory.tensor(blob.shape) for blob in self.bottoms]
-        if self.keeps_bottom and self._bottom is not None and self._bottom.shape == values[0].shape:
+        if self._bottom is not None and self._is_shaped_like(self.bottoms[0], self._bottom):
             values = [self._bottom]
         found = gradients_from_memory(self.layer, values, top, diff)
         for blob, gradient, asked in zip(self.bottoms, found, self.wanted, strict=True):
@@ -203,7 +212,7 @@ class LayerStep:
         If the layer has not run with these shapes, it is run first, without an effect on the net.
         """
         tape, bottoms = self._tape, self.bottoms
-        if tape is None or any(leaf.shape != blob.shape for leaf, blob in zip(tape.leaves, bottoms, strict=True)):
+        if tape is None or not all(map(self._is_shaped_like, bottoms, tape.leaves)):
             self.layer.fit([blob.shape for blob in bottoms])
             with undisturbed(self.layer):
                 return self._record()
@@ -214,6 +223,11 @@ class LayerStep:
             if value.data_ptr() != leaf.data_ptr():  # else it has the values, and torch refuses to copy some shapes
                 leaf.data.copy_(value)
         return tape
+
+
+def _shape_of(top: Blob, made: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the shape that a layer gave to its top. A later layer in place may have given it another since."""
+    return made if math.prod(made) == top.count else top.shape
 
 
 class PythonStep(LayerStep):

@@ -57,7 +57,12 @@ def ignores_propagate_down(layer: Layer) -> frozenset[int]:
 def gradients_from_memory(
     layer: Layer, bottoms: Sequence[torch.Tensor], top: torch.Tensor, diff: torch.Tensor
 ) -> tuple[torch.Tensor, ...]:
-    """Return the gradients of the bottoms of a layer that computes them from memory, as Caffe does."""
+    """Return the gradients of the bottoms of a layer that computes them from memory, as Caffe does.
+
+    A later layer in place may have given the memory of the top other axes: MVN makes four.
+    """
+    bottoms = [top.view(diff.shape) if bottom is top else bottom for bottom in bottoms]
+    top = top.view(diff.shape)
     if len(bottoms) > 1:
         return offered(layer, "caffes_gradients")(bottoms, top, diff)
     return (offered(layer, "caffes_gradient")(bottoms[0], top, diff),)

@@ -81,7 +81,9 @@ class Reduction(Layer):
         p, shape = self.param.reduction_param, bottom_shapes[0]
         self.axis = self.canonical_axis(p.axis, shape, "reduction_param", "axis")
         count = math.prod(shape[self.axis :])
-        self.coeff: float = p.coeff / count if p.operation == self.MEAN else p.coeff
+        self.coeff: float = p.coeff
+        if p.operation == self.MEAN:
+            self.coeff = p.coeff / count if count else math.nan  # Caffe divides by 0, and multiplies the sum 0 by it
         return [shape[: self.axis]]
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:

@@ -34,6 +34,9 @@ class _PoolingBase(Layer):
 
     def pool(self, maps: torch.Tensor, windows: Windows, method: int) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Return the pooled maps (N, C, down, across) and, for MAX, the index of each maximum."""
+        if maps.shape[1] == 0:  # torch takes no maps without channels
+            empty = maps.new_empty(*maps.shape[:2], *windows.count)
+            return empty, empty if method == MAX else None
         if method == MAX:
             return max_pool(maps, windows)
         if method == AVE:
@@ -127,6 +130,8 @@ class SPP(_PoolingBase):
         shape, param = bottom_shapes[0], self.param.spp_param
         if len(shape) != 4:
             raise self.error(f"SPP needs a bottom of 4 axes (N, C, H, W), found shape {shape}", "bottom")
+        if 0 in shape[2:]:
+            raise self.error(f"found maps of {shape[2]} x {shape[3]} pixels, expected at least one", "bottom")
         self.levels = [_pyramid_level(2**level, (shape[2], shape[3])) for level in range(param.pyramid_height)]
         for windows in self.levels:
             self.check_pad(windows, param.pool, "spp_param")

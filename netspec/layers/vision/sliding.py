@@ -130,6 +130,6 @@ class Im2col(SlidingFilter):
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         overhang = self.overhang(self.bottom_shapes[0])
         maps = F.pad(data, overhang) if any(overhang) else data
-        maps = maps.reshape(-1, *maps.shape[self.channel_axis :])
+        maps = maps.reshape(math.prod(maps.shape[: self.channel_axis]), *maps.shape[self.channel_axis :])
         sliding = Filter(self.kernel, self.stride, self.pad, self.dilation)
         return self.arithmetic(data).columns(maps, sliding).reshape(self.top_shapes[0])

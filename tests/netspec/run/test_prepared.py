@@ -373,6 +373,63 @@ layer {{ name: "{name}" type: "InnerProduct" bottom: "{bottom}" top: "{name}" pa
     assert last_sequence(net).kinds == ["packed"] * 3
 
 
+@pytest.mark.parametrize("exact", ["none", "small", "all"])
+@pytest.mark.parametrize("items", [3, 300])
+def test_layers_that_share_weights_by_count_keep_a_copy_for_each_shape(
+    net_of: Callable[..., Net], exact: str, items: int
+) -> None:
+    """With share_mode: PERMISSIVE, one blob is a matrix (4, 7), its transpose (7, 4), and filters (28, 1, 1, 1)."""
+    text = f"""
+layer {{ name: "x" type: "Input" top: "x" input_param {{ shape {{ dim: {items} dim: 7 }} }} }}
+layer {{ name: "a" type: "InnerProduct" bottom: "x" top: "a" param {{ name: "w" }}
+  inner_product_param {{ num_output: 4 bias_term: false weight_filler {{ type: "xavier" }} }} }}
+layer {{ name: "b" type: "InnerProduct" bottom: "x" top: "b" param {{ name: "w" share_mode: PERMISSIVE }}
+  inner_product_param {{ num_output: 4 bias_term: false transpose: true }} }}
+layer {{ name: "r" type: "Reshape" bottom: "x" top: "r" reshape_param {{ shape: {{ dim: 0 dim: 1 dim: 7 dim: 1 }} }} }}
+layer {{ name: "c" type: "Convolution" bottom: "r" top: "c" param {{ name: "w" share_mode: PERMISSIVE }}
+  convolution_param {{ num_output: 28 kernel_size: 1 bias_term: false }} }}
+"""
+    net, x = net_of(text, exact=exact), torch.randn(items, 7)
+    w = net.params["a"][0].detach().clone()
+    found = quickly(net, x=x)
+    assert_same(found, slowly(net, x=x))
+    expected = {"a": x @ w.T, "b": x @ w.view(7, 4), "c": x[:, None, :, None] * w.view(28, 1, 1)}
+    for name, values in expected.items():
+        torch.testing.assert_close(found[name], values)
+
+
+@pytest.mark.parametrize(
+    ("loss", "bottoms", "expected"),
+    [
+        ("EuclideanLoss", "x y", 24 / 4),
+        ("HingeLoss", "x label", 6),
+        ("MultinomialLogisticLoss", "x label", -np.log(2)),
+        ("SigmoidCrossEntropyLoss", "x y", 3 * (np.log1p(np.exp(-2)) - 6)),
+        ("ContrastiveLoss", "x y label", 0),
+        ("SoftmaxWithLoss", "x label", np.log(3)),
+    ],
+)
+@pytest.mark.parametrize("exact", ["none", "all"])
+def test_a_loss_without_a_top_counts(
+    net_of: Callable[..., Net], loss: str, bottoms: str, expected: float, exact: str
+) -> None:
+    """Caffe gives it an automatic top with loss_weight 1. The bottoms have rows of 2s and of 4s; labels are 0."""
+    text = f"""
+layer {{ name: "d" type: "DummyData" top: "x" top: "y" top: "label" dummy_data_param {{
+  shape {{ dim: 2 dim: 3 }} shape {{ dim: 2 dim: 3 }} shape {{ dim: 2 }}
+  data_filler {{ value: 2 }} data_filler {{ value: 4 }} data_filler {{ value: 0 }} }} }}
+layer {{ name: "quiet" type: "Silence" {" ".join(f'bottom: "{b}"' for b in ("x", "y", "label"))} }}
+layer {{ name: "loss" type: "{loss}" {" ".join(f'bottom: "{b}"' for b in bottoms.split())} }}
+"""
+    net = net_of(text, exact=exact)
+    with torch.no_grad():
+        quick = net.forward_loss()[0].item()
+    assert quick == net.forward_loss()[0].item()
+    named = net_of(text.replace(f'type: "{loss}"', f'type: "{loss}" top: "loss"'), exact=exact)
+    assert quick == named()["loss"].item()
+    assert quick == pytest.approx(expected, abs=1e-6)
+
+
 def test_a_subclass_with_its_own_forward_inherits_no_kernels() -> None:
     class Halved(Convolution):
         @override

@@ -101,6 +101,17 @@ def test_a_tally_is_the_mean_of_each_element_over_the_batches():
     assert tally.scores == {"loss": [1.5], "acc": [2.0, 2.0]}
 
 
+def test_an_output_whose_size_changes_has_no_mean(lines: Callable[[], list[str]]):
+    """As that of a detector: the other outputs keep theirs. Caffe adds to the elements of other outputs."""
+    tally = Tally()
+    for size in (2, 3, 2):
+        tally.add(torch.tensor(1.0), {"acc": torch.tensor([1.0]), "found": torch.ones(size), "none": torch.ones(0)})
+    assert tally.scores == {"acc": [1.0], "none": []}
+    assert [line.partition("] ")[2] for line in lines() if "found" in line] == [
+        'output "found" has 3 values in batch 2, and 2 before; its mean is not computed'
+    ]
+
+
 def test_scores_are_printed_with_their_contribution_to_the_loss():
     lines = score_lines({"acc": [0.5, 1 / 3], "loss": [2.0]}, {"acc": 0.0, "loss": 0.3})
     assert list(lines) == ["acc = 0.5", "acc = 0.333333", "loss = 2 (* 0.3 = 0.6 loss)"]

@@ -10,7 +10,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import torch
 
+import netspec
 import netspec.pycaffe as caffe
 from case_files import read_cases
 from paths import ROOT
@@ -192,6 +194,44 @@ DRAWN = 'dummy_data_param { shape { dim: 1 dim: 2 } data_filler { type: "gaussia
 DRAWS = f'layer {{ name: "d" type: "DummyData" top: "x" {DRAWN}'
 FC = 'layer {{ name: "ip" type: "InnerProduct" bottom: "x" top: "y" inner_product_param {{ num_output: {} }} }}'.format
 READS = 'layer { name: "d" type: "HDF5Data" top: "x" hdf5_data_param { source: "list" batch_size: 1 } }'
+
+
+IN_PLACE_OF_ANY_SHAPE = [
+    *(
+        f'type: "MVN" mvn_param {{ {options} }}'
+        for options in ("", "across_channels: true", "normalize_variance: false")
+    ),
+    'type: "ReLU"',
+    'type: "BatchNorm"',
+]
+
+
+@pytest.mark.parametrize("layer", IN_PLACE_OF_ANY_SHAPE)
+@pytest.mark.parametrize("shape", [(3, 5), (3, 4, 5), (2, 3, 4, 5)])
+@pytest.mark.parametrize("after", ["", 'layer { name: "after" type: "ReLU" bottom: "c" top: "c" }'])
+def test_a_layer_in_place_that_adds_axes_has_the_gradient_of_a_net(
+    write: Callable[..., str], layer: str, shape: tuple[int, ...], after: str
+) -> None:
+    """MVN makes four axes of its bottom, which is also the top of the layer before it."""
+    dims = " ".join(f"dim: {size}" for size in shape)
+    path = write(
+        f"""
+force_backward: true
+layer {{ name: "x" type: "Input" top: "x" input_param {{ shape {{ {dims} }} }} }}
+layer {{ name: "c" type: "Power" bottom: "x" top: "c" power_param {{ scale: 2 power: 3 }} }}
+layer {{ name: "it" {layer} bottom: "c" top: "c" }}
+{after}
+layer {{ name: "p" type: "Power" bottom: "c" top: "p" power_param {{ power: 2 }} }}
+"""
+    )
+    x = torch.from_numpy(image(*shape)).requires_grad_()
+    top = netspec.load_net(path, phase="TRAIN")(x=x)["p"]
+    top.backward(torch.from_numpy(diff := image(*top.shape)))
+    assert x.grad is not None
+    net = caffe.Net(path, caffe.TRAIN)
+    for _ in range(2):
+        net.forward(x=x.detach().numpy())
+        np.testing.assert_allclose(net.backward(p=diff)["x"], x.grad.numpy(), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(
