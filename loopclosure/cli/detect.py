@@ -14,7 +14,7 @@ from loopclosure.cli.data_set import recording_of, typed, warn_of_unreadable
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
-from loopclosure.detector.decision import DetectorSettings, LoopResult
+from loopclosure.detector.decision import RECENT, DetectorSettings, LoopResult
 from loopclosure.detector.detector import Describe, LoopDetector
 from loopclosure.detector.export import write_g2o, write_loops_csv
 from loopclosure.detector.map import EXTRACTED, Map, checked_name
@@ -109,7 +109,7 @@ def _add_detect(commands: Commands) -> None:
         type=int,
         metavar="FRAMES",
         help="number of recent frames that are never candidates "
-        f"(default: the length of a visit to a place; {OF.exclude_recent} if decided frame by frame)",
+        f"(default: the length of a visit to a place; {RECENT} if decided frame by frame without --exclude-seconds)",
     )
     parser.add_argument(
         "--exclude-seconds", type=float, metavar="S", help="frames of the last S seconds are never candidates"

@@ -10,6 +10,7 @@ import numpy as np
 from loopclosure.descriptors.similarity import check_metric
 from loopclosure.errors import InputError
 
+RECENT = 50  # frames that are no candidates where nothing says how old one must be: 2 to 20 s at usual rates
 Runs = list[tuple[int, int]]  # of one frame: (candidate, number of consecutive frames that led to it)
 
 
@@ -46,7 +47,8 @@ class DetectorSettings:
     metric              "euclidean" (score = minus the distance) or "cosine"
     views               the number of views of an image in a descriptor, one after the other; the score of two
                         frames is the score of their two most similar views
-    exclude_recent      frames i - exclude_recent .. i - 1 are not candidates of frame i
+    exclude_recent      frames i - exclude_recent .. i - 1 are not candidates of frame i; None: 50, or 0 where
+                        exclude_seconds says how old a candidate must be
     exclude_seconds     frames less than this many seconds old are not candidates either
     top_k               how many candidates are examined
     threshold           a candidate needs score >= threshold. None: the geometric check decides alone; without a check,
@@ -58,7 +60,7 @@ class DetectorSettings:
 
     metric: str = "euclidean"
     views: int = 1
-    exclude_recent: int = 50
+    exclude_recent: int | None = None
     exclude_seconds: float = 0.0
     top_k: int = 5
     threshold: float | None = None
@@ -69,12 +71,19 @@ class DetectorSettings:
         check_metric(self.metric)
         for name in ("views", "top_k", "exclude_recent", "exclude_seconds", "consistency"):
             least = int(name in ("views", "top_k"))
-            if getattr(self, name) < least:
-                raise InputError(f"{name} is {getattr(self, name)}; expected {least} or more")
+            if (value := getattr(self, name)) is not None and value < least:
+                raise InputError(f"{name} is {value}; expected {least} or more")
         if self.threshold is not None and np.isnan(self.threshold):
             raise InputError("threshold is nan; expected a number")
         if self.consistency_window < 0:
             raise InputError(f"consistency_window is {self.consistency_window}; expected 0 or more")
+
+    @property
+    def recent(self) -> int:
+        """How many frames before a frame are not its candidates, whatever their age in seconds."""
+        if self.exclude_recent is not None:
+            return self.exclude_recent
+        return 0 if self.exclude_seconds else RECENT
 
 
 def result_of(found: Any, count: int) -> LoopResult:

@@ -39,7 +39,8 @@ SAVED = "a file that LoopDetector.save wrote"
 class LoopDetector:
     """Finds loops frame by frame; ``loops`` holds the results that were accepted, in order.
 
-    Frames are numbered from 0. The newest ``exclude_recent`` frames are not candidates.
+    Frames are numbered from 0. The newest frames are not candidates: those of the last ``exclude_seconds``, or the last
+    ``exclude_recent`` frames (:class:`DetectorSettings`).
 
         >>> detector = LoopDetector(exclude_recent=1, threshold=-0.5)
         >>> for place in (0, 1, 2, 0):
@@ -328,7 +329,7 @@ class LoopDetector:
     def _end(self, stamp: float | None) -> int:
         """Return how many frames are candidates: all of earlier sessions, and those of this one that are not recent."""
         frames, settings, begin = self._frames, self.settings, self._sessions[-1]
-        end = max(begin, frames.count - settings.exclude_recent)
+        end = max(begin, frames.count - settings.recent)
         if settings.exclude_seconds and stamp is not None:
             latest = stamp - settings.exclude_seconds
             end = min(end, begin + int(np.searchsorted(frames.stamps[begin:end], latest, side="right")))
@@ -396,7 +397,7 @@ class LoopDetector:
         most = 0
         for number, value in steady:
             found = self.check.agreement(local, self._frames.local[number])
-            inliers = self.check.enough(found)
+            inliers = self.check.sure(found)
             if inliers:
                 return result("accepted", number, value, inliers)
             most = max(most, found.inliers)

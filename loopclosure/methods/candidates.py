@@ -177,5 +177,9 @@ def far_apart(poses: np.ndarray) -> np.ndarray:
     known = np.all(np.isfinite(positions), axis=1)
     way = np.zeros(len(poses))
     way[known] = np.cumsum(np.linalg.norm(np.diff(positions[known], axis=0, prepend=positions[known][:1]), axis=1))
-    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    return apart > FAR_M + DRIFT * np.abs(np.subtract.outer(way, way))  # False for NaN
+    far = np.zeros((len(poses), len(poses)), bool)
+    for first in range(0, len(poses), BLOCK):
+        rows = slice(first, first + BLOCK)
+        apart = np.sqrt(sum(np.square(np.subtract.outer(of[rows], of)) for of in positions.T))
+        far[rows] = apart > FAR_M + DRIFT * np.abs(np.subtract.outer(way[rows], way))  # False for NaN
+    return far

@@ -81,7 +81,7 @@ def later_threshold(detector: LoopDetector, accepted: np.ndarray) -> float | Non
     accepted; None if there is none.
     """
     settings, rows, stamps = detector.settings, detector.descriptors, detector.stamps
-    exclusion = Exclusion(settings.exclude_recent, settings.exclude_seconds)
+    exclusion = Exclusion(settings.recent, settings.exclude_seconds)
     single = np.full(len(rows), -np.inf)
     for start in range(0, len(rows), BLOCK):
         stop = min(start + BLOCK, len(rows))

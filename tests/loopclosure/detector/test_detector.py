@@ -76,6 +76,17 @@ def test_frames_can_be_excluded_by_time():
         detector.add_descriptor(np.ones(3), 1.0)
 
 
+@pytest.mark.parametrize(
+    ("settings", "loops"),
+    [({"exclude_seconds": 10.0}, 15), ({"exclude_seconds": 10.0, "exclude_recent": 35}, 0), ({}, 0)],
+)
+def test_frames_are_excluded_by_number_only_if_nothing_says_how_old_they_must_be(settings, loops):
+    """45 key frames, one a second, around a room of 30 places."""
+    places = np.random.default_rng(1).normal(size=(30, 16))
+    detector = LoopDetector(threshold=-0.1, **settings)
+    assert sum(bool(detector.add_descriptor(places[k % 30], float(k))) for k in range(45)) == loops
+
+
 def test_consistency_requires_earlier_frames_to_agree():
     descriptors = two_laps()
     lonely = descriptors[:60].copy()

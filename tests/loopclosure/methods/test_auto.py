@@ -1,6 +1,7 @@
 """Loops without settings: what sequences, decoys and verification decide, on drives whose truth is known."""
 
 import re
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -352,6 +353,15 @@ def test_odometry_distinguishes_places():
     assert not far[lag % 100 <= 2].any()
     assert far[lag == 50].all()
     assert not far_apart(np.full((5, 7), np.nan)).any()
+
+
+def test_odometry_of_a_long_drive_needs_little_more_memory_than_its_result():
+    poses = round_and_round(1500)
+    tracemalloc.start()
+    far = far_apart(poses)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 14 * far.size
 
 
 @pytest.mark.slow
