@@ -19,6 +19,7 @@ from netspec.errors import printable
 
 logger = logging.getLogger("netspec")
 SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)  # glog's 0 to 3
+INTERRUPTED = "interrupted"  # how a command ends after a signal; netspec/inspect/logs reads it
 VARIABLE = "GLOG_minloglevel"  # the environment variable with the lowest severity to log
 
 

@@ -97,8 +97,9 @@ def _show(arguments: argparse.Namespace, records: Records, found: Survey) -> Non
 
     ending_of(arguments.out, ("png", "svg"))
     if arguments.start is None:
-        faulty = [fault.number for fault in found.faults[:SHOWN_FAULTS]]
-        numbers = faulty + [k for k in spread(len(records), arguments.count) if k not in faulty][: -len(faulty) or None]
+        numbers = [fault.number for fault in found.faults[: min(SHOWN_FAULTS, arguments.count)]]
+        others = [k for k in range(len(records)) if k not in numbers]
+        numbers += [others[k] for k in spread(len(others), arguments.count - len(numbers))]
     else:
         numbers = list(range(arguments.start, min(arguments.start + arguments.count, len(records))))
     write_figure(sheet([records[k] for k in numbers], found, arguments.source, arguments.images), arguments.out)

@@ -14,6 +14,8 @@ from pathlib import Path
 ALWAYS_ALLOWED = 1 << 28  # bytes that a file of any size may declare
 MOST_PACKED = 100  # times a file's size: real data is compressed 2 to 20 times, a malicious file 1000 times
 
+OUT_OF_MEMORY = "out of memory; this machine has "  # how a command ends; netspec/inspect/logs reads it
+
 _UNITS = {"": 0, "k": 10, "m": 20, "g": 30, "t": 40}
 _CONTAINER = Path("/sys/fs/cgroup/memory.max")  # Linux: the limit of a container, a number or "max"
 

@@ -66,6 +66,8 @@ def spread(count: int, wanted: int | None) -> list[int]:
 
     Each is drawn at random from its part, with a fixed seed, since labels often alternate.
     """
+    if wanted == 0:
+        return []
     if wanted is None or wanted >= count:
         return list(range(count))
     ends = [k * count // wanted for k in range(wanted + 1)]

@@ -17,8 +17,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 
 from netspec.errors import SpecError, printable
-from netspec.files.limits import amount, is_out_of_memory, memory
-from netspec.log import SEVERITIES, VARIABLE
+from netspec.files.limits import OUT_OF_MEMORY, amount, is_out_of_memory, memory
+from netspec.log import INTERRUPTED, SEVERITIES, VARIABLE
 from netspec.terminal.output import logging_to
 
 DONE, FAULT, WRONG_USAGE = 0, 1, 2  # exit statuses; a signal's is 128 + its number: 130, 143
@@ -48,44 +48,53 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
         return int(end.code or DONE)
     arguments.command_line = shlex.join([parser.prog, *words])
     try:
-        form, folder = arguments.log_form, arguments.log_dir
-        shown = logging_to(_level(arguments), form, folder) if form else nullcontext()
-        with interruptible(), shown:
+        shown = nullcontext()
+        if arguments.log_form:
+            shown = logging_to(
+                _level(arguments), arguments.log_form, arguments.log_dir, lambda fault: _ending(fault, arguments)[0]
+            )
+        with shown, interruptible():
             if arguments.prepare:
                 arguments.prepare(arguments)
             return arguments.function(arguments) or DONE
-    except SpecError as fault:
-        print(fault, file=sys.stderr)
-        return arguments.fault_status
-    except WrongUsage as fault:
-        print(f"{arguments.prog}: error: {fault}", file=sys.stderr)
-        return WRONG_USAGE
-    except BrokenPipeError:
-        return FAULT  # quietly
-    except OSError as fault:
-        print(f"{fault.filename}: {fault.strerror}" if fault.filename else fault, file=sys.stderr)
-        return arguments.fault_status
-    except Exception as fault:
-        if is_out_of_memory(fault):
-            line = f"out of memory; this machine has {amount(memory())}"
-        elif part := _missing_part(fault):
-            line = f"this command needs {part}, which is missing from this installation"
-        elif not (line := _fault_of_plugin(fault, getattr(arguments, "plugin", None) or ())):
+    except (Exception, KeyboardInterrupt) as fault:
+        line, status = _ending(fault, arguments)
+        if status is None:
             raise
-        print(line, file=sys.stderr)
-        return FAULT
-    except KeyboardInterrupt as end:
-        print("interrupted", file=sys.stderr)
-        return 128 + int(end.args[0] if end.args else signal.SIGINT)
+        if line:
+            print(line, file=sys.stderr)
+        return status
 
 
-def _missing_part(fault: Exception) -> str:
+def _ending(fault: BaseException, arguments: argparse.Namespace) -> tuple[str, int | None]:
+    """Return the line with which a command ends, "" for none, and its exit status; None: Python prints a traceback."""
+    match fault:
+        case SpecError():
+            return str(fault), arguments.fault_status
+        case WrongUsage():
+            return f"{arguments.prog}: error: {fault}", WRONG_USAGE
+        case BrokenPipeError():
+            return "", FAULT
+        case OSError():
+            return f"{fault.filename}: {fault.strerror}" if fault.filename else str(fault), arguments.fault_status
+        case KeyboardInterrupt():
+            return INTERRUPTED, 128 + int(fault.args[0] if fault.args else signal.SIGINT)
+    if is_out_of_memory(fault):
+        return OUT_OF_MEMORY + amount(memory()), FAULT
+    if part := _missing_part(fault):
+        return f"{part}: is missing from this installation; this command needs it", FAULT
+    if line := _fault_of_plugin(fault, getattr(arguments, "plugin", None) or ()):
+        return line, FAULT
+    return printable(f"{type(fault).__name__}: {fault}"), None
+
+
+def _missing_part(fault: BaseException) -> str:
     """Return the folder of netspec that a command needs and that is missing; "" for any other error."""
     missing = (fault.name or "").split(".") if isinstance(fault, ModuleNotFoundError) else []
     return "/".join(missing[:2]) if missing[:1] == ["netspec"] and len(missing) > 1 else ""
 
 
-def _fault_of_plugin(fault: Exception, plugins: Sequence[str]) -> str:
+def _fault_of_plugin(fault: BaseException, plugins: Sequence[str]) -> str:
     """Return the message for an exception that a user's file of layers raised; "" for any other exception."""
     files = {os.path.abspath(plugin) for plugin in plugins}
     for frame in reversed(traceback.extract_tb(fault.__traceback__)):

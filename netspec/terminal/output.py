@@ -8,7 +8,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -50,16 +50,19 @@ def in_columns(rows: Sequence[Sequence[str]], left: int = 1, spans: Sequence[tup
 
 
 @contextmanager
-def logging_to(level: int, form: logging.Formatter, folder: str | None) -> Iterator[None]:
+def logging_to(
+    level: int, form: logging.Formatter, folder: str | None, ending: Callable[[BaseException], str]
+) -> Iterator[None]:
     """Show Caffe's log on stderr, above the progress bar if there is one; or write it into a folder, as glog does.
 
-    A warning is shown once, even if several nets of a solver give it.
+    A warning is shown once, even if several nets of a solver give it. If the block raises an exception, the file ends
+    with the line that ``ending`` returns for it.
     """
     handlers: list[logging.Handler] = [logging.StreamHandler(_BarAware())]
     if folder:
         handlers[0].setLevel(logging.WARNING)
         moment = time.strftime("%Y%m%d-%H%M%S")
-        name = f"caffe.{platform.node()}.{getpass.getuser()}.log.INFO.{moment}.{os.getpid()}"
+        name = f"caffe.{platform.node()}.{_user()}.log.INFO.{moment}.{os.getpid()}"
         handlers.append(logging.FileHandler(os.path.join(folder, name), encoding="utf-8"))
     for handler in handlers:
         handler.setFormatter(form)
@@ -71,12 +74,26 @@ def logging_to(level: int, form: logging.Formatter, folder: str | None) -> Itera
     log.logger.propagate = False
     try:
         yield
+    except BaseException as fault:
+        for handler in handlers:
+            if isinstance(handler, logging.FileHandler):
+                with open(handler.baseFilename, "a", encoding="utf-8") as file:
+                    file.write(f"{ending(fault)}\n")
+        raise
     finally:
         for handler in handlers:
             log.logger.removeHandler(handler)
             handler.close()
         level, log.logger.propagate = before
         log.logger.setLevel(level)
+
+
+def _user() -> str:
+    """Return the user's name, or glog's "invalid-user" for one without, as in a container with ``--user 1234``."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError, ImportError):
+        return "invalid-user"
 
 
 class _WarnOnce(logging.Filter):

@@ -109,7 +109,7 @@ def test_train_works_without_optional_packages_and_export_reports_its_own(tmp_pa
         "print(main(['train', '--solver', 'sgd_step/solver.prototxt', '-q']))\nsys.stderr = sys.stdout\n"
         "main(['export', 'sgd_step/train_val.prototxt', '--to', 'onnx', '--out', 'x.onnx'])\n"
     )
-    line = "this command needs netspec/export, which is missing from this installation\n"
+    line = "netspec/export: is missing from this installation; this command needs it\n"
     assert run(program, folder) == f"0\n{line}"
     trained = (folder / "sgd_step" / "ref_iter_60.caffemodel").read_bytes()
     subprocess.run(

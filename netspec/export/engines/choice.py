@@ -42,7 +42,12 @@ def fastest() -> str:
     return ONNXRUNTIME if all(find_spec(module) for module in _NEEDS[ONNXRUNTIME]) else TORCH
 
 
-def user_folder() -> Path:
-    """Return the default folder of the models: ``netspec`` in XDG_CACHE_HOME, or in ``~/.cache``."""
+def user_folder() -> Path | None:
+    """Return the default folder of the models: ``netspec`` in XDG_CACHE_HOME, or in ``~/.cache``.
+
+    None for a user without a home, as in a container with ``--user 1234``.
+    """
     base = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "netspec"
+    if not os.path.isabs(base):
+        base = os.path.expanduser("~/.cache")
+    return Path(base) / "netspec" if os.path.isabs(base) else None

@@ -31,7 +31,9 @@ def bug_report(paths: list[str]) -> str:
     parts = ["## Machine", *_block(_machine())]
     for path in paths:
         parts += ["", f"## {printable(path)}", *_about(Path(path))]
-    return "\n".join(parts).replace(str(Path.home()), "~") + "\n"
+    text = "\n".join(parts) + "\n"
+    home = os.path.expanduser("~")  # "/" or "~" for a user without a name, as in a container with --user 1234
+    return text.replace(home, "~") if len(home) > 1 else text
 
 
 def _machine() -> Iterator[str]:

@@ -45,10 +45,10 @@ def sheet(records: Sequence[Record], found: Survey, name: str, images: int | Non
     width, tall = side_by_side * (size[0] + SEAM) - SEAM, size[1]
     columns = max(1, int((WIDTH + GAP) / (width + GAP)))
     rows = -(-len(records) // columns)
-    lines = [*as_lines(found, name), *_fault_lines(found)]
+    lines = [*((line, "black") for line in as_lines(found, name)), *_fault_lines(found)]
     note = "" if usual is None else what_is_shown(split(usual, side_by_side)[0])
-    lines += [f"shown: {note}"] if note else []
-    wrapped = [part for line in lines for part in textwrap.wrap(line, 88, subsequent_indent="    ")]
+    lines += [(f"shown: {note}", "black")] if note else []
+    wrapped = [(part, color) for line, color in lines for part in textwrap.wrap(line, 88, subsequent_indent="    ")]
     head = max(HEAD, LINE * (len(wrapped) + 2))
     height = head + rows * (tall + CAPTION + GAP) + GAP
     with matplotlib.rc_context(STYLE):
@@ -82,16 +82,19 @@ def _tile_size(usual: np.ndarray | None) -> tuple[float, float]:
     return max(width * scale, LONGER / 4), max(height * scale, LONGER / 4)
 
 
-def _fault_lines(found: Survey) -> list[str]:
+def _fault_lines(found: Survey) -> list[tuple[str, str]]:
+    """Return the lines about the errors, with their colors."""
     if not found.num_faults:
-        return ["faults: none"]
-    examples = [f"  {fault.key}: {fault.text}" for fault in found.faults[:3]]
-    return [f"errors: {found.num_faults:,} records that a data layer refuses", *examples]
+        return [("errors: none", "black")]
+    count = "1 record" if found.num_faults == 1 else f"{found.num_faults:,} records"
+    examples = [(f"  {fault.key}: {fault.text}", "black") for fault in found.faults[:3]]
+    return [(f"errors: {count} that a data layer refuses", FAULT), *examples]
 
 
-def _draw_head(figure: Figure, whole: Axes, lines: Sequence[str], found: Survey, height: float, head: float) -> None:
-    for number, line in enumerate(lines):
-        color = FAULT if line.startswith("faults:") and found.num_faults else "black"
+def _draw_head(
+    figure: Figure, whole: Axes, lines: Sequence[tuple[str, str]], found: Survey, height: float, head: float
+) -> None:
+    for number, (line, color) in enumerate(lines):
         weight = "bold" if number == 0 else "normal"
         y = height - GAP - LINE * (number + 1)
         text_at(whole, GAP, y, line, fontsize=8.5, color=color, fontweight=weight)

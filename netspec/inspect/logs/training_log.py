@@ -16,7 +16,8 @@ import numpy as np
 
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
-from netspec.log import number
+from netspec.files.limits import OUT_OF_MEMORY
+from netspec.log import INTERRUPTED, number
 
 _POINTS_OF_WINDOW = 25  # a curve is smoothed over this share of its points
 _USUAL, _MANY = 98, 20  # the percentage of values to show, and the minimum number of values for it
@@ -112,7 +113,10 @@ _OUTPUT = re.compile(rf"(Train|Test) net output #{_COUNT}: (.*) = (\S+?)(?: \(\*
 _SCORE = re.compile(rf"Test score #{_COUNT}: (\S+)")  # until 2014
 _TEST_LOSS = re.compile(r"Test loss: (\S+)")
 # Python's, a signal's, and netspec's own: `solver.prototxt:3:1: ...`.
-_FAULT = re.compile(r"Traceback |\*\*\* .*SIG|\S[^:]*:\d+:\d+: |there is not enough memory")
+_FAULT = re.compile(r"Traceback |\*\*\* .*SIG|\S[^:]*:\d+:\d+: ")
+# What else a command of netspec ends with: `file: ...`. In a log with prefixes, such a line is an error only if the
+# training does not go on: a net is printed without prefixes too, and so is what a Python layer prints.
+_LAST_LINE = re.compile(rf"\S[^:]*: |\[Errno |{OUT_OF_MEMORY}")
 _WINDOWS = {"1.#QNAN": "nan", "-1.#IND": "nan", "1.#INF": "inf", "-1.#INF": "-inf"}
 _YEAR = 366 * 86400.0
 _GREATEST = float(np.finfo(np.float32).max)
@@ -162,6 +166,8 @@ class LogReader:
         self._net = 0  # the test net being tested
         self._first: float | None = None
         self._last = 0.0
+        self._has_prefixes = self._is_fatal = False
+        self.begins = False  # whether the start of a training was read
         self._names: dict[tuple[str, int, int], tuple[str, str]] = {}
 
     def feed(self, line: str) -> None:
@@ -169,17 +175,26 @@ class LogReader:
         line = line.rstrip("\r\n")
         prefix = _PREFIX.search(line)
         if not prefix:
-            if _FAULT.match(line):
-                self.log.state = FAILED
-            else:
-                self._read(line, None)  # lines without prefix, for GLOG_log_prefix=false
+            self._read_without_prefix(line)
             return
+        self._has_prefixes = True
         message = prefix[10]
         if message.startswith("Initializing solver from parameters"):
+            self.log.state, self._is_fatal, self.begins = RUNNING, False, True
+        elif prefix[1] == "I" and self.log.state == FAILED and not self._is_fatal:
             self.log.state = RUNNING
         self._read(message, self._seconds(prefix))
         if prefix[1] == "F":
+            self.log.state, self._is_fatal = FAILED, True
+
+    def _read_without_prefix(self, line: str) -> None:
+        """Read a line of the program, or of a log that was written with GLOG_log_prefix=false."""
+        if line == INTERRUPTED:
+            self.log.state = STOPPED
+        elif _FAULT.match(line) or (self._has_prefixes and self.log.state == RUNNING and _LAST_LINE.match(line)):
             self.log.state = FAILED
+        else:
+            self._read(line, None)
 
     def _read(self, message: str, seconds: float | None) -> None:
         log = self.log
@@ -199,7 +214,7 @@ class LogReader:
             self._output("Test", int(found[1]), f"score {found[1]}", found[2], False)
         elif found := _TEST_LOSS.match(message):
             self._output("Test", -1, "test loss", found[1], True)
-        elif message.startswith("Optimization stopped early"):
+        elif message.startswith("Optimization stopped early") or message == INTERRUPTED:
             log.state = STOPPED
         elif message.startswith("Optimization Done") and log.state == RUNNING:
             log.state = DONE
@@ -242,7 +257,10 @@ class LogReader:
 
 
 def read_log(path: str | Path, name: str = "") -> TrainingLog:
-    """Return the training in a log. Raises SpecError if the file cannot be read or contains no training."""
+    """Return the training in a log; one that failed before its first iteration has no curves.
+
+    Raises SpecError if the file cannot be read or contains no training.
+    """
     reader = LogReader(name or str(path))
     try:
         with open(path, encoding="utf-8", errors="replace", newline="\n") as file:
@@ -250,7 +268,8 @@ def read_log(path: str | Path, name: str = "") -> TrainingLog:
                 reader.feed(line)
     except OSError as fault:
         raise SpecError(unreadable(path, fault), Where(str(path))) from None
-    if not any(len(curve) for curve in reader.log.curves()):
+    failed_at_start = reader.begins and reader.log.state == FAILED
+    if not failed_at_start and not any(len(curve) for curve in reader.log.curves()):
         advice = "expected what `netspec train` or `caffe train` writes to stderr (2> train.log), with display above 0"
         raise SpecError(f"contains no iteration of a training; {advice}", Where(str(path)))
     return reader.log

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 import netspec
+from netspec.export.engines.choice import user_folder
 from netspec.files import whole_file
 from netspec.graph.options import BuildOptions
 from netspec.layers import layer_types
@@ -215,6 +216,26 @@ def test_flags_of_glog_and_of_caffes_other_commands_are_accepted(run: Run, tmp_p
     assert "] Use CPU." in logged.read_text()
     wrong = run("time", "-model", NET, "-flagfile", "nowhere")
     assert wrong.status == 2
+
+
+@pytest.mark.slow
+def test_a_user_without_a_name_or_a_home_is_served(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container with ``--user 1234``. glog writes "invalid-user"."""
+
+    def unknown(uid: int) -> None:
+        raise KeyError(f"getpwuid(): uid not found: {uid}")
+
+    monkeypatch.setattr(pytest.importorskip("pwd"), "getpwuid", unknown)
+    for name in ("HOME", "LOGNAME", "USER", "LNAME", "USERNAME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    assert run("time", "-model", NET, "-iterations", "1", "-log_dir", str(tmp_path)).status == 0
+    (path,) = tmp_path.glob("caffe.*.log.INFO.*")
+    assert ".invalid-user." in path.name
+    assert user_folder() is None
+    report = run("bug-report", NET)
+    assert report.status == 0
+    monkeypatch.setenv("HOME", "/")  # what Docker sets
+    assert f"/{NET.rpartition('/')[2]}" in run("bug-report", NET).out
 
 
 def test_layers_prints_the_first_line_of_each_docstring(run: Run) -> None:

@@ -1,6 +1,7 @@
 """``netspec data``: statistics of databases, faulty and unusual records, and pictures of records."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -168,6 +169,22 @@ def test_data_show_draws_pairs_and_lists_errors_first(run: Run, tmp_path: Path) 
     assert "00000030" in text
     run("data", "show", GOLDEN / "images" / "lmdb_encoded", "--out", "y.svg", "--start", 4)
     assert "00000003" not in Path("y.svg").read_text()
+
+
+def test_the_count_of_errors_is_red_and_no_good_record_is_left_out_for_a_bad_one(run: Run, tmp_path: Path) -> None:
+    path = write(tmp_path / "bad", [image(0), image(1), b"\xff", image(3), b"\xff"])
+    assert run("data", "show", path, "--out", "x.svg", "--count", 40).out == "x.svg: 5 of 5 records\n"
+    (line,) = re.findall(r"<text[^>]*>errors:[^<]*</text>", Path("x.svg").read_text())
+    assert "c62828" in line
+    assert line.endswith(">errors: 2 records that a data layer refuses</text>")
+    assert run("data", "show", path, "--out", "x.svg", "--count", 1).out == "x.svg: 1 of 5 records\n"
+    one = write(tmp_path / "one", [image(0), b"\xff"])
+    assert run("data", "show", one, "--out", "x.svg").out == "x.svg: 2 of 2 records\n"
+    assert ">errors: 1 record that a data layer refuses<" in Path("x.svg").read_text()
+    sound = write(tmp_path / "sound", [image(0)])
+    run("data", "show", sound, "--out", "x.svg")
+    (line,) = re.findall(r"<text[^>]*>errors: none</text>", Path("x.svg").read_text())
+    assert "c62828" not in line
 
 
 @pytest.mark.parametrize(
