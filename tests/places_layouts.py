@@ -56,6 +56,14 @@ def euroc_rows(poses: np.ndarray, per_second: int = 1) -> str:
     return "\r\n".join(rows) + "\r\n"
 
 
+def write_tum(folder: Path) -> Path:
+    names = [f"{i:06d}.png" for i in range(COUNT)]
+    write_pictures(folder / "tum" / "rgb", names)
+    (folder / "tum" / "rgb.txt").write_text("".join(f"{i}.0 rgb/{name}\n" for i, name in enumerate(names)))
+    (folder / "tum" / "groundtruth.txt").write_text(tum_rows(path()))
+    return folder / "tum"
+
+
 def write_euroc(folder: Path) -> Path:
     base = folder / "MH_00" / "mav0"
     stamps = [1403636579 * 10**9 + i * 10**9 for i in range(COUNT)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -22,17 +23,17 @@ from lmdb_build.pairs.choose import SPLITS, PairSource
 from lmdb_build.pairs.list_file import join_lists, root_of, write_contact_sheet
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.errors import InputError
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_sequence
+from loopclosure.places.sequences import benchmark_parts
 from loopclosure.places.source import (
     LAYOUTS,
     PAIRED,
     POSE_FORM_HELP,
     POSES_HELP,
-    RECORDED,
     Source,
-    extract,
     is_recording,
+    open_sequence,
     read_source,
 )
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
@@ -267,7 +268,7 @@ def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
     if kind not in SEQUENCES:
         refuse(arguments, POSED, f"is for sequences with poses, not for {kind}")
     sequences = _sequences(arguments) if kind in SEQUENCES else []
-    places = [folder.resolve().parent for _, folder, _ in sequences]
+    places = [sequence.source.resolve().parent for sequence in sequences]
     if kind not in SEQUENCES:
         places = [path.parent if kind in ("table", "index") else path]
         places += [other for other in (first.get("references", Path),) if other]
@@ -303,28 +304,33 @@ def _camera(source: Source) -> str:
     return camera
 
 
-def _sequences(arguments: argparse.Namespace) -> list[tuple[str, Path, PoseChoice | None]]:
-    """Return layout, folder and poses of every sequence; bags and videos are extracted below --out."""
-    found = []
+def _sequences(arguments: argparse.Namespace) -> list[ImageSequence]:
+    """Read the sequences; the frames of bags and videos are extracted to a folder of each below --out."""
+    found, taken = [], set[str]()
     for source in arguments.source:
-        path, layout, poses = source.path, source.kind, source.pose_choice()
-        if layout in RECORDED or (not layout and is_recording(path)):
-            topics = source.get("topic", str) or "", source.get("pose-topic", str) or ""
-            path, summary = extract(path, arguments.out / path.stem, *topics, bar)
-            print(summary)
-            layout = "images" if poses else "tum"
-        found.append((layout or layout_of(path, "images" if poses else "tum"), path, poses))
+        name = next(n for k in itertools.count(1) if (n := f"{source.path.stem}_{k}".removesuffix("_1")) not in taken)
+        if is_recording(source.path):
+            taken.add(name)
+        sequence, said = open_sequence(
+            source,
+            arguments.out / name,
+            posed=True,
+            videos=True,
+            max_difference=arguments.max_difference,
+            progress=bar,
+        )
+        if said:
+            print(said)
+        found.append(sequence)
     return found
 
 
-def _pose_source(
-    arguments: argparse.Namespace, named: list[tuple[str, Path, PoseChoice | None]], root: Path
-) -> PoseSource:
+def _pose_source(arguments: argparse.Namespace, opened: list[ImageSequence], root: Path) -> PoseSource:
     sequences = []
-    for layout, folder, poses in named:
-        every = read_sequence(folder, layout, arguments.max_difference, poses)
+    for every in opened:
         sequence = every.with_poses()
-        print(f"{folder}: {len(sequence)} images with a pose, {len(every) - len(sequence)} without one left out")
+        left_out = len(every) - len(sequence)
+        print(f"{every.source}: {len(sequence)} images with a pose, {left_out} without one left out")
         for doubt in sequence.doubts:
             warn(doubt)
         sequences.append(sequence)
@@ -337,7 +343,7 @@ def _pose_source(
         clear_view_angle_deg=arguments.clear_view_angle,
     )
     scenes = Scenes(tuple(arguments.same_scene), tuple(arguments.same_frame), arguments.different_scenes)
-    folders = [Path(os.path.relpath(folder.resolve(), root.resolve())).as_posix() for _, folder, _ in named]
+    folders = [Path(os.path.relpath(every.source.resolve(), root.resolve())).as_posix() for every in opened]
     return PoseSource(sequences, folders, rule, scenes)
 
 

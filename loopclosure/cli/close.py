@@ -83,7 +83,7 @@ def _close(a: argparse.Namespace) -> None:
     if a.seed is not None and a.drift is None:
         raise WrongUsage("--seed needs --drift")
     source = typed(a.source, CLOSED)
-    frames = sequence(source, a.out)
+    frames = sequence(source, out / "frames")
     camera = intrinsics.from_text(a.camera) if a.camera else frames.camera
     if camera is None:
         raise InputError(f"has no camera calibration; give --camera {intrinsics.FORM}", frames.source)

@@ -7,24 +7,22 @@ from pathlib import Path
 
 from loopclosure.errors import InputError
 from loopclosure.places import datasets
-from loopclosure.places.bags import is_bag
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.masks import CAMERAS
 from loopclosure.places.overlap import FOV_DEG, ViewOverlap
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.sequences import benchmark_parts, layout_of, read_sequence
+from loopclosure.places.sequences import benchmark_parts, layout_of
 from loopclosure.places.source import (
     DETECTED,
     EVALUATED,
     LAYOUTS,
     POSE_FORM_HELP,
     POSES_HELP,
-    RECORDED,
     TOPICS,
     Kinds,
     Source,
-    extract,
     is_recording,
+    open_sequence,
     read_source,
 )
 from loopclosure.places.truth import Exclusion
@@ -111,19 +109,15 @@ def typed(text: str, kinds: Kinds) -> Source:
         raise WrongUsage(str(fault)) from None
 
 
-def sequence(source: Source, out: str | Path, layout: str = "") -> ImageSequence:
-    """Read a sequence. The frames of a bag or video are extracted to ``out``/frames.
+def sequence(source: Source, frames: Path, posed: bool = False) -> ImageSequence:
+    """Read a sequence, with a warning for all that looks wrong; see :func:`~loopclosure.places.source.open_sequence`.
 
-    ``layout`` is a key of LAYOUTS; "" means that it is detected from the files.
+    The frames of a bag or video are extracted to the folder ``frames``. ``posed``: the command needs poses.
     """
-    poses, path = source.pose_choice(), source.path
-    if layout in RECORDED or (not layout and is_recording(path)):
-        topics = source.get("topic", str) or "", source.get("pose-topic", str) or ""
-        path, summary = extract(path, Path(out) / "frames", *topics, bar)
-        print(summary)
-        layout = "images"
-    read = read_sequence(path, layout, poses=poses)
-    for doubt in read.doubts:
+    read, said = open_sequence(source, frames, posed=posed, videos=True, progress=bar)
+    if said:
+        print(said)
+    for doubt in read.doubts if posed else read.remarks():
         warn(doubt)
     return read
 
@@ -151,13 +145,14 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
             raise WrongUsage("give either truth or poses, not both")
         if references and "poses" in source.settings:
             raise WrongUsage("poses=FILE is for one sequence; with references, each sequence must have its own poses")
-        layout = kind or ("" if is_recording(source.path) else _layout(source, source.path))
+        out, topics = Path(a.out), {name: text for name, text in source.settings.items() if name in TOPICS}
+        others = Source(source.kind, Path(references), topics) if references else None
         return datasets.load_sequence(
-            sequence(source, a.out, layout),
+            sequence(source, out / "frames", posed=True),
             chosen,
             exclusion,
             limits=datasets.PoseLimits(a.max_distance, a.max_angle, a.soft_distance, a.soft_angle),
-            references=sequence(Source(kind, Path(references)), a.out, layout) if references else None,
+            references=sequence(others, out / "references", posed=True) if others else None,
             view_overlap=ViewOverlap(a.fov, ViewOverlap().least if a.overlap is None else a.overlap),
         )
     if kind == "fabmap":
@@ -185,14 +180,10 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
 def _check_truth(source: Source, kind: str) -> None:
     """Raise InputError for a plain folder of images, which has no ground truth."""
     path = source.path
-    plain = not kind and not is_recording(path) and "poses" not in source.settings and _layout(source, path) == "tum"
+    plain = not kind and not is_recording(path) and "poses" not in source.settings and not layout_of(path, "")
     if plain and path.is_dir() and not (path / "rgb.txt").exists():
         expected = "add ,poses=FILE, or write images:FOLDER,truth=MASK; the command detect needs no ground truth"
         raise InputError(f"has no ground truth of which frames show the same place; {expected}", path)
-
-
-def _layout(source: Source, path: Path) -> str:
-    return layout_of(path, "images" if "poses" in source.settings else "tum")
 
 
 def warn_of_unreadable(recording: ImageSequence) -> ImageSequence:
@@ -205,13 +196,10 @@ def warn_of_unreadable(recording: ImageSequence) -> ImageSequence:
 def recording_of(text: str, frames: Path) -> ImageSequence:
     """Open a source for the detector; the frames of a bag are extracted to the folder ``frames``."""
     source = typed(text, DETECTED)
-    path, (topic, pose_topic) = source.path, (source.get(name, str) or "" for name in TOPICS)
-    if is_bag(path):
-        path, summary = extract(path, frames, topic, pose_topic, bar)
-        print(summary)
-    elif topic or pose_topic:
-        raise WrongUsage(f"{source}: topics are for bags")
-    recording = read_sequence(path).taken(source.selection())
-    for doubt in recording.doubts:
-        warn(doubt)
+    read, said = open_sequence(source, frames, progress=bar)
+    if said:
+        print(said)
+    recording = read.taken(source.selection())
+    for remark in recording.remarks():
+        warn(remark)
     return recording

@@ -30,7 +30,8 @@ class ImageSequence(ImageList):
     poses       (N, 7) of the camera in the world, tx ty tz qx qy qz qw, NaN where not known; None if no pose is known
     camera      None if not known
     depths      N files of depth in TUM's form (16 bits, 5000 per meter), None for an image without one; or None
-    doubts      sentences about poses that look wrong
+    doubts      sentences about poses that look wrong, and about files that could not be used
+    pose_fault  why the sequence's own poses could not be read
     unreadable  indices of the images that ``frames`` could not read
     """
 
@@ -40,6 +41,7 @@ class ImageSequence(ImageList):
     camera: Intrinsics | None = None
     depths: tuple[Path | None, ...] | None = None
     doubts: tuple[str, ...] = ()
+    pose_fault: InputError | None = None
     unreadable: list[int] = field(default_factory=list)
 
     @classmethod
@@ -69,6 +71,12 @@ class ImageSequence(ImageList):
             return np.zeros(len(self), bool)
         return np.all(np.isfinite(self.poses), axis=1)
 
+    def remarks(self) -> Iterator[str]:
+        """Yield a sentence for all that looks wrong, for a command that needs no poses."""
+        yield from self.doubts
+        if self.pose_fault is not None:
+            yield f"{self.pose_fault}; continued without poses"
+
     def taken(self, selection: Selection) -> ImageSequence:
         """Return the selected frames. The selection counts all frames, with or without a pose."""
         return self.at(selection.numbers(len(self)))
@@ -89,6 +97,8 @@ class ImageSequence(ImageList):
 
     def with_poses(self) -> ImageSequence:
         """Return the frames that have a pose. Raises InputError if none has."""
+        if self.pose_fault is not None:
+            raise self.pose_fault
         if self.poses is None:
             raise InputError("has no poses; expected groundtruth.txt, or the name of a file of poses", self.source)
         known = np.flatnonzero(self.known)

@@ -4,39 +4,26 @@ TUM    ``timestamp tx ty tz qx qy qz qw``: seconds, meters, w last
 KITTI  twelve numbers, the upper three rows of a 4 x 4 matrix; no time: one row per image
 EuRoC  ``timestamp,px,py,pz,qw,qx,qy,qz,...``: nanoseconds, meters, w first; further columns are ignored
 
+The first line or a comment before it may name the columns; the quaternion is then read in their order.
+
 All of them give the pose of the camera (EuRoC: the body) in the world, unless the form has ``world-to-camera``.
 """
 
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
-from loopclosure.places.trajectory import (
-    MAX_DIFFERENCE_S,
-    NORM_TOLERANCE,
-    Trajectory,
-    associate,
-    content_lines,
-    number,
-    read_groundtruth,
-)
+from loopclosure.places.pose_table import UNITS, form_of, numbers_of, read_lines, seconds_of
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, associate
 
 FORMS = ("tum", "kitti", "euroc")
 ORDERS = ("w-first", "w-last")
 DIRECTIONS = ("camera-to-world", "world-to-camera")
-EXPECTED = (
-    "a file of poses: TUM (timestamp tx ty tz qx qy qz qw), KITTI (twelve numbers of a matrix), or EuRoC "
-    "(timestamp,px,py,pz,qw,qx,qy,qz)"
-)
-# A rotation matrix in text has at least four decimals.
-MATRIX_TOLERANCE = 0.02
 # A step is a jump if its speed is this many times the 99th percentile, and it is longer than this.
 JUMP_FACTOR, JUMP_M = 10.0, 0.5
 # A car or a robot always moves in one direction of its own frame. If that is so only with another reading of the poses,
@@ -48,8 +35,8 @@ ONE_WAY, ALL_WAYS, SHORTER = 0.9, 0.7, 0.5
 class PoseForm:
     """How to read a file of poses; an empty field means the default.
 
-    form       "tum", "kitti" or "euroc"; default: found from the number of columns and the commas
-    order      "w-first" or "w-last" of the quaternion; default: w first for EuRoC, last for TUM
+    form       "tum", "kitti" or "euroc"; default: found from the rows
+    order      "w-first" or "w-last" of the quaternion; default: as the header says, or w first for EuRoC, last for TUM
     direction  "camera-to-world" (default) or "world-to-camera"
     """
 
@@ -62,7 +49,7 @@ class PoseForm:
 class PoseFile:
     """N poses, camera-to-world: ``poses`` (N, 7) tx ty tz qx qy qz qw, and ``stamps`` (N,) in s, None for KITTI.
 
-    ``doubts`` are sentences about what looks wrong.
+    A row that has no usable pose is NaN. ``doubts`` are sentences about what looks wrong.
     """
 
     poses: np.ndarray
@@ -91,14 +78,20 @@ class PoseFile:
                     path,
                 )
             return self.poses
-        nearest = associate(stamps, Trajectory(self.stamps, self.poses[:, :3], self.poses[:, 3:]), max_difference)
+        known = np.isfinite(self.poses).all(axis=1)
+        poses = self.poses[known]
+        nearest = associate(stamps, self.stamps[known], max_difference)
+        for unit in UNITS:  # times since the start of a drive do not tell their unit
+            found = associate(stamps, self.stamps[known] * unit, max_difference)
+            if nearest.max() < 0 and np.mean(found >= 0) > 0.5:
+                nearest = found
         if nearest.max() < 0:
             raise InputError(
                 f"none of {images} images has a pose within {max_difference:g} s: images from {stamps[0]:.3f} to "
                 f"{stamps[-1]:.3f} s, poses from {self.stamps[0]:.3f} to {self.stamps[-1]:.3f} s",
                 path,
             )
-        return np.where(nearest[:, None] < 0, np.nan, self.poses[nearest])
+        return np.where(nearest[:, None] < 0, np.nan, poses[nearest])
 
 
 def pose_form(text: str) -> PoseForm:
@@ -118,41 +111,58 @@ def pose_form(text: str) -> PoseForm:
 def read_poses(path: str | os.PathLike[str], form: PoseForm = PoseForm()) -> PoseFile:
     """Read a file of poses, sorted by time if it has stamps.
 
-    Raises InputError (file:line:column) for a line in another form, and for numbers that are not a rotation.
+    Rows without a usable pose are NaN; ``doubts`` counts them. Raises InputError (file:line:column) if no row is
+    usable, or if the form cannot be told from the rows.
     """
-    kind = form.form or _form_of(path)
-    order = form.order or ("w-first" if kind == "euroc" else "w-last")
-    if kind == "tum":
-        trajectory = read_groundtruth(path)
-        stamps, positions, quaternions = trajectory.stamps, trajectory.positions, trajectory.quaternions
-    elif kind == "euroc":
-        table = _rows(path, kind, 8)
-        table = table[np.argsort(table[:, 0], kind="stable")]
-        stamps, positions, quaternions = table[:, 0] * 1e-9, table[:, 1:4], table[:, 4:8]
+    lines = read_lines(path)
+    kind = form.form or form_of(lines, form.order, path)
+    order = form.order or lines.order or ("w-first" if kind == "euroc" else "w-last")
+    table, faults = numbers_of(lines, kind, order, path)
+    if kind == "kitti":
+        stamps, matrices, usable = None, table.reshape(-1, 3, 4), np.isfinite(table).all(axis=1)
+        poses = np.full((len(table), 7), np.nan)
+        turns = Rotation.from_matrix(matrices[usable, :, :3]).as_quat(canonical=True)
+        poses[usable] = np.hstack([matrices[usable, :, 3], turns])
     else:
-        matrices = _rows(path, kind, 12).reshape(-1, 3, 4)
-        stamps, positions = None, matrices[:, :, 3]
-        quaternions = Rotation.from_matrix(matrices[:, :, :3]).as_quat(canonical=True)
-    if kind != "kitti" and order == "w-first":
-        quaternions = np.roll(quaternions, -1, axis=1)
-    poses = np.hstack([positions, quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)])
+        table = table[np.isfinite(table[:, 0])]
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        stamps, quaternions = _seconds(table[:, 0], kind), table[:, 4:]
+        if order == "w-first":
+            quaternions = np.roll(quaternions, -1, axis=1)
+        poses = np.hstack([table[:, 1:4], quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)])
     if form.direction == "world-to-camera":
         poses = inverse(poses)
     read = PoseForm(kind, "" if kind == "kitti" else order, form.direction or DIRECTIONS[0])
-    return PoseFile(poses, stamps, read, tuple(doubts(poses, stamps, read)))
+    known = np.isfinite(poses).all(axis=1)
+    found = doubts(poses[known], None if stamps is None else stamps[known], read)
+    return PoseFile(poses, stamps, read, (*([str(faults)] if faults else []), *found))
+
+
+def _seconds(times: np.ndarray, kind: str) -> np.ndarray:
+    """Return times in seconds. EuRoC's are nanoseconds, also if they are counted from the start of the drive."""
+    seconds = seconds_of(times)
+    relative = kind == "euroc" and seconds is times and np.all(times % 1 == 0) and times[-1] > 1e6
+    return times * 1e-9 if relative else seconds
 
 
 def inverse(poses: np.ndarray) -> np.ndarray:
-    """Return the inverse (N, 7) of each pose (7,)."""
-    turns = Rotation.from_quat(poses[:, 3:]).inv()
-    return np.hstack([-turns.apply(poses[:, :3]), turns.as_quat(canonical=True)])
+    """Return the inverse (N, 7) of each pose (7,); NaN stays NaN."""
+    known, back = np.isfinite(poses).all(axis=1), np.full(poses.shape, np.nan)
+    turns = Rotation.from_quat(poses[known, 3:]).inv()
+    back[known] = np.hstack([-turns.apply(poses[known, :3]), turns.as_quat(canonical=True)])
+    return back
 
 
 def moved(poses: np.ndarray, mount: np.ndarray) -> np.ndarray:
-    """Return the poses (N, 7) of a sensor from the poses of its body; ``mount`` (4, 4): its pose in the body."""
-    turns = Rotation.from_quat(poses[:, 3:])
-    positions = poses[:, :3] + turns.apply(mount[:3, 3])
-    return np.hstack([positions, (turns * Rotation.from_matrix(mount[:3, :3])).as_quat(canonical=True)])
+    """Return the poses (N, 7) of a sensor from the poses of its body; ``mount`` (4, 4): its pose in the body.
+
+    NaN stays NaN.
+    """
+    known, there = np.isfinite(poses).all(axis=1), np.full(poses.shape, np.nan)
+    turns = Rotation.from_quat(poses[known, 3:])
+    positions = poses[known, :3] + turns.apply(mount[:3, 3])
+    there[known] = np.hstack([positions, (turns * Rotation.from_matrix(mount[:3, :3])).as_quat(canonical=True)])
+    return there
 
 
 def doubts(poses: np.ndarray, stamps: np.ndarray | None, form: PoseForm = PoseForm()) -> list[str]:
@@ -206,52 +216,3 @@ def _one_way(poses: np.ndarray) -> float:
         return 0.0
     own = Rotation.from_quat(poses[:-1, 3:][long]).inv().apply(steps[long] / lengths[long, None])
     return float(np.linalg.norm(own.mean(axis=0)))
-
-
-def _form_of(path: str | os.PathLike[str]) -> str:
-    """Find the form of a file of poses from its first row."""
-    for line_number, line in content_lines(path, EXPECTED):
-        count = len(re.findall(r"[^\s,]+", line))
-        if "," in line and count >= 8:
-            return "euroc"
-        if count == 12:
-            return "kitti"
-        if count == 8:
-            return "tum"
-        raise InputError(f"has {count} numbers in a row; expected {EXPECTED}", path, line_number, 1)
-    raise InputError("holds no pose", path)
-
-
-def _rows(path: str | os.PathLike[str], kind: str, count: int) -> np.ndarray:
-    """Return the first ``count`` numbers of each row (N, count)."""
-    rows = []
-    for line_number, line in content_lines(path, EXPECTED):
-        fields = list(re.finditer(r"[^\s,]+", line))
-        if len(fields) < count or (kind == "kitti" and len(fields) > count):
-            fault = f"has {len(fields)} numbers, a row of {kind.upper()}'s form has {count}"
-            raise InputError(fault, path, line_number, 1)
-        row = [number(fields[i], f"column {i + 1}", path, line_number) for i in range(count)]
-        if fault := _rotation_fault(row, kind):
-            raise InputError(fault, path, line_number, fields[0 if kind == "kitti" else 4].start() + 1)
-        rows.append(row)
-    if not rows:
-        raise InputError("holds no pose", path)
-    return np.array(rows)
-
-
-def _rotation_fault(row: Sequence[float], kind: str) -> str:
-    """Return why a row has no valid rotation; empty if it has one."""
-    if kind == "euroc":
-        length = float(np.linalg.norm(row[4:8]))
-        wrong = abs(length - 1) > NORM_TOLERANCE
-        return f"qw qx qy qz have length {length:.4g}, a rotation has length 1" if wrong else ""
-    return matrix_fault(np.array(row).reshape(3, 4)[:, :3])
-
-
-def matrix_fault(matrix: np.ndarray) -> str:
-    """Return why the first three columns (3, 3) of a pose are not a rotation; empty if they are."""
-    difference = float(np.abs(matrix.T @ matrix - np.eye(3)).max()) if np.abs(matrix).max() < 2 else np.inf
-    if not difference <= MATRIX_TOLERANCE:
-        return f"its first three columns are not a rotation: M^T M differs from the identity by {difference:.3g}"
-    reflected = np.linalg.det(matrix) < 0
-    return "its first three columns are a reflection (determinant -1), not a rotation" if reflected else ""

@@ -18,7 +18,8 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import VIDEO_SUFFIXES, video_length
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import kitti_projection, read_intrinsics, yaml_numbers
-from loopclosure.places.pose_files import PoseForm, matrix_fault, moved, read_poses
+from loopclosure.places.pose_files import PoseForm, moved, read_poses
+from loopclosure.places.pose_table import matrix_fault, seconds_of
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, content_lines, number
 from netspec.errors import SpecError
 from netspec.files.image_list import list_images
@@ -43,8 +44,9 @@ def read_sequence(
 ) -> ImageSequence:
     """Read a sequence with a layout "tum", "euroc", "kitti", "images" or "video"; "": found from the files.
 
-    A frame gets the pose nearest in time, within ``max_difference`` seconds, or none. Raises InputError for files that
-    are missing or damaged.
+    A frame gets the pose nearest in time, within ``max_difference`` seconds, or none. If the sequence's own poses or
+    calibration cannot be read, it has none, and says why. Raises InputError for images or lists that are missing or
+    damaged, and for ``poses`` that cannot be read.
     """
     source = Path(source)
     sequence = _READERS[layout or layout_of(source)](source, max_difference, poses is None)
@@ -52,7 +54,7 @@ def read_sequence(
         return sequence
     read = read_poses(poses.path, poses.form)
     found = read.of_images(len(sequence), sequence.stamps, poses.path, max_difference)
-    return replace(sequence, poses=found, doubts=_named(read.doubts, poses.path))
+    return replace(sequence, poses=found, doubts=(*sequence.doubts, *_named(read.doubts, poses.path)))
 
 
 def layout_of(source: Path, otherwise: str = "images") -> str:
@@ -96,28 +98,51 @@ def _tum(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
     listed = list_images(folder)
     if listed.stamps is None:
         raise InputError('has lines without a time stamp; expected "timestamp filename" in each line', listing)
-    sequence = ImageSequence(listed.paths, listed.names, listed.stamps, folder)
-    return _with_tum_files(sequence, listed.stamps, max_difference, own_poses)
+    stamps = seconds_of(listed.stamps)
+    sequence = ImageSequence(listed.paths, listed.names, stamps, folder)
+    return _with_tum_files(sequence, stamps, max_difference, own_poses)
 
 
 def _with_tum_files(
     sequence: ImageSequence, stamps: np.ndarray, max_difference: float, own_poses: bool
 ) -> ImageSequence:
     """Add the poses, depth and calibration of a TUM sequence, if it has them."""
-    folder, doubts = sequence.source, []
+    folder = sequence.source
     if own_poses:
-        path = folder / "groundtruth.txt"
-        read = read_poses(path, PoseForm("tum"))
-        sequence = replace(sequence, poses=read.of_images(len(sequence), stamps, path, max_difference))
-        doubts += _named(read.doubts, path)
+        sequence = _with_poses(sequence, folder / "groundtruth.txt", "tum", max_difference)
     if (folder / "depth.txt").is_file():
         try:
             sequence = replace(sequence, depths=_nearest_depths(folder / "depth.txt", stamps, max_difference))
         except SpecError as fault:
-            doubts.append(f"{fault}; depth is not used")
+            sequence = replace(sequence, doubts=(*sequence.doubts, f"{fault}; depth is not used"))
     if (folder / "calibration.txt").is_file():
-        sequence = replace(sequence, camera=read_intrinsics(folder / "calibration.txt"))
-    return replace(sequence, doubts=tuple(doubts))
+        sequence = _with_camera(sequence, folder / "calibration.txt")
+    return sequence
+
+
+def _with_poses(
+    sequence: ImageSequence, path: Path, form: str, max_difference: float, mount: np.ndarray | None = None
+) -> ImageSequence:
+    """Add the poses in a file of a sequence; ``mount`` (4, 4): the camera in the frame whose poses the file has.
+
+    If the file cannot be read, the sequence has no poses, and its ``pose_fault`` says why.
+    """
+    try:
+        read = read_poses(path, PoseForm(form))
+        found = read.of_images(len(sequence), sequence.stamps, path, max_difference)
+    except InputError as fault:
+        return replace(sequence, pose_fault=fault)
+    if mount is not None:
+        found = moved(found, mount)
+    return replace(sequence, poses=found, doubts=(*sequence.doubts, *_named(read.doubts, path)))
+
+
+def _with_camera(sequence: ImageSequence, path: Path, projection: str = "") -> ImageSequence:
+    """Add the camera of a calibration file; a sentence about the file if it cannot be used."""
+    try:
+        return replace(sequence, camera=read_intrinsics(path, projection))
+    except InputError as fault:
+        return replace(sequence, doubts=(*sequence.doubts, f"{fault}; the calibration is not used"))
 
 
 def _nearest_depths(listing: Path, stamps: np.ndarray, max_difference: float) -> tuple[Path | None, ...]:
@@ -125,19 +150,21 @@ def _nearest_depths(listing: Path, stamps: np.ndarray, max_difference: float) ->
     depths = list_images(listing)
     if depths.stamps is None:
         raise InputError('has lines without a time stamp; expected "timestamp filename" in each line', listing)
-    nearest = np.abs(stamps[:, None] - depths.stamps).argmin(axis=1)
-    near = np.abs(stamps - depths.stamps[nearest]) <= max_difference
+    times = seconds_of(depths.stamps)
+    nearest = np.abs(stamps[:, None] - times).argmin(axis=1)
+    near = np.abs(stamps - times[nearest]) <= max_difference
     return tuple(depths.paths[number] if there else None for number, there in zip(nearest, near, strict=True))
 
 
 def _images(source: Path, max_difference: float, own_poses: bool) -> ImageSequence:
     listed = list_images(source)
-    sequence = ImageSequence(listed.paths, (), listed.stamps, source)
+    stamps = None if listed.stamps is None else seconds_of(listed.stamps)
+    sequence = ImageSequence(listed.paths, (), stamps, source)
     sequence = replace(sequence, names=tuple(os.path.relpath(path, sequence.folder) for path in listed.paths))
-    if listed.stamps is None or not source.is_dir():
+    if stamps is None or not source.is_dir():
         return sequence
     own_poses = own_poses and (source / "groundtruth.txt").is_file()
-    return _with_tum_files(sequence, listed.stamps, max_difference, own_poses)
+    return _with_tum_files(sequence, stamps, max_difference, own_poses)
 
 
 def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
@@ -150,35 +177,39 @@ def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
     stamps, images = [], []
     for line_number, line in content_lines(listing, 'a list of images, "timestamp [ns],filename" per line'):
         row = next(csv.reader([line]))
+        if not images and len(row) >= 2 and not any(character.isdigit() for character in line):
+            continue  # the names of the columns
         if len(row) < 2 or not re.fullmatch(r"\s*[0-9]{1,19}\s*", row[0]):
             found = line.strip()[:60]
-            raise InputError(f'expected "timestamp [ns],filename", found "{found}"', listing, line_number, 1)
+            expected = "a time in nanoseconds and the name of an image, with a comma between them"
+            raise InputError(f'expected {expected}, found "{found}"', listing, line_number, 1)
         stamps.append(int(row[0]) * 1e-9)
         images.append(_existing(listing.parent / "data" / row[1].strip(), listing, line_number))
     if not images:
         raise InputError("lists no images", listing)
     order = np.argsort(stamps, kind="stable")
     images = tuple(images[i] for i in order)
-    times = np.array(stamps)[order]
+    sequence = ImageSequence(images, _names(images, folder), np.array(stamps)[order], folder)
     sensor = listing.parent / "sensor.yaml"
-    camera, mount = None, np.eye(4)
     if sensor.is_file():
-        camera = read_intrinsics(sensor)
-        mount = np.array(yaml_numbers(sensor.read_text(encoding="utf-8-sig"), "data", 16, sensor)).reshape(4, 4)
-        if fault := matrix_fault(mount[:3, :3]):
-            raise InputError(f"the camera's pose in the body, T_BS: {fault}", sensor)
-    sequence = ImageSequence(images, _names(images, folder), times, folder, camera=camera)
-    if not own_poses:
+        sequence = _with_camera(sequence, sensor)
+    paths = [base / name / "data.csv" for name in EUROC_POSES]
+    path = next((path for path in paths if path.is_file()), None)
+    if not own_poses or path is None:
         return sequence
-    for name in EUROC_POSES:
-        path = base / name / "data.csv"
-        if path.is_file():
-            body = read_poses(path, PoseForm("euroc"))
-            found = body.of_images(len(sequence), times, path, max_difference)
-            known = np.isfinite(found[:, 0])
-            found[known] = moved(found[known], mount)
-            return replace(sequence, poses=found, doubts=_named(body.doubts, path))
-    return sequence
+    try:
+        mount = _mount(sensor) if sensor.is_file() else np.eye(4)
+    except InputError as fault:
+        return replace(sequence, pose_fault=fault)
+    return _with_poses(sequence, path, "euroc", max_difference, mount)
+
+
+def _mount(sensor: Path) -> np.ndarray:
+    """Return the pose of the camera in the body (4, 4) from a ``sensor.yaml``. Raises InputError if it is not one."""
+    mount = np.array(yaml_numbers(sensor.read_text(encoding="utf-8-sig"), "data", 16, sensor)).reshape(4, 4)
+    if fault := matrix_fault(mount[:3, :3]):
+        raise InputError(f"the camera's pose in the body, T_BS: {fault}", sensor)
+    return mount
 
 
 def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
@@ -196,21 +227,23 @@ def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
         times = np.array([_time(line, folder / "times.txt", line_number) for line_number, line in rows])
         if len(times) != len(images):
             raise InputError(f"has {len(times)} times, but there are {len(images)} images", folder / "times.txt")
-    camera, offset = None, np.eye(4)
-    if (folder / "calib.txt").is_file():
-        path, projection = folder / "calib.txt", f"P{cameras[0][-1]}"
-        camera = read_intrinsics(path, projection)
-        matrix = kitti_projection(path.read_text(encoding="utf-8-sig"), projection, path)
-        offset[:3, 3] = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
-    sequence = ImageSequence(images, _names(images, folder), times, folder, camera=camera)
-    if not own_poses:
+    sequence = ImageSequence(images, _names(images, folder), times, folder)
+    calibration, projection = folder / "calib.txt", f"P{cameras[0][-1]}"
+    if calibration.is_file():
+        sequence = _with_camera(sequence, calibration, projection)
+    paths = (folder / "poses.txt", folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt")
+    path = next((path for path in paths if path.is_file()), None)
+    if not own_poses or path is None:
         return sequence
-    for path in (folder / "poses.txt", folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"):
-        if path.is_file():
-            read = read_poses(path, PoseForm("kitti"))
-            found = moved(read.of_images(len(sequence), times, path, max_difference), offset)
-            return replace(sequence, poses=found, doubts=_named(read.doubts, path))
-    return sequence
+    mount = np.eye(4)
+    try:
+        if calibration.is_file():
+            text = calibration.read_text(encoding="utf-8-sig", errors="replace")
+            matrix = kitti_projection(text, projection, calibration)
+            mount[:3, 3] = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    except InputError as fault:
+        return replace(sequence, pose_fault=fault)
+    return _with_poses(sequence, path, "kitti", max_difference, mount)
 
 
 def _video(source: Path, max_difference: float, own_poses: bool) -> ImageSequence:
@@ -232,9 +265,8 @@ _READERS: dict[str, Callable[[Path, float, bool], ImageSequence]] = {
 
 
 def _time(line: str, path: Path, line_number: int) -> float:
-    found = re.search(r"\S+", line)
-    assert found is not None, "a line with content"
-    return number(found, "the time in seconds", path, line_number)
+    text = line.split()[0]
+    return number(text, "the time in seconds", path, line_number, line.index(text) + 1)
 
 
 def _names(images: tuple[Path, ...], folder: Path) -> tuple[str, ...]:

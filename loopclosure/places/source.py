@@ -13,10 +13,11 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.places.bags import is_bag, open_bag
 from loopclosure.places.frames import VIDEO_SUFFIXES, Selection, video_frames, video_length, write_picture
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import write_calibration
 from loopclosure.places.pose_files import DIRECTIONS, FORMS, ORDERS, pose_form
-from loopclosure.places.sequences import PoseChoice
-from loopclosure.places.trajectory import Trajectory, write_rgb_list, write_trajectory
+from loopclosure.places.sequences import PoseChoice, layout_of, read_sequence
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Trajectory, write_rgb_list, write_trajectory
 from loopclosure.progress import Progress, silent
 from netspec.errors import did_you_mean
 from netspec.files.kinds import nearest_existing
@@ -121,7 +122,6 @@ LAYOUTS = {
     "bag": "a ROS 1 or ROS 2 bag",
     "video": "a video (with poses)",
 }
-RECORDED = ("bag", "video")  # their frames are extracted first
 POSES_HELP = "camera poses in the format of TUM, KITTI or EuRoC, instead of the sequence's own"
 POSE_FORM_HELP = (
     f"format of the poses, if not detected from the file: one or more of "
@@ -132,6 +132,34 @@ POSE_FORM_HELP = (
 def is_recording(source: Path) -> bool:
     """Return whether a source is a bag or a video."""
     return is_bag(source) or source.suffix.lower() in VIDEO_SUFFIXES
+
+
+def open_sequence(
+    source: Source,
+    frames: Path,
+    *,
+    posed: bool = False,
+    videos: bool = False,
+    max_difference: float = MAX_DIFFERENCE_S,
+    progress: Progress = silent,
+) -> tuple[ImageSequence, str]:
+    """Read a sequence with all its frames; return it, and a sentence if its frames were extracted.
+
+    frames          folder for the frames of a bag, see :func:`extract`
+    posed           a folder that has no other layout must be a TUM sequence
+    videos          extract the frames of videos, too
+    max_difference  between an image and its pose, in seconds
+    """
+    path, layout, said, poses = source.path, source.kind, "", source.pose_choice()
+    topics = [source.get(name, str) or "" for name in TOPICS]
+    video = layout == "video" or (not layout and path.suffix.lower() in VIDEO_SUFFIXES)
+    if layout == "bag" or (not layout and is_bag(path)) or (video and videos):
+        path, said = extract(path, frames, *topics, progress=progress)
+        layout = "images"
+    elif any(topics):
+        raise InputError("is no bag; topic and pose-topic are for bags", path)
+    layout = layout or layout_of(path, "tum" if posed and poses is None else "images")
+    return read_sequence(path, layout, max_difference, poses), said
 
 
 def extract(

@@ -1,4 +1,4 @@
-"""Reads and writes camera poses in the files of the TUM RGB-D benchmark.
+"""Camera poses in time, and the files of the TUM RGB-D benchmark that hold them.
 
 A sequence is a folder with ``rgb.txt`` (``timestamp filename``) and ``groundtruth.txt`` (``timestamp tx ty tz qx qy qz
 qw``). A pose is camera-to-world: the position of the optical center in meters and a unit quaternion with w last; the
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,37 +60,6 @@ class Trajectory:
 Posed = Poses | Trajectory
 
 
-def read_groundtruth(path: str | os.PathLike[str]) -> Trajectory:
-    """Read ``groundtruth.txt``, in order of time; quaternions are normalized (the file has four decimals).
-
-    Raises InputError (file:line:column) if a line is not eight numbers, or if its last four are not a quaternion.
-    """
-    names = "timestamp tx ty tz qx qy qz qw"
-    rows = []
-    for line_number, line in content_lines(path, f'a trajectory, "{names}" per line (TUM RGB-D: groundtruth.txt)'):
-        fields = list(re.finditer(r"\S+", line))
-        if len(fields) != 8:
-            raise InputError(
-                f'expected the eight numbers "{names}", found {len(fields)}: "{line.strip()}"',
-                path,
-                line_number,
-                _column_of_count_fault(line, fields, 8),
-            )
-        row = [number(field, name, path, line_number) for field, name in zip(fields, names.split(), strict=True)]
-        norm = math.hypot(*row[4:])
-        if abs(norm - 1) > NORM_TOLERANCE:
-            raise InputError(
-                f"qx qy qz qw have length {norm:.4g}, a rotation has length 1", path, line_number, fields[4].start() + 1
-            )
-        rows.append(row)
-    if not rows:
-        raise InputError("holds no pose", path)
-    table = np.array(rows)
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    quaternions = table[:, 4:] / np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
-    return Trajectory(table[:, 0].copy(), table[:, 1:4].copy(), quaternions)
-
-
 def write_rgb_list(
     path: str | os.PathLike[str], frames: Iterable[tuple[float, str]], what: str = "color images"
 ) -> None:
@@ -115,21 +83,26 @@ def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory, what:
 
 
 def associate(
-    frame_stamps: NDArray[np.float64], trajectory: Trajectory, max_difference: float = MAX_DIFFERENCE_S
+    frame_stamps: NDArray[np.float64], stamps: NDArray[np.float64], max_difference: float = MAX_DIFFERENCE_S
 ) -> NDArray[np.intp]:
-    """Find for each frame (N,) the pose nearest in time: its index (N,), -1 if none is within ``max_difference`` s.
+    """Find for each frame (N,) the nearest of ascending ``stamps``: its index (N,), -1 if none is near enough.
 
-    Frames may share a pose, unlike in TUM's associate.py, which pairs one to one: poses come faster than images.
+    ``max_difference`` is in seconds. Frames may share a pose, unlike in TUM's associate.py, which pairs one to one:
+    poses come faster than images.
     """
-    stamps = trajectory.stamps
     after = np.searchsorted(stamps, frame_stamps).clip(0, len(stamps) - 1)
     before = (after - 1).clip(0)
     nearest = np.where(np.abs(stamps[before] - frame_stamps) <= np.abs(stamps[after] - frame_stamps), before, after)
     return np.where(np.abs(stamps[nearest] - frame_stamps) <= max_difference, nearest, -1)
 
 
-def content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple[int, str]]:
-    """Yield the lines that are not empty and not a comment, with their numbers from 1."""
+def content_lines(
+    path: str | os.PathLike[str], expected: str, comments: list[str] | None = None
+) -> Iterator[tuple[int, str]]:
+    """Yield the lines that are not empty and not a comment, with their numbers from 1.
+
+    Comments are added to ``comments``.
+    """
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -139,22 +112,19 @@ def content_lines(path: str | os.PathLike[str], expected: str) -> Iterator[tuple
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield number, line
+        elif line.strip() and comments is not None:
+            comments.append(line)
 
 
-def number(field: re.Match[str], name: str, path: str | os.PathLike[str], line: int) -> float:
-    """Return a matched field as a number; ``name`` is for the message.
+def number(text: str, name: str, path: str | os.PathLike[str], line: int, column: int) -> float:
+    """Return a field of a file as a number; ``name`` is for the message.
 
     Raises InputError (file:line:column) if it is not a number, or if it is too large to compute distances with.
     """
     try:
-        value = float(field.group())
+        value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(16 * value * value):
-        raise InputError(f'expected a number for {name}, found "{field.group()}"', path, line, field.start() + 1)
+        raise InputError(f'expected a number for {name}, found "{text}"', path, line, column)
     return value
-
-
-def _column_of_count_fault(line: str, fields: list[re.Match[str]], expected: int) -> int:
-    """Return the column (from 1) of the first extra field, or where the first missing field should be."""
-    return fields[expected].start() + 1 if len(fields) > expected else len(line.rstrip()) + 1

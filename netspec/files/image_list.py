@@ -17,7 +17,8 @@ IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff
 SUBFOLDERS = ("rgb", "images", "Images")
 _EXPECTED = "a folder of images, or a text file that lists them"
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_LINE = re.compile(rf"(?:(?P<stamp>{_NUMBER})\s+)?(?P<name>.+?)(?:\s+[+-]?\d+)?")
+_LINE = re.compile(rf"(?:(?P<stamp>{_NUMBER})(?:\s+|\s*,\s*))?(?P<name>.+?)(?:\s+[+-]?\d+)?")
+_HEADER = re.compile(r"(?:time|stamp)[a-z_]*(?:\s*\[\w+\])?[\s,]+[a-z_ ]+", re.IGNORECASE)  # timestamp filename
 _COMMENT = re.compile(r"\s+#")
 
 
@@ -94,6 +95,8 @@ def _read_list(path: Path) -> ImageList:
                 stamps.append(stamp)
                 break
         else:
+            if not names and _HEADER.fullmatch(text):
+                continue
             name = readings[-1][0]
             raise SpecError(f'no such image "{name}" in {path.parent}', Where(str(path), number, line.index(name) + 1))
     if not names:

@@ -28,7 +28,7 @@ from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.places.frames import read_bgr
 from loopclosure.places.masks import read_coordinates, read_truth_matrix
-from loopclosure.places.trajectory import read_groundtruth
+from loopclosure.places.pose_files import read_poses
 from loopclosure.words.chow_liu import learn_tree
 from loopclosure.words.vocabulary import Extractor, Vocabulary
 from loopclosure.words.word_model import WordModel
@@ -280,7 +280,7 @@ FORMATS = {
     "truth.npy": Format(".npy", lambda path: np.save(path, np.eye(6)), read_truth_matrix),
     "truth.txt": Format(".txt", lambda path: np.savetxt(path, np.eye(6), "%d"), read_truth_matrix),
     "coordinates": Format(".txt", text("a.png 1 2\nb.png 3 4\n"), read_coordinates),
-    "groundtruth": Format(".txt", text("# stamp tx ty tz qx qy qz qw\n" + POSES), read_groundtruth),
+    "groundtruth": Format(".txt", text("# stamp tx ty tz qx qy qz qw\n" + POSES), read_poses),
     "image list": Format(
         ".txt", text("a.png 0\nb c.png 1\n# note\nd.png 2\n"), lambda path: read_image_list(str(path))
     ),

@@ -53,6 +53,12 @@ FOUND: dict[str, tuple[dict[str, str], str, list[str], list[float] | None]] = {
         ["a.png", "b.png", "c.png"], None),
     "stamp and label": ({"l.txt": "7.5 a.png 1\n8.5 b c.png 0", "a.png": "", "b c.png": ""}, "l.txt",
         ["a.png", "b c.png"], [7.5, 8.5]),
+    "stamps with commas, below the names of the columns": (
+        {"l.txt": "timestamp,filename\n1.5,a.png\n2.5, b,c.png\n3,4.png\n", "a.png": "", "b,c.png": "", "4.png": ""},
+        "l.txt", ["a.png", "b,c.png", "4.png"], [1.5, 2.5, 3]),
+    "an image that has the name of a column": (
+        {"rgb.txt": "time file\na.png\n", "a.png": "", "time file": ""},
+        "rgb.txt", ["time file", "a.png"], None),
     "comments": (
         {"l.txt": "# chosen\n  # and\n#a.png\na.png # twice\n1 a.png 0  # again\n", "a.png": "", "#a.png": ""}, "l.txt",
         ["a.png", "a.png"], None),

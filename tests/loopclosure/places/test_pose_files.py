@@ -65,13 +65,17 @@ def test_a_jump_is_noticed(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("1 0 0 0 1 0 0 0 1 0 0\n", "a.txt:1:1: has 11 numbers in a row; expected a file of poses: TUM"),
+        ("0 1 2 3 0 0 0 1 9\n", "a.txt:1:1: has 9 numbers in a row; expected a file of poses: TUM"),
         ("# empty\n", "a.txt: holds no pose"),
+        ("timestamp tx ty tz qx qy qz qw\n", "a.txt: holds no pose"),
         ("1 0 0 0 0 2 0 0 0 0 1 0\n", "a.txt:1:1: its first three columns are not a rotation: M^T M differs"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "a.txt:1:1: its first three columns are a reflection"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0\n", "a.txt:2:1: has 8 numbers, a row of KITTI's form has 12"),
-        ("#t\n5,0,0,0,1,1,0,0\n", "a.txt:2:9: qw qx qy qz have length 1.414, a rotation has length 1"),
-        ("5,0,0,x,1,0,0,0\n", 'a.txt:1:7: expected a number for column 4, found "x"'),
+        ("#t,x,y,z,qw,qx,qy,qz\n5,0,0,0,1,1,0,0\n", "a.txt:2:9: qw qx qy qz have length 1.414, a rotation has"),
+        ("t,x,y,z,qw,qx,qy,qz\n5,0,0,x,1,0,0,0\n", 'a.txt:2:7: expected a number for tz, found "x"'),
         ("0 1 2 3 0.9 0.9 0 0\n", "a.txt:1:9: qx qy qz qw have length 1.273, a rotation has length 1"),
+        ("0 1 2 nan 1 0 0 0\n", 'a.txt:1:7: expected a number for tz, found "nan"'),
+        ("0 1 1e300 3 1 0 0 0\n", 'a.txt:1:5: expected a number for ty, found "1e300"'),
+        ("#t\n5,0,0,0,1,0,0,0\n", "a.txt:2:9: the last four columns may be qx,qy,qz,qw as in TUM's form or qw,"),
     ],
 )
 def test_an_invalid_row_is_one_line(text: str, message: str, tmp_path: Path) -> None:
@@ -79,6 +83,89 @@ def test_an_invalid_row_is_one_line(text: str, message: str, tmp_path: Path) -> 
         read_poses(write(tmp_path / "a.txt", text))
     assert str(caught.value).startswith(f"{tmp_path}/{message}")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("fault", ["NaN NaN NaN NaN", "0 0 0 0", "1 1 0 0", "0 0 0", "0 0 zero 1"])
+def test_a_row_without_a_usable_pose_is_no_pose(fault: str, tmp_path: Path) -> None:
+    rows = tum_rows(path()).splitlines(keepends=True)
+    rows[7] = f"7.0 1 2 3 {fault}\n"
+    file = write(tmp_path / "poses.txt", "".join(rows))
+    read = read_poses(file)
+    assert len(read.doubts) == 1
+    assert read.doubts[0].startswith("1 of 48 rows has no usable pose; line 8: ")
+    others = np.arange(COUNT) != 7
+    found = read.of_images(COUNT, np.arange(COUNT) + 0.01, file)
+    assert np.isnan(found[7]).all()
+    same_poses(found[others], path()[others])
+    np.testing.assert_array_equal(read.of_images(COUNT, None, file), found)  # images without a time
+
+
+def test_a_row_of_a_matrix_without_a_usable_pose_keeps_its_place(tmp_path: Path) -> None:
+    rows = kitti_rows(path()).splitlines(keepends=True)
+    rows[3] = " ".join(["nan"] * 12) + "\n"
+    rows[5] = "1 2 3\n"
+    read = read_poses(write(tmp_path / "poses.txt", "".join(rows)), PoseForm("kitti", direction="world-to-camera"))
+    assert read.doubts[0] == '2 of 48 rows have no usable pose; line 4: expected a number for column 1, found "nan"'
+    assert np.flatnonzero(np.isnan(read.poses[:, 0])).tolist() == [3, 5]
+    same_poses(read.poses[6:], np.linalg.inv(path()[6:]))
+
+
+def listed(order: str, separator: str, factor: int = 1, header: str = "") -> str:
+    """The path with quaternions in an order, times in seconds or whole parts of one, and separators."""
+    lines = [header + "\n"] if header else []
+    for i, (pose, (x, y, z, w)) in enumerate(zip(path(), quaternions(path()), strict=True)):
+        turn = (w, x, y, z) if order == "w-first" else (x, y, z, w)
+        time = f"{100 + i / 2:.3f}" if factor == 1 else str(100 * factor + i * factor // 2)
+        lines.append(separator.join([time, *(f"{value:.6f}" for value in (*pose[:3, 3], *turn))]) + "\n")
+    return "".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "order"),
+    [
+        (listed("w-last", ",", header="timestamp,tx,ty,tz,qx,qy,qz,qw"), "w-last"),
+        (
+            listed("w-last", ",", 10**9, "#timestamp [ns], p_WS_x, p_WS_y, p_WS_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w"),
+            "w-last",
+        ),
+        (listed("w-first", ",", 10**9, "timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z"), "w-first"),
+        (listed("w-first", " ", header="# time x y z qw qx qy qz"), "w-first"),
+        (listed("w-last", ";", header="timestamp;tx;ty;tz;q.x;q.y;q.z;q.w"), "w-last"),
+        (listed("w-last", ";", header="timestamp;tx;ty;tz;qx;qy;qz;qw").replace(".", ","), "w-last"),
+        (listed("w-last", " ").replace(".", ","), "w-last"),
+        (listed("w-last", "\t", header="timestamp tx ty tz qx qy qz qw"), "w-last"),
+        (listed("w-last", " ", 1000), "w-last"),
+        (listed("w-last", " ", 10**9), "w-last"),
+    ],
+)
+def test_the_header_and_the_separators_tell_the_form(text: str, order: str, tmp_path: Path) -> None:
+    file = write(tmp_path / "poses.csv", text)
+    read = read_poses(file)
+    assert read.form.order == order
+    same_poses(read.of_images(COUNT, 100 + np.arange(COUNT) / 2, file), path())
+
+
+def test_the_form_of_a_list_with_commas_and_no_header_must_be_named(tmp_path: Path) -> None:
+    file = write(tmp_path / "poses.csv", listed("w-last", ","))
+    for word in ("tum", "w-last"):
+        same_poses(read_poses(file, pose_form(word)).poses, path())
+    file.write_text(listed("w-first", ", ", 10**9))
+    for word in ("euroc", "w-first"):
+        read = read_poses(file, pose_form(word))
+        same_poses(read.poses, path())
+        assert read.stamps is not None
+        assert read.stamps[:2].tolist() == [100, 100.5]
+
+
+@pytest.mark.parametrize("factor", [10**3, 10**6, 10**9])
+def test_dates_in_another_unit_are_seconds(factor: int, tmp_path: Path) -> None:
+    rows = [
+        f"{1403636579 * factor + i * factor} {row.split(' ', 1)[1]}\n"
+        for i, row in enumerate(tum_rows(path()).splitlines())
+    ]
+    read = read_poses(write(tmp_path / "a.txt", "".join(rows)))
+    assert read.stamps is not None
+    np.testing.assert_allclose(read.stamps, 1403636579 + np.arange(COUNT), rtol=0, atol=1e-6)
 
 
 def test_an_unknown_word_of_the_form_names_the_known_ones() -> None:

@@ -1,6 +1,7 @@
 """EuRoC, KITTI, VPR benchmarks and videos: the same path from each, and one clear line for what is missing."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of,
 from loopclosure.places.source import extract
 from loopclosure.places.truth import Exclusion
 from places_layouts import (
+    COUNT,
     kitti_rows,
     path,
     quaternions,
@@ -22,6 +24,7 @@ from places_layouts import (
     write_benchmark,
     write_euroc,
     write_kitti,
+    write_tum,
     write_video,
 )
 
@@ -60,33 +63,71 @@ def test_euroc_without_its_truth_or_with_a_missing_image(tmp_path: Path) -> None
         read_sequence(tmp_path, "euroc")
     for stamp in ("9" * 400, "\u00b2"):
         (folder / "mav0/cam0/data.csv").write_text(f"{stamp},1.png\n")
-        with pytest.raises(InputError, match=r'data\.csv:1:1: expected "timestamp \[ns\],filename", found'):
+        with pytest.raises(InputError, match=r"data\.csv:1:1: expected a time in nanoseconds and the name of an image"):
             read_sequence(folder)
 
 
-def test_an_unknown_distortion_is_refused(tmp_path: Path) -> None:
+def test_a_list_of_euroc_may_begin_with_the_names_of_its_columns(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path)
+    for name in ("mav0/cam0/data.csv", "mav0/state_groundtruth_estimate0/data.csv"):
+        (folder / name).write_text((folder / name).read_text().removeprefix("#"))
+    sequence = read_sequence(folder)
+    assert sequence.pose_fault is None
+    same_path(sequence.poses, path())
+
+
+def test_an_unknown_distortion_is_no_camera(tmp_path: Path) -> None:
     folder = write_euroc(tmp_path)
     sensor = folder / "mav0/cam0/sensor.yaml"
-    sensor.write_text(sensor.read_text().replace("radial-tangential", "equidistant"))
-    with pytest.raises(InputError, match="distortion model equidistant is not supported"):
-        read_sequence(folder)
+    sensor.write_text(sensor.read_text().replace("radial-tangential", "omni"))
+    sequence = read_sequence(folder)
+    assert sequence.camera is None
+    assert "distortion model omni is not supported" in sequence.doubts[0]
+    assert sequence.doubts[0].endswith("; the calibration is not used")
+    same_path(sequence.poses, path())
 
 
 @pytest.mark.parametrize("value", ["99999999999999999999", "1e999", "nan", "0.5"])
-def test_an_invalid_mount_is_refused(value: str, tmp_path: Path) -> None:
+def test_without_a_mount_there_are_no_poses(value: str, tmp_path: Path) -> None:
     folder = write_euroc(tmp_path)
     sensor = folder / "mav0/cam0/sensor.yaml"
     sensor.write_text(sensor.read_text().replace("data: [0,", f"data: [{value},"))
+    sequence = read_sequence(folder)
+    (remark,) = sequence.remarks()
+    assert remark.endswith("; continued without poses")
     with pytest.raises(InputError, match=r"sensor\.yaml: the camera's pose in the body, T_BS: .* not a rotation"):
-        read_sequence(folder)
+        sequence.with_poses()
 
 
 @pytest.mark.parametrize("row", ["30 0 15.5 0 30 0 15.5 0 0 0 1 0", "30 0 15.5 0 0 30 11.5 0 0 0 1 inf"])
-def test_an_invalid_projection_is_refused(row: str, tmp_path: Path) -> None:
+def test_without_a_projection_there_is_no_camera_and_no_pose(row: str, tmp_path: Path) -> None:
     folder = write_kitti(tmp_path)
     (folder / "calib.txt").write_text(f"P0: {row}\n")
+    sequence = read_sequence(folder)
+    assert sequence.camera is None
+    assert len(list(sequence.remarks())) == 2
     with pytest.raises(InputError, match=r'calib\.txt: expected "P0:" and the twelve numbers of a projection'):
-        read_sequence(folder)
+        sequence.with_poses()
+
+
+@pytest.mark.parametrize("write", [write_euroc, write_kitti, write_tum])
+def test_poses_that_cannot_be_read_do_not_stop_what_needs_none(write: Callable[[Path], Path], tmp_path: Path) -> None:
+    folder = write(tmp_path)
+    names = ("groundtruth.txt", "mav0/state_groundtruth_estimate0/data.csv", "../../poses/07.txt")
+    (file,) = (folder / name for name in names if (folder / name).exists())
+    rows = file.read_text()
+    file.write_text(rows.replace(rows.splitlines()[5], "1 2 nan", 1))
+    sequence = read_sequence(folder)
+    assert np.flatnonzero(~sequence.known).tolist() in ([4], [5])  # EuRoC has a line of names
+    assert "1 of 48 rows has no usable pose; line 6: " in sequence.doubts[0]
+    same_path(sequence.with_poses().poses, path()[sequence.known])
+    for text in ("", "# nothing\n", "a,b\n", "1 2 3\n"):
+        file.write_text(text)
+        sequence = read_sequence(folder)
+        assert len(sequence) == len(list(sequence.frames())) == COUNT
+        assert [remark.endswith("; continued without poses") for remark in sequence.remarks()] == [True]
+        with pytest.raises(InputError, match=file.name):
+            sequence.with_poses()
 
 
 def test_missing_files_of_a_sequence_are_reported(tmp_path: Path) -> None:
@@ -115,7 +156,7 @@ def test_kitti_with_too_few_poses_or_no_images(tmp_path: Path) -> None:
     folder = write_kitti(tmp_path)
     (tmp_path / "dataset/poses/07.txt").write_text(kitti_rows(path()[:40]))
     with pytest.raises(InputError, match=r"07\.txt: has 40 poses, but there are 48 images"):
-        read_sequence(folder)
+        read_sequence(folder).with_poses()
     (folder / "times.txt").write_text("0\n1\n")
     with pytest.raises(InputError, match=r"times\.txt: has 2 times, but there are 48 images"):
         read_sequence(folder)

@@ -6,18 +6,16 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
+from loopclosure.places.pose_files import read_poses
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import (
     Trajectory,
     associate,
-    read_groundtruth,
     write_rgb_list,
     write_trajectory,
 )
 from netspec.errors import SpecError
 from paths import shared
-
-GOOD_POSE = "1.5 0.1 0.2 0.3 0 0 0 1"
 
 
 def trajectory_at(*stamps: float) -> Trajectory:
@@ -34,37 +32,6 @@ def pictures(folder: Path, *names: str) -> None:
 def write(path: Path, text: str) -> Path:
     path.write_text(text)
     return path
-
-
-def test_groundtruth_is_sorted_and_its_quaternions_are_normalized(tmp_path: Path) -> None:
-    path = write(tmp_path / "groundtruth.txt", "# comment\n\n2 1 2 3 0.7071 0 0 0.7071\n1 4 5 6 0 0 0.9998 0\n")
-    trajectory = read_groundtruth(path)
-    assert trajectory.stamps.tolist() == [1, 2]
-    assert trajectory.positions.tolist() == [[4, 5, 6], [1, 2, 3]]
-    np.testing.assert_allclose(trajectory.quaternions, [[0, 0, 1, 0], [0.5**0.5, 0, 0, 0.5**0.5]], atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("line", "column", "words"),
-    [
-        ("1.5 0.1 0.2 0.3 0 0 0", 22, "expected the eight numbers"),
-        ("1.5 0.1 0.2 0.3 0 0 0 1 9", 25, "found 9"),
-        ("1.5 0.1 zwei 0.3 0 0 0 1", 9, 'expected a number for ty, found "zwei"'),
-        ("1.5 0.1 nan 0.3 0 0 0 1", 9, 'expected a number for ty, found "nan"'),
-        ("1.5 0.1 1e300 0.3 0 0 0 1", 9, 'expected a number for ty, found "1e300"'),
-        ("1.5 0.1 0.2 0.3 0 0 0 0", 17, "length 0, a rotation has length 1"),
-        ("1.5 0.1 0.2 0.3 90 0 0 1", 17, "length 90"),
-    ],
-)
-def test_an_invalid_line_of_groundtruth_is_reported_with_its_column(
-    tmp_path: Path, line: str, column: int, words: str
-) -> None:
-    path = write(tmp_path / "groundtruth.txt", f"# head\n{GOOD_POSE}\n{line}\n")
-    with pytest.raises(InputError) as caught:
-        read_groundtruth(path)
-    assert str(caught.value).startswith(f"{path}:3:{column}: ")
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_an_invalid_line_of_rgb_txt_is_reported(tmp_path: Path) -> None:
@@ -106,10 +73,10 @@ def test_missing_empty_and_binary_files_are_one_line(tmp_path: Path) -> None:
 
 
 def test_associate_chooses_the_nearest_pose_within_the_limit() -> None:
-    trajectory = trajectory_at(1.0, 2.0, 3.0)
+    stamps = np.array([1.0, 2.0, 3.0])
     frames = np.array([0.5, 0.98, 1.02, 1.51, 2.49, 3.0, 3.03, 3.2])
-    assert associate(frames, trajectory, 0.05).tolist() == [-1, 0, 0, -1, -1, 2, 2, -1]
-    assert associate(frames, trajectory, 1.0).tolist() == [0, 0, 0, 1, 1, 2, 2, 2]
+    assert associate(frames, stamps, 0.05).tolist() == [-1, 0, 0, -1, -1, 2, 2, -1]
+    assert associate(frames, stamps, 1.0).tolist() == [0, 0, 0, 1, 1, 2, 2, 2]
 
 
 def test_frames_without_a_pose_are_counted_and_omitted(tmp_path: Path) -> None:
@@ -143,10 +110,11 @@ def test_written_lists_can_be_read(tmp_path: Path) -> None:
     folder = tmp_path / "caf\udce9"  # a name that is not UTF-8
     folder.mkdir()
     write_trajectory(folder / "groundtruth.txt", written)
-    back = read_groundtruth(folder / "groundtruth.txt")
+    back = read_poses(folder / "groundtruth.txt")
+    assert back.stamps is not None
     np.testing.assert_allclose(back.stamps, written.stamps, atol=1e-6)
-    np.testing.assert_allclose(back.positions, written.positions, atol=1e-6)
-    np.testing.assert_allclose(back.quaternions, written.quaternions, atol=2e-6)
+    np.testing.assert_allclose(back.poses[:, :3], written.positions, atol=1e-6)
+    np.testing.assert_allclose(back.poses[:, 3:], written.quaternions, atol=2e-6)
 
 
 @pytest.mark.parametrize(("name", "posed", "listed"), [("xyz", 796, 798), ("rpy", 721, 723)])
