@@ -18,7 +18,6 @@ from netspec.fast.folding import Absorbed, Affine
 from netspec.fast.table import folds_of
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.offers import passes_on
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ def roles_of(plan: Plan, layers: Sequence[Layer]) -> Roles:
         absorbs=[t and fold.absorb is not None for t, fold in zip(one_top, folds, strict=True)],
         affine=affine,
         absorbs_before=[a and fold.absorb_before is not None for a, fold in zip(affine, folds, strict=True)],
-        passes_on=[passes_on(layer) for layer in layers],
+        passes_on=[layer.passes_on for layer in layers],
     )
 
 

@@ -33,7 +33,6 @@ from netspec.graph.options import PACK
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias
-from netspec.layers.contract.reading import changes_itself
 from netspec.run.shapes import fitted
 from netspec.run.walk import Result, Step, Values, losses_of, walk
 
@@ -208,7 +207,7 @@ class Prepared:
         layer = layers[step.node]
         last = layers[step.chain.last if step.chain else step.node]
         if depends_on_values:
-            layer = layer if changes_itself(layer) else copy.copy(layer)
+            layer = layer if layer.changes_itself else copy.copy(layer)
             return lambda *bottoms: layer.run(*(bottom.contiguous() for bottom in bottoms)), "by value"
         members = (step.node, *(step.chain.folded if step.chain else ()))
         blobs = [blob for i in members for blob in layers[i].blobs]

@@ -21,7 +21,6 @@ from netspec.fast.table import learning_kernels, learns_alone
 from netspec.files.limits import is_out_of_memory
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.gradients import gradient_reads, gradients_from_memory
 from netspec.layers.contract.learned import Seen, blobs_of
 from netspec.run.parts import Part
 from netspec.run.recorded import Backward, Kernels, recorded
@@ -224,13 +223,13 @@ class TrainingStep:
         """Return the kernels of a layer whose gradient reads what later layers wrote into the memory of its blobs."""
         node, layer = self._plan.nodes[i], self._layers[i]
         final = self._plan.final[node.tops[0]]
-        held = node.in_place[0] and bool(gradient_reads(layer) & {"bottom", "sign"})
+        held = node.in_place[0] and bool(layer.gradient_reads & {"bottom", "sign"})
 
         def forward(*bottoms: torch.Tensor) -> torch.Tensor:
             return layer.run(*bottoms)[0]
 
         def backward(diff: torch.Tensor) -> tuple[torch.Tensor, ...]:
             top = self._values[final]
-            return gradients_from_memory(layer, [top] if held else [self._values[v] for v in node.bottoms], top, diff)
+            return layer.gradients_from_memory([top] if held else [self._values[v] for v in node.bottoms], top, diff)
 
         return Kernels(forward, backward)

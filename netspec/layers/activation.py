@@ -43,9 +43,6 @@ class Rounded(Activation):
         """Return the activated bottom, computed by the functions of a module: torch or netspec.exact.libm."""
         raise NotImplementedError
 
-    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        raise NotImplementedError
-
 
 @register("ReLU", "relu_param")
 class ReLU(Activation):
@@ -58,7 +55,6 @@ class ReLU(Activation):
 
     def setup(self) -> None:
         self.slope: float = self.param.relu_param.negative_slope
-        self.gradient_reads = frozenset({"sign" if self.slope >= 0 else "bottom"})  # the top has the sign of the bottom
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return F.leaky_relu(x, self.slope) if self.slope else F.relu(x)
@@ -66,6 +62,10 @@ class ReLU(Activation):
     @property
     def joins_as(self) -> str:
         return "" if self.slope else "relu"
+
+    @property
+    def gradient_reads(self) -> frozenset[str]:
+        return frozenset({"sign" if self.slope >= 0 else "bottom"})  # the top has the sign of the bottom
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         return torch.where(bottom > 0, diff, diff * self.slope)
@@ -103,7 +103,10 @@ class ELU(Rounded):
 
     def setup(self) -> None:
         self.alpha: float = self.param.elu_param.alpha
-        self.gradient_reads = frozenset({"top", "sign" if self.alpha >= 0 else "bottom"})  # as ReLU's
+
+    @property
+    def gradient_reads(self) -> frozenset[str]:
+        return frozenset({"top", "sign" if self.alpha >= 0 else "bottom"})  # as ReLU's
 
     @override
     def compute(self, x: torch.Tensor, functions: Any) -> torch.Tensor:

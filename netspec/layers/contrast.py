@@ -33,8 +33,6 @@ class LRN(Layer):
             raise self.error(f"local_size must be {expected}, found {param.local_size}", "lrn_param", "local_size")
         if param.norm_region == ACROSS_CHANNELS:
             self.ignores_propagate_down = frozenset({0})
-            if not is_in_place(self):
-                self.gradient_reads = frozenset({"top"})
         else:
             self.ignores = frozenset({"lrn_param.k"})
 
@@ -47,6 +45,11 @@ class LRN(Layer):
         if self.param.lrn_param.norm_region == ACROSS_CHANNELS:
             return self.arithmetic(data).across_channels(data, self.settings)
         return self.arithmetic(data).within_channel(data, self.settings)
+
+    @property
+    def gradient_reads(self) -> frozenset[str]:
+        across = self.param.lrn_param.norm_region == ACROSS_CHANNELS
+        return frozenset({"top"} if across and not is_in_place(self) else ())
 
     @property
     def settings(self) -> Settings:
@@ -71,10 +74,6 @@ class MVN(Layer):
 
     ignores_propagate_down = frozenset({0})
 
-    def setup(self) -> None:
-        if self.param.mvn_param.normalize_variance:  # Caffe keeps the variance of the forward pass, but not the top
-            self.gradient_reads = frozenset({"top", "kept"} if is_in_place(self) else {"top"})
-
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shape = bottom_shapes[0]
         if len(shape) > 4:
@@ -85,6 +84,12 @@ class MVN(Layer):
         param = self.param.mvn_param
         eps = param.eps if param.normalize_variance else None
         return self.arithmetic(data).standardized(self._maps(data), eps).reshape(self.top_shapes[0])
+
+    @property
+    def gradient_reads(self) -> frozenset[str]:
+        if not self.param.mvn_param.normalize_variance:
+            return frozenset()
+        return frozenset({"top", "kept"} if is_in_place(self) else {"top"})  # Caffe keeps the variance, but not the top
 
     def _maps(self, blob: torch.Tensor) -> torch.Tensor:
         """Return the maps of a bottom or top as rows."""

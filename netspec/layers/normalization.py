@@ -13,7 +13,6 @@ from typing_extensions import override
 from netspec.exact import SMALL_ITEM
 from netspec.exact.arithmetic import AsTorch, Function
 from netspec.layers.contract.base import Layer, Param, Shape
-from netspec.layers.contract.offers import offered
 from netspec.layers.contract.registry import register
 from netspec.proto.schema import TEST
 
@@ -86,7 +85,7 @@ class BatchNorm(Layer):
 
     def joined_with(self, after: Layer) -> Layer | None:
         """Return this layer joined with a Scale of its channels or a ReLU after it, for one kernel of torch."""
-        kind = offered(after, "joins_as")
+        kind = after.joins_as
         fits = (kind == "scale" and not self.joined) or (kind == "relu" and not self.rectifies)
         if not fits or self.use_global_stats or self.arithmetic(self.blob(0)).is_caffes:
             return None

@@ -15,7 +15,7 @@ from typing_extensions import override
 from netspec.exact import libm
 from netspec.exact.arithmetic import AsTorch
 from netspec.exact.pointwise import tanh_gradient
-from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.base import Layer, Shape, State
 from netspec.layers.contract.registry import register
 
 
@@ -33,7 +33,7 @@ class Recurrent(Layer):
     label_bottoms = frozenset({1})
     ignores = frozenset({"recurrent_param.debug_info"})
     state_names: ClassVar[tuple[str, ...]]
-    remembers = True
+    changes_itself = True
     how: AsTorch  # the arithmetic of the current forward pass
     gates: ClassVar[int] = 1  # number of inputs of a hidden unit
 
@@ -105,7 +105,7 @@ class Recurrent(Layer):
         self.state = last
         return (torch.stack(outputs),)
 
-    def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
+    def running_state(self) -> State:
         return {"state": self.state}
 
     def resume(self, state: Mapping[str, Any]) -> None:

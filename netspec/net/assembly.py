@@ -25,8 +25,6 @@ from netspec.layers import class_of, unknown_type
 from netspec.layers.contract.base import Layer, Shape, shape_string
 from netspec.layers.contract.context import Context, Random, device_of
 from netspec.layers.contract.fillers import READS
-from netspec.layers.contract.gradients import ignores_propagate_down
-from netspec.layers.contract.reading import bytes_ahead
 from netspec.proto.forks import forks
 from netspec.proto.schema import TEST
 from netspec.run.eager import last_uses
@@ -213,7 +211,7 @@ class Assembly:
             learns.append(any(_spec(node, layer, j).lr_mult for j in range(len(layer.blobs))))
         has_loss = [[bool(w) for w in weights] for weights in self.loss_weights]
         labels = [layer.label_bottoms for layer in layers]
-        ignoring = [ignores_propagate_down(layer) for layer in layers]
+        ignoring = [layer.ignores_propagate_down for layer in layers]
         backward = plan_backward(self._plan, learns, has_loss, labels, ignoring)
         for node, needs in zip(reversed(self._plan.nodes), reversed(backward.layers), strict=True):
             if needs:
@@ -322,9 +320,8 @@ class MemoryNeed:
         self._alive += made
         self.tops = max(self.tops, self._alive)
         self.parameters += parameters
-        ahead = bytes_ahead(layer)
-        self.ahead += ahead
-        self._largest = max(self._largest, (made + parameters + ahead, -i))
+        self.ahead += layer.ahead
+        self._largest = max(self._largest, (made + parameters + layer.ahead, -i))
         for v in self._ends[i]:
             home = self._home.pop(v, None)
             if home is not None:

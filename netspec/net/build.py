@@ -16,8 +16,7 @@ from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits
-from netspec.layers import class_of
-from netspec.layers.contract.reading import source_of
+from netspec.layers.contract.registry import source_of
 from netspec.net.net import Net
 from netspec.net.weights import copy_weights, load_weights
 from netspec.proto.schema import TEST, NetParameter, PhaseValue
@@ -70,7 +69,7 @@ def check_sources(net: NetParameter, source: SourceMap, options: BuildOptions) -
     with log.silent():
         net, source = filter_net(net, source)
         for i, layer in enumerate(net.layer):
-            path = source_of(layer, class_of(layer))
+            path = source_of(layer)
             if path and not os.path.exists(path):
                 only = NetParameter(layer=[layer], state=net.state)
                 build_filtered(only, source.with_layers([source.layers[i]]), options)  # the layer raises the error

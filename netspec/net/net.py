@@ -22,7 +22,6 @@ from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Plan, unblocked
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.context import device_of
-from netspec.layers.contract.reading import NeedsInput, Restarts, TakesArrays
 from netspec.net.assembly import Assembly
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST
@@ -95,7 +94,6 @@ class Net(torch.nn.Module):
         self.need, self.random = assembly.need, assembly.random
         self.inputs = [blob for layer in self.layers if layer.is_input for blob in layer.param.top]
         self.outputs = list(plan.outputs)
-        self._need_input = [layer for layer in self.layers if isinstance(layer, NeedsInput)]
         self._input_values = [
             v for node, layer in zip(plan.nodes, self.layers, strict=False) if layer.is_input for v in node.tops
         ]
@@ -282,7 +280,7 @@ class Net(torch.nn.Module):
         Raises SpecError for other shapes, and for a net without such a layer.
         Caffe: Net_SetInputArrays (python/caffe/_caffe.cpp)
         """
-        taker = next((layer for layer in self.layers if isinstance(layer, TakesArrays)), None)
+        taker = next((layer for layer in self.layers if layer.takes_arrays), None)
         if taker is None:
             message = "set_input_arrays needs a MemoryData layer, and this net has none; call net(blob=array)"
             raise SpecError(message, Where(self.plan.source.file))
@@ -290,13 +288,12 @@ class Net(torch.nn.Module):
 
     def missing_inputs(self) -> Iterator[SpecError]:
         """Yield an error for each layer that needs inputs. A solver needs a net without such layers."""
-        yield from filter(None, [layer.missing_input() for layer in self._need_input])
+        yield from filter(None, [layer.missing_input() for layer in self.layers])
 
     def restart_data(self) -> None:
         """Make every data layer start again at its first record."""
         for layer in self.layers:
-            if isinstance(layer, Restarts):
-                layer.restart()
+            layer.restart()
 
     def close(self) -> None:
         """Close files and stop threads."""

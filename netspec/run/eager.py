@@ -17,7 +17,6 @@ import torch
 
 from netspec.graph.plan import Node, Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.gradients import gradient_reads, gradients_from_memory
 from netspec.run.parts import Part, parts_of
 from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
 
@@ -141,7 +140,7 @@ class Memory:
 
 def is_overwritten(layer: Layer, node: Node, plan: Plan) -> bool:
     """Return whether the layer's backward reads data that this layer, or a later one, has overwritten."""
-    reads = gradient_reads(layer)
+    reads = layer.gradient_reads
     if not reads:
         return False
     in_place, later = node.in_place[0], plan.final[node.tops[0]] != node.tops[0]
@@ -152,7 +151,7 @@ def run_overwritten(
     layer: Layer, bottoms: Sequence[torch.Tensor], memory: Memory, in_place: bool
 ) -> tuple[torch.Tensor, ...]:
     """Run a layer; its gradient reads ``memory`` as its top and, if it is in place, as its bottom."""
-    held = in_place and bool(gradient_reads(layer) & {"bottom", "sign"})
+    held = in_place and bool(layer.gradient_reads & {"bottom", "sign"})
     return (_Overwritten.apply(layer, memory, held, *bottoms),)
 
 
@@ -168,4 +167,4 @@ class _Overwritten(torch.autograd.Function):
     def backward(ctx: Any, diff: torch.Tensor) -> Any:
         held = ctx.memory.data
         bottoms = (held,) if ctx.bottom_is_held else ctx.saved_tensors
-        return None, None, None, *gradients_from_memory(ctx.layer, bottoms, held, diff)
+        return None, None, None, *ctx.layer.gradients_from_memory(bottoms, held, diff)

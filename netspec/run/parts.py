@@ -14,7 +14,6 @@ import torch
 
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.joining import joined
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ def parts_of(
     for i, (node, layer) in enumerate(zip(plan.nodes, layers, strict=True)):
         before, one = parts[-1] if parts else None, None
         if before and plan.nodes[before.last].tops == node.bottoms and not (alone[before.first] or alone[i]):
-            one = joined(before.layer, layer) if [*map(is_between, node.bottoms)] == [True] else None
+            one = before.layer.joined_with(layer) if [*map(is_between, node.bottoms)] == [True] else None
         if before and one:
             parts[-1] = Part(before.first, i, one, (*before.members, layer))
         else:

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.reading import changes_itself
 
 
 def fitted(
@@ -22,7 +21,7 @@ def fitted(
     found: list[Layer | None] = []
     for node, layer in zip(plan.nodes, layers, strict=True):
         known = bool(node.bottoms) and all(v in shapes for v in node.bottoms)
-        if known and not changes_itself(layer):
+        if known and not layer.changes_itself:
             layer = copy.copy(layer)
             layer.fit([shapes[v] for v in node.bottoms])
             if layer.counted_axis is None and layer.fixed_shapes:

@@ -16,7 +16,6 @@ from netspec.errors import Report, SpecError, raise_fault
 from netspec.exact import ALL, NONE
 from netspec.files.whole_file import whole_file, why_unwritable
 from netspec.graph.plan import Node
-from netspec.layers.contract.reading import resume, running_state
 from netspec.net.net import Net
 from netspec.proto.schema import added_fields
 from netspec.proto.source_map import Position
@@ -114,9 +113,9 @@ def bad_top(net: Net, passes: int, part: str) -> str:
     changed state.
     """
     for layer in net.layers:
-        state = running_state(layer)
+        state = layer.running_state()
         if "iteration" in state:
-            resume(layer, {"iteration": max(0, int(state["iteration"]) - passes)})  # pyright: ignore[reportArgumentType]
+            layer.restore({"iteration": max(0, int(state["iteration"]) - passes)})  # pyright: ignore[reportArgumentType]
     net.random.begin(part)
     found: list[str] = []
     hooks = [

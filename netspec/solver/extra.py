@@ -21,7 +21,6 @@ import torch
 from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.files.whole_file import write_whole
-from netspec.layers.contract import reading
 from netspec.net.assembly import WITHOUT_EFFECT
 from netspec.net.extra_file import FAULTS, Digest, damaged, extra_text, read_content, shown, whole_number
 from netspec.net.net import Net
@@ -84,7 +83,7 @@ def settings_of(param: Any, nets: Mapping[str, Net], run_settings: Mapping[str, 
         for layer in net.layers:
             for field, value in _fields(layer.param, _IGNORED_IN_LAYERS):
                 found[name][f'layer "{layer.param.name}" {field}'] = value
-            if records := getattr(layer, "num_records", 0):
+            if records := layer.num_records:
                 found[name][f'layer "{layer.param.name}" number of records'] = records
     return found
 
@@ -140,7 +139,7 @@ class Extra:
     """The contents of the file.
 
     ``seed`` is the solver's. ``losses`` are the last ``average_loss`` losses. ``nets`` has the state of the layers of
-    the training nets of all ranks, then of the test nets (netspec/layers/contract/reading.py).
+    the training nets of all ranks, then of the test nets (netspec/layers/contract/base.py).
     """
 
     seed: int
@@ -158,7 +157,7 @@ def extra_path(state: str | Path) -> Path:
 
 def running_state(net: Net) -> Remembered:
     """Return the state of a net's layers as JSON values."""
-    states = {str(i): reading.running_state(layer) for i, layer in enumerate(net.layers)}
+    states = {str(i): layer.running_state() for i, layer in enumerate(net.layers)}
     return {i: {name: _packed(value) for name, value in state.items()} for i, state in states.items() if state}
 
 
@@ -167,7 +166,7 @@ def resume(net: Net, states: Remembered) -> None:
     for i, state in states.items():
         if int(i) >= len(net.layers):
             raise SpecError(f"has the state of layer {i}, but the net has {len(net.layers)} layers")
-        reading.resume(net.layers[int(i)], {name: _unpacked(value) for name, value in state.items()})
+        net.layers[int(i)].restore({name: _unpacked(value) for name, value in state.items()})
 
 
 def write_extra(path: str | Path, extra: Extra) -> None:

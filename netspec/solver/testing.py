@@ -13,7 +13,6 @@ from typing import Any
 import torch
 
 from netspec import log
-from netspec.layers.contract.reading import Scores, Waits, reads_data
 from netspec.log import number
 from netspec.net.net import Net
 from netspec.solver.extra import Remembered, running_state
@@ -25,8 +24,8 @@ Scorer = Callable[[Sequence[torch.Tensor]], list[float]]
 def scorers(net: Net, solver: Any = None) -> dict[str, Scorer]:
     """Return, by output, the function that computes its score from all batches, for layers that define one."""
     makers = {v: layer for node, layer in zip(net.plan.nodes, net.layers, strict=True) for v in node.tops}
-    found = [(name, makers.get(v)) for name, v in net.plan.outputs.items()]
-    return {name: partial(layer.score, solver=solver) for name, layer in found if isinstance(layer, Scores)}
+    found = [(name, makers[v]) for name, v in net.plan.outputs.items()]
+    return {name: partial(layer.score, solver=solver) for name, layer in found if layer.scores_tests}
 
 
 class Tally:
@@ -143,8 +142,7 @@ class Display:
 
     def __init__(self, training: Training) -> None:
         self._training = training
-        self._reads = any(reads_data(layer) for layer in training.net.layers)
-        self._waiting = [layer for layer in training.net.layers if isinstance(layer, Waits)]
+        self._reads = any(layer.reads_data for layer in training.net.layers)
 
     def begin(self) -> None:
         """Start the clock."""
@@ -166,4 +164,4 @@ class Display:
         self._time, self._iteration, self._waited = now, training.iteration, waited
 
     def _seconds_waited(self) -> float:
-        return sum(layer.waited for layer in self._waiting)
+        return sum(layer.waited for layer in self._training.net.layers)

@@ -17,7 +17,6 @@ import torch
 from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.layers.contract.context import device_of
-from netspec.layers.contract.reading import Scores
 from netspec.net.build import build_net, check_sources
 from netspec.net.net import Net
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_large
@@ -212,8 +211,8 @@ class Training:
 
     def _warn_of_settings(self) -> None:
         """Warn of fields without effect, and of settings that make the training slow or dependent on the machine."""
-        scores = [layer for net in self.test_nets for layer in net.layers if isinstance(layer, Scores)]
-        read = forks().rate_fields().union(*(layer.solver_reads for layer in scores))
+        tested = [layer for net in self.test_nets for layer in net.layers]
+        read = forks().rate_fields().union(*(layer.solver_reads for layer in tested))
         for line in fields_without_effect(self.param, self.node, read):
             log.warning("solver.cpp:45", line)
         if said := dependence(self.net, torch.get_num_threads()):

@@ -300,7 +300,7 @@ class Net:
     def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
         """Give the net's first layer, a MemoryData, images (n, C, H, W) and labels (n,), both float32."""
         layer = self.runner.net.layers[0]
-        if not hasattr(layer, "set_input_arrays"):
+        if not layer.takes_arrays:
             kind = f'it is "{self._layer_names[0]}" ({layer.type})'
             raise RuntimeError(f"set_input_arrays may only be called if the first layer is a MemoryDataLayer; {kind}")
         layer.set_input_arrays(data, labels)

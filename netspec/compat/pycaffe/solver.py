@@ -22,7 +22,6 @@ from netspec.compat.pycaffe.net import FilePath, Net
 from netspec.compat.pycaffe.whole import WholeRun
 from netspec.graph.options import BuildOptions
 from netspec.graph.speed import speed
-from netspec.layers.contract.reading import Constant
 from netspec.layers.utility.python import Python
 from netspec.net import net as core
 from netspec.proto.text import parse_solver
@@ -47,8 +46,7 @@ class _Training(core_solver.Solver):
         self.net.largest_trained = math.inf  # blobs keep all tops anyway
         self._whole: WholeRun | None = None  # set after the first pass, if it is possible
         self.is_watched = bool(self.net.inputs) or any(
-            isinstance(layer, Python)
-            or (isinstance(layer, Constant) and any(top is not None for top in layer.filled_once()))
+            isinstance(layer, Python) or any(top is not None for top in layer.filled_once())
             for layer in self.net.layers
         )
 

@@ -23,9 +23,7 @@ from netspec.compat.pycaffe.tapes import (
     undisturbed,
 )
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.gradients import gradient_reads, gradients_from_memory
 from netspec.layers.contract.learned import Seen
-from netspec.layers.contract.reading import Constant
 from netspec.layers.utility.live_blobs import Blob
 from netspec.layers.utility.pycaffe_shim import importable
 from netspec.layers.utility.python import Python
@@ -47,8 +45,8 @@ class LayerStep:
         self.params = parameters(self.layer)
         weights = zip(self.tops, net.loss_weights[i], strict=True)
         self.losses = [(top, weight) for top, weight in weights if weight]
-        self.constants = self.layer.filled_once() if isinstance(self.layer, Constant) else ()
-        self.reads = gradient_reads(self.layer)
+        self.constants = self.layer.filled_once()
+        self.reads = self.layer.gradient_reads
         self.reached, self.wanted = net.backward_plan.layers[i], tuple(net.backward_plan.computed[i])
         self._speed, self._device = net.options.speed, net.device
         self.records = self._is_asked() and not (self.reads or self.layer.shares)
@@ -201,7 +199,7 @@ class LayerStep:
         values = [top if blob is first else blob.data_memory.tensor(blob.shape) for blob in self.bottoms]
         if self._bottom is not None and self._is_shaped_like(self.bottoms[0], self._bottom):
             values = [self._bottom]
-        found = gradients_from_memory(self.layer, values, top, diff)
+        found = self.layer.gradients_from_memory(values, top, diff)
         for blob, gradient, asked in zip(self.bottoms, found, self.wanted, strict=True):
             if asked:
                 blob.diff_memory.put(gradient)

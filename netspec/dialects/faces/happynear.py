@@ -19,7 +19,7 @@ from netspec.dialects.layers import replace
 from netspec.dialects.not_learned import NotLearned
 from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer, common, register
-from netspec.layers.contract.base import Shape
+from netspec.layers.contract.base import Shape, State
 from netspec.layers.loss.base import VALID, Classified, Loss, ignore_label, normalization_mode, normalizer
 from netspec.layers.loss.scores import FLT_MIN
 from netspec.proto.schema import TEST, value
@@ -181,7 +181,7 @@ class LabelSpecificAdd(Layer):
             top = scores + torch.zeros_like(flat).scatter_(1, labels, added).view_as(scores)
         return top if self.num_tops == 1 else (top, scores.new_full((1,), self.bias))
 
-    def running_state(self) -> dict[str, Any]:
+    def running_state(self) -> State:
         return {"passes": self.passes}
 
     def resume(self, state: Mapping[str, Any]) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from netspec.layers.contract.base import Shape
+from netspec.layers.contract.base import Shape, State
 from netspec.layers.loss.base import Classified
 from netspec.proto.schema import value
 
@@ -81,7 +81,7 @@ class MarginProduct(Classified):
         """Return the products (M, num_output) of vectors (M, K); the margin is weighted by ``share``."""
         raise NotImplementedError
 
-    def running_state(self) -> dict[str, Any]:
+    def running_state(self) -> State:
         return {"passes": self.passes}
 
     def resume(self, state: Mapping[str, Any]) -> None:

@@ -17,8 +17,7 @@ from netspec import log
 from netspec.dialects.boxes import Array, as_array, highest, overlaps
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
-from netspec.layers.contract.base import Layer, Shape
-from netspec.layers.contract.reading import State
+from netspec.layers.contract.base import Layer, Shape, State
 from netspec.proto.schema import value
 
 IMAGE, LABEL, CONFIDENCE = 0, 1, 2  # columns of a detection; its box follows
@@ -44,7 +43,8 @@ class DetectionEvaluate(Layer):
     label_bottoms = frozenset({0, 1})
     counted_axis = 2
     not_exported = "it compares with true boxes"
-    remembers = True  # index of the next image
+    changes_itself = True  # index of the next image
+    scores_tests = True
     solver_reads = frozenset({"eval_type", "ap_version", "show_per_class_result"})
 
     def setup(self) -> None:

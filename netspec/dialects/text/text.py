@@ -21,8 +21,7 @@ from netspec.dialects.text.ctc import (
     WarpCTCLoss,
 )
 from netspec.layers import Layer, register
-from netspec.layers.contract.base import Shape
-from netspec.layers.contract.reading import State
+from netspec.layers.contract.base import Shape, State
 from netspec.proto.schema import has, value
 
 DECLARATIONS = """
@@ -169,7 +168,7 @@ class Lstm(Layer):
     not_exported = "its steps are a loop"
 
     @property
-    def remembers(self) -> bool:
+    def changes_itself(self) -> bool:
         """Whether the state continues in the next pass."""
         return len(self.bottom_shapes) > 1
 
@@ -218,7 +217,7 @@ class Lstm(Layer):
         return torch.stack(tops)
 
     def running_state(self) -> State:
-        return {"state": self.state} if self.remembers else {}
+        return {"state": self.state} if self.changes_itself else {}
 
     def resume(self, state: Mapping[str, Any]) -> None:
         found, shape = state["state"], (self.bottom_shapes[0][1], self.size)

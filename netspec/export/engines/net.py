@@ -20,8 +20,6 @@ from netspec.export.table import layer_notes
 from netspec.graph.options import TORCH, BuildOptions
 from netspec.graph.plan import origins
 from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias
-from netspec.layers.contract.offers import passes_on
-from netspec.layers.contract.reading import reads_data
 from netspec.net.net import Net
 from netspec.proto.schema import PHASE_NAMES, TEST
 from netspec.run.shapes import fitted
@@ -95,11 +93,11 @@ class Engine:
         # A loss without a top is no value of the model: torch computes it from its bottoms.
         unnamed = {i for i, (node, own) in enumerate(losses) if any(j >= len(node.tops) for j, _ in own)}
         self._unnamed = [step for step in net.eager.one_by_one() if step.node in unnamed]
-        first = origins(net.plan, [passes_on(layer) for layer in net.layers])
+        first = origins(net.plan, [layer.passes_on for layer in net.layers])
         self._read = {v: first[v] for step in self._unnamed for v in step.bottoms}
-        self._readers = [step for step in net.eager.one_by_one() if reads_data(self._layers[step.node])]
+        self._readers = [step for step in net.eager.one_by_one() if self._layers[step.node].reads_data]
         layers = zip(net.plan.nodes, net.layers, strict=True)
-        ends = [node for node, layer in layers if layer.is_input or reads_data(layer)]
+        ends = [node for node, layer in layers if layer.is_input or layer.reads_data]
         self._ends = {
             v: net.plan.blobs[v] for node in ends for v in node.tops
         }  # inputs, and tops of layers that read data
@@ -183,7 +181,7 @@ class Engine:
 def _writer(net: Net, path: Path) -> Write:
     """Return a function that exports ``net``, which was read from ``path``. It does not keep the net alive."""
     held, chosen = weakref.ref(net), net.options
-    readers = [blob for layer in net.layers if reads_data(layer) for blob in layer.param.top]
+    readers = [blob for layer in net.layers if layer.reads_data for blob in layer.param.top]
 
     def write(to: Path, blobs: Sequence[str]) -> None:
         original = held()

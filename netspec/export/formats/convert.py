@@ -20,7 +20,6 @@ from netspec.files.kinds import unreadable
 from netspec.files.version import version
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
-from netspec.layers.contract.offers import passes_on
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights
@@ -115,7 +114,7 @@ def fold_files(source: Source, prefix: Path) -> tuple[int, int]:
     net = source.net()
     message = fold(net)
     write_caffe(message, prefix)
-    splits = sum(passes_on(layer) for layer in net.layers)
+    splits = sum(layer.passes_on for layer in net.layers)
     return len(net.layers) - splits, len(message.layer)
 
 

@@ -20,8 +20,6 @@ from netspec.graph.filter import filter_net
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import origins
 from netspec.graph.speed import speed
-from netspec.layers.contract.offers import passes_on
-from netspec.layers.contract.reading import reads_data
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import NetParameter, ParamSpec
@@ -49,7 +47,7 @@ def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool
             missing.update(layer.top)
             continue
         missing.difference_update(layer.top)
-        if not reads_data(built[layer.name]):
+        if not built[layer.name].reads_data:
             result.layer.add().CopyFrom(layer)
             positions.append(source.layers[i])
             continue
@@ -68,7 +66,7 @@ def fold(net: Net) -> NetParameter:
     """
     folds = _found_folds(net)
     plan = net.plan
-    passes = [passes_on(layer) for layer in net.layers]
+    passes = [layer.passes_on for layer in net.layers]
     origin = origins(plan, passes)
     names = _names(net, origin)
     folded = {i for each in folds for i in each.chain.folded}
@@ -115,7 +113,7 @@ def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
     taken.update(
         origin[v]
         for node, layer in zip(plan.nodes, net.layers, strict=True)
-        if not passes_on(layer)
+        if not layer.passes_on
         for v in node.bottoms
     )
     taken.update(v for node, layer in zip(plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops)

@@ -15,8 +15,8 @@ from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.export.formats.inputs import add_input, is_input, shapes_of_input
 from netspec.graph.options import BuildOptions
-from netspec.layers import class_of, layer_class
-from netspec.layers.contract.reading import channels_read, reads_data, source_of, takes_shapes
+from netspec.layers import layer_class
+from netspec.layers.contract.registry import source_of
 from netspec.net.build import build_filtered
 from netspec.proto.binary import parse_net_binary
 from netspec.proto.schema import LayerParameter, NetParameter
@@ -65,7 +65,7 @@ def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParam
             kept.ClearField(name)
     if len(net.layer) == len(given):
         advice = " or ".join(_advice(inputs))
-        sources = [path for layer in layers if (path := source_of(layer, class_of(layer)))]
+        sources = [path for layer in layers if (path := source_of(layer))]
         gone = f', and "{sources[0]}", which it was trained on, cannot be read here' if sources else ""
         raise SpecError(f"the shape of its input is not in the file{gone}; give {advice}", where)
     if without:
@@ -76,7 +76,7 @@ def recover_net(path: str | Path, shapes: Mapping[str, Shape]) -> tuple[NetParam
 
 def _reads_data(layer: LayerParameter) -> bool:
     cls = layer_class(layer.type)
-    return not layer.bottom and (cls is None or reads_data(cls) or takes_shapes(cls))
+    return not layer.bottom and (cls is None or cls.reads_data or cls.takes_shapes)
 
 
 def _inputs(layers: list[LayerParameter]) -> dict[str, Shape]:
@@ -107,7 +107,7 @@ def _shape_of_images(reader: LayerParameter, top: str, layers: list[LayerParamet
 
 def _shape_of_records(reader: LayerParameter) -> Shape:
     """Return the shape of the first record of a data layer, as one image; () if its source cannot be read here."""
-    if not os.path.exists(source_of(reader, class_of(reader))):
+    if not os.path.exists(source_of(reader)):
         return ()
     with log.silent(), suppress(SpecError):
         alone = NetParameter(layer=[reader])
@@ -119,7 +119,8 @@ def _shape_of_records(reader: LayerParameter) -> Shape:
 def _channels(blob: str, layers: list[LayerParameter]) -> int:
     """Return the channels that the filters of the first convolution of a blob have; 0 where there is none."""
     for layer in layers:
-        if blob in layer.bottom and (channels := channels_read(layer, layer_class(layer.type))):
+        cls = layer_class(layer.type) if blob in layer.bottom else None
+        if cls and (channels := cls.channels_read(layer)):
             return channels
     return 0
 

@@ -21,7 +21,6 @@ from netspec.export.table import exported, refusal
 from netspec.export.targets import Sizes, TorchCode
 from netspec.graph.plan import origins
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.offers import passes_on
 from netspec.net.net import Net
 
 WIDTH = 88  # ruff's and black's line length where nothing else is configured
@@ -233,7 +232,7 @@ class _Collector:
         self.net, self.shapes = net, shapes
         self.made = Definition(names=dict(enumerate(net.plan.blobs)))
         self.value = list(range(len(net.plan.blobs)))  # value of the Plan -> value of the program
-        passes = [passes_on(layer) for layer in net.layers]
+        passes = [layer.passes_on for layer in net.layers]
         origin = origins(net.plan, passes)
         self.readers = [0] * len(self.value)
         for node, passed in zip(net.plan.nodes, passes, strict=True):

@@ -74,8 +74,7 @@ def _test_sizes(solver: Any, node: Position, nets: Sequence[Net]) -> Findings:
     """
     for k, net in enumerate(nets[1:]):
         for layer in net.layers:
-            records = getattr(layer, "num_records", 0)
-            if records:
+            if records := layer.num_records:
                 batch, iterations = layer.top_shapes[0][0], solver.test_iter[k]
                 read = iterations * batch
                 if abs(read - records) > TOLERANCE * records:

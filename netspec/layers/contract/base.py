@@ -11,9 +11,10 @@ constructor, before it logs the layer's bottoms and tops, and reads the first re
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from typing_extensions import override
 
@@ -36,6 +37,8 @@ def shape_string(shape: Sequence[int]) -> str:
     return "".join(f"{d} " for d in shape) + f"({math.prod(shape)})"
 
 
+State = dict[str, int | str | tuple[torch.Tensor, ...]]  # what a layer keeps between passes
+
 _PLAIN = frozenset({bool, int, float, str, tuple, list})
 _NO_BLOBS = torch.nn.ParameterList()  # shared by all layers without blobs; stays empty
 
@@ -46,6 +49,9 @@ class Layer(torch.nn.Module):
     ``setup()`` reads ``self.param``, refuses what is wrong (``raise self.error(...)``) and adds the learnable blobs;
     ``self.bottom_shapes`` is known. ``reshape(bottom_shapes)`` returns the tops' shapes; it runs in the constructor and
     again whenever bottoms of other shapes arrive. ``forward(*bottoms)`` returns a tensor, or a tuple, one per top.
+
+    Everything else that a layer can do has a default here. A subclass that replaces ``forward`` starts again from the
+    defaults of ``OF_FORWARD``, because what its base class says of the old ``forward`` need not be true of the new one.
 
     Caffe: include/caffe/layer.hpp
     """
@@ -63,6 +69,38 @@ class Layer(torch.nn.Module):
     counted_axis: ClassVar[int | None] = None  # the axis of the tops with a size that is known only after forward
     # whether its tops have the shapes that ``reshape`` returned, except in ``counted_axis``
     fixed_shapes: ClassVar[bool] = True
+    reads_data: ClassVar[bool] = False  # its tops are records: inputs of an exported net
+    takes_shapes: ClassVar[bool] = False  # ``--shape`` may set the shapes of its tops, although it has bottoms
+    takes_arrays: ClassVar[bool] = False  # its records are arrays of a program: ``set_input_arrays``
+    scores_tests: ClassVar[bool] = False  # it has its own score of a test: ``score``
+    solver_reads: ClassVar[frozenset[str]] = frozenset()  # a fork's fields of the solver that ``score`` reads
+    ignores_propagate_down: frozenset[int] = frozenset()  # the bottoms that get a gradient even where it is false
+    ahead: int = 0  # bytes of the batches that it reads ahead
+    waited: float = 0.0  # the seconds that forward passes have waited for records
+    num_records: int = 0  # 0: it reads none, or the data is not open
+    changes_itself: bool = False  # a pass changes its state, so it can be neither prepared nor copied
+    passes_on: bool = False  # every top is the bottom, unchanged, at the present settings
+    # what the layer before it may compute too: "relu" (max(x, 0)), "scale" (factors and biases of channels)
+    joins_as: str = ""
+    # what its gradient reads from memory: of "bottom", "sign" (of it), "top" and "kept" (the bottom of the forward
+    # pass); empty if autograd saves all that it needs
+    gradient_reads: frozenset[str] = frozenset()
+
+    OF_FORWARD: ClassVar[tuple[str, ...]] = (
+        "passes_on",
+        "joins_as",
+        "joined_with",
+        "gradient_reads",
+        "caffes_gradient",
+        "caffes_gradients",
+    )
+
+    @override
+    def __init_subclass__(cls, **named: Any) -> None:
+        super().__init_subclass__(**named)
+        if "forward" in vars(cls):
+            for name in set(cls.OF_FORWARD) - set(vars(cls)):
+                setattr(cls, name, vars(Layer)[name])
 
     def __init__(self, param: Any, bottom_shapes: Sequence[Shape], context: Context | None = None) -> None:
         super().__init__()
@@ -126,6 +164,86 @@ class Layer(torch.nn.Module):
     def multiply_adds(self) -> int:
         """Return the multiply-adds of one forward pass at the present shapes (0 where they are not counted)."""
         return 0
+
+    # What a layer may do in addition; see also the attributes
+
+    def joined_with(self, after: Layer) -> Layer | None:
+        """Return a layer that does the work of this one and of ``after`` in a training, with the blobs of both."""
+        return None
+
+    def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+        """Return the bottom's gradient with Caffe's steps, from the data in memory at the backward pass.
+
+        Not for a layer with several tops. A layer that works in place gets the same tensor as its bottom and its top.
+        """
+        raise NotImplementedError
+
+    def caffes_gradients(
+        self, bottoms: Sequence[torch.Tensor], top: torch.Tensor, diff: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Return the gradients of all bottoms; see :meth:`caffes_gradient`. With several, it is never in place."""
+        return (self.caffes_gradient(bottoms[0], top, diff),)
+
+    def gradients_from_memory(
+        self, bottoms: Sequence[torch.Tensor], top: torch.Tensor, diff: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Return the result of ``caffes_gradients``, with the memory of the top in the shape of its gradient.
+
+        A later layer in place may have given it other axes: MVN makes four.
+        """
+        bottoms = [top.view(diff.shape) if bottom is top else bottom for bottom in bottoms]
+        return self.caffes_gradients(bottoms, top.view(diff.shape), diff)
+
+    @classmethod
+    def source_of(cls, param: Any) -> str:
+        """Return the path that a LayerParameter names for its records, "" where it names none."""
+        return ""
+
+    @staticmethod
+    def channels_read(param: Any) -> int:
+        """Return how many channels of its bottoms the filters in a LayerParameter need; 0 without filters."""
+        return 0
+
+    def restart(self) -> None:
+        """Return to the first record."""
+
+    def running_state(self) -> State:
+        """Return the state that the layer keeps between passes, without its blobs."""
+        return {}
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        """Restore a result of :meth:`running_state`. Raises SpecError for an impossible value."""
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Do the same as :meth:`resume`. Raises SpecError also if the state is that of another kind of layer."""
+        found, mine = (
+            ", ".join(f"{name} ({type(value).__name__})" for name, value in sorted(each.items()))
+            for each in (state, self.running_state())
+        )
+        if found != mine:
+            raise self.error(f"found a saved state with {found}, expected {mine or 'nothing'}")
+        self.resume(state)
+
+    def missing_input(self) -> SpecError | None:
+        """Return an error if a solver cannot run the layer, because a program must first give it data."""
+        return None
+
+    def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
+        """Take images (n, C, H, W) and labels (n,) as records. Raises SpecError for other shapes."""
+        raise NotImplementedError
+
+    def filled_once(self) -> Sequence[torch.Tensor | None]:
+        """Return for each top its values, filled when it was built, or None; an empty sequence if none is constant."""
+        return ()
+
+    def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
+        """Return the scores of a test from the tops of all its batches; without it, they are the means of the tops.
+
+        ``solver`` is the SolverParameter, None where there is no solver.
+        """
+        raise NotImplementedError
+
+    # Running
 
     def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Reshape if the bottoms' shapes changed, run ``forward``, return a tuple."""

@@ -49,6 +49,12 @@ def class_of(param: LayerParameter, options: BuildOptions | None = None) -> type
     return forks().class_of(param, options) or layer_class(param.type)
 
 
+def source_of(param: LayerParameter) -> str:
+    """Return the path that a layer names for its records, "" where it names none, or is unknown."""
+    cls = class_of(param)
+    return cls.source_of(param) if cls else ""
+
+
 def layer_types() -> list[str]:
     """Return all registered types, in alphabetical order."""
     return sorted(_LAYERS)

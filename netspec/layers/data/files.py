@@ -23,7 +23,7 @@ from netspec.data.prefetch import Feed
 from netspec.data.sources import Cursor, DatabaseSource, Draws, ImageListSource, Source, Together, batches, draw_skip
 from netspec.data.transformer import Transformer, contradictions
 from netspec.errors import SpecError, UnknownShape, Where
-from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.base import Layer, Shape, State
 from netspec.layers.contract.registry import register
 from netspec.proto.schema import PHASE_NAMES, value
 
@@ -45,7 +45,6 @@ class ReadingLayer(Layer):
     bottoms = (0, 0)
     tops = (2, 2)
     reads_data = True
-    ahead: int = 0
     in_order = False  # whether batches can be made only one after the other
     group: ClassVar[str]  # the field with the layer's own settings
 
@@ -54,6 +53,10 @@ class ReadingLayer(Layer):
         if self._source is not None:
             raise TypeError(f"{self.error('reads open files, so it cannot be copied or pickled; build its net again')}")
         return dict(self.__dict__)
+
+    @classmethod
+    def source_of(cls, param: Any) -> str:
+        return value(param, cls.group).source
 
     def open(self) -> Source | None:
         """Open the files. Return None if :meth:`attempt` caught an error."""
@@ -161,7 +164,7 @@ class ReadingLayer(Layer):
         if self._feed:
             self._feed.restart(iteration)
 
-    def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
+    def running_state(self) -> State:
         return {"iteration": self.iteration}
 
     def resume(self, state: Mapping[str, Any]) -> None:
@@ -255,6 +258,10 @@ class Data(ReadingLayer):
             p = self.param.data_param
             self._reader = self.attempt(open_reader, p.source, BACKENDS[p.backend], self.where)
 
+    @classmethod
+    def source_of(cls, param: Any) -> str:
+        return value(param, cls.group).source
+
     def open(self) -> Source | None:
         p, reader = self.param.data_param, self._reader
         transformer = self.attempt(self.transformer)
@@ -297,6 +304,10 @@ class ImageData(ReadingLayer):
             yield self.error("new_height and new_width must be given together", self.group)
         yield from super().wrong_settings()
         yield from contradictions(self.param.transform_param, self.context.at)
+
+    @classmethod
+    def source_of(cls, param: Any) -> str:
+        return value(param, cls.group).source
 
     def open(self) -> Source | None:
         """Read the list; its first image sets the shape."""
@@ -352,6 +363,10 @@ class WindowData(ReadingLayer):
             message = f"context_pad {p.context_pad} on both sides leaves no pixels of crop_size {crop}"
             yield self.error(message, self.group, "context_pad")
         yield from wrong_means(self.param.transform_param, self.context.at)
+
+    @classmethod
+    def source_of(cls, param: Any) -> str:
+        return value(param, cls.group).source
 
     def open(self) -> Source | None:
         from netspec.data.windows import WindowSource, read_window_file, window_mean

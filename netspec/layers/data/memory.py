@@ -12,7 +12,7 @@ import torch
 from netspec import log
 from netspec.errors import SpecError
 from netspec.layers.contract import fillers
-from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.base import Layer, Shape, State
 from netspec.layers.contract.registry import register
 from netspec.proto.schema import FillerParameter
 
@@ -125,6 +125,7 @@ class MemoryData(Layer):
     bottoms = (0, 0)
     tops = (2, 2)
     reads_data = True
+    takes_arrays = True
 
     def setup(self) -> None:
         p = self.param.memory_data_param
@@ -158,7 +159,7 @@ class MemoryData(Layer):
     def restart(self) -> None:
         self._next = 0
 
-    def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
+    def running_state(self) -> State:
         return {"next": self._next}
 
     def resume(self, state: Mapping[str, Any]) -> None:

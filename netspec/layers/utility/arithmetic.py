@@ -39,8 +39,6 @@ class Eltwise(Layer):
             raise self.error("found coeff for PROD, expected it for SUM only", "eltwise_param", "coeff")
         if self.operation == self.MAX:
             self.ignores = frozenset({"eltwise_param.coeff"})
-        if self.operation == self.PROD and not p.stable_prod_grad and self.param.top[0] not in self.param.bottom:
-            self.gradient_reads = frozenset({"top"})
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         for i, shape in enumerate(bottom_shapes):
@@ -59,6 +57,11 @@ class Eltwise(Layer):
         for x in others:
             top = torch.where(x > top, x, top)
         return top
+
+    @property
+    def gradient_reads(self) -> frozenset[str]:
+        stable, in_place = self.param.eltwise_param.stable_prod_grad, self.param.top[0] in self.param.bottom
+        return frozenset({"top"} if self.operation == self.PROD and not stable and not in_place else ())
 
     def caffes_gradients(
         self, bottoms: Sequence[torch.Tensor], top: torch.Tensor, diff: torch.Tensor

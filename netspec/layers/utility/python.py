@@ -19,7 +19,7 @@ import torch
 
 from netspec import log
 from netspec.errors import SpecError, did_you_mean
-from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.base import Layer, Shape, State
 from netspec.layers.contract.registry import register
 from netspec.layers.utility.live_blobs import Blob
 from netspec.layers.utility.pycaffe_shim import can_import, importable
@@ -120,7 +120,7 @@ class Python(Layer):
             for blob, need in zip([*self.bottom, *self.code.blobs], needed, strict=True)
         ]
 
-    def running_state(self) -> dict[str, int | str | tuple[torch.Tensor, ...]]:
+    def running_state(self) -> State:
         """Return the result of the code's running_state as JSON, or "" if it has none."""
         if not hasattr(self.code, "running_state"):
             return {"code": ""}

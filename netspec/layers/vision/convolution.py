@@ -34,7 +34,8 @@ class Convolution(SlidingFilter):
 
     @staticmethod
     def channels_read(param: Any) -> int:
-        """Return the number of channels that the filters in a LayerParameter need."""
+        if not param.blobs:
+            return 0
         filters = param.blobs[0]
         channels = filters.shape.dim[1] if len(filters.shape.dim) > 1 else filters.channels
         return channels * param.convolution_param.group

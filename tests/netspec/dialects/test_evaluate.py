@@ -13,7 +13,6 @@ from netspec.cli import main
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.layers import Layer
-from netspec.layers.contract.reading import resume, running_state
 
 Build = Callable[..., Layer]
 
@@ -84,10 +83,10 @@ def test_resuming_continues_at_the_next_line_of_name_size_file(build: Build, tmp
     bottoms = [torch.tensor([[rows]], dtype=torch.float32) for rows in (FOUND[:1], TRUTH)]
     first, second = (build("ssd", text, *(bottom.shape for bottom in bottoms)) for _ in range(2))
     first.run(*bottoms)
-    resume(second, running_state(first))
-    assert running_state(second) == {"image": 1}
+    second.restore(first.running_state())
+    assert second.running_state() == {"image": 1}
     with pytest.raises(SpecError, match="found image -1 to go on from"):
-        resume(second, {"image": -1})
+        second.restore({"image": -1})
 
 
 def test_average_precision_of_each_version_equals_hand_computed_values() -> None:

@@ -8,7 +8,6 @@ import torch
 
 from netspec.errors import SpecError
 from netspec.layers import Layer
-from netspec.layers.contract.reading import resume, running_state
 
 Build = Callable[..., Layer]
 STEPS, ITEMS, CLASSES = 4, 2, 3
@@ -107,13 +106,13 @@ def test_lstm_state_continues_where_the_second_bottom_is_one(build: Build) -> No
     first = parts.run(data[:2], torch.tensor([[0.0, 0], [1, 1]]))[0]
     resumed = build("text", LSTM % "", (2, 2, 5), (2, 2))  # a training, from a snapshot
     resumed.load_state_dict(parts.state_dict())
-    resume(resumed, running_state(parts))
+    resumed.restore(parts.running_state())
     for each in (parts, resumed):
         second = each.run(data[2:], torch.ones(2, 2))[0]
         torch.testing.assert_close(torch.cat([first, second]), whole.run(data)[0])
     with pytest.raises(SpecError, match=r"found states of shapes \[\(3, 3\)\], expected 2 of \(2, 3\)"):
-        resume(resumed, {"state": (torch.zeros(3, 3),)})
-    assert running_state(whole) == {}
+        resumed.restore({"state": (torch.zeros(3, 3),)})
+    assert whole.running_state() == {}
 
 
 def test_an_invalid_label_is_refused(build: Build) -> None:

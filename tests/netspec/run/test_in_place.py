@@ -1,12 +1,18 @@
 """In-place layers one after the other: the gradients that Caffe's shared memory gives, by plain numpy."""
 
+import inspect
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
+from typing_extensions import override
 
 from netspec.graph.filter import with_state
+from netspec.layers.activation import ReLU
+from netspec.layers.contract import registry
+from netspec.layers.contract.base import Layer
+from netspec.layers.recurrent import LSTM
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import TRAIN
@@ -102,3 +108,25 @@ def test_the_last_layer_of_a_chain_has_torchs_gradient(layer: str) -> None:
     y = chain('type: "BatchNorm"', layer)(x=torch.ones(SHAPE, requires_grad=True))["y"]
     assert y.grad_fn is not None
     assert "Overwritten" not in y.grad_fn.name()
+
+
+class OwnForward(ReLU):
+    """A ReLU with another forward pass: all that ReLU says of its own no longer holds."""
+
+    @override
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return 3 * super().forward(x)
+
+
+def test_a_subclass_with_its_own_forward_gets_its_gradient_from_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place below BatchNorm, ReLU's gradient reads the memory; that of the subclass must not."""
+    monkeypatch.setitem(registry._LAYERS, "ReLU", OwnForward)
+    x, y, diff, gradient = run(chain('type: "ReLU"', 'type: "BatchNorm"'))
+    inner = 3 * x.clip(0)
+    np.testing.assert_allclose(gradient, batch_norm_gradient(inner, y, diff) * 3 * (x > 0), rtol=1e-6, atol=1e-9)
+
+
+def test_a_subclass_with_its_own_forward_starts_from_the_defaults() -> None:
+    kept = {name for name in Layer.OF_FORWARD if vars(Layer)[name] is not inspect.getattr_static(OwnForward, name)}
+    assert not kept
+    assert inspect.getattr_static(LSTM, "changes_itself")
