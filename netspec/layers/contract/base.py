@@ -191,8 +191,8 @@ class Layer(torch.nn.Module):
 
         A later layer in place may have given it other axes: MVN makes four.
         """
-        bottoms = [top.view(diff.shape) if bottom is top else bottom for bottom in bottoms]
-        return self.caffes_gradients(bottoms, top.view(diff.shape), diff)
+        fitting = top.view(diff.shape)
+        return self.caffes_gradients([fitting if bottom is top else bottom for bottom in bottoms], fitting, diff)
 
     @classmethod
     def source_of(cls, param: Any) -> str:
