@@ -84,25 +84,26 @@ def close(odometry: np.ndarray, loops: Sequence[Loop], truth: np.ndarray | None 
     node = {int(frame): number for number, frame in enumerate(frames)}
     taken = [loop for loop in loops if loop.relative is not None and {loop.query, loop.match} <= set(node)]
     steps = [
-        Edge(number, number + 1, step, _information_of_step(step)) for number, step in enumerate(steps_between(path))
+        Edge(number, number + 1, step, information_of_step(step)) for number, step in enumerate(steps_between(path))
     ]
     edges = []
     for loop in taken:
         assert loop.relative is not None
-        edges.append(Edge(node[loop.match], node[loop.query], *_constraint(loop.relative)))
+        edges.append(Edge(node[loop.match], node[loop.query], *constraint(loop.relative)))
     solution = solve(path, steps, edges)
     left_out = len(loops) - len(taken)
     known = None if truth is None else truth[frames]
     return Closed(frames, path, solution.poses, steps, edges, taken, solution.accepted, left_out, known)
 
 
-def _information_of_step(step: np.ndarray) -> np.ndarray:
+def information_of_step(step: np.ndarray) -> np.ndarray:
+    """Return the information (6, 6) of a step (7,) of the odometry."""
     length, turn = float(np.linalg.norm(step[:3])), float(Rotation.from_quat(step[3:]).magnitude())
     sigmas = [STEP_SHARE * length + STEP_M] * 3 + [TURN_SHARE * turn + TURN_RAD] * 3
     return np.diag(np.array(sigmas) ** -2.0)
 
 
-def _constraint(relative: Relative) -> tuple[np.ndarray, np.ndarray]:
+def constraint(relative: Relative) -> tuple[np.ndarray, np.ndarray]:
     """Return the pose (7,) and the information (6, 6) of a loop's edge.
 
     If the length of the translation is not known, the information along its direction is 0. If only the rotation is

@@ -1,0 +1,231 @@
+"""Closes the loops of a robot while it drives: keyframes, loops as constraints of a pose graph, the corrected path.
+
+    closer = LoopCloser(LoopDetector(describe, check=CHECK, exclude_recent=0, exclude_seconds=10), camera)
+    closer.start()
+    for stamp, image, pose in robot:  # the pose of the robot by its wheels
+        closer.add(image, stamp, pose)
+        closer.correction  # the frame of the odometry in the map; map -> odom in ROS
+
+A thread of its own solves the graph, so an image is never waited for. The class knows nothing of ROS;
+``examples/ros2_node.py`` is a node around it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from threading import Event, Lock, Thread
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loopclosure.closing.close import Closed, constraint, information_of_step
+from loopclosure.closing.graph import Edge, solve
+from loopclosure.closing.measure import Loop
+from loopclosure.closing.relative import METRIC, View, relative_view
+from loopclosure.detector.detector import LoopDetector
+from loopclosure.detector.export import relative_pose
+from loopclosure.errors import InputError
+from loopclosure.places.intrinsics import Intrinsics
+from netspec import log
+
+STILL = np.array([0, 0, 0, 0, 0, 0, 1.0])  # the pose of a frame in itself
+FORWARD = np.array([0, 0, 0, -0.5, 0.5, -0.5, 0.5])  # a camera that looks along the robot's x axis; y is left, z is up
+# A stamp this much earlier than the one before it begins another drive: a recording starts again. A smaller step back
+# is an image that came late.
+ANOTHER_DRIVE_S = 1.0
+
+
+def after(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Return the pose (..., 7) that has the pose ``step`` (..., 7) in the frame of ``pose``."""
+    turn = Rotation.from_quat(pose[..., 3:])
+    place = pose[..., :3] + turn.apply(step[..., :3])
+    return np.concatenate([place, (turn * Rotation.from_quat(step[..., 3:])).as_quat(canonical=True)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Keyframes:
+    """The least motion between keyframes, which are looked up and become nodes of the graph."""
+
+    step_m: float = 0.1
+    turn_rad: float = 0.1
+
+
+@dataclass
+class _Graph:
+    """The keyframes so far: their stamps, poses by the odometry, and edges. Poses are of the camera."""
+
+    stamps: list[float] = field(default_factory=list)
+    odometry: list[np.ndarray] = field(default_factory=list)
+    steps: list[Edge] = field(default_factory=list)
+    loops: list[Loop] = field(default_factory=list)
+
+
+class LoopCloser:
+    """Closes the loops of a robot while it drives; what a sensor sends wrong is warned of and left out.
+
+    detector   an empty one with a geometric check, which finds the points that measure its loops
+    camera     the intrinsics of the images; ``camera.size`` may differ from theirs
+    mount      pose (7,) of the camera in the frame of the robot, tx ty tz qx qy qz qw
+    keyframes  the least motion between keyframes
+    warn       gets a sentence for each image that is left out
+
+    ``correction`` is the pose (7,) of the odometry's frame in the map, by the last of the ``solutions`` of the graph.
+    """
+
+    def __init__(
+        self,
+        detector: LoopDetector,
+        camera: Intrinsics,
+        mount: Sequence[float] | np.ndarray = FORWARD,
+        keyframes: Keyframes | None = None,
+        warn: Callable[[str], None] = log.logger.warning,
+    ) -> None:
+        if len(detector) or detector.check is None:
+            raise InputError("loops are closed from the first keyframe on: the detector must be empty and have a check")
+        self.detector, self.camera, self.warn = detector, camera, warn
+        self.mount = np.asarray(mount, np.float64)
+        self.keyframes = keyframes or Keyframes()
+        self._graph, self._lock = _Graph(), Lock()
+        self._solved, self._accepted = np.zeros((0, 7)), np.zeros(0, bool)
+        self.correction, self.solutions = STILL, 0
+        self._new, self._stop, self._thread = Event(), Event(), None
+
+    def add(self, image: np.ndarray, stamp: float, odometry: Sequence[float] | np.ndarray) -> Loop | None:
+        """Add an image (H, W, 3) uint8 BGR, taken at ``stamp`` seconds where the robot had this pose (7,).
+
+        Returns the loop that it closes, measured from the two images; None if there is none, or the robot has hardly
+        moved.
+        """
+        pose = np.asarray(odometry, np.float64).reshape(-1)
+        if pose.shape != (7,) or not np.all(np.isfinite(pose)) or not np.any(pose[3:]):
+            self.warn(f"the odometry at {stamp:.6f} is {pose}, not a pose; the image is left out")
+            return None
+        pose = after(pose, self.mount)
+        graph, another = self._graph, False
+        if graph.stamps:
+            back = graph.stamps[-1] - stamp
+            another = back > ANOTHER_DRIVE_S
+            if another:
+                self.warn(f"the time goes back by {back:.1f} s, to {stamp:.6f}: another drive begins")
+                self.detector.begin_session()
+            elif back > 0:
+                self.warn(f"an image came late, {back:.3f} s before the one that was seen last; it is left out")
+                return None
+            elif not self._moved(relative_pose(graph.odometry[-1], pose)):
+                return None
+        try:
+            found = self.detector.add(image, stamp, pose)
+        except InputError as fault:
+            self.warn(f"the image at {stamp:.6f} is left out: {fault.message}")
+            return None
+        number = found.query_id
+        loop = None if found.accepted is None else self._measured(number, found.accepted, image)
+        with self._lock:
+            if number and not another:
+                step = relative_pose(graph.odometry[-1], pose)
+                graph.steps.append(Edge(number - 1, number, step, information_of_step(step)))
+            graph.stamps.append(stamp)
+            graph.odometry.append(pose)
+            if loop is not None:
+                graph.loops.append(loop)
+        if loop is not None:
+            self._new.set()
+        return loop
+
+    def _moved(self, step: np.ndarray) -> bool:
+        turn = float(Rotation.from_quat(step[3:]).magnitude())
+        return float(np.linalg.norm(step[:3])) >= self.keyframes.step_m or turn >= self.keyframes.turn_rad
+
+    def _measured(self, query: int, match: int, image: np.ndarray) -> Loop | None:
+        camera = self.camera.of_size(image.shape[1], image.shape[0])
+        first, second = (View(self.detector.local_features(frame), camera) for frame in (match, query))
+        assert self.detector.check is not None
+        relative = relative_view(first, second, self.detector.check.matches(first.local, second.local))
+        return None if relative is None else Loop(query, match, relative)
+
+    def path(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the stamps (N,) of all keyframes, and the corrected poses (N, 7) of the robot in the map."""
+        with self._lock:
+            stamps, poses = np.array(self._graph.stamps), self._corrected(self._odometry())
+        return stamps, after(poses, _inverse(self.mount))
+
+    def by_loop(self, loop: Loop) -> np.ndarray:
+        """Return the pose (7,) of the robot in the map by one loop; by the path where the loop has no length."""
+        assert loop.relative is not None
+        with self._lock:
+            poses = self._corrected(self._odometry())
+        pose = after(poses[loop.match], loop.relative.pose)
+        if loop.relative.kind != METRIC:
+            pose[:3] = poses[loop.query, :3]
+        return after(pose, _inverse(self.mount))
+
+    def _corrected(self, odometry: np.ndarray) -> np.ndarray:
+        return np.concatenate([self._solved, after(self.correction, odometry[len(self._solved) :])])
+
+    def closed(self) -> Closed:
+        """Solve the graph, and return the path and the loops, which ``write_closed`` writes."""
+        self.solve()
+        with self._lock:
+            graph = self._graph
+            count, edges = len(self._solved), _edges(graph.loops)
+            kept = graph.loops[: len(self._accepted)]
+            return Closed(
+                np.arange(count),
+                self._odometry()[:count],
+                self._solved,
+                [step for step in graph.steps if step.second < count],
+                edges[: len(kept)],
+                kept,
+                self._accepted,
+                0,
+            )
+
+    def solve(self) -> None:
+        """Solve the graph of all keyframes so far, and set the correction."""
+        with self._lock:
+            odometry, steps, loops = self._odometry(), list(self._graph.steps), list(self._graph.loops)
+            start = self._corrected(odometry)
+        if not len(odometry):
+            return
+        found = solve(start, steps, _edges(loops))
+        with self._lock:
+            self._solved, self._accepted = found.poses, found.accepted
+            # The robot's, not the camera's: both have the same motion, so the mount cancels out.
+            self.correction = after(found.poses[-1], _inverse(odometry[-1]))
+            self.solutions += 1
+
+    def _odometry(self) -> np.ndarray:
+        return np.array(self._graph.odometry).reshape(-1, 7)
+
+    def start(self) -> None:
+        """Start the thread that solves the graph when a loop is new, at most half of the time."""
+        self._thread = Thread(target=self._run, name="pose graph", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            if self._new.wait(0.2):
+                self._new.clear()
+                begin = time.monotonic()
+                self.solve()
+                self._stop.wait(time.monotonic() - begin)
+
+    def stop(self) -> None:
+        """End the thread, after the solution that it works on."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+
+
+def _inverse(pose: np.ndarray) -> np.ndarray:
+    return relative_pose(pose, STILL)
+
+
+def _edges(loops: Sequence[Loop]) -> list[Edge]:
+    found = []
+    for loop in loops:
+        assert loop.relative is not None
+        found.append(Edge(loop.match, loop.query, *constraint(loop.relative)))
+    return found

@@ -1,0 +1,185 @@
+"""Loops closed while a robot drives: a bag of a rendered robot whose wheels drift, and slip in one corner."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lmdb_build.cli import main as lmdb_build
+from loopclosure.closing.close import ate_rmse_m, drifted, path_of, steps_between, write_closed
+from loopclosure.closing.measure import CHECK
+from loopclosure.closing.online import STILL, Keyframes, LoopCloser, after
+from loopclosure.descriptors.thumbnails import Thumbnailer
+from loopclosure.detector.detector import LoopDetector
+from loopclosure.detector.export import relative_pose
+from loopclosure.errors import InputError
+from loopclosure.places.frames import read_bgr
+from loopclosure.places.image_sequence import ImageSequence
+from loopclosure.places.intrinsics import Intrinsics
+from loopclosure.places.messages import camera_of, image_of, pose_of, seconds
+from loopclosure.places.sequences import read_sequence
+
+CAMERA = Intrinsics(131.25, 131.25, 79.5, 59.5, size=(160, 120))
+SLIP_DEG, SLIP_M = 12.0, 0.3
+
+
+def slipped(odometry: np.ndarray, at: int) -> np.ndarray:
+    """Return odometry whose wheels slip at one frame: they turn less than the robot, and roll in place."""
+    steps = steps_between(odometry)
+    steps[at, :3] += [0, 0, SLIP_M]
+    steps[at, 3:] = (Rotation.from_quat(steps[at, 3:]) * Rotation.from_euler("y", SLIP_DEG, degrees=True)).as_quat()
+    return path_of(odometry[0], steps)
+
+
+def write_bag(file: Path, sequence: ImageSequence, odometry: np.ndarray) -> None:
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    make = {name.rsplit("/")[-1]: kind for name, kind in store.types.items()}
+    kinds = {"/image": "sensor_msgs/msg/Image", "/camera_info": "sensor_msgs/msg/CameraInfo"}
+    kinds["/odom"] = "nav_msgs/msg/Odometry"
+    zero, none = make["Vector3"](x=0.0, y=0.0, z=0.0), np.zeros(36)
+    camera = sequence.camera
+    assert camera is not None
+    assert sequence.stamps is not None
+    with Writer(file, version=9) as writer:
+        opened = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
+
+        def write(topic: str, stamp: float, message: Any) -> None:
+            writer.write(opened[topic], round(stamp * 1e9), store.serialize_cdr(message, kinds[topic]))
+
+        for image, stamp, pose in zip(sequence.paths, sequence.stamps.tolist(), odometry.tolist(), strict=True):
+            pixels = read_bgr(image)
+            height, width = pixels.shape[:2]
+            at = make["Time"](sec=int(stamp), nanosec=round(stamp % 1 * 1e9))
+            header = make["Header"](stamp=at, frame_id="camera")
+            k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1])
+            roi = make["RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+            size = {"height": height, "width": width}
+            info = {"distortion_model": "plumb_bob", "d": np.zeros(5), "k": k, "r": np.eye(3).ravel()}
+            info |= {"p": np.zeros(12), "binning_x": 0, "binning_y": 0, "roi": roi}
+            write("/camera_info", stamp, make["CameraInfo"](header=header, **size, **info))
+            place = make["Pose"](
+                position=make["Point"](x=pose[0], y=pose[1], z=pose[2]),
+                orientation=make["Quaternion"](x=pose[3], y=pose[4], z=pose[5], w=pose[6]),
+            )
+            moving = make["TwistWithCovariance"](twist=make["Twist"](linear=zero, angular=zero), covariance=none)
+            known = make["PoseWithCovariance"](pose=place, covariance=none)
+            write("/odom", stamp, make["Odometry"](header=header, child_frame_id="base", pose=known, twist=moving))
+            row = {"encoding": "bgr8", "is_bigendian": 0, "step": 3 * width, "data": pixels.ravel()}
+            write("/image", stamp, make["Image"](header=header, **size, **row))
+
+
+def closer_of(camera: Intrinsics = CAMERA, **given: Any) -> LoopCloser:
+    detector = LoopDetector(Thumbnailer(), check=CHECK, exclude_recent=0, exclude_seconds=10)
+    return LoopCloser(detector, camera, STILL, **given)
+
+
+@pytest.mark.slow
+def test_a_recorded_robot_gets_a_corrected_path(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    from rosbags.highlevel import AnyReader
+
+    assert lmdb_build(["walk", str(tmp_path / "walk"), "--frames", "64", "--laps", "2", "--size", "160x120"]) == 0
+    sequence = read_sequence(tmp_path / "walk" / "walk_1")
+    assert sequence.poses is not None
+    odometry = slipped(drifted(sequence.poses, 3.0, 1), 20)
+    write_bag(tmp_path / "bag", sequence, odometry)
+    closer, newest, spent = None, {}, []
+    with AnyReader([tmp_path / "bag"]) as reader:
+        for connection, _, raw in reader.messages():
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            newest[connection.topic] = message
+            if connection.topic == "/image":
+                if closer is None:
+                    camera = camera_of(newest["/camera_info"])
+                    assert camera is not None
+                    closer = closer_of(camera)
+                    closer.start()
+                begin = time.process_time()
+                closer.add(image_of(message), seconds(message.header.stamp), pose_of(newest["/odom"]))
+                spent.append(time.process_time() - begin)
+    assert closer is not None
+    closer.stop()
+    closed = closer.closed()
+    stamps, path = closer.path()
+    assert len(stamps) == len(sequence)
+    before, corrected = (ate_rmse_m(poses, sequence.poses) for poses in (odometry, path))
+    used = int(np.count_nonzero(closed.accepted))
+    said = f"{used} of {len(closed.loops)} loops used, ATE {before:.3f} m before, {corrected:.3f} m after"
+    print(f"{said}, {1e3 * np.median(spent):.0f} ms per image")
+    assert used >= 3
+    assert corrected < 0.4 * before
+    newer = after(closer.correction, odometry[-1])
+    np.testing.assert_allclose(newer[:3], path[-1, :3], atol=1e-6)
+    write_closed(tmp_path / "closed", closed, stamps, sequence.names)
+    assert (tmp_path / "closed" / "closed.g2o").read_text().count("EDGE_SE3:QUAT") == len(sequence) - 1 + used
+
+
+def picture(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    squares = [
+        np.kron(rng.integers(0, 120, (120 // side, 160 // side, 3)), np.ones((side, side, 1))) for side in (8, 20)
+    ]
+    return np.sum(squares, axis=0).astype(np.uint8)
+
+
+def at(x: float, turn_deg: float = 0.0) -> np.ndarray:
+    return np.array([x, 0, 0, *Rotation.from_euler("z", turn_deg, degrees=True).as_quat()])
+
+
+def test_keyframes_are_apart_by_a_step_or_a_turn() -> None:
+    closer = closer_of(keyframes=Keyframes(step_m=1.0, turn_rad=np.radians(30)))
+    for second, pose in enumerate((at(0), at(0.9), at(1.1), at(1.1, 29), at(1.1, 31))):
+        closer.add(picture(second), second, pose)
+    assert closer.path()[0].tolist() == [0, 2, 4]
+    np.testing.assert_allclose(closer.path()[1], [at(0), at(1.1), at(1.1, 31)], atol=1e-12)
+
+
+def test_faults_of_a_sensor_are_warned_of_and_left_out() -> None:
+    said: list[str] = []
+    closer = closer_of(warn=said.append)
+    closer.add(picture(0), 100.0, at(0))
+    closer.add(picture(1), 101.0, [np.nan] * 7)
+    closer.add(picture(1), 101.0, [0] * 7)
+    closer.add(picture(1), np.nan, at(1))
+    closer.add(picture(1), 99.5, at(1))
+    assert [text.split(",")[0].split(" is ")[0] for text in said] == [
+        "the odometry at 101.000000",
+        "the odometry at 101.000000",
+        "the image at nan",
+        "an image came late",
+    ]
+    assert len(closer.path()[0]) == 1
+    closer.add(picture(2), 101.0, at(2))
+    assert len(closer.path()[0]) == 2
+
+
+def test_another_drive_is_no_step_of_the_odometry_and_is_joined_by_its_loops() -> None:
+    """A recording that starts again: the robot is somewhere else by its odometry, and sees the first place again."""
+    said: list[str] = []
+    closer = closer_of(warn=said.append)
+    pictures = [picture(seed) for seed in range(3)]
+    for number, image in enumerate(pictures):
+        closer.add(image, 100.0 + number, at(number))
+    for number, image in enumerate(pictures):
+        closer.add(image, 50.0 + number, at(10.0 + number))
+    assert said == ["the time goes back by 52.0 s, to 50.000000: another drive begins"]
+    closed = closer.closed()
+    assert [(step.first, step.second) for step in closed.steps] == [(0, 1), (1, 2), (3, 4), (4, 5)]
+    assert [(loop.query, loop.match) for loop in closed.loops] == [(3, 0), (4, 1), (5, 2)]
+    assert closed.accepted.all()
+    turns = relative_pose(closed.poses[:3], closed.poses[3:])
+    np.testing.assert_allclose(turns[:, 3:], np.tile(STILL[3:], (3, 1)), atol=0.02)
+
+
+def test_a_detector_with_frames_or_without_a_check_is_refused() -> None:
+    used = LoopDetector(check=CHECK)
+    used.add_descriptor(np.ones(3), image=picture(0))
+    for detector in (used, LoopDetector()):
+        with pytest.raises(InputError, match="the detector must be empty and have a check"):
+            LoopCloser(detector, CAMERA)
