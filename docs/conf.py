@@ -124,7 +124,7 @@ def _write_search_texts(app: Any, exception: Exception | None) -> None:
     if exception is None and app.builder.format == "html":
         texts = {name: app.env.get_doctree(name).astext() for name in sorted(app.env.found_docs)}
         made = Path(app.outdir, "_static", "texts.js")
-        made.write_text(f"const TEXTS = {json.dumps(texts)};\n")
+        made.write_text(f"const TEXTS = {json.dumps(texts)};\n", "utf-8")
 
 
 def _add_search_scripts(app: Any, pagename: str, *_: object) -> None:

@@ -245,7 +245,7 @@ def _netspec(words: list[str], log: Path, say: Say, step: Step = lambda *_: None
     command = [sys.executable, "-m", "netspec", *words]
     environment = {**os.environ, "PYTHONPATH": path}
     with (
-        log.open("w") as file,
+        log.open("w", encoding="utf-8") as file,
         subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process,
     ):
         assert process.stderr is not None

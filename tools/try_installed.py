@@ -66,7 +66,7 @@ def main(golden: Path) -> None:
     assert run("netspec", "--version") == f"netspec {version('netspec-caffe')}\n"
     run("netspec", "check", "--data", "sgd_step/solver.prototxt")
     log = run("netspec", "train", "--solver", "sgd_step/solver.prototxt", stderr=subprocess.STDOUT)
-    Path("train.log").write_text(log)
+    Path("train.log").write_text(log, "utf-8")
     out = run("netspec", "plot", "train.log", "--out", "training.html")
     assert "state done, iterations 60" in out, out
     run("netspec", "data", "show", "pairs/test_lmdb", "--out", "sheet.png")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
 from lmdb_build.pairs.runs import folder_runs, index_runs, join_runs
@@ -11,6 +10,7 @@ from lmdb_build.views import Batches, Changes, write_views
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.errors import InputError
 from loopclosure.places.source import Source, read_source
+from netspec.files.drives import common_folder
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar
 from netspec.terminal.parser import Commands, above_zero, seed
@@ -99,7 +99,7 @@ def _add_views(commands: Commands) -> None:
 
 def _views(arguments: argparse.Namespace) -> None:
     sources: list[Source] = arguments.source
-    root = Path(os.path.commonpath([(each.path.parent if each.kind else each.path).resolve() for each in sources]))
+    root = common_folder([(each.path.parent if each.kind else each.path).resolve() for each in sources])
     if all(each.kind for each in sources):
         refuse(arguments, ("step",), "is for folders; a table has its own times")
     parts = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,6 +36,7 @@ from loopclosure.places.source import (
     read_source,
 )
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
+from netspec.files.drives import common_folder, relative
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands, above_zero, seed
@@ -273,7 +273,7 @@ def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
         places = [path.parent if kind in ("table", "index") else path]
         places += [other for other in (first.get("references", Path),) if other]
     warped = [arguments.out] if arguments.warp_share or kind == "singles" else []
-    root = arguments.root or Path(os.path.relpath(os.path.commonpath([str(p.resolve()) for p in [*places, *warped]])))
+    root = arguments.root or Path(relative(common_folder([p.resolve() for p in [*places, *warped]])))
     if sequences:
         return _pose_source(arguments, sequences, root), root
     min_gap = None if arguments.min_gap is None else int(arguments.min_gap)
@@ -343,7 +343,7 @@ def _pose_source(arguments: argparse.Namespace, opened: list[ImageSequence], roo
         clear_view_angle_deg=arguments.clear_view_angle,
     )
     scenes = Scenes(tuple(arguments.same_scene), tuple(arguments.same_frame), arguments.different_scenes)
-    folders = [Path(os.path.relpath(every.source.resolve(), root.resolve())).as_posix() for every in opened]
+    folders = [relative(every.source.resolve(), root.resolve()) for every in opened]
     return PoseSource(sequences, folders, rule, scenes)
 
 

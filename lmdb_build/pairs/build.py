@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -29,6 +28,7 @@ from lmdb_build.picture import write_warped
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.errors import InputError
 from loopclosure.progress import Progress, silent
+from netspec.files.drives import relative
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def _head(source: PairSource, plan: Plan, split: Split, root: Path, out: Path) -
     cut = f"time, {plan.split_gap:g} between splits" if plan.by == "time" else source.group_word
     shares = ", ".join(f"{name} {plan.shares[name]:g}" for name in SPLITS if plan.counts.get(name))
     head = dict(source.settings)
-    head[ROOT_FOLDER] = Path(os.path.relpath(root.resolve(), out.resolve())).as_posix()
+    head[ROOT_FOLDER] = relative(root.resolve(), out.resolve())
     head["split"] = f"{split.name}, by {cut}; shares: {shares}; {len(split.images)} images"
     if plan.features is not None:
         head["hard negatives"] = f"{plan.hard_share:g} of the negatives, by {plan.features.path.name}"

@@ -5,7 +5,6 @@ A name that contains blanks, or begins with ``#``, is in double quotes.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_bgr
 from netspec.errors import SpecError
+from netspec.files.drives import common_folder, relative
 from netspec.files.kinds import unreadable
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import write_whole
@@ -109,10 +109,10 @@ def join_lists(lists: Sequence[Path], out: Path, seed: int, root: Path | None = 
     Image names become relative to ``root`` or to the common parent of the lists' roots.
     """
     roots = [root_of(path).resolve() for path in lists]
-    common = Path(os.path.commonpath(roots)) if root is None else root.resolve()
+    common = common_folder(roots) if root is None else root.resolve()
     pairs = []
     for path, own_root in zip(lists, roots, strict=True):
-        prefix = Path(os.path.relpath(own_root, common)).as_posix()
+        prefix = relative(own_root, common)
         if prefix.startswith(".."):
             raise InputError(
                 f"its images are in {own_root}, not below the root folder {common}; give another root", path
@@ -121,8 +121,8 @@ def join_lists(lists: Sequence[Path], out: Path, seed: int, root: Path | None = 
         pairs += [(above + pair.first, above + pair.second, pair.label) for pair in read_pair_list(path)]
     order = np.random.default_rng(seed).permutation(len(pairs))
     settings = {
-        "source": "the lists " + ", ".join(Path(os.path.relpath(path, out.parent)).as_posix() for path in lists),
-        ROOT_FOLDER: Path(os.path.relpath(common, out.parent.resolve())).as_posix(),
+        "source": "the lists " + ", ".join(relative(path, out.parent) for path in lists),
+        ROOT_FOLDER: relative(common, out.parent.resolve()),
         "seed": str(seed),
     }
     write_pair_list(out, (pairs[index] for index in order), settings)

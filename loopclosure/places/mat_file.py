@@ -30,12 +30,12 @@ def read_mat(path: str | Path) -> dict[str, Any]:
 
 
 def _limit_memory(path: str) -> None:
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
     statm = Path("/proc/self/statm")
-    used = int(statm.read_text().split()[0]) * resource.getpagesize() if statm.exists() else 0
+    if not statm.exists():  # Windows has no such limit, and macOS refuses one below what it has reserved
+        return
+    import resource
+
+    used = int(statm.read_text("ascii").split()[0]) * resource.getpagesize()
     most = used + LIMIT + TIMES * Path(path).stat().st_size
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
     resource.setrlimit(resource.RLIMIT_AS, (most if hard < 0 else min(most, hard), hard))

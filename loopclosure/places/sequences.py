@@ -22,6 +22,7 @@ from loopclosure.places.pose_files import PoseForm, moved, read_poses
 from loopclosure.places.pose_table import matrix_fault, seconds_of
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, content_lines, number
 from netspec.errors import SpecError
+from netspec.files.drives import relative
 from netspec.files.image_list import list_images
 from netspec.files.kinds import nearest_existing
 
@@ -160,7 +161,7 @@ def _images(source: Path, max_difference: float, own_poses: bool) -> ImageSequen
     listed = list_images(source)
     stamps = None if listed.stamps is None else seconds_of(listed.stamps)
     sequence = ImageSequence(listed.paths, (), stamps, source)
-    sequence = replace(sequence, names=tuple(os.path.relpath(path, sequence.folder) for path in listed.paths))
+    sequence = replace(sequence, names=tuple(relative(path, sequence.folder) for path in listed.paths))
     if stamps is None or not source.is_dir():
         return sequence
     own_poses = own_poses and (source / "groundtruth.txt").is_file()

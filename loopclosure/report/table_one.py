@@ -74,7 +74,7 @@ def read_runs(path: Path, judged: str = "validation") -> list[Run]:
     Raises InputError if a file or an array is missing.
     """
     try:
-        entries = json.loads(path.read_text())
+        entries = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as fault:
         raise InputError(f"cannot read this run file: {fault}", str(path)) from None
     return [_judge(entry, judged) for entry in entries]

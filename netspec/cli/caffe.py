@@ -220,14 +220,12 @@ def _newest(prefix: str) -> Path | None:
 
 def _sole_writer(solver: Solver) -> AbstractContextManager[None]:
     """Refuse a second training that would write snapshots of the same names."""
-    from netspec.files.whole_file import has_locks, only_one
+    from netspec.files.whole_file import only_one
 
     if not (solver.param.snapshot or solver.param.snapshot_after_train):
         return nullcontext()
     solver.check_prefix()
     prefix = solver.param.snapshot_prefix
-    if not has_locks():
-        log.logger.warning(f'no file locks here: nothing stops another training from writing over "{prefix}"')
     folder, name = os.path.split(prefix)
     lock = os.path.join(folder, f".{name}.lock")
     return only_one(lock, f'give each training a snapshot_prefix of its own, not "{prefix}" to both')

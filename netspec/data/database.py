@@ -177,7 +177,7 @@ class _LevelDbReader(Reader):
         for name in set(os.listdir(source)) - {"LOCK", "LOG", "LOG.old"}:
             if name.endswith(".log") and _ends_within_a_record(Path(source, name)):
                 raise ValueError(f"is damaged: its file {name} is truncated; copy or write the database again")
-            os.symlink(os.path.abspath(os.path.join(source, name)), os.path.join(folder, name))
+            _link(os.path.abspath(os.path.join(source, name)), os.path.join(folder, name))
         try:
             self._db = library.DB(folder, create_if_missing=False, paranoid_checks=True)
             with self._db.iterator(include_value=False, verify_checksums=True) as keys:
@@ -209,6 +209,15 @@ class _LevelDbReader(Reader):
     @property
     def is_current(self) -> bool:
         return _contents(self._source) == self._stamp
+
+
+def _link(file: str, link: str) -> None:
+    """Make a symbolic link to a file; where that is not allowed (Windows), a hard link; on another drive, a copy."""
+    for make in (os.symlink, os.link, shutil.copyfile):
+        with suppress(OSError):
+            make(file, link)
+            return
+    raise OSError(f"cannot be copied to {os.path.dirname(link)}")
 
 
 def _runs(numbers: Sequence[int]) -> Iterator[slice]:

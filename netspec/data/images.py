@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from netspec.data.datum import decode_pixels, planar
+from netspec.data.resize import resized
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
 from netspec.files.limits import read_bytes
@@ -29,7 +30,7 @@ class ListedImage:
 def read_image(path: str, color: bool = True, size: tuple[int, int] | None = None) -> np.ndarray:
     """Return an image file as uint8 (C, H, W): 3 channels (blue, green, red), or 1 if ``color`` is false.
 
-    ``size`` is (height, width). Images are resized bilinearly without low-pass filtering, as by cv::resize.
+    ``size`` is (height, width). Images are resized bilinearly without low-pass filtering, with Caffe's pixels.
     Raises ValueError with the name of the file if it is missing or is not an image.
     """
     try:
@@ -41,8 +42,8 @@ def read_image(path: str, color: bool = True, size: tuple[int, int] | None = Non
     if size:
         height, width = size
         try:
-            pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_LINEAR)
-        except cv2.error:  # too large
+            pixels = resized(pixels, height, width)
+        except (cv2.error, MemoryError):  # too large
             raise ValueError(f'image "{path}" cannot be resized to {height} x {width}') from None
     return planar(pixels)
 

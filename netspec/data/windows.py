@@ -18,11 +18,11 @@ from netspec import log
 from netspec.data.datum import decode_pixels, planar
 from netspec.data.mean import read_mean
 from netspec.data.random_words import words_at
+from netspec.data.resize import resized
 from netspec.data.sources import Arrays, Cursor, Draws, Shape
 from netspec.data.transformer import mean_contradictions
 from netspec.errors import SpecError, Where
 from netspec.files.limits import read_bytes
-from netspec.files.opencv import cv2
 
 CHANNELS = 3  # images are always read in color
 
@@ -165,7 +165,7 @@ class WindowSource:
             raise SpecError(f'the window {window} is not inside image "{path}"', self._where)
         if not (height and width):
             return
-        patch = cv2.resize(pixels[y1 : y2 + 1, x1 : x2 + 1], (width, height), interpolation=cv2.INTER_LINEAR)
+        patch = resized(pixels[y1 : y2 + 1, x1 : x2 + 1], height, width)
         if mirror:
             patch = patch[:, ::-1]
         region = np.s_[:, top : top + height, left : left + width]

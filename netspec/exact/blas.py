@@ -200,24 +200,21 @@ def one_thread() -> Iterator[None]:
 
 
 def kernels() -> set[str]:
-    """Return OpenBLAS' names of the kernels that BLAS has."""
+    """Return OpenBLAS' names of the kernels that SciPy's BLAS has; an empty set if it is another BLAS."""
     return {pool.info().get("architecture", "unknown") for pool in _pools()}
 
 
-def other_kernels() -> str:
-    """Return a note if BLAS does not use its kernels for AVX-512; "" if it does."""
-    found = kernels() or {"another BLAS"}
-    if CAFFES in found:
-        return ""
-    return (
-        f"Caffe's sums are computed by the kernels for {', '.join(sorted(found))}, not {CAFFES} (AVX-512): "
-        "they have the bits of a Caffe on such a CPU"
-    )
+def name() -> str:
+    """Return the name of the BLAS that SciPy was built with, e.g. "scipy-openblas" or "accelerate" (macOS)."""
+    config: Any = scipy.show_config(mode="dicts")
+    return config["Build Dependencies"]["blas"]["name"]
 
 
 @cache
 def _pools() -> list[Any]:
     """Return the OpenBLAS of SciPy, or every loaded one if SciPy's is not in a folder of its own."""
     _library("_fblas")  # loads its OpenBLAS
+    if name() == "accelerate":
+        return []
     pools = ThreadpoolController().select(internal_api="openblas").lib_controllers
-    return [pool for pool in pools if "scipy.libs" in pool.filepath] or pools
+    return [pool for pool in pools if "scipy.libs" in pool.filepath or "scipy/.dylibs" in pool.filepath] or pools

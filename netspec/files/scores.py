@@ -61,7 +61,7 @@ def read_scores(path: str | Path) -> Scores:
     """Read a file that ``Scores.write`` wrote. Raises SpecError for any other file."""
     where = Where(str(path))
     try:
-        entries = json.loads(Path(path).read_text())
+        entries = json.loads(Path(path).read_text("utf-8"))
         tests = [Score(test["iteration"], test["net"], test["outputs"]) for test in entries["tests"]]
         return Scores(tests, [Snapshot(entry["iteration"], entry["path"]) for entry in entries["snapshots"]])
     except OSError as fault:

@@ -1,7 +1,8 @@
 """Writing files and folders completely or not at all, lock files, and a check whether a path is writable.
 
 An unfinished file has a hidden name next to its path, ``.NAME.XXXXXXXX.unfinished``, and is locked. If its process is
-killed, the next process that writes into the same folder removes it.
+killed, the next process that writes into the same folder removes it. Windows can neither rename an open file nor open a
+folder: there, a file next to it, ``.NAME.XXXXXXXX.lock``, is locked.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import secrets
 import shutil
 import stat
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,13 +27,16 @@ from netspec.errors import SpecError, Where, printable
 
 try:
     import fcntl
-except ImportError:  # Windows, where an open file cannot be removed
+except ImportError:
     fcntl: Any = None
+    import msvcrt
 
 NO_NUL = "a file name cannot contain a NUL character"
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.unfinished")
 _MARK = re.compile(rb"a lock of netspec, held by process (\d+)\n")
-_AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # no links, and no waiting for pipes
+# No links, no waiting for pipes, no conversion of line ends.
+_AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+_FAR = 0x7FFFFFFF  # Windows: a locked byte cannot be read, so one behind every content is locked
 _UNSEEN = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")  # control characters except tabs and line ends
 _FORMULA = tuple("=+-@\t\r\n")  # first characters of formulas in spreadsheets
 _swept: set[Path] = set()
@@ -64,7 +68,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
                 if fcntl is not None:
                     unfinished.replace(real)  # while it is locked, so that no sweep removes it
             if fcntl is None:
-                unfinished.replace(real)  # Windows cannot rename open files
+                unfinished.replace(real)
             sync_folder(real.parent)
     except OSError as fault:
         reason = os.strerror(fault.errno) if fault.errno else fault  # h5py's own message is a paragraph
@@ -113,13 +117,14 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
     real = Path(os.path.realpath(path))
     with _temporary(real) as unfinished:
         unfinished.mkdir()
-        held = None if fcntl is None else os.open(unfinished, os.O_RDONLY)  # Windows cannot open folders
+        held = None if fcntl is None else os.open(unfinished, os.O_RDONLY)
         try:
             if held is not None:
                 _lock(held)
             yield unfinished
             for file in unfinished.iterdir():
-                _sync(file)
+                if file.is_file():
+                    _sync(file)
             sync_folder(unfinished)
             unfinished.rename(real)
             sync_folder(real.parent)
@@ -132,11 +137,12 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
 def only_one(path: str | Path, advice: str) -> Iterator[None]:
     """Hold the lock file ``path`` within the block. The lock also ends if the process is killed.
 
-    The lock file of a killed process is reused; any other file is not changed. If the system or the file system has no
-    locks, nothing is locked. Raises SpecError, with ``advice``, if another process holds the lock, or if the file
+    The lock file of a killed process is reused; any other file is not changed. If the file system has no locks, nothing
+    is locked. Raises SpecError, with ``advice``, if another process holds the lock, or if the file
     cannot be created.
     """
     path = Path(path)
+    ours = False
     mark = f"a lock of netspec, held by process {os.getpid()}\n".encode()
     try:
         try:
@@ -159,25 +165,25 @@ def only_one(path: str | Path, advice: str) -> Iterator[None]:
         os.ftruncate(held, 0)
         os.lseek(held, 0, os.SEEK_SET)
         os.write(held, mark)
+        ours = True
         try:
             yield
         finally:
-            with suppress(OSError):  # Windows cannot remove open files; the file stays, unlocked
-                path.unlink()
+            if fcntl is not None:
+                _remove(path)  # while it is locked, so that it is not the next owner's
     finally:
         os.close(held)
-
-
-def has_locks() -> bool:
-    """Return whether the system can lock files, so that :func:`only_one` can refuse a second process."""
-    return fcntl is not None
+        if ours and fcntl is None:
+            _remove(path)  # Windows refuses this if the next owner has opened it
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync a folder to disk, since a power failure could otherwise undo a rename.
+    """Sync a folder to disk, since a power failure could otherwise undo a rename. Windows has no such call.
 
-    If the system or the file system cannot do this, a warning is logged once.
+    If the file system cannot do this, a warning is logged once.
     """
+    if fcntl is None:
+        return
     try:
         _sync(folder)
     except OSError as fault:
@@ -216,10 +222,18 @@ def _temporary(path: Path) -> Iterator[Path]:
     """Yield the temporary path of ``path``, after sweeping the folder. At the end, remove it if it still exists."""
     _sweep(path.parent)
     unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.unfinished")
-    try:
-        yield unfinished
-    finally:
-        _remove(unfinished)
+    with nullcontext() if fcntl is not None else _created(_lock_beside(unfinished), 0o600):
+        try:
+            yield unfinished
+        finally:
+            _remove(unfinished)
+    if fcntl is None:
+        _remove(_lock_beside(unfinished))
+
+
+def _lock_beside(unfinished: Path) -> Path:
+    """Return the path of the lock of an unfinished file or folder on Windows."""
+    return unfinished.with_suffix(".lock")
 
 
 @contextmanager
@@ -260,11 +274,14 @@ def _open_locked(path: Path, flags: int, mode: int = 0o666) -> tuple[int, bool]:
 
 def _lock(descriptor: int) -> bool | None:
     """Lock an open file. Return False if another process holds the lock, and None if locks are not supported."""
-    if fcntl is None:
-        return None
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        if fcntl is not None:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        else:
+            os.lseek(descriptor, _FAR, os.SEEK_SET)
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
+            os.lseek(descriptor, 0, os.SEEK_SET)
+    except (BlockingIOError, PermissionError):
         return False
     except OSError:
         return None
@@ -280,14 +297,16 @@ def _sweep(folder: Path) -> None:
         for name in os.listdir(folder):
             if _LEFTOVER.fullmatch(name) and _is_abandoned(folder / name):
                 _remove(folder / name)
+                if fcntl is None:
+                    _remove(_lock_beside(folder / name))
 
 
 def _is_abandoned(path: Path) -> bool:
-    """Return whether an unfinished file is not locked. Without locks return True, since open files are not removed."""
-    if fcntl is None:
-        return True
+    """Return whether an unfinished file or folder is not locked."""
     try:
-        held = os.open(path, os.O_RDONLY | _AS_IT_IS)
+        held = os.open(path if fcntl is not None else _lock_beside(path), os.O_RDONLY | _AS_IT_IS)
+    except FileNotFoundError:
+        return fcntl is None
     except OSError:
         return False
     try:
@@ -314,7 +333,7 @@ def _warn_not_synced(reason: str) -> None:
 
 
 def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY if fcntl is not None else os.O_RDWR)  # Windows syncs what can be written
     try:
         os.fsync(descriptor)
     finally:

@@ -17,7 +17,7 @@ from typing_extensions import override
 from netspec import log
 from netspec.errors import SpecError, Where, check_blobs, did_you_mean
 from netspec.exact import ALL
-from netspec.exact.blas import other_kernels
+from netspec.exact.machine import other_bits
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Plan, unblocked
 from netspec.layers.contract.base import Layer
@@ -84,7 +84,7 @@ class Net(torch.nn.Module):
         self.keep: str | Iterable[str] = ()
         self._kept_values: dict[str | tuple[str, ...], frozenset[int]] = {}  # what the last ``keep`` means
         self._passes = _Passes()
-        if options.exact == ALL and self.device.type == "cpu" and (warning := other_kernels()):
+        if options.exact == ALL and self.device.type == "cpu" and (warning := other_bits()):
             log.warning("net.cpp:53", warning)
         assembly = Assembly(plan, options)
         self.options = assembly.options

@@ -17,6 +17,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 
 from netspec.errors import SpecError, printable
+from netspec.files.drives import relative
 from netspec.files.limits import OUT_OF_MEMORY, amount, is_out_of_memory, memory
 from netspec.log import INTERRUPTED, SEVERITIES, VARIABLE
 from netspec.terminal.output import logging_to
@@ -100,7 +101,7 @@ def _fault_of_plugin(fault: BaseException, plugins: Sequence[str]) -> str:
     for frame in reversed(traceback.extract_tb(fault.__traceback__)):
         if frame.filename in files:
             text = printable(" ".join(str(fault).split()))
-            return f"{os.path.relpath(frame.filename)}:{frame.lineno}: in {frame.name}: {type(fault).__name__}: {text}"
+            return f"{relative(frame.filename)}:{frame.lineno}: in {frame.name}: {type(fault).__name__}: {text}"
     return ""
 
 

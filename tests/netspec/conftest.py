@@ -11,10 +11,9 @@ import pytest
 import torch
 
 from gradients import check_gradients
-from libm_bits import GLIBC_2_36, digest
 from netspec.cli import main
 from netspec.errors import Report, raise_fault
-from netspec.exact.blas import CAFFES, kernels
+from netspec.exact.machine import other_bits
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.graph.speed import speed
@@ -32,7 +31,7 @@ def caffes_bits() -> bool:
 
     BLAS does with the kernels for AVX-512, the C library if its functions round as those of glibc 2.36.
     """
-    return CAFFES in kernels() and digest() == GLIBC_2_36
+    return not other_bits()
 
 
 @pytest.fixture(scope="session")

@@ -43,6 +43,7 @@ _EXAMPLES: dict[str, tuple[str, list[str]]] = {  # in the build folder only
     "examples/siamese/convert_mnist_siamese_data": (_BUILD, ["mnist", "--pairs", "--backend=leveldb"]),
     "examples/cifar10/convert_cifar_data": (_BUILD, ["cifar"]),
 }
+_WINDOWS = sys.platform == "win32"
 _ASIDE = ".before-netspec"  # suffix of files that are in the way, while ours are installed
 
 
@@ -52,7 +53,7 @@ def install_caffe(replace: bool = False) -> list[Path]:
     Raises SpecError if a real Caffe or a command of one of these names exists, unless ``replace``, and OSError if the
     environment cannot be written to.
     """
-    paths = {_package(): _PACKAGE} | {_scripts() / name: _command(*command) for name, command in _COMMANDS.items()}
+    paths = {_package(): _PACKAGE} | {_script(name): _command(*command) for name, command in _COMMANDS.items()}
     in_the_way = [str(path) for path in paths if path.exists() and not _is_ours(path)]
     real = real_caffe()
     if real and real not in in_the_way:
@@ -74,7 +75,7 @@ def install_caffe(replace: bool = False) -> list[Path]:
 def remove_caffe() -> list[Path]:
     """Remove what :func:`install_caffe` wrote, and restore the files that it renamed; return the removed paths."""
     removed = []
-    for path in (_package(), *(_scripts() / name for name in _COMMANDS)):
+    for path in (_package(), *map(_script, _COMMANDS)):
         owner = path.parent if path.name == "__init__.py" else path
         if not _is_ours(path):
             continue
@@ -119,19 +120,26 @@ def remove_build_folder(folder: Path) -> list[Path]:
 
 def _build_paths(folder: Path) -> dict[Path, tuple[str, list[str]]]:
     commands = {f"tools/{name}": command for name, command in _COMMANDS.items()} | _EXAMPLES
-    return {folder / f"{name}{end}": command for name, command in commands.items() for end in ("", ".bin")}
+    return {folder / _file(f"{name}{end}"): command for name, command in commands.items() for end in ("", ".bin")}
 
 
 def _package() -> Path:
     return Path(sysconfig.get_path("purelib")) / NAME / "__init__.py"
 
 
-def _scripts() -> Path:
-    return Path(sysconfig.get_path("scripts"))
+def _script(name: str) -> Path:
+    return Path(sysconfig.get_path("scripts"), _file(name))
+
+
+def _file(command: str) -> str:
+    """Return the name of a command's file. Windows starts only files whose extension it knows."""
+    return f"{command}.cmd" if _WINDOWS else command
 
 
 def _command(module: str, words: list[str]) -> str:
-    return f"""#!{sys.executable}
+    # On Windows the first line is a batch file that runs the other lines with Python, which skips the first (-x).
+    first = f'@"{sys.executable}" -x "%~f0" %* & exit /b' if _WINDOWS else f"#!{sys.executable}"
+    return f"""{first}
 {MARK}: written by `netspec install-caffe`, removed by `netspec remove-caffe`.
 import sys
 

@@ -9,7 +9,6 @@ import collections
 import collections.abc
 import importlib
 import importlib.abc
-import importlib.util
 import inspect
 import os
 import re
@@ -23,6 +22,7 @@ from typing import Any
 
 from netspec.compat.scripts.as_python2 import py2_bytes
 from netspec.compat.scripts.operations import TRANSLATED
+from netspec.files.drives import relative
 from netspec.log import VARIABLE
 
 
@@ -156,9 +156,9 @@ def remedy(fault: BaseException) -> str:
         return forks.advice(unknown[1], tuple(sorted(forks.with_field("", unknown[1]))))
     caffe = sys.modules.get("netspec.compat.pycaffe")
     if isinstance(fault, FileNotFoundError) and caffe and isinstance(fault.filename, str):
-        relative = os.path.relpath(fault.filename, os.path.dirname(str(caffe.__file__)))
-        if not relative.startswith(os.pardir):
-            return f"this is python/caffe/{relative} of Caffe's sources: put a copy at {fault.filename}"
+        name = relative(fault.filename, os.path.dirname(str(caffe.__file__)))
+        if not name.startswith(os.pardir):
+            return f"this is python/caffe/{name} of Caffe's sources: put a copy at {fault.filename}"
     return ""
 
 

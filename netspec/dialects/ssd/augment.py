@@ -16,6 +16,7 @@ import numpy as np
 
 from netspec.data.datum import planar, shape_text
 from netspec.data.mean import read_mean
+from netspec.data.resize import resized
 from netspec.data.transformer import contradictions
 from netspec.dialects.boxes import Array, coverage, overlaps, sizes
 from netspec.errors import SpecError, Where
@@ -254,7 +255,11 @@ class Augmenter:
         pads = param.resize_mode == FIT_LARGE_SIZE_AND_PAD
         rows, columns = _fitted(height, width, param, inside=True) if pads else self._resized_to(height, width)
         channels = image.shape[2]
-        image = cv2.resize(image, (columns, rows), interpolation=interpolation).reshape(rows, columns, channels)
+        if interpolation == cv2.INTER_LINEAR:
+            image = resized(image, rows, columns)
+        else:
+            image = cv2.resize(image, (columns, rows), interpolation=interpolation)
+        image = image.reshape(rows, columns, channels)
         if not pads:
             return image
         top, left = (param.height - rows) // 2, (param.width - columns) // 2

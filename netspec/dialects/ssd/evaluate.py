@@ -63,7 +63,7 @@ class DetectionEvaluate(Layer):
     def _read_sizes(self, file: str) -> Array:
         """Return the width and height of each image (n, 2), from lines of name, height and width."""
         try:
-            rows = [line.split() for line in Path(file).read_text().splitlines() if line.strip()]
+            rows = [line.split() for line in Path(file).read_text("utf-8").splitlines() if line.strip()]
         except (OSError, UnicodeDecodeError) as fault:
             message = f'name_size_file "{file}" {unreadable(file, fault)}'
             raise self.error(message, "detection_evaluate_param", "name_size_file") from None

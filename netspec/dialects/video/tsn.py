@@ -16,11 +16,11 @@ from typing_extensions import override
 
 from netspec.data.images import list_lines, read_image
 from netspec.data.random_words import words
+from netspec.data.resize import resized
 from netspec.data.sources import Arrays, Cursor, Source
 from netspec.data.transformer import Transformer, contradictions
 from netspec.dialects.layers import replace
 from netspec.errors import SpecError, Where
-from netspec.files.opencv import cv2
 from netspec.layers import register
 from netspec.layers.contract.base import Shape
 from netspec.layers.data import files
@@ -127,7 +127,7 @@ class Windows(Transformer):
         cut = _cut(image, corner, window)
         if window == (size, size):
             return cut
-        return np.stack([cv2.resize(plane, (size, size), interpolation=cv2.INTER_LINEAR) for plane in cut])
+        return np.stack([resized(plane, size, size) for plane in cut])
 
 
 def _cut(image: Array, corner: Sequence[int], window: tuple[int, int]) -> Array:

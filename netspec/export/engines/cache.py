@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import tempfile
+import secrets
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
@@ -43,7 +43,7 @@ def processor() -> str:
     """Return a description of the processor, for models that are optimized for it."""
     machine = platform.machine()
     try:
-        lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
+        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").partition("\n\n")[0].splitlines()
     except OSError:
         return f"{machine} {platform.processor()}"
     return " ".join([machine, *(line for line in lines if line.startswith(("model", "flags", "Features", "CPU part")))])
@@ -82,7 +82,7 @@ def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, b
     if path.is_dir():
         if _is_whole(path):
             return path, False
-        aside = Path(tempfile.mkdtemp(prefix=".damaged-", dir=folder))
+        aside = folder / f".damaged-{secrets.token_hex(4)}"
         log.logger.warning(f"{path}: was damaged and is being recreated; the damaged one was renamed to {aside.name}")
         with suppress(FileNotFoundError):  # another process moved it
             path.rename(aside)
@@ -91,7 +91,7 @@ def entry(folder: Path, key: str, make: Callable[[Path], None]) -> tuple[Path, b
         with whole_folder(path) as unfinished:
             make(unfinished)
             digests = {file.name: _digest(file) for file in unfinished.iterdir()}
-            (unfinished / DIGESTS).write_text(json.dumps(digests))
+            (unfinished / DIGESTS).write_text(json.dumps(digests), "utf-8")
     except OSError:
         if not path.is_dir():  # another process may have made the same entry
             raise

@@ -151,6 +151,6 @@ def _first_line(file: str) -> int:
 
 def _lines(file: str) -> list[str]:
     try:
-        return Path(file).read_text(errors="replace").splitlines()
+        return Path(file).read_text("utf-8", "replace").splitlines()
     except OSError:
         return []  # the text did not come from a file

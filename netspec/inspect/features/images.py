@@ -15,6 +15,7 @@ import numpy as np
 from netspec import log
 from netspec.data.blobs import Shape
 from netspec.data.datum import decode_pixels, planar
+from netspec.data.resize import resized
 from netspec.errors import SpecError, Where
 from netspec.export.engines.choice import Choice
 from netspec.export.engines.model import Model, Origin
@@ -254,5 +255,5 @@ def fitted(image: np.ndarray, shape: Shape) -> np.ndarray:
     elif channels == 1 and image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     if image.shape[:2] != (height, width):
-        image = cv2.resize(image, (width, height))
+        image = resized(image, height, width)
     return planar(image)

@@ -1,5 +1,6 @@
 """Masks and coordinates in every format, and errors for broken ones."""
 
+import resource
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import scipy.io
 import scipy.sparse
 
 from loopclosure.errors import InputError
+from loopclosure.places import mat_file
 from loopclosure.places.masks import (
     CAMERAS,
     comparable,
@@ -156,3 +158,14 @@ def test_for_both_cameras_only_images_of_the_same_camera_are_compared() -> None:
     assert both.tolist() == [[(i + j) % 2 == 0 for j in range(4)] for i in range(4)]
     for camera in ("all", "left", "right", "joined"):
         assert comparable(camera, images_of_places(camera, 4)).all()
+
+
+def test_on_macos_the_memory_of_the_matlab_reader_is_not_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """macOS has no /proc, and refuses a limit of the address space below what a process has reserved."""
+
+    def refuse(*_: object) -> None:
+        raise ValueError("current limit exceeds maximum limit")
+
+    monkeypatch.setattr(resource, "setrlimit", refuse)
+    monkeypatch.setattr(Path, "exists", lambda self: False)
+    mat_file._limit_memory("file.mat")

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from netspec.exact import blas
+from netspec.exact import blas, machine
 from netspec.exact.blas import CAFFES, CORE_TYPE
 from netspec.net.net import Net
 from paths import ROOT
@@ -57,18 +57,42 @@ def test_scipy_linalg_is_complete_when_imported_afterwards() -> None:
     ("kernels", "exact", "said"),
     [
         ("Haswell", "all", ["Caffe's sums are computed by the kernels for Haswell, not SkylakeX (AVX-512)"]),
+        (None, "all", ["Caffe's sums are computed by another BLAS (accelerate), not OpenBLAS"]),
         ("SkylakeX", "all", []),
         ("Haswell", "small", []),
     ],
 )
 def test_other_kernels_are_reported(
-    kernels: str,
+    kernels: str | None,
     exact: str,
     said: list[str],
     net_of: Callable[..., Net],
     warnings: Callable[[], list[str]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(blas, "_pools", lambda: [SimpleNamespace(info=lambda: {"architecture": kernels})])
+    pools = [SimpleNamespace(info=lambda: {"architecture": kernels})] if kernels else []
+    monkeypatch.setattr(blas, "_pools", lambda: pools)
+    monkeypatch.setattr(blas, "name", lambda: "accelerate")
+    monkeypatch.setattr(machine, "_functions", lambda: "")
     net_of('layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 } } }', exact=exact)
     assert [line.partition(":")[0] for line in warnings()] == said
+
+
+def test_a_blas_other_than_openblas_has_no_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SciPy for macOS adds with Accelerate, even if another library has loaded an OpenBLAS."""
+    monkeypatch.setattr(blas, "name", lambda: "accelerate")
+    blas._pools.cache_clear()
+    try:
+        assert blas.kernels() == set()
+        assert "another BLAS (accelerate)" in machine.other_bits()
+    finally:
+        blas._pools.cache_clear()
+
+
+def test_functions_that_are_rounded_otherwise_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    digests = {**machine._GLIBCS, "exp": "1", "pow": "2"}
+    monkeypatch.setattr(machine, "digests", lambda: digests)
+    monkeypatch.setattr(blas, "kernels", lambda: {CAFFES})
+    assert machine.other_bits() == (
+        "this C library rounds exp, pow otherwise than glibc 2.36, with which Caffe was compared"
+    )

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from libm_bits import GLIBC_2_36, digest
-from netspec.exact import libm
+from netspec.exact import libm, machine
+from netspec.exact.machine import digests
 
 LIBRARY, VERSION = platform.libc_ver()  # ("glibc", "2.36"); of another C library ("", "")
 WIDE = np.array(
@@ -49,7 +49,23 @@ def test_tanh_of_a_million_floats_has_the_bits_of_glibc_2_36() -> None:
 
 @pytest.mark.skipif(LIBRARY != "glibc", reason="another C library may round differently")
 def test_the_functions_have_the_bits_of_the_golden_files() -> None:
-    assert digest() == GLIBC_2_36
+    assert digests() == machine._GLIBCS
+
+
+def test_exponential_of_large_floats_without_the_c_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows cannot look up a function of the program itself; then a double is rounded."""
+
+    def refuse(name: None) -> None:
+        raise TypeError("argument of type 'NoneType' is not iterable")
+
+    values = torch.tensor([88.5, 89, -1, 3])
+    expected = libm.exp(values)
+    monkeypatch.setattr(ctypes, "CDLL", refuse)
+    libm._expf.cache_clear()
+    try:
+        torch.testing.assert_close(libm.exp(values), expected, rtol=1e-7, atol=0)
+    finally:
+        libm._expf.cache_clear()
 
 
 @pytest.mark.skipif(

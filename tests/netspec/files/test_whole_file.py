@@ -69,7 +69,7 @@ def test_a_folder_that_cannot_be_synced_gives_one_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def refuse(path: Path) -> None:
-        raise PermissionError(errno.EACCES, "Access is denied")  # as on Windows
+        raise PermissionError(errno.EACCES, "Access is denied")
 
     monkeypatch.setattr(package, "_sync", refuse)
     monkeypatch.setattr(logging.getLogger(package.__name__), "propagate", True)
@@ -84,7 +84,10 @@ def test_a_folder_that_cannot_be_synced_gives_one_warning(
 
 
 def test_where_files_have_no_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(package, "fcntl", None)
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")  # as on some network file systems
+
+    monkeypatch.setattr(package.fcntl, "flock", refuse)
     with package.whole_file(tmp_path / "file") as unfinished:
         unfinished.write_text("new")
     with package.whole_folder(tmp_path / "folder") as unfinished:

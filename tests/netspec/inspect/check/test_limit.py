@@ -1,8 +1,11 @@
 """The limit of memory: nets and files above it are refused in one line, with the size, the layer and the place."""
 
+import ctypes
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -282,3 +285,17 @@ def test_a_pyramid_with_too_many_windows_is_refused(net_of: Callable[..., Net]) 
     spp = 'layer { name: "s" type: "SPP" bottom: "data" top: "s" spp_param { pyramid_height: 4000000000 } }'
     with pytest.raises(SpecError, match="pyramid_height must be at most 16, so that an int can count its windows"):
         net_of(INPUT + spp)
+
+
+def test_windows_reports_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    def report(pointer: Any) -> int:
+        status = pointer._obj
+        assert status.length == ctypes.sizeof(status) == 64
+        status.total = 3 * MIB
+        return 1
+
+    monkeypatch.delattr(os, "sysconf")
+    assert limits.memory() == 8 << 30
+    kernel = SimpleNamespace(GlobalMemoryStatusEx=report)
+    monkeypatch.setattr(ctypes, "windll", SimpleNamespace(kernel32=kernel), raising=False)
+    assert limits.memory() == 3 * MIB
