@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ import torch
 
 import netspec
 from golden_cases import set_parameters
+from netspec.export.formats.onnx import export_onnx
 from netspec.export.formats.shapes import NetShapes
+from netspec.export.formats.source import class_name
 from netspec.export.formats.torch import torch_source
-from netspec.export.formats.torch_code import class_name
 from netspec.net.net import Net
 from netspec.run.walk import Step, walk
 
@@ -99,6 +101,14 @@ def here(net: Net, inputs: Arrays) -> dict[str, np.ndarray]:
     """Return the outputs of the net itself."""
     with torch.no_grad():
         return {name: blob.numpy() for name, blob in net(**inputs).items()}
+
+
+def onnx_model(net: Net, **options: Any) -> tuple[Any, list[str]]:
+    """Return the exported ONNX model of a net, and its notes."""
+    onnx = pytest.importorskip("onnx", reason=ONNX_EXTRA)
+    with tempfile.TemporaryDirectory() as folder:
+        notes = export_onnx(net, Path(folder) / "net.onnx", **options)
+        return onnx.load(Path(folder) / "net.onnx"), notes
 
 
 def in_onnxruntime(model: Any, inputs: Arrays) -> dict[str, np.ndarray]:

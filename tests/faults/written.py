@@ -7,10 +7,10 @@ import json
 from pathlib import Path
 from xml.etree import ElementTree
 
+from exported import onnx_model
 from netspec.errors import SpecError
 from netspec.export.formats.convert import blob_tensors
 from netspec.export.formats.deploy import fold
-from netspec.export.formats.onnx import onnx_model
 from netspec.export.formats.pt2 import torch_module
 from netspec.export.formats.torch import torch_source
 from netspec.graph.filter import with_state

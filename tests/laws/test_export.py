@@ -1,6 +1,7 @@
 """Every layer type can be exported with the same results, or is refused with a reason."""
 
 import importlib.util
+import operator
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,15 +11,14 @@ import torch
 from google.protobuf import text_format
 from typing_extensions import override
 
-from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, run_module, source_module
+from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, onnx_model, run_module, source_module
 from laws.examples import EXAMPLES
 from laws.test_registry import TYPES, folder  # noqa: F401
 from netspec.errors import SpecError
-from netspec.export.exporter import EXPORTERS
+from netspec.export.exporter import EXPORTERS, exported, exporter_class, refusal
+from netspec.export.expression import Expression, Value
 from netspec.export.formats.deploy import with_inputs
-from netspec.export.formats.onnx import onnx_model
 from netspec.export.formats.pt2 import torch_module
-from netspec.export.table import exported, exporter_class, refusal
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer, layer_class
@@ -67,8 +67,6 @@ def test_exporters_are_registered_for_existing_classes() -> None:
 
 def test_a_class_outside_netspec_defines_its_own_export() -> None:
     class Doubled(Layer):
-        torch_call = "2 * {x}"
-
         @override
         def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
             return bottom_shapes
@@ -77,8 +75,12 @@ def test_a_class_outside_netspec_defines_its_own_export() -> None:
         def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
             return 2 * bottoms[0]
 
+        def to_torch(self, code: object, x: Expression) -> Expression:
+            return 2 * x
+
     layer = Doubled(LayerParameter(name="it", bottom=["x"], top=["y"]), [(1, 2)])
-    assert exported(layer, "torch_call") == "2 * {x}"
+    made = exported(layer, "to_torch")(None, Value(0))
+    assert (made.function, made.args[0]) == (operator.mul, 2)
     assert exported(layer, "to_onnx") is exported(layer, "onnx_op") is None
     assert str(refusal(layer, "ONNX")).endswith("cannot be exported to ONNX: its class does not support it")
 

@@ -6,13 +6,17 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import torch
+import torch.nn.functional as F
 from typing_extensions import override
 
-from netspec.export.exporter import Exporter, exports
+from netspec.export.exporter import Exporter, exports, rounded
+from netspec.export.expression import Expression, Plain, call, with_axes
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.export.layers.common import DropoutExport
 from netspec.export.layers.normalization import BatchNormExport
 from netspec.export.layers.vision import ConvolutionExport
-from netspec.export.targets import OnnxGraph, TorchCode, rounded
 from netspec.layers.vision import pooling, windows
 from netspec.proto.schema import TRAIN, value
 
@@ -28,17 +32,13 @@ class AxpyExport(Exporter):
             a = graph.node("Unsqueeze", a, graph.constant(missing))
         return graph.node("Add", graph.node("Mul", a, x), y)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        a, x, y = bottoms
-        missing = len(self.layer.bottom_shapes[1]) - len(self.layer.bottom_shapes[0])
-        if missing:
-            a = code.call(f"{{a}}[..., {', '.join(['None'] * missing)}]", a=a)
-        return code.call("{a} * {x} + {y}", a=a, x=x, y=y)
+    def to_torch(self, code: TorchCode, a: Expression, x: Expression, y: Expression) -> Expression:
+        return with_axes(a, len(self.layer.bottom_shapes[1]) - len(self.layer.bottom_shapes[0])) * x + y
 
 
 @exports("netspec.dialects.blocks.blocks.ShuffleChannel")
 class ShuffleChannelExport(Exporter):
-    torch_call = "F.channel_shuffle({x}, {group})"
+    torch_call = Plain(F.channel_shuffle, "group")
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         layer = self.layer
@@ -67,18 +67,18 @@ class InterpExport(Exporter):
         grid = {"mode": "linear", "coordinate_transformation_mode": "align_corners"}
         return graph.node("Resize", data, "", "", sizes, **grid)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        param, (x, *like) = value(self.layer.param, "interp_param"), bottoms
+    def to_torch(self, code: TorchCode, x: Expression, *like: Expression) -> Expression:
+        param = value(self.layer.param, "interp_param")
         cut = (param.pad_beg, param.pad_end) * 2
         if any(cut):
-            x = code.call("F.pad({x}, {cut})", x=x, cut=cut)
-        template = 'F.interpolate({x}, size={size}, mode="bilinear", align_corners=True)'
+            x = call(F.pad, x, cut)
         if like:
-            return code.call(template.replace("{size}", "{y}.shape[2:]"), x=x, y=like[0])
-        if None not in code.sizes(0)[2:] or param.HasField("height"):
-            return code.call(template, x=x, size=tuple(self.layer.top_shapes[0][2:]))
-        size = f"{code.function(zoomed_size)}({{x}}, {{shrink}}, {{zoom}})"
-        return code.call(template.replace("{size}", size), x=x, shrink=param.shrink_factor, zoom=param.zoom_factor)
+            size = like[0].shape[2:]
+        elif None not in code.sizes(0)[2:] or param.HasField("height"):
+            size = tuple(self.layer.top_shapes[0][2:])
+        else:
+            size = call(zoomed_size, x, param.shrink_factor, param.zoom_factor)
+        return call(F.interpolate, x, size=size, mode="bilinear", align_corners=True)
 
 
 @exports("netspec.dialects.blocks.blocks.DeephiResize")
@@ -95,13 +95,13 @@ class DeephiResizeExport(Exporter):
             grid = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
         return graph.node("Resize", bottoms[0], "", "", sizes, **grid)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        layer = self.layer
-        how = {"x": bottoms[0], "mode": repr("nearest" if layer.nearest else "bilinear")}
-        if layer.settings.new_height:
-            return code.call("F.interpolate({x}, {size}, mode={mode})", size=tuple(layer.top_shapes[0][2:]), **how)
-        template = "F.interpolate({x}, scale_factor={scales}, mode={mode}, recompute_scale_factor=True)"
-        return code.call(template, scales=(layer.settings.scale_h, layer.settings.scale_w), **how)
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        layer, p = self.layer, self.layer.settings
+        mode = "nearest" if layer.nearest else "bilinear"
+        if p.new_height:
+            return call(F.interpolate, x, tuple(layer.top_shapes[0][2:]), mode=mode)
+        scales = (p.scale_h, p.scale_w)
+        return call(F.interpolate, x, scale_factor=scales, mode=mode, recompute_scale_factor=True)
 
 
 @exports("netspec.dialects.blocks.filters.Convolution")
@@ -118,11 +118,10 @@ class PaddedConvolutionExport(ConvolutionExport):
             raise self.refusal("ONNX", "its filter is longer than the map")
         return super().to_onnx(graph, *bottoms)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        if any(self.layer.sides):
-            sides = tuple(self.layer.sides)
-            bottoms = tuple(code.call("F.pad({x}, {sides})", x=bottom, sides=sides) for bottom in bottoms)
-        return super().to_torch(code, *bottoms)
+    def to_torch(self, code: TorchCode, *bottoms: Expression) -> Sequence[Expression]:
+        sides = tuple(self.layer.sides)
+        padded = [call(F.pad, bottom, sides) for bottom in bottoms] if any(sides) else bottoms
+        return super().to_torch(code, *padded)
 
 
 @exports("netspec.dialects.blocks.filters.Pooling")
@@ -153,13 +152,13 @@ class ScaledDropoutExport(DropoutExport):
             return top
         return graph.node("Mul", *bottoms, graph.constant(1 - self.layer.ratio))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         layer = self.layer
         if value(layer.param.dropout_param, "scale_train"):
-            return super().to_torch(code, *bottoms)
+            return super().to_torch(code, x)
         if layer.phase == TRAIN:
             raise self.refusal("PyTorch", "torch's dropout scales in training, this one in testing")
-        return code.call("{x} * {kept}", x=bottoms[0], kept=1 - layer.ratio)
+        return x * (1 - layer.ratio)
 
 
 @exports("netspec.dialects.blocks.layout.CropCenter")
@@ -172,9 +171,9 @@ class CropCenterExport(Exporter):
         starts, ends = (graph.constant([sign * cuts[axis] for axis in axes]) for sign in (1, -1))
         return graph.node("Slice", bottoms[0], starts, ends, graph.constant(axes))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        parts = [f"{part.start}:-{part.start}" if part.start else ":" for part in self.layer.window]
-        return code.call(f"{{x}}[{', '.join(parts)}]", x=bottoms[0])
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        cuts = [part.start for part in self.layer.window]
+        return x[tuple(slice(cut, -cut) if cut else slice(None) for cut in cuts)]
 
 
 @exports("netspec.dialects.blocks.normalize.Normalize")
@@ -192,18 +191,15 @@ class NormalizeExport(Exporter):
             top = graph.node("Mul", top, graph.blob(0, shape))
         return top if layer.num_tops == 1 else [top, size]
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression | Sequence[Expression]:
         layer = self.layer
-        axes = len(layer.bottom_shapes[0])
+        axes, eps = len(layer.bottom_shapes[0]), rounded(layer.eps)
         over = tuple(range(1, axes)) if layer.across else 1
-        given = {"x": bottoms[0], "over": over, "eps": rounded(layer.eps)}
         if layer.blobs:
             shape = (*layer.blob_shapes[0], *(1,) * (axes - 2)) if layer.blob_shapes[0] else ()
-            template = f"{code.function(normalize)}({{x}}, {{scale}}, {{over}}, eps={{eps}})"
-            return code.call(template, scale=code.parameter(0, shape), **given)
-        size = code.call(f"{code.function(length)}({{x}}, {{over}}, {{eps}}, {layer.squares})", **given)
-        top = code.call("{x} / {size}", x=bottoms[0], size=size)
-        return top if layer.num_tops == 1 else [top, size]
+            return call(normalize, x, code.parameter(0, shape), over, eps=eps)
+        size = call(length, x, over, eps, layer.squares)
+        return x / size if layer.num_tops == 1 else [x / size, size]
 
 
 @exports("netspec.dialects.blocks.nvidia.BatchNorm")
@@ -216,22 +212,26 @@ class NvidiaBatchNormExport(BatchNormExport):
         shape = (layer.channels, *(1,) * (len(layer.bottom_shapes[0]) - 2))
         return graph.node("Add", graph.node("Mul", top, graph.blob(SLOPES, shape)), graph.blob(BIASES, shape))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         layer = self.layer
-        top = super().to_torch(code, *bottoms)
-        if not layer.scales:
+        top = super().to_torch(code, x)
+        if layer.use_global_stats or not layer.scales:
             return top
         shape = (layer.channels, *(1,) * (len(layer.bottom_shapes[0]) - 2))
-        slope, bias = code.parameter(SLOPES, shape, "slope"), code.parameter(BIASES, shape, "bias")
-        return code.call("{x} * {slope} + {bias}", x=top, slope=slope, bias=bias)
+        return top * code.parameter(SLOPES, shape, "slope") + code.parameter(BIASES, shape, "bias")
+
+    @override
+    def affine(self, code: TorchCode) -> dict[str, torch.Tensor]:
+        layer = self.layer
+        return {"weight": layer.blob(SLOPES), "bias": layer.blob(BIASES)} if layer.scales else super().affine(code)
 
 
 @exports("netspec.dialects.blocks.order.Reordered")
 class ReorderedExport(Exporter):
     onnx_op, onnx_attributes = "Transpose", ("perm",)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call(f"{{x}}.permute({', '.join(map(str, self.layer.perm))})", x=bottoms[0])
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        return x.permute(*self.layer.perm)
 
 
 @exports("netspec.dialects.blocks.relu6.Capped")
@@ -242,10 +242,8 @@ class CappedExport(Exporter):
         leaky = graph.node("LeakyRelu", *bottoms, alpha=self.layer.slope)
         return graph.node("Min", leaky, graph.constant(6.0))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.layer.slope == 0:
-            return code.call("F.relu6({x})", x=bottoms[0])
-        return code.call("F.leaky_relu({x}, {slope}).clamp(max=6)", x=bottoms[0], slope=self.layer.slope)
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        return call(F.relu6, x) if self.layer.slope == 0 else call(F.leaky_relu, x, self.layer.slope).clamp(max=6)
 
 
 def zoomed_size(x, shrink, zoom):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import torch.nn.functional as F
 
-from netspec.export.exporter import Exporter, exports
+from netspec.export.exporter import Exporter, exports, rounded
+from netspec.export.expression import Expression, call
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.export.layers.loss import onnx_normalized_sum
-from netspec.export.targets import OnnxGraph, TorchCode, rounded
 from netspec.layers.loss.base import BATCH_SIZE
 
 
@@ -44,20 +46,15 @@ class SmoothL1LossExport(Exporter):
             losses = graph.node("Mul", losses, aligned[2])
         return onnx_normalized_sum(graph, losses, "", BATCH_SIZE)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, *bottoms: Expression) -> Expression:
         layer = self.layer
         if len(set(layer.bottom_shapes)) > 1 or layer.by_pixel:
             raise self.refusal("PyTorch", "it is exported for bottoms of one shape, and not as R-FCN's")
-        knee = rounded(layer.knee)
-        if len(bottoms) == 2:
-            template = 'F.smooth_l1_loss({x}, {y}, beta={knee}, reduction="sum") / {x}.shape[0]'
-            return code.call(template, x=bottoms[0], y=bottoms[1], knee=knee)
-        template = f"{code.function(weighted_smooth_l1_loss)}({', '.join(bottoms)}, beta={{knee}})"
-        return code.call(template, knee=knee)
+        return call(smooth_l1_loss, *bottoms, beta=rounded(layer.knee))
 
 
-def weighted_smooth_l1_loss(predictions, targets, inside, outside=1.0, beta=1.0):
-    """Return the weighted sum of the smooth L1 losses of weighted differences, divided by N."""
+def smooth_l1_loss(predictions, targets, inside=1.0, outside=1.0, beta=1.0):
+    """Return the weighted sum of the smooth L1 losses of the differences, which may be weighted too, divided by N."""
     x, y = inside * predictions, inside * targets
     losses = F.smooth_l1_loss(x, y, beta=beta, reduction="none")
     return (outside * losses).sum() / predictions.shape[0]

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 
-from netspec.export.exporter import Exporter, exports
+import torch.nn.functional as F
+
+from netspec.export.exporter import Exporter, exports, rounded
+from netspec.export.expression import Expression, call
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.export.layers.normalization import onnx_normalized, torch_batch_norm
-from netspec.export.targets import OnnxGraph, TorchCode, rounded
 from netspec.proto.schema import value
 
 
@@ -27,25 +31,17 @@ class UpsampleExport(Exporter):
         empty = graph.node("Expand", graph.constant(0.0), shape)
         return graph.reshape_to_top(graph.node("ScatterElements", empty, mask, values, axis=2))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        layer = self.layer
+    def to_torch(self, code: TorchCode, x: Expression, *mask: Expression) -> Expression:
+        layer, param = self.layer, value(self.layer.param, "upsample_param")
         scale = (layer.scale_h, layer.scale_w)
-        if len(bottoms) == 1:
-            factor = layer.scale_h if layer.scale_h == layer.scale_w else scale
-            return code.call("F.interpolate({x}, scale_factor={factor})", x=bottoms[0], factor=factor)
-        if None in code.sizes(0)[2:] and value(layer.param, "upsample_param").HasField("upsample_h") is False:
-            cut = (
-                value(layer.param, "upsample_param").pad_out_h,
-                value(layer.param, "upsample_param").pad_out_w,
-            )
-            sides = [f"{{x}}.shape[{2 + k}] * {scale[k]}{' - 1' if cut[k] else ''}" for k in (0, 1)]
-            return code.call(
-                f"{code.function(unpool)}({{x}}, {{mask}}, ({', '.join(sides)}))", x=bottoms[0], mask=bottoms[1]
-            )
+        if not mask:
+            return call(F.interpolate, x, scale_factor=scale[0] if scale[0] == scale[1] else scale)
         size = tuple(layer.top_shapes[0][2:])
-        return code.call(
-            f"{code.function(unpool)}({{x}}, {{mask}}, {{size}})", x=bottoms[0], mask=bottoms[1], size=size
-        )
+        if None in code.sizes(0)[2:] and not param.HasField("upsample_h"):
+            cut = (param.pad_out_h, param.pad_out_w)
+            sides = [x.shape[2 + k] * scale[k] for k in (0, 1)]
+            size = tuple(side - 1 if cut[k] else side for k, side in enumerate(sides))
+        return call(unpool, x, *mask, size)
 
 
 @exports("netspec.dialects.segmentation.segnet.BN")
@@ -68,20 +64,18 @@ class BNExport(Exporter):
         normalized = onnx_normalized(graph, bottoms[0], len(layer.bottom_shapes[0]), layer.eps)
         return graph.node("Add", graph.node("Mul", normalized, slope), bias)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         layer = self.layer
         if layer.num_tops > 1:
             raise self.refusal("PyTorch", "it shows a batch's mean")
-        axes = len(layer.bottom_shapes[0])
-        shape, eps = (layer.channels, *(1,) * (axes - 2)), rounded(layer.eps)
+        axes, eps = len(layer.bottom_shapes[0]), rounded(layer.eps)
         if layer.by_batch or not layer.moving:
-            template = "F.batch_norm({x}, None, None, training=True, eps={eps})" if layer.by_batch else "{x}"
-            operands = {"y": code.parameter(0, shape, "slope"), "z": code.parameter(1, shape, "bias")}
-            return code.call(f"{template} * {{y}} + {{z}}", x=bottoms[0], eps=eps, **operands)
+            shape = (layer.channels, *(1,) * (axes - 2))
+            top = call(F.batch_norm, x, None, None, training=True, eps=eps) if layer.by_batch else x
+            return top * code.parameter(0, shape, "slope") + code.parameter(1, shape, "bias")
         weight, bias, mean, variance = (layer.blob(i).reshape(-1) for i in range(4))
         variance = variance.pow(-2) - layer.eps if layer.inverse else variance
-        norm = torch_batch_norm(code, axes, mean, variance, eps, weight=weight, bias=bias)
-        return code.call("{norm}({x})", norm=norm, x=bottoms[0])
+        return torch_batch_norm(code, axes, mean, variance, eps, weight=weight, bias=bias)(x)
 
 
 def unpool(x, mask, size):

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from netspec.export.exporter import Exporter, exports
-from netspec.export.targets import OnnxGraph, TorchCode, rounded
+from netspec.export.exporter import Exporter, exports, rounded
+from netspec.export.expression import Expression, call
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.proto.schema import value
 
 CENTER_SIZE, CORNER_SIZE = 2, 3  # netspec/dialects/ssd/ssd.py: enum PriorBoxParameter.CodeType
@@ -36,7 +38,7 @@ def onnx_decode(graph: OnnxGraph, codes: str, priors: str, variances: str | None
 
 @exports("netspec.dialects.ssd.detection.DetectionOutput")
 class DetectionOutputExport(Exporter):
-    def _exported(self, target: str, bottoms: Sequence[str]) -> Any:
+    def _exported(self, target: str, bottoms: Sequence[Any]) -> Any:
         """Return the parameters for an exported net; raise SpecError for unsupported ones."""
         param = value(self.layer.param, "detection_output_param")
         if param.nms_param.eta < 1:
@@ -142,13 +144,11 @@ class DetectionOutputExport(Exporter):
         rows = graph.node("Slice", rows, start, end, graph.constant([0]))
         return graph.node("Unsqueeze", rows, graph.constant([0, 1]))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, *bottoms: Expression) -> Expression:
         param = self._exported("PyTorch", bottoms)
         nms = param.nms_param
         if param.code_type != CENTER_SIZE or not param.share_location:
             raise self.refusal("PyTorch", "it is exported for code_type: CENTER_SIZE and share_location: true")
-        code.function(decode_boxes)
-        code.function(suppressed)
         options = {
             "classes": param.num_classes,
             "background": param.background_label_id,
@@ -158,9 +158,7 @@ class DetectionOutputExport(Exporter):
             **({"most": param.keep_top_k} if param.keep_top_k > -1 else {}),
             **({"encoded": True} if param.variance_encoded_in_target else {}),
         }
-        given = ", ".join(f"{name}={{{name}}}" for name in options)
-        template = f"{code.function(detection_output)}({', '.join(bottoms[:3])}, {given})"
-        return code.call(template, **options)
+        return call(detection_output, *bottoms[:3], **options)
 
 
 @exports("netspec.dialects.ssd.priors.PriorBox")
@@ -203,23 +201,19 @@ class PriorBoxExport(Exporter):
         variances = graph.node("Expand", graph.constant(layer.variances), graph.shape_of(boxes))
         return graph.node("Concat", *(graph.reshape(part, [1, 1, -1]) for part in (boxes, variances)), axis=1)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression, *image: Expression) -> Expression:
         layer = self.layer
         param = value(layer.param, "prior_box_param")
         if param.denser_prior_boxes:
             raise self.refusal("PyTorch", "it has denser_prior_boxes")
-        image = code.call("{image}", image=layer.image) if layer.image else code.call("{y}.shape[2:]", y=bottoms[1])
-        sizes = [(rounded(float(width)), rounded(float(height))) for width, height in layer.sizes]
         options = {
-            "sizes": sizes,
+            "sizes": [(rounded(float(width)), rounded(float(height))) for width, height in layer.sizes],
             "variances": tuple(rounded(float(v)) for v in layer.variances),
             **({"step": layer.step} if layer.step else {}),
             **({"offset": rounded(param.offset)} if param.offset != 0.5 else {}),
             **({"clip": True} if param.clip else {}),
         }
-        given = ", ".join(f"{name}={{{name}}}" for name in options)
-        template = f"{code.function(prior_boxes)}({{x}}, {{image}}, {given})"
-        return code.call(template, x=bottoms[0], image=image, **options)
+        return call(prior_boxes, x, layer.image or image[0].shape[2:], **options)
 
 
 def decode_boxes(codes, priors, variances):

@@ -14,9 +14,9 @@ from netspec.data.blobs import Shape
 from netspec.export.engines.choice import Choice
 from netspec.export.engines.model import Model, Origin
 from netspec.export.engines.runners import Unable, warn_unable
+from netspec.export.exporter import layer_notes
 from netspec.export.formats.convert import Source
 from netspec.export.formats.onnx import export_onnx
-from netspec.export.table import layer_notes
 from netspec.graph.options import TORCH, BuildOptions
 from netspec.graph.plan import origins
 from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias

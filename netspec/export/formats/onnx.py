@@ -14,10 +14,9 @@ import numpy as np
 import torch
 
 from netspec.errors import SpecError
+from netspec.export.exporter import exported, layer_notes, refusal
 from netspec.export.formats.preprocess import Preprocess
-from netspec.export.formats.shapes import Fixed, NetShapes, settled
-from netspec.export.table import exported, layer_notes, refusal
-from netspec.export.targets import OnnxGraph, Sizes
+from netspec.export.formats.shapes import Fixed, NetShapes, Sizes, settled
 from netspec.files.whole_file import whole_file, write_whole
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import values_of
@@ -53,7 +52,9 @@ def export_onnx(
     Weights of more than ``largest`` bytes are in a file next to it: ``path`` with ``.data`` appended.
     Raises SpecError if a layer cannot be exported or the file cannot be written.
     """
-    writer, notes = _written(net, preprocess)
+    _onnx()
+    writer, shapes = settled(net, lambda shapes: _Writer(net, shapes, preprocess))
+    notes = [*shapes.fixed, *layer_notes(net.layers)]
     path = Path(path)
     if sum(array.nbytes for array in writer.initializers.values()) <= largest:
         write_whole(path, writer.model(metadata or {}).SerializeToString())
@@ -64,20 +65,6 @@ def export_onnx(
             model = writer.model(metadata or {}, _DataFile(file, data.name))
         unfinished.write_bytes(model.SerializeToString())
     return [*notes, f"the weights are in {data.name}, next to the model"]
-
-
-def onnx_model(
-    net: Net, metadata: Mapping[str, str] | None = None, preprocess: Preprocess | None = None
-) -> tuple[Any, list[str]]:
-    """Return an onnx.ModelProto of a net, and notes for the user, as lines."""
-    writer, notes = _written(net, preprocess)
-    return writer.model(metadata or {}), notes
-
-
-def _written(net: Net, preprocess: Preprocess | None) -> tuple[_Writer, list[str]]:
-    _onnx()
-    writer, shapes = settled(net, lambda shapes: _Writer(net, shapes, preprocess))
-    return writer, [*shapes.fixed, *layer_notes(net.layers)]
 
 
 def _write_layer(layer: Layer, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
@@ -118,7 +105,7 @@ class _Writer:
         self._constants: dict[bytes, str] = {}
         self._blobs: dict[tuple[int, tuple[int, ...]], str] = {}  # by address and shape
         for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
-            tops = _write_layer(layer, _LayerGraph(self, i), *(self.values[v] for v in node.bottoms))
+            tops = _write_layer(layer, OnnxGraph(self, i), *(self.values[v] for v in node.bottoms))
             named = (tops,) if isinstance(tops, str) else tops
             self.values.update(zip(node.tops, named, strict=False))
 
@@ -249,35 +236,45 @@ def _value_info(name: str, dtype: Any, sizes: Sequence[int | str]) -> Any:
 
 
 class _Steps:
-    """Nodes and constants: the part of :class:`netspec.export.targets.OnnxGraph` that needs no layer."""
+    """Nodes and constants: the part of :class:`OnnxGraph` that needs no layer."""
 
     def __init__(self, writer: _Writer, name: str) -> None:
         self.writer, self.name = writer, name
 
     def node(self, op: str, *inputs: str, **attributes: Any) -> str:
+        """Add a node of one output and return the output. An empty input is one that is left out."""
         return self.writer.add(op, inputs, 1, self.name, attributes)[0]
 
     def nodes(self, op: str, *inputs: str, outputs: int, **attributes: Any) -> tuple[str, ...]:
+        """Add a node of several outputs and return them."""
         return tuple(self.writer.add(op, inputs, outputs, self.name, attributes))
 
     def constant(self, values: Any) -> str:
+        """Return a constant: numbers, lists or arrays. Whole numbers become int64, other numbers float32."""
         array = values_of(values).cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
         if array.dtype != bool:
             array = array.astype(np.int64 if array.dtype.kind in "iu" else np.float32)
         return self.writer.store(array, f"{self.name}/constant")
 
     def shape_of(self, value: str, start: int = 0, end: int | None = None) -> str:
+        """Return the sizes of the axes from ``start`` to ``end`` of a value, as they are when the net runs."""
         return self.node("Shape", value, start=start, **({} if end is None else {"end": end}))
 
     def reshape(self, value: str, sizes: Sequence[int]) -> str:
+        """Return the value in another shape; 0 copies the size of the same axis, one -1 is inferred."""
         return self.node("Reshape", value, self.constant(list(sizes)))
 
     def cast(self, value: str, dtype: str) -> str:
+        """Return the value as ``float32``, ``int64`` or ``bool``."""
         return self.node("Cast", value, to=CAST_TO[dtype])
 
 
-class _LayerGraph(_Steps):
-    """See :class:`netspec.export.targets.OnnxGraph`."""
+class OnnxGraph(_Steps):
+    """The ONNX graph that is being written, as one layer sees it. Values are known by name.
+
+    Bottoms and tops are known by their index in the layer. Sizes that the caller of the exported net may choose are
+    None; a layer that needs such a size as a number asks for it with :meth:`size`, which fixes it.
+    """
 
     def __init__(self, writer: _Writer, index: int) -> None:
         self.layer: Layer = writer.net.layers[index]
@@ -286,23 +283,28 @@ class _LayerGraph(_Steps):
         super().__init__(writer, self.plan_node.name)
 
     def blob(self, index: int, shape: Sequence[int] | None = None) -> str:
+        """Return a learned blob of the layer, in its own shape or in another of as many elements."""
         wanted = self.layer.blob_shapes[index] if shape is None else tuple(shape)
         return self.writer.store_blob(self.layer.blob(index), wanted, f"{self.name}.{index}")
 
     def input(self, top: int) -> str:
+        """Return a new input of the whole net, for a top that its caller gives."""
         value = self.plan_node.tops[top]
         return self.writer.add_input(value, self.writer.net.plan.blobs[value])
 
     def sizes(self, bottom: int) -> Sizes:
+        """Return the shape of a bottom."""
         return self.shapes.sizes(self.plan_node.bottoms[bottom])
 
     def size(self, bottom: int, axis: int, why: str) -> int:
+        """Return the size of an axis of a bottom; if it was free, it is fixed, and the user sees ``why``."""
         value = self.plan_node.bottoms[bottom]
         if self.shapes.chosen(value, axis):
             raise Fixed(value, axis, f'layer "{self.name}" ({self.layer.type}): {why}')
         return self.shapes.built[value][axis]
 
     def reshape_to_top(self, value: str, top: int = 0) -> str:
+        """Return the value in the shape of a top of the layer, whatever the free sizes are."""
         number = self.plan_node.tops[top] if top < len(self.plan_node.tops) else -1
         sizes = list(self.layer.top_shapes[top]) if number < 0 else list(self.shapes.sizes(number))
         free = [axis for axis, size in enumerate(sizes) if size is None]

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from tokenize import TokenError
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from netspec.data.mean import center, read_mean
 from netspec.errors import SpecError, Where
-from netspec.export.targets import Sizes
+
+if TYPE_CHECKING:
+    from netspec.export.formats.shapes import Sizes  # which imports torch
 
 
 @dataclass(frozen=True)

@@ -1,39 +1,28 @@
 """``--to pt2``: writes a net as a torch.export archive, which computes the same as the exported source.
 
-It does not write and run source: the expressions of the layers are parsed and computed one by one.
+It does not write and run source: the expressions of the layers are evaluated one by one.
 """
 
 from __future__ import annotations
 
-import ast
 import inspect
 import io
-import math
-import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import nn
 
 from netspec.errors import SpecError, Where
-from netspec.export.formats.shapes import NetShapes, input_shapes, settled
-from netspec.export.formats.torch_code import MARK, Definition, check_shapes, legal, unique, write_definition
-from netspec.export.table import layer_notes
+from netspec.export.exporter import layer_notes
+from netspec.export.expression import TRAINING, Submodule, evaluate
+from netspec.export.formats.shapes import NetShapes, check_shapes, input_shapes, settled
+from netspec.export.formats.source import legal, unique
+from netspec.export.formats.torch_code import Definition, write_definition
 from netspec.files.whole_file import whole_file
 from netspec.net.net import Net
 from netspec.proto.schema import TRAIN
-
-OPERATORS: dict[type, Callable[..., Any]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.USub: operator.neg,
-    ast.NotEq: operator.ne,
-}
 
 
 def export_pt2(net: Net, path: str | Path) -> list[str]:
@@ -89,23 +78,17 @@ class _Defined(nn.Module):
     def __init__(self, definition: Definition, expected: Mapping[str, tuple[int | str, ...]]) -> None:
         super().__init__()
         self.definition, self.expected = definition, expected
-        self.attributes = definition.attributes()
-        libraries = {"torch": torch, "nn": nn, "F": F, "math": math}
-        self.known = {**libraries, **definition.functions}
-        state = {}
-        for m, attribute in self.attributes.items():
-            module = definition.modules[m]
-            made = _value(_parsed(module.constructor()), libraries)
-            if module.kind == "buffer":
-                self.register_buffer(attribute, made)
+        for stored, name in definition.attributes.items():
+            if isinstance(stored, Submodule):
+                setattr(self, name, stored.cls(*stored.args, **stored.options))
+            elif stored.learned:
+                setattr(self, name, nn.Parameter(torch.zeros(stored.values.shape)))
             else:
-                setattr(self, attribute, made)
-            state.update(module.tensors(attribute))
-        self.load_state_dict(state)
-        self.steps = [(statement.targets, _parsed(statement.expression)) for statement in definition.statements]
+                self.register_buffer(name, torch.zeros(stored.values.shape))
+        self.load_state_dict(definition.state())
 
-        taken = set(definition.functions)
-        arguments = [unique(legal(definition.names[v], "blob_"), taken) for v in definition.inputs]
+        taken: set[str] = set()
+        arguments = [unique(legal(definition.blobs[v], "blob_"), taken) for v in definition.inputs]
         kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
         self.signature = inspect.Signature([inspect.Parameter(name, kind) for name in arguments])
 
@@ -119,45 +102,12 @@ class _Defined(nn.Module):
         """Return the output, or a dict of the outputs if there are several."""
         definition = self.definition
         check_shapes(self.expected, *inputs)
-        names = {**self.known, "self": self, **{f"v{v}": x for v, x in zip(definition.inputs, inputs, strict=True)}}
-        names.update({f"m{m}": getattr(self, attribute) for m, attribute in self.attributes.items()})
-        for targets, expression in self.steps:
-            made = _value(expression, names)
-            names.update({f"v{v}": x for v, x in zip(targets, made if len(targets) > 1 else (made,), strict=True)})
-        outputs = {name: names[f"v{v}"] for name, v in definition.outputs.items()}
+        known: dict[Any, Any] = {each: getattr(self, name) for each, name in definition.attributes.items()}
+        known[TRAINING] = self.training
+        known.update((definition.values[v], x) for v, x in zip(definition.inputs, inputs, strict=True))
+        for targets, expression in definition.statements:
+            made = evaluate(expression, known)
+            tops = made if len(targets) > 1 else (made,)
+            known.update((definition.values[v], x) for v, x in zip(targets, tops, strict=True))
+        outputs = {name: known[definition.values[v]] for name, v in definition.outputs.items()}
         return outputs if len(outputs) != 1 else next(iter(outputs.values()))
-
-
-def _parsed(expression: str) -> ast.expr:
-    """Return the syntax tree of an expression, with names such as v3 for its marks."""
-    return ast.parse(MARK.sub(r"\1\2", expression), mode="eval").body
-
-
-def _value(node: ast.AST | None, names: Mapping[str, Any]) -> Any:
-    """Return the value of an expression, for the kinds of expressions that layers write."""
-    match node:
-        case None | ast.Constant():
-            return None if node is None else node.value
-        case ast.Name():
-            return names[node.id]
-        case ast.Attribute():
-            return getattr(_value(node.value, names), node.attr)
-        case ast.Tuple():
-            return tuple(_value(each, names) for each in node.elts)
-        case ast.List():
-            return [_value(each, names) for each in node.elts]
-        case ast.Subscript():
-            return _value(node.value, names)[_value(node.slice, names)]
-        case ast.Slice():
-            return slice(_value(node.lower, names), _value(node.upper, names), _value(node.step, names))
-        case ast.UnaryOp():
-            return OPERATORS[type(node.op)](_value(node.operand, names))
-        case ast.BinOp():
-            return OPERATORS[type(node.op)](_value(node.left, names), _value(node.right, names))
-        case ast.Compare(ops=[operation], comparators=[right]):
-            return OPERATORS[type(operation)](_value(node.left, names), _value(right, names))
-        case ast.Call():
-            arguments = [_value(each, names) for each in node.args]
-            options = {keyword.arg: _value(keyword.value, names) for keyword in node.keywords if keyword.arg}
-            return _value(node.func, names)(*arguments, **options)
-    raise AssertionError(f"a layer wrote {ast.dump(node)}")

@@ -12,9 +12,9 @@ from typing import TypeVar
 
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where
-from netspec.export.targets import Sizes
 from netspec.net.net import Net
 
+Sizes = tuple[int | None, ...]  # a shape; None where the size is known only when the exported net runs
 Shapes = tuple[Shape, ...]  # by value number of the Plan
 Axis = tuple[int, int]  # value number, axis
 T = TypeVar("T")
@@ -143,6 +143,18 @@ def input_shapes(net: Net, shapes: NetShapes) -> dict[str, tuple[int | str, ...]
             found[net.plan.blobs[v]] = tuple(sizes)
     _propagate(net, {})
     return found
+
+
+def check_shapes(expected, *inputs):
+    """Raise an error for inputs of other shapes. A name stands for any size, and equal names for equal sizes."""
+    sizes = {}
+    for (name, shape), x in zip(expected.items(), inputs, strict=True):
+        for size, wanted in zip(x.shape, shape, strict=False):
+            if isinstance(wanted, str):
+                sizes.setdefault(wanted, size)
+        shape = tuple(sizes.get(wanted, wanted) for wanted in shape)
+        if tuple(x.shape) != shape:
+            raise ValueError(f"{name} has shape {tuple(x.shape)}, expected {shape}")
 
 
 def _input_sizes(net: Net) -> dict[str, tuple[Axis, ...]]:

@@ -6,7 +6,7 @@ origin mentions this project. The module computes the same as the net.
 
 from __future__ import annotations
 
-import inspect
+import itertools
 import json
 import re
 import textwrap
@@ -16,22 +16,24 @@ from pathlib import Path
 import torch
 
 from netspec.errors import SpecError
-from netspec.export.formats.shapes import NetShapes, input_shapes, settled
-from netspec.export.formats.torch_code import (
-    MARK,
+from netspec.export.exporter import layer_notes
+from netspec.export.expression import Call, Stored, Submodule, Value, parts
+from netspec.export.formats.shapes import NetShapes, check_shapes, input_shapes, settled
+from netspec.export.formats.source import (
     WIDTH,
-    Definition,
-    Module,
-    check_shapes,
+    Parts,
+    Printed,
+    Source,
     class_name,
+    copied,
     lay_out,
     legal,
-    number,
     quoted,
+    source_of,
+    text_of,
     unique,
-    write_definition,
 )
-from netspec.export.table import layer_notes
+from netspec.export.formats.torch_code import Definition, write_definition
 from netspec.files.whole_file import whole_file
 from netspec.net.net import Net
 
@@ -74,12 +76,10 @@ def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: Mappi
 def torch_source(net: Net, origin: str = "a prototxt") -> tuple[str, dict[str, torch.Tensor], list[str]]:
     """Return a net as PyTorch source, the state_dict of its class, and notes for the user, as lines."""
     definition, shapes = settled(net, lambda shapes: write_definition(net, shapes))
-    attributes = definition.attributes()
-    body = _parts(net, definition, attributes, shapes)
+    body = _parts(net, definition, shapes)
     header = " ".join(f"{net.name or 'A net'}, converted from {origin}".split())
     header = header if len(header) < WIDTH - 8 else header[: WIDTH - 12] + "..."
     imports = [
-        *(["import math"] if "math." in body else []),
         "from pathlib import Path",
         "",
         "import torch",
@@ -88,39 +88,37 @@ def torch_source(net: Net, origin: str = "a prototxt") -> tuple[str, dict[str, t
         "from torch import nn",
     ]
     text = "\n".join([f'""{quoted(f"{header}.")}""', "", *imports, "", "", body, ""])
-    state: dict[str, torch.Tensor] = {}
-    for m, attribute in attributes.items():
-        state.update(definition.modules[m].tensors(attribute))
-    return text, state, [*shapes.fixed, *layer_notes(net.layers)]
+    return text, definition.state(), [*shapes.fixed, *layer_notes(net.layers)]
 
 
-def _parts(net: Net, definition: Definition, attributes: Mapping[int, str], shapes: NetShapes) -> str:
+def _parts(net: Net, definition: Definition, shapes: NetShapes) -> str:
     """Return the file below its imports: functions, the class, and code that loads and runs it."""
     name, expected = class_name(net.name or "net"), input_shapes(net, shapes)
+    source = Source({stored: f"self.{attribute}" for stored, attribute in definition.attributes.items()})
+    functions = copied(part for _, expression in definition.statements for part in parts(expression))
     if expected:
-        definition.functions[check_shapes.__name__] = check_shapes
-    taken = set(definition.functions)
-    inputs = {v: unique(legal(definition.names[v], "blob_"), taken) for v in definition.inputs}
-    takes = ", ".join(f"{definition.names[v]} {_shape(shapes, v)}" for v in inputs)
+        functions[check_shapes.__name__] = check_shapes
+    taken = set(functions)
+    inputs = {v: unique(legal(definition.blobs[v], "blob_"), taken) for v in definition.inputs}
+    takes = ", ".join(f"{definition.blobs[v]} {_shape(shapes, v)}" for v in inputs)
     gives = ", ".join(f"{blob} {_shape(shapes, v)}" for blob, v in net.plan.outputs.items())
-    example = ", ".join(f"torch.zeros({', '.join(map(str, shapes.built[v]))})" for v in inputs)
+    example: Printed = source.arguments([Call(torch.zeros, shapes.built[v], {}) for v in inputs], {})
     head = f"    def forward(self, {', '.join(inputs.values())}):"
     if len(head) > WIDTH:
-        head = (
-            "\n        ".join(["    def forward(", "self,", *(f"{given}," for given in inputs.values())]) + "\n    ):"
-        )
+        head = "\n        ".join(["    def forward(", "self,", *(f"{each}," for each in inputs.values())]) + "\n    ):"
     lines = [f"class {name}(nn.Module):", *_docstring(f"{takes} -> {gives}."), ""]
     if expected:
-        lines += ["    expected = {", *(f"        {quoted(b)}: {number(s)}," for b, s in expected.items()), "    }", ""]
-    if attributes:
+        sizes = [f"        {quoted(blob)}: {text_of(source.of(shape))}," for blob, shape in expected.items()]
+        lines += ["    expected = {", *sizes, "    }", ""]
+    if definition.attributes:
         lines += ["    def __init__(self):", "        super().__init__()"]
-        for m, attribute in attributes.items():
-            lines += lay_out(_constructed(definition.modules[m], attribute), 8)
+        made = [_made(source, stored, attribute) for stored, attribute in definition.attributes.items()]
+        lines += itertools.chain(*made)
         lines += [""]
     lines.append(head)
     if expected:
-        lines += lay_out(f"check_shapes(self.expected, {', '.join(inputs.values())})", 8)
-    lines += _forward(definition, inputs, attributes)
+        lines += lay_out(["check_shapes(", Parts([["self.expected"], *([each] for each in inputs.values())]), ")"], 8)
+    lines += _forward(definition, source, inputs, set(functions))
     load = [
         'def load(weights=Path(__file__).with_suffix(".safetensors")):',
         '    """Return the net with its trained weights, for inference."""',
@@ -128,13 +126,13 @@ def _parts(net: Net, definition: Definition, attributes: Mapping[int, str], shap
         "    net.load_state_dict(load_file(weights))",
         "    return net.eval()",
     ]
-    main = ['if __name__ == "__main__":', *lay_out(f"outputs = load()({example})", 4)]
+    main = ['if __name__ == "__main__":', *lay_out(["outputs = load()", *example], 4)]
     if len(definition.outputs) > 1:
         main += ["    for name, output in outputs.items():", "        print(name, tuple(output.shape))"]
     else:
-        main += lay_out(f"print({quoted(next(iter(definition.outputs), ''))}, tuple(outputs.shape))", 4)
-    functions = [textwrap.dedent(inspect.getsource(each)).strip() for each in definition.functions.values()]
-    return "\n\n\n".join([*functions, *("\n".join(part) for part in (lines, load, main))])
+        shown = Parts([[quoted(next(iter(definition.outputs), ""))], ["tuple(outputs.shape)"]])
+        main += lay_out(["print(", shown, ")"], 4)
+    return "\n\n\n".join([*map(source_of, functions.values()), *("\n".join(part) for part in (lines, load, main))])
 
 
 def _shape(shapes: NetShapes, value: int) -> str:
@@ -152,24 +150,29 @@ def _docstring(text: str) -> list[str]:
     return ['    """Inputs and outputs.', "", *(f"    {line}" for line in wrapped), '    """']
 
 
-def _constructed(module: Module, attribute: str) -> str:
-    call = module.constructor()
-    if module.kind == "buffer":
-        return f'self.register_buffer("{attribute}", {call})'
-    return f"self.{attribute} = {call}"
+def _made(source: Source, stored: Stored | Submodule, attribute: str) -> list[str]:
+    """Return the statement that makes a submodule, a parameter or a buffer, as lines."""
+    if isinstance(stored, Submodule):
+        return lay_out([f"self.{attribute} = ", *source.constructor(stored)], 8)
+    zeros = source.of(Call(torch.zeros, (tuple(stored.values.shape),), {}))
+    if stored.learned:
+        return lay_out([f"self.{attribute} = nn.Parameter(", Parts([zeros]), ")"], 8)
+    return lay_out(["self.register_buffer(", Parts([[quoted(attribute)], zeros]), ")"], 8)
 
 
-def _forward(definition: Definition, inputs: Mapping[int, str], attributes: Mapping[int, str]) -> list[str]:
+def _forward(definition: Definition, source: Source, inputs: Mapping[int, str], taken: set[str]) -> list[str]:
     """Return the statements of the forward method, as lines.
 
     A value that only the next statement reads is named ``x``, so that its memory is freed. Others have the name
     of their blob.
     """
-    names, statements = dict(inputs), definition.statements
+    statements, names = definition.statements, source.names
+    names.update({definition.values[v]: name for v, name in inputs.items()})
     readers: dict[int, list[int]] = {}
-    for i, statement in enumerate(statements):
-        for v in statement.values():
-            readers.setdefault(v, []).append(i)
+    for i, (_, expression) in enumerate(statements):
+        for part in parts(expression):
+            if isinstance(part, Value):
+                readers.setdefault(part.number, []).append(i)
     for v in definition.outputs.values():
         readers.setdefault(v, []).append(len(statements))
     holder = {name: v for v, name in inputs.items()}
@@ -178,19 +181,19 @@ def _forward(definition: Definition, inputs: Mapping[int, str], attributes: Mapp
         return name not in holder or max(readers.get(holder[name], [-1])) <= i
 
     lines: list[str] = []
-    for i, statement in enumerate(statements):
-        expression = MARK.sub(
-            lambda m: names[int(m[2])] if m[1] == "v" else f"self.{attributes[int(m[2])]}", statement.expression
-        )
-        for v in statement.targets:
-            wanted = legal(definition.names[v], "blob_")
-            wanted = f"{wanted}_" if wanted in definition.functions else wanted
+    for i, (targets, expression) in enumerate(statements):
+        printed = source.of(expression)
+        made = []
+        for v in targets:
+            wanted = legal(definition.blobs[v], "blob_")
+            wanted = f"{wanted}_" if wanted in taken else wanted
             passed = set(readers.get(v, [])) == {i + 1}
             candidates = [*("x", "y")[: 2 * passed], wanted, *(f"{wanted}_{k}" for k in range(2, 1000))]
-            names[v] = next(name for name in candidates if free(name, i)) if v in readers else "_"
-            holder[names[v]] = v
-        lines += lay_out(f"{', '.join(names[v] for v in statement.targets)} = {expression}", 8)
-    if len(definition.outputs) == 1:
-        return [*lines, f"        return {names[next(iter(definition.outputs.values()))]}"]
-    pairs = [f"            {quoted(name)}: {names[v]}," for name, v in definition.outputs.items()]
-    return [*lines, "        return {", *pairs, "        }"]
+            made.append(next(name for name in candidates if free(name, i)) if v in readers else "_")
+            names[definition.values[v]] = made[-1]
+            holder[made[-1]] = v
+        lines += lay_out([f"{', '.join(made)} = ", *printed], 8)
+    outputs = {name: names[definition.values[v]] for name, v in definition.outputs.items()}
+    if len(outputs) == 1:
+        return [*lines, f"        return {next(iter(outputs.values()))}"]
+    return [*lines, "        return {", *(f"            {quoted(n)}: {x}," for n, x in outputs.items()), "        }"]

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import math
 
+import torch
+import torch.nn.functional as F
+from torch import nn
+
 from netspec.export.exporter import Exporter, exports
-from netspec.export.targets import OnnxGraph, TorchCode
+from netspec.export.expression import Expression, Plain, call
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.layers.activation import BNLL, ELU, Clip, PReLU, ReLU, Sigmoid, Swish, TanH, Threshold
 
 
@@ -16,12 +22,10 @@ def scaled_and_shifted(graph: OnnxGraph, value: str, scale: float, shift: float)
     return graph.node("Add", value, graph.constant(float(shift))) if shift else value
 
 
-def torch_scaled_and_shifted(code: TorchCode, value: str, scale: float, shift: float) -> str:
-    """Return the expression of scale value + shift, without parts that have no effect."""
-    template = ("{scale} * {x}" if scale != 1 else "{x}") + (
-        " + {shift}" if shift > 0 else " - {shift}" if shift else ""
-    )
-    return code.call(template, x=value, scale=float(scale), shift=abs(float(shift)))
+def torch_scaled_and_shifted(x: Expression, scale: float, shift: float) -> Expression:
+    """Return scale x + shift, without parts that have no effect."""
+    x = float(scale) * x if scale != 1 else x
+    return x + float(shift) if shift > 0 else x - abs(float(shift)) if shift else x
 
 
 @exports(ReLU)
@@ -33,10 +37,8 @@ class ReLUExport(Exporter):
             else graph.node("Relu", *bottoms)
         )
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.layer.slope:
-            return code.call("F.leaky_relu({x}, {slope})", x=bottoms[0], slope=self.layer.slope)
-        return code.call("F.relu({x})", x=bottoms[0])
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        return call(F.leaky_relu, x, self.layer.slope) if self.layer.slope else call(F.relu, x)
 
 
 @exports(PReLU)
@@ -47,43 +49,41 @@ class PReLUExport(Exporter):
         spatial = len(layer.bottom_shapes[0]) - 2
         return graph.node("PRelu", *bottoms, graph.blob(0, (slopes, *(1,) * (spatial if layer.blob_shapes[0] else 0))))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         slopes = self.layer.blob(0).reshape(-1)
-        slope = code.module("nn.PReLU({channels})", {"weight": slopes}, channels=len(slopes))
-        return code.call("{slope}({x})", slope=slope, x=bottoms[0])
+        return code.module(nn.PReLU, len(slopes), state={"weight": slopes})(x)
 
 
 @exports(ELU)
 class ELUExport(Exporter):
     onnx_op, onnx_attributes = "Elu", ("alpha",)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.layer.alpha == 1:
-            return code.call("F.elu({x})", x=bottoms[0])
-        return code.call("F.elu({x}, alpha={alpha})", x=bottoms[0], alpha=self.layer.alpha)
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        return call(F.elu, x) if self.layer.alpha == 1 else call(F.elu, x, alpha=self.layer.alpha)
 
 
 @exports(Sigmoid)
 class SigmoidExport(Exporter):
-    onnx_op, torch_call = "Sigmoid", "torch.sigmoid({x})"
+    onnx_op, torch_call = "Sigmoid", Plain(torch.sigmoid)
 
 
 @exports(TanH)
 class TanHExport(Exporter):
-    onnx_op, torch_call = "Tanh", "torch.tanh({x})"
+    onnx_op, torch_call = "Tanh", Plain(torch.tanh)
 
 
 @exports(BNLL)
 class BNLLExport(Exporter):
-    onnx_op, torch_call = "Softplus", "F.softplus({x})"
+    onnx_op, torch_call = "Softplus", Plain(F.softplus)
 
 
 @exports(Threshold)
 class ThresholdExport(Exporter):
-    torch_call = "torch.gt({x}, {threshold}).to({x}.dtype)"
-
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.cast(graph.node("Greater", *bottoms, graph.constant(self.layer.threshold)), "float32")
+
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        return call(torch.gt, x, self.layer.threshold).to(x.dtype)
 
 
 @exports(Clip)
@@ -92,10 +92,8 @@ class ClipExport(Exporter):
         layer = self.layer
         return graph.node("Clip", *bottoms, graph.constant(layer.low), graph.constant(max(layer.low, layer.high)))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        layer = self.layer
-        high = max(layer.low, layer.high)
-        return code.call("torch.clamp({x}, {low}, {high})", x=bottoms[0], low=layer.low, high=high)
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        return call(torch.clamp, x, self.layer.low, max(self.layer.low, self.layer.high))
 
 
 @exports(Swish)
@@ -104,7 +102,6 @@ class SwishExport(Exporter):
         gate = graph.node("Sigmoid", scaled_and_shifted(graph, bottoms[0], self.layer.beta, 0))
         return graph.node("Mul", *bottoms, gate)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if self.layer.beta == 1:
-            return code.call("F.silu({x})", x=bottoms[0])
-        return code.call("{x} * torch.sigmoid({beta} * {x})", x=bottoms[0], beta=self.layer.beta)
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        beta = self.layer.beta
+        return call(F.silu, x) if beta == 1 else x * call(torch.sigmoid, beta * x)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import torch
 from torch.nn import functional as F
 
-from netspec.export.exporter import Exporter, exports
-from netspec.export.targets import OnnxGraph, TorchCode, rounded
+from netspec.export.exporter import Exporter, exports, rounded
+from netspec.export.expression import Expression, call, with_axes
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.layers.contrast import ACROSS_CHANNELS, LRN, MVN
 
 
@@ -23,17 +25,15 @@ class LRNExport(Exporter):
         base = graph.node("Add", mean, graph.constant(1.0))
         return graph.node("Mul", *bottoms, graph.node("Pow", base, graph.constant(-param.beta)))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        param, (x,) = self.layer.param.lrn_param, bottoms
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        param = self.layer.param.lrn_param
         alpha, beta = rounded(param.alpha), rounded(param.beta)
-        if param.norm_region == ACROSS_CHANNELS:
-            usual = {"alpha": 1e-4, "beta": 0.75, "k": 1.0}
-            given = {"alpha": alpha, "beta": beta, "k": rounded(param.k)}
-            given = {name: number for name, number in given.items() if number != usual[name]}
-            options = "".join(f", {name}={{{name}}}" for name in given)
-            return code.call(f"F.local_response_norm({{x}}, {{size}}{options})", x=x, size=param.local_size, **given)
-        template = f"{code.function(spatial_response_norm)}({{x}}, {{size}}, {{alpha}}, {{beta}})"
-        return code.call(template, x=x, size=param.local_size, alpha=alpha, beta=beta)
+        if param.norm_region != ACROSS_CHANNELS:
+            return call(spatial_response_norm, x, param.local_size, alpha, beta)
+        usual = {"alpha": 1e-4, "beta": 0.75, "k": 1.0}
+        given = {"alpha": alpha, "beta": beta, "k": rounded(param.k)}
+        options = {name: number for name, number in given.items() if number != usual[name]}
+        return call(F.local_response_norm, x, param.local_size, **options)
 
 
 @exports(MVN)
@@ -50,16 +50,13 @@ class MVNExport(Exporter):
         variance = graph.node("ReduceMean", graph.node("Mul", top, top), axes, keepdims=1)
         return graph.node("Div", top, graph.node("Add", graph.node("Sqrt", variance), graph.constant(param.eps)))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        param, x = self.layer.param.mvn_param, bottoms[0]
-        missing = 4 - len(self.layer.bottom_shapes[0])
-        if missing:
-            x = code.call(f"{{x}}[..., {', '.join(['None'] * missing)}]", x=x)
-        function = code.function(standardize if param.normalize_variance else center)
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        param = self.layer.param.mvn_param
+        x = with_axes(x, 4 - len(self.layer.bottom_shapes[0]))
         axes = (1, 2, 3) if param.across_channels else (2, 3)
         if not param.normalize_variance:
-            return code.call(f"{function}({{x}}, {{axes}})", x=x, axes=axes)
-        return code.call(f"{function}({{x}}, {{axes}}, eps={{eps}})", x=x, axes=axes, eps=rounded(param.eps))
+            return call(center, x, axes)
+        return call(standardize, x, axes, eps=rounded(param.eps))
 
 
 def spatial_response_norm(x, size, alpha, beta):

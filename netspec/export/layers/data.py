@@ -7,7 +7,9 @@ from collections.abc import Sequence
 import torch
 
 from netspec.export.exporter import Exporter, exports
-from netspec.export.targets import OnnxGraph, TorchCode
+from netspec.export.expression import Expression
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.layers.data.hdf5 import HDF5Output
 from netspec.layers.data.memory import DummyData, Input
 
@@ -17,7 +19,7 @@ class InputExport(Exporter):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         return [graph.input(i) for i in range(self.layer.num_tops)]
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+    def to_torch(self, code: TorchCode) -> Sequence[Expression]:
         return [code.input(i) for i in range(self.layer.num_tops)]
 
 
@@ -35,7 +37,7 @@ class DummyDataExport(Exporter):
             raise self.refusal(target)
         return fixed
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+    def to_torch(self, code: TorchCode) -> Sequence[Expression]:
         return [code.buffer(values) for values in self._fixed("PyTorch")]
 
 

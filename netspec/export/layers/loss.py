@@ -8,8 +8,10 @@ from collections.abc import Sequence
 import torch
 import torch.nn.functional as F
 
-from netspec.export.exporter import Exporter, exports
-from netspec.export.targets import OnnxGraph, TorchCode, rounded
+from netspec.export.exporter import Exporter, exports, rounded
+from netspec.export.expression import Expression, call
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.layers.loss.base import (
     BATCH_SIZE,
     FULL,
@@ -45,22 +47,18 @@ class ClassifiedExport(Exporter):
         valid = graph.cast(graph.node("Not", graph.node("Equal", labels, graph.constant(ignore_label))), "int64")
         return graph.cast(valid, "float32"), graph.node("Mul", labels, valid)
 
-    def torch_scores_and_labels(self, code: TorchCode, bottoms: Sequence[str], axis: int) -> tuple[str, str]:
+    def torch_scores_and_labels(self, x: Expression, y: Expression, axis: int) -> tuple[Expression, Expression]:
         """Return scores (outer, classes, ...) and labels (outer, ...), from scores with the classes on ``axis``."""
-        x, y = bottoms
         scores, labels = self.layer.bottom_shapes
         axis %= len(scores)
-        items = (*scores[:axis], *scores[axis + 1 :])
-        if labels == (*scores[:axis], 1, *scores[axis + 1 :]):
-            y = code.call("{y}.squeeze({axis})", y=y, axis=axis)
-        elif labels != items:
-            y = code.call("{y}.reshape({x}.select({axis}, 0).shape)", x=x, y=y, axis=axis)
+        before, after = scores[:axis], scores[axis + 1 :]
+        if labels == (*before, 1, *after):
+            y = y.squeeze(axis)
+        elif labels != (*before, *after):
+            y = y.reshape(x.select(axis, 0).shape)
         if axis == 0:
-            return code.call("{x}[None]", x=x), code.call("{y}[None]", y=y)
-        if axis > 1:
-            flat = "{x}.flatten(0, {last})"
-            return code.call(flat, x=x, last=axis - 1), code.call(flat, x=y, last=axis - 1)
-        return x, y
+            return x[None], y[None]
+        return (x.flatten(0, axis - 1), y.flatten(0, axis - 1)) if axis > 1 else (x, y)
 
 
 def onnx_normalized_sum(graph: OnnxGraph, losses: str, valid: str, mode: int) -> str:
@@ -94,11 +92,8 @@ class HingeLossExport(ClassifiedExport):
             margins = graph.node("Mul", margins, margins)
         return onnx_normalized_sum(graph, margins, "", BATCH_SIZE)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        norm = 2 if self.layer.param.hinge_loss_param.norm == self.layer.L2 else 1
-        return code.call(
-            f"{code.function(hinge_loss)}({{x}}, {{y}}, norm={{norm}})", x=bottoms[0], y=bottoms[1], norm=norm
-        )
+    def to_torch(self, code: TorchCode, x: Expression, y: Expression) -> Expression:
+        return call(hinge_loss, x, y, norm=2 if self.layer.param.hinge_loss_param.norm == self.layer.L2 else 1)
 
 
 @exports(SigmoidCrossEntropyLoss)
@@ -116,19 +111,17 @@ class SigmoidCrossEntropyLossExport(Exporter):
             valid = graph.cast(graph.node("Not", ignored), "float32")
         return onnx_normalized_sum(graph, graph.node("Add", linear, softplus), valid, layer.normalization)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression, y: Expression) -> Expression:
         layer = self.layer
         if layer.ignore_label is not None:
             raise self.refusal("PyTorch", "torch's binary cross entropy cannot ignore a label")
-        x, y = bottoms
         if layer.bottom_shapes[0] != layer.bottom_shapes[1]:
-            y = code.call("{y}.reshape({x}.shape)", x=x, y=y)
+            y = y.reshape(x.shape)
         if layer.normalization in (FULL, VALID):
-            return code.call("F.binary_cross_entropy_with_logits({x}, {y})", x=x, y=y)
-        total = 'F.binary_cross_entropy_with_logits({x}, {y}, reduction="sum")'
+            return call(F.binary_cross_entropy_with_logits, x, y)
         if layer.normalization == NONE:
-            return code.call(total, x=x, y=y)
-        return code.call(f"{code.function(sigmoid_loss)}({{x}}, {{y}})", x=x, y=y)
+            return call(F.binary_cross_entropy_with_logits, x, y, reduction="sum")
+        return call(sigmoid_loss, x, y)
 
 
 @exports(EuclideanLoss)
@@ -139,11 +132,10 @@ class EuclideanLossExport(Exporter):
         total = graph.node("ReduceSum", graph.node("Mul", difference, difference), keepdims=0)
         return graph.node("Div", total, graph.node("Mul", onnx_items(graph, a), graph.constant(2.0)))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        x, y = bottoms
+    def to_torch(self, code: TorchCode, x: Expression, y: Expression) -> Expression:
         if self.layer.bottom_shapes[0] != self.layer.bottom_shapes[1]:
-            x, y = (code.call("{x}.flatten(1)", x=bottom) for bottom in bottoms)
-        return code.call("({x} - {y}).square().sum() / (2 * {x}.shape[0])", x=x, y=y)
+            x, y = x.flatten(1), y.flatten(1)
+        return (x - y).square().sum() / (2 * x.shape[0])
 
 
 @exports(ContrastiveLoss)
@@ -161,11 +153,10 @@ class ContrastiveLossExport(Exporter):
         losses = graph.node("Where", graph.node("Equal", label, graph.constant(0)), dissimilar, squared)
         return graph.node("Mul", graph.node("ReduceMean", losses, keepdims=0), graph.constant(0.5))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, a: Expression, b: Expression, similar: Expression) -> Expression:
         p = self.layer.param.contrastive_loss_param
-        function = code.function(legacy_contrastive_loss if p.legacy_version else contrastive_loss)
-        template = f"{function}({', '.join(bottoms)}, margin={{margin}})"
-        return code.call(template, margin=rounded(p.margin))
+        loss = legacy_contrastive_loss if p.legacy_version else contrastive_loss
+        return call(loss, a, b, similar, margin=rounded(p.margin))
 
 
 @exports(SoftmaxWithLoss)
@@ -180,20 +171,17 @@ class SoftmaxWithLossExport(ClassifiedExport):
         loss = onnx_normalized_sum(graph, losses, valid, layer.normalization)
         return (loss,) if layer.num_tops == 1 else (loss, graph.reshape_to_top(softmax, 1))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+    def to_torch(self, code: TorchCode, scores: Expression, labels: Expression) -> Sequence[Expression]:
         layer = self.layer
         axis = layer.param.softmax_param.axis % len(layer.bottom_shapes[0])
-        x, y = self.torch_scores_and_labels(code, bottoms, axis)
+        x, y = self.torch_scores_and_labels(scores, labels, axis)
         if layer.ignore_label is None and layer.normalization in (FULL, VALID):
-            loss = code.call("F.cross_entropy({x}, {y}.long())", x=x, y=y)
+            loss = call(F.cross_entropy, x, y.long())
         else:
             divisor = {FULL: "all", VALID: "counted", BATCH_SIZE: "items", NONE: "none"}[layer.normalization]
             options = {} if layer.ignore_label is None else {"ignore": layer.ignore_label}
-            given = ", ".join([f'divide_by="{divisor}"', *(f"{name}={{{name}}}" for name in options)])
-            loss = code.call(f"{code.function(softmax_loss)}({{x}}, {{y}}, {given})", x=x, y=y, **options)
-        return (
-            (loss,) if layer.num_tops == 1 else (loss, code.call("F.softmax({x}, dim={axis})", x=bottoms[0], axis=axis))
-        )
+            loss = call(softmax_loss, x, y, divide_by=divisor, **options)
+        return (loss, call(F.softmax, scores, dim=axis))[: layer.num_tops]
 
 
 @exports(InfogainLoss)
@@ -221,12 +209,14 @@ class InfogainLossExport(ClassifiedExport):
 
 @exports(MultinomialLogisticLoss)
 class MultinomialLogisticLossExport(ClassifiedExport):
-    torch_call = "F.nll_loss(torch.log({x}.flatten(1).clamp(min={least})), {y}.flatten().long())"
-
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         p, labels = self.onnx_scores_and_labels(graph, *bottoms)
         chosen = graph.node("Max", graph.node("GatherElements", p, labels, axis=1), graph.constant(self.layer.least))
         return onnx_normalized_sum(graph, graph.node("Neg", graph.node("Log", chosen)), "", BATCH_SIZE)
+
+    def to_torch(self, code: TorchCode, p: Expression, labels: Expression) -> Expression:
+        least = self.layer.least
+        return call(F.nll_loss, call(torch.log, p.flatten(1).clamp(min=least)), labels.flatten().long())
 
 
 @exports(Accuracy)
@@ -250,14 +240,12 @@ class AccuracyExport(ClassifiedExport):
         hits = graph.node("ReduceSum", graph.node("Mul", of_class, right), axes, keepdims=0)
         return accuracy, graph.node("Div", hits, graph.node("Max", occurrences, graph.constant(1.0)))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+    def to_torch(self, code: TorchCode, scores: Expression, labels: Expression) -> Expression:
         layer = self.layer
         if layer.num_tops > 1:
             raise self.refusal("PyTorch", "it is exported without the accuracy of each class")
-        bottoms = self.torch_scores_and_labels(code, bottoms, layer.param.accuracy_param.axis)
-        function = code.function(accuracy)
-        template = f"{function}({', '.join(bottoms)}, top_k={{top_k}}, ignore_label={{ignore}})"
-        return code.call(template, top_k=layer.top_k, ignore=layer.ignore_label)
+        x, y = self.torch_scores_and_labels(scores, labels, layer.param.accuracy_param.axis)
+        return call(accuracy, x, y, top_k=layer.top_k, ignore_label=layer.ignore_label)
 
 
 def sigmoid_loss(scores, targets):

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
+from torch import nn
 
-from netspec.export.exporter import Exporter, exports
-from netspec.export.targets import OnnxGraph, TorchCode, rounded
+from netspec.export.exporter import Exporter, exports, rounded
+from netspec.export.expression import Expression, Submodule, call
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.layers.normalization import BatchNorm
+from netspec.layers.scale import Scale
 
 
 @exports(BatchNorm)
@@ -20,26 +25,33 @@ class BatchNormExport(Exporter):
         constants = [graph.constant(values) for values in (ones, zeros, *layer.stored_statistics())]
         return graph.node("BatchNormalization", *bottoms, *constants, epsilon=eps)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         layer = self.layer
         eps = rounded(layer.param.batch_norm_param.eps)
         if not layer.use_global_stats:
-            return code.call("F.batch_norm({x}, None, None, training=True, eps={eps})", x=bottoms[0], eps=eps)
+            return call(F.batch_norm, x, None, None, training=True, eps=eps)
+        affine = self.affine(code)
         mean, variance = layer.stored_statistics()
-        norm = torch_batch_norm(code, len(layer.bottom_shapes[0]), mean, variance, eps)
-        return code.call("{norm}({x})", norm=norm, x=bottoms[0])
+        return torch_batch_norm(code, len(layer.bottom_shapes[0]), mean, variance, eps, **affine)(x)
+
+    def affine(self, code: TorchCode) -> dict[str, torch.Tensor]:
+        """Return the weight and bias of the module, those of a Scale that alone reads the top, or nothing."""
+        scale = code.absorb(lambda after: type(after) is Scale and after.by_channel)
+        if scale is None:
+            return {}
+        weight = scale.blob(0)
+        return {"weight": weight, "bias": scale.blob(1) if len(scale.blobs) > 1 else torch.zeros_like(weight)}
 
 
 def torch_batch_norm(
     code: TorchCode, axes: int, mean: torch.Tensor, variance: torch.Tensor, eps: float, **affine: torch.Tensor
-) -> str:
-    """Add torch's batch normalization by stored statistics; ``affine`` has its weight and bias, or is empty."""
+) -> Submodule:
+    """Return torch's batch normalization by stored statistics; ``affine`` has its weight and bias, or is empty."""
     count = torch.zeros((), dtype=torch.long)
     state = {**affine, "running_mean": mean, "running_var": variance, "num_batches_tracked": count}
-    options = ("" if eps == 1e-5 else ", eps={eps}") + ("" if affine else ", affine=False")
-    template = f"nn.BatchNorm{max(1, axes - 2)}d({{channels}}{options})"
-    numbers = {"channels": len(mean), **({} if eps == 1e-5 else {"eps": eps})}
-    return code.module(template, state, **numbers)
+    options = {**({} if eps == 1e-5 else {"eps": eps}), **({} if affine else {"affine": False})}
+    cls = (nn.BatchNorm1d, nn.BatchNorm1d, nn.BatchNorm1d, nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)[axes]
+    return code.module(cls, len(mean), state=state, **options)
 
 
 def onnx_normalized(graph: OnnxGraph, data: str, axes: int, eps: float) -> str:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import torch
 
 from netspec.export.exporter import Exporter, exports
+from netspec.export.expression import Expression, Plain, call
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.export.layers.activation import scaled_and_shifted, torch_scaled_and_shifted
-from netspec.export.targets import OnnxGraph, TorchCode
 from netspec.layers.powers import AbsVal, Exp, Log, Power
 
 
 @exports(AbsVal)
 class AbsValExport(Exporter):
-    onnx_op, torch_call = "Abs", "torch.abs({x})"
+    onnx_op, torch_call = "Abs", Plain(torch.abs)
 
 
 @exports(Power)
@@ -25,13 +27,12 @@ class PowerExport(Exporter):
         value = scaled_and_shifted(graph, bottoms[0], layer.scale, layer.shift)
         return value if layer.power == 1 else graph.node("Pow", value, graph.constant(layer.power))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         layer = self.layer
         if layer.power * layer.scale == 0:
-            template = "torch.full_like({x}, {shift}).pow({power})"
-            return code.call(template, x=bottoms[0], shift=layer.shift, power=layer.power)
-        value = torch_scaled_and_shifted(code, bottoms[0], layer.scale, layer.shift)
-        return value if layer.power == 1 else code.call("torch.pow({x}, {power})", x=value, power=layer.power)
+            return call(torch.full_like, x, layer.shift).pow(layer.power)
+        x = torch_scaled_and_shifted(x, layer.scale, layer.shift)
+        return x if layer.power == 1 else call(torch.pow, x, layer.power)
 
 
 @exports(Exp)
@@ -39,10 +40,8 @@ class ExpExport(Exporter):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Exp", scaled_and_shifted(graph, bottoms[0], self.layer.scale, self.layer.shift))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.call(
-            "torch.exp({x})", x=torch_scaled_and_shifted(code, bottoms[0], self.layer.scale, self.layer.shift)
-        )
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        return call(torch.exp, torch_scaled_and_shifted(x, self.layer.scale, self.layer.shift))
 
 
 @exports(Log)
@@ -52,7 +51,7 @@ class LogExport(Exporter):
         logarithm = graph.node("Log", scaled_and_shifted(graph, bottoms[0], layer.scale, layer.shift))
         return scaled_and_shifted(graph, logarithm, layer.base_scale, 0)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         layer = self.layer
-        value = torch_scaled_and_shifted(code, bottoms[0], layer.scale, layer.shift)
-        return torch_scaled_and_shifted(code, code.call("torch.log({x})", x=value), layer.base_scale, 0)
+        logarithm = call(torch.log, torch_scaled_and_shifted(x, layer.scale, layer.shift))
+        return torch_scaled_and_shifted(logarithm, layer.base_scale, 0)

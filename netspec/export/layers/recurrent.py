@@ -11,7 +11,9 @@ import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.export.exporter import Exporter, exports
-from netspec.export.targets import OnnxGraph, TorchCode
+from netspec.export.expression import Expression, call
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.layers.recurrent import LSTM, RNN, LSTMUnit
 
 # These functions are copied into exported source code.
@@ -109,16 +111,16 @@ class RecurrentExport(Exporter):
         """Return the product with a learnable matrix."""
         return graph.node("MatMul", value, graph.node("Transpose", graph.blob(blob), perm=[1, 0]))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+    def to_torch(self, code: TorchCode, *bottoms: Expression) -> Expression | Sequence[Expression]:
         layer = self.layer
         x, cont, *others = bottoms
         names = [name for name in self.blob_names if layer.has_static or name != "w_static"]
         weights = [code.parameter(i, name=name) for i, name in enumerate(names)]
-        static = [code.call("{x}.flatten(1)", x=others[0]), weights.pop(2)] if layer.has_static else ["None", "None"]
-        state = list(others[layer.has_static :]) or ["None"] * len(layer.state_names)
-        x = x if len(layer.bottom_shapes[0]) == 3 else code.call("{x}.flatten(2)", x=x)
-        call = f"{code.function(self.torch_function)}({', '.join([x, cont, *weights, *static, *state])})"
-        return call if layer.exposed else (f"{call}[0]",)
+        static = [others[0].flatten(1), weights.pop(2)] if layer.has_static else [None, None]
+        state = others[layer.has_static :] or [None] * len(layer.state_names)
+        x = x if len(layer.bottom_shapes[0]) == 3 else x.flatten(2)
+        made = call(self.torch_function, x, cont, *weights, *static, *state)
+        return made if layer.exposed else (made[0],)
 
 
 @exports(RNN)
@@ -165,5 +167,5 @@ class LSTMUnitExport(Exporter):
         keep = graph.node("Unsqueeze", cont, graph.constant([2]))
         return _onnx_unit(graph, cell, gates, keep, self.layer.bottom_shapes[0][2])
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return f"{code.function(lstm_unit)}({', '.join(bottoms)}[..., None])"
+    def to_torch(self, code: TorchCode, cell: Expression, gates: Expression, cont: Expression) -> Expression:
+        return call(lstm_unit, cell, gates, cont[..., None])

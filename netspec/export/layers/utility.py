@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial, reduce
+from operator import mul, ne
 
 import torch
+import torch.nn.functional as F
 
 from netspec.export.exporter import Exporter, exports
-from netspec.export.targets import OnnxGraph, TorchCode
+from netspec.export.expression import Expression, Plain, call, with_axes
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.layers.utility.arithmetic import ArgMax, Eltwise, Parameter, Reduction, Silence, Softmax
 from netspec.layers.utility.parts import BatchReindex, Concat, Crop, Filter, Slice
 from netspec.layers.utility.python import Python
@@ -27,20 +32,18 @@ class EltwiseExport(Exporter):
             top = graph.node(op, top, bottom)
         return top
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, *bottoms: Expression) -> Expression:
         layer = self.layer
         if layer.operation == layer.MAX:
-            top, *others = bottoms
-            for bottom in others:
-                top = code.call("torch.maximum({x}, {y})", x=top, y=bottom)
-            return top
+            return reduce(partial(call, torch.maximum), bottoms)
         if layer.operation == layer.PROD:
-            return " * ".join(bottoms)
-        top = ""
-        for bottom, coeff in zip(bottoms, layer.coeff, strict=True):
-            sign = " - " if coeff < 0 else " + "
-            term = bottom if abs(coeff) == 1 else code.call("{coeff} * {x}", coeff=abs(coeff), x=bottom)
-            top = f"{top}{sign}{term}" if top else term if coeff > 0 else f"-{term}"
+            return reduce(mul, bottoms)
+        first, *others = zip(bottoms, layer.coeff, strict=True)
+        top = first[0] if abs(first[1]) == 1 else abs(first[1]) * first[0]
+        top = -top if first[1] < 0 else top
+        for x, coeff in others:
+            term = x if abs(coeff) == 1 else abs(coeff) * x
+            top = top - term if coeff < 0 else top + term
         return top
 
 
@@ -58,15 +61,14 @@ class ReductionExport(Exporter):
         top = graph.node(op, data, axes, keepdims=0)
         return top if p.coeff == 1 else graph.node("Mul", top, graph.constant(p.coeff))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         layer = self.layer
         p = layer.param.reduction_param
-        form = {layer.ASUM: "{x}.abs()", layer.SUMSQ: "{x}.square()"}.get(p.operation, "{x}")
-        axes = list(range(layer.axis, len(layer.bottom_shapes[0])))
-        over = f"dim={axes[0] if len(axes) == 1 else tuple(axes)}" if layer.axis else ""
-        operation = "mean" if p.operation == layer.MEAN else "sum"
-        times = "" if p.coeff == 1 else "{coeff} * "
-        return code.call(f"{times}{form}.{operation}({over})", x=bottoms[0], coeff=p.coeff)
+        x = x.abs() if p.operation == layer.ASUM else x.square() if p.operation == layer.SUMSQ else x
+        axes = tuple(range(layer.axis, len(layer.bottom_shapes[0])))
+        over = {"dim": axes[0] if len(axes) == 1 else axes} if layer.axis else {}
+        top = x.mean(**over) if p.operation == layer.MEAN else x.sum(**over)
+        return top if p.coeff == 1 else p.coeff * top
 
 
 @exports(ArgMax)
@@ -91,24 +93,22 @@ class ArgMaxExport(Exporter):
         ones = len(layer.top_shapes[0]) - 3
         return graph.node("Unsqueeze", top, graph.constant(list(range(3, 3 + ones)))) if ones > 0 else top
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         layer = self.layer
-        p, (x,) = layer.param.argmax_param, bottoms
-        axis = 1 if layer.axis is None else layer.axis
+        p = layer.param.argmax_param
         if layer.axis is None and len(layer.bottom_shapes[0]) > 2:
-            x = code.call("{x}.flatten(1)", x=x)
-        found = code.call(f"{code.function(arg_max)}({{x}}, dim={axis}, top_k={{top_k}})", x=x, top_k=p.top_k)
+            x = x.flatten(1)
+        found = call(arg_max, x, dim=1 if layer.axis is None else layer.axis, top_k=p.top_k)
         if layer.axis is not None:
-            return f"{found}[{1 if p.out_max_val else 0}]"
-        top = f"torch.stack({found}, 1)" if p.out_max_val else f"{found}[0][:, None]"
-        ones = max(0, len(layer.top_shapes[0]) - 3)
-        return f"{top}[{', '.join(['...'] + ['None'] * ones)}]" if ones else top
+            return found[1 if p.out_max_val else 0]
+        top = call(torch.stack, found, 1) if p.out_max_val else found[0][:, None]
+        return with_axes(top, len(layer.top_shapes[0]) - 3)
 
 
 @exports(Softmax)
 class SoftmaxExport(Exporter):
     onnx_op, onnx_attributes = "Softmax", ("axis",)
-    torch_call = "F.softmax({x}, dim={axis})"
+    torch_call = Plain(F.softmax, dim="axis")
 
 
 @exports(Silence)
@@ -116,7 +116,7 @@ class SilenceExport(Exporter):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         return ()
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+    def to_torch(self, code: TorchCode, *bottoms: Expression) -> Sequence[Expression]:
         return ()
 
 
@@ -125,7 +125,7 @@ class ParameterExport(Exporter):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Identity", graph.blob(0))
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+    def to_torch(self, code: TorchCode) -> Sequence[Expression]:
         return (code.parameter(0),)
 
 
@@ -133,10 +133,8 @@ class ParameterExport(Exporter):
 class ConcatExport(Exporter):
     onnx_op, onnx_attributes = "Concat", ("axis",)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        if len(bottoms) == 1:
-            return bottoms[0]
-        return code.call(f"torch.cat([{', '.join(bottoms)}], dim={{axis}})", axis=self.layer.axis)
+    def to_torch(self, code: TorchCode, *bottoms: Expression) -> Expression:
+        return bottoms[0] if len(bottoms) == 1 else call(torch.cat, list(bottoms), dim=self.layer.axis)
 
 
 @exports(Slice)
@@ -156,16 +154,16 @@ class SliceExport(Exporter):
             for start, end in zip([0, *points], [*points, 2**62], strict=True)
         ]
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression | Sequence[Expression]:
         layer = self.layer
-        if layer.num_tops == 1:
-            return bottoms
-        if len(set(layer.sizes)) == 1 and not layer.param.slice_param.slice_point:
-            return code.call("{x}.chunk({count}, dim={axis})", x=bottoms[0], count=layer.num_tops, axis=layer.axis)
-        if code.sizes(0)[layer.axis] is not None:
-            return code.call("{x}.split({sizes}, dim={axis})", x=bottoms[0], sizes=list(layer.sizes), axis=layer.axis)
         points = list(layer.param.slice_param.slice_point)
-        return code.call("{x}.tensor_split({points}, dim={axis})", x=bottoms[0], points=points, axis=layer.axis)
+        if layer.num_tops == 1:
+            return (x,)
+        if len(set(layer.sizes)) == 1 and not points:
+            return x.chunk(layer.num_tops, dim=layer.axis)
+        if code.sizes(0)[layer.axis] is not None:
+            return x.split(list(layer.sizes), dim=layer.axis)
+        return x.tensor_split(points, dim=layer.axis)
 
 
 @exports(Crop)
@@ -179,24 +177,22 @@ class CropExport(Exporter):
         axes = graph.constant(list(range(axis, len(layer.window))))
         return graph.node("Slice", bottoms[0], start, graph.node("Add", wanted, start), axes)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression, like: Expression) -> Expression:
         parts = []
         for axis, part in enumerate(self.layer.window):
-            if part == slice(None):
-                parts.append(":")
-            elif part.start == 0:
-                parts.append(f": {{y}}.shape[{axis}]")
-            else:
-                parts.append(f"{part.start} : {part.start} + {{y}}.shape[{axis}]")
-        return code.call(f"{{x}}[{', '.join(parts)}]", x=bottoms[0], y=bottoms[1])
+            size = like.shape[axis]
+            cut = slice(part.start, part.start + size) if part.start else slice(None, size)
+            parts.append(part if part == slice(None) else cut)
+        return x[tuple(parts)]
 
 
 @exports(BatchReindex)
 class BatchReindexExport(Exporter):
-    torch_call = "{x}[{y}.long()]"
-
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Gather", bottoms[0], graph.cast(bottoms[1], "int64"), axis=0)
+
+    def to_torch(self, code: TorchCode, x: Expression, chosen: Expression) -> Expression:
+        return x[chosen.long()]
 
 
 @exports(Filter)
@@ -207,9 +203,9 @@ class FilterExport(Exporter):
         kept = graph.node("Squeeze", graph.node("NonZero", graph.node("Not", dropped)), graph.constant([0]))
         return [graph.node("Gather", x, kept, axis=0) for x in data]
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+    def to_torch(self, code: TorchCode, *bottoms: Expression) -> Sequence[Expression]:
         *data, selector = bottoms
-        return [code.call("{x}[{selector}.flatten() != 0]", x=x, selector=selector) for x in data]
+        return [x[call(ne, selector.flatten(), 0)] for x in data]
 
 
 @exports(Flatten, Reshape)
@@ -217,8 +213,8 @@ class OtherShapeExport(Exporter):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.reshape_to_top(bottoms[0])
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
-        return code.reshape_to_top(bottoms[0])
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
+        return code.reshape_to_top(x)
 
 
 @exports(Split)
@@ -226,13 +222,13 @@ class SplitExport(Exporter):
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         return bottoms * self.layer.num_tops
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
-        return bottoms * self.layer.num_tops
+    def to_torch(self, code: TorchCode, x: Expression) -> Sequence[Expression]:
+        return (x,) * self.layer.num_tops
 
 
 @exports(Tile)
 class TileExport(Exporter):
-    torch_call = "{x}.repeat({repeats})"
+    torch_call = Plain(torch.Tensor.repeat, "repeats")
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
         return graph.node("Tile", *bottoms, graph.constant(self.layer.repeats))

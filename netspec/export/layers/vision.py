@@ -7,10 +7,13 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
+from torch import nn
 from torch.nn import functional as F
 
 from netspec.export.exporter import Exporter, exports
-from netspec.export.targets import OnnxGraph, TorchCode
+from netspec.export.expression import Expression, call
+from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.formats.torch_code import TorchCode
 from netspec.layers.contract.base import Shape
 from netspec.layers.vision.convolution import Convolution, Deconvolution
 from netspec.layers.vision.pooling import AVE, MAX, SPP, STOCHASTIC, Pooling
@@ -51,18 +54,16 @@ class SlidingFilterExport(Exporter):
         return graph.node(self.onnx_filter, maps, *weights, group=group, **geometry)
 
     def torch_geometry(self) -> dict[str, Any]:
-        """Return kernel, stride, padding and dilation for torch: one number if all axes have the same."""
+        """Return the arguments of torch that are not usual; one number if all axes have the same."""
         layer = self.layer
-        given = {
-            "kernel_size": layer.kernel,
-            "stride": layer.stride,
-            "padding": layer.pad,
-            "dilation": layer.dilation,
-        }
-        return {name: values[0] if len(set(values)) == 1 else values for name, values in given.items()}
+        given = {"stride": (layer.stride, 1), "padding": (layer.pad, 0), "dilation": (layer.dilation, 1)}
+        unusual = {name: each(values) for name, (values, usual) in given.items() if set(values) != {usual}}
+        return {"kernel_size": each(layer.kernel), **unusual}
 
 
-TORCH_USUAL = {"stride": 1, "padding": 0, "dilation": 1, "groups": 1}
+def each(sizes: Shape) -> Shape | int:
+    """Return the sizes along some axes; one number if all are the same."""
+    return sizes[0] if len(set(sizes)) == 1 else tuple(sizes)
 
 
 @exports(Im2col)
@@ -77,21 +78,17 @@ class Im2colExport(SlidingFilterExport):
         )
         return self.onnx_convolved(graph, bottoms[0], [graph.constant(picks)], layer.channels, self.onnx_geometry())
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         layer = self.layer
         if layer.channel_axis != 1 or layer.spatial_axes != 2 or any(layer.overhang(layer.bottom_shapes[0])):
             raise self.refusal("PyTorch", "it is exported for (N, C, H, W) and filters that fit")
-        numbers = self.torch_geometry()
-        options = ", ".join(f"{name}={{{name}}}" for name, value in numbers.items() if value != TORCH_USUAL.get(name))
-        rows = layer.top_shapes[0][2]
         code.size(0, 2, "the rows of windows are counted in advance")
-        template = f"{code.function(lay_out_windows)}({{x}}, {{rows}}, {options})"
-        return code.call(template, x=bottoms[0], rows=rows, **numbers)
+        return call(lay_out_windows, x, layer.top_shapes[0][2], **self.torch_geometry())
 
 
 @exports(Convolution)
 class ConvolutionExport(SlidingFilterExport):
-    torch_module: ClassVar[str] = "Conv"
+    torch_modules: ClassVar[Sequence[type[nn.Module]]] = (nn.Conv1d, nn.Conv2d, nn.Conv3d)
 
     def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
         layer = self.layer
@@ -127,24 +124,26 @@ class ConvolutionExport(SlidingFilterExport):
         spatial = [graph.size(0, axis, why) for axis in range(first, first + layer.spatial_axes)] or [1]
         return graph.reshape(bottom, [-1, layer.channels, *spatial])
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> Sequence[str]:
+    def to_torch(self, code: TorchCode, *bottoms: Expression) -> Sequence[Expression]:
         layer = self.layer
         if layer.channel_axis != 1 or not layer.spatial_axes or any(layer.overhang(layer.bottom_shapes[0])):
             raise self.refusal("PyTorch", "it is exported for (N, C, spatial axes) and filters that fit")
-        numbers = {"in_channels": layer.channels, "out_channels": layer.num_output}
-        numbers |= {**self.torch_geometry(), "groups": layer.group}
-        options = ", ".join(f"{name}={{{name}}}" for name in list(numbers)[2:])
-        bias = "" if len(layer.blobs) > 1 else ", bias=False"
-        template = f"nn.{self.torch_module}{layer.spatial_axes}d({{in_channels}}, {{out_channels}}, {options}{bias})"
-        state = {"weight": layer.blob(0), **({"bias": layer.blob(1)} if len(layer.blobs) > 1 else {})}
-        conv = code.module(template, state, TORCH_USUAL, **numbers)
-        return [code.call("{conv}({x})", conv=conv, x=bottom) for bottom in bottoms]
+        options, state = self.torch_geometry(), {"weight": layer.blob(0)}
+        if layer.group != 1:
+            options["groups"] = layer.group
+        if len(layer.blobs) > 1:
+            state["bias"] = layer.blob(1)
+        else:
+            options["bias"] = False
+        cls = self.torch_modules[layer.spatial_axes - 1]
+        convolution = code.module(cls, layer.channels, layer.num_output, state=state, **options)
+        return [convolution(bottom) for bottom in bottoms]
 
 
 @exports(Deconvolution)
 class DeconvolutionExport(ConvolutionExport):
     onnx_filter = "ConvTranspose"
-    torch_module = "ConvTranspose"
+    torch_modules = (nn.ConvTranspose1d, nn.ConvTranspose2d, nn.ConvTranspose3d)
 
 
 class PoolingBaseExport(Exporter):
@@ -193,36 +192,27 @@ class PoolingBaseExport(Exporter):
         counts = dict(geometry, pads=[0, 0, *beyond])
         return graph.node("Div", means, graph.node("AveragePool", padded, count_include_pad=1, **counts))
 
-    def torch_pool(self, code: TorchCode, x: str, windows: Windows, method: int, mask: bool = False) -> str:
-        """Return the expression of the pooled maps; with ``mask``, of the maps and the mask."""
+    def torch_pool(self, x: Expression, windows: Windows, method: int, mask: bool = False) -> Expression:
+        """Return the pooled maps; with ``mask``, the maps and the mask."""
         if self.layer.phase == TRAIN and method == STOCHASTIC:
             raise self.refusal("PyTorch", "STOCHASTIC pooling draws random numbers in the training phase")
-        geometry = list(zip(windows.kernel, windows.stride, windows.pad, windows.reach, strict=True))
-        if any(r >= k for k, _, _, r in geometry) or (method != MAX and any(2 * p > k for k, _, p, _ in geometry)):
+        much = any(2 * p > k for p, k in zip(windows.pad, windows.kernel, strict=True))  # more than torch allows
+        if any(r >= k for r, k in zip(windows.reach, windows.kernel, strict=True)) or (much and method != MAX):
             raise self.refusal("PyTorch", "windows can lie outside the map; use round_mode: FLOOR, or less padding")
-        numbers: dict[str, Any] = {"kernel_size": windows.kernel, "stride": windows.stride, "padding": windows.pad}
-        options = ["{kernel_size}"]
-        if windows.stride != windows.kernel:
-            options.append("stride={stride}")
-        if any(2 * p > k for k, _, p, _ in geometry):
+        kernel = each(windows.kernel)
+        options = {"stride": each(windows.stride)} if windows.stride != windows.kernel else {}
+        if much:
             frame = (windows.pad[1], windows.reach[1], windows.pad[0], windows.reach[0])
             if mask:
-                template = f"{code.function(max_pool_of_padded)}({{x}}, {{frame}}, {', '.join(options)})"
-                numbers = {name: pair[0] if pair[0] == pair[1] else pair for name, pair in numbers.items()}
-                return code.call(template, x=x, frame=frame, **numbers)
-            x = code.call("F.pad({x}, {frame}, value=-torch.inf)", x=x, frame=frame)
-        else:
-            options += ["padding={padding}"] if any(windows.pad) else []
-            options += ["ceil_mode=True"] if windows.round_mode == CEIL and windows.stride != (1, 1) else []
-        options += ["return_indices=True"] if mask else []
-        numbers = {name: pair[0] if pair[0] == pair[1] else pair for name, pair in numbers.items()}
-        arguments = ", ".join(options)
+                return call(max_pool_of_padded, x, frame, kernel, **options)
+            return call(F.max_pool2d, call(F.pad, x, frame, value=-math.inf), kernel, **options)
+        options |= {"padding": each(windows.pad)} if any(windows.pad) else {}
+        options |= {"ceil_mode": True} if windows.round_mode == CEIL and windows.stride != (1, 1) else {}
+        options |= {"return_indices": True} if mask else {}
         if method == STOCHASTIC:
-            template = (
-                f"F.avg_pool2d({{x}}.square(), {arguments}) / F.avg_pool2d({{x}}, {arguments}).clamp(min={{least}})"
-            )
-            return code.call(template, x=x, least=SMALLEST, **numbers)
-        return code.call(f"F.{'max' if method == MAX else 'avg'}_pool2d({{x}}, {arguments})", x=x, **numbers)
+            mean = call(F.avg_pool2d, x, kernel, **options).clamp(min=SMALLEST)
+            return call(F.avg_pool2d, x.square(), kernel, **options) / mean
+        return call(F.max_pool2d if method == MAX else F.avg_pool2d, x, kernel, **options)
 
 
 @exports(Pooling)
@@ -236,12 +226,12 @@ class PoolingExport(PoolingBaseExport):
                 graph.size(0, axis, "its only window is the whole map")
         return self.onnx_pool(graph, bottoms[0], layer.windows, layer.method, mask=layer.num_tops > 1)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str | Sequence[str]:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         layer = self.layer
         mask = layer.num_tops > 1
         if not layer.param.pooling_param.global_pooling or layer.method == STOCHASTIC or mask:
-            return self.torch_pool(code, bottoms[0], layer.windows, layer.method, mask)
-        return code.call(f"F.adaptive_{'max' if layer.method == MAX else 'avg'}_pool2d({{x}}, 1)", x=bottoms[0])
+            return self.torch_pool(x, layer.windows, layer.method, mask)
+        return call(F.adaptive_max_pool2d if layer.method == MAX else F.adaptive_avg_pool2d, x, 1)
 
 
 @exports(SPP)
@@ -255,14 +245,11 @@ class SPPExport(PoolingBaseExport):
             return levels[0]
         return graph.node("Concat", *(graph.node("Flatten", level, axis=1) for level in levels), axis=1)
 
-    def to_torch(self, code: TorchCode, *bottoms: str) -> str:
+    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
         for axis in (2, 3):
             code.size(0, axis, "the windows of its pyramid depend on the map's size")
-        method = self.layer.param.spp_param.pool
-        levels = [self.torch_pool(code, bottoms[0], windows, method) for windows in self.layer.levels]
-        if len(levels) == 1:
-            return levels[0]
-        return f"torch.cat([{', '.join(f'{level}.flatten(1)' for level in levels)}], dim=1)"
+        levels = [self.torch_pool(x, windows, self.layer.param.spp_param.pool) for windows in self.layer.levels]
+        return levels[0] if len(levels) == 1 else call(torch.cat, [level.flatten(1) for level in levels], dim=1)
 
 
 def max_pool_of_padded(x, frame, kernel_size, stride=None):

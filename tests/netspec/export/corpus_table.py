@@ -27,6 +27,7 @@ from exported import (
     here,
     in_onnxruntime,
     in_opencv,
+    onnx_model,
     random_inputs,
     run_module,
     source_module,
@@ -34,7 +35,6 @@ from exported import (
 )
 from netspec.dialects import use_dialect
 from netspec.export.formats.deploy import fold, write_caffe
-from netspec.export.formats.onnx import onnx_model
 from netspec.net.net import Net
 from paths import SHARED
 

@@ -13,6 +13,7 @@ from exported import (
     here,
     in_onnxruntime,
     in_opencv,
+    onnx_model,
     other_inputs,
     random_inputs,
     run_module,
@@ -21,7 +22,6 @@ from exported import (
 )
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
-from netspec.export.formats.onnx import onnx_model
 from netspec.export.formats.shapes import find_shapes
 from netspec.net.net import Net
 

@@ -16,6 +16,7 @@ from exported import (
     here,
     in_onnxruntime,
     in_opencv,
+    onnx_model,
     other_inputs,
     random_inputs,
     run_module,
@@ -24,7 +25,7 @@ from exported import (
 )
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
-from netspec.export.formats.onnx import export_onnx, onnx_model
+from netspec.export.formats.onnx import export_onnx
 from netspec.export.formats.preprocess import Preprocess
 from netspec.export.formats.pt2 import export_pt2
 from netspec.export.formats.shapes import find_shapes

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 import netspec
-from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, run_module, source_module, trained
+from exported import ONNX_EXTRA, assert_same, here, in_onnxruntime, onnx_model, run_module, source_module, trained
 from netspec.dialects import use_dialect
-from netspec.export.formats.onnx import onnx_model
 from netspec.export.formats.pt2 import torch_module
 from netspec.net.net import Net
 

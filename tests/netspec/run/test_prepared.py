@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from exported import trained
 from netspec.exact.blas import one_thread
-from netspec.export.table import exported
+from netspec.export.exporter import exported
 from netspec.fast import prepared
 from netspec.fast.entry import Entry
 from netspec.fast.table import entry_of
