@@ -36,22 +36,27 @@ class BatchNorm(Layer):
     ignores_propagate_down = frozenset({0})
     joined: tuple[Layer, ...] = ()  # a Scale and a ReLU after it that it also computes, in training
     rectifies = False  # whether they include a ReLU
+    first_weight = 0.0  # what blobs[2] begins with
 
     def setup(self) -> None:
         """Add the sums, all zero. Raise SpecError for a ``param`` that would train them."""
         param = self.param.batch_norm_param
-        for i, spec in enumerate(self.param.param[:3]):
-            if spec.lr_mult != 0:
-                message = f"BatchNorm's blobs are statistics, not learned: set lr_mult: 0, found {spec.lr_mult:g}"
-                raise self.error(message, "param", i, "lr_mult")
+        self.check_params()
         self.use_global_stats: bool = (
             param.use_global_stats if param.HasField("use_global_stats") else self.phase == TEST
         )
         if len(self.bottom_shapes[0]) < 2:
             raise self.error(f"BatchNorm needs at least 2 axes (N, C), found shape {self.bottom_shapes[0]}", "bottom")
         self.channels = self.bottom_shapes[0][1]
-        for shape in ((self.channels,), (self.channels,), (1,)):
-            self.add_blob(shape)
+        for shape, start in (((self.channels,), 0.0), ((self.channels,), 0.0), ((1,), self.first_weight)):
+            self.add_blob(shape, value=start)
+
+    def check_params(self) -> None:
+        """Raise SpecError for a ``param`` that would train the sums."""
+        for i, spec in enumerate(self.param.param[:3]):
+            if spec.lr_mult != 0:
+                message = f"BatchNorm's blobs are statistics, not learned: set lr_mult: 0, found {spec.lr_mult:g}"
+                raise self.error(message, "param", i, "lr_mult")
 
     @override
     def param_spec(self, j: int, given: Param | None) -> Param:

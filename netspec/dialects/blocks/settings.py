@@ -1,7 +1,8 @@
-"""Settings of whole nets and solvers that forks added: Intel's, NVIDIA's and Yuanjun Xiong's Caffe.
+"""Settings that forks added: Intel's, NVIDIA's and Yuanjun Xiong's Caffe.
 
-Some of them change the learning rate. Settings of types and memory affect only how a fork computes. Here they have no
-effect, and a warning says so.
+Some of them change the learning rate. Settings of types, memory, threads, engines and machines affect only how a fork
+computes. Here they have no effect, and a warning says so; ``engine`` has none in Caffe's own fields either. A field
+that changes numbers, such as ``larc``, is not declared, so it is refused.
 """
 
 from __future__ import annotations
@@ -19,6 +20,33 @@ message MemoryOptimizationParameter {
   optional bool optimize_test = 2 [default = false];
   repeated string exclude_blob = 3;
 }
+enum MoreEngines { MKL2017 = 3; MKLDNN = 4; }
+message AllEngines { enum Engine { DEFAULT = 0; CAFFE = 1; CUDNN = 2; MKL2017 = 3; MKLDNN = 4; } }
+message AlgorithmSeekers { enum Seeker { GET = 0; FINDEX = 1; } }
+message Packings { enum Packing { NCHW = 0; NHWC = 1; } }
+message MultinodeParameter {
+  message ModelParallel {
+    optional string layer_from = 1;
+    optional string layer_to = 2;
+    optional uint32 num_nodes = 3 [default = 0];
+    optional uint32 model_parts = 4 [default = 1];
+  }
+  message LayerTypes { repeated string layer_type = 1; }
+  repeated ModelParallel model_parallel = 1;
+  optional LayerTypes compress_layer_type_list = 2;
+}
+message MultinodeLayerParameter {
+  optional uint32 num_nodes = 1 [default = 0];
+  optional uint32 model_parts = 2 [default = 1];
+}
+message MnActivationParameter {
+  optional uint32 num_nodes_in = 1 [default = 0];
+  optional uint32 num_nodes_out = 2 [default = 0];
+  optional uint32 model_parts_in = 3 [default = 1];
+  optional uint32 model_parts_out = 4 [default = 1];
+  optional bool need_reduce = 5 [default = true];
+}
+message MnParamGradCompressParameter { repeated bool param_grad_compress_enable = 1; }
 extend SolverParameter {
   optional int32 warmup_iter = 10048 [default = 0];
   optional float warmup_start_lr = 10049 [default = 0];
@@ -28,6 +56,9 @@ extend SolverParameter {
   optional int32 rampup_interval = 10153 [default = 0];
   optional float rampup_lr = 10154 [default = 0];
   optional int32 richness = 10155;
+  optional string engine = 10300;
+  optional Type solver_data_type = 10301 [default = FLOAT];
+  optional bool store_blobs_in_old_format = 10302 [default = false];
 }
 extend NetParameter {
   optional string engine = 10009;
@@ -37,6 +68,14 @@ extend NetParameter {
   optional Type default_backward_math = 10014 [default = FLOAT];
   optional MemoryOptimizationParameter mem_param = 10200;
   optional int32 richness = 10155;
+  optional float global_grad_scale = 10300 [default = 1];
+  optional bool global_grad_scale_adaptive = 10301 [default = false];
+  optional string default_conv_algos_override = 10302;
+  optional int32 reduce_buckets = 10303 [default = 6];
+  optional int32 default_cudnn_math_override = 10304 [default = -1];
+  optional bool eltwise_mem_sharing = 10305 [default = true];
+  optional uint32 bn_stats_batch_size = 10306 [default = 0];
+  optional MultinodeParameter multinode = 10307;
 }
 extend LayerParameter {
   optional string engine = 10149;
@@ -44,7 +83,48 @@ extend LayerParameter {
   optional Type backward_type = 10146 [default = FLOAT];
   optional Type forward_math = 10147 [default = FLOAT];
   optional Type backward_math = 10148 [default = FLOAT];
+  optional bool debug = 10300 [default = false];
+  optional int32 cudnn_math_override = 10301 [default = -1];
+  optional MultinodeLayerParameter multinode = 10302;
+  optional MnActivationParameter mn_activation_param = 10303;
+  optional MnParamGradCompressParameter mn_grad_compress_param = 10304;
 }
+extend TransformationParameter {
+  optional Packings.Packing forward_packing = 10300 [default = NCHW];
+  optional bool use_gpu_transform = 10301 [default = false];
+  optional int64 random_seed = 10302 [default = -1];
+  optional bool display = 10303 [default = false];
+}
+extend DataParameter {
+  optional uint32 threads = 10300 [default = 0];
+  optional uint32 parser_threads = 10301 [default = 0];
+  optional bool cache = 10302 [default = false];
+  optional bool precache = 10303 [default = false];
+}
+extend ImageDataParameter {
+  optional uint32 threads = 10300 [default = 4];
+  optional bool cache = 10301 [default = false];
+  optional bool precache = 10302 [default = false];
+}
+extend ConvolutionParameter {
+  optional MoreEngines engine = 10300;
+  optional AlgorithmSeekers.Seeker cudnn_convolution_algo_seeker = 10301 [default = FINDEX];
+  optional string conv_algos_override = 10302;
+}
+extend DropoutParameter {
+  optional AllEngines.Engine engine = 10300;
+  optional int64 random_seed = 10301 [default = -1];
+}
+extend LRNParameter { optional MoreEngines engine = 10300; }
+extend PoolingParameter { optional MoreEngines engine = 10300; }
+extend ReLUParameter {
+  optional MoreEngines engine = 10300;
+  optional bool fuse = 10301 [default = false];
+}
+extend BatchNormParameter { optional AllEngines.Engine engine = 10300; }
+extend ConcatParameter { optional AllEngines.Engine engine = 10300; }
+extend EltwiseParameter { optional AllEngines.Engine engine = 10300; }
+extend InnerProductParameter { optional AllEngines.Engine engine = 10300; }
 """
 
 #: The warm-up of Intel and NVIDIA: its length, initial rate and exponent

@@ -86,7 +86,10 @@ def _bare_batch_norms(net: NetParameter, source: SourceMap, plan: Plan) -> Findi
         for v in node.bottoms:
             readers.setdefault(v, set()).add(node.type)
     for i, node in enumerate(plan.nodes):
-        if node.type == "BatchNorm" and node.tops and "Scale" not in readers.get(node.tops[0], set()):
+        if node.type != "BatchNorm" or not node.tops or "Scale" in readers.get(node.tops[0], set()):
+            continue
+        fields = plan.net.layer[i].batch_norm_param.ListFields()
+        if not any(field.is_extension for field, _ in fields):  # with a fork's, it may scale and shift itself
             yield _where(plan, i), "no Scale layer follows; Caffe's BatchNorm itself does not scale and shift"
 
 
