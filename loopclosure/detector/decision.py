@@ -26,6 +26,7 @@ class LoopResult:
     score       of the accepted frame, or of the best candidate; -inf without one
     inliers     inliers of the accepted candidate, or the most of any candidate tried; None if none was tried
     stamp       seconds, as given
+    reason      what decided: the sequence of the frame or its points; empty where the verdict says all
     """
 
     query_id: int
@@ -35,6 +36,7 @@ class LoopResult:
     score: float
     inliers: int | None = None
     stamp: float | None = None
+    reason: str = ""
 
     def __bool__(self) -> bool:
         return self.accepted is not None
@@ -89,7 +91,7 @@ class DetectorSettings:
 def result_of(found: Any, count: int) -> LoopResult:
     """Return a loop read from a file of ``count`` frames. Raises ValueError, LookupError or TypeError."""
     candidates = [(int(number), float(score)) for number, score in found["candidates"]]
-    loop = LoopResult(**{**found, "candidates": candidates})
+    loop = LoopResult(**{**found, "candidates": candidates, "reason": str(found.get("reason", ""))})
     ends = (loop.query_id, loop.accepted)
     if not all(isinstance(end, int) and 0 <= end < count for end in ends) or not isinstance(loop.score, float):
         raise ValueError(f"a loop of frames {ends} among {count}")

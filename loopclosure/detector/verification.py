@@ -32,9 +32,11 @@ LEAST_MATCHES = 8
 # of one object are not independent, and because a detector compares thousands of pairs.
 BY_CHANCE = 1e-6
 # With this many times the inliers that rule out chance, a pair is accepted against its score. Once is not enough: the
-# windows of a facade repeat and agree more often than by chance. On the drives used to choose these values, no pair of
-# different places had three times as many.
-SURE, DOUBTLESS = 1.5, 3.0
+# windows of a facade repeat and agree more often than by chance.
+SURE = 1.5
+# And so many of its matches must be inliers. Two floors of a tower have the same doors and signs, but also points that
+# match at other positions: a poster, another number.
+SHARE = 0.7
 SAMPLE, SOLUTIONS = 7, 3  # matches in a sample, and the largest number of fundamental matrices they give
 PARTS = (8, 6)  # of an image, across and down
 SPREAD = 5  # at most 1 / SPREAD of the needed inliers are counted in one part
@@ -67,6 +69,11 @@ class Agreement(NamedTuple):
     matches: int
     inliers: int
     needed: int
+
+    @property
+    def whole(self) -> bool:
+        """Whether most matches are inliers, as of one place; of two that look alike, only a part of it is the same."""
+        return self.inliers >= SHARE * self.matches
 
 
 @dataclass(frozen=True)
@@ -173,7 +180,9 @@ class GeometricCheck:
 
     def sure(self, found: Agreement) -> int:
         """Return the inliers of an agreement if they outweigh a low score; 0 otherwise."""
-        return found.inliers if self.evidence(found) >= (1.0 if self.min_inliers else SURE) else 0
+        if self.min_inliers:
+            return self.enough(found)
+        return found.inliers if self.evidence(found) >= SURE and found.whole else 0
 
     def __post_init__(self) -> None:
         if (

@@ -18,9 +18,11 @@ from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.run import verdicts_said
 from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
+from loopclosure.methods import reasons as said
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
 from loopclosure.methods.candidates import Candidates, Compared, candidates, far_apart
-from loopclosure.methods.decision import WINDOW, decide
+from loopclosure.methods.contradiction import Visits, temporal
+from loopclosure.methods.decision import WINDOW, Decision, decide
 from loopclosure.methods.decoys import elsewhere
 from loopclosure.methods.geometry import Agree, Geometry, Matches, verify
 from loopclosure.methods.lines import Lines, best_lines, pool
@@ -31,8 +33,6 @@ from loopclosure.progress import Progress, silent, timed
 
 PRECISION = 0.99
 NEAR_A_STOP = 2  # frames, of those in which the camera moves
-DOUBTFUL = 0.1  # a smaller share of verified loops is rare where light and season are the same
-TRIED = 10  # matches that a user who wants more may look at first
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,7 @@ class Searched:
 
     stamps    (N,) seconds of the queries of the whole drive, NaN or None where not known
     age_said  a sentence about which pairs show different places; empty for two traverses
+    temporal  (N, A) the score of each query with those before it; None: not known
     """
 
     stamps: np.ndarray | None
@@ -71,12 +72,13 @@ class Searched:
     lines: Lines | None
     matches: Matches
     age_said: str
+    temporal: np.ndarray | None = None
 
     @property
     def line_scores(self) -> np.ndarray:
         """The score of the best line of each query (N,), -inf without one."""
         none = np.full(len(self.given.queries), -np.inf)
-        return (none if self.lines is None else self.lines.targets)[self.given.stands]
+        return (none if self.lines is None else self.lines.best.targets)[self.given.stands]
 
     @property
     def image_scores(self) -> np.ndarray:
@@ -91,7 +93,8 @@ def find_matches(compared: Compared, precision: float = PRECISION) -> Searched:
     given = candidates(compared)
     decoys, age_said = elsewhere(given)
     lines = best_lines(given, pool(given, decoys), precision)
-    return Searched(compared.stamps, given, lines, Matches.of(given, lines, precision), age_said)
+    before = compared.temporal if compared.two else temporal(compared.scores)
+    return Searched(compared.stamps, given, lines, Matches.of(given, lines, precision), age_said, before)
 
 
 def answer(
@@ -108,35 +111,45 @@ def answer(
     worth         the queries (N,) bool whose matches are verified; None: all
     """
     given, lines, matches = searched.given, searched.lines, searched.matches
-    said = "verification: not tried, there are no images"
+    geometry, visits = None, None
     if check is not None and agree is not None:
         rows = np.ones(len(given.queries), bool)
         if worth is not None:
             rows = np.bincount(given.stands, worth, len(rows)) > 0
         geometry = Geometry.of(given, check, agree, rows)
         verify(given, lines, matches, rows, geometry, progress)
-        said = _verified_said(matches, geometry)
-    loops = decide(matches, lines)
-    rejected = np.where(matches.inliers >= 0, "not verified", "below threshold")
-    verdicts = np.where(loops, "accepted", np.where(matches.there, rejected, "no candidate"))
-    results = _results(given, matches, loops, verdicts.tolist(), searched.stamps)
+        visits = _visits(searched, geometry)
+    decision = decide(matches, lines, given.scores, visits)
+    results = _results(searched, decision)
     reasons = [
         *filter(None, [given.said, searched.age_said]),
-        _sequences_said(lines if matches.by_lines else None, given.far),
-        said,
-        *_doubtful_said(matches, loops),
+        said.sequences(lines if matches.by_lines else None, given.far),
+        said.verification(matches, geometry),
+        *said.doubts(matches, decision),
+        said.total(results, given),
     ]
-    there = sum(bool(result.candidates) for result in results)
-    reasons.append(_total_said(sum(map(bool, results)), there, given))
     return Answer(results, reasons)
 
 
-def _results(
-    given: Candidates, matches: Matches, loops: np.ndarray, verdicts: list[str], stamps: np.ndarray | None
-) -> list[LoopResult]:
+def _visits(searched: Searched, geometry: Geometry) -> Visits | None:
+    """Return what frames of one visit have in common; None if they cannot be compared."""
+    agree = geometry.among_queries(searched.given.two)
+    if agree is None or searched.temporal is None:
+        return None
+    return Visits(
+        searched.temporal, lambda a, b: geometry.evidence(agree(a, b)) >= 1, (geometry.common, geometry.tried)
+    )
+
+
+def _results(searched: Searched, decision: Decision) -> list[LoopResult]:
     """Return the result of each query of the whole drive: that of the frame that stands for it."""
+    given, matches, stamps = searched.given, searched.matches, searched.stamps
+    rejected = np.where(matches.tried, "not verified", "below threshold")
+    verdicts = np.where(decision.loops, "accepted", np.where(matches.there, rejected, "no candidate")).tolist()
+    why = [said.why(row, matches, searched.lines, decision) for row in range(len(verdicts))]
     results, looked_at = [], given.references[matches.match]
-    for query, (row, match) in enumerate(zip(given.stands, places(given, matches, loops).tolist(), strict=True)):
+    frames = places(given, matches, decision.loops).tolist()
+    for query, (row, match) in enumerate(zip(given.stands, frames, strict=True)):
         score, inliers, verdict = float(matches.score[row]), int(matches.inliers[row]), verdicts[row]
         stamp = np.nan if stamps is None else float(stamps[query])
         results.append(
@@ -148,6 +161,7 @@ def _results(
                 score,
                 inliers if inliers >= 0 and (query, match) == (given.queries[row], looked_at[row]) else None,
                 None if np.isnan(stamp) else stamp,
+                why[row],
             )
         )
     return results
@@ -175,46 +189,6 @@ def places(given: Candidates, matches: Matches, loops: np.ndarray) -> np.ndarray
 def _near_a_stop(frames: np.ndarray) -> np.ndarray:
     """Return which of the frames (n,) in which a camera moved stand for several, or are near such a frame."""
     return maximum_filter1d(np.diff(frames, append=frames[-1] + 1) > 1, 2 * NEAR_A_STOP + 1, mode="constant")
-
-
-def _verified_said(matches: Matches, geometry: Geometry) -> str:
-    tried = np.count_nonzero(matches.inliers >= 0)
-    same, few = np.count_nonzero(matches.inliers > 0), np.count_nonzero(matches.few & (matches.inliers <= 0))
-    unknown = f"; {few} frames cannot be verified" if few else ""
-    unlike = f"{round(geometry.common * geometry.tried)} of {geometry.tried} unlike pairs"
-    hidden = f" ({100 * geometry.hidden:.1f} % of the image never changes, and is left out)" if geometry.hidden else ""
-    return f"verification: {same} of {tried} matches and {unlike} show the same points{hidden}{unknown}"
-
-
-def _doubtful_said(matches: Matches, loops: np.ndarray) -> list[str]:
-    tried = loops & (matches.inliers >= 0) & ~matches.few
-    same, total = np.count_nonzero(matches.inliers[tried] > 0), np.count_nonzero(tried)
-    if not total or same >= DOUBTFUL * total:
-        return []
-    return [
-        f"only {same} of {total} accepted matches show the same points: if light and season are the same, look at "
-        "them; --odometry tells places that look alike apart"
-    ]
-
-
-def _sequences_said(lines: Lines | None, far: np.ndarray | None) -> str:
-    others = "where the drive is read backwards" if far is None else "far apart in the odometry"
-    if lines is None:
-        return f"sequences: none is more alike than what is seen {others}, so images are compared one by one"
-    return f"{lines}: a match counts if it is more alike than what is seen {others}"
-
-
-def _total_said(loops: int, queries: int, given: Candidates) -> str:
-    if loops:
-        return f"{loops} of the {queries} frames that have a candidate close a loop"
-    if not queries:
-        return "no frame has a candidate: the camera did not come back, or the drive is too short to tell"
-    alike = np.argsort(-given.best, kind="stable")[:TRIED]
-    alike = alike[given.there[alike]]  # fewer where few frames have a candidate
-    least, ages = given.best[alike].min(), given.queries[alike] - given.references[given.single[alike]]
-    recent = "" if given.two else f" --exclude-recent {max(0, ages.min() - 1)}"
-    tried = f"detect --threshold {np.floor(1e3 * least) / 1e3:g}{recent} accepts the most alike, to be looked at"
-    return f"nothing here tells loops from chance: none is accepted ({tried})"
 
 
 @dataclass

@@ -33,6 +33,8 @@ class Compared:
     visit    for one drive: a reference is a candidate if it is more than this many frames older; None: found
              automatically
     stamps   (Q,) seconds of the queries, NaN or None where not known
+    temporal  (Q, A) the score of each query with the query before it, the one before that, ...; NaN where there is
+             none. Of one drive they are found in ``scores``; None: not known
     """
 
     scores: np.ndarray
@@ -41,6 +43,7 @@ class Compared:
     far: np.ndarray | None = None
     visit: int | None = None
     stamps: np.ndarray | None = None
+    temporal: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -163,6 +166,8 @@ def _returned(scores: np.ndarray, allowed: np.ndarray, frames: np.ndarray) -> tu
         after, before = away & (rows > numbers), away & (rows + AWAY <= numbers)
         left = np.where((left == count) & after.any(axis=0), first + after.argmax(axis=0), left)
         entered = np.where(before.any(axis=0), rows[-1] - before[::-1].argmax(axis=0), entered)
+    # A turn of the road ends the visit of what was straight ahead within a second: no visit is shorter than is usual.
+    left = np.maximum(left, numbers + int(np.median(left - numbers)))
     back = numbers[:, None] >= left + AWAY
     back &= numbers < entered[:, None]
     return back, frames[np.minimum(left, count - 1)] - frames

@@ -2,39 +2,72 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from loopclosure.detector.verification import DOUBTLESS, SURE
+from loopclosure.detector.verification import SURE
+from loopclosure.methods.contradiction import Visits
 from loopclosure.methods.geometry import Matches
-from loopclosure.methods.lines import LEAST_ACCEPTED, Lines
-from loopclosure.methods.seqslam import SequenceSettings
+from loopclosure.methods.lines import LEAST_ACCEPTED, Course, Lines
 
 WINDOW = 5  # references to each side of a line, and at least so many queries along it, where a loop has neighbors
 MOST = 0.5  # of the matches between two loops are on one line with them, where it goes on between them
+LEAST_VERIFIED = 3  # fewer verified matches of a stretch do not tell whether they agree only in part
 UNLIKELY = 0.05  # that so many matches in a row are not verified, at the share that is
 
 
-def decide(matches: Matches, lines: Lines | None) -> np.ndarray:
-    """Return the queries (Q,) whose matches are loops."""
+@dataclass(frozen=True)
+class Decision:
+    """What became of the matches (Q,) bool.
+
+    loops   these are accepted
+    by_line of these, the ones whose sequence is more alike than chance; the others are by their points
+    fell    matches of sequences that their points speak against
+    part    matches of which enough points agree, but only a part of those that match: places look alike
+    alike   whether places look alike so often that no single image is accepted
+    """
+
+    loops: np.ndarray
+    by_line: np.ndarray
+    fell: np.ndarray
+    part: np.ndarray
+    alike: bool
+
+
+def decide(matches: Matches, lines: Lines | None, scores: np.ndarray, visits: Visits | None = None) -> Decision:
+    """Decide which matches are loops.
+
+    scores  (Q, R) the similarity of each pair
+    visits  what frames of one visit have in common; None: not known
+    """
+    many, nothing = matches.evidence >= SURE, np.zeros(len(matches.match), bool)
+    part = many & ~matches.whole
+    alike = 2 * np.count_nonzero(part) > np.count_nonzero(many)
+    sure = nothing if alike else many & matches.whole
     if lines is None:
-        return matches.evidence >= SURE
-    pairs, verified = neighbors(matches.match, lines.sequence), matches.evidence >= 1
+        return Decision(sure, nothing, nothing, part, alike)
+    pairs = neighbors(matches.match, lines.course)
     if not matches.by_lines:
-        return grown(matches.evidence >= SURE, verified, pairs)
+        return Decision(grown(sure, matches.verified, pairs), nothing, nothing, part, alike)
+    found = of_lines(matches, lines, pairs)
+    fell = contradicted(found, matches.verified, matches.tried, pairs, lines.course.length)
+    fell |= fallen(found & ~fell, matches, pairs, scores, visits)
+    by_line = found & ~fell
+    by_line |= between(by_line, lines.best.match, lines.course) & (matches.match == lines.best.match)
+    loops = grown(by_line | (sure & ~fell), lines.near & matches.verified & ~fell, pairs)
+    return Decision(loops, by_line, fell, part, alike)
+
+
+def of_lines(matches: Matches, lines: Lines, pairs: np.ndarray) -> np.ndarray:
+    """Return the queries (Q,) with an accepted line, of enough on a stretch, and those next to them above chance."""
     label = stretches(matches.line, pairs)
     many = np.bincount(label, matches.line)[label] >= LEAST_ACCEPTED
-    seeds = matches.line & (many | (np.bincount(label, verified & matches.line)[label] > 0))
-    of_line = matches.match == lines.match
-    by_line = grown(seeds, lines.above_decoys & of_line, pairs)
-    loops = by_line & ~contradicted(by_line, verified, matches.inliers >= 0, pairs, lines.sequence.length)
-    loops |= between(loops, lines.match, lines.sequence) & of_line
-    # From afar a place is seen before the camera is there: other queries fit it better.
-    loops |= lines.near & (matches.evidence >= DOUBTLESS)
-    return grown(loops, lines.near & verified, pairs)
+    seeds = matches.line & (many | (np.bincount(label, matches.verified & matches.line)[label] > 0))
+    return grown(seeds, lines.above_decoys & (matches.match == lines.best.match), pairs)
 
 
 def grown(loops: np.ndarray, possible: np.ndarray, pairs: np.ndarray) -> np.ndarray:
@@ -78,7 +111,25 @@ def contradicted(
     return against
 
 
-def between(loops: np.ndarray, match: np.ndarray, sequence: SequenceSettings) -> np.ndarray:
+def fallen(
+    loops: np.ndarray, matches: Matches, pairs: np.ndarray, scores: np.ndarray, visits: Visits | None
+) -> np.ndarray:
+    """Return the loops (Q,) of stretches whose points speak against all of it.
+
+    Either too few are verified for one place, or of those that are, most agree only in part.
+    """
+    stretch, against = stretches(loops, pairs), np.zeros_like(loops)
+    for number in np.unique(stretch[loops]):
+        queries = np.flatnonzero(loops & (stretch == number))
+        tried = queries[matches.tried[queries]]
+        verified = tried[matches.verified[tried]]
+        in_part = len(verified) >= LEAST_VERIFIED and 2 * np.count_nonzero(matches.whole[verified]) < len(verified)
+        similarity = float(np.median(scores[tried, matches.match[tried]])) if len(tried) else 0.0
+        against[queries] = in_part or (visits is not None and visits.contradict(similarity, len(verified), len(tried)))
+    return against
+
+
+def between(loops: np.ndarray, match: np.ndarray, course: Course) -> np.ndarray:
     """Return the queries (Q,) between two loops of one line whose matches are on it, as at least half of them are.
 
     Nothing leads a match there but the place itself, though its score is no greater than chance makes some.
@@ -86,7 +137,7 @@ def between(loops: np.ndarray, match: np.ndarray, sequence: SequenceSettings) ->
     filled = np.zeros_like(loops)
     for first, last in pairwise(np.flatnonzero(loops).tolist()):
         way, moved = last - first, match[last] - match[first]
-        if way > 1 and sequence.slowest * way - WINDOW <= moved <= sequence.fastest * way + WINDOW:
+        if way > 1 and _on_course(moved, way, course):
             line = match[first] + moved * np.arange(1, way) / way
             on = np.abs(match[first + 1 : last] - line) <= WINDOW
             filled[first + 1 : last] = on & (np.mean(on) >= MOST)
@@ -100,15 +151,20 @@ def stretches(loops: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     return connected_components(links, directed=False)[1]
 
 
-def neighbors(match: np.ndarray, sequence: SequenceSettings) -> np.ndarray:
+def neighbors(match: np.ndarray, course: Course) -> np.ndarray:
     """Return pairs (N, 2) of queries, the earlier first, whose matches lie on the line through one another.
 
-    The line has the length and the velocities of the ``sequence``, and is ``WINDOW`` references wide to each side.
+    The line has the length, the speed and the direction of the ``course``, and is ``WINDOW`` references wide to each
+    side.
     """
     pairs = []
-    for step in range(1, max(WINDOW, sequence.length // 2) + 1):
-        moved = match[step:] - match[:-step]
-        low, high = sequence.slowest * step - WINDOW, sequence.fastest * step + WINDOW
-        earlier = np.flatnonzero((moved >= low) & (moved <= high))
+    for step in range(1, max(WINDOW, course.length // 2) + 1):
+        earlier = np.flatnonzero(_on_course(match[step:] - match[:-step], step, course))
         pairs.append(np.stack([earlier, earlier + step], axis=1))
     return np.concatenate(pairs)
+
+
+def _on_course(moved: np.ndarray, way: int, course: Course) -> np.ndarray:
+    """Return which matches that ``moved`` so many references are on one line, over ``way`` queries."""
+    ahead, sequence = -moved if course.backwards else moved, course.sequence
+    return (sequence.slowest * way - WINDOW <= ahead) & (ahead <= sequence.fastest * way + WINDOW)

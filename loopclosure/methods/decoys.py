@@ -16,7 +16,6 @@ import numpy as np
 from loopclosure.methods.candidates import Candidates
 
 SETTLED = 0.05  # the remaining share of the fall from the similarity of neighbors to that of different places
-ENOUGH = 0.5  # of the queries with a candidate must have frames that are far apart by odometry, for these to be decoys
 
 
 def elsewhere(given: Candidates) -> tuple[np.ndarray, str]:

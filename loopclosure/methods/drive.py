@@ -18,6 +18,7 @@ from loopclosure.errors import InputError
 from loopclosure.methods.auto import PRECISION, Answer, Searched, answer, find_matches
 from loopclosure.methods.base import BLOCK
 from loopclosure.methods.candidates import Compared, far_apart
+from loopclosure.methods.contradiction import AGES, temporal
 from loopclosure.places.frames import gray, read_gray
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.truth import Exclusion
@@ -166,7 +167,8 @@ class _Comparison:
         far = None if request.odometry is None else far_apart(request.odometry[::step])
         visit = None if request.visit is None else request.visit // step
         allowed = np.ones((len(queries), len(references)), bool) if two else _earlier(stamps[::step], request.seconds)
-        compared = Compared(_compared(detector, queries, references), allowed, two, far, visit, stamps[::step])
+        before = _before(detector, queries) if two else None
+        compared = Compared(_compared(detector, queries, references), allowed, two, far, visit, stamps[::step], before)
         return cls(queries, references, stamps, find_matches(compared, request.precision))
 
     def decided(
@@ -216,6 +218,17 @@ def _compared(detector: LoopDetector, queries: range, references: range) -> np.n
     rows, known = (detector.descriptors_of(of.start, of.stop)[:: of.step] for of in (queries, references))
     same, settings = queries == references, detector.settings
     return similarity_matrix(rows, None if same else known, settings.metric, settings.views)
+
+
+def _before(detector: LoopDetector, frames: range) -> np.ndarray:
+    """Return the scores (N, A) of frames with those before them, as :func:`temporal` does."""
+    rows, settings = detector.descriptors_of(frames.start, frames.stop)[:: frames.step], detector.settings
+    found = np.full((len(rows), AGES), np.nan, np.float32)
+    for first in range(0, len(rows), BLOCK):
+        around = max(0, first - AGES)
+        part = temporal(similarity_matrix(rows[around : first + BLOCK], None, settings.metric, settings.views))
+        found[first : first + BLOCK, : part.shape[1]] = part[first - around :]
+    return found
 
 
 def _earlier(stamps: np.ndarray, seconds: float) -> np.ndarray:

@@ -7,7 +7,7 @@ The number of inliers that chance explains is computed for each pair from the nu
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.lines import Lines
 from loopclosure.progress import Progress
 
-SAMPLE = 40  # pairs from which fixed parts of the images are found
+SAMPLE = 40  # pairs from which fixed parts of the images, and the points of unlike pairs, are found
 
 Agree = Callable[[int, int], Agreement]
 
@@ -30,6 +30,7 @@ class Matches:
     line      whether its line makes it a loop
     inliers   of the match, 0 if chance explains them, -1 if it was not verified
     evidence  its inliers divided by the number needed
+    whole     whether most of its points that match agree, see :attr:`Agreement.whole`
     few       whether it had too few points to be verified or rejected
     """
 
@@ -38,6 +39,7 @@ class Matches:
     line: np.ndarray
     inliers: np.ndarray
     evidence: np.ndarray
+    whole: np.ndarray
     few: np.ndarray
 
     @classmethod
@@ -46,15 +48,26 @@ class Matches:
         count = len(given.queries)
         match, score, line = np.where(given.there, given.single, -1), given.best, np.zeros(count, bool)
         if lines is not None and np.any(accepted := lines.accepted(precision)):
-            there = lines.match >= 0
-            match = np.where(there, lines.match, match)
-            score, line = np.where(there, lines.targets, -np.inf), accepted
-        return cls(match, score, line, np.full(count, -1), np.zeros(count), np.zeros(count, bool))
+            there = lines.best.match >= 0
+            match = np.where(there, lines.best.match, match)
+            score, line = np.where(there, lines.best.targets, -np.inf), accepted
+        whole, few = np.zeros((2, count), bool)
+        return cls(match, score, line, np.full(count, -1), np.zeros(count), whole, few)
 
     @property
     def there(self) -> np.ndarray:
         """Whether each query has a match."""
         return self.match >= 0
+
+    @property
+    def tried(self) -> np.ndarray:
+        """Whether each match was verified."""
+        return self.inliers >= 0
+
+    @property
+    def verified(self) -> np.ndarray:
+        """Whether each match has more points that agree than chance explains."""
+        return self.evidence >= 1
 
     @property
     def by_lines(self) -> bool:
@@ -64,11 +77,11 @@ class Matches:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Verification of the frames of :class:`Candidates`, by row and column.
+    """Verification of frames, by their number in the whole drive.
 
     check   the geometric check
     agree   a function: how many points of a query and a reference agree
-    common  the share of dissimilar pairs that agree: the stripes of a curb repeat, and a desk is in all images of it
+    common  how many dissimilar pairs agree: the stripes of a curb repeat, and a desk is in all images of it
     points  the mean number of their points that agree, of those pairs that do not agree 0
     tried   the number of dissimilar pairs that were examined
     hidden  the share of the images that is ignored
@@ -76,7 +89,7 @@ class Geometry:
 
     check: GeometricCheck
     agree: Agree
-    common: float = 0.0
+    common: int = 0
     points: float = 0.0
     tried: int = 0
     hidden: float = 0.0
@@ -87,22 +100,24 @@ class Geometry:
 
         rows  (Q,) bool: the queries to verify
         """
-        unlike = _unlike(given, rows)
+        unlike = _numbers(given, _unlike(given, rows))
+        hidden = 0.0
         if isinstance(agree, Between) and unlike:
-            pairs = unlike + _left(given, rows)
-            agree = agree.without_fixed([(int(given.queries[q]), int(given.references[r])) for q, r in pairs])
-
-        def of_rows(query: int, reference: int) -> Agreement:
-            return agree(int(given.queries[query]), int(given.references[reference]))
-
-        hidden = agree.hidden if isinstance(agree, Between) else 0.0
-        inliers = np.array([check.enough(of_rows(query, reference)) for query, reference in unlike])
-        common, points = (float(np.mean(inliers > 0)), float(np.mean(inliers))) if len(inliers) else (0.0, 0.0)
-        return cls(check, of_rows, common, points, len(inliers), hidden)
+            agree = agree.without_fixed(unlike + _numbers(given, _left(given, rows)))
+            hidden = agree.hidden
+        inliers = np.array([check.enough(agree(query, reference)) for query, reference in unlike])
+        points = float(np.mean(inliers)) if len(inliers) else 0.0
+        return cls(check, agree, np.count_nonzero(inliers), points, len(inliers), hidden)
 
     def evidence(self, agreement: Agreement) -> float:
         """Return the inliers of an agreement divided by the number needed: against chance and dissimilar pairs."""
         return agreement.inliers / ((self.check.min_inliers or agreement.needed) + self.points)
+
+    def among_queries(self, two: bool) -> Agree | None:
+        """Return a function: how many points of two queries agree; None if that cannot be told of ``two`` traverses."""
+        if isinstance(self.agree, Between):
+            return replace(self.agree, references=self.agree.queries)
+        return None if two else self.agree
 
 
 def _sample(numbers: np.ndarray) -> np.ndarray:
@@ -110,6 +125,11 @@ def _sample(numbers: np.ndarray) -> np.ndarray:
     if not len(numbers):
         return numbers
     return numbers[np.unique(np.linspace(0, len(numbers) - 1, SAMPLE).round().astype(int))]
+
+
+def _numbers(given: Candidates, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return pairs (row, column) by their numbers in the whole drive."""
+    return [(int(given.queries[query]), int(given.references[reference])) for query, reference in pairs]
 
 
 def _unlike(given: Candidates, rows: np.ndarray) -> list[tuple[int, int]]:
@@ -140,16 +160,17 @@ def verify(
     """
     there, instead, alone = np.flatnonzero(matches.there & rows), given.single, None
     if lines is not None and matches.by_lines:
-        alone = lines.alone
+        alone = lines.best.alone
     elif lines is not None:
-        instead = np.where(lines.match >= 0, lines.match, instead)
+        instead = np.where(lines.best.match >= 0, lines.best.match, instead)
     for query in progress(there, "verification", len(there)):
         # The lamps of a tunnel repeat: one verified image does not overrule an accepted sequence.
         other = matches.match if matches.line[query] else instead
         for reference in dict.fromkeys((int(matches.match[query]), int(other[query]))):
-            agreement = geometry.agree(int(query), reference)
+            agreement = geometry.agree(int(given.queries[query]), int(given.references[reference]))
             matches.inliers[query] = geometry.check.enough(agreement)
             matches.evidence[query] = geometry.evidence(agreement)
+            matches.whole[query] = agreement.whole
             matches.few[query] = agreement.matches < LEAST_MATCHES
             if matches.inliers[query]:
                 if reference != matches.match[query]:

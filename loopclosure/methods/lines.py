@@ -7,7 +7,7 @@ columns are standardized: a query that is like everything, and a pass in another
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
@@ -17,8 +17,9 @@ from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.seqslam import SequenceSettings, standardize, trajectory_costs
 
 LENGTHS = (10, 30)  # steps of a line
-VELOCITIES = (0.8, 1.2, 0.1)  # least, greatest and step, as shares of the ratio of the lengths of the traverses
-LEAST_LENGTHS = 5  # lengths of a line that a drive must have, to show what chance does
+VELOCITIES = (0.8, 1.2, 0.1)  # least, greatest and step, as shares of the speed
+SPEEDS = (0.5, 2.0, 0.25, 4.0)  # references for a query, tried where neither the ratio of the lengths nor 1 finds any
+LEAST_PIECES = 25  # pieces of the length of a line, of queries times of references, that show what chance does
 TAIL = 0.1  # share of the decoys that the tail is fitted to, and at least so many:
 LEAST_TAIL = 5
 LEAST_ACCEPTED = 10  # fewer matches than this cannot be told from one chance line
@@ -29,58 +30,98 @@ MIDDLE = 4  # steps in the middle of a line
 
 
 @dataclass(frozen=True)
+class Course:
+    """How lines run: steps of a line, references for a query, and whether the references are passed backwards."""
+
+    length: int
+    speed: float = 1.0
+    backwards: bool = False
+
+    @property
+    def sequence(self) -> SequenceSettings:
+        """The search for such lines, among references in the order in which they are passed."""
+        slowest, fastest, step = (self.speed * velocity for velocity in VELOCITIES)
+        return SequenceSettings(self.length, slowest, fastest, step, contrast=0)
+
+    def __str__(self) -> str:
+        s, back = self.sequence, ", backwards" if self.backwards else ""
+        return f"sequences of {s.length} frames, at {s.slowest:.3g} to {s.fastest:.3g} times the speed{back}"
+
+
+@dataclass(frozen=True)
 class Pool:
     """The pairs among which lines are searched.
 
     distances  (Q, R) standardized, NaN for what is no candidate
     found      (Q, R) bool: what a line may match
     decoys     (Q, R) bool: what a decoy may match
-    backwards  decoys are lines with the references in reverse order; False: as the others
+    reverse    decoys are lines that pass the references in the other order; False: as the others
     """
 
     distances: np.ndarray
     found: np.ndarray
     decoys: np.ndarray
-    backwards: bool
+    reverse: bool
+
+    def backwards(self) -> Pool:
+        """Return the pool with the references in reverse order."""
+        return Pool(self.distances[:, ::-1], self.found[:, ::-1], self.decoys[:, ::-1], self.reverse)
 
 
 @dataclass(frozen=True)
-class Lines:
-    """What a search found, of each query (Q,).
+class Best:
+    """The best line of each query (Q,).
 
-    sequence  how lines run
-    match     its best reference, -1 without one
-    targets   that score, -inf without one
-    alone     the score of the line through the best single image, -inf without one
-    decoys    the best score of a line elsewhere, -inf without one
-    near      whether the place itself is on the line. Where a loop ends, the line through its last place is the best
-              one for a while
-    odds      from how many pairs a line was chosen, as a multiple of those that its decoy was chosen from
+    match    its reference, -1 without one
+    targets  its score, -inf without one
+    alone    the score of the line through the best single image, -inf without one
+    decoys   the best score of a line elsewhere, -inf without one
+    owner    how many queries away that is which fits the match best
+    middle   the score of the middle of the line
+    chance   what such a short line scores by chance
     """
 
-    sequence: SequenceSettings
     match: np.ndarray
     targets: np.ndarray
     alone: np.ndarray
     decoys: np.ndarray
+    owner: np.ndarray
+    middle: np.ndarray
+    chance: np.ndarray
+
+    @classmethod
+    def joined(cls, parts: list[Best]) -> Best:
+        """Return the lines of consecutive blocks of queries as one."""
+        return cls(*(np.concatenate([getattr(part, of.name) for part in parts]) for of in fields(cls)))
+
+
+@dataclass(frozen=True)
+class Lines:
+    """What a search found.
+
+    near  whether the place itself is on the line (Q,). Where a loop ends, the line through its last place is the best
+          one for a while
+    odds  from how many pairs a line was chosen, as a multiple of those that its decoy was chosen from
+    """
+
+    course: Course
+    best: Best
     near: np.ndarray
     odds: float
 
     def accepted(self, precision: float) -> np.ndarray:
         """Return which best matches (Q,) are loops by their lines; none if they are too few to tell."""
-        together = max(REACH, self.sequence.length / 2)
-        accepted = self.near & (self.targets >= threshold(self.targets, self.decoys, precision, together, self.odds))
-        least = max(LEAST_ACCEPTED, self.sequence.length)
-        return accepted if np.count_nonzero(accepted) >= least else np.zeros_like(accepted)
+        together = max(REACH, self.course.length / 2)
+        least = threshold(self.best.targets, self.best.decoys, precision, together, self.odds)
+        accepted = self.near & (self.best.targets >= least)
+        enough = max(LEAST_ACCEPTED, self.course.length)
+        return accepted if np.count_nonzero(accepted) >= enough else np.zeros_like(accepted)
 
     @property
     def above_decoys(self) -> np.ndarray:
         """Which queries (Q,) have a line that is better than every decoy."""
-        return self.near & (self.targets > self.decoys.max(initial=-np.inf)) & np.isfinite(self.decoys).any()
-
-    def __str__(self) -> str:
-        s = self.sequence
-        return f"sequences of {s.length} frames, at {s.slowest:.3g} to {s.fastest:.3g} times the speed"
+        decoys = self.best.decoys
+        return self.near & (self.best.targets > decoys.max(initial=-np.inf)) & np.isfinite(decoys).any()
 
 
 def threshold(
@@ -122,63 +163,72 @@ def _standardized(given: Candidates, which: np.ndarray) -> np.ndarray:
     return standardize(distances, usual=True)
 
 
-def sequences(among: Pool, two: bool) -> Iterator[SequenceSettings]:
-    """Yield how lines may run, the shortest first; ``two`` traverses, or one drive with itself."""
-    queries, references = among.found.shape
-    ratio = references / queries if two else 1.0
-    slowest, fastest, step = (ratio * velocity for velocity in VELOCITIES)
-    judged = min(np.count_nonzero(among.decoys.any(axis=1)), references / ratio)
-    for length in LENGTHS:
-        if judged >= LEAST_LENGTHS * length:
-            yield SequenceSettings(length, slowest, fastest, step, contrast=0)
+def courses(among: Pool, two: bool) -> Iterator[list[Course]]:
+    """Yield groups of courses, those of a group the shortest first: one speed and direction.
+
+    One drive is passed at its own speed. Of two traverses one may be a part of the other, at any speed: the ratio of
+    their lengths is the speed only if both cover the whole route.
+    """
+    queries, references = np.count_nonzero(among.decoys.any(axis=1)), among.found.shape[1]
+    whole = references / max(1, len(among.found))
+    tried = [whole] if two else []
+    for speed in [*tried, 1.0, *(SPEEDS if two else ())]:
+        if speed != whole and any(VELOCITIES[0] <= speed / other <= VELOCITIES[1] for other in tried):
+            continue  # searched already
+        tried.append(speed)
+        for backwards in (False, True):
+            group = [
+                Course(length, speed, backwards)
+                for length in LENGTHS
+                if queries * references / speed >= LEAST_PIECES * length**2
+                and min(queries, references / speed) >= length
+            ]
+            if group:
+                yield group
 
 
-def search(given: Candidates, among: Pool, sequence: SequenceSettings) -> Lines:
+def search(given: Candidates, among: Pool, course: Course) -> Lines:
     """Find the best line of each query, and its decoy."""
-    count, width = among.found.shape
-    blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
-    parts = [_search_rows(given, among, sequence, rows) for rows in blocks]
-    match, targets, alone, decoys, owner, middle, chance, spread = (
-        np.concatenate(column) for column in zip(*parts, strict=True)
-    )
+    single = given.single
+    if course.backwards:
+        among, single = among.backwards(), among.found.shape[1] - 1 - single
+    blocks = [range(first, min(first + BLOCK, len(single))) for first in range(0, len(single), BLOCK)]
+    best = Best.joined([_search_rows(among, course.sequence, rows, single) for rows in blocks])
     # A line that lies partly past the end of a loop has one wholly inside within half its length.
-    whole = maximum_filter1d(np.maximum(targets, chance), 2 * (sequence.length // 2) + 1)
-    near = (middle >= (chance + whole) / 2) & (np.abs(owner) <= max(REACH, count / width if given.two else 1))
-    crossed = 2 * sequence.length + 1 if among.backwards else 0
+    whole = maximum_filter1d(np.maximum(best.targets, best.chance), 2 * (course.length // 2) + 1)
+    near = (best.middle >= (best.chance + whole) / 2) & (np.abs(best.owner) <= max(REACH, 1 / course.speed))
+    crossed = 2 * course.length + 1 if among.reverse else 0
     chances = np.maximum(0, among.decoys.sum(axis=1) - crossed).sum()
     odds = max(1.0, among.found.sum() / max(1, chances))
-    # Where chance lines differ more than usual, as of frames in one season, so much more is needed.
-    usual = np.median(spread[spread > 0]) if np.any(spread > 0) else 1.0
-    targets, alone = (scores / np.maximum(1.0, spread / usual) for scores in (targets, alone))
-    targets = np.where(np.isfinite(decoys), targets, -np.inf)  # of what has no decoy nothing is known
-    return Lines(sequence, np.where(np.isneginf(targets), -1, match), targets, alone, decoys, near, odds)
+    targets = np.where(np.isfinite(best.decoys), best.targets, -np.inf)  # of what has no decoy nothing is known
+    match = among.found.shape[1] - 1 - best.match if course.backwards else best.match
+    return Lines(course, replace(best, targets=targets, match=np.where(np.isneginf(targets), -1, match)), near, odds)
 
 
-def _search_rows(given: Candidates, among: Pool, sequence: SequenceSettings, rows: range) -> tuple[np.ndarray, ...]:
-    """Return of some queries (n,): match, targets, alone and decoys of :class:`Lines`, and what tells where loops end.
-
-    These are how many queries away that is which fits the match best, the score of the middle of the line, and what
-    such a short line scores by chance.
-    """
+def _search_rows(among: Pool, sequence: SequenceSettings, rows: range, single: np.ndarray) -> Best:
+    """Return the best lines of some queries; ``single`` (Q,): the best single image of each query."""
     reach, numbers = sequence.length, np.arange(len(rows))
     around = range(max(0, rows.start - reach), min(rows.stop + reach, len(among.found)))
     found = _scores(among.distances, among.found, sequence, around)
     own = found[rows.start - around.start :][: len(rows)]
-    match, targets = own.argmax(axis=1), own.max(axis=1)
-    owner = np.array(
-        [_owner(found[:, column], row - around.start, reach) for row, column in zip(rows, match, strict=True)]
-    )
+    match = own.argmax(axis=1)
+    owner = [_owner(found[:, column], row - around.start, reach) for row, column in zip(rows, match, strict=True)]
     middle = _scores(among.distances, among.found, replace(sequence, length=MIDDLE), rows)
-    chance = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in middle])
-    if among.backwards:
+    chance = [np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in middle]
+    if among.reverse:
         decoys = _scores(among.distances[:, ::-1], among.decoys[:, ::-1], sequence, rows)[:, ::-1]
+        decoys[np.abs(np.arange(decoys.shape[1]) - match[:, None]) <= reach] = -np.inf
     else:
         decoys = _scores(among.distances, among.decoys, sequence, rows)
-    spread = np.array([row[np.isfinite(row)].std() if np.isfinite(row).any() else 0.0 for row in decoys])
-    if among.backwards:
-        decoys[np.abs(np.arange(decoys.shape[1]) - match[:, None]) <= reach] = -np.inf
-    alone = own[numbers, given.single[rows.start : rows.stop]]
-    return match, targets, alone, decoys.max(axis=1), owner, middle[numbers, match], chance, spread
+    return Best(
+        match,
+        own.max(axis=1),
+        own[numbers, single[rows.start : rows.stop]],
+        decoys.max(axis=1),
+        np.array(owner),
+        middle[numbers, match],
+        np.array(chance),
+    )
 
 
 def _scores(distances: np.ndarray, which: np.ndarray, sequence: SequenceSettings, rows: range) -> np.ndarray:
@@ -201,12 +251,15 @@ def best_lines(given: Candidates, among: Pool, precision: float) -> Lines | None
 
     None if the drive is too short for lines.
     """
-    chosen, most = None, 0
-    for sequence in sequences(among, given.two):
-        if most and np.count_nonzero(given.there) * NEARLY <= most:
-            break  # no other can find more
-        found = search(given, among, sequence)
-        count = np.count_nonzero(found.accepted(precision))
-        if chosen is None or count * NEARLY > most:
-            chosen, most = found, count
+    chosen, most, there = None, 0, np.count_nonzero(given.there)
+    for group in courses(among, given.two):
+        if group[0].speed in SPEEDS and most:
+            break
+        for course in group:
+            if most and there * NEARLY <= most:
+                return chosen  # no other can find more
+            found = search(given, among, course)
+            count = np.count_nonzero(found.accepted(precision))
+            if chosen is None or count * NEARLY > most:
+                chosen, most = found, count
     return chosen

@@ -18,7 +18,7 @@ from netspec.files.figures import COLORS, GRID, png
 from netspec.files.whole_file import write_whole
 
 BEST, WORST, REJECTED = 4, 3, 3  # number of pairs shown
-IN_WORDS = {"below threshold": "not similar enough", "not verified": "their points do not agree"}
+IN_WORDS = {"below threshold": "not similar enough", "not verified": "too few points agree"}
 PARTS = 30  # of a drive; the pairs shown differ by at least one part
 OF_PATH = "The path from its known poses; green lines join the two frames of each loop."
 OF_FRAMES = (
@@ -122,10 +122,10 @@ def _match(result: LoopResult) -> int:
 
 def _pair(result: LoopResult, images: dict[int, np.ndarray], first: int) -> Pair:
     match = _match(result)
-    points = "" if result.inliers is None else f", {result.inliers} points agree"
-    why = "" if result else f", {IN_WORDS.get(result.verdict, result.verdict)}"
+    points = "" if not result.inliers else f"{result.inliers} points agree"
+    why = result.reason or (points if result else IN_WORDS.get(result.verdict, result.verdict))
     picture = side_by_side(images[result.query_id - first], images[match - first])
-    return Pair(picture, f"{result.query_id} and {match}{points}{why}")
+    return Pair(picture, f"{result.query_id} and {match}{', ' if why else ''}{why}")
 
 
 def _spread(results: Sequence[LoopResult], count: int, frames: int) -> list[LoopResult]:

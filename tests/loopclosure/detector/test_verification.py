@@ -98,14 +98,16 @@ def test_geometry_is_checked_last(tmp_path, check):
 
 def test_an_online_loop_needs_more_points_than_rule_out_chance(check, monkeypatch):
     """The windows of a facade repeat: as `detect` does, the detector needs 1.5 times as many."""
-    found = Agreement(100, 28, 20)
+    found = Agreement(36, 28, 20)
     monkeypatch.setattr(GeometricCheck, "agreement", lambda *_: found)
     detector = LoopDetector(lambda image: np.ones(2), exclude_recent=0, check=check)
     detector.add(wall(0))
     result = detector.add(wall(1))
     assert (result.verdict, result.inliers) == ("not verified", 28)
-    found = Agreement(100, 32, 20)
-    assert detector.add(wall(2)).verdict == "accepted"
+    found = Agreement(60, 32, 20)  # most of the points that match disagree
+    assert detector.add(wall(2)).verdict == "not verified"
+    found = Agreement(40, 32, 20)
+    assert detector.add(wall(3)).verdict == "accepted"
 
 
 @pytest.mark.parametrize("camera", [{}, {"focal_px": 260.0, "center_x_px": 160.0, "center_y_px": 120.0}])

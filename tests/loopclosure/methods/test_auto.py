@@ -22,9 +22,8 @@ from loopclosure.methods.candidates import Candidates, Compared, candidates, far
 from loopclosure.methods.decision import between, contradicted, neighbors
 from loopclosure.methods.decoys import floor_age
 from loopclosure.methods.geometry import Geometry, Matches
-from loopclosure.methods.lines import threshold
+from loopclosure.methods.lines import Course, threshold
 from loopclosure.methods.named import make_method
-from loopclosure.methods.seqslam import SequenceSettings
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.progress import silent
 
@@ -161,7 +160,7 @@ def test_a_loop_ends_with_its_last_verified_match(elsewhere):
 def test_the_end_of_a_line_counts_only_if_its_points_may_have_been_missed(start):
     """Up to there each match, or each fifth, is verified; after it none, for less than the length of a line."""
     match, verified = np.arange(70), np.arange(70) % 5 == 0
-    pairs, loops = neighbors(match, SequenceSettings(30)), np.ones(70, bool)
+    pairs, loops = neighbors(match, Course(30)), np.ones(70, bool)
     verified[start:] = False
     every = np.ones(70, bool)
     assert contradicted(loops, verified, every, pairs, 30).any() == (start == 50)
@@ -170,7 +169,7 @@ def test_the_end_of_a_line_counts_only_if_its_points_may_have_been_missed(start)
 
 def test_a_short_line_without_a_verified_match_counts_only_where_few_are():
     match = np.concatenate([np.arange(40), np.full(20, -1), 100 + np.arange(8)])
-    pairs, loops, numbers = neighbors(match, SequenceSettings(10)), match >= 0, np.arange(68)
+    pairs, loops, numbers = neighbors(match, Course(10)), match >= 0, np.arange(68)
     every = np.ones(68, bool)
     assert np.array_equal(contradicted(loops, (numbers < 40), every, pairs, 10), numbers >= 60)
     assert not contradicted(loops, (numbers < 40) & (numbers % 8 == 0), every, pairs, 10)[60:].any()
@@ -185,7 +184,7 @@ def test_between_two_loops_of_one_line_most_matches_are_on_it(on, jump):
     loops = (numbers < 20) | (numbers >= 40)
     match[20:40] = np.where(np.arange(20) % 5 < 5 * on, numbers[20:40] + 3, 500)
     expected = ~loops & (match < 500) & (on > 0.5) & (jump == 0)
-    assert np.array_equal(between(loops, match, SequenceSettings(10)), expected)
+    assert np.array_equal(between(loops, match, Course(10)), expected)
 
 
 def test_stops_of_both_traverses_are_matched_frame_by_frame():
@@ -194,21 +193,75 @@ def test_stops_of_both_traverses_are_matched_frame_by_frame():
     rows = np.searchsorted(queries, np.arange(40), side="right") - 1
     given = Candidates(np.eye(21), np.ones((21, 21), bool), True, queries, references, rows)
     match, loops = np.arange(21), np.ones(21, bool)
-    matches = Matches(match, np.ones(21), loops, np.full(21, -1), np.zeros(21), np.zeros(21, bool))
+    matches = Matches(match, np.ones(21), loops, np.full(21, -1), np.zeros(21), *np.zeros((2, 21), bool))
     assert np.array_equal(places(given, matches, loops), np.arange(40))
     loops[11] = False
     assert places(given, matches, loops)[11] == 30
 
 
-def test_queries_with_more_variable_chance_scores_need_better_lines():
-    """Half of the queries are like some references and unlike others, without an order."""
-    rng, road = np.random.default_rng(0), drive(160, 1)
-    scores = alike(again(road, 1.0, 2), road)
-    scores[:80] = np.repeat(rng.normal(size=(20, 40)), 4, axis=0).repeat(4, axis=1)
-    given = candidates(Compared(scores, everything(scores), True))
-    among = lines.pool(given, given.allowed)
-    found = lines.search(given, among, next(lines.sequences(among, True)))
-    assert found.targets[:80].max() < found.targets[90:].min()
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize(
+    ("frames", "first", "last", "step"), [(600, 200, 400, 1), (400, 100, 160, 1), (600, 100, 500, 2)]
+)
+def test_a_part_of_a_route_is_found_at_any_speed_and_in_both_directions(frames, first, last, step, backwards):
+    road = drive(frames, 1)
+    where = np.arange(first, last, step)[:: -1 if backwards else 1]
+    scores = alike(again(road[where], 1.0, 2), road)
+    found = answer(find_matches(Compared(scores, everything(scores), True)))
+    assert np.count_nonzero(found.accepted) > 0.9 * len(where)
+    assert np.all(np.abs(found.match - where)[found.accepted] <= 3)
+    assert ("backwards" in found.reasons[0]) == backwards
+
+
+def test_the_way_back_is_found_in_one_drive():
+    road = drive(150, 3)
+    rows = np.concatenate([road, drive(40, 4), again(road[::-1], 1.0, 5)])
+    found = answer(find_matches(Compared(alike(rows, rows), np.tri(len(rows), k=-11, dtype=bool), False)))
+    assert np.count_nonzero(found.accepted[190:]) > 135
+    assert np.count_nonzero(found.accepted[:190]) <= 1
+    assert np.all(np.abs(found.match - (339 - np.arange(340)))[found.accepted] <= 3)
+
+
+@pytest.mark.parametrize("seen", ["the same", "no points", "another place", "in part"])
+def test_the_points_of_a_stretch_may_speak_against_it(seen):
+    """A house in which a walk through more rooms looks like a second lap through the first ones."""
+    road = drive(150, 6)
+    rows = np.concatenate([road, again(road, 1.0, 7)])
+    few = Agreement(40, 9, 20)
+
+    def agree(a, b):
+        if abs(a - b) < 100:  # one visit
+            return few if seen == "no points" else Agreement(60, 50, 20) if abs(a - b) < 10 else few
+        return {"the same": Agreement(60, 50, 20), "in part": Agreement(60, 36, 20)}.get(seen, few) if a % 3 else few
+
+    found = answer(
+        find_matches(Compared(alike(rows, rows), np.tri(300, k=-31, dtype=bool), False)), GeometricCheck(), agree
+    )
+    right = np.abs(found.match - np.arange(300) + 150) <= 3
+    if seen in ("the same", "no points"):
+        assert np.count_nonzero(found.accepted & right) > 130
+        assert found.results[200].reason.startswith("sequence: ")
+    else:
+        assert not found.accepted.any()
+        assert "because their points speak against them" in " ".join(found.reasons)
+        assert "the points of its stretch speak against it" in found.results[200].reason
+
+
+def test_where_most_matches_agree_only_in_part_places_look_alike():
+    """The floors of a tower have the same doors and signs, but not the same posters."""
+    rng = np.random.default_rng(8)
+    seen = rng.integers(0, 5, 200)
+    rows = again(drive(5, 9)[seen], 0.3, 10)
+    compared = Compared(alike(rows, rows), np.tri(200, k=-6, dtype=bool), False)
+    for share in (0.3, 0.7):
+        whole = rng.random((200, 200)) < share
+        found = answer(
+            find_matches(compared),
+            GeometricCheck(),
+            lambda a, b, whole=whole: Agreement(60, 50 if whole[a, b] else 36, 20 if seen[a] == seen[b] else 99),
+        )
+        assert bool(found.accepted.any()) == (share > 0.5)
+        assert ("places look alike" in " ".join(found.reasons)) == (share < 0.5)
 
 
 def test_one_repeated_image_does_not_override_a_sequence():

@@ -1,0 +1,79 @@
+"""Whether the points of a stretch of matches speak against it (step 5 of :mod:`loopclosure.methods.auto`).
+
+Matches of one place are verified as often as frames of one visit that are as similar; matches of different places as
+rarely as other pairs of different places. Where frames of one visit are not verified either, as in images of 64x32,
+points tell nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import betaln
+
+AGES = 100  # frames: the greatest age of a frame of the same visit
+SAMPLE = 40  # pairs of frames of one visit
+AGAINST = 0.01  # a stretch falls if the ratio of the likelihoods is less
+
+
+def temporal(scores: np.ndarray) -> np.ndarray:
+    """Return the score (N, A) of each frame of one drive (N, N) with the frame before it, the one before that, ..."""
+    count = len(scores)
+    found = np.full((count, max(1, min(AGES, count - 1))), np.nan, scores.dtype)
+    for age in range(1, min(AGES, count - 1) + 1):
+        found[age:, age - 1] = np.diagonal(scores, -age)
+    return found
+
+
+@dataclass(frozen=True)
+class Visits:
+    """What frames of one visit, and pairs of different places, have in common.
+
+    temporal  (N, A) see :func:`temporal`
+    verified  whether two frames show the same points, by number
+    unlike    how many pairs of different places did, and of how many
+    """
+
+    temporal: np.ndarray
+    verified: Callable[[int, int], bool]
+    unlike: tuple[int, int]
+
+    @cached_property
+    def together(self) -> int:
+        """How many frames in a row tell no more than one: the age at which half of the similarity has gone."""
+        known = np.flatnonzero(np.isfinite(self.temporal).any(axis=0))
+        if not len(known):
+            return 1
+        means = np.nanmean(self.temporal[:, known], axis=0)
+        return int(np.flatnonzero(means <= (means[0] + means.min()) / 2)[0]) + 1
+
+    def as_similar(self, similarity: float) -> tuple[int, int]:
+        """Return how many pairs of frames of one visit, no more similar than this, are verified, and of how many."""
+        low = self.temporal <= similarity
+        frames = np.flatnonzero(low.any(axis=1))
+        if not len(frames):
+            return 0, 0
+        frames = frames[np.unique(np.linspace(0, len(frames) - 1, SAMPLE).round().astype(int))]
+        pairs = [(frame, frame - 1 - int(low[frame].argmax())) for frame in frames.tolist()]
+        return sum(self.verified(*pair) for pair in pairs), len(pairs)
+
+    def contradict(self, similarity: float, verified: int, tried: int) -> bool:
+        """Return whether the ``verified`` of the ``tried`` matches of this similarity are too few for one place."""
+        if 2 * verified >= tried:
+            return False
+        counts = np.array([verified, tried - verified]) / self.together
+        return _log_likelihood(counts, *self.as_similar(similarity)) - _log_likelihood(counts, *self.unlike) < np.log(
+            AGAINST
+        )
+
+
+def _log_likelihood(counts: np.ndarray, hits: int, tries: int) -> float:
+    """Return the log of the beta-binomial likelihood of counts (yes, no) after ``hits`` of ``tries``, but a constant.
+
+    The prior of the share is that of Jeffreys.
+    """
+    yes, no = hits + 0.5, tries - hits + 0.5
+    return float(betaln(counts[0] + yes, counts[1] + no) - betaln(yes, no))
