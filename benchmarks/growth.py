@@ -40,6 +40,7 @@ TRAINED = "small/siamese_resnet27_256"
 WALK = 300  # frames; more descriptors are made by perturbing theirs
 QUERIES, AT_ONCE = 50, 4096  # frames searched for, and added at a time
 SAME_PLACE = 0.3  # distance of two descriptors of one place, as a share of that of two places
+LAP, IN_MEMORY = 40, 100  # images of a lap, and frames that the detector keeps in memory
 PAIRS = 2000  # converted with each number of workers
 
 
@@ -156,6 +157,38 @@ def frames(size: int) -> Found:
     return found
 
 
+def keyframes(size: int) -> Found:
+    """Add images of 640x480 to a detector that has ``size`` frames: net, points, search and check."""
+    from lmdb_build.walk.sequence import Walk, write_walk
+    from loopclosure.detector.detector import LoopDetector
+    from loopclosure.detector.frames import Points
+    from loopclosure.detector.verification import GeometricCheck
+    from loopclosure.places.frames import read_bgr
+    from netspec.inspect.features.shipped import default
+
+    describe, check, random = default(), GeometricCheck(), np.random.default_rng(0)
+    with TemporaryDirectory(prefix="growth-") as folder:
+        walk = Walk(frames=2 * LAP, width=640, height=480, laps=2)
+        first, again = np.split(np.array([read_bgr(file) for file in write_walk(Path(folder) / "walk", walk)]), 2)
+    rows, local = np.array([describe(image) for image in first]), [check.describe(image) for image in first]
+    detector = LoopDetector(describe, check=check, in_memory=IN_MEMORY, exclude_recent=0)
+    for begin in range(0, size, LAP):  # each block of frames is that lap, with other descriptors
+        count = min(LAP, size - begin)
+        ends = np.cumsum([len(each.points) for each in local[:count]])
+        parts = (np.concatenate([getattr(each, name) for each in local[:count]]) for name in ("points", "descriptors"))
+        no_poses = {"stamps": np.full(count, np.nan), "poses": np.full((count, 7), np.nan)}
+        points = Points(np.tile([640, 480], (count, 1)), ends, *parts)
+        detector.take_session([perturbed(rows, count, random)], no_poses, points)
+    detector.begin_session()
+    detector.add(again[0])  # warm-up
+    spent = []
+    for image in again[1:]:
+        start = time.process_time()
+        detector.add(image)
+        spent.append(time.process_time() - start)
+    return {"add, ms": 1e3 * float(np.median(spent)), "add, slowest, ms": 1e3 * max(spent)}
+
+
 def described_walk(frames: int) -> np.ndarray:
     """Return the small net's descriptors of a synthetic walk, minus their mean, with at most 256 components."""
     from lmdb_build.walk.sequence import Walk, write_walk
@@ -220,6 +253,7 @@ KINDS: Mapping[str, Kind] = {
     "batch": Kind("pairs per iteration", (1, 2, 4, 8, 16, 32, 64), batch),
     "pairs": Kind("pairs in an LMDB", (1000, 10_000, 100_000, 1_000_000), pairs),
     "frames": Kind("frames", (1000, 10_000, 100_000, 1_000_000), frames),
+    "keyframes": Kind("frames in the detector", (100, 1000, 10_000), keyframes),
     "workers": Kind("workers", (1, 2), workers),
 }
 

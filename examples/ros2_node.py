@@ -6,8 +6,8 @@ in   image  sensor_msgs/Image;  camera_info  sensor_msgs/CameraInfo;  odom  nav_
 out  loops  geometry_msgs/PoseWithCovarianceStamped: the position of the robot by a loop, on the corrected path
      path   nav_msgs/Path: all keyframes, corrected;  tf: the frame of the odometry in map_frame
 parameters  describe (default), map_frame (map), step (m) and turn (rad) between keyframes, recent (s): no loops with
-            the last so many seconds, slop (s): the largest difference of stamps; mount: the camera in the robot, seven
-            numbers, x y z qx qy qz qw (default: from tf)
+            the last so many seconds, slop (s): the largest difference of stamps, in_memory (1000): the others are in a
+            temporary file; mount: the camera in the robot, seven numbers, x y z qx qy qz qw (default: from tf)
 """
 
 import queue
@@ -36,7 +36,8 @@ from loopclosure.errors import InputError
 from loopclosure.places.messages import camera_of, image_of, pose_of, seconds
 
 UNKNOWN = 1e6  # the variance of a position that a loop does not measure
-DEFAULTS = {"describe": "default", "map_frame": "map", "step": 0.1, "turn": 0.1, "recent": 10.0, "slop": 0.05}
+DEFAULTS = {"describe": "default", "map_frame": "map", "step": 0.1, "turn": 0.1, "recent": 10.0}
+DEFAULTS |= {"slop": 0.05, "in_memory": 1000}
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # who subscribes later gets the last message
 
 
@@ -57,8 +58,7 @@ class LoopClosure(Node):
         self.tf, self.buffer = tf2_ros.TransformBroadcaster(self), tf2_ros.Buffer()
         self.listener = tf2_ros.TransformListener(self.buffer, self)
         topics = ((Image, "image"), (CameraInfo, "camera_info"), (Odometry, "odom"))
-        best_effort = {"qos_profile": qos_profile_sensor_data}
-        inputs = [message_filters.Subscriber(self, kind, topic, **best_effort) for kind, topic in topics]
+        inputs = [message_filters.Subscriber(self, *each, qos_profile=qos_profile_sensor_data) for each in topics]
         self.joined = message_filters.ApproximateTimeSynchronizer(inputs, 30, self.set["slop"])
         self.joined.registerCallback(self.on_messages)
         self.create_timer(0.1, self.tell)
@@ -96,16 +96,20 @@ class LoopClosure(Node):
             except tf2_ros.TransformException as fault:
                 self.warn(f"tf has no camera in the robot ({fault}); the images are left out until it has")
                 return False
-        detector = LoopDetector(self.describe, check=CHECK, exclude_recent=0, exclude_seconds=self.set["recent"])
-        keyframes = Keyframes(self.set["step"], self.set["turn"])
+        kept, recent = self.set["in_memory"], self.set["recent"]
+        detector = LoopDetector(self.describe, check=CHECK, exclude_seconds=recent, in_memory=kept)
         self.odom_frame = odometry.header.frame_id
-        self.closer = LoopCloser(detector, camera, mount, keyframes, self.warn)
+        self.closer = LoopCloser(detector, camera, mount, Keyframes(self.set["step"], self.set["turn"]), self.warn)
         self.closer.start()
         return True
 
-    def tell_loop(self, loop, stamp):
-        message = PoseWithCovarianceStamped()
+    def stamped(self, kind, stamp):
+        message = kind()
         message.header.stamp, message.header.frame_id = stamp, self.set["map_frame"]
+        return message
+
+    def tell_loop(self, loop, stamp):
+        message = self.stamped(PoseWithCovarianceStamped, stamp)
         fill(message.pose.pose.position, message.pose.pose.orientation, self.closer.by_loop(loop))
         place = UNKNOWN if loop.relative.kind == ROTATION_ONLY else LOOP_SIGMAS.translation_m**2
         message.pose.covariance = np.diag([place] * 3 + [LOOP_SIGMAS.rotation_rad**2] * 3).ravel().tolist()
@@ -114,22 +118,16 @@ class LoopClosure(Node):
     def tell(self):  # ten times a second: the transform, and the path if it was corrected again
         if self.closer is None:
             return
-        message = TransformStamped()
-        message.header.stamp, message.header.frame_id = self.get_clock().now().to_msg(), self.set["map_frame"]
+        message = self.stamped(TransformStamped, self.get_clock().now().to_msg())
         message.child_frame_id = self.odom_frame
         fill(message.transform.translation, message.transform.rotation, self.closer.correction)
         self.tf.sendTransform(message)
-        if self.closer.solutions == self.shown:
-            return
-        self.shown, path = self.closer.solutions, Path(header=message.header)
-        for stamp, pose in zip(*self.closer.path(), strict=True):
-            path.poses.append(PoseStamped())
-            path.poses[-1].header.stamp, path.poses[-1].header.frame_id = (
-                Time(seconds=stamp).to_msg(),
-                self.set["map_frame"],
-            )
-            fill(path.poses[-1].pose.position, path.poses[-1].pose.orientation, pose)
-        self.path.publish(path)
+        if self.closer.solutions > self.shown:
+            self.shown, path = self.closer.solutions, self.stamped(Path, message.header.stamp)
+            for stamp, pose in zip(*self.closer.path(), strict=True):
+                path.poses.append(self.stamped(PoseStamped, Time(seconds=stamp).to_msg()))
+                fill(path.poses[-1].pose.position, path.poses[-1].pose.orientation, pose)
+            self.path.publish(path)
 
     def end(self):
         self.newest.put(None)

@@ -1,6 +1,6 @@
 """Closes the loops of a robot while it drives: keyframes, loops as constraints of a pose graph, the corrected path.
 
-    closer = LoopCloser(LoopDetector(describe, check=CHECK, exclude_recent=0, exclude_seconds=10), camera)
+    closer = LoopCloser(LoopDetector(describe, check=CHECK, exclude_seconds=10), camera)
     closer.start()
     for stamp, image, pose in robot:  # the pose of the robot by its wheels
         closer.add(image, stamp, pose)

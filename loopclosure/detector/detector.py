@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from loopclosure.detector.decision import DetectorSettings, LoopResult, Runs, result_of
-from loopclosure.detector.frames import Frames, Points, points_of
+from loopclosure.detector.frames import Frames, Local, LocalOnDisk, Points, points_of
 from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.index.index import Index, open_index
@@ -56,6 +56,7 @@ class LoopDetector:
         *,
         check: GeometricCheck | None = None,
         index: Index | str = "exact",
+        in_memory: int | None = None,
         **changes: Any,
     ) -> None:
         """Make an empty detector.
@@ -67,6 +68,8 @@ class LoopDetector:
         check     verifies candidates by their geometry, best first; None: no verification
         index     an empty index that stores and searches the descriptors, or a name for
                   :func:`loopclosure.index.index.open_index`
+        in_memory keep the descriptors and points of about this many frames in memory, and the others in temporary files
+                  (``TMPDIR`` names their folder); None: all of them
         """
         given = asdict(settings or DetectorSettings())
         unknown = set(changes) - set(given)
@@ -78,7 +81,11 @@ class LoopDetector:
         self.check = check
         self.loops: list[LoopResult] = []
         metric = self.settings.metric
-        self._frames = Frames(open_index(index, metric) if isinstance(index, str) else index, self.settings.views)
+        if in_memory is not None and in_memory < 1:
+            raise InputError(f"{in_memory} frames are to be kept in memory; expected at least 1")
+        views, rows = self.settings.views, None if in_memory is None else in_memory * self.settings.views
+        opened = open_index(index, metric, in_memory=rows) if isinstance(index, str) else index
+        self._frames = Frames(opened, views, local=Local() if in_memory is None else LocalOnDisk(in_memory))
         self._sessions = [0]  # the first frame of each
         self._steps: list[float] = []  # the score of each frame with the one before it
         self._runs: Runs = []  # of the last frame
@@ -233,7 +240,13 @@ class LoopDetector:
             np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 
     @classmethod
-    def load(cls, path: str | Path, describe: Describe | None = None, index: Index | str = "exact") -> LoopDetector:
+    def load(
+        cls,
+        path: str | Path,
+        describe: Describe | None = None,
+        index: Index | str = "exact",
+        in_memory: int | None = None,
+    ) -> LoopDetector:
         """Read a file that ``save`` wrote; ``describe`` must be the function that the detector was made with.
 
         Raises InputError for any other file, or if the file and ``describe`` have different fingerprints.
@@ -246,7 +259,8 @@ class LoopDetector:
             check = None
             if about["check"] is not None:  # older files lack newer settings
                 check = from_json(GeometricCheck, {**asdict(GeometricCheck()), **about["check"]})
-            detector = cls(describe, from_json(DetectorSettings, about["settings"]), check=check, index=index)
+            settings = from_json(DetectorSettings, about["settings"])
+            detector = cls(describe, settings, check=check, index=index, in_memory=in_memory)
             detector.fingerprint = about.get("fingerprint")
             refuse_another(fingerprint_of(describe), detector.fingerprint, "or start a new file", path)
             detector._take(arrays)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
+from tempfile import TemporaryFile
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -75,6 +79,51 @@ class Local:
         self._starts.append(self._count)
 
 
+POINT_BYTES = 2 * 4 + 128  # x and y, and a descriptor
+
+
+class LocalOnDisk:
+    """Like :class:`Local`, in a temporary file; the frames read last, at most ``in_memory``, are in memory too."""
+
+    def __init__(self, in_memory: int) -> None:
+        self._file = TemporaryFile(prefix="loopclosure-")  # noqa: SIM115  removed when it is closed, with this object
+        self._ends = array("q")  # in bytes
+        self._sizes = array("l")
+        self._lock = Lock()  # several threads may read
+        self._read = lru_cache(in_memory)(self._from_file)
+
+    def __len__(self) -> int:
+        return len(self._ends)
+
+    def __getitem__(self, frame: int) -> LocalFeatures:
+        return self._read(frame)
+
+    def _from_file(self, frame: int) -> LocalFeatures:
+        begin = self._ends[frame - 1] if frame else 0
+        count = (self._ends[frame] - begin) // POINT_BYTES
+        with self._lock:
+            self._file.seek(begin)
+            data = self._file.read(count * POINT_BYTES)
+        points = np.frombuffer(data, np.float32, 2 * count).reshape(-1, 2)
+        descriptors = np.frombuffer(data, np.uint8, offset=8 * count).reshape(-1, 128)
+        return LocalFeatures(points, descriptors, (self._sizes[2 * frame], self._sizes[2 * frame + 1]))
+
+    def append(self, features: LocalFeatures) -> None:
+        """Add the features of the next frame."""
+        data = features.points.astype(np.float32).tobytes() + features.descriptors.tobytes()
+        begin = self._ends[-1] if self._ends else 0
+        with self._lock:
+            self._file.seek(begin)
+            self._file.write(data)
+        self._ends.append(begin + len(data))
+        self._sizes.extend(features.size)
+
+    def extend(self, points: Points) -> None:
+        """Add the features of many frames."""
+        for frame in range(len(points.ends)):
+            self.append(points.of(frame))
+
+
 @dataclass
 class Frames:
     """All frames so far, ``count`` of them, in arrays that double when full.
@@ -89,7 +138,7 @@ class Frames:
     stamps: np.ndarray = field(default_factory=lambda: np.zeros(0))
     poses: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
     waiting: list[np.ndarray] = field(default_factory=list)
-    local: Local = field(default_factory=Local)
+    local: Local | LocalOnDisk = field(default_factory=Local)
 
     def append(self, row: np.ndarray, stamp: float | None, pose: np.ndarray | None) -> None:
         """Add a frame with a descriptor (views, D)."""

@@ -37,8 +37,11 @@ class Index(Protocol):
         ...
 
 
-def open_index(name: str, metric: str, first: int | None = None) -> Index:
+def open_index(name: str, metric: str, first: int | None = None, in_memory: int | None = None) -> Index:
     """Return an index: "exact" or "faiss", empty, or one in Milvus, ``FILE.db`` or ``http://HOST:PORT``.
+
+    ``in_memory``: how many descriptors "exact" keeps in memory, see :class:`~loopclosure.index.exact.ExactIndex`; the
+    other indexes have files of their own, or shorten their descriptors.
 
     ``first``: use at most this many of the descriptors in Milvus, and add new ones after them; None: use all.
 
@@ -48,7 +51,7 @@ def open_index(name: str, metric: str, first: int | None = None) -> Index:
     if name == "exact":
         from loopclosure.index.exact import ExactIndex
 
-        return ExactIndex(metric)
+        return ExactIndex(metric, in_memory)
     if name == "faiss":
         _need("faiss", "faiss")
         from loopclosure.index.by_faiss import FaissIndex

@@ -75,7 +75,7 @@ def write_bag(file: Path, sequence: ImageSequence, odometry: np.ndarray) -> None
 
 
 def closer_of(camera: Intrinsics = CAMERA, **given: Any) -> LoopCloser:
-    detector = LoopDetector(Thumbnailer(), check=CHECK, exclude_recent=0, exclude_seconds=10)
+    detector = LoopDetector(Thumbnailer(), check=CHECK, exclude_seconds=10)
     return LoopCloser(detector, camera, STILL, **given)
 
 

@@ -285,6 +285,32 @@ def test_a_visitor_is_checked_by_geometry_and_needs_images() -> None:
         Visitor(LoopDetector()).add(walls[0])
 
 
+def test_frames_on_disk_close_the_same_loops(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    walls = [np.kron(rng.integers(0, 256, (24, 32, 3)), np.ones((10, 10, 1))).astype(np.uint8) for _ in range(6)]
+    bare = np.full((240, 320, 3), 7, np.uint8)  # no points
+    made = [
+        LoopDetector(
+            lambda image: image[5::60, 5::80].ravel(), check=GeometricCheck(), exclude_recent=0, in_memory=limit
+        )
+        for limit in (None, 2)
+    ]
+    for detector in made:
+        for wall in [*walls, bare]:
+            assert detector.add(wall).accepted is None
+        assert [detector.add(np.roll(wall, 2, 1)).accepted for wall in walls] == [0, 1, 2, 3, 4, 5]
+        for frame in (0, 3, 6, 12, 0):
+            found, expected = (each.local_features(frame) for each in (detector, made[0]))
+            np.testing.assert_array_equal(found.points, expected.points)
+            np.testing.assert_array_equal(found.descriptors, expected.descriptors)
+            assert found.size == expected.size == (320, 240)
+        detector.save(tmp_path / "x.npz")
+        again = LoopDetector.load(tmp_path / "x.npz", detector.describe, in_memory=1)
+        assert [again.add(wall).accepted for wall in walls[:2]] == [0, 1]
+    with pytest.raises(InputError, match="0 frames are to be kept in memory; expected at least 1"):
+        LoopDetector(in_memory=0)
+
+
 def test_sessions_of_a_damaged_file(tmp_path) -> None:
     import json
 

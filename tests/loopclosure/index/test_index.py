@@ -105,3 +105,37 @@ def test_unknown_and_missing_indexes_are_refused(monkeypatch: pytest.MonkeyPatch
         open_index("faiss", "cosine")
     with pytest.raises(InputError, match=r"pymilvus is not installed; pip install netspec-caffe\[milvus\]"):
         open_index("places.db", "cosine")
+
+
+@pytest.mark.parametrize("in_memory", [None, 1, 300])
+@pytest.mark.parametrize("metric", ["cosine", "euclidean"])
+def test_of_equal_descriptors_the_earliest_come_first(metric: str, in_memory: int | None) -> None:
+    index = open_index("exact", metric, in_memory=in_memory)
+    index.add(np.tile(directions(1, 8), (1000, 1)))
+    assert index.search(directions(1, 8)[0], 5)[0].tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("far", [0, 10, 1000])
+def test_the_nearest_of_descriptors_far_from_the_origin(far: float) -> None:
+    rng = np.random.default_rng(1)
+    rows = (far + rng.normal(0, 0.01, (500, 256))).astype(np.float32)
+    index = open_index("exact", "euclidean")
+    index.add(rows)
+    for row in rows[:50]:
+        query = row + rng.normal(0, 0.002, 256).astype(np.float32)
+        distances = np.linalg.norm(rows.astype(np.float64) - query, axis=1)
+        assert index.search(query, 3)[0].tolist() == np.argsort(distances)[:3].tolist()
+
+
+@pytest.mark.parametrize("metric", ["cosine", "euclidean"])
+def test_descriptors_on_disk_are_found_as_those_in_memory(metric: str) -> None:
+    rows = directions(2000)
+    in_memory, on_disk = open_index("exact", metric), open_index("exact", metric, in_memory=300)
+    for part in np.split(rows, [1, 255, 256, 700, 1999]):
+        in_memory.add(part)
+        on_disk.add(part)
+    for query in directions(20, seed=1):
+        for found, expected in zip(on_disk.search(query, 5), in_memory.search(query, 5), strict=True):
+            np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(on_disk.rows(100, 1900), rows[100:1900])
+    np.testing.assert_array_equal(on_disk.rows(1999, 2000), rows[1999:])
