@@ -1,11 +1,13 @@
 """Small synthetic ROS bags of the common path, written with the library that reads them."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -25,14 +27,25 @@ class Bag:
         second_camera: bool = False,
         topic: str = "/cam/image",
         count: int = COUNT,
+        stamp: Callable[[int], float] = lambda i: START_S + i,
+        amcl: bool = False,
+        begin: int = 0,
+        storage: str = "SQLITE3",
+        odometry: Callable[[int, np.ndarray], np.ndarray] = lambda _, pose: pose,
     ) -> None:
-        self.file, self._ros = file, ros
+        """Write a bag to a file, or to a folder for ROS 2.
+
+        stamp     the stamp of message i; each is received at START_S + begin + i
+        amcl      also write the true poses to /amcl_pose
+        odometry  the number of a message and the pose (4, 4) of the body -> the pose that the wheels measure
+        """
+        self.file, self._ros, self._stamp, self._begin = file, ros, stamp, begin
         self._store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
         tree = "tf2_msgs/msg/TFMessage"
         if tree not in self._store.types:
             self._store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", tree))
         self._types = self._store.types
-        with Writer1(file) if ros == 1 else Writer2(file, version=9) as writer:
+        with Writer1(file) if ros == 1 else Writer2(file, version=9, storage_plugin=StoragePlugin[storage]) as writer:
             self._writer = writer
             camera_info = topic.rsplit("/", 1)[0] + "/camera_info"
             topics = {
@@ -41,6 +54,8 @@ class Bag:
                 "/tf_static": "tf2_msgs/msg/TFMessage",
                 camera_info: "sensor_msgs/msg/CameraInfo",
             }
+            if amcl:
+                topics["/amcl_pose"] = "geometry_msgs/msg/PoseWithCovarianceStamped"
             if second_camera:
                 topics["/other/image"] = topics[topic]
             self._connections = {
@@ -54,7 +69,9 @@ class Bag:
                 self._write(topic, i, self._image(i, encoding))
                 if second_camera:
                     self._write("/other/image", i, self._image(i, encoding))
-                self._write("/odom", i, self._odometry(i, body[i]))
+                self._write("/odom", i, self._odometry(i, odometry(i, body[i])))
+                if amcl:
+                    self._write("/amcl_pose", i, self._posed(i, path()[i]))
 
     def make(self, kind: str, **fields: Any) -> Any:
         return self._types[kind](**fields)
@@ -62,10 +79,11 @@ class Bag:
     def _write(self, topic: str, second: int, message: Any) -> None:
         kind = self._kinds[topic]
         serialize = self._store.serialize_ros1 if self._ros == 1 else self._store.serialize_cdr
-        self._writer.write(self._connections[topic], (START_S + second) * 10**9, serialize(message, kind))
+        self._writer.write(self._connections[topic], (START_S + self._begin + second) * 10**9, serialize(message, kind))
 
     def _header(self, second: int, frame: str) -> Any:
-        stamp = self.make("builtin_interfaces/msg/Time", sec=START_S + second, nanosec=0)
+        sec, part = divmod(self._stamp(second), 1)
+        stamp = self.make("builtin_interfaces/msg/Time", sec=int(sec), nanosec=round(part * 1e9))
         numbered = {"seq": second} if self._ros == 1 else {}
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **numbered)
 
@@ -90,12 +108,19 @@ class Bag:
         )
 
     def _turn(self, pose: np.ndarray) -> Any:
-        x, y, z, w = quaternions(pose[None])[0]
+        x, y, z, w = quaternions(pose[None])[0] if np.isfinite(pose).all() else np.full(4, np.nan)
         return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
-    def _odometry(self, i: int, pose: np.ndarray) -> Any:
+    def _at(self, pose: np.ndarray) -> Any:
         point = self.make("geometry_msgs/msg/Point", x=pose[0, 3], y=pose[1, 3], z=pose[2, 3])
         at = self.make("geometry_msgs/msg/Pose", position=point, orientation=self._turn(pose))
+        return self.make("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=np.zeros(36))
+
+    def _posed(self, i: int, pose: np.ndarray) -> Any:
+        header = self._header(i, "map")
+        return self.make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header, pose=self._at(pose))
+
+    def _odometry(self, i: int, pose: np.ndarray) -> Any:
         none = np.zeros(36)
         zero = self.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
         twist = self.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
@@ -103,7 +128,7 @@ class Bag:
             "nav_msgs/msg/Odometry",
             header=self._header(i, "odom"),
             child_frame_id="base",
-            pose=self.make("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=none),
+            pose=self._at(pose),
             twist=self.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
         )
 

@@ -85,7 +85,7 @@ def test_it_closes_a_loop_and_goes_on_after_faults(node: Any) -> None:
     for second, shift in enumerate((0, 160, 320)):
         looked(node, messages(second, shift), lambda count=second + 1: keyframes(node) == count)
     for sent, said in (
-        (messages(3.0, 320, "yuv422"), 'images in "yuv422"; known: mono8'),
+        (messages(3.0, 320, "32FC1"), 'images in "32FC1"; known: mono8'),
         (messages(1.5, 320), "an image came late, 0.500 s before"),
     ):
         before = len(node.warnings)

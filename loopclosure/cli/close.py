@@ -51,7 +51,10 @@ def _add_close(commands: Commands) -> None:
     )
     exclusive = parser.add_mutually_exclusive_group()
     exclusive.add_argument(
-        "--odometry", type=Path, metavar="FILE", help="the path to correct: poses in the format of TUM, KITTI or EuRoC"
+        "--odometry",
+        type=Path,
+        metavar="FILE",
+        help="the path to correct: poses in the format of TUM, KITTI or EuRoC (default: the odometry of a bag)",
     )
     exclusive.add_argument(
         "--drift", type=float, metavar="PERCENT", help="simulate drifting odometry from the true poses"
@@ -74,8 +77,6 @@ def _close(a: argparse.Namespace) -> None:
         return
     if not a.source or not a.loops:
         raise WrongUsage("expected the frames and --loops, or --graph")
-    if a.odometry is None and a.drift is None:
-        raise WrongUsage("one of the arguments --odometry --drift is required")
     if a.odometry_form and not a.odometry:
         raise WrongUsage("--odometry-form needs --odometry")
     if a.rerun:
@@ -128,6 +129,10 @@ def _odometry(a: argparse.Namespace, frames: ImageSequence) -> np.ndarray:
         for doubt in read.doubts:
             warn(f"{a.odometry}: {doubt}".replace("pose-form=", "--odometry-form "))
         return read.of_images(len(frames), frames.stamps, a.odometry)
+    if a.drift is None:
+        if frames.odometry is None:
+            raise InputError("has no odometry; give --odometry FILE, or --drift PERCENT to simulate it", frames.source)
+        return frames.odometry
     if frames.poses is None:
         raise InputError(
             "has no true poses to simulate drift from; give --odometry, or add ,poses=FILE to the source", frames.source

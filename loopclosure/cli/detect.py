@@ -71,7 +71,7 @@ def _add_detect(commands: Commands) -> None:
         help="find loops while images arrive, from camera 0, rtsp://HOST/PATH or a file",
     )
     parser.add_argument(
-        "--out", required=True, metavar="FOLDER", help="folder for loops.csv, and for loops.g2o if there are poses"
+        "--out", required=True, metavar="FOLDER", help="folder for loops.csv, and for loops.g2o with poses or odometry"
     )
     exclusive = parser.add_mutually_exclusive_group()
     exclusive.add_argument(
@@ -193,10 +193,15 @@ def _detect(a: argparse.Namespace) -> None:
     print("\n".join(reasons))
     if engine := getattr(net, "engine", ""):
         print(f"descriptors: {a.describe}, computed by {engine}")
-    if np.isfinite(detector.poses).any():
-        left_out = write_g2o(out / "loops.g2o", detector.poses, detector.loops, run.from_poses(detector))
-        note = f", {left_out} loops without a pose left out" if left_out else ""
-        print(f"pose graph, with relative poses from the known poses{note}: {out / 'loops.g2o'}")
+    poses, odometry = detector.poses, detector.odometry
+    measured = np.isfinite(odometry).any()
+    if measured or np.isfinite(poses).any():
+        left_out = write_g2o(
+            out / "loops.g2o", odometry if measured else poses, detector.loops, run.from_poses(detector)
+        )
+        note = f"; loops without a known relative pose, left out: {left_out}" if left_out else ""
+        print(f"pose graph of the {'odometry' if measured else 'known poses'}{note}: {out / 'loops.g2o'}")
+    if np.isfinite(poses).any():
         print(run.judged_by_poses(detector))
     if a.save:
         detector.save(a.save)

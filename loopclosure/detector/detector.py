@@ -109,18 +109,28 @@ class LoopDetector:
         """The poses (N, 7), tx ty tz qx qy qz qw, NaN for frames without one."""
         return self._frames.poses[: len(self)].copy()
 
+    @property
+    def odometry(self) -> np.ndarray:
+        """The poses (N, 7) by the robot's odometry, NaN for frames without one."""
+        return self._frames.odometry[: len(self)].copy()
+
     def add(
-        self, image: np.ndarray, stamp: float | None = None, pose: Sequence[float] | np.ndarray | None = None
+        self,
+        image: np.ndarray,
+        stamp: float | None = None,
+        pose: Sequence[float] | np.ndarray | None = None,
+        odometry: Sequence[float] | np.ndarray | None = None,
     ) -> LoopResult:
         """Add the next frame, (H, W, 3) uint8 BGR, and return whether it closes a loop.
 
-        ``stamp`` is in seconds. ``pose`` is tx ty tz qx qy qz qw, camera-to-world; it is only stored for the export.
+        ``stamp`` is in seconds. ``pose`` is tx ty tz qx qy qz qw, camera-to-world, and ``odometry`` is such a pose as
+        the robot measures it; both are only stored for the export.
 
         The cost is one call of ``describe`` and one pass over all earlier descriptors of 4 D bytes (docs/growth.md).
         """
         if self.describe is None:
             raise InputError("this detector has no describe function; give one, or use add_descriptor")
-        return self.add_descriptor(self.describe(image), stamp, pose, image)
+        return self.add_descriptor(self.describe(image), stamp, pose, image, odometry)
 
     def add_descriptor(
         self,
@@ -128,16 +138,17 @@ class LoopDetector:
         stamp: float | None = None,
         pose: Sequence[float] | np.ndarray | None = None,
         image: np.ndarray | None = None,
+        odometry: Sequence[float] | np.ndarray | None = None,
     ) -> LoopResult:
         """Add a frame by its descriptor (D,); ``image`` is needed only for a geometric check."""
-        position = _checked_pose(pose)
+        path = _checked_pose(pose), _checked_pose(odometry)
         row = self._row(descriptor)
         self._check_stamp(stamp)
         self._frames.settle(self._end(stamp))
         candidates = self._candidates(row, False)
         local = self._local(image)
         result, self._runs = self._decide(len(self), candidates, stamp, local, self._runs)
-        self._keep(row, stamp, position, local)
+        self._keep(row, stamp, path, local)
         if result.accepted is not None:
             self.loops.append(result)
         return result
@@ -148,6 +159,7 @@ class LoopDetector:
         stamp: float | None = None,
         pose: Sequence[float] | np.ndarray | None = None,
         image: np.ndarray | None = None,
+        odometry: Sequence[float] | np.ndarray | None = None,
     ) -> None:
         """Add the next frame without looking for loops, which are found later from all frames of the drive.
 
@@ -158,11 +170,11 @@ class LoopDetector:
             if self.describe is None or image is None:
                 raise InputError("a frame has neither a descriptor nor an image that can be described")
             descriptor = self.describe(image)
-        position = _checked_pose(pose)
+        path = _checked_pose(pose), _checked_pose(odometry)
         row = self._row(descriptor)
         self._check_stamp(stamp)
         self._runs = []
-        self._keep(row, stamp, position, self._local(image))
+        self._keep(row, stamp, path, self._local(image))
 
     def look_up(self, frame: int) -> LoopResult:
         """Look for the place of a frame of the last session in the sessions before it."""
@@ -174,12 +186,17 @@ class LoopDetector:
         return self._decide(frame, known, None if np.isnan(stamp) else stamp, local, [])[0]
 
     def _keep(
-        self, row: np.ndarray, stamp: float | None, position: np.ndarray | None, local: LocalFeatures | None
+        self,
+        row: np.ndarray,
+        stamp: float | None,
+        path: tuple[np.ndarray | None, np.ndarray | None],
+        local: LocalFeatures | None,
     ) -> None:
+        """Store a frame; ``path`` is its pose and its odometry."""
         if len(self) > self._sessions[-1]:
             self._steps.append(float(self._score(self._last, row)))
         self._last = row
-        self._frames.append(row, stamp, position)
+        self._frames.append(row, stamp, *path)
         if local is not None:
             self._frames.local.append(local)
 

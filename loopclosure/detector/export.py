@@ -81,9 +81,9 @@ def write_g2o(path: str | Path, poses: np.ndarray, loops: Sequence[LoopResult], 
 
     poses     (N, 7) poses of the frames, tx ty tz qx qy qz qw, as the robot estimates them; NaN if not known. They are
               the vertices, and consecutive poses give the odometry edges.
-    relative  (query_id, match_id) -> pose (7,) of the query in the frame of the match, or None. It must come from an
-              independent measurement (depth, motion capture), because the loop is to correct the drift of the
-              robot's poses. Loops without it are left out.
+    relative  (query_id, match_id) -> pose (7,) of the query in the frame of the match, or None. It must be measured
+              (by the images, depth, or motion capture), and never come from the robot's poses, because the loop is
+              to correct their drift. Loops without it are left out.
     """
     poses = np.asarray(poses, np.float64)
     known: list[int] = np.flatnonzero(np.all(np.isfinite(poses), axis=1)).tolist()

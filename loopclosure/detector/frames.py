@@ -137,16 +137,21 @@ class Frames:
     count: int = 0
     stamps: np.ndarray = field(default_factory=lambda: np.zeros(0))
     poses: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
+    odometry: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
     waiting: list[np.ndarray] = field(default_factory=list)
     local: Local | LocalOnDisk = field(default_factory=Local)
 
-    def append(self, row: np.ndarray, stamp: float | None, pose: np.ndarray | None) -> None:
+    def append(
+        self, row: np.ndarray, stamp: float | None, pose: np.ndarray | None, odometry: np.ndarray | None = None
+    ) -> None:
         """Add a frame with a descriptor (views, D)."""
         if self.count == len(self.stamps):
             room = np.empty((max(FIRST_CAPACITY, self.count), 7))
             self.stamps, self.poses = np.append(self.stamps, room[:, 0]), np.concatenate([self.poses, room])
+            self.odometry = np.concatenate([self.odometry, room])
         self.stamps[self.count] = np.nan if stamp is None else stamp
         self.poses[self.count] = np.nan if pose is None else pose
+        self.odometry[self.count] = np.nan if odometry is None else odometry
         self.waiting.append(row)
         self.count += 1
 
@@ -174,6 +179,8 @@ class Frames:
     def arrays(self, checked: bool, start: int = 0) -> dict[str, np.ndarray]:
         """Return the arrays of the frames from ``start`` on, without descriptors; ``checked``: with local features."""
         found = {"stamps": self.stamps[start : self.count], "poses": self.poses[start : self.count]}
+        if np.isfinite(odometry := self.odometry[start : self.count]).any():
+            found["odometry"] = odometry
         if checked:
             local = [self.local[i] for i in range(start, self.count)]
             found["sizes"] = np.array([f.size for f in local], np.int64).reshape(-1, 2)
@@ -192,6 +199,9 @@ class Frames:
         check_array(arrays, "poses", "f", (count, 7), finite=False)
         self.stamps = np.concatenate([self.stamps[: self.count], arrays["stamps"]])
         self.poses = np.concatenate([self.poses[: self.count], arrays["poses"]])
+        odometry = arrays.get("odometry", np.full((count, 7), np.nan))  # absent without odometry
+        check_array({"odometry": odometry}, "odometry", "f", (count, 7), finite=False)
+        self.odometry = np.concatenate([self.odometry[: self.count], odometry])
         if points is not None:
             self.local.extend(points)
         self.count += count

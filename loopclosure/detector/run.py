@@ -7,6 +7,7 @@ import importlib.util
 import re
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, cast
@@ -30,6 +31,21 @@ NAME = r"[\w-]+"  # the form of a name in that group
 OWN = ("netspec", "loopclosure", "lmdb_build")  # one distribution; a checkout of it may be the working directory
 
 
+@dataclass(frozen=True)
+class _Frame:
+    """The stamp of a frame in seconds, its true pose and its odometry (7,), None where not known."""
+
+    stamp: float | None
+    pose: np.ndarray | None
+    odometry: np.ndarray | None
+
+    @classmethod
+    def of(cls, sequence: ImageSequence, i: int, stamp: float | None) -> _Frame:
+        """Return what is known of a frame of a sequence."""
+        rows = [None if path is None else path[i] for path in (sequence.poses, sequence.odometry)]
+        return cls(stamp, *(row if row is not None and np.isfinite(row).all() else None for row in rows))
+
+
 def run_detector(
     detector: LoopDetector | Visitor,
     sequence: ImageSequence,
@@ -41,12 +57,13 @@ def run_detector(
     Images that cannot be read are left out: the frames are then those of ``sequence.readable()``.
     """
     results = []
-    for row, image, stamp, pose in _described(sequence, features, detector.check is not None, progress):
+    for row, image, frame in _described(sequence, features, detector.check is not None, progress):
+        path = frame.pose, frame.odometry
         if row is not None:
-            results.append(detector.add_descriptor(row, stamp, pose, image))
+            results.append(detector.add_descriptor(row, frame.stamp, path[0], image, path[1]))
         else:
             assert image is not None
-            results.append(detector.add(image, stamp, pose))
+            results.append(detector.add(image, frame.stamp, *path))
     return results
 
 
@@ -54,14 +71,14 @@ def remember_all(
     detector: LoopDetector, sequence: ImageSequence, features: Features | None = None, progress: Progress = silent
 ) -> None:
     """Add all frames as :func:`run_detector` does, without looking for loops; see :meth:`LoopDetector.remember`."""
-    for row, image, stamp, pose in _described(sequence, features, detector.check is not None, progress):
-        detector.remember(row, stamp, pose, image)
+    for row, image, frame in _described(sequence, features, detector.check is not None, progress):
+        detector.remember(row, frame.stamp, frame.pose, image, frame.odometry)
 
 
 def _described(
     sequence: ImageSequence, features: Features | None, checked: bool, progress: Progress
-) -> Iterator[tuple[np.ndarray | None, np.ndarray | None, float | None, np.ndarray | None]]:
-    """Yield the descriptor, image, stamp and pose of each frame; None for what is not needed or not known.
+) -> Iterator[tuple[np.ndarray | None, np.ndarray | None, _Frame]]:
+    """Yield the descriptor and the image of each frame, None for what is not needed, and what else is known of it.
 
     ``checked``: read the images for a geometric check, even if their descriptors are known.
     """
@@ -72,10 +89,10 @@ def _described(
         rows = features.rows_of(sequence.paths)
     if rows is not None and not checked:
         for i, row in enumerate(progress(rows, "frames", len(rows))):
-            yield row, None, None if sequence.stamps is None else float(sequence.stamps[i]), _pose(sequence, i)
+            yield row, None, _Frame.of(sequence, i, None if sequence.stamps is None else float(sequence.stamps[i]))
         return
     for i, image, stamp in progress(sequence.frames(), "frames", len(sequence)):
-        yield None if rows is None else rows[i], image, stamp, _pose(sequence, i)
+        yield None if rows is None else rows[i], image, _Frame.of(sequence, i, stamp)
 
 
 def verdicts_said(results: Sequence[LoopResult]) -> str:
@@ -208,9 +225,3 @@ def _value(text: str) -> int | float | str:
         except ValueError:
             continue
     return text
-
-
-def _pose(sequence: ImageSequence, i: int) -> np.ndarray | None:
-    if sequence.poses is None or np.isnan(sequence.poses[i]).any():
-        return None
-    return sequence.poses[i]

@@ -30,12 +30,16 @@ class Visitor:
         return self.detector.check
 
     def add(
-        self, image: np.ndarray, stamp: float | None = None, pose: Sequence[float] | np.ndarray | None = None
+        self,
+        image: np.ndarray,
+        stamp: float | None = None,
+        pose: Sequence[float] | np.ndarray | None = None,
+        odometry: Sequence[float] | np.ndarray | None = None,
     ) -> LoopResult:
         """Look up this session's next frame, (H, W, 3) uint8 BGR; ``accepted`` is a frame of the detector."""
         if self.detector.describe is None:
             raise InputError("this detector has no describe function; give one, or use add_descriptor")
-        return self.add_descriptor(self.detector.describe(image), stamp, pose, image)
+        return self.add_descriptor(self.detector.describe(image), stamp, pose, image, odometry)
 
     def add_descriptor(
         self,
@@ -43,8 +47,9 @@ class Visitor:
         stamp: float | None = None,
         pose: Sequence[float] | np.ndarray | None = None,
         image: np.ndarray | None = None,
+        odometry: Sequence[float] | np.ndarray | None = None,
     ) -> LoopResult:
-        """Look up a frame by its descriptor (D,); ``pose`` is not used."""
+        """Look up a frame by its descriptor (D,); ``pose`` and ``odometry`` are not used."""
         result, self._runs = self.detector.looked_up(self._count, descriptor, stamp, image, self._runs)
         self._count += 1
         return result

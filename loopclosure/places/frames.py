@@ -14,6 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
+from loopclosure.places.bag_files import is_bag
+from loopclosure.places.bags import bag_frames
+from loopclosure.places.pixels import eight_bits
 from netspec.files.environment import environment
 from netspec.files.image_list import list_images
 from netspec.files.kinds import is_cut_png, nearest_existing, unreadable
@@ -70,8 +73,12 @@ def image_paths(source: str | Path) -> list[Path]:
 
 
 def read_bgr(path: str | Path) -> np.ndarray:
-    """Read an image (H, W, 3) uint8, BGR. Raises InputError if it cannot be read."""
-    return read_pixels(path, cv2.IMREAD_COLOR)
+    """Read an image (H, W, 3) uint8, BGR. Raises InputError if it cannot be read.
+
+    Of 16 bits, those that the image uses are kept: see :func:`~loopclosure.places.pixels.eight_bits`.
+    """
+    image = eight_bits(read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
+    return image if image.dtype == np.uint8 else read_pixels(path, cv2.IMREAD_COLOR)
 
 
 def read_pixels(path: str | Path, mode: int) -> np.ndarray:
@@ -183,13 +190,13 @@ def read_gray(path: Path) -> np.ndarray:
 def live_frames(source: str) -> Generator[tuple[float, np.ndarray], None, None]:
     """Yield (seconds from the start, image (H, W, 3) uint8 BGR) until the source ends, or the caller stops.
 
-    source  the number of a camera; the address of a stream, as in ``rtsp://HOST/PATH``; or a video file
+    source  the number of a camera; the address of a stream, as in ``rtsp://HOST/PATH``; or a video file or bag
 
     A camera or stream always gives its newest image. Images that arrive while the caller processes one are dropped, so
     that results are not late. Raises InputError if the source cannot be opened.
     """
     if not source.isdigit() and "://" not in source:
-        yield from video_frames(Path(source))
+        yield from bag_frames(Path(source)) if is_bag(Path(source)) else video_frames(Path(source))
         return
     capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
     if not capture.isOpened():

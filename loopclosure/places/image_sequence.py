@@ -27,7 +27,8 @@ class ImageSequence(ImageList):
     stamps      (N,) seconds, None if not known
     source      the folder, list or video that was read
     numbers     (N,) positions of the frames in the source, counted from 0; None: all of its frames
-    poses       (N, 7) of the camera in the world, tx ty tz qx qy qz qw, NaN where not known; None if no pose is known
+    poses       (N, 7) the camera's true poses in the world, tx ty tz qx qy qz qw, NaN where not known; None without any
+    odometry    (N, 7) the camera's path as the robot measured it, which drifts, NaN where not known; None without it
     camera      None if not known
     depths      N files of depth in TUM's form (16 bits, 5000 per meter), None for an image without one; or None
     doubts      sentences about poses that look wrong, and about files that could not be used
@@ -38,6 +39,7 @@ class ImageSequence(ImageList):
     source: Path = Path()
     numbers: np.ndarray | None = None
     poses: np.ndarray | None = None
+    odometry: np.ndarray | None = None
     camera: Intrinsics | None = None
     depths: tuple[Path | None, ...] | None = None
     doubts: tuple[str, ...] = ()
@@ -91,6 +93,7 @@ class ImageSequence(ImageList):
             stamps=None if self.stamps is None else self.stamps[indices],
             numbers=indices if self.numbers is None else self.numbers[indices],
             poses=None if self.poses is None else self.poses[indices],
+            odometry=None if self.odometry is None else self.odometry[indices],
             depths=None if self.depths is None else tuple(self.depths[i] for i in indices),
             unreadable=[],
         )
@@ -99,6 +102,12 @@ class ImageSequence(ImageList):
         """Return the frames that have a pose. Raises InputError if none has."""
         if self.pose_fault is not None:
             raise self.pose_fault
+        if self.poses is None and self.odometry is not None:
+            raise InputError(
+                "has odometry, but no true poses; odometry drifts, so it does not tell which frames show one place. If "
+                "it is exact enough, name its topic in pose-topic=",
+                self.source,
+            )
         if self.poses is None:
             raise InputError("has no poses; expected groundtruth.txt, or the name of a file of poses", self.source)
         known = np.flatnonzero(self.known)

@@ -6,41 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.errors import InputError
 from loopclosure.places.intrinsics import Intrinsics
-from netspec.files.opencv import cv2
-
-BAYER = {
-    "bayer_rggb8": cv2.COLOR_BayerBG2BGR,
-    "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
-    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR,
-    "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
-}
-TO_BGR = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGR, "bgra8": cv2.COLOR_BGRA2BGR, **BAYER}
-CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, **dict.fromkeys(BAYER, 1)}
+from loopclosure.places.pixels import compressed_pixels, raw_pixels
 
 
 def image_of(message: Any) -> np.ndarray:
     """Return the image (H, W, 3) uint8 BGR of an Image or CompressedImage. Raises InputError for other encodings."""
-    if not hasattr(message, "encoding"):
-        image = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)
-        if image is None:
-            raise InputError("a compressed image that cannot be read")
-        return image
-    channels = CHANNELS.get(message.encoding)
-    if channels is None:
-        raise InputError(f'images in "{message.encoding}"; known: {", ".join(CHANNELS)}')
-    data = np.frombuffer(message.data, np.uint8)
-    if message.step < message.width * channels or data.size < message.height * message.step:
-        size = f"{message.width}x{message.height}"
-        raise InputError(
-            f"an image of {size} in {message.encoding} has rows of {message.step} bytes, {data.size} in all"
-        )
-    rows = data[: message.height * message.step].reshape(message.height, message.step)
-    image = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
-    if message.encoding in TO_BGR:
-        return cv2.cvtColor(image, TO_BGR[message.encoding])
-    return np.repeat(image, 3, axis=2) if channels == 1 else image
+    return raw_pixels(message) if hasattr(message, "encoding") else compressed_pixels(message)
 
 
 def camera_of(message: Any) -> Intrinsics | None:

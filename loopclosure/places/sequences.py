@@ -26,6 +26,7 @@ from netspec.files.drives import relative
 from netspec.files.image_list import list_images
 from netspec.files.kinds import nearest_existing
 
+GROUNDTRUTH, ODOMETRY = "groundtruth.txt", "odometry.txt"
 QUERIES = ("query", "queries", "Query", "Queries")
 REFERENCES = ("ref", "refs", "reference", "references", "database", "Ref", "Reference", "Database")
 KITTI_CAMERAS = ("image_0", "image_2", "image_1", "image_3")
@@ -110,7 +111,9 @@ def _with_tum_files(
     """Add the poses, depth and calibration of a TUM sequence, if it has them."""
     folder = sequence.source
     if own_poses:
-        sequence = _with_poses(sequence, folder / "groundtruth.txt", "tum", max_difference)
+        sequence = _with_poses(sequence, folder / GROUNDTRUTH, "tum", max_difference)
+    if (folder / ODOMETRY).is_file():
+        sequence = _with_odometry(sequence, folder / ODOMETRY, max_difference)
     if (folder / "depth.txt").is_file():
         try:
             sequence = replace(sequence, depths=_nearest_depths(folder / "depth.txt", stamps, max_difference))
@@ -136,6 +139,16 @@ def _with_poses(
     if mount is not None:
         found = moved(found, mount)
     return replace(sequence, poses=found, doubts=(*sequence.doubts, *_named(read.doubts, path)))
+
+
+def _with_odometry(sequence: ImageSequence, path: Path, max_difference: float) -> ImageSequence:
+    """Add the odometry in a file of a sequence; a sentence about the file if it cannot be used."""
+    try:
+        read = read_poses(path, PoseForm("tum"))
+        found = read.of_images(len(sequence), sequence.stamps, path, max_difference)
+    except InputError as fault:
+        return replace(sequence, doubts=(*sequence.doubts, f"{fault}; the odometry is not used"))
+    return replace(sequence, odometry=found, doubts=(*sequence.doubts, *_named(read.doubts, path)))
 
 
 def _with_camera(sequence: ImageSequence, path: Path, projection: str = "") -> ImageSequence:
@@ -164,7 +177,7 @@ def _images(source: Path, max_difference: float, own_poses: bool) -> ImageSequen
     sequence = replace(sequence, names=tuple(relative(path, sequence.folder) for path in listed.paths))
     if stamps is None or not source.is_dir():
         return sequence
-    own_poses = own_poses and (source / "groundtruth.txt").is_file()
+    own_poses = own_poses and (source / GROUNDTRUTH).is_file()
     return _with_tum_files(sequence, stamps, max_difference, own_poses)
 
 

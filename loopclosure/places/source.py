@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.bags import is_bag, open_bag
+from loopclosure.places.bag_files import is_bag
+from loopclosure.places.bags import BY_NAME, NO_POSES, Topics, open_bag
 from loopclosure.places.frames import VIDEO_SUFFIXES, Selection, video_frames, video_length, write_picture
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import write_calibration
 from loopclosure.places.pose_files import DIRECTIONS, FORMS, ORDERS, pose_form
-from loopclosure.places.sequences import PoseChoice, layout_of, read_sequence
+from loopclosure.places.sequences import GROUNDTRUTH, ODOMETRY, PoseChoice, layout_of, read_sequence
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Trajectory, write_rgb_list, write_trajectory
 from loopclosure.progress import Progress, silent
 from netspec.errors import did_you_mean
@@ -26,7 +27,7 @@ from netspec.files.whole_file import whole_folder
 
 FRAMES = ("start", "stop", "stride", "limit")
 POSES = ("poses", "pose-form")
-TOPICS = ("topic", "pose-topic")
+TOPICS = ("topic", "pose-topic", "odometry-topic")
 Kinds = Mapping[str, Sequence[str]]  # the settings of each kind of source; "" if no kind is named
 Listed = list[tuple[float, str]]  # the stamp in seconds and the file of each frame
 T = TypeVar("T")
@@ -113,7 +114,8 @@ def read_source(text: str, kinds: Kinds) -> Source:
     return Source(kind, Path(path), settings)
 
 
-MADE_FROM = "source.txt"
+MADE_FROM = "source.txt"  # the file and topics, then a line for each doubt about them
+MADE_BY = 2  # the version of what extract writes
 # The sequences with poses, as the help texts describe them.
 LAYOUTS = {
     "tum": "a TUM RGB-D sequence",
@@ -150,68 +152,99 @@ def open_sequence(
     videos          extract the frames of videos, too
     max_difference  between an image and its pose, in seconds
     """
-    path, layout, said, poses = source.path, source.kind, "", source.pose_choice()
-    topics = [source.get(name, str) or "" for name in TOPICS]
+    path, layout, poses = source.path, source.kind, source.pose_choice()
+    topics = Topics(*(source.get(name, str) or "" for name in TOPICS))
     video = layout == "video" or (not layout and path.suffix.lower() in VIDEO_SUFFIXES)
     if layout == "bag" or (not layout and is_bag(path)) or (video and videos):
-        path, said = extract(path, frames, *topics, progress=progress)
-        layout = "images"
-    elif any(topics):
-        raise InputError("is no bag; topic and pose-topic are for bags", path)
+        extracted = extract(path, frames, topics, progress)
+        sequence = read_sequence(extracted.folder, "images", max_difference, poses)
+        doubts = tuple(f"{path}: {doubt}" for doubt in extracted.doubts)
+        fault = InputError(extracted.pose_fault, path) if extracted.pose_fault and poses is None else None
+        return replace(sequence, doubts=(*doubts, *sequence.doubts), pose_fault=fault), extracted.said
+    if topics != BY_NAME:
+        raise InputError(f"is no bag; {', '.join(TOPICS)} are for bags", path)
     layout = layout or layout_of(path, "tum" if posed and poses is None else "images")
-    return read_sequence(path, layout, max_difference, poses), said
+    return read_sequence(path, layout, max_difference, poses), ""
 
 
-def extract(
-    source: Path, folder: Path, topic: str = "", pose_topic: str = "", progress: Progress = silent
-) -> tuple[Path, str]:
-    """Write the frames of a bag or video to a new ``folder`` in TUM's layout; return it, and a sentence about it.
+@dataclass(frozen=True)
+class Extracted:
+    """The folder with the frames of a bag or video, and a sentence about it.
 
-    rgb/ has the images as PNG, and rgb.txt their times. groundtruth.txt and calibration.txt are written if a bag has
-    poses and a CameraInfo. An existing folder that was made from the same file and topics is not written again.
+    doubts      sentences about what looks wrong in the bag
+    pose_fault  why there are no poses, if there are several topics with poses
+    """
+
+    folder: Path
+    said: str
+    doubts: Sequence[str] = ()
+    pose_fault: str = ""
+
+
+def extract(source: Path, folder: Path, topics: Topics = BY_NAME, progress: Progress = silent) -> Extracted:
+    """Write the frames of a bag or video to a new ``folder`` in TUM's layout.
+
+    rgb/ has the images as PNG, and rgb.txt their times. groundtruth.txt, odometry.txt and calibration.txt are written
+    if a bag has poses, odometry and a CameraInfo. An existing folder that was made from the same file and topics is not
+    written again.
     Raises InputError if there is another folder of that name, or if the source cannot be read.
     """
     if not source.exists():
         raise InputError(f"no such file{nearest_existing(source)}", source)
-    state = source.stat()
-    made_from = f"{source.resolve()} {state.st_size} {state.st_mtime_ns} {topic} {pose_topic}".rstrip() + "\n"
+    state, names = source.stat(), (topics.images, topics.poses, topics.odometry)
+    made_from = f"{source.resolve()} {state.st_size} {state.st_mtime_ns} {MADE_BY} {' '.join(names)}".rstrip()
     if folder.exists():
-        if (folder / MADE_FROM).is_file() and (folder / MADE_FROM).read_text(encoding="utf-8") == made_from:
-            return folder, f"{source}: its frames are in {folder} already"
+        known, *notes = _lines(folder / MADE_FROM)
+        if known == made_from:
+            fault = next((note for note in notes if note.startswith(NO_POSES)), "")
+            doubts = [note for note in notes if note != fault]
+            return Extracted(folder, f"{source}: its frames are in {folder} already", doubts, fault)
         raise InputError(f"already exists, and was not made from {source}; remove it, or give another --out", folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with whole_folder(folder) as unfinished:
         (unfinished / "rgb").mkdir()
         write = _bag if is_bag(source) else _video
-        frames, about = write(source, unfinished, topic, pose_topic, progress)
+        frames, about = write(source, unfinished, topics, progress)
         write_rgb_list(unfinished / "rgb.txt", frames)
-        (unfinished / MADE_FROM).write_text(made_from, encoding="utf-8")
-    return folder, f"{source}: {len(frames)} frames{about}: {folder}"
+        notes = [*about.doubts, *filter(None, [about.pose_fault])]
+        (unfinished / MADE_FROM).write_text("\n".join([made_from, *notes]) + "\n", encoding="utf-8")
+    return replace(about, folder=folder, said=f"{source}: {len(frames)} frames{about.said}: {folder}")
 
 
-def _bag(source: Path, folder: Path, topic: str, pose_topic: str, progress: Progress) -> tuple[Listed, str]:
-    with open_bag(source, topic, pose_topic) as bag:
-        frames = _write_images(folder, progress(bag.images(), source.name, bag.count))
-        if not frames:
-            raise InputError(f"has no image in {bag.topic}", source)
-        about = f" of {bag.topic}"
+def _lines(path: Path) -> list[str]:
+    return path.read_text(encoding="utf-8").splitlines() or [""] if path.is_file() else [""]
+
+
+def _bag(source: Path, folder: Path, topics: Topics, progress: Progress) -> tuple[Listed, Extracted]:
+    with open_bag(source, topics) as bag:
+        times = []
+
+        def images() -> Iterator[tuple[float, np.ndarray]]:
+            for stamp, received, image in bag.images():
+                times.append((stamp, received))
+                yield stamp, image
+
+        files = [file for _, file in _write_images(folder, progress(images(), source.name, bag.count))]
+        if not files:
+            raise InputError(f"has no image in {bag.topics.images}", source)
+        stamps = bag.mended(np.array(times), bag.topics.images).tolist()
+        about = [f" of {bag.topics.images}"]
         camera = bag.camera()
         if camera is not None:
             write_calibration(folder / "calibration.txt", camera)
-        if bag.pose_topic:
-            stamps, poses, note = bag.poses()
-            if len(poses):
-                order = np.argsort(stamps, kind="stable")
-                trajectory = Trajectory(stamps[order], poses[order, :3], poses[order, 3:])
-                write_trajectory(folder / "groundtruth.txt", trajectory)
-                about += f", {note}"
-    return frames, about
+        for path, name in ((bag.poses(), GROUNDTRUTH), (bag.odometry(), ODOMETRY)):
+            if path is not None and len(path.stamps):
+                trajectory = Trajectory(path.stamps, path.poses[:, :3], path.poses[:, 3:])
+                write_trajectory(folder / name, trajectory, name.removesuffix(".txt"))
+                about.append(path.about)
+    return list(zip(stamps, files, strict=True)), Extracted(folder, ", ".join(about), bag.doubts, bag.pose_fault)
 
 
-def _video(source: Path, folder: Path, topic: str, pose_topic: str, progress: Progress) -> tuple[Listed, str]:
-    if topic or pose_topic:
+def _video(source: Path, folder: Path, topics: Topics, progress: Progress) -> tuple[Listed, Extracted]:
+    if topics != BY_NAME:
         raise InputError("is a video, which has no topics", source)
-    return _write_images(folder, progress(video_frames(source), source.name, video_length(source))), ""
+    frames = _write_images(folder, progress(video_frames(source), source.name, video_length(source)))
+    return frames, Extracted(folder, "")
 
 
 def _write_images(folder: Path, images: Iterable[tuple[float, np.ndarray]]) -> Listed:

@@ -21,6 +21,7 @@ BEST, WORST, REJECTED = 4, 3, 3  # number of pairs shown
 IN_WORDS = {"below threshold": "not similar enough", "not verified": "too few points agree"}
 PARTS = 30  # of a drive; the pairs shown differ by at least one part
 OF_PATH = "The path from its known poses; green lines join the two frames of each loop."
+OF_ODOMETRY = "The path by the odometry, which drifts; green lines join the two frames of each loop."
 OF_FRAMES = (
     "Each green dot is a loop: a frame (across) and the earlier frame of the same place (upward). "
     "Gray dots are the best matches that were not accepted. A way driven again makes a rising line."
@@ -32,14 +33,15 @@ def write_drive(
 ) -> None:
     """Write the page; ``recording`` is None for a camera, because its images were not kept."""
     loops = sum(1 for result in results if result)
-    known = recording is not None and recording.poses is not None and np.isfinite(recording.poses[:, 0]).sum() > 1
-    picture = _path(recording.poses, results) if known and recording and recording.poses is not None else _dots(results)
+    paths = () if recording is None else ((recording.poses, OF_PATH), (recording.odometry, OF_ODOMETRY))
+    known = [(path, caption) for path, caption in paths if path is not None and np.isfinite(path[:, 0]).sum() > 1]
+    picture, caption = (_path(known[0][0], results), known[0][1]) if known else (_dots(results), OF_FRAMES)
     text = rendered(
         "drive.html.jinja",
         title=verdict(loops, len(results)),
         lead="" if recording is None else str(recording.source),
         picture=png(picture),
-        caption=OF_PATH if known else OF_FRAMES,
+        caption=caption,
         kinds=[] if recording is None else _kinds(results, recording),
         reasons=reasons,
         command=command,

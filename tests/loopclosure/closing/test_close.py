@@ -143,7 +143,7 @@ def test_odometry_from_a_file(
         ("--drift 2 --loops LOOPS --camera 1,2,3", 1, "expected FX,FY,CX,CY"),
         ("--drift 2 --loops LOOPS --odometry-form tum", 2, "--odometry-form needs --odometry"),
         ("--odometry FAR --seed 4 --loops LOOPS", 2, "--seed needs --drift"),
-        ("--loops LOOPS", 2, "one of the arguments --odometry --drift is required"),
+        ("--loops LOOPS", 1, "has no odometry; give --odometry FILE, or --drift PERCENT to simulate it"),
     ],
 )
 def test_errors_are_reported_in_one_line(

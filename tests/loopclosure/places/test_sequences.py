@@ -175,13 +175,14 @@ def test_a_file_of_poses_replaces_the_sequences_poses(tmp_path: Path) -> None:
 
 def test_a_video_is_extracted_once(tmp_path: Path) -> None:
     video = write_video(tmp_path / "drive.avi")
-    folder, said = extract(video, tmp_path / "frames")
-    assert said == f"{video}: 48 frames: {folder}"
+    extracted = extract(video, tmp_path / "frames")
+    folder = extracted.folder
+    assert extracted.said == f"{video}: 48 frames: {folder}"
     poses = tmp_path / "poses.txt"
     poses.write_text(tum_rows(path()))
     same_path(read_sequence(folder, poses=PoseChoice(poses)).poses, path())
-    again, said = extract(video, tmp_path / "frames")
-    assert (again, said) == (folder, f"{video}: its frames are in {folder} already")
+    again = extract(video, tmp_path / "frames")
+    assert (again.folder, again.said) == (folder, f"{video}: its frames are in {folder} already")
     other = write_video(tmp_path / "other.avi")
     with pytest.raises(InputError, match="already exists, and was not made from"):
         extract(other, folder)

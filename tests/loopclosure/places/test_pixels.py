@@ -1,0 +1,128 @@
+"""Pixels of all encodings become the same picture; images of 10 to 16 bits are neither black nor clipped."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from loopclosure.errors import InputError
+from loopclosure.places.frames import read_bgr
+from loopclosure.places.messages import image_of
+from loopclosure.places.pixels import BAYER, ENCODINGS, PACKED, PLANAR, eight_bits
+
+RNG = np.random.default_rng(5)
+# Smooth, so that colors which pixels share are exact enough.
+PICTURE = cv2.resize(RNG.integers(30, 220, (3, 4, 3), np.uint8), (32, 24), interpolation=cv2.INTER_CUBIC)
+GRAY = cv2.cvtColor(PICTURE, cv2.COLOR_BGR2GRAY)
+
+
+def mosaic(colors: str) -> np.ndarray:
+    """What a sensor behind a filter of Bayer's sees: the first two letters are its first row."""
+    seen = np.zeros(PICTURE.shape[:2], np.uint8)
+    for k, color in enumerate(colors.removeprefix("bayer_")):
+        part = (slice(k // 2, None, 2), slice(k % 2, None, 2))
+        seen[part] = PICTURE[..., "bgr".index(color)][part]
+    return seen
+
+
+def pixels_of(colors: str) -> np.ndarray:
+    if colors in BAYER:
+        return mosaic(colors)
+    codes = {"rgb": cv2.COLOR_BGR2RGB, "rgba": cv2.COLOR_BGR2RGBA, "bgra": cv2.COLOR_BGR2BGRA}
+    return {"mono": GRAY, "bgr": PICTURE}[colors] if colors not in codes else cv2.cvtColor(PICTURE, codes[colors])
+
+
+def message(encoding: str, pixels: np.ndarray, big: bool = False) -> SimpleNamespace:
+    """A message Image whose rows are longer than their pixels."""
+    rows = np.pad(pixels.reshape(len(pixels), -1).view(np.uint8), ((0, 0), (0, 6)))
+    height, width = PICTURE.shape[:2]
+    return SimpleNamespace(
+        encoding=encoding, height=height, width=width, step=rows.shape[1], is_bigendian=big, data=rows.ravel()
+    )
+
+
+def same(found: np.ndarray, colors: str, within: float) -> None:
+    assert (found.dtype, found.shape) == (np.uint8, PICTURE.shape)
+    wanted = cv2.cvtColor(GRAY, cv2.COLOR_GRAY2BGR) if colors == "mono" else PICTURE
+    inner = (slice(2, -2), slice(2, -2))  # a mosaic has no neighbors at the border
+    assert np.abs(found[inner].astype(int) - wanted[inner]).max() <= within
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_every_encoding_is_the_same_picture(encoding: str) -> None:
+    colors, bits = ENCODINGS[encoding]
+    pixels = pixels_of(colors)
+    within = 40 if colors in BAYER else 0
+    if bits == 8:
+        for name in (encoding, encoding.upper(), f" {encoding}"):
+            same(image_of(message(name, pixels)), colors, within)
+        return
+    wide = np.ascontiguousarray(pixels).astype(np.uint16) * 257
+    same(image_of(message(encoding, wide)), colors, within)
+    same(image_of(message(encoding, wide.byteswap(), big=True)), colors, within)
+
+
+@pytest.mark.parametrize("encoding", [*PACKED, *PLANAR])
+def test_shared_colors_are_nearly_the_same_picture(encoding: str) -> None:
+    codes = {"yuv422": cv2.COLOR_BGR2YUV_UYVY, "uyvy": cv2.COLOR_BGR2YUV_UYVY}
+    if encoding in PACKED:
+        pixels = cv2.cvtColor(PICTURE, codes.get(encoding, cv2.COLOR_BGR2YUV_YUY2))
+    else:  # the colors of four pixels, interleaved below the gray values
+        planes = cv2.cvtColor(PICTURE, cv2.COLOR_BGR2YUV_I420)
+        first, second = planes[24:].reshape(2, -1)[:: 1 if encoding == "nv12" else -1]
+        pixels = np.concatenate([planes[:24], np.stack([first, second], axis=1).reshape(12, 32)])
+    same(image_of(message(encoding, pixels)), "bgr", 40)
+
+
+@pytest.mark.parametrize(
+    ("form", "pixels", "colors"),
+    [
+        ("jpeg", PICTURE, "bgr"),
+        ("png", PICTURE, "bgr"),
+        ("rgb8; jpeg compressed bgr8", PICTURE, "bgr"),
+        ("bayer_rggb8; jpeg compressed bgr8", PICTURE, "bgr"),
+        ("bayer_gbrg8; png compressed ", mosaic("bayer_gbrg"), "bayer_gbrg"),
+        ("bayer_rggb8; png compressed bayer_rggb8", mosaic("bayer_rggb"), "bayer_rggb"),
+        ("bayer_rggb8; png compressed mono8", GRAY, "mono"),
+        ("bayer_rggb16; png compressed ", mosaic("bayer_rggb").astype(np.uint16) * 257, "bayer_rggb"),
+        ("mono16; png compressed ", GRAY.astype(np.uint16) * 257, "mono"),
+        ("16UC1; png compressed ", GRAY.astype(np.uint16) * 257, "mono"),
+    ],
+)
+def test_compressed_images_are_read_as_their_format_says(form: str, pixels: np.ndarray, colors: str) -> None:
+    _, data = cv2.imencode(".jpg" if "jpeg" in form else ".png", pixels, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    same(image_of(SimpleNamespace(format=form, data=data)), colors, 40 if colors in BAYER else 16 * ("jpeg" in form))
+
+
+def test_what_is_no_image_is_named() -> None:
+    for encoding in ("32FC1", "", "bayer_rggb12"):
+        with pytest.raises(InputError, match=f'images in "{encoding}"; known: mono8, rgb8'):
+            image_of(message(encoding, GRAY))
+    short = message("bgr8", GRAY)
+    with pytest.raises(InputError, match="an image of 32x24 in bgr8 has rows of 38 bytes, 912 in all"):
+        image_of(short)
+    depth = SimpleNamespace(format="16UC1; compressedDepth png", data=np.zeros(20, np.uint8))
+    with pytest.raises(InputError, match="depth, not images"):
+        image_of(depth)
+    with pytest.raises(InputError, match="a compressed image that cannot be read"):
+        image_of(SimpleNamespace(format="jpeg", data=np.zeros(20, np.uint8)))
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".pgm"])
+def test_an_image_of_16_bits_keeps_the_bits_that_it_uses(bits: int, suffix: str, tmp_path: Path) -> None:
+    wide = (GRAY.astype(np.uint16) << (bits - 8)) + (1 << (bits - 8)) - 1
+    wide[0, 0] = (1 << bits) - 1
+    wanted = GRAY.copy()
+    wanted[0, 0] = 255
+    np.testing.assert_array_equal(eight_bits(wide), wanted)
+    assert cv2.imwrite(str(tmp_path / f"a{suffix}"), wide)
+    np.testing.assert_array_equal(read_bgr(tmp_path / f"a{suffix}"), cv2.cvtColor(wanted, cv2.COLOR_GRAY2BGR))
+
+
+def test_images_of_8_bits_are_read_as_before(tmp_path: Path) -> None:
+    for name, image in (("a.png", PICTURE), ("b.png", GRAY)):
+        assert cv2.imwrite(str(tmp_path / name), image)
+        np.testing.assert_array_equal(read_bgr(tmp_path / name), cv2.imread(str(tmp_path / name)))
