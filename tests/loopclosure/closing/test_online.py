@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lmdb_build.cli import main as lmdb_build
+from loopclosure.closing import online
 from loopclosure.closing.close import ate_rmse_m, drifted, path_of, steps_between, write_closed
+from loopclosure.closing.graph import Solution, solve
 from loopclosure.closing.measure import CHECK
 from loopclosure.closing.online import STILL, Keyframes, LoopCloser, after
 from loopclosure.descriptors.thumbnails import Thumbnailer
@@ -175,6 +178,27 @@ def test_another_drive_is_no_step_of_the_odometry_and_is_joined_by_its_loops() -
     assert closed.accepted.all()
     turns = relative_pose(closed.poses[:3], closed.poses[3:])
     np.testing.assert_allclose(turns[:, 3:], np.tile(STILL[3:], (3, 1)), atol=0.02)
+
+
+def test_images_do_not_wait_for_a_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, go_on = Event(), Event()
+
+    def slow(*given: Any) -> Solution:
+        begun.set()
+        assert go_on.wait(60)
+        return solve(*given)
+
+    monkeypatch.setattr(online, "solve", slow)
+    closer = closer_of()
+    closer.start()
+    for number in (0, 1, 2, 0):
+        closer.add(picture(number), 20.0 * len(closer.path()[0]), at(len(closer.path()[0])))
+    assert begun.wait(60)
+    assert closer.add(picture(1), 80.0, at(4)) is not None
+    assert (closer.solutions, len(closer.path()[0])) == (0, 5)
+    go_on.set()
+    closer.stop()
+    assert closer.solutions >= 1
 
 
 def test_a_detector_with_frames_or_without_a_check_is_refused() -> None:
