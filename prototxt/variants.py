@@ -4,7 +4,7 @@ normalized  descriptors of length 1, which the paper does not name: they train w
 small       the same for pairs of 64x64 pixels and a laptop: batches of 32, 300 iterations
 normalized/siamese_slim27_128  a quarter of the channels
 
-Needs nothing but Python. tools/setup.sh and the build of the wheel run it.
+Needs nothing but Python. tools/install.py and the build of the wheel run it.
 """
 
 import re

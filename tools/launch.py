@@ -1,13 +1,15 @@
 """Used by each script in this folder: runs a command of the packages in this project."""
 
 import os
+import subprocess
 import sys
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-VENV = ROOT / ".venv"  # made by tools/setup.sh
+VENV = ROOT / ".venv"  # made by tools/install.py
+PYTHON = VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 REQUIRED = ("torch", "google.protobuf", "lmdb", "cv2")  # commands import some of these late, or in another process
 
 
@@ -26,9 +28,11 @@ def run(module: str, *words: str) -> int:
                 raise ModuleNotFoundError(f"No module named '{name}'", name=name)
         return import_module("netspec.terminal.main").program(module)
     except ModuleNotFoundError as fault:
-        python = VENV / "bin" / "python"
-        if python.is_file() and Path(sys.prefix).resolve() != VENV.resolve():
-            os.execv(python, [str(python), *typed])
-        needed = f"to install the required packages: bash {ROOT / 'tools' / 'setup.sh'}"
+        if PYTHON.is_file() and Path(sys.prefix).resolve() != VENV.resolve():
+            command = [str(PYTHON), *typed]
+            if os.name == "nt":  # its execv does not wait
+                return subprocess.call(command)
+            os.execv(PYTHON, command)
+        needed = f"to install the required packages: {sys.executable} {ROOT / 'tools' / 'install.py'}"
         print(f"{sys.argv[0]}: {fault.msg} for {sys.executable}; {needed}", file=sys.stderr)
         return 1

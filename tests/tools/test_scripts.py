@@ -14,9 +14,7 @@ from paths import GOLDEN, ROOT
 pytestmark = pytest.mark.slow
 
 SCRIPTS = sorted(
-    path.name
-    for path in (ROOT / "tools").iterdir()
-    if path.is_file() and "python" in path.read_text().partition("\n")[0]
+    path.name for path in (ROOT / "tools").iterdir() if path.is_file() and "from launch import run" in path.read_text()
 )
 
 
@@ -63,7 +61,7 @@ def test_without_one_a_message_names_the_command_to_run(script: str, project: Pa
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"{project}/tools/{script}: ")
     assert "No module named " in line
-    assert line.endswith(f"bash {project}/tools/setup.sh")
+    assert line.endswith(f"to install the required packages: {bare_python} {project}/tools/install.py")
 
 
 def test_a_virtual_environment_without_the_packages_is_tried_only_once(project: Path, bare_python: Path) -> None:
