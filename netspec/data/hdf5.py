@@ -5,6 +5,7 @@ Caffe: src/caffe/layers/hdf5_data_layer.cpp, src/caffe/layers/hdf5_output_layer.
 
 from __future__ import annotations
 
+import os
 import threading
 import weakref
 from collections.abc import Iterator, Sequence
@@ -118,6 +119,9 @@ class Hdf5Source:
 def _listed(path: str, where: Where | None) -> list[tuple[str, Where]]:
     """Return the files in a list, and their positions in it. Raises SpecError if there are none."""
     log.info("hdf5_data_layer.cpp:80", f"Loading list of HDF5 filenames from: {path}")
+    if os.path.isfile(path) and h5py.is_hdf5(path):
+        message = f'"{path}" is an HDF5 file; expected a text file that lists HDF5 files, one in each line'
+        raise SpecError(message, where or Where(path))
     named = [(name, position) for line, position in list_lines(path, where) for name in line.split()]
     log.info("hdf5_data_layer.cpp:94", f"Number of HDF5 files: {len(named)}")
     if not named:
@@ -136,7 +140,8 @@ def _row_shapes(name: str, where: Where, tops: Sequence[str]) -> tuple[int, list
                 raise SpecError(f'has no dataset "{top}", the name of a top; it has {found}')
             datasets.append(dataset)
             if dataset.ndim == 0 or dataset.dtype.kind not in "fiu":
-                raise SpecError(f'dataset "{top}" of "{name}" contains no rows of numbers', where)
+                found = "has no rows" if dataset.ndim == 0 else f"has values of type {dataset.dtype}"
+                raise SpecError(f'dataset "{top}" of "{name}" {found}; expected rows of numbers', where)
         counts = [len(dataset) for dataset in datasets]
         if min(counts) != max(counts) or not counts[0]:
             raise SpecError(f'datasets of "{name}" have {counts} rows; expected equal numbers, above 0', where)

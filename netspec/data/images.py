@@ -5,6 +5,7 @@ Caffe: src/caffe/util/io.cpp (ReadImageToCVMat), src/caffe/layers/image_data_lay
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -17,6 +18,10 @@ from netspec.files.kinds import unreadable
 from netspec.files.limits import read_bytes
 from netspec.files.opencv import cv2
 
+_TOO_LARGE = 2**31  # for a Datum's label, an int32
+_MOST_DIGITS = 4000  # Python refuses to read more than 4300
+_INTEGER = re.compile(r"[+-]?[0-9]+")
+
 
 @dataclass(frozen=True)
 class ListedImage:
@@ -25,6 +30,14 @@ class ListedImage:
     name: str
     label: int
     where: Where
+
+
+def read_label(digits: str, where: Where) -> int:
+    """Return an integer label. Raises SpecError for one beyond the 32 bits of a Datum's."""
+    label = int(digits[:_MOST_DIGITS])
+    if not -_TOO_LARGE <= label < _TOO_LARGE:
+        raise SpecError(f"found label {digits}, expected one of 32 bits, {-_TOO_LARGE} to {_TOO_LARGE - 1}", where)
+    return label
 
 
 def read_image(path: str, color: bool = True, size: tuple[int, int] | None = None) -> np.ndarray:
@@ -75,12 +88,9 @@ def read_image_list(path: str, where: Where | None = None) -> list[ListedImage]:
     images = []
     for line, position in list_lines(path, where):
         name, _, label = line.rpartition(" ") if " " in line else line.rpartition("\t")
-        try:
-            images.append(ListedImage(name.rstrip(), int(label), position))
-        except ValueError:
-            name = ""
-        if not name:
+        if not name or not _INTEGER.fullmatch(label):
             raise SpecError(f'found "{line}", expected an image name, a space and an integer label', position)
+        images.append(ListedImage(name.rstrip(), read_label(label, position), position))
     if not images:
         raise SpecError(f'the image list "{path}" is empty', where or Where(path))
     return images

@@ -87,6 +87,8 @@ def read_window_file(param: Any, where: Where | None) -> WindowFile:
         for _ in range(int(numbers(1, "the number of windows")[0])):
             label, overlap, *corners = numbers(6, "label overlap x1 y1 x2 y2")
             x1, y1, x2, y2 = map(int, corners)
+            if not (label.is_integer() and abs(label) < 2**31):
+                raise SpecError(f"found label {label:.17g}, expected an integer of 32 bits", position)
             if overlap >= param.fg_threshold:
                 if label <= 0:
                     raise SpecError(

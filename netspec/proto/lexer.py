@@ -7,6 +7,7 @@ parser (strings over several lines, a number directly before a name), the parser
 from __future__ import annotations
 
 import re
+import unicodedata
 from bisect import bisect_right
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -30,6 +31,7 @@ _TOKEN = re.compile(
 )
 _ESCAPE = re.compile(r"\\(?:([0-7]{1,3})|[xX]([0-9a-fA-F]{1,2})|u([0-9a-fA-F]{4})|U([0-9a-fA-F]{8})|(.))", re.DOTALL)
 _PLACEHOLDER = re.compile(r"\$?\{+ *[A-Za-z_][\w.]* *\}+|\$[A-Za-z_]\w*|@[A-Za-z_]\w*@|%(?:\([A-Za-z_]\w*\))?[dfrs]\b")
+_COMMENT = re.compile(r"//|/\*|\*/|<!--|--|%")  # as other languages write it
 _SIMPLE_ESCAPES = {"a": 7, "b": 8, "f": 12, "n": 10, "r": 13, "t": 9, "v": 11, "\\": 92, "?": 63, "'": 39, '"': 34}
 
 
@@ -76,12 +78,14 @@ class Lexer:
         return Where(self.file, line, start - self._lines[line - 1] + 1)
 
     def suspicion(self, start: int) -> str:
-        """Return a hint for an error at a placeholder, or directly after a string over several lines; else "".
+        """Return a hint for an error at a placeholder, at a comment, or after a string over several lines; else "".
 
         If a closing quote is missing, the string continues to the next opening quote, and the error appears there.
         """
         if found := _PLACEHOLDER.match(self.text, start):
             return f"; is this file a template? replace {found[0]} with a value"
+        if _COMMENT.match(self.text, start):
+            return "; a comment begins with #"
         for token in reversed(self._long_strings):
             end = token.start + len(token.text)
             if token.start < start and self.where(start).line <= self.where(end).line + 1:
@@ -134,6 +138,13 @@ class Lexer:
             return SpecError(fault, self.where(position))
         if "\udc80" <= character <= "\udcff":
             return self._not_utf8(position)
+        if character.isspace() or unicodedata.category(character) == "Cf":  # of zero width
+            name = unicodedata.name(character, "character").lower()
+            fault = f"unexpected {name} (0x{ord(character):02x}); replace it with an ordinary space"
+            return SpecError(fault, self.where(position))
+        if character in "“”„«»‘’‚":
+            fault = f'unexpected quotation mark {character}; write strings in straight quotes: "text"'
+            return SpecError(fault, self.where(position))
         if not character.isprintable():
             return SpecError(f"unexpected character 0x{ord(character):02x}; is this a text file?", self.where(position))
         fault = f'unexpected character "{character}"{self.suspicion(position)}'

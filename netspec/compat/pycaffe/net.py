@@ -75,6 +75,9 @@ class Net:
     ) -> None:
         if isinstance(phase, (str, bytes, Path)):
             phase, weights, level = _older_form(network_file, phase, level)
+        if isinstance(level, (str, bytes, Path)):
+            message = f"level is an integer, found {str(level)!r}; name the weights: Net(file, phase, weights=...)"
+            raise TypeError(message)
         network_file = file_of(network_file)
         weights = None if weights is None else file_of(weights)
         with caffes_errors():
@@ -270,6 +273,8 @@ class Net:
         """Yield the arrays batch by batch."""
         if not arrays:
             return
+        for name in {"start", "end"} & arrays.keys() - self.blobs.keys():
+            raise ValueError(f"all layers run in batches, so {name} cannot be given; use forward({name}=...)")
         given = {name: np.asarray(array) for name, array in arrays.items()}
         first = next(iter(given))
         size, count = self.blobs[first].num, len(given[first])

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from netspec.data.images import list_lines, read_image
+from netspec.data.images import list_lines, read_image, read_label
 from netspec.data.random_words import words
 from netspec.data.resize import resized
 from netspec.data.sources import Arrays, Cursor, Source
@@ -190,12 +190,12 @@ def read_videos(path: str, where: Where | None = None) -> list[Video]:
     """Read lines ``folder frames label``. Raises SpecError for another line, and for a list without lines."""
     videos = []
     for line, position in list_lines(path, where):
-        found = re.fullmatch(r"(.+?)\s+(\d+)\s+(\d+)", line)
+        found = re.fullmatch(r"(.+?)\s+([0-9]{1,9})\s+([0-9]+)", line)
         if not found:
             raise SpecError(
                 f'found "{line}", expected the folder of a video, how many frames it has, its label', position
             )
-        videos.append(Video(found[1], int(found[2]), int(found[3]), position))
+        videos.append(Video(found[1], int(found[2]), read_label(found[3], position), position))
     if not videos:
         raise SpecError(f'the list "{path}" is empty', where or Where(path))
     return videos

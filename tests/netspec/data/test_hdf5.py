@@ -81,7 +81,12 @@ def test_invalid_files_are_reported_with_their_line(tmp_path: Path, listed: str)
     refuse(tmp_path, f"{tmp_path}/a.h5 {tmp_path}/wide.h5", "all files must agree")
     with h5py.File(tmp_path / "words.h5", "w") as file:
         file["data"], file["label"] = np.zeros((3, 2, 4)), np.array([b"x", b"y", b"z"])
-    refuse(tmp_path, f"{tmp_path}/words.h5", 'dataset "label" .* contains no rows of numbers')
+    refuse(tmp_path, f"{tmp_path}/words.h5", 'dataset "label" .* has values of type .*; expected rows of numbers')
+    with h5py.File(tmp_path / "bool.h5", "w") as file:
+        file["data"], file["label"] = np.zeros((3, 2, 4), bool), np.zeros(3)
+    refuse(tmp_path, f"{tmp_path}/bool.h5", 'dataset "data" .* has values of type bool; expected rows of numbers')
+    with pytest.raises(SpecError, match=r'bool.h5" is an HDF5 file; expected a text file that lists HDF5 files'):
+        Hdf5Source(str(tmp_path / "bool.h5"), ["data", "label"], 2, where=PLACE)
 
 
 def test_results_are_appended_in_caffes_four_axes(tmp_path: Path) -> None:

@@ -56,10 +56,19 @@ def test_list_lines_are_split_at_the_last_space(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("line", ["a.png", "a.png x", "a.png 1.5", "3"])
+@pytest.mark.parametrize(
+    "line", ["a.png", "a.png x", "a.png 1.5", "3", "a.png 3.0", "a.png 0x10", "a.png nan", "a.png 1_000", "a.png ٣"]
+)
 def test_a_line_without_a_label_is_reported(tmp_path: Path, line: str) -> None:
     (tmp_path / "l").write_text(f"ok.png 1\n{line}\n")
     with pytest.raises(SpecError, match=f'l:2:1: found "{line}", expected an image name'):
+        read_image_list(str(tmp_path / "l"))
+
+
+@pytest.mark.parametrize("label", ["2147483648", "-2147483649", "4294967296", "9" * 5000])
+def test_a_label_beyond_32_bits_is_refused(tmp_path: Path, label: str) -> None:
+    (tmp_path / "l").write_text(f"ok.png 2147483647\nb.png -2147483648\na.png {label}\n")
+    with pytest.raises(SpecError, match=f"l:3:1: found label {label}, expected one of 32 bits, -2147483648 to"):
         read_image_list(str(tmp_path / "l"))
 
 

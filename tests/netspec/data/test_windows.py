@@ -141,6 +141,8 @@ def test_images_can_be_cached(folder: Path) -> None:
         ),
         ("40\n4\n", "40\n5\n", 'windows.txt:10:1: found "", expected label overlap'),
         ("5 0.9", "0 0.9", "windows.txt:7:1: found label 0 for a foreground window"),
+        ("5 0.9", "1.5 0.9", "windows.txt:7:1: found label 1.5, expected an integer of 32 bits"),
+        ("5 0.9", "4294967296 0.9", "windows.txt:7:1: found label 4294967296, expected an integer of 32 bits"),
         ("3 0.1", "3 0.45", "has no background windows"),
     ],
 )

@@ -23,6 +23,29 @@ def test_a_binary_file() -> None:
         parse_net_text("\x0a\x03net\x00", "f")
 
 
+@pytest.mark.parametrize("comment", ["// a", "/* a */", "<!-- a -->", "-- a", "% a"])
+@pytest.mark.parametrize("before", ["", 'name: "n" '])
+def test_comments_of_other_languages_are_named(comment: str, before: str) -> None:
+    with pytest.raises(SpecError, match=rf"^f:1:{len(before) + 1}: .*; a comment begins with #$"):
+        parse_net_text(f"{before}{comment}", "f")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("\xa0", "no-break space (0xa0); replace it with an ordinary space"),
+        ("\u3000", "ideographic space (0x3000); replace it with an ordinary space"),
+        ("\u200b", "zero width space (0x200b); replace it with an ordinary space"),
+        ("\u201cn\u201d", 'quotation mark \u201c; write strings in straight quotes: "text"'),
+    ],
+    ids=["no_break", "ideographic", "zero_width", "quotes"],
+)
+def test_characters_of_word_processors_are_named(text: str, said: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        parse_net_text(f"name: {text}", "f")
+    assert str(caught.value) == f"f:1:7: unexpected {said}"
+
+
 def test_a_net_for_a_solver() -> None:
     with pytest.raises(SpecError, match=r'^f:1:1: SolverParameter has no field "layer", .* is this file a net\?$'):
         parse_solver_text("layer {}", "f")
