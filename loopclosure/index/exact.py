@@ -6,9 +6,7 @@ from tempfile import TemporaryFile
 
 import numpy as np
 
-from loopclosure.descriptors.similarity import squared_distances
-
-BLOCK = 256  # descriptors, which are stored and multiplied at a time
+LEAST_BLOCK, BLOCK = 64, 4096  # descriptors, which are stored and multiplied at a time
 
 
 class ExactIndex:
@@ -21,9 +19,11 @@ class ExactIndex:
 
     def __init__(self, metric: str, in_memory: int | None = None) -> None:
         self._metric, self._in_memory = metric, in_memory
+        self._block = BLOCK if in_memory is None else min(BLOCK, max(LEAST_BLOCK, in_memory // 4))
         self._count = 0
-        self._blocks: list[np.ndarray] = []  # (BLOCK, D) each; the last one may have room
-        self._squares: list[np.ndarray] = []  # (BLOCK,) of each block
+        self._blocks: list[np.ndarray] = []  # (block, D) each; the last one may have room
+        self._squares = np.zeros(0, np.float32)  # the squared length of each descriptor, with room for more
+        self._longest = 0.0  # the largest of them
         self._on_disk = 0  # blocks; they are the first ones
         self._file = None if in_memory is None else TemporaryFile(prefix="loopclosure-")  # noqa: SIM115
 
@@ -33,19 +33,23 @@ class ExactIndex:
     def add(self, rows: np.ndarray) -> None:
         """See :class:`~loopclosure.index.index.Index`."""
         while len(rows):
-            begin = self._count % BLOCK
+            begin = self._count % self._block
             if not begin:
                 self._make_room(rows.shape[1])
-            some = rows[: BLOCK - begin]
+            some = rows[: self._block - begin]
             self._blocks[-1][begin : begin + len(some)] = some
-            self._squares[-1][begin : begin + len(some)] = np.square(some).sum(axis=1)
+            squares = np.square(some).sum(axis=1)
+            self._squares[self._count : self._count + len(some)] = squares
+            self._longest = max(self._longest, float(squares.max()))
             self._count += len(some)
             rows = rows[len(some) :]
 
     def _make_room(self, width: int) -> None:
         """Append a block, and write the oldest one in memory to the file if there are too many."""
         if self._file is not None and self._in_memory is not None:
-            while self._blocks[self._on_disk :] and self._count - BLOCK * self._on_disk >= max(self._in_memory, BLOCK):
+            while self._blocks[self._on_disk :] and self._count - self._block * self._on_disk >= max(
+                self._in_memory, self._block
+            ):
                 block = self._blocks[self._on_disk]
                 begin = self._on_disk * block.nbytes
                 self._file.seek(begin)
@@ -53,38 +57,37 @@ class ExactIndex:
                 self._file.flush()
                 self._blocks[self._on_disk] = np.memmap(self._file, np.float32, "r", begin, block.shape)
                 self._on_disk += 1
-        self._blocks.append(np.empty((BLOCK, width), np.float32))
-        self._squares.append(np.empty(BLOCK, np.float32))
+        self._blocks.append(np.empty((self._block, width), np.float32))
+        if self._count == len(self._squares):
+            self._squares = np.append(self._squares, np.empty(max(self._block, self._count), np.float32))
 
     def search(self, row: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
         """See :class:`~loopclosure.index.index.Index`; of equal scores, the earlier one comes first."""
         k = min(k, self._count)
         if not k:
             return np.zeros(0, np.intp), np.zeros(0, np.float32)
-        scores = np.concatenate([self._products(number, row) for number in range(len(self._blocks))])
+        scores = np.empty(self._count, np.float32)
+        for number, block in enumerate(self._blocks):
+            part = scores[number * self._block : (number + 1) * self._block]
+            np.matmul(block[: len(part)], row, out=part)
+        if self._metric != "cosine":  # minus the squared distance, without the square of ``row``, has the same order
+            scores *= 2
+            scores -= self._squares[: self._count]
         # The product is fast but rounds: the descriptors that may be the best k are compared directly.
         near = np.flatnonzero(scores >= np.partition(scores, self._count - k)[self._count - k] - self._rounding(row))
-        rows = np.array([self._blocks[number // BLOCK][number % BLOCK] for number in near], np.float64)
+        rows = np.array([self._blocks[number // self._block][number % self._block] for number in near], np.float64)
         values = rows @ row if self._metric == "cosine" else -np.linalg.norm(rows - row, axis=1)
         values = values.astype(np.float32)
         order = np.lexsort((near, -values))[:k]
         return near[order], values[order]
 
-    def _products(self, number: int, row: np.ndarray) -> np.ndarray:
-        """Return the scores of the descriptors of a block, rounded; for Euclidean distances, minus their squares."""
-        rows = self._blocks[number][: self._count - number * BLOCK]
-        if self._metric == "cosine":
-            return rows @ row
-        return -squared_distances(rows, row[None], self._squares[number][: len(rows), None], np.zeros(1))[:, 0]
-
     def _rounding(self, row: np.ndarray) -> float:
-        """Return twice the largest error of a product: that of a sum of D terms."""
-        longest = max(float(squares[: self._count - k * BLOCK].max()) for k, squares in enumerate(self._squares))
-        error = len(row) * np.finfo(np.float32).eps * max(longest, float(row @ row))
-        return 2 * error if self._metric == "cosine" else 8 * error
+        """Return twice the largest error of a score, a sum of D terms."""
+        error = len(row) * np.finfo(np.float32).eps * max(self._longest, float(row @ row))
+        return float(2 * error if self._metric == "cosine" else 8 * error)
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         """See :class:`~loopclosure.index.index.Index`."""
-        first, last = start // BLOCK, -(-stop // BLOCK)
-        parts = [block[: self._count - k * BLOCK] for k, block in enumerate(self._blocks[first:last], first)]
-        return np.concatenate(parts)[start - first * BLOCK : stop - first * BLOCK]
+        first, last = start // self._block, -(-stop // self._block)
+        parts = [block[: self._count - k * self._block] for k, block in enumerate(self._blocks[first:last], first)]
+        return np.concatenate(parts)[start - first * self._block : stop - first * self._block]
