@@ -107,7 +107,7 @@ class Geometry:
             hidden = agree.hidden
         inliers = np.array([check.enough(agree(query, reference)) for query, reference in unlike])
         points = float(np.mean(inliers)) if len(inliers) else 0.0
-        return cls(check, agree, np.count_nonzero(inliers), points, len(inliers), hidden)
+        return cls(check, agree, int(np.count_nonzero(inliers)), points, len(inliers), hidden)
 
     def evidence(self, agreement: Agreement) -> float:
         """Return the inliers of an agreement divided by the number needed: against chance and dissimilar pairs."""
