@@ -41,6 +41,7 @@ def parser() -> Parser:
     _add_growth(commands)
     _add_feeding(commands)
     _add_settings(commands)
+    _add_revisits(commands)
     _add_tables(commands)
     _add_pages(commands)
     _add_list(commands)
@@ -128,6 +129,19 @@ def _settings(arguments: argparse.Namespace) -> None:
     if arguments.halves:
         print(halves(results))
     print(summary(results))
+
+
+def _add_revisits(commands: Commands) -> None:
+    parser = commands.add_parser("revisits", help="measure what loopclosure finds on real drives that come back")
+    parser.set_defaults(function=_revisits)
+    _add_data(parser)
+    parser.add_argument("drives", nargs="*", metavar="DRIVE", help="how the names of the drives begin (default: all)")
+
+
+def _revisits(arguments: argparse.Namespace) -> None:
+    from benchmarks.revisits import measure
+
+    measure(arguments.data, arguments.work, arguments.drives, partial(print, flush=True), arguments.words)
 
 
 def _add_tables(commands: Commands) -> None:

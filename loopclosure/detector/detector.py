@@ -23,7 +23,7 @@ import numpy as np
 
 from loopclosure.detector.decision import DetectorSettings, LoopResult, Runs, result_of
 from loopclosure.detector.frames import Frames, Local, LocalOnDisk, Points, points_of
-from loopclosure.detector.verification import GeometricCheck, LocalFeatures
+from loopclosure.detector.verification import SURE, GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.index.index import Index, open_index
 from netspec.errors import SpecError
@@ -32,6 +32,8 @@ from netspec.files.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]
 LEAST_STEPS = 20  # scores of consecutive frames that are needed to choose a threshold
+PART = "enough points agree, but only a part of those that match"
+ALIKE = "places look alike: of most frames with enough points, only a part of those that match agrees"
 FORMAT = 1  # of the file that save writes
 SAVED = "a file that LoopDetector.save wrote"
 
@@ -90,6 +92,7 @@ class LoopDetector:
         self._steps: list[float] = []  # the score of each frame with the one before it
         self._runs: Runs = []  # of the last frame
         self._last = np.zeros((0, 0), np.float32)  # the descriptor of the last frame
+        self._whole, self._part = 0, 0  # frames with enough points, of which most agree, or only a part
 
     def __len__(self) -> int:
         return self._frames.count
@@ -151,6 +154,8 @@ class LoopDetector:
         self._keep(row, stamp, path, local)
         if result.accepted is not None:
             self.loops.append(result)
+        self._whole += result.accepted is not None or result.reason == ALIKE
+        self._part += result.reason == PART
         return result
 
     def remember(
@@ -249,6 +254,7 @@ class LoopDetector:
             "settings": asdict(self.settings),
             "check": None if self.check is None else asdict(self.check),
             "runs": self._runs,
+            "agreed": [self._whole, self._part],
             "loops": [asdict(loop) for loop in self.loops],
             "sessions": self._sessions,
         }
@@ -283,6 +289,7 @@ class LoopDetector:
             detector._take(arrays)
             detector._sessions = _starts(about.get("sessions", [0]), len(detector))
             detector._steps = detector._all_steps()
+            detector._whole, detector._part = map(int, about.get("agreed", (0, 0)))
             detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
             detector.loops = [result_of(found, len(detector)) for found in about["loops"]]
         except SpecError as fault:
@@ -404,9 +411,13 @@ class LoopDetector:
         score = candidates[0][1] if candidates else float("-inf")
 
         def result(
-            verdict: str, accepted: int | None = None, value: float = score, inliers: int | None = None
+            verdict: str,
+            accepted: int | None = None,
+            value: float = score,
+            inliers: int | None = None,
+            reason: str = "",
         ) -> tuple[LoopResult, Runs]:
-            return LoopResult(query, candidates, accepted, verdict, value, inliers, stamp), runs
+            return LoopResult(query, candidates, accepted, verdict, value, inliers, stamp, reason), runs
 
         if not candidates:
             return result("no candidate")
@@ -425,14 +436,22 @@ class LoopDetector:
         if self.check is None:
             return result("accepted", *steady[0])
         assert local is not None
-        most = 0
+        most, reason = 0, ""
         for number, value in steady:
             found = self.check.agreement(local, self._frames.local[number])
-            inliers = self.check.sure(found)
-            if inliers:
+            if inliers := self.check.sure(found):
+                if self._alike:
+                    return result("not verified", inliers=inliers, reason=ALIKE)
                 return result("accepted", number, value, inliers)
             most = max(most, found.inliers)
-        return result("not verified", inliers=most)
+            if self.check.evidence(found) >= SURE:
+                reason = PART
+        return result("not verified", inliers=most, reason=reason)
+
+    @property
+    def _alike(self) -> bool:
+        """Whether most frames with enough points agree only in part: then places cannot be told apart."""
+        return self._part > self._whole
 
 
 def fingerprint_of(describe: Describe | None) -> str:

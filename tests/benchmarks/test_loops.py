@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks import drives, settings
+from benchmarks import drives, revisits, settings
 
 
 def test_a_route_in_another_season_has_the_same_places(tmp_path: Path) -> None:
@@ -57,3 +57,22 @@ def test_two_runs_in_one_folder_keep_the_results_of_both(tmp_path: Path, monkeyp
     monkeypatch.setattr(settings, "drives", drives_of)
     monkeypatch.setattr(settings, "measure", measured)
     assert {result.family for result in settings.run(tmp_path, tmp_path, ["a"], print)} == {"a", "b"}
+
+
+def test_real_drives_are_judged_by_two_rules_and_only_by_pairs_that_count() -> None:
+    """Frame 9 shows frame 1, 10 frame 5 at another angle, 11 another place, and 8 the frame before it."""
+    rule, wide = np.zeros((2, 12, 12), bool)
+    rule[9, 1] = wide[9, 1] = wide[10, 5] = True
+    real = revisits.Real("a", [Path(f"{i}.png") for i in range(12)], rule, wide, revisits._pairs_before(12, 2), gap=2)
+    match = np.full(12, -1)
+    match[8:] = 7, 1, 5, 0
+    row = revisits.judged(real, match, "detect")
+    assert {name: row[name] for name in ("frames", "accepted", "right, 15", "right, 45")} == {
+        "frames": 12,
+        "accepted": 3,
+        "right, 15": 1,
+        "right, 45": 2,
+    }
+    assert (row["recall, 15"], row["recall, 45"], row["with a loop, 45"]) == (1.0, 1.0, 2)
+    assert revisits.judged(real, match, "map query")["accepted"] == 3
+    assert [part.tolist() for part in real.third(1)] == [[4, 5, 6, 7], [0, 1, 2, 3, 8, 9, 10, 11]]

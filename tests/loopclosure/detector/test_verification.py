@@ -96,18 +96,40 @@ def test_geometry_is_checked_last(tmp_path, check):
         detector.add_descriptor(np.ones(2))
 
 
-def test_an_online_loop_needs_more_points_than_rule_out_chance(check, monkeypatch):
-    """The windows of a facade repeat: as `detect` does, the detector needs 1.5 times as many."""
-    found = Agreement(36, 28, 20)
+@pytest.mark.parametrize(
+    ("found", "verdict"),
+    [
+        (Agreement(36, 28, 20), "not verified"),  # the windows of a facade repeat
+        (Agreement(60, 32, 20), "not verified"),  # most of the points that match disagree
+        (Agreement(40, 32, 20), "accepted"),
+    ],
+)
+def test_an_online_loop_needs_more_points_than_rule_out_chance(check, monkeypatch, found, verdict):
+    """1.5 times as many, and 70 % of those that match, as `detect` does."""
     monkeypatch.setattr(GeometricCheck, "agreement", lambda *_: found)
     detector = LoopDetector(lambda image: np.ones(2), exclude_recent=0, check=check)
     detector.add(wall(0))
     result = detector.add(wall(1))
-    assert (result.verdict, result.inliers) == ("not verified", 28)
-    found = Agreement(60, 32, 20)  # most of the points that match disagree
-    assert detector.add(wall(2)).verdict == "not verified"
-    found = Agreement(40, 32, 20)
-    assert detector.add(wall(3)).verdict == "accepted"
+    assert (result.verdict, result.inliers) == (verdict, found.inliers)
+
+
+def test_online_nothing_is_accepted_where_places_look_alike(check, monkeypatch, tmp_path):
+    """Most frames agree only in part: then a frame that agrees as a whole is no loop either, also after loading."""
+    found = Agreement(60, 36, 20)
+    monkeypatch.setattr(GeometricCheck, "agreement", lambda *_: found)
+    detector = LoopDetector(lambda image: np.ones(2), exclude_recent=0, check=check)
+    for number in range(3):
+        result = detector.add(wall(number))
+    assert (result.verdict, result.reason) == (
+        "not verified",
+        "enough points agree, but only a part of those that match",
+    )
+    detector.save(tmp_path / "d.npz")
+    found = Agreement(40, 36, 20)
+    for one in (detector, LoopDetector.load(tmp_path / "d.npz", detector.describe)):
+        results = [one.add(wall(number)) for number in range(4)]
+        assert results[0].reason.startswith("places look alike")
+        assert [bool(result) for result in results] == [False, False, True, True]
 
 
 @pytest.mark.parametrize("camera", [{}, {"focal_px": 260.0, "center_x_px": 160.0, "center_y_px": 120.0}])

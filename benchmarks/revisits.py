@@ -1,0 +1,239 @@
+"""Measures what loopclosure finds on real drives that come back, and on drives that do not: ``tools/bench revisits``.
+
+Each drive is decided as ``detect`` decides it, frame by frame as ``LoopDetector`` does, and in thirds: each third of a
+drive is asked of the other two, as ``map query`` does. Nothing is warped, relit or rendered here; for drives that are,
+see :mod:`benchmarks.drives`.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import results
+from benchmarks.drives import GAP, NEAR, OVERLAP, SOFT_DEG
+from benchmarks.pages import RESULTS
+from benchmarks.settings import Cache
+from loopclosure.descriptors.similarity import similarity_matrix
+from loopclosure.detector.detector import LoopDetector
+from loopclosure.detector.verification import Between, GeometricCheck, LocalFeatures, Pairs
+from loopclosure.methods.auto import answer, find_matches
+from loopclosure.methods.base import earlier
+from loopclosure.methods.candidates import Compared
+from loopclosure.methods.contradiction import temporal
+from loopclosure.places.datasets import load_folder
+from loopclosure.places.frames import image_paths
+from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
+from loopclosure.places.sequences import read_sequence
+from loopclosure.places.trajectory import Poses
+
+FIRST = (
+    "kitchen",
+    "fr1_rpy",
+    "nordland_1",
+    "tower, floors 3 to 12",
+    "tower, floors 3 to 12, second walks",
+)  # chosen on
+OVERLAPS = 0.25, 0.05  # of the footprint of a drone's image that another sees: the same place, and no mistake
+HALVES = {"nordland_1": slice(596), "nordland_2": slice(596, None)}
+FLOORS = {"3 to 12": range(3, 13), "13 to 23": range(13, 24)}
+FILE = RESULTS / "revisits.json"
+
+
+@dataclass(frozen=True)
+class Real:
+    """A drive, and which of its frames (N, N) show the same place.
+
+    rule    what must be found: less than 2 m and 15 degrees apart, or as the data set says
+    wide    what is no mistake: less than 45 degrees apart
+    judged  pairs that count
+    """
+
+    name: str
+    images: list[Path]
+    rule: np.ndarray
+    wide: np.ndarray
+    judged: np.ndarray
+    gap: int = GAP
+
+    def third(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the frames of a third, 0 to 2, and the others."""
+        frames = np.arange(len(self.images))
+        inside = frames * 3 // len(frames) == number
+        return frames[inside], frames[~inside]
+
+
+def drives(data: Path, only: Sequence[str] = ()) -> Iterator[Real]:
+    """Yield the drives in the folder ``data``: all, or those with a name that begins as one of ``only``."""
+    for name, load in _drives(data).items():
+        if not only or name.startswith(tuple(only)):
+            yield replace(load(), name=name)
+
+
+def _drives(data: Path) -> dict[str, Callable[[], Real]]:
+    rooms, desks = data / "seven_scenes", data / "tum_fr1"
+    made: dict[str, Callable[[], Real]] = {
+        "kitchen": lambda: _posed([rooms / "redkitchen"]),
+        "fr1_rpy": lambda: _posed([desks / "rgbd_dataset_freiburg1_rpy"]),
+        "nordland_1": lambda: _seasons(data / "nordland_64x32", HALVES["nordland_1"]),
+        "chess": lambda: _posed(sorted(rooms.glob("chess_*"))),
+        "fr1_xyz": lambda: _posed([desks / "rgbd_dataset_freiburg1_xyz"]),
+        "nordland_2": lambda: _seasons(data / "nordland_64x32", HALVES["nordland_2"]),
+        "corridor": lambda: _corridor(data / "corridor_loop"),
+        "drone_village": lambda: _drone(data / "drone_village"),
+    }
+    for floors, numbers in FLOORS.items():
+        for rank, which in enumerate(("", ", second walks")):
+            made[f"tower, floors {floors}{which}"] = lambda n=numbers, k=rank: _tower(data / "ie_tower", n, k)
+    with (data / "sequences" / "index.csv").open(encoding="utf-8") as table:
+        for row in csv.DictReader(table):
+            if row["has_revisits"] == "no":
+                folder = data / "sequences" / row["name"]
+                made[f"road: {row['name']}"] = lambda folder=folder: _without(image_paths(folder))
+    return made
+
+
+def _pairs_before(count: int, gap: int) -> np.ndarray:
+    return earlier(count, gap) | earlier(count, gap).T
+
+
+def _posed(folders: Sequence[Path]) -> Real:
+    """Make one drive of sequences in one frame of reference; frames without a pose are left out."""
+    parts = [read_sequence(folder, "tum") for folder in folders]
+    paths = [path for part in parts for path in part.paths]
+    poses = np.concatenate([part.poses for part in parts if part.poses is not None])
+    known = np.flatnonzero(np.all(np.isfinite(poses), axis=1))
+    posed = Poses(poses[known, :3], poses[known, 3:])
+    rule, wide = (same_place_matrix(posed, posed, MAX_DISTANCE_M, angle) for angle in (MAX_ANGLE_DEG, SOFT_DEG))
+    return Real("", [paths[i] for i in known.tolist()], rule, wide, _pairs_before(len(known), GAP))
+
+
+def _seasons(folder: Path, half: slice) -> Real:
+    """Make one drive of half of the railway in summer, then in winter."""
+    images = [path for season in ("summer", "winter") for path in image_paths(folder / season)[half]]
+    where = np.tile(np.arange(len(images) // 2), 2)
+    apart = np.abs(np.subtract.outer(where, where))
+    return Real("", images, apart <= NEAR, apart <= OVERLAP, _pairs_before(len(images), GAP))
+
+
+def _corridor(folder: Path) -> Real:
+    truth = load_folder(folder / "samples", folder / "samples_GT.bmp")
+    same = truth.truth.hard | truth.truth.hard.T
+    return Real("", list(truth.queries.paths), same, same, _pairs_before(len(same), 0), gap=0)
+
+
+def _drone(folder: Path) -> Real:
+    with np.load(folder / "overlap.npz") as kept:
+        overlap = np.maximum(kept["overlap"], kept["overlap"].T)
+    images = list(read_sequence(folder, "tum").paths)
+    return Real("", images, *(overlap >= least for least in OVERLAPS), _pairs_before(len(images), 15), gap=15)
+
+
+def _tower(folder: Path, floors: Sequence[int], rank: int) -> Real:
+    """Make one drive of one walk on each floor, its longest or second longest: other floors are other places."""
+    clips: dict[str, dict[str, list[Path]]] = {f"floor{floor}": {} for floor in floors}
+    with (folder / "index.csv").open(encoding="utf-8") as table:
+        for row in csv.DictReader(table):
+            if row["floor"] in clips:
+                clips[row["floor"]].setdefault(row["clip"], []).append(folder / row["image"])
+    walks = [sorted(of.values(), key=len, reverse=True)[min(rank, len(of) - 1)] for of in clips.values()]
+    walk = np.repeat(np.arange(len(walks)), [len(one) for one in walks])
+    never = np.zeros((len(walk), len(walk)), bool)
+    return Real("", [path for one in walks for path in one], never, never, walk[:, None] != walk, gap=0)
+
+
+def _without(images: list[Path]) -> Real:
+    """Make a drive that never comes back."""
+    never = np.zeros((len(images), len(images)), bool)
+    return Real("", images, never, never, _pairs_before(len(images), 0), gap=0)
+
+
+@dataclass(frozen=True)
+class Known(GeometricCheck):
+    """A check whose images are named by their paths; their points are computed once."""
+
+    pairs: Pairs = field(default_factory=lambda: Pairs(lambda path: path))
+
+    def describe(self, image: Any) -> LocalFeatures:
+        """Return the points of the image with this path."""
+        return self.pairs.features(GeometricCheck(), image)
+
+
+def as_detect(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
+    """Return the match of each frame (N,), -1 without an accepted one, as ``detect`` without options decides."""
+    compared = Compared(similarity_matrix(rows), earlier(len(rows), 0), False)
+    return _answered(compared, cache, real.images, real.images)
+
+
+def as_query(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
+    """Return the match of each frame (N,) among the two other thirds, -1 without one, as ``map query`` decides."""
+    match = np.full(len(rows), -1)
+    for number in range(3):
+        inside, others = real.third(number)
+        scores = similarity_matrix(rows[inside], rows[others])
+        before = temporal(similarity_matrix(rows[inside]))
+        compared = Compared(scores, np.ones(scores.shape, bool), True, temporal=before)
+        images = ([real.images[i] for i in frames] for frames in (inside, others))
+        found = _answered(compared, cache, *images)
+        match[inside] = np.where(found >= 0, others[found], -1)
+    return match
+
+
+def _answered(compared: Compared, cache: Cache, queries: Sequence[Path], references: Sequence[Path]) -> np.ndarray:
+    check = GeometricCheck()
+    found = answer(find_matches(compared), check, Between(check, cache.pairs, queries, references))
+    return np.where(found.accepted, found.match, -1)
+
+
+def online(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
+    """Return the match of each frame (N,), -1 without one, as ``LoopDetector`` with a geometric check decides."""
+    detector = LoopDetector(check=Known(pairs=cache.pairs), exclude_recent=real.gap or None)
+    images: Sequence[Any] = real.images
+    found = [detector.add_descriptor(row, image=image) for row, image in zip(rows, images, strict=True)]
+    return np.array([-1 if result.accepted is None else result.accepted for result in found])
+
+
+HOW = {"detect": as_detect, "map query": as_query, "online": online}
+
+
+def judged(real: Real, match: np.ndarray, how: str) -> dict[str, Any]:
+    """Return a row of figures: of the accepted matches that count, how many are right by both rules."""
+    count = real.judged & np.tri(len(match), k=-1, dtype=bool) if how != "map query" else real.judged.copy()
+    if how == "map query":
+        parts = np.arange(len(match)) * 3 // len(match)
+        count &= parts[:, None] != parts
+    queries = np.flatnonzero(match >= 0)
+    queries = queries[count[queries, match[queries]]]
+    row: dict[str, Any] = {"how": how, "drive": real.name, "chosen on": "yes" if real.name in FIRST else ""}
+    row |= {"frames": len(match), "accepted": len(queries)}
+    for angle, same in (("15", real.rule), ("45", real.wide)):
+        loops = np.any(same & count, axis=1)
+        right = int(np.count_nonzero(same[queries, match[queries]]))
+        row |= {f"with a loop, {angle}": int(np.count_nonzero(loops)), f"right, {angle}": right}
+        row |= {f"recall, {angle}": round(right / int(loops.sum()), 3) if loops.any() else None}
+    return row
+
+
+def measure(data: Path, work: Path, only: Sequence[str], say: Callable[[str], None], words: Sequence[str]) -> None:
+    """Measure the drives, all or some, and update the figures; ``words`` are the arguments of the command."""
+    stored = json.loads(FILE.read_text(encoding="utf-8"))["rows"] if FILE.is_file() else []
+    rows = {(row["how"], row["drive"]): row for row in stored}
+    for real in drives(data, only):
+        cache = Cache(work / "kept" / f"{real.name.replace(': ', '_')}.pickle")
+        descriptors = cache.descriptors(real.images)
+        for how, decide in HOW.items():
+            if how == "map query" and not real.rule.any():
+                continue
+            row = judged(real, decide(real, descriptors, cache), how)
+            say(", ".join(f"{name}: {value}" for name, value in row.items() if value not in ("", None)))
+            rows[how, real.name] = row
+        cache.save()
+        names = list(_drives(data))
+        ordered = sorted(rows.values(), key=lambda row: (list(HOW).index(row["how"]), names.index(row["drive"])))
+        results.write(FILE, ordered, words)
