@@ -176,7 +176,8 @@ def _detect(a: argparse.Namespace) -> None:
             detector.decided(detector.loops, later_threshold(detector, found.accepted))
     else:
         results = run.run_detector(detector, recording, features, bar)
-        reasons = [run.verdicts_said(results)]
+        by = "their scores alone" if detector.check is None else "their scores and their points"
+        reasons = [f"decided frame by frame, by {by}", run.verdicts_said(results)]
     if recording is not None:
         recording = warn_of_unreadable(recording)
         names += recording.names
@@ -187,7 +188,10 @@ def _detect(a: argparse.Namespace) -> None:
     # Drawing takes a second to import.
     from loopclosure.report.drive import write_drive
 
+    read = 0 if recording is None else len(recording.unreadable)
     write_drive(out / "report.html", results, reasons, recording, a.command_line)
+    if recording is not None and len(recording.unreadable) > read:
+        warn(f"{len(recording.unreadable) - read} images cannot be read; the report shows no pairs with them")
     loops = sum(result.accepted is not None for result in results)
     print(f"{loops} loops in {len(results)} frames: {out / 'loops.csv'}; report: {out / 'report.html'}")
     print("\n".join(reasons))
@@ -281,7 +285,7 @@ def _detector(a: argparse.Namespace, describe: Describe | None, views: int) -> L
     changes = _changes(a)
     if a.video:
         changes.setdefault("exclude_seconds", RECENT_SECONDS)
-    if a.verify or (a.video and a.threshold is None):
+    if a.verify or ((a.video or a.save) and a.threshold is None):
         check = GeometricCheck()
     return LoopDetector(describe, check=check, views=views, **changes)
 
@@ -352,6 +356,7 @@ def _decided(detector: LoopDetector, own: bool = True) -> list[LoopResult]:
     found = last_session(detector, own=own, progress=bar)
     for limit in found.limits:
         warn(limit)
+    print("\n".join(reason for reason in found.reasons if reason not in found.limits))
     return found.results
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -36,14 +35,18 @@ class Loop:
     relative: Relative | None = None
 
 
-def read_loops(path: Path, names: Sequence[str]) -> list[Loop]:
-    """Read the loops.csv of ``loopclosure detect``: loops between the frames with these names (N).
+def read_loops(path: Path, frames: ImageSequence) -> list[Loop]:
+    """Read the loops.csv of ``loopclosure detect``: loops between these frames.
 
-    Frames are found by their names, or by their numbers if the table has no names. Raises InputError (file:line)
-    for a frame that is not there.
+    Frames are found by their names, or by their numbers if the table has no names. "frame K" is frame K of a video,
+    whichever of its frames are selected. Raises InputError (file:line) for a frame that is not there.
     """
+    names = frames.names
     numbers = {str(safe_cell(name)): number for number, name in enumerate(names)}
     numbers |= {name: number for number, name in enumerate(names)}
+    if not any(name.startswith("frame ") for name in names):  # a video whose frames were extracted
+        of_video = range(len(frames)) if frames.numbers is None else frames.numbers.tolist()
+        numbers |= {f"frame {number}": index for index, number in enumerate(of_video)}
     loops = []
     if not path.exists():
         expected = "expected the loops.csv that loopclosure detect writes"
@@ -91,10 +94,8 @@ def _frame(row: dict[str, str], end: str, numbers: dict[str, int], path: Path, l
     name, number = row.get(f"{end}_name", ""), row[f"{end}_id"]
     if name in numbers:
         return numbers[name]
-    of_video = re.fullmatch(r"frame (\d+)", name)
-    if name and not of_video:
-        raise InputError(f'no image of the sequence has the name "{name}"', path, line, 1)
-    digits = of_video[1] if of_video else number
-    if not digits.isdigit() or int(digits) >= len(numbers):
-        raise InputError(f'no frame has the number "{digits}"; there are {len(numbers)}', path, line, 1)
-    return int(digits)
+    if name:
+        raise InputError(f'no selected image of the sequence has the name "{name}"', path, line, 1)
+    if not number.isdigit() or int(number) >= (count := len(set(numbers.values()))):
+        raise InputError(f'no frame has the number "{number}"; there are {count}', path, line, 1)
+    return int(number)

@@ -26,6 +26,7 @@ class LoopResult:
     score       of the accepted frame, or of the best candidate; -inf without one
     inliers     inliers of the accepted candidate, or the most of any candidate tried; None if none was tried
     stamp       seconds, as given
+    score_of    what the score compares: "image", or the "sequence" of frames around it; they are different scales
     reason      what decided: the sequence of the frame or its points; empty where the verdict says all
     """
 
@@ -37,6 +38,7 @@ class LoopResult:
     inliers: int | None = None
     stamp: float | None = None
     reason: str = ""
+    score_of: str = "image"
 
     def __bool__(self) -> bool:
         return self.accepted is not None
@@ -91,7 +93,8 @@ class DetectorSettings:
 def result_of(found: Any, count: int) -> LoopResult:
     """Return a loop read from a file of ``count`` frames. Raises ValueError, LookupError or TypeError."""
     candidates = [(int(number), float(score)) for number, score in found["candidates"]]
-    loop = LoopResult(**{**found, "candidates": candidates, "reason": str(found.get("reason", ""))})
+    words = {name: str(found[name]) for name in ("reason", "score_of") if name in found}
+    loop = LoopResult(**{**found, "candidates": candidates, **words})
     ends = (loop.query_id, loop.accepted)
     if not all(isinstance(end, int) and 0 <= end < count for end in ends) or not isinstance(loop.score, float):
         raise ValueError(f"a loop of frames {ends} among {count}")

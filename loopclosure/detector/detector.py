@@ -288,6 +288,7 @@ class LoopDetector:
             refuse_another(fingerprint_of(describe), detector.fingerprint, "or start a new file", path)
             detector._take(arrays)
             detector._sessions = _starts(about.get("sessions", [0]), len(detector))
+            detector._settle()
             detector._steps = detector._all_steps()
             detector._whole, detector._part = map(int, about.get("agreed", (0, 0)))
             detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
@@ -307,6 +308,12 @@ class LoopDetector:
             raise ValueError(f"{count} rows and {frames.count} stamps")
         if count:
             frames.waiting.extend(arrays["rows"].reshape(count, self.settings.views, -1))
+
+    def _settle(self) -> None:
+        """Move the frames that are candidates of any next frame into the index."""
+        last = float(self._frames.stamps[len(self) - 1]) if len(self) else np.nan
+        if not self.settings.exclude_seconds or np.isfinite(last):
+            self._frames.settle(self._end(last))
 
     def take_session(self, blocks: Iterable[np.ndarray], arrays: dict[str, np.ndarray], points: Points | None) -> None:
         """Add the frames of a finished session without looking for loops.

@@ -21,7 +21,17 @@ from netspec.files.whole_file import write_csv, write_whole
 
 VERTEX, EDGE, VERTEX_2D, EDGE_2D = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_SE2", "EDGE_SE2"
 PLANE = np.array([0, 1, 5])  # x, y and the rotation about z, in the 6-vector of a pose error
-LOOPS = ("query_id", "match_id", "score", "inliers", "query_stamp", "match_stamp", "query_name", "match_name")
+LOOPS = (
+    "query_id",
+    "match_id",
+    "score",
+    "inliers",
+    "query_stamp",
+    "match_stamp",
+    "query_name",
+    "match_name",
+    "score_of",
+)
 
 RelativePose = Callable[[int, int], np.ndarray | None]
 
@@ -59,6 +69,8 @@ def write_loops_csv(
 ) -> None:
     """Write one row per loop: query_id, match_id, score, inliers, and stamps (N,) in seconds and names (N) if known.
 
+    The last column says whether the score is one of images or of sequences.
+
     ``match_stamps`` and ``match_names`` (M) are given if the matches are frames of another drive.
     """
     path = Path(path)
@@ -72,7 +84,7 @@ def write_loops_csv(
         times = ["" if of is None or np.isnan(of[i]) else f"{of[i]:.6f}" for of, i in zip(every, ends, strict=True)]
         names_of_ends = ["" if of is None else of[i] for of, i in zip(all_names, ends, strict=True)]
         inliers = "" if loop.inliers is None else loop.inliers
-        rows.append([*ends, f"{loop.score:.9g}", inliers, *times, *names_of_ends])
+        rows.append([*ends, f"{loop.score:.9g}", inliers, *times, *names_of_ends, loop.score_of])
     write_csv(path, LOOPS, rows, "surrogateescape")
 
 

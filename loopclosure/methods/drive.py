@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -65,8 +66,10 @@ def whole_drive(
     if recording.unreadable and odometry is not None:
         odometry = np.delete(odometry, recording.unreadable, axis=0)
     recording = recording.readable()
-    check, pairs = GeometricCheck(), Pairs(lambda number: _gray_image(recording, number))
-    if not recording.paths:  # frames that cannot be read later
+    check, pairs = detector.check or GeometricCheck(), Pairs(lambda number: _gray_image(recording, number))
+    if detector.check is not None:
+        pairs = Pairs(detector.local_features)
+    elif not recording.paths:  # frames that cannot be read later
         frames = progress(recording.frames(), "local features", len(recording))
         pairs = Pairs({number: check.describe(gray(image)) for number, image, _ in frames}.__getitem__)
     request = replace(request, seconds=detector.settings.exclude_seconds, odometry=odometry)
@@ -131,14 +134,31 @@ def last_session(
     comparisons = [_Comparison.of(detector, span, request) for span in spans]
     for comparison, worth in zip(comparisons, _worth(comparisons), strict=True):
         answered = comparison.decided(detector.check, pairs_of, worth, progress)
-        found, limits, reasons = [*found, answered.results], [*limits, *answered.limits], answered.reasons
+        found, limits = [*found, answered.results], [*limits, *answered.limits]
+        reasons += _named(answered, spans[len(found) - 1], detector.sessions, len(spans))
     if results is not None and left:
         elsewhere = [any(first <= (result.accepted or 0) < end for first, end in left) for result in results]
         none = {"candidates": [], "accepted": None, "score": -np.inf, "inliers": None}
         found.append([r if r and kept else replace(r, **none) for r, kept in zip(results, elsewhere, strict=True)])
         limits.append(f"{len(earlier)} sessions {TOO_MANY}: {len(left)} are searched frame by frame")
-    best = [max(each, key=lambda r: (bool(r), r.inliers or 0, r.score)) for each in zip(*found, strict=True)]
+    best = [max(each, key=_worth_of) for each in zip(*found, strict=True)]
     return Answer(best or results or [], [*limits, *reasons], limits)
+
+
+def _named(answered: Answer, span: tuple[int, int], sessions: Sequence[int], count: int) -> list[str]:
+    """Return the reasons of one of ``count`` comparisons; of several, those that found no loop are said in a line."""
+    if count == 1:
+        return answered.reasons
+    number = sessions.index(span[0])
+    where = "this drive with itself" if number == len(sessions) - 1 else f"session {number:06d}"
+    if not any(answered.results):
+        return [f"{where}: no loop"]
+    return [f"{where}: {reason}" for reason in answered.reasons]
+
+
+def _worth_of(result: LoopResult) -> tuple[bool, int, bool, float]:
+    """Return how sure a result is; scores are compared only with scores of the same kind."""
+    return bool(result), result.inliers or 0, result.score_of == "sequence", result.score
 
 
 @dataclass(frozen=True)
@@ -190,6 +210,7 @@ class _Comparison:
                     accepted=None if result.accepted is None else self.references[result.accepted],
                     inliers=None if number % step else result.inliers,
                     stamp=None if np.isnan(stamp) else stamp,
+                    score_of="sequence" if self.searched.matches.by_lines else "image",
                 )
             )
         thinned = (

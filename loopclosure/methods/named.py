@@ -42,8 +42,11 @@ def make_method(spec: str, context: MethodContext | None = None) -> Method:
         raise InputError(f'unknown method "{name}" in "{spec}"{close}')
     argument, inner = spec[len(name) :], None
     if name in REFINERS or argument.startswith("+"):
-        argument, plus, inner_spec = argument.partition("+")
-        inner = make_method(inner_spec, context) if plus else None
+        # A path may contain "+"; a method begins where its name follows.
+        begins = re.search(rf"\+(?=({'|'.join(METHODS)})([:+]|$))|^\+", argument)
+        if begins:
+            argument, inner_spec = argument[: begins.start()], argument[begins.end() :]
+            inner = make_method(inner_spec, context)
     if inner is not None and name not in REFINERS:
         raise InputError(f"{name}+{inner.name}: {name} works on images, not on the scores of another method")
     return METHODS[name](argument.removeprefix(":"), context, inner)

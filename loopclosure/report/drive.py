@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import matplotlib
@@ -11,6 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from loopclosure.detector.decision import LoopResult
+from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.report.page import Kind, Pair, rendered, side_by_side, spread
 from loopclosure.report.plots import AXES, FOUND, MISSED, STYLE
@@ -114,8 +116,20 @@ def _kinds(results: Sequence[LoopResult], recording: ImageSequence) -> list[Kind
         ("rejected", "not accepted, with the highest scores"): rejected,
     }
     wanted = {end - first for some in groups.values() for r in some for end in (r.query_id, _match(r))}
-    images = {number: image for number, image, _ in recording.frames(wanted)}
-    return [Kind(name, title, [_pair(r, images, first) for r in some]) for (name, title), some in groups.items()]
+    images = _read(recording, wanted)
+    kinds = []
+    for (name, title), some in groups.items():
+        seen = [r for r in some if {r.query_id - first, _match(r) - first} <= set(images)]
+        kinds.append(Kind(name, title, [_pair(r, images, first) for r in seen]))
+    return kinds
+
+
+def _read(recording: ImageSequence, wanted: set[int]) -> dict[int, np.ndarray]:
+    """Return the images of frames. With features from a file, images that cannot be read are met only here."""
+    images: dict[int, np.ndarray] = {}
+    with suppress(InputError):  # none can be read
+        images.update((number, image) for number, image, _ in recording.frames(wanted))
+    return images
 
 
 def _match(result: LoopResult) -> int:

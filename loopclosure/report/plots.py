@@ -145,11 +145,13 @@ def maps(evaluation: Evaluation) -> Figure:
 
 
 def decisions(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the numbers of the queries found, false and missed at the best F1 of their best matches.
+    """Return the numbers of the queries found, false and missed, by their best matches.
 
+    They are what the method accepted, or what it would accept at the threshold of its best F1 if it does not decide.
     A query that has a loop but a wrong match is both false and missed, and is drawn as both.
     """
-    accepted = (outcome.matches.reference >= 0) & (outcome.matches.score >= outcome.best.best_f1_threshold)
+    least = -np.inf if outcome.answer else outcome.best.best_f1_threshold
+    accepted = (outcome.matches.reference >= 0) & (outcome.matches.score >= least)
     found = accepted & outcome.matches.right
     false = accepted & ~outcome.matches.right & ~outcome.matches.ignored
     missed = truth.queries_with_a_loop & ~found

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from loopclosure.cli import main
+from loopclosure.detector.detector import LoopDetector
 from paths import ROOT
 
 
@@ -119,8 +120,10 @@ def test_detect_chooses_the_threshold_automatically(tmp_path, capsys):
     with (tmp_path / "found" / "loops.csv").open() as stream:
         loops = [(int(row["query_id"]), int(row["match_id"])) for row in csv.DictReader(stream)]
     assert len(loops) > 60
+    assert LoopDetector.load(tmp_path / "d.npz").check is not None  # the frames after it are verified too
     resumed = ["detect", str(drive), "--resume", str(tmp_path / "d.npz"), "--out", str(tmp_path / "again")]
     assert main([*resumed, *thumbnails]) == 0
+    assert "decided frame by frame, by their scores and their points" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import pytest
 from given_scores import GivenScores
 from loopclosure.errors import InputError
 from loopclosure.evaluate import SOFT_ZONE, evaluate, named_method
+from loopclosure.methods.auto import Auto
 from loopclosure.methods.base import MethodContext
 from loopclosure.methods.features import FeatureMethod
 from loopclosure.methods.named import METHODS, make_method
@@ -82,6 +83,15 @@ def test_methods_can_refine_another():
     assert method.name == "seqslam+a (cosine)"
     assert method.inner == FeatureMethod(Path("a.npz"), Path("a.npz"), "cosine")
     assert method.exclude_frames == 7
+
+
+def test_a_path_in_a_method_may_have_a_plus():
+    for path in ("a+b/o.txt", "a+hog/o.txt"):
+        method = make_method(f"auto:odometry={path}+seqslam+thumbnails")
+        assert isinstance(method, Auto)
+        assert (method.odometry, method.name) == (path, "auto+seqslam+thumbnails")
+    with pytest.raises(InputError, match='unknown method "foo" in "foo:1"'):
+        make_method("auto+foo:1")
 
 
 def test_methods_can_refine_a_refining_method():

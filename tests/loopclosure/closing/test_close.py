@@ -14,6 +14,7 @@ from loopclosure.cli import main
 from loopclosure.closing.measure import read_loops
 from loopclosure.detector.export import relative_pose
 from loopclosure.errors import InputError
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.same_place import same_place_matrix
 from loopclosure.places.sequences import read_sequence
@@ -202,7 +203,7 @@ def test_missing_loops_are_reported_with_a_limit(tmp_path: Path, monkeypatch: py
     (tmp_path / "out").mkdir()
     expected = "out/lops.csv: no such file; expected the loops.csv that loopclosure detect writes"
     with pytest.raises(InputError) as fault:
-        read_loops(Path("out/lops.csv"), ["a.png"])
+        read_loops(Path("out/lops.csv"), ImageSequence.of_files([Path("a.png")]))
     assert str(fault.value) == f"{expected}; relative paths start from {tmp_path}"
     with pytest.raises(InputError, match=f'; "{tmp_path}" has no "gone"$'):
-        read_loops(tmp_path / "gone" / "loops.csv", ["a.png"])
+        read_loops(tmp_path / "gone" / "loops.csv", ImageSequence.of_files([Path("a.png")]))

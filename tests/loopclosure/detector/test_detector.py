@@ -125,6 +125,21 @@ def test_without_a_threshold_a_loop_is_as_similar_as_consecutive_frames(tmp_path
         assert all(abs(angles[r.accepted] - angles[r.query_id]) < 0.06 for r in one.loops)
 
 
+def test_the_frames_of_a_loaded_detector_are_in_its_index(tmp_path):
+    """Only those that are too recent wait, as they do in the detector that was saved: a visitor looks at each."""
+    rows = np.random.default_rng(0).normal(size=(40, 8))
+    by_seconds = DetectorSettings(exclude_recent=0, exclude_seconds=4.5, threshold=-1.0)
+    for settings, waiting in ((DetectorSettings(exclude_recent=7, threshold=-1.0), 7), (by_seconds, 5)):
+        detector = LoopDetector(None, settings)
+        for i, row in enumerate(rows):
+            detector.add_descriptor(row, stamp=float(i))
+        detector.save(tmp_path / "d.npz")
+        again = LoopDetector.load(tmp_path / "d.npz")
+        assert len(again._frames.waiting) == waiting
+        one, other = (Visitor(each).add_descriptor(rows[39]) for each in (detector, again))
+        assert one == other
+
+
 def test_a_loaded_detector_continues_identically(tmp_path):
     descriptors = two_laps(places=300)
     settings = DetectorSettings(exclude_recent=20, threshold=-0.4, consistency=2, top_k=3)

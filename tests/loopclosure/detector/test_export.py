@@ -12,6 +12,8 @@ from loopclosure.closing.measure import read_loops
 from loopclosure.detector.detector import LoopResult
 from loopclosure.detector.export import Sigmas, relative_pose, write_g2o, write_loops_csv
 from loopclosure.errors import InputError
+from loopclosure.places.frames import Selection
+from loopclosure.places.image_sequence import ImageSequence
 
 
 def matrix(pose):
@@ -89,8 +91,28 @@ def test_csv(tmp_path):
         "match_stamp": "0.000000",
         "query_name": "c.png",
         "match_name": "a.png",
+        "score_of": "image",
     }
     assert (rows[1]["inliers"], rows[1]["match_stamp"], rows[1]["match_name"]) == ("", "", "b.png")
+
+
+def named(*names: str) -> ImageSequence:
+    return ImageSequence.of_files([Path(name) for name in names])
+
+
+def test_frames_of_a_video_are_found_by_their_numbers(tmp_path: Path) -> None:
+    """``detect`` reads the video itself; ``close`` reads the images that it wrote, of the same selected frames."""
+    video = ImageSequence.of_video(tmp_path / "d.avi", 40).taken(Selection(start=4, stride=3))
+    found = [LoopResult(7, [(2, 0.5)], 2, "accepted", 0.5), LoopResult(11, [(0, 0.5)], 0, "accepted", 0.5)]
+    write_loops_csv(tmp_path / "loops.csv", found, None, video.names)
+    assert "frame 25,frame 10" in (tmp_path / "loops.csv").read_text()
+    images = named(*(f"rgb/{i:06d}.png" for i in range(40)))
+    for frames in (video, images.taken(Selection(start=4, stride=3))):
+        assert [(loop.query, loop.match) for loop in read_loops(tmp_path / "loops.csv", frames)] == [(7, 2), (11, 0)]
+    whole = [(loop.query, loop.match) for loop in read_loops(tmp_path / "loops.csv", images)]
+    assert whole == [(25, 10), (37, 4)]
+    with pytest.raises(InputError, match='no selected image of the sequence has the name "frame 25"'):
+        read_loops(tmp_path / "loops.csv", images.taken(Selection(stride=2)))
 
 
 def test_a_name_can_be_any_bytes(tmp_path):
@@ -98,7 +120,7 @@ def test_a_name_can_be_any_bytes(tmp_path):
     names = [os.fsdecode(name) for name in (b"=1+1.png", b"caf\xe9.png")]
     write_loops_csv(tmp_path / "loops.csv", [loop(1, 0)], names=names)
     assert b"caf\xe9.png,'=1+1.png" in (tmp_path / "loops.csv").read_bytes()
-    (found,) = read_loops(tmp_path / "loops.csv", names)
+    (found,) = read_loops(tmp_path / "loops.csv", named(*names))
     assert (found.query, found.match) == (1, 0)
 
 
@@ -106,5 +128,5 @@ def test_control_characters_of_names_are_escaped_and_restored(tmp_path: Path) ->
     names = ["a\x1b[2J\x9b.png", "b.png"]
     write_loops_csv(tmp_path / "loops.csv", [LoopResult(1, [(0, 0.5)], 0, "accepted", 0.5)], None, names)
     assert not set(b"\x1b\x9b") & set((tmp_path / "loops.csv").read_bytes())
-    (loop,) = read_loops(tmp_path / "loops.csv", names)
+    (loop,) = read_loops(tmp_path / "loops.csv", named(*names))
     assert (loop.query, loop.match) == (1, 0)

@@ -88,11 +88,14 @@ def test_build_add_and_query(
     assert main(["map", "build", "M", str(drives / "a"), *more]) == 0
     assert main(["map", "add", "M", str(drives / "b"), *more]) == 0
     said = capsys.readouterr().out.splitlines()
-    assert said[0] == "session 000000: 10 frames, 0 loops, 0 to earlier sessions: M/000000/loops.csv"
-    assert said[2:] == [
+    first = said.index("session 000000: 10 frames, 0 loops, 0 to earlier sessions: M/000000/loops.csv")
+    assert said[-2:] == [
         "session 000001: 10 frames, 10 loops, 10 to earlier sessions: M/000001/loops.csv",
         "20 frames in 2 sessions: M",
     ]
+    assert said[0].startswith("one visit to a place lasts")
+    assert any(line.startswith("session 000000: verification: 10 of 10 matches") for line in said[first:])
+    assert said[-3] == "this drive with itself: no loop"
     expected = [(f"000001/{i:03d}.png", f"000000/{i:03d}.png") for i in range(PLACES)]
     assert loops(tmp_path / "M" / "000001" / "loops.csv") == expected
     before = contents(tmp_path / "M")
@@ -122,6 +125,10 @@ def test_each_frame_is_verified_in_the_most_similar_session_only(
     found = [result.accepted for result in last_session(detector, own=False).results]
     assert [None if match is None else match % PLACES for match in found] == [5, 6, 7, 8, 9] + [None] * PLACES
     assert len(verified) <= 2 * len(found)
+    reasons = last_session(detector, own=False).reasons
+    sessions = {reason.partition(": ")[0] for reason in reasons}
+    assert sessions == {f"session {number:06d}" for number in range(len(a_map.sessions))}
+    assert f"session {len(a_map.sessions) - 1:06d}: no loop" in reasons  # and the reasons of those with loops
 
 
 @pytest.mark.slow

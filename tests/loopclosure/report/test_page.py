@@ -11,11 +11,15 @@ import numpy as np
 import pytest
 
 from given_scores import GivenScores
-from loopclosure.evaluate import evaluate, named_method
+from loopclosure.detector.decision import LoopResult
+from loopclosure.evaluate import Judgment, Outcome, evaluate, named_method
 from loopclosure.methods.base import MethodContext
 from loopclosure.places.datasets import load_sequence, load_traverses
+from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.sequences import read_sequence
+from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
+from loopclosure.report.drive import write_drive
 from loopclosure.report.files import measures_text
 from loopclosure.report.page import write_report
 from loopclosure.report.plots import best_true_references, decisions
@@ -178,6 +182,34 @@ def test_decisions_at_the_best_f1(evaluation):
     _, false, missed = decisions(evaluation.outcomes[2], truth)
     assert false.tolist() == []
     assert missed.tolist() == list(range(20, 40))
+
+
+def test_decisions_of_a_method_that_decides_itself(evaluation):
+    """Its wrong loops are drawn, however low their scores; the best threshold, chosen with the truth, is not used."""
+    hard = np.zeros((12, 12), bool)
+    hard[range(6), range(6)] = True
+    truth = Truth(hard, hard, np.ones_like(hard), "by hand")
+    scores = np.full(hard.shape, np.nan)
+    scores[range(6), range(6)] = np.linspace(0.9, 0.8, 6)
+    scores[7, 2], scores[8, 3] = 0.2, 0.1
+    for answer, wrong in (("8 accepted", [7, 8]), ("", [])):
+        judged = Judgment.of(scores, truth)
+        found, false, _ = decisions(Outcome("auto", scores, judged, None, {}, (), [], answer=answer), truth)
+        assert (found.tolist(), false.tolist()) == ([*range(6)], wrong)
+
+
+def test_images_that_cannot_be_read_are_not_shown(tmp_path):
+    """With features from a file, they are first read for the report."""
+    files = [tmp_path / f"{i}.png" for i in range(30)]
+    for i, file in enumerate(files):
+        cv2.imwrite(str(file), np.full((12, 16, 3), 8 * i, np.uint8))
+    results = [LoopResult(i, [(i - 15, 0.5)], i - 15, "accepted", 0.5) for i in range(15, 30)]
+    none = [LoopResult(i, [], None, "no candidate", float("-inf")) for i in range(15)]
+    for broken in (files[::2], files):
+        for file in broken:
+            file.write_bytes(file.read_bytes()[:40])
+        write_drive(tmp_path / "report.html", [*none, *results], [], ImageSequence.of_files(files), "detect")
+        assert "15 of 30 frames show a place" in (tmp_path / "report.html").read_text()
 
 
 def test_two_traverses_without_positions(tmp_path):
