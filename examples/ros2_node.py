@@ -2,11 +2,11 @@
 
     python3 ros2_node.py --ros-args -r image:=/camera/image_raw -r camera_info:=/camera/camera_info -r odom:=/odom
 
-in   image  sensor_msgs/Image;  camera_info  sensor_msgs/CameraInfo;  odom  nav_msgs/Odometry: joined by their stamps
+in   image  sensor_msgs/Image;  camera_info  sensor_msgs/CameraInfo;  odom  nav_msgs/Odometry
 out  loops  geometry_msgs/PoseWithCovarianceStamped: the position of the robot by a loop, on the corrected path
      path   nav_msgs/Path: all keyframes, corrected;  tf: the frame of the odometry in map_frame
 parameters  describe (default), map_frame (map), step (m) and turn (rad) between keyframes, recent (s): no loops with
-            the last so many seconds, slop (s): the largest difference of stamps, in_memory (1000): the others are in a
+            the last so many seconds, gap (s): the longest one in the odometry, in_memory (1000): the others are in a
             temporary file; mount: the camera in the robot, seven numbers, x y z qx qy qz qw (default: from tf)
 """
 
@@ -14,8 +14,6 @@ import queue
 import threading
 from contextlib import suppress
 
-import message_filters
-import numpy as np
 import rclpy
 import tf2_ros
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
@@ -29,15 +27,13 @@ from sensor_msgs.msg import CameraInfo, Image
 from loopclosure import LoopDetector
 from loopclosure.closing.measure import CHECK
 from loopclosure.closing.online import Keyframes, LoopCloser
-from loopclosure.closing.relative import ROTATION_ONLY
-from loopclosure.detector.export import LOOP_SIGMAS
+from loopclosure.closing.synchronizer import Synchronizer
 from loopclosure.detector.run import load_describe
 from loopclosure.errors import InputError
 from loopclosure.places.messages import camera_of, image_of, pose_of, seconds
 
-UNKNOWN = 1e6  # the variance of a position that a loop does not measure
 DEFAULTS = {"describe": "default", "map_frame": "map", "step": 0.1, "turn": 0.1, "recent": 10.0}
-DEFAULTS |= {"slop": 0.05, "in_memory": 1000}
+DEFAULTS |= {"gap": 0.5, "in_memory": 1000}
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # who subscribes later gets the last message
 
 
@@ -52,56 +48,62 @@ class LoopClosure(Node):
         self.set = {name: self.declare_parameter(name, value).value for name, value in DEFAULTS.items()}
         self.mount = list(self.declare_parameter("mount", [0.0] * 7).value)  # no rotation: not given
         self.describe, self.closer, self.shown = load_describe(self.set["describe"]), None, 0
-        self.warn, self.odom_frame, self.newest = self.get_logger().warning, "", queue.Queue(1)
+        self.warn, self.newest = self.get_logger().warning, queue.Queue(1)
         self.loops = self.create_publisher(PoseWithCovarianceStamped, "loops", 10)
         self.path = self.create_publisher(Path, "path", KEPT)
         self.tf, self.buffer = tf2_ros.TransformBroadcaster(self), tf2_ros.Buffer()
         self.listener = tf2_ros.TransformListener(self.buffer, self)
-        topics = ((Image, "image"), (CameraInfo, "camera_info"), (Odometry, "odom"))
-        inputs = [message_filters.Subscriber(self, *each, qos_profile=qos_profile_sensor_data) for each in topics]
-        self.joined = message_filters.ApproximateTimeSynchronizer(inputs, 30, self.set["slop"])
-        self.joined.registerCallback(self.on_messages)
+        self.joined = Synchronizer(self.set["gap"], self.warn)
+        self.camera, self.odom_frames = CameraInfo(), ("", "")  # the frames of the odometry and of the robot
+        self.create_subscription(CameraInfo, "camera_info", self.on_camera_info, qos_profile_sensor_data)
+        self.create_subscription(Odometry, "odom", self.on_odometry, qos_profile_sensor_data)
+        self.create_subscription(Image, "image", self.on_image, qos_profile_sensor_data)
         self.create_timer(0.1, self.tell)
         self.worker = threading.Thread(target=self.work, daemon=True)
         self.worker.start()
 
-    def on_messages(self, *messages):  # the newest ones; the worker looks at them when it is ready
-        with suppress(queue.Empty):
-            self.newest.get_nowait()
-        self.newest.put(messages)
+    def on_camera_info(self, message):
+        self.camera = message
+
+    def on_odometry(self, message):
+        self.odom_frames = message.header.frame_id, message.child_frame_id
+        self.joined.odometry(seconds(message.header.stamp), pose_of(message))
+        self.join()
+
+    def on_image(self, message):
+        self.joined.image(seconds(message.header.stamp), message)
+        self.join()
+
+    def join(self):  # the newest image whose pose is known waits until the worker is ready
+        found = self.joined.newest()
+        if found is not None:
+            with suppress(queue.Empty):
+                self.newest.get_nowait()
+            self.newest.put(found)
 
     def work(self):
-        while (messages := self.newest.get()) is not None:
+        while (found := self.newest.get()) is not None:
             try:
-                self.look(*messages)
-            except InputError as fault:
-                self.warn(f"{fault.message}; the image is left out")
+                self.look(*found)
+            except Exception as fault:  # a robot drives on
+                self.warn(f"{getattr(fault, 'message', fault)}; the image is left out")
 
-    def look(self, image, camera_info, odometry):
-        if self.closer is None and not self.begin(image, camera_info, odometry):
-            return
-        loop = self.closer.add(image_of(image), seconds(image.header.stamp), pose_of(odometry))
+    def look(self, stamp, image, pose):
+        self.closer = self.closer or self.begin(image)
+        loop = self.closer.add(image_of(image), stamp, pose)
         if loop is not None:
             self.tell_loop(loop, image.header.stamp)
 
-    def begin(self, image, camera_info, odometry):
-        camera, mount = camera_of(camera_info), self.mount
+    def begin(self, image):
+        camera, mount = camera_of(self.camera), self.mount
         if camera is None:
-            self.warn("camera_info has no calibration of a pinhole camera; the images are left out until it has")
-            return False
+            raise InputError("camera_info has no calibration of a pinhole camera yet")
         if not any(mount[3:]):
-            frames = odometry.child_frame_id, image.header.frame_id
-            try:
-                mount = pose_of(self.buffer.lookup_transform(*frames, Time()))
-            except tf2_ros.TransformException as fault:
-                self.warn(f"tf has no camera in the robot ({fault}); the images are left out until it has")
-                return False
-        kept, recent = self.set["in_memory"], self.set["recent"]
-        detector = LoopDetector(self.describe, check=CHECK, exclude_seconds=recent, in_memory=kept)
-        self.odom_frame = odometry.header.frame_id
-        self.closer = LoopCloser(detector, camera, mount, Keyframes(self.set["step"], self.set["turn"]), self.warn)
-        self.closer.start()
-        return True
+            mount = pose_of(self.buffer.lookup_transform(self.odom_frames[1], image.header.frame_id, Time()))
+        limits = {"exclude_seconds": self.set["recent"], "in_memory": self.set["in_memory"]}
+        detector = LoopDetector(self.describe, check=CHECK, **limits)
+        keyframes = Keyframes(self.set["step"], self.set["turn"])
+        return LoopCloser(detector, camera, mount, keyframes, self.warn).start()
 
     def stamped(self, kind, stamp):
         message = kind()
@@ -110,16 +112,16 @@ class LoopClosure(Node):
 
     def tell_loop(self, loop, stamp):
         message = self.stamped(PoseWithCovarianceStamped, stamp)
-        fill(message.pose.pose.position, message.pose.pose.orientation, self.closer.by_loop(loop))
-        place = UNKNOWN if loop.relative.kind == ROTATION_ONLY else LOOP_SIGMAS.translation_m**2
-        message.pose.covariance = np.diag([place] * 3 + [LOOP_SIGMAS.rotation_rad**2] * 3).ravel().tolist()
+        pose, covariance = self.closer.by_loop(loop)
+        fill(message.pose.pose.position, message.pose.pose.orientation, pose)
+        message.pose.covariance = covariance.ravel().tolist()
         self.loops.publish(message)
 
     def tell(self):  # ten times a second: the transform, and the path if it was corrected again
         if self.closer is None:
             return
         message = self.stamped(TransformStamped, self.get_clock().now().to_msg())
-        message.child_frame_id = self.odom_frame
+        message.child_frame_id = self.odom_frames[0]
         fill(message.transform.translation, message.transform.rotation, self.closer.correction)
         self.tf.sendTransform(message)
         if self.closer.solutions > self.shown:

@@ -1,8 +1,7 @@
 """A stand-in for rclpy and what a node uses beside it, after their documentation: docs.ros.org, Jazzy.
 
 ``installed(monkeypatch)`` puts it in the place of the packages. Messages have the fields of their definitions, with
-zeros. A subscriber is called with ``Subscriber.callback``, a timer with ``Node.timers``; what a node publishes and logs
-is in lists.
+zeros. The callbacks of a node are in ``subscriptions`` and ``timers``; what it publishes and logs is in lists.
 """
 
 import sys
@@ -68,7 +67,7 @@ class Node:
     given: ClassVar[dict[str, Any]] = {}  # parameters by name
 
     def __init__(self, name: str) -> None:
-        self.name, self.publishers, self.timers, self.warnings = name, {}, [], []
+        self.name, self.publishers, self.subscriptions, self.timers, self.warnings = name, {}, {}, [], []
 
     def declare_parameter(self, name: str, value: Any) -> Any:
         found = self.given.get(name, value)
@@ -79,6 +78,10 @@ class Node:
         assert qos_profile is not None
         self.publishers[topic] = Publisher(kind, topic)
         return self.publishers[topic]
+
+    def create_subscription(self, msg_type: type, topic: str, callback: Any, qos_profile: Any) -> None:
+        assert qos_profile is not None
+        self.subscriptions[topic] = (msg_type, callback)
 
     def create_timer(self, timer_period_sec: float, callback: Any) -> None:
         assert timer_period_sec > 0
@@ -92,20 +95,6 @@ class Node:
 
     def destroy_node(self) -> None:
         pass
-
-
-class Subscriber:
-    def __init__(self, node: Node, msg_type: type, topic: str, *, qos_profile: Any) -> None:
-        assert qos_profile is not None
-        self.kind, self.topic = msg_type, topic
-
-
-class ApproximateTimeSynchronizer:
-    def __init__(self, fs: list[Subscriber], queue_size: int, slop: float) -> None:
-        self.topics = [(each.kind, each.topic) for each in fs]
-
-    def registerCallback(self, callback: Any) -> None:
-        self.callback = callback
 
 
 class TransformBroadcaster:
@@ -150,12 +139,6 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     }
     modules = {name: module(monkeypatch, f"rclpy.{name}", **given) for name, given in parts.items()}
     module(monkeypatch, "rclpy", init=lambda: None, spin=lambda node: None, try_shutdown=lambda: None, **modules)
-    module(
-        monkeypatch,
-        "message_filters",
-        Subscriber=Subscriber,
-        ApproximateTimeSynchronizer=ApproximateTimeSynchronizer,
-    )
     module(
         monkeypatch,
         "tf2_ros",

@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 from loopclosure.closing.close import Closed, constraint, information_of_step
 from loopclosure.closing.graph import Edge, solve
 from loopclosure.closing.measure import Loop
-from loopclosure.closing.relative import METRIC, View, relative_view
+from loopclosure.closing.relative import METRIC, ROTATION_ONLY, View, relative_view
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.export import relative_pose
+from loopclosure.detector.export import LOOP_SIGMAS, relative_pose
 from loopclosure.errors import InputError
 from loopclosure.places.intrinsics import Intrinsics
 from netspec import log
@@ -35,6 +35,7 @@ FORWARD = np.array([0, 0, 0, -0.5, 0.5, -0.5, 0.5])  # a camera that looks along
 # A stamp this much earlier than the one before it begins another drive: a recording starts again. A smaller step back
 # is an image that came late.
 ANOTHER_DRIVE_S = 1.0
+UNKNOWN = 1e6  # the variance of a position that a loop does not measure
 
 
 def after(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -151,15 +152,20 @@ class LoopCloser:
             stamps, poses = np.array(self._graph.stamps), self._corrected(self._odometry())
         return stamps, after(poses, _inverse(self.mount))
 
-    def by_loop(self, loop: Loop) -> np.ndarray:
-        """Return the pose (7,) of the robot in the map by one loop; by the path where the loop has no length."""
+    def by_loop(self, loop: Loop) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pose (7,) of the robot in the map by one loop, and its covariance (6, 6): x y z, then rotation.
+
+        The position is that of the path where the length of the loop's translation is not known.
+        """
         assert loop.relative is not None
         with self._lock:
             poses = self._corrected(self._odometry())
         pose = after(poses[loop.match], loop.relative.pose)
         if loop.relative.kind != METRIC:
             pose[:3] = poses[loop.query, :3]
-        return after(pose, _inverse(self.mount))
+        place = UNKNOWN if loop.relative.kind == ROTATION_ONLY else LOOP_SIGMAS.translation_m**2
+        variances = [place] * 3 + [LOOP_SIGMAS.rotation_rad**2] * 3
+        return after(pose, _inverse(self.mount)), np.diag(variances)
 
     def _corrected(self, odometry: np.ndarray) -> np.ndarray:
         return np.concatenate([self._solved, after(self.correction, odometry[len(self._solved) :])])
@@ -199,17 +205,21 @@ class LoopCloser:
     def _odometry(self) -> np.ndarray:
         return np.array(self._graph.odometry).reshape(-1, 7)
 
-    def start(self) -> None:
-        """Start the thread that solves the graph when a loop is new, at most half of the time."""
+    def start(self) -> LoopCloser:
+        """Start the thread that solves the graph when a loop is new, at most half of the time; return the closer."""
         self._thread = Thread(target=self._run, name="pose graph", daemon=True)
         self._thread.start()
+        return self
 
     def _run(self) -> None:
         while not self._stop.is_set():
             if self._new.wait(0.2):
                 self._new.clear()
                 begin = time.monotonic()
-                self.solve()
+                try:
+                    self.solve()
+                except Exception as fault:  # a robot drives on, with the solution before
+                    self.warn(f"the pose graph was not solved: {type(fault).__name__}: {fault}")
                 self._stop.wait(time.monotonic() - begin)
 
     def stop(self) -> None:

@@ -15,6 +15,7 @@ from loopclosure.closing.close import ate_rmse_m, drifted, path_of, steps_betwee
 from loopclosure.closing.graph import Solution, solve
 from loopclosure.closing.measure import CHECK
 from loopclosure.closing.online import STILL, Keyframes, LoopCloser, after
+from loopclosure.closing.synchronizer import Synchronizer, between
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import relative_pose
@@ -92,19 +93,25 @@ def test_a_recorded_robot_gets_a_corrected_path(tmp_path: Path) -> None:
     assert sequence.poses is not None
     odometry = slipped(drifted(sequence.poses, 3.0, 1), 20)
     write_bag(tmp_path / "bag", sequence, odometry)
-    closer, newest, spent = None, {}, []
+    said: list[str] = []
+    closer, joined, spent = None, Synchronizer(warn=said.append), []
     with AnyReader([tmp_path / "bag"]) as reader:
         for connection, _, raw in reader.messages():
             message: Any = reader.deserialize(raw, connection.msgtype)
-            newest[connection.topic] = message
-            if connection.topic == "/image":
-                if closer is None:
-                    camera = camera_of(newest["/camera_info"])
-                    assert camera is not None
-                    closer = closer_of(camera)
-                    closer.start()
+            if connection.topic == "/camera_info" and closer is None:
+                camera = camera_of(message)
+                assert camera is not None
+                closer = closer_of(camera)
+                closer.start()
+            stamp = seconds(message.header.stamp)
+            if connection.topic == "/odom":
+                joined.odometry(stamp, pose_of(message))
+            elif connection.topic == "/image":
+                joined.image(stamp, message)
+            if (found := joined.newest()) is not None:
+                assert closer is not None
                 begin = time.process_time()
-                closer.add(image_of(message), seconds(message.header.stamp), pose_of(newest["/odom"]))
+                closer.add(image_of(found[1]), found[0], found[2])
                 spent.append(time.process_time() - begin)
     assert closer is not None
     closer.stop()
@@ -113,8 +120,9 @@ def test_a_recorded_robot_gets_a_corrected_path(tmp_path: Path) -> None:
     assert len(stamps) == len(sequence)
     before, corrected = (ate_rmse_m(poses, sequence.poses) for poses in (odometry, path))
     used = int(np.count_nonzero(closed.accepted))
-    said = f"{used} of {len(closed.loops)} loops used, ATE {before:.3f} m before, {corrected:.3f} m after"
-    print(f"{said}, {1e3 * np.median(spent):.0f} ms per image")
+    assert not said
+    counted = f"{used} of {len(closed.loops)} loops used, ATE {before:.3f} m before, {corrected:.3f} m after"
+    print(f"{counted}, {1e3 * np.median(spent):.0f} ms per image")
     assert used >= 3
     assert corrected < 0.4 * before
     newer = after(closer.correction, odometry[-1])
@@ -123,16 +131,64 @@ def test_a_recorded_robot_gets_a_corrected_path(tmp_path: Path) -> None:
     assert (tmp_path / "closed" / "closed.g2o").read_text().count("EDGE_SE3:QUAT") == len(sequence) - 1 + used
 
 
+def at(x: float, turn_deg: float = 0.0) -> np.ndarray:
+    return np.array([x, 0, 0, *Rotation.from_euler("z", turn_deg, degrees=True).as_quat()])
+
+
+def test_an_image_gets_the_pose_between_two_of_the_odometry() -> None:
+    said: list[str] = []
+    joined = Synchronizer(gap_s=0.5, warn=said.append)
+    joined.image(10.05, "a")
+    assert joined.newest() is None  # nothing is known yet
+    joined.odometry(10.0, at(1, 10))
+    assert joined.newest() is None  # it may move on
+    joined.odometry(10.1, at(2, 30))
+    joined.odometry(10.06, at(9))  # late
+    found = joined.newest()
+    assert found is not None
+    assert found[:2] == (10.05, "a")
+    np.testing.assert_allclose(found[2], at(1.5, 20), atol=1e-9)
+    assert joined.newest() is None
+    for stamp, image in ((10.1, "b"), (10.12, "c"), (10.2, "d"), (10.3, "e")):
+        joined.image(stamp, image)
+    joined.odometry(10.2, at(3))
+    assert joined.newest() == (10.2, "d", pytest.approx(at(3)))
+    joined.odometry(11.0, at(4))
+    assert joined.newest() is None
+    joined.image(9.0, "before all")
+    assert joined.newest() is None
+    assert said == [f"the image at {t} has no odometry within 0.5 s; it is left out" for t in ("10.300000", "9.000000")]
+
+
+def test_when_the_time_goes_back_the_poses_before_are_forgotten() -> None:
+    said: list[str] = []
+    joined = Synchronizer(warn=said.append)
+    for stamp in np.arange(100, 400, 0.1):  # more than are kept
+        joined.odometry(stamp, at(stamp))
+    joined.image(399.55, "a")
+    found = joined.newest()
+    assert found is not None
+    assert found[2][0] == pytest.approx(399.55)
+    joined.image(600.0, "never")
+    joined.odometry(50.0, at(5))
+    joined.odometry(50.1, at(6))
+    joined.image(50.05, "b")
+    found = joined.newest()
+    assert found is not None
+    assert (found[1], found[2][0]) == ("b", pytest.approx(5.5))
+    assert not said
+
+
+def test_half_of_a_turn_beyond_180_degrees() -> None:
+    np.testing.assert_allclose(np.abs(between(at(0, 170), at(1, -170), 0.5)), np.abs(at(0.5, 180)), atol=1e-9)
+
+
 def picture(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     squares = [
         np.kron(rng.integers(0, 120, (120 // side, 160 // side, 3)), np.ones((side, side, 1))) for side in (8, 20)
     ]
     return np.sum(squares, axis=0).astype(np.uint8)
-
-
-def at(x: float, turn_deg: float = 0.0) -> np.ndarray:
-    return np.array([x, 0, 0, *Rotation.from_euler("z", turn_deg, degrees=True).as_quat()])
 
 
 def test_keyframes_are_apart_by_a_step_or_a_turn() -> None:
