@@ -50,10 +50,10 @@ class SmoothL1LossExport(Exporter):
         layer = self.layer
         if len(set(layer.bottom_shapes)) > 1 or layer.by_pixel:
             raise self.refusal("PyTorch", "it is exported for bottoms of one shape, and not as R-FCN's")
-        return call(smooth_l1_loss, *bottoms, beta=rounded(layer.knee))
+        return call(weighted_smooth_l1_loss, *bottoms, beta=rounded(layer.knee))
 
 
-def smooth_l1_loss(predictions, targets, inside=1.0, outside=1.0, beta=1.0):
+def weighted_smooth_l1_loss(predictions, targets, inside=1.0, outside=1.0, beta=1.0):
     """Return the weighted sum of the smooth L1 losses of the differences, which may be weighted too, divided by N."""
     x, y = inside * predictions, inside * targets
     losses = F.smooth_l1_loss(x, y, beta=beta, reduction="none")

@@ -62,7 +62,12 @@ class DetectionOutputExport(Exporter):
             candidates = graph.node("ScatterElements", none, places, best, axis=2)
         least = graph.constant([param.confidence_threshold]) if param.HasField("confidence_threshold") else lowest
         overlap = graph.constant([min(nms.nms_threshold, 1.0)])
-        found = graph.node("NonMaxSuppression", boxes, candidates, every, overlap, least)
+        if param.code_type == CENTER_SIZE:
+            areas = boxes
+        else:  # ONNX takes the corners in any order; in Caffe, a box that is turned inside out overlaps nothing
+            low, high = graph.nodes("Split", boxes, graph.constant([2, 2]), outputs=2, axis=-1)
+            areas = graph.node("Concat", low, graph.node("Max", low, high), axis=-1)
+        found = graph.node("NonMaxSuppression", areas, candidates, every, overlap, least)
         # Add a row that is not a detection, since OpenCV 5.0 crashes on empty tensors.
         found = graph.node("Concat", found, graph.constant([[0, 0, 0]]), axis=0)
         if param.keep_top_k > -1:

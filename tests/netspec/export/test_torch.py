@@ -19,6 +19,7 @@ from netspec.export.formats.shapes import settled
 from netspec.export.formats.torch import export_torch, torch_source
 from netspec.export.formats.torch_code import write_definition
 from netspec.net.net import Net
+from netspec.proto.schema import TRAIN
 from paths import GOLDEN, ROOT
 
 pytestmark = pytest.mark.slow
@@ -106,6 +107,16 @@ def test_deconvolution_with_a_filter_larger_than_the_map_computes_the_same(net_o
       convolution_param { num_output: 2 kernel_size: 5 stride: 2 } }"""
     net = trained(net_of(text))
     assert_same(run_module(source_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
+
+
+def test_dropout_of_a_net_in_phase_train_drops_and_scales(net_of: Callable[..., Net]) -> None:
+    text = """layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 4 dim: 200 } } }
+    layer { name: "drop" type: "Dropout" bottom: "x" top: "y" dropout_param { dropout_ratio: 0.2 } }"""
+    net = net_of(text, phase=TRAIN)
+    dropped = source_module(net).train()(torch.ones(4, 200))
+    assert set(dropped.unique().tolist()) == {0.0, 1.25}
+    assert 0.1 < float((dropped == 0).float().mean()) < 0.3
+    assert torch.equal(source_module(net)(torch.ones(4, 200)), torch.ones(4, 200))
 
 
 def test_names_that_are_invalid_in_python_compute_the_same(net_of: Callable[..., Net]) -> None:
