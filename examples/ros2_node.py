@@ -4,10 +4,10 @@
 
 in   image  sensor_msgs/Image;  camera_info  sensor_msgs/CameraInfo;  odom  nav_msgs/Odometry
 out  loops  geometry_msgs/PoseWithCovarianceStamped: the position of the robot by a loop, on the corrected path
-     path   nav_msgs/Path: all keyframes, corrected;  tf: the frame of the odometry in map_frame
-parameters  describe (default), map_frame (map), step (m) and turn (rad) between keyframes, recent (s): no loops with
-            the last so many seconds, gap (s): the longest one in the odometry, in_memory (1000): the others are in a
-            temporary file; mount: the camera in the robot, seven numbers, x y z qx qy qz qw (default: from tf)
+     path   nav_msgs/Path: all keyframes, corrected;  tf: the frame of the odometry in the map
+parameters  describe: the net (default);  map: the frame;  step, turn: meters or radians between keyframes;  recent: no
+            loops with the last so many seconds;  gap: the longest in the odometry, in seconds;  kept: keyframes in
+            memory, the others are in a temporary file;  mount: x y z qx qy qz qw of the camera (default: from tf)
 """
 
 import queue
@@ -32,8 +32,7 @@ from loopclosure.detector.run import load_describe
 from loopclosure.errors import InputError
 from loopclosure.places.messages import camera_of, image_of, pose_of, seconds
 
-DEFAULTS = {"describe": "default", "map_frame": "map", "step": 0.1, "turn": 0.1, "recent": 10.0}
-DEFAULTS |= {"gap": 0.5, "in_memory": 1000}
+DEFAULTS = {"describe": "default", "map": "map", "step": 0.1, "turn": 0.1, "recent": 10.0, "gap": 0.5, "kept": 1000}
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # who subscribes later gets the last message
 
 
@@ -100,14 +99,13 @@ class LoopClosure(Node):
             raise InputError("camera_info has no calibration of a pinhole camera yet")
         if not any(mount[3:]):
             mount = pose_of(self.buffer.lookup_transform(self.odom_frames[1], image.header.frame_id, Time()))
-        limits = {"exclude_seconds": self.set["recent"], "in_memory": self.set["in_memory"]}
+        limits = {"exclude_seconds": self.set["recent"], "in_memory": self.set["kept"]}
         detector = LoopDetector(self.describe, check=CHECK, **limits)
-        keyframes = Keyframes(self.set["step"], self.set["turn"])
-        return LoopCloser(detector, camera, mount, keyframes, self.warn).start()
+        return LoopCloser(detector, camera, mount, Keyframes(self.set["step"], self.set["turn"]), self.warn).start()
 
     def stamped(self, kind, stamp):
         message = kind()
-        message.header.stamp, message.header.frame_id = stamp, self.set["map_frame"]
+        message.header.stamp, message.header.frame_id = stamp, self.set["map"]
         return message
 
     def tell_loop(self, loop, stamp):
