@@ -298,7 +298,7 @@ def test_unknown_fields_and_types_activate_no_dialect(fresh_files: None) -> None
     assert activated_by('layer { type: "NoSuchType" no_such_param { } }') == []
 
 
-def test_docs_netspec_md_lists_every_dialect() -> None:
-    table = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "netspec.md").read_text(), re.MULTILINE)
+def test_docs_forks_md_lists_every_dialect() -> None:
+    table = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "forks.md").read_text(), re.MULTILINE)
     own = {name for name, file in known_files().items() if file.module.startswith("netspec.dialects.")}
     assert own <= set(table)
