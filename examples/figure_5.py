@@ -3,7 +3,8 @@
 python3 figure_5.py SEQUENCE_1 SEQUENCE_2 --weights table_1/.../siamese_resnet27_512_iter_3000.caffemodel
     --vocabulary OTHER_PLACE --out figure_5
 
-The sequences show one place, in the layout of TUM RGB-D, with poses in one frame of reference. They become one walk.
+The sequences show one place, in the layout of TUM RGB-D, with poses in one frame of reference. The last fifth of each,
+which table_1.py keeps for tests, becomes a part of one walk.
 FAB-MAP's vocabulary and tree are learned from images of another place. The report in OUT/report has the matrix of
 true loops, the matrix of each method, and precision against recall; the last lines have the times of the methods.
 Run it in a clone, or in a folder with a copy of the clone's folder prototxt.
@@ -28,26 +29,33 @@ def parse() -> argparse.Namespace:
     parser.add_argument("sequence", nargs="+", type=Path)
     parser.add_argument("--net", default="siamese_resnet27_512", help="folder in prototxt/normalized (%(default)s)")
     parser.add_argument("--weights", required=True, help="trained weights of the net")
+    parser.add_argument(
+        "--start",
+        type=float,
+        default=0.8,
+        help="share of each sequence that is left out, since table_1.py trained and chose on it (default: 0.8)",
+    )
     parser.add_argument("--size", type=int, default=64, help="side of the images in pixels (default: 64)")
     parser.add_argument("--vocabulary", required=True, help="folder or sequence with images of another place")
     parser.add_argument("--out", type=Path, default=Path("figure_5"), help="folder for all files (default: figure_5)")
     return parser.parse_args()
 
 
-def join(folders: list[Path], out: Path) -> None:
-    """Write one sequence in TUM's layout that has the images and poses of several, one after the other."""
+def join(folders: list[Path], out: Path, start_share: float) -> None:
+    """Write one sequence in TUM's layout with the last images and poses of several, one sequence after the other."""
     out.mkdir(parents=True, exist_ok=True)
     names, stamps, poses, start = [], [], [], 0.0
     for folder in folders:
         link = out / folder.name
         link.unlink(missing_ok=True)
         link.symlink_to(folder.resolve())
-        sequence = read_sequence(folder, "tum")
+        sequence = read_sequence(folder, "tum").with_poses()
         assert sequence.stamps is not None
         assert sequence.poses is not None
-        names += [f"{folder.name}/{name}" for name in sequence.names]
-        stamps.append(sequence.stamps - sequence.stamps[0] + start)
-        poses.append(sequence.poses)
+        first = round(start_share * len(sequence.names))
+        names += [f"{folder.name}/{name}" for name in sequence.names[first:]]
+        stamps.append(sequence.stamps[first:] - sequence.stamps[first] + start)
+        poses.append(sequence.poses[first:])
         start = stamps[-1][-1] + PAUSE_S
     times, known = np.concatenate(stamps), np.concatenate(poses)
     write_rgb_list(out / "rgb.txt", zip(times, names, strict=True))
@@ -68,7 +76,7 @@ def main() -> None:
     """Make the figure."""
     arguments = parse()
     walk, features = arguments.out / "walk", arguments.out / "features.npz"
-    join(arguments.sequence, walk)
+    join(arguments.sequence, walk, arguments.start)
     net = Path("prototxt", "normalized", arguments.net, "deploy.prototxt")
     shape = f"data=1,3,{arguments.size},{arguments.size}"
     extract = ["netspec", "extract", net, "--weights", arguments.weights, "--blob", "feat", "--shape", shape]

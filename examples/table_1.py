@@ -22,7 +22,7 @@ from importlib import import_module
 from pathlib import Path
 from statistics import mean
 
-from loopclosure.report.table_one import read_runs
+from loopclosure.report.table_one import intervals, read_runs
 
 NETS = ("siamese_8", "siamese_128", "siamese_resnet27_256", "siamese_resnet27_512")
 ALL = "all rooms"
@@ -47,7 +47,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--validation", type=int, default=1200, help="validation pairs, at most, and as many test pairs (default: 1200)"
     )
-    parser.add_argument("--min-gap", default="1", help="minimum seconds between the images of a pair (default: 1)")
+    parser.add_argument(
+        "--min-gap", default="1", help="minimum seconds between images of a pair, and between parts (default: 1)"
+    )
     parser.add_argument("--gpu", help="number of the GPU (default: the CPU)")
     parser.add_argument(
         "--precision",
@@ -77,7 +79,8 @@ def make_pairs(arguments: argparse.Namespace, rooms: list[list[Path]], out: Path
     names = ("train", "val", "test")
     if not all((out / f"{name}.txt").exists() for name, count in zip(names, counts, strict=True) if count):
         command = ["lmdb-build", "pairs", *(sequence for room in rooms for sequence in room), "--root", root]
-        command += ["--split", "time", "--shares", shares, "--min-gap", arguments.min_gap, "--different-scenes"]
+        command += ["--split", "time", "--shares", shares, "--split-gap", arguments.min_gap]
+        command += ["--min-gap", arguments.min_gap, "--different-scenes"]
         command += ["--at-most", "--out", out]
         for room in rooms:
             if len(room) > 1:
@@ -141,14 +144,16 @@ def train(arguments: argparse.Namespace, pairs: Path, test: Path, out: Path) -> 
 
 
 def row(trained_on: str, net: str, files: list[Path]) -> dict[str, object]:
-    """Return the table's row of a net: means over the runs of its seeds, and the range of more than one."""
+    """Return the table's row of a net: means over the runs of its seeds, and 95 % intervals by bootstrap over pairs."""
     cells: dict[str, object] = {"net": net, "trained on": trained_on, "seeds": len(files)}
     for judged in ("validation", "test"):
-        metrics = [read_runs(file, judged)[0].metrics for file in files]
+        runs = [read_runs(file, judged)[0] for file in files]
+        ends = intervals(runs)
         for name, field in {"precision": "precision", "recall": "recall", "ROC AUC": "roc_auc"}.items():
-            values = [getattr(metric, field) for metric in metrics]
-            spread = f" ({min(values):.3f} to {max(values):.3f})" if len(values) > 1 else ""
-            cells[f"{judged} {name}"] = f"{mean(values):.3f}{spread}"
+            low, high = ends[field]
+            cells[f"{judged} {name}"] = (
+                f"{mean(getattr(run.metrics, field) for run in runs):.3f} ({low:.3f} to {high:.3f})"
+            )
     return cells
 
 

@@ -129,7 +129,8 @@ class LoopDetector:
         ``stamp`` is in seconds. ``pose`` is tx ty tz qx qy qz qw, camera-to-world, and ``odometry`` is such a pose as
         the robot measures it; both are only stored for the export.
 
-        The cost is one call of ``describe`` and one pass over all earlier descriptors of 4 D bytes (docs/performance.md).
+        The cost is one call of ``describe`` and one pass over all earlier descriptors of 4 D bytes:
+        docs/performance.md.
         """
         if self.describe is None:
             raise InputError("this detector has no describe function; give one, or use add_descriptor")

@@ -281,6 +281,22 @@ def judge_pairs(
     return metrics_at(best_threshold(train_distances, train_labels), distances, labels)
 
 
+def intervals(runs: Sequence[Run], draws: int = 1000, seed: int = 0) -> dict[str, tuple[float, float]]:
+    """Return intervals that contain 95 % of the means of some runs, by bootstrap over the judged pairs.
+
+    The runs are of one net with several seeds, judged on the same pairs. The keys are precision, recall and roc_auc.
+    """
+    rng = np.random.default_rng(seed)
+    found: dict[str, list[float]] = {"precision": [], "recall": [], "roc_auc": []}
+    for _ in range(draws):
+        drawn = rng.integers(0, len(runs[0].labels), len(runs[0].labels))
+        metrics = [metrics_at(run.metrics.threshold, run.distances[drawn], run.labels[drawn]) for run in runs]
+        for name, values in found.items():
+            values.append(float(np.mean([getattr(metric, name) for metric in metrics])))
+    ends = {name: np.nanquantile(values, [0.025, 0.975]) for name, values in found.items()}
+    return {name: (float(low), float(high)) for name, (low, high) in ends.items()}
+
+
 def _share(part: int, whole: int) -> float:
     return part / whole if whole else float("nan")
 

@@ -5,7 +5,15 @@ import pytest
 from sklearn.metrics import accuracy_score, f1_score, precision_score, recall_score, roc_auc_score
 
 from loopclosure.errors import InputError
-from loopclosure.report.table_one import best_threshold, judge_pairs, metrics_at, pair_distances, roc_auc
+from loopclosure.report.table_one import (
+    Run,
+    best_threshold,
+    intervals,
+    judge_pairs,
+    metrics_at,
+    pair_distances,
+    roc_auc,
+)
 
 
 def test_distances_of_pairs():
@@ -96,3 +104,22 @@ def test_errors_are_reported(distances, labels, sentence):
 def test_unequal_features_are_refused():
     with pytest.raises(InputError, match="differ in shape"):
         pair_distances(np.zeros((2, 3)), np.zeros((2, 4)))
+
+
+def test_intervals_contain_the_figure_and_shrink_with_the_root_of_the_pairs() -> None:
+    def run(count: int) -> Run:
+        rng = np.random.default_rng(count)
+        labels = np.arange(count) % 2 == 0
+        distances = rng.normal(np.where(labels, 0.4, 0.6), 0.1)
+        return Run("net", metrics_at(0.5, distances, labels), distances, labels, (), 0.0, 0, 0)
+
+    widths = {}
+    for count in (200, 3200):
+        one = run(count)
+        found = intervals([one], draws=200)
+        for name, (low, high) in found.items():
+            assert low < getattr(one.metrics, name) < high
+            widths[name, count] = high - low
+    for name in ("precision", "recall", "roc_auc"):
+        assert 2.5 < widths[name, 200] / widths[name, 3200] < 6  # about 4
+    assert intervals([one, one], draws=20) == intervals([one], draws=20)
