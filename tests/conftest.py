@@ -98,5 +98,5 @@ def _the_process_is_left_as_it_was() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def _no_dialect_is_left_on(_the_process_is_left_as_it_was: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    yield from fresh_dialects(monkeypatch)
+def _no_dialect_stays_added(_the_process_is_left_as_it_was: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    fresh_dialects(monkeypatch)

@@ -1,50 +1,42 @@
-"""Dialects for one test. Afterwards the registry and the schema are restored."""
-
-import sys
-from collections.abc import Iterator
-from copy import copy
+"""Dialects for one test."""
 
 import pytest
 
-from netspec.dialects import files, layers
-from netspec.dialects import registry as dialect
+from netspec.dialects import known
 from netspec.layers import layer_class
 from netspec.layers.contract import registry
+from netspec.proto.forks import forks
+from netspec.proto.schema import given
 from netspec.proto.text import parse_net_text
 
 
-def keep_registry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restore the registry of layers after the test."""
-    monkeypatch.setattr(registry, "_LAYERS", copy(registry._LAYERS))
-    for name in ("_owners", "_replacing", "_everywhere"):
-        monkeypatch.setattr(layers, name, copy(getattr(layers, name)))
+def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a test add dialects for every net; afterwards there are none."""
+    assert known.added() == ()
+    monkeypatch.setattr(known, "_added", {})
 
 
-def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let a test use dialects; switch them off when it is done."""
-    assert dialect.active() == []
-    files.announce_known()
-    monkeypatch.setattr(dialect, "_known", dict(dialect._known))
-    keep_registry(monkeypatch)
-    before = set(sys.modules)
-    yield
-    files.waiting.clear()  # activated, but their layers were never used
-    for name in dialect.active():
-        dialect.deactivate(name)
-    own = {file.module for file in files.known_files().values()} & sys.modules.keys()
-    for name in own | {name for name in sys.modules.keys() - before if name.startswith("netspec_dialect_")}:
-        del sys.modules[name]
+def used_by(text: str) -> list[str]:
+    """Return the dialects of a net's fields, in the order of the text, then those of its layer types.
 
-
-def activated_by(text: str) -> list[str]:
-    """Read a net, where unknown fields are left out, and look its layers up; return the dialects that are then active.
-
-    The first are those of fields, in the order of the text.
+    Unknown fields are left out.
     """
-    order: list[str] = []
     net, _ = parse_net_text(text, "net.prototxt", report=lambda fault: None)
-    order += dialect.active()
+    order = list(dict.fromkeys(dialect for layer in net.layer for dialect in _dialects_in(layer)))
     for layer in net.layer:
-        layer_class(layer.type)
-        order += [name for name in dialect.active() if name not in order]
+        cls = layer_class(layer.type)
+        owners = forks().additions().types.get(layer.type, ()) if cls and layer.type not in registry._LAYERS else ()
+        order += [name for name in owners if name not in order]
     return order
+
+
+def _dialects_in(message) -> list[str]:
+    found = []
+    for field in given(message):
+        if field.descriptor.is_extension:
+            found.append(field.descriptor.file.package.rpartition(".")[2])
+        elif field.descriptor.message_type:
+            values = field.get(message)
+            for value in values if field.repeated else [values]:
+                found += _dialects_in(value)
+    return found

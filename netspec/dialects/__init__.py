@@ -1,12 +1,12 @@
 '''Dialects: the layers of Caffe's forks, one file for each, with their additions to the schema.
 
-A prototxt with fields or layers that Caffe does not have activates the dialects that define them: netspec's own (the
-files in this folder), and those of installed packages (entry points of the group ``netspec.dialects``). To add a
-dialect from a file, for every net of the process, pass ``--plugin FILE.py`` on the command line, or call
-``netspec.use_dialect("FILE.py")``. The whole process then knows the new fields, because protobuf has one schema for a
-process. A layer that replaces one of Caffe's is used only in nets that use the dialect (BuildOptions.dialects). A field
-or layer type that several dialects define is an error; ``--plugin NAME`` chooses one. If forks define different layers
-of one type, the table in netspec/dialects/signatures.py decides which one is meant.
+A prototxt with fields or layers that Caffe does not have uses the dialects that define them: netspec's own (the files
+in this folder), and those of installed packages (entry points of the group ``netspec.dialects``). Other nets of the
+process do not: a layer that replaces one of Caffe's is used only in nets that use the dialect (BuildOptions.dialects).
+To add a dialect from a file, for every net of the process, pass ``--plugin FILE.py`` on the command line, or call
+``netspec.use_dialect("FILE.py")``. If several dialects define a field, the fields inside it decide which one is meant;
+if they do not, and for a layer type of several dialects, write ``# dialect: NAME`` into the prototxt or pass
+``--plugin NAME``. If forks define different layers of one type, the table in netspec/dialects/signatures.py decides.
 
 To write a dialect, save this as a file, for example ``doubling.py``, and pass ``--plugin doubling.py``::
 
@@ -53,17 +53,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from netspec.dialects.files import activate_file, find_file
+from netspec.dialects import known
+from netspec.dialects.files import find_file, read_dialect
 
 
 def use_dialect(name: str | Path) -> None:
-    """Add the fields and layers of a dialect to the whole process. ``name`` is its name, or the path of its file.
+    """Add the fields and layers of a dialect to every net of the process. ``name`` is its name, or that of its file.
 
     Does nothing if it was added before. Raises SpecError if there is no such dialect, if its file has an error, or if
-    Caffe or another dialect already has one of its fields or layer types.
+    Caffe or another added dialect already has one of its fields or layer types.
     """
-    from netspec.dialects.layers import use_everywhere  # imported here, since it needs torch
+    from netspec.dialects.layers import load  # imported here, since it needs torch
 
-    file = find_file(name)
-    activate_file(file)
-    use_everywhere(file.name)
+    if dialect := known.to_add(read_dialect(find_file(name))):
+        load(dialect)
+        known.add(dialect)

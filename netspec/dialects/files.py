@@ -15,20 +15,21 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from netspec import log
-from netspec.dialects.registry import Dialect, activate, announce
+from netspec.dialects.registry import Dialect
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.files.kinds import unreadable
 
+OF_FILES = "netspec_dialect_"  # begins the names of modules that are given by their paths
 GROUP = "netspec.dialects"  # entry points of other packages: the name of a dialect and its module
 
 
 @dataclass(frozen=True)
 class DialectFile:
-    """A file that has not been read. ``module`` is its module name, or "" for a file given by its path."""
+    """A file that has not been read. ``module`` is the name of its module."""
 
     name: str
     path: Path
-    module: str = ""
+    module: str
 
 
 @cache
@@ -57,7 +58,8 @@ def find_file(name: str | Path) -> DialectFile:
     """Return the file of a dialect, given by its name or by a path that ends in .py. Raises SpecError."""
     path = Path(name)
     if path.suffix == ".py":
-        return DialectFile(re.sub(r"\W", "_", path.stem), path)
+        name = re.sub(r"\W", "_", path.stem)
+        return DialectFile(name, path, f"{OF_FILES}{name}")
     files = known_files()
     if str(name) not in files:
         known = f"; expected one of: {', '.join(files)}, or the path of a .py file"
@@ -88,7 +90,7 @@ def read_dialect(file: DialectFile) -> Dialect:
     if not source and not types:
         raise SpecError("declares no dialect: neither DECLARATIONS nor a layer with @register", Where(str(file.path)))
     advice = f'add --plugin {file.name}, in Python netspec.use_dialect("{file.name}")'
-    return Dialect(file.name, source, tuple(types), advice, str(file.path))
+    return Dialect(file.name, source, tuple(types), advice, str(file.path), file.module)
 
 
 def _registered_types(tree: ast.Module) -> Iterator[str]:
@@ -102,29 +104,3 @@ def _registered_types(tree: ast.Module) -> Iterator[str]:
 
 def _name(node: ast.expr) -> str:
     return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
-
-
-waiting: list[tuple[DialectFile, Dialect]] = []  # active dialects whose layers are not registered yet
-
-
-def activate_file(file: DialectFile) -> None:
-    """Add the fields of a dialect to the schema. Its layers are registered when the next layer is looked up.
-
-    Raises SpecError if its file has an error, or Caffe or another dialect has one of its fields.
-    """
-    dialect = read_dialect(file)
-    activate(dialect)
-    waiting.append((file, dialect))
-
-
-@cache
-def announce_known() -> None:
-    """Announce every dialect that can be found, so that errors can name it; once, when the first error needs it.
-
-    A file that cannot be read is ignored with a warning.
-    """
-    for file in known_files().values():
-        try:
-            announce(read_dialect(file))
-        except SpecError as fault:
-            log.logger.warning(f'dialect "{file.name}" is ignored: {fault}')

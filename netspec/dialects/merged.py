@@ -1,7 +1,7 @@
-"""Caffe's schema with the additions of the active dialects as ordinary messages and fields.
+"""Caffe's schema with the additions of dialects as ordinary messages and fields.
 
-:mod:`netspec.dialects.registry` adds the fields of dialects as extensions, so that they can be removed again. Programs
-for a fork use them as fields of the fork's ``caffe_pb2``: ``layer.permute_param.order``. This module makes their
+:mod:`netspec.dialects.registry` adds the fields of dialects as extensions, so that each net has its own. Programs for a
+fork use them as fields of the fork's ``caffe_pb2``: ``layer.permute_param.order``. This module makes their
 classes. They have the same text format, and the same binary format except for values added to Caffe's enums.
 """
 
@@ -13,23 +13,19 @@ from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool
 
-from netspec.dialects.registry import Dialect, active_dialects, full_name_of
+from netspec.dialects.registry import Dialect, full_name_of
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import PACKAGE, pool
 
 _FILE = "caffe.proto"
 
 
-def merged_file() -> Any:
-    """Return the descriptor of caffe.proto with the active dialects; without any, the schema's own.
-
-    Raises SpecError if two active dialects have different messages with the same name.
-    """
-    return _merged(active_dialects())
-
-
 @cache
-def _merged(dialects: tuple[Dialect, ...]) -> Any:
+def merged_file(dialects: tuple[Dialect, ...]) -> Any:
+    """Return the descriptor of caffe.proto with these dialects; without any, the schema's own.
+
+    Raises SpecError if two of them have different messages with the same name.
+    """
     if not dialects:
         return pool.FindFileByName(_FILE)
     file = descriptor_pb2.FileDescriptorProto()
@@ -76,5 +72,5 @@ def _add_message(
         file.message_type.append(declared)
         messages[declared.name] = file.message_type[-1]
     elif known != declared:
-        message = f'another active dialect, or Caffe, has another message "{PACKAGE}.{declared.name}"'
+        message = f'another dialect, or Caffe, has another message "{PACKAGE}.{declared.name}"'
         raise SpecError(message, Where(dialect.declarations.name))

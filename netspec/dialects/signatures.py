@@ -41,14 +41,12 @@ class Signature:
     """The forks that define a layer type. The first one is the default.
 
     ``alike`` returns whether all forks compute the same for a layer. ``advice`` is the end of the warning, if it is
-    not the usual one that names dialects. ``ignores_unit_axes``: the files of some forks have blobs
-    with more or fewer axes of size 1.
+    not the usual one that names dialects.
     """
 
     forks: tuple[Fork, ...]
     alike: Callable[[Layer], bool] = never
     advice: str = ""
-    ignores_unit_axes: bool = False
 
 
 def _has(layer: Layer, field: str) -> bool:
@@ -75,7 +73,6 @@ SIGNATURES = {
             Fork("segmentation", fields=("bn_param.scale_filler", "bn_param.shift_filler", "bn_param.bn_mode")),
             Fork("happynear", "of happynear, L-Softmax, domain-guided dropout: 1 / std is there"),
         ),
-        ignores_unit_axes=True,  # TSN's and happynear's files have (1, C)
     ),
     "CenterLoss": Signature(
         (
@@ -157,11 +154,6 @@ def _shown_fork(layer: Layer) -> str:
 def has_several(layer_type: str) -> bool:
     """Return whether several dialects define a layer type."""
     return layer_type in SIGNATURES and len(SIGNATURES[layer_type].forks) > 1
-
-
-def ignores_unit_axes(layer: Layer) -> bool:
-    """Return whether the blobs of a layer have different axes of size 1 in the files of some forks."""
-    return layer.type in SIGNATURES and SIGNATURES[layer.type].ignores_unit_axes
 
 
 def fork_of(layer: Layer) -> str:

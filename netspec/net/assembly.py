@@ -56,17 +56,18 @@ class Learnable:
 class Assembly:
     """The layers of a plan, and what the net needs to run them.
 
-    ``layers[i]`` belongs to node i. If errors are collected rather than raised, faulty layers are missing. ``shapes``
-    has the shape of each blob, and ``loss_weights[i][j]`` is the loss weight of top j of layer i. ``backward`` says
-    which layers need backward computation; it is None if a layer is missing. ``options`` are the given options, with
-    the dialects of the net added.
+    ``plan`` is the given plan with what its forks rewrite. ``layers[i]`` belongs to node i. If errors are collected
+    rather than raised, faulty layers are missing. ``shapes`` has the shape of each blob, and ``loss_weights[i][j]`` is
+    the loss weight of top j of layer i. ``backward`` says which layers need backward computation; it is None if a layer
+    is missing. ``options`` are the given options, with the dialects of the net added.
     """
 
     def __init__(self, plan: Plan, options: BuildOptions) -> None:
-        self._plan, self._report = plan, plan.source.report
         dialects = {*options.dialects, *plan.source.dialects, *forks().dialects_of(plan.net)}
         self.options = replace(options, dialects=tuple(sorted(dialects)))
-        self._warnings = forks().rewrite(plan, self.options.dialects)
+        plan, self._warnings = forks().rewritten(plan, self.options.dialects)
+        self.plan = self._plan = plan
+        self._report = plan.source.report
         self.layers: dict[int, Layer] = {}
         self.shapes: dict[str, Shape] = {}
         self.loss_weights: list[list[float]] = []

@@ -76,10 +76,6 @@ class Net(torch.nn.Module):
     def __init__(self, plan: Plan, options: BuildOptions | None = None) -> None:
         super().__init__()
         options = options or BuildOptions()
-        self.plan = plan
-        self.param = plan.net
-        self.name: str = plan.net.name
-        self.phase = plan.net.state.phase
         self.device = device_of(options.device)
         self.keep: str | Iterable[str] = ()
         self._kept_values: dict[str | tuple[str, ...], frozenset[int]] = {}  # what the last ``keep`` means
@@ -88,6 +84,10 @@ class Net(torch.nn.Module):
             log.warning("net.cpp:53", warning)
         assembly = Assembly(plan, options)
         self.options = assembly.options
+        self.plan = plan = assembly.plan
+        self.param = plan.net
+        self.name: str = plan.net.name
+        self.phase = plan.net.state.phase
         self.layers: Any = torch.nn.ModuleList(assembly.layers.values())
         self.shapes = ByName("blob", assembly.shapes)
         self.loss_weights, self.learnable = assembly.loss_weights, assembly.learnable

@@ -30,7 +30,6 @@ from netspec.layers.contract.base import Layer, shape_string
 from netspec.net.extra_file import check_weights
 from netspec.net.net import Net
 from netspec.proto.binary import MOST_BYTES, net_without_numbers
-from netspec.proto.forks import forks
 from netspec.proto.schema import NetParameter
 
 MOST_NAMES = 20  # layers that a warning names
@@ -346,7 +345,7 @@ def _wrong_count(path: str, name: str, found: int, expected: int) -> SpecError:
 def _fits_loosely(layer: Layer, j: int, shape: tuple[int, ...]) -> bool:
     """Return whether a file's blob differs only in axes of size 1, in which forks differ for this layer type."""
     same = [n for n in shape if n != 1] == [n for n in layer.blob_shapes[j] if n != 1]
-    return same and forks().ignores_unit_axes(layer)
+    return same and layer.ignores_unit_axes
 
 
 def _wrong_shape(path: str, name: str, j: int, found: tuple[int, ...], expected: tuple[int, ...]) -> SpecError:

@@ -1,14 +1,15 @@
 """Reads protobuf's text format into a message, by reflection, with the position of every part.
 
 It accepts the files that Caffe's C++ parser accepts, and refuses others with one line that gives the position and the
-reason. It also accepts ``ceil_mode: true`` in a pooling_param, which many forks use for ``round_mode: CEIL``. If Caffe
-lacks a field or value and exactly one known fork has it, it is added to the schema (netspec/proto/forks.py).
+reason. It also accepts ``ceil_mode: true`` in a pooling_param, which many forks use for ``round_mode: CEIL``. A field
+or value that Caffe lacks is that of the one known fork that can be meant (netspec/proto/forks.py).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import tee
 from typing import Any
 
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
@@ -18,7 +19,7 @@ from netspec import log
 from netspec.errors import ForkFault, SpecError, Where, did_you_mean
 from netspec.proto.forks import forks
 from netspec.proto.lexer import END, FLOAT, INTEGER, NAME, STRING, SYMBOL, Lexer, Token
-from netspec.proto.schema import MORE, Field, NetParameter, SolverParameter, V1LayerParameter, fields_of
+from netspec.proto.schema import Field, NetParameter, SolverParameter, V1LayerParameter, fields_of
 from netspec.proto.source_map import Position
 
 _RANGES: dict[int, tuple[int, int]] = {
@@ -48,22 +49,32 @@ _CLOSING = {"{": "}", "<": ">", "[": "]"}
 Children = dict[str, list[Position]]
 
 
-def read_text(text: str, file: str, message: Message, report: Callable[[SpecError], None] | None = None) -> Position:
+def read_text(
+    text: str,
+    file: str,
+    message: Message,
+    report: Callable[[SpecError], None] | None = None,
+    dialects: Sequence[str] = (),
+) -> Position:
     """Read a text into an empty ``message``; return the positions of its parts.
 
-    ``report``, if given, gets a ForkFault for each unknown field, which is then left out with its contents.
+    ``report``, if given, gets a ForkFault for each unknown field, which is then left out with its contents. A field of
+    several forks is that of the one in ``dialects``, or of the only one whose message has the fields inside.
 
     Raises SpecError for unknown fields, values of the wrong type or out of range, singular fields given twice, missing
     required fields, and text that is not protobuf's text format.
     """
-    return _Reader(text, file, report).read(message)
+    return _Reader(text, file, report, dialects).read(message)
 
 
 class _Reader:
     """A recursive descent parser; ``self.token`` is the next token."""
 
-    def __init__(self, text: str, file: str, report: Callable[[SpecError], None] | None) -> None:
+    def __init__(
+        self, text: str, file: str, report: Callable[[SpecError], None] | None, dialects: Sequence[str]
+    ) -> None:
         self._report = report
+        self._dialects = [*dialects, *forks().everywhere]  # those that are used
         self.lexer = Lexer(text, file)
         self._tokens = iter(self.lexer)
         self._open: list[tuple[Message, Token]] = []  # the messages being read, each with the token that named it
@@ -86,10 +97,9 @@ class _Reader:
         name = self._next()
         key = (message.DESCRIPTOR.full_name, name.text)
         alias, meaning = _ALIASES.get(key, (name.text, None))
-        fields = fields_of(message.DESCRIPTOR)
-        if alias not in fields and forks().add_field(*key, self.lexer.text, self.token.start, self.lexer.file):
-            fields = fields_of(message.DESCRIPTOR)
-        field = fields.get(alias)
+        field = fields_of(message.DESCRIPTOR).get(alias)
+        if field is None:
+            field = self._of_fork(*key, forks().additions().fields.get(key, ()))
         if field is None:
             fault = self._unknown_field(message, name)
             if self._report is None or not isinstance(fault, ForkFault):
@@ -97,8 +107,7 @@ class _Reader:
             self._report(fault)
             self._skip(name)
             return
-        more = fields.get(alias + MORE)
-        if not field.repeated and any(f is not None and f.present(message) for f in (field, more)):
+        if not field.repeated and children.get(alias):
             first = children[alias][0].where.line
             raise self._error(f'"{alias}" was already given in line {first}; it can be given only once', name)
         nodes = children.setdefault(field.name, [])
@@ -125,13 +134,42 @@ class _Reader:
         """Return the enum field that has a value: ``field``, or the one for values that forks add to it."""
         if value in field.descriptor.enum_type.values_by_name:
             return field
-        for is_last in (False, True):
-            more = fields_of(message.DESCRIPTOR).get(field.name + MORE)
-            if more is not None and value in more.descriptor.enum_type.values_by_name:
-                return more
-            if is_last or not forks().add_value(message.DESCRIPTOR.full_name, field.name, value, self.lexer.file):
-                break
+        owner = message.DESCRIPTOR.full_name
+        dialects = forks().additions().values.get((owner, field.name, value), ())
+        return self._of_fork(owner, field.name, dialects) or field
+
+    def _of_fork(self, message: str, name: str, dialects: Sequence[str]) -> Field | None:
+        """Return the field of a message that one of these dialects adds, or None if it is not clear which one."""
+        meant = [dialect for dialect in dialects if dialect in self._dialects] or dialects
+        found = {dialect: forks().field(dialect, message, name) for dialect in meant}
+        if len(found) > 1:
+            inside, types = self._names_inside(), {d: f.descriptor.message_type for d, f in found.items()}
+            found = {d: found[d] for d, of in types.items() if of is None or inside <= fields_of(of).keys()}
+        if len(found) != 1:
+            return None
+        ((dialect, field),) = found.items()
+        if dialect not in self._dialects:
+            self._dialects.append(dialect)
+            log.logger.info(f"{self.lexer.file}: uses the dialect {dialect}")
         return field
+
+    def _added_values(self, message: str, field: str) -> list[str]:
+        """Return the values that the dialects in use add to the enum of one of Caffe's fields."""
+        added = forks().additions().values.items()
+        return [value for (*key, value), owners in added if key == [message, field] and {*owners} & {*self._dialects}]
+
+    def _names_inside(self) -> set[str]:
+        """Return the names of the fields inside the message that begins at the next token."""
+        self._tokens, ahead = tee(self._tokens)
+        names, depth, token = set[str](), 0, self.token
+        while token.kind != END:
+            before, token = token, next(ahead)
+            depth += (before.text in _CLOSING) - (before.text in _CLOSING.values())
+            if depth == 0 and before.kind == SYMBOL and before.text != ":":
+                break
+            if depth == 1 and token.kind == NAME and before.text != ":":
+                names.add(token.text)
+        return names
 
     def _skip(self, name: Token) -> None:
         """Skip the value of an unknown field: a scalar, a list or a message with any contents."""
@@ -261,12 +299,11 @@ class _Reader:
             word = self._next().text
             if word in values:
                 return values[word].number
-            more = fields_of(self._open[-1][0].DESCRIPTOR).get(field.name + MORE)
-            names = [*values, *(more.descriptor.enum_type.values_by_name if more else ())]
-            owner = self._open[-1][0].DESCRIPTOR
-            dialects = forks().with_value(owner.full_name, field.name, word)
+            owner, additions = self._open[-1][0].DESCRIPTOR, forks().additions()
+            dialects = additions.values.get((owner.full_name, field.name, word), ())
+            names = [*values, *self._added_values(owner.full_name, field.name)]
             known = did_you_mean(word, names) or f"; it is one of {', '.join(names)}"
-            hint = f"; {forks().advice(word, dialects)}" if dialects else known
+            hint = f"; {additions.advise(word, dialects)}" if dialects else known
             error = self._error(f'"{field.name}" has no value "{word}"{hint}', start)
             raise ForkFault(error.message, error.where, "value", word, dialects, owner.name) if dialects else error
         negative = self._minus()
@@ -372,10 +409,11 @@ class _Reader:
         It is a ForkFault, unless the cause seems to be a bracket, a quotation mark or the kind of file.
         """
         descriptor, name = message.DESCRIPTOR, token.text
-        dialects = forks().with_field(descriptor.full_name, name)
+        additions = forks().additions()
+        dialects = additions.fields.get((descriptor.full_name, name), ())
         fault = f'{descriptor.name} has no field "{name}"'
         elsewhere = "" if dialects else self._elsewhere(message, name)
-        hint = f"; {forks().advice(name, dialects)}" if dialects else self._meant(message, name)
+        hint = f"; {additions.advise(name, dialects)}" if dialects else self._meant(message, name)
         error = self._error(fault + (elsewhere or hint), token)
         if elsewhere or self.lexer.suspicion(token.start):
             return error

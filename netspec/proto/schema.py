@@ -17,10 +17,10 @@ from google.protobuf.message import Message
 from netspec.errors import SpecError
 
 PACKAGE = "caffe"
-MORE = "+"  # no name in a text ends with this
+SCOPE = "FieldsOf"  # the fields that a fork adds to a message are declared inside one of this name and the message's
 _LAST_NUMBER = 1 << 29  # field numbers are below this
 
-#: The pool; forks add their messages and fields to it (netspec/dialects/registry.py).
+#: The pool. The messages and fields of forks are added to it when they are first needed (netspec/dialects/registry.py).
 pool = descriptor_pool.DescriptorPool()
 _declarations: dict[str, descriptor_pb2.DescriptorProto] = {}  # by the message's full name
 
@@ -137,10 +137,9 @@ class Field:
         return message.HasField(self.name)
 
 
-#: Fields that active dialects add: full name of the message -> name of the field -> Field. Values added to one of
-#: Caffe's enums are stored as a Field with the name of Caffe's field, under that name followed by MORE.
-added_fields: dict[str, dict[str, Field]] = {}
 _own_fields: dict[str, dict[str, Field]] = {}
+_of_forks: dict[str, Field] = {}  # the fields of forks, by the full name of their descriptor
+_newest: dict[tuple[str, str], Field] = {}  # of those with the same name in a message; a user's file comes last
 
 
 def as_field(declared: descriptor_pb2.FieldDescriptorProto, descriptor: Any) -> Field:
@@ -154,31 +153,69 @@ def as_field(declared: descriptor_pb2.FieldDescriptorProto, descriptor: Any) -> 
     )
 
 
+def add_field(declared: descriptor_pb2.FieldDescriptorProto, descriptor: Any) -> Field:
+    """Make a field of a fork known, given by its declaration and its descriptor in the pool, and return it.
+
+    New values of an enum of Caffe's are a field with the name of Caffe's field.
+    """
+    field = _of_forks.setdefault(descriptor.full_name, as_field(declared, descriptor))
+    _newest[descriptor.containing_type.full_name, field.name] = field
+    return field
+
+
+def extension(name: str) -> Field:
+    """Return a known field of a fork by the full name of its descriptor; see :func:`extension_name`."""
+    return _of_forks[name]
+
+
 def fields_of(descriptor: Any) -> dict[str, Field]:
-    """Return the fields of a message by name: the schema's own, then those of the active dialects."""
+    """Return the fields that a message has by itself, without those of forks, by name."""
     name = descriptor.full_name
     if name not in _own_fields:
         declared = _declarations[name].field
         _own_fields[name] = {f.name: as_field(f, descriptor.fields_by_name[f.name]) for f in declared}
-    return {**_own_fields[name], **added_fields[name]} if name in added_fields else _own_fields[name]
+    return _own_fields[name]
 
 
-def _field(message: Message, name: str) -> Field:
-    field = fields_of(message.DESCRIPTOR).get(name)
-    assert field is not None, f"{message.DESCRIPTOR.full_name} has no field {name}, nor has an active dialect"
-    return field
+def given(message: Message) -> list[Field]:
+    """Return the fields that were given, including those of forks, in the order of their numbers."""
+    own, found = fields_of(message.DESCRIPTOR), []
+    descriptors: Any = [descriptor for descriptor, _ in message.ListFields()]
+    for descriptor in descriptors:
+        found.append(_of_forks[descriptor.full_name] if descriptor.is_extension else own[descriptor.name])
+    return found
+
+
+def same_field(field: Field, message: Message) -> Field | None:
+    """Return the field of a message, perhaps of another type, with the name and the fork of ``field``; or None."""
+    if not field.descriptor.is_extension:
+        return fields_of(message.DESCRIPTOR).get(field.name)
+    if field.descriptor.containing_type is message.DESCRIPTOR:
+        return field
+    return _of_forks.get(extension_name(field.descriptor.file.package, message.DESCRIPTOR.name, field.name))
+
+
+def extension_name(package: str, message: str, field: str) -> str:
+    """Return the full name of the descriptor with which the fork of a package extends a message, given by its name."""
+    return f"{package}.{SCOPE}{message}.{field}"
 
 
 def value(message: Message, name: str) -> Any:
-    """Return the value of a field, or its default if it is absent; ``name`` may be a field of an active dialect."""
-    return _field(message, name).get(message)
+    """Return the value of a field, or its default if it is absent; ``name`` may be a field of a fork."""
+    own = fields_of(message.DESCRIPTOR).get(name)
+    if own is not None:
+        return own.get(message)
+    for field in given(message):
+        if field.name == name:
+            return field.get(message)
+    return _newest[message.DESCRIPTOR.full_name, name].get(message)
 
 
 def given_fields(message: Message) -> set[str]:
-    """Return the names of the fields that were given, including those of active dialects."""
+    """Return the names of the fields that were given, including those of forks."""
     return {field.name for field, _ in message.ListFields()}
 
 
 def has(message: Message, name: str) -> bool:
-    """Return whether a field was given; ``name`` may be a field of an active dialect."""
-    return _field(message, name).present(message)
+    """Return whether a field was given; ``name`` may be a field of a fork."""
+    return name in given_fields(message)

@@ -35,8 +35,7 @@ def read_solver(path: str | Path) -> SolverParameter:
 def parse_net(path: str | Path, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
     """Return the net of a .prototxt, and the positions of its parts. Raises SpecError.
 
-    ``report``, if given, gets a ForkFault for each unknown field, which is then left out. If one known fork has the
-    field, it is added to the schema instead (netspec/proto/forks.py).
+    ``report``, if given, gets a ForkFault for each unknown field, which is then left out.
     """
     return parse_net_text(text_of(path), str(path), upgrade, report)
 
@@ -45,7 +44,7 @@ def parse_net_text(text: str, file: str, upgrade: bool = True, report: Report = 
     """Return the net in a text, and the positions of its parts; ``file`` is its name in errors."""
     net = NetParameter()
     named = forks().named_in(text, file)
-    source = replace(SourceMap.of(read_text(text, file, net, report)), dialects=named)
+    source = replace(SourceMap.of(read_text(text, file, net, report, named)), dialects=named)
     return upgrades.upgrade_net(net, source) if upgrade else (net, source)
 
 
@@ -63,7 +62,7 @@ def parse_solver_text(
 ) -> tuple[SolverParameter, Position]:
     """Return the solver in a text, and the positions of its parts; ``file`` is its name in errors."""
     solver = SolverParameter()
-    node = read_text(text, file, solver, report)
+    node = read_text(text, file, solver, report, forks().named_in(text, file))
     if upgrade:
         solver, node = upgrades.upgrade_solver(solver, node)
         solver = upgrades.upgrade_snapshot_prefix(solver, file)

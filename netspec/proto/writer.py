@@ -8,7 +8,7 @@ from typing import Any
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
 from google.protobuf.message import Message
 
-from netspec.proto.schema import Field, fields_of
+from netspec.proto.schema import Field, given
 
 _ESCAPES = {9: "\\t", 10: "\\n", 13: "\\r", 34: '\\"', 39: "\\'", 92: "\\\\"}
 
@@ -21,8 +21,7 @@ def write_text(message: Message) -> str:
 
 
 def _write(message: Message, indent: str, lines: list[str]) -> None:
-    fields = [f for f in fields_of(message.DESCRIPTOR).values() if f.present(message)]
-    for field in sorted(fields, key=lambda f: f.descriptor.number):
+    for field in given(message):
         for value in field.get(message) if field.repeated else [field.get(message)]:
             if field.type == Declared.TYPE_MESSAGE:
                 lines.append(f"{indent}{field.name} {{")

@@ -17,7 +17,7 @@ from netspec.exact import ALL, NONE
 from netspec.files.whole_file import whole_file, why_unwritable
 from netspec.graph.plan import Node
 from netspec.net.net import Net
-from netspec.proto.schema import added_fields
+from netspec.proto.schema import given
 from netspec.proto.source_map import Position
 from netspec.solver.lr_policy import policy_faults
 from netspec.solver.update import rule_faults
@@ -47,8 +47,9 @@ def check_settings(param: Any, node: Position, report: Report = raise_fault) -> 
 
 def fields_without_effect(param: Any, node: Position, read: frozenset[str] = frozenset()) -> Iterator[str]:
     """Yield a line for each field of a fork without effect; ``read`` are those that layers of the test nets read."""
-    for name, field in added_fields.get(param.DESCRIPTOR.full_name, {}).items():
-        if field.present(param) and name not in read:
+    for field in given(param):
+        name = field.name
+        if field.descriptor.is_extension and name not in read:
             yield f"{node.find(name)}: {name} has no effect: it is a fork's field, and nothing in these nets reads it"
 
 

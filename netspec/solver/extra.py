@@ -24,7 +24,7 @@ from netspec.files.whole_file import write_whole
 from netspec.net.assembly import WITHOUT_EFFECT
 from netspec.net.extra_file import FAULTS, Digest, damaged, extra_text, read_content, shown, whole_number
 from netspec.net.net import Net
-from netspec.proto.schema import fields_of
+from netspec.proto.schema import given
 from netspec.solver.snapshot import find_learned_net, read_state
 
 Settings = dict[str, dict[str, Any]]  # for the solver and for each net: name -> JSON value
@@ -90,8 +90,9 @@ def settings_of(param: Any, nets: Mapping[str, Net], run_settings: Mapping[str, 
 
 def _fields(message: Any, ignored: frozenset[str] | set[str]) -> Iterator[tuple[str, Any]]:
     """Yield the fields whose value is not the default; fields of inner messages have a path."""
-    for name, field in fields_of(message.DESCRIPTOR).items():
-        if name in ignored or not field.present(message):
+    for field in given(message):
+        name = field.name
+        if name in ignored:
             continue
         value = field.get(message)
         if field.descriptor.message_type is None:

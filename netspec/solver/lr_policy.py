@@ -65,13 +65,13 @@ def policy_faults(param: Any, node: Position) -> Iterator[SpecError]:
     Caffe detects a stepsize of 0 and a negative gamma only when it uses them. With a missing gamma or max_iter, its
     rate becomes 0 or infinite.
     """
-    known = [*POLICIES, *forks().policies()]
+    known = [*POLICIES, *forks().rates.policies]
     if param.lr_policy not in known:
         found = f'unknown lr_policy "{param.lr_policy}"' if param.lr_policy else "no lr_policy"
         hint = did_you_mean(param.lr_policy, known)
         yield SpecError(f"{found}, expected one of {', '.join(known)}{hint}", node.find("lr_policy"))
         return
-    if fault := forks().policy_fault(param):
+    if fault := forks().rates.fault(param):
         yield SpecError(fault, node.find("lr_policy"))
     for field in POLICIES[param.lr_policy].needs if param.lr_policy in POLICIES else ():
         value = getattr(param, field)
@@ -105,7 +105,7 @@ def learning_rate(param: Any, iteration: int, step: int) -> float:
         return POLICIES[param.lr_policy].rate(base, param, iteration, step)
 
     with np.errstate(all="ignore"):
-        rate = float(np.float32(forks().learning_rate(param, iteration, caffes)))
+        rate = float(np.float32(forks().rates.rate(param, iteration, caffes)))
     if not math.isfinite(rate):
         message = f'lr_policy "{param.lr_policy}" gives the learning rate {rate} at iteration {iteration}'
         raise SpecError(f"{message} (max_iter {param.max_iter})")

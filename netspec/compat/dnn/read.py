@@ -22,8 +22,8 @@ _CAFFE = (".prototxt", ".caffemodel", ".caffemodel.h5")
 def readNetFromCaffe(prototxt: FileOrBytes, caffeModel: FileOrBytes | None = None) -> Net:
     """Return the net of a prototxt with the weights of a .caffemodel (or .caffemodel.h5).
 
-    Each is a path or the content of the file: bytes, a bytearray or an array of bytes. The dialects that the prototxt
-    needs are activated. Raises DnnError.
+    Each is a path or the content of the file: bytes, a bytearray or an array of bytes. The prototxt may use
+    dialects. Raises DnnError.
     """
     if isinstance(caffeModel, str) and not caffeModel:
         caffeModel = None

@@ -57,7 +57,7 @@ class Net:
     """A net and its blobs in memory.
 
     ``Net(file, phase, level=0, stages=None, weights=None)`` builds the net of a prototxt for a phase (TRAIN or TEST),
-    ``Net(file, weights, phase)`` is the older form. The dialects that the prototxt needs are activated. Raises
+    ``Net(file, weights, phase)`` is the older form. The prototxt may use dialects. Raises
     RuntimeError for a missing file, SpecError (a ValueError) for every other fault of the files, and any exception of
     the code of a Python layer.
 

@@ -77,10 +77,10 @@ class Function:
         if own:
             messages.append(layer.DESCRIPTOR.fields_by_name[own].message_type)
         owners = f"{own} and LayerParameter have" if own else "LayerParameter has"
-        known = forks()
-        with_field = {d for message in messages for d in known.with_field(message.full_name, name)}
-        with_type = known.with_type(self.type_name)
-        advice = known.advice(name, tuple(sorted(with_field))) or known.advice(self.type_name, with_type)
+        known = forks().additions()
+        with_field = {d for message in messages for d in known.fields.get((message.full_name, name), ())}
+        with_type = known.types.get(self.type_name, ())
+        advice = known.advise(name, tuple(sorted(with_field))) or known.advise(self.type_name, with_type)
         fields = [field for message in messages for field in message.fields_by_name]
         hint = f"; {advice}" if advice else did_you_mean(name, fields)
         return f'layer of type "{self.type_name}": {owners} no field "{name}"{hint}'

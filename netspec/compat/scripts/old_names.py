@@ -152,8 +152,8 @@ def remedy(fault: BaseException) -> str:
     if np and _is_too_new(np) and text.startswith(one_element):
         return _TOO_NEW.format(np.__version__)
     if unknown := re.search(r'has no (?:field named )?"(\w+)"', text):
-        forks = importlib.import_module("netspec.proto.forks").forks()
-        return forks.advice(unknown[1], tuple(sorted(forks.with_field("", unknown[1]))))
+        additions = importlib.import_module("netspec.proto.forks").forks().additions()
+        return additions.advise(unknown[1], additions.with_field(unknown[1]))
     caffe = sys.modules.get("netspec.compat.pycaffe")
     if isinstance(fault, FileNotFoundError) and caffe and isinstance(fault.filename, str):
         name = relative(fault.filename, os.path.dirname(str(caffe.__file__)))

@@ -8,10 +8,12 @@ that changes numbers, such as ``larc``, is not declared, so it is refused.
 from __future__ import annotations
 
 import bisect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from netspec.proto.schema import added_fields
+from typing_extensions import override
+
+from netspec.proto.forks import Rates
 
 DECLARATIONS = """
 enum Type { DOUBLE = 0; FLOAT = 1; FLOAT16 = 2; INT = 3; UINT = 4; }
@@ -129,38 +131,49 @@ extend InnerProductParameter { optional AllEngines.Engine engine = 10300; }
 
 #: The warm-up of Intel and NVIDIA: its length, initial rate and exponent
 RAMPS = (("warmup_iter", "warmup_start_lr", 1), ("rampup_interval", "rampup_lr", 2))
-POLICIES = ("multifixed",)
-RATE_FIELDS = frozenset({"stagelr", "stageiter", "min_lr", *(name for ramp in RAMPS for name in ramp[:2])})
+LISTS = ("stagelr", "stageiter")  # the rates of "multifixed", and the iterations at which they end
+MULTIFIXED = "multifixed"
 
 
-def policy_fault(param: Any) -> str:
-    """Return what lr_policy "multifixed" lacks, "" for nothing."""
-    rates, ends = (len(_added_value(param, name, ())) for name in ("stagelr", "stageiter"))
-    if param.lr_policy != "multifixed" or rates == ends > 0:
-        return ""
-    return f'lr_policy "multifixed" needs as many stagelr as stageiter, found {rates} and {ends}'
+class SettingsRates(Rates):
+    """The learning rates of Intel, NVIDIA and Yuanjun Xiong."""
+
+    policies = (MULTIFIXED,)
+    fields = frozenset({*LISTS, "min_lr", *(name for ramp in RAMPS for name in ramp[:2])})
+
+    @override
+    def fault(self, param: Any) -> str:
+        """Return what lr_policy "multifixed" lacks, "" for nothing."""
+        added = _added(param)
+        rates, ends = (len(added.get(name, ())) for name in LISTS)
+        if param.lr_policy != MULTIFIXED or rates == ends > 0:
+            return ""
+        return f'lr_policy "multifixed" needs as many stagelr as stageiter, found {rates} and {ends}'
+
+    @override
+    def rate(self, param: Any, iteration: int, caffes: Callable[[float], Any]) -> Any:
+        """Return the rate of an iteration: of a ramp, at the start, or of the policy, at least min_lr."""
+        added = _added(param)
+        if not added:
+            return caffes(param.base_lr)
+        least = added.get("min_lr", 0)
+        found = _above(param, added, iteration, least, caffes)
+        return max(found, least) if least else found
 
 
-def learning_rate(param: Any, iteration: int, caffes: Callable[[float], Any]) -> Any:
-    """Return the rate of an iteration: of a ramp, at the start, or of the policy, at least min_lr."""
-    least = _added_value(param, "min_lr")
-    return max(_above(param, iteration, least, caffes), least) if least else _above(param, iteration, 0.0, caffes)
-
-
-def _above(param: Any, iteration: int, least: float, caffes: Callable[[float], Any]) -> Any:
+def _above(param: Any, added: Mapping[str, Any], iteration: int, least: float, caffes: Callable[[float], Any]) -> Any:
     for length, start, power in RAMPS:
-        if iteration < _added_value(param, length):
-            first = _added_value(param, start)
-            return first + (param.base_lr - first) * (iteration / _added_value(param, length)) ** power
-    if param.lr_policy == "multifixed":
-        rates, ends = _added_value(param, "stagelr"), _added_value(param, "stageiter")
+        if iteration < added.get(length, 0):
+            first = added.get(start, 0)
+            return first + (param.base_lr - first) * (iteration / added[length]) ** power
+    if param.lr_policy == MULTIFIXED:
+        rates, ends = (added[name] for name in LISTS)
         return rates[min(bisect.bisect_left(ends, iteration), len(ends) - 1)]
     if param.lr_policy == "poly" and least:
         return caffes(param.base_lr - least) + least
     return caffes(param.base_lr)
 
 
-def _added_value(param: Any, name: str, default: Any = 0) -> Any:
-    """Return the value of a field that the dialect added; ``default`` if the dialect is not active."""
-    field = added_fields.get(param.DESCRIPTOR.full_name, {}).get(name)
-    return default if field is None else field.get(param)
+def _added(param: Any) -> dict[str, Any]:
+    """Return the fields that were given and that the dialect added, by name."""
+    return {field.name: value for field, value in param.ListFields() if field.is_extension}

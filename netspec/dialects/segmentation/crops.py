@@ -8,12 +8,13 @@ Fork: s9xie/hed, src/caffe/layers/crop_layer.cpp. The rule became BVLC's python/
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
 from netspec.graph.plan import Plan
-from netspec.proto.schema import LayerParameter
+from netspec.proto.schema import LayerParameter, NetParameter
 
 Line = tuple[Fraction, Fraction]  # (scale, shift): pixel i is at scale i + shift
 SAME = (Fraction(1), Fraction(0))
@@ -56,7 +57,17 @@ EDGES = (
 )
 
 
-def align_crops(plan: Plan, dialects: Collection[str]) -> Iterator[str]:
+def with_aligned_crops(plan: Plan, dialects: Collection[str]) -> tuple[Plan, Sequence[str]]:
+    """Return a plan whose Crops without crop_param have offsets where HED's branch is meant, and warnings."""
+    if not any(layer.type == "Crop" for layer in plan.net.layer):
+        return plan, ()
+    net = NetParameter()
+    net.CopyFrom(plan.net)
+    aligned = replace(plan, net=net)
+    return aligned, list(_align(aligned, dialects))
+
+
+def _align(plan: Plan, dialects: Collection[str]) -> Iterator[str]:
     """Set the offsets of each Crop without crop_param as in HED's branch, if the net is made for it; yield warnings.
 
     It is if the dialect is named, or if a convolution before the Crop has more padding than its kernel, because only

@@ -113,6 +113,7 @@ class BN(NotLearned):
     Fork: hszhao/PSPNet, happynear/caffe-windows and alexgkendall/caffe-segnet, src/caffe/layers/bn_layer.cpp
     """
 
+    ignores_unit_axes = True  # TSN's and happynear's files have (1, C)
     tops = (1, 3)
 
     def setup(self) -> None:

@@ -13,7 +13,8 @@ import numpy as np
 
 from netspec.data.random_words import derived
 from netspec.data.sources import Arrays, Cursor, Draws, Source
-from netspec.dialects.files import activate_file, find_file
+from netspec.dialects.known import dialect
+from netspec.dialects.registry import declare
 from netspec.dialects.ssd.augment import COLUMNS, Augmenter, fixed_size, wrong_settings
 from netspec.errors import SpecError, Where
 from netspec.files.opencv import cv2
@@ -125,7 +126,7 @@ class VideoData(ReadingLayer):
     in_order = True
 
     def construct(self) -> None:
-        activate_file(find_file("ssd"))  # its transform_param
+        declare(dialect("ssd"))  # its transform_param
         super().construct()
 
     def wrong_settings(self) -> Iterator[SpecError]:

@@ -33,7 +33,7 @@ def key_of(files: Sequence[str | Path], options: Mapping[str, Any]) -> str:
     Raises SpecError for a file that cannot be read.
     """
     digests = [_digest(path) for path in files]
-    dialects = [[name, _digest(file) if file else source] for name, file, source in forks().active()]
+    dialects = [[name, _digest(file) if file else source] for name, file, source in forks().sources()]
     parts = {"code": _code(), "files": digests, "dialects": dialects, "options": options}
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 

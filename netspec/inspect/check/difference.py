@@ -9,7 +9,7 @@ from typing import Any
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Declared
 
 from netspec.errors import Where, printable
-from netspec.proto.schema import Field, fields_of
+from netspec.proto.schema import Field, fields_of, given
 from netspec.proto.source_map import Position
 from netspec.proto.writer import scalar_text
 
@@ -73,9 +73,9 @@ def differences(first: Any, second: Any, here: Position, there: Position, ignore
                 done.update((name, *sides))
                 one, other = (_window(message, fields, name, sides, default) for message in (first, second))
                 if one != other:
-                    given = [n for n in (name, *sides) if here.fields.get(n)] or [name]
+                    named = [n for n in (name, *sides) if here.fields.get(n)] or [name]
                     yield Difference(
-                        here.find(given[0]), f"{name} is {_times(other)}, was {_times(one)}", there.find(name)
+                        here.find(named[0]), f"{name} is {_times(other)}, was {_times(one)}", there.find(name)
                     )
     for old, name in OLD_NAMES.items():
         if old in fields:
@@ -83,8 +83,9 @@ def differences(first: Any, second: Any, here: Position, there: Position, ignore
             one, other = (fields[old if fields[old].present(m) else name].get(m) for m in (first, second))
             if one != other:
                 yield Difference(here.find(name), f"{name} is {other}, was {one}", there.find(name))
-    for name, field in fields.items():
-        if name not in done:
+    added = {f.descriptor.full_name: f for m in (first, second) for f in given(m) if f.descriptor.is_extension}
+    for field in (*fields.values(), *added.values()):
+        if field.name not in done:
             yield from _in_field(first, second, here, there, field)
 
 
@@ -120,9 +121,9 @@ def _window(message: Any, fields: dict[str, Field], name: str, sides: list[str],
     if any(fields[side].present(message) for side in sides):
         return tuple(fields[side].get(message) for side in sides)
     values = fields[name].get(message)
-    given = tuple(values) if fields[name].repeated else (values,)
-    given = given or (default,)
-    return given[:1] * 2 if len(set(given)) == 1 else given
+    found = tuple(values) if fields[name].repeated else (values,)
+    found = found or (default,)
+    return found[:1] * 2 if len(set(found)) == 1 else found
 
 
 def _times(sizes: tuple[int, ...]) -> str:

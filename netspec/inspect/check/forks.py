@@ -15,11 +15,12 @@ MOST_LINES = 8  # number of lines to list in an error
 
 def unknown_types(net: NetParameter, source: SourceMap) -> Iterator[ForkFault]:
     """Yield a fault for each layer of a type that is not known."""
+    dialects = {*source.dialects, *forks().dialects_of(net)}
     for i, layer in enumerate(net.layer):
-        if layer_class(layer.type) is None:
+        if layer_class(layer.type, dialects) is None:
             where = source.at(i, "type", layer=layer.name, type=layer.type)
             message = unknown_type(layer.type)
-            yield ForkFault(message, where, "layer", layer.type, forks().with_type(layer.type))
+            yield ForkFault(message, where, "layer", layer.type, forks().additions().types.get(layer.type, ()))
 
 
 def python_layers(net: NetParameter, source: SourceMap) -> Iterator[SpecError]:

@@ -10,7 +10,7 @@ from netspec.graph.plan import Plan
 from netspec.inspect.check.findings import NET, PLAN, TEXT, Findings, rule
 from netspec.layers import layer_class
 from netspec.net.net import Net
-from netspec.proto.schema import TEST, TRAIN, NetParameter, fields_of
+from netspec.proto.schema import TEST, TRAIN, NetParameter, fields_of, given
 from netspec.proto.source_map import SourceMap
 
 WITHOUT_GRADIENT = frozenset({"Accuracy", "ArgMax", "Threshold"})
@@ -265,9 +265,9 @@ def _is_training(plan: Plan) -> bool:
 
 def own_settings(layer: Any) -> Iterator[tuple[str, Any]]:
     """Yield the names and messages of the fields with a layer's own settings."""
-    for name, field in fields_of(layer.DESCRIPTOR).items():
-        if name.endswith("_param") and not field.repeated and field.present(layer):
-            yield name, field.get(layer)
+    for field in given(layer):
+        if field.name.endswith("_param") and not field.repeated:
+            yield field.name, field.get(layer)
 
 
 def _where(plan: Plan, i: int, *path: str | int) -> Where:

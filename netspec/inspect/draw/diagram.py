@@ -21,7 +21,7 @@ from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Node, Plan, make_plan
 from netspec.layers import Layer, layer_class
 from netspec.net.build import build_filtered
-from netspec.proto.schema import PHASE_NAMES, NetParameter, PhaseValue, fields_of
+from netspec.proto.schema import PHASE_NAMES, NetParameter, PhaseValue, given
 from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.text import write_text
 from netspec.proto.writer import scalar_text
@@ -38,31 +38,31 @@ NOT_SHOWN_VALUES = (("group", "1"), ("dilation", "1"))
 def settings_text(layer: Any) -> str:
     """Return the layer's own settings in the prototxt, without inner messages (fillers, lists of shapes)."""
     words: list[str] = []
-    for name, field in fields_of(layer.DESCRIPTOR).items():
-        if name.endswith(OWN) and name not in COMMON and not field.repeated and field.present(layer):
+    for field in given(layer):
+        if field.name.endswith(OWN) and field.name not in COMMON and not field.repeated:
             words += _words(field.get(layer))
     return ", ".join(words[:MOST_SETTINGS])
 
 
 def _words(param: Any) -> Iterator[str]:
-    given: dict[str, Any] = {}
-    for field in fields_of(param.DESCRIPTOR).values():
-        name = field.name
-        if field.type != Declared.TYPE_MESSAGE and field.present(param) and name not in NOT_SHOWN:
-            given[name] = _value(field, field.get(param))
+    shown = {
+        field.name: _value(field, field.get(param))
+        for field in given(param)
+        if field.type != Declared.TYPE_MESSAGE and field.name not in NOT_SHOWN
+    }
     for name, (high, wide) in WINDOWS.items():
-        sizes = given[name].split("×") if name in given else [given.pop(side, DEFAULTS[name]) for side in (high, wide)]
-        given.pop(name, None)
+        sizes = shown[name].split("×") if name in shown else [shown.pop(side, DEFAULTS[name]) for side in (high, wide)]
+        shown.pop(name, None)
         if set(sizes) == {DEFAULTS[name]}:
             continue
         if len(set(sizes)) > 1:
-            given[name] = "×".join(sizes)
+            shown[name] = "×".join(sizes)
         else:
-            given[name] = f"{sizes[0]}×{sizes[0]}" if name == "kernel_size" else sizes[0]
+            shown[name] = f"{sizes[0]}×{sizes[0]}" if name == "kernel_size" else sizes[0]
     for name in ("kernel_size", "num_output", "pool"):
-        if name in given:
-            yield given.pop(name)
-    for name, value in given.items():
+        if name in shown:
+            yield shown.pop(name)
+    for name, value in shown.items():
         if value == "true":
             yield name.replace("_", " ")
         elif (name, value) not in NOT_SHOWN_VALUES:

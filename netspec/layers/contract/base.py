@@ -78,6 +78,7 @@ class Layer(torch.nn.Module):
     ahead: int = 0  # bytes of the batches that it reads ahead
     waited: float = 0.0  # the seconds that forward passes have waited for records
     num_records: int = 0  # 0: it reads none, or the data is not open
+    ignores_unit_axes: ClassVar[bool] = False  # files may store its blobs with other axes of size 1
     changes_itself: bool = False  # a pass changes its state, so it can be neither prepared nor copied
     passes_on: bool = False  # every top is the bottom, unchanged, at the present settings
     # what the layer before it may compute too: "relu" (max(x, 0)), "scale" (factors and biases of channels)

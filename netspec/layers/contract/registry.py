@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Collection
 from typing import TypeVar
 
 from netspec.errors import did_you_mean
@@ -22,31 +23,38 @@ def register(type_name: str, *reads: str) -> Callable[[L], L]:
     others (netspec/net/assembly.py).
     """
 
+    module = calling_module()
+
     def add(cls: L) -> L:
-        assert type_name not in _LAYERS, f"layer type {type_name} registered twice"
         cls.type = type_name
         cls.reads = frozenset(reads)
-        _LAYERS[type_name] = cls
+        if not forks().adopt(cls, module):
+            assert type_name not in _LAYERS, f"layer type {type_name} registered twice"
+            _LAYERS[type_name] = cls
         return cls
 
     return add
 
 
+def calling_module() -> str:
+    """Return the name of the module that called the caller. A fork's module may register the classes of another."""
+    return sys._getframe(2).f_globals["__name__"]
+
+
 def registered(type_name: str) -> type[Layer] | None:
-    """Return the class registered for a type so far, or None."""
+    """Return the class that Caffe, or the program, has for a type, or None."""
     return _LAYERS.get(type_name)
 
 
-def layer_class(type_name: str) -> type[Layer] | None:
-    """Return the class of a layer type, or None. If one known fork defines the type, it is registered first."""
-    if type_name not in _LAYERS:
-        forks().register_type(type_name)
-    return _LAYERS.get(type_name)
+def layer_class(type_name: str, dialects: Collection[str] = ()) -> type[Layer] | None:
+    """Return the class of a layer type: Caffe's, or that of the only fork or dialect that can be meant; or None."""
+    return registered(type_name) or forks().class_of(LayerParameter(type=type_name), dialects, False)
 
 
 def class_of(param: LayerParameter, options: BuildOptions | None = None) -> type[Layer] | None:
     """Return the class of a layer, or None: that of ``options.dialects`` for it, or else that of its type."""
-    return forks().class_of(param, options) or layer_class(param.type)
+    dialects, runs_python = (options.dialects, options.allow_python) if options else ((), False)
+    return forks().class_of(param, dialects, runs_python) or registered(param.type)
 
 
 def source_of(param: LayerParameter) -> str:
@@ -56,15 +64,16 @@ def source_of(param: LayerParameter) -> str:
 
 
 def layer_types() -> list[str]:
-    """Return all registered types, in alphabetical order."""
-    return sorted(_LAYERS)
+    """Return Caffe's types, and those of the dialects that a user added for every net, in alphabetical order."""
+    types = forks().additions().types if forks().everywhere else {}
+    return sorted({*_LAYERS, *(name for name, owners in types.items() if {*owners} & {*forks().everywhere})})
 
 
 def unknown_type(type_name: str) -> str:
     """Return the message for an unknown type, with a similar type or the fork that defines it."""
-    known = forks()
-    advice = known.advice(type_name, known.with_type(type_name))
-    close = did_you_mean(type_name, sorted({*layer_types(), *known.layer_types()}), near=True) or ";"
-    new = f", {known.new_layer}" if known.new_layer else ""
+    additions, new_layer = forks().additions(), forks().new_layer
+    advice = additions.advise(type_name, additions.types.get(type_name, ()))
+    close = did_you_mean(type_name, sorted({*layer_types(), *additions.types}), near=True) or ";"
+    new = f", {new_layer}" if new_layer else ""
     hint = f"; {advice}" if advice else f"{close} `netspec layers` lists the known ones{new}"
     return f'unknown layer type "{type_name}"{hint}'

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from google.protobuf.message import Message
 
 from netspec.errors import Where
-from netspec.proto.schema import Field, fields_of
+from netspec.proto.schema import Field, fields_of, given, same_field
 from netspec.proto.source_map import Position
 
 M = TypeVar("M", bound=Message)
@@ -26,15 +26,17 @@ class Draft:
 
     def copy(self, message: Message, positions: Position, leave_out: Collection[str] = ()) -> None:
         """Copy all fields of a message that this one also has, except those to omit."""
-        for name, field in fields_of(message.DESCRIPTOR).items():
-            if name not in leave_out and name in fields_of(self.message.DESCRIPTOR) and field.present(message):
-                self.put(name, field.get(message), positions.fields.get(field.name, ()))
+        for field in given(message):
+            if field.name not in leave_out and (mine := same_field(field, self.message)):
+                self._put(mine, field.get(message), positions.fields.get(field.name, ()))
 
     def put(self, name: str, value: Any, positions: tuple[Position, ...]) -> None:
         """Set a field, or add one or several values to a repeated one."""
-        field = fields_of(self.message.DESCRIPTOR)[name]
+        self._put(fields_of(self.message.DESCRIPTOR)[name], value, positions)
+
+    def _put(self, field: Field, value: Any, positions: tuple[Position, ...]) -> None:
         _put(self.message, field, value)
-        before = self.positions.get(name, ()) if field.repeated else ()
+        before = self.positions.get(field.name, ()) if field.repeated else ()
         self.positions[field.name] = (*before, *positions)
 
     def inner(self, name: str, where: Where) -> Draft:
@@ -65,7 +67,7 @@ def _put(message: Message, field: Field, value: Any) -> None:
 def copy_without(message: M, leave_out: Collection[str]) -> M:
     """Return a copy of a message without some of its fields; these are never copied, not even temporarily."""
     result = type(message)()
-    for name, field in fields_of(message.DESCRIPTOR).items():
-        if name not in leave_out and field.present(message):
+    for field in given(message):
+        if field.name not in leave_out:
             _put(result, field, field.get(message))
     return result

@@ -4,7 +4,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,9 @@ import pytest
 
 import netspec
 import netspec.dialects
-from fresh_dialects import activated_by
+from fresh_dialects import used_by
 from netspec.cli import main
-from netspec.dialects import files as dialect_files
-from netspec.dialects import registry as dialect
-from netspec.dialects import use_dialect
+from netspec.dialects import known, use_dialect
 from netspec.dialects.files import find_file, known_files, read_dialect
 from netspec.errors import SpecError
 from netspec.layers import layer_class, layer_types
@@ -47,11 +44,11 @@ def fork(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def fresh_files() -> Iterator[None]:
-    known_files.cache_clear()
-    dialect_files.announce_known.cache_clear()
+    for cached in (known_files, known._found, known._additions):
+        cached.cache_clear()
     yield
-    known_files.cache_clear()
-    dialect_files.announce_known.cache_clear()
+    for cached in (known_files, known._found, known._additions):
+        cached.cache_clear()
 
 
 # ---- A file of the user ----
@@ -66,7 +63,7 @@ def test_the_documented_example_works_in_commands(fork: Path, capsys: pytest.Cap
     assert main(["-plugin", str(fork), "check", net]) == 2  # an option of the command
     assert main(["layers", "--plugin", str(fork)]) == 0
     assert re.search(r"^Times +Multiply by a number\.$", capsys.readouterr().out, re.MULTILINE)
-    assert dialect.active() == ["doubling"]
+    assert known.added() == ("doubling",)
 
 
 def test_the_documented_example_computes(fork: Path) -> None:
@@ -84,11 +81,11 @@ def test_upgrade_net_proto_text_keeps_fields_of_a_dialect(fork: Path, tmp_path: 
     assert "times_param {\n    factor: 5" in out.read_text()
 
 
-def test_several_plugins_are_active_at_once(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_plugins_are_added_at_once(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["layers", "--plugin", str(fork), "--plugin", "ssd", "--plugin", "blocks"]) == 0
     found = {line.split()[0] for line in capsys.readouterr().out.splitlines()}
     assert {"Times", "PriorBox", "MultiBoxLoss", "Axpy", "Convolution"} <= found
-    assert dialect.active() == ["blocks", "doubling", "ssd"]
+    assert known.added() == ("doubling", "ssd", "blocks")
 
 
 FAULTS = {
@@ -140,7 +137,7 @@ def test_errors_of_a_plugin_are_reported_in_one_line(
     assert main(["layers", "--plugin", name.format(path=path)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(message.format(path=path))
-    assert dialect.active() == []
+    assert known.added() == ()
 
 
 def test_two_dialects_with_the_same_type_number_or_name_are_refused(fork: Path, tmp_path: Path) -> None:
@@ -158,7 +155,7 @@ def test_two_dialects_with_the_same_type_number_or_name_are_refused(fork: Path, 
     namesake = tmp_path / "elsewhere" / "doubling.py"
     namesake.parent.mkdir()
     namesake.write_text('DECLARATIONS = "extend LayerParameter { optional int32 more = 1001; }"\n')
-    with pytest.raises(SpecError, match=rf'^{namesake}: another dialect "doubling" is active, from {fork}$'):
+    with pytest.raises(SpecError, match=rf'^{namesake}: another dialect "doubling" was added, from {fork}$'):
         use_dialect(namesake)
 
 
@@ -166,23 +163,23 @@ def test_any_file_name_can_be_used(tmp_path: Path) -> None:
     path = tmp_path / "my-fork 2.py"
     path.write_text('DECLARATIONS = "extend LayerParameter { optional int32 my_fork = 1002; }"\n')
     use_dialect(path)
-    assert dialect.active() == ["my_fork_2"]
+    assert known.added() == ("my_fork_2",)
     parse_net_text("layer { my_fork: 3 }", "f")
 
 
-# ---- Activated by fields and types, and layer types ----
+# ---- Used because of fields and types, and layer types ----
 
 FOUND = """
-import sys
-from netspec.dialects.registry import active
+import logging, sys
 from netspec.proto.text import parse_net_text
+logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
 for text in sys.argv[1:]:
     parse_net_text(text, "f")
-print(active(), "torch" in sys.modules)
+print("torch" in sys.modules)
 """
 
 
-def test_a_field_activates_its_dialect_without_importing_torch() -> None:
+def test_a_field_shows_its_dialect_without_importing_torch() -> None:
     texts = [
         "layer { prior_box_param { min_size: 1 } }",
         "layer { dropout_param { scale_train: true } }",
@@ -190,10 +187,10 @@ def test_a_field_activates_its_dialect_without_importing_torch() -> None:
     ]
     command = [sys.executable, "-c", FOUND, *texts]
     said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert said == "['blocks', 'filters', 'ssd'] False\n"
+    assert said.splitlines() == [*(f"f: uses the dialect {name}" for name in ("ssd", "filters", "blocks")), "False"]
 
 
-def test_a_layer_type_activates_its_dialect(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_layer_type_shows_its_dialect(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     net = tmp_path / "net.prototxt"
     for kind in ("MultiBoxLoss", "Axpy", "PSROIPooling"):
         net.write_text(f'layer {{ name: "l" type: "{kind}" top: "x" }}')
@@ -208,15 +205,16 @@ def test_a_layer_type_activates_its_dialect(tmp_path: Path, capsys: pytest.Captu
 def test_a_layer_type_of_two_dialects_is_refused_with_the_options_to_give(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    dialect_files.announce_known()
-    for name in ("ssd", "blocks"):
-        known = dialect._known[name]
-        dialect.announce(replace(known, layer_types=(*known.layer_types, "Lens")))
     net = tmp_path / "net.prototxt"
-    net.write_text('layer { name: "l" type: "Lens" top: "x" }')
+    net.write_text('layer { name: "l" type: "ImageLabelmapData" top: "x" top: "y" }')
     assert main(["check", str(net)]) == 1
     said = capsys.readouterr().err
-    assert 'unknown layer type "Lens"; dialects "blocks" and "ssd" have "Lens"; add --plugin blocks' in said
+    assert 'unknown layer type "ImageLabelmapData"; dialects "hed" and "rcf" have "ImageLabelmapData"; add --' in said
+    assert 'or write "# dialect: hed" into the prototxt' in said
+    for name in ("rcf", "hed"):
+        net.write_text(f'# dialect: {name}\nlayer {{ name: "l" type: "ImageLabelmapData" top: "x" top: "y" }}')
+        assert main(["check", str(net)]) == 1
+        assert 'layer "l" (ImageLabelmapData): source is missing' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", sorted(known_files()))
@@ -266,36 +264,36 @@ def test_an_entry_point_of_a_package_is_used_and_invalid_ones_are_reported(
     assert cls.__module__ == "forky.doubling"
 
 
-# ---- Activated by a whole prototxt ----
+# ---- Used by a whole prototxt ----
 
 
-def test_a_prototxt_activates_the_dialects_it_needs(fresh_files: None) -> None:
+def test_a_prototxt_uses_the_dialects_it_needs(fresh_files: None) -> None:
     text = 'layer { name: "n" type: "Normalize" bottom: "x" top: "n" norm_param { across_spatial: false } }'
-    assert activated_by(text) == ["ssd"]
+    assert used_by(text) == ["ssd"]
     assert layer_class("Normalize") is not None
 
 
-def test_a_prototxt_of_caffes_layers_activates_no_dialect(fresh_files: None) -> None:
+def test_a_prototxt_of_caffes_layers_uses_no_dialect(fresh_files: None) -> None:
     text = 'layer { name: "Normalize" type: "ReLU" bottom: "Permute" top: "Swish" }'  # names, not types
-    assert activated_by(text) == []
+    assert used_by(text) == []
 
 
-def test_a_field_that_caffe_has_in_another_message_activates_its_dialect(fresh_files: None) -> None:
+def test_a_field_that_caffe_has_in_another_message_shows_its_dialect(fresh_files: None) -> None:
     before = layer_class("BatchNorm")
     text = 'layer { type: "Convolution" convolution_param { num_output: 1 bias_filler { type: "constant" } } }'
-    assert activated_by(text) == []
-    assert activated_by('layer { type: "BatchNorm" batch_norm_param { bias_filler { } } }') == ["nvidia"]
+    assert used_by(text) == []
+    assert used_by('layer { type: "BatchNorm" batch_norm_param { bias_filler { } } }') == ["nvidia"]
     assert layer_class("BatchNorm") is before
 
 
 @pytest.mark.slow
-def test_a_prototxt_of_two_dialects_activates_both(fresh_files: None) -> None:
+def test_a_prototxt_of_two_dialects_uses_both(fresh_files: None) -> None:
     text = 'layer { type: "Permute" permute_param { order: 0 } } layer { type: "Axpy" } layer { type: "Normalize" }'
-    assert activated_by(text) == ["ssd", "blocks"]
+    assert used_by(text) == ["ssd", "blocks"]
 
 
-def test_unknown_fields_and_types_activate_no_dialect(fresh_files: None) -> None:
-    assert activated_by('layer { type: "NoSuchType" no_such_param { } }') == []
+def test_unknown_fields_and_types_use_no_dialect(fresh_files: None) -> None:
+    assert used_by('layer { type: "NoSuchType" no_such_param { } }') == []
 
 
 def test_docs_forks_md_lists_every_dialect() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fresh_dialects import activated_by
+from fresh_dialects import used_by
 from netspec.errors import SpecError
 from netspec.layers import Layer, activation
 from netspec.layers.vision import pooling
@@ -23,7 +23,7 @@ def test_hole_in_a_file_of_the_older_format_activates_the_dialect() -> None:
     text = """input: "data" input_dim: 1 input_dim: 3 input_dim: 9 input_dim: 9
         layers { bottom: "data" top: "fc6" name: "fc6" type: CONVOLUTION
           convolution_param { num_output: 4 pad: 2 hole: 2 kernel_size: 3 } }"""
-    assert activated_by(text) == ["filters"]
+    assert used_by(text) == ["filters"]
     assert build_net(*parse_net_text(text, "net.prototxt")).shapes["fc6"] == (1, 4, 9, 9)
 
 

@@ -9,7 +9,6 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -22,9 +21,7 @@ from benchmarks.pages import write
 from dialect_numbers import NUMBERS
 from fresh_dialects import fresh_dialects
 from golden_cases import LayerCase, layer_distances, parameters, set_parameters, train
-from netspec.dialects import use_dialect
-from netspec.dialects.files import announce_known
-from netspec.dialects.registry import known
+from netspec.dialects import known, use_dialect
 from netspec.errors import SpecError
 from paths import GOLDEN, ROOT
 
@@ -162,7 +159,8 @@ def table(monkeypatch: pytest.MonkeyPatch, margin: float = 1) -> list[tuple[str,
             continue
         kind = re.findall(r'layer \{[^{]*?type: "(\w+)"', (folder / "net.prototxt").read_text())[-1]
         monkeypatch.chdir(GOLDEN / "ssd")  # name_size.txt
-        with pytest.MonkeyPatch.context() as patch, contextmanager(fresh_dialects)(patch):
+        with pytest.MonkeyPatch.context() as patch:
+            fresh_dialects(patch)
             if name in NAMED:
                 use_dialect(NAMED[name])
             off = max(differences(case).values(), default=0.0)
@@ -187,7 +185,7 @@ def table(monkeypatch: pytest.MonkeyPatch, margin: float = 1) -> list[tuple[str,
 def layer_types() -> dict[str, list[str]]:
     """Return the dialects that have a layer type, or put a layer in the place of one of Caffe's."""
     owners: dict[str, list[str]] = {}
-    for dialect in known():
+    for dialect in known._found().values():
         if not Path(dialect.file).is_relative_to(ROOT / "netspec"):  # of a package, from another test
             continue
         source = Path(dialect.file).read_text()
@@ -211,7 +209,6 @@ def golden_cases() -> Iterator[tuple[Path, str]]:
 
 
 if __name__ == "__main__":
-    announce_known()
     rows = [dict(zip(COLUMNS, row, strict=True)) for row in table(pytest.MonkeyPatch(), margin=2)]
     note = {"note": "differences are rounded up, so that those of other processors are not larger"}
     command = "PYTHONPATH=.:tests python tests/netspec/dialects/test_forks_golden.py"

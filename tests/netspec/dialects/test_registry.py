@@ -1,6 +1,6 @@
-"""The declarations of dialects: their fields and messages are known only while the dialect is active."""
+"""The declarations of dialects: their fields and messages, and what is refused."""
 
-from collections.abc import Iterator
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +8,9 @@ import pytest
 from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto, FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 
-from netspec.dialects import registry as dialect
+from netspec.dialects import known
 from netspec.dialects.declarations import read_declarations
-from netspec.dialects.registry import Dialect
+from netspec.dialects.registry import Dialect, declare
 from netspec.errors import SpecError
 from netspec.proto import schema
 from netspec.proto.schema import BlobProto, LayerParameter, NetParameter
@@ -22,17 +22,24 @@ SOURCE = (Path(__file__).parent / "nets" / "dialect.proto").read_text()
 NET = (Path(__file__).parent / "nets" / "dialect.prototxt").read_text()
 
 
+MADE_UP = Dialect("madeup", SOURCE, ("Warp", "Bend"), "add --plugin madeup")
+
+
+def add(dialect: Dialect) -> None:
+    found = known.to_add(dialect)
+    assert found is dialect
+    declare(dialect)
+    known.add(dialect)
+
+
 @pytest.fixture
-def fork() -> Iterator[Dialect]:
-    made_up = Dialect("madeup", SOURCE, ("Warp", "Bend"), "add --plugin madeup")
-    dialect.activate(made_up)
-    yield made_up
-    if "madeup" in dialect.active():
-        dialect.deactivate("madeup")
+def fork() -> Dialect:
+    add(MADE_UP)
+    return MADE_UP
 
 
 @pytest.mark.usefixtures("fork")
-def test_fields_of_an_active_dialect_are_read_and_written() -> None:
+def test_fields_of_a_dialect_are_read_and_written() -> None:
     net, source = parse_net_text(NET, "f")
     layer = net.layer[0]
     warp = schema.value(layer, "warp_param")
@@ -66,33 +73,32 @@ def test_upgrades_carry_a_dialects_fields() -> None:
     assert str(source.at(2, "ages")) == "f:3:2"
 
 
-def test_classes_and_schema_are_caffes_without_a_dialect(fork: Dialect) -> None:
+def test_classes_and_schema_are_caffes_with_and_without_a_dialect(monkeypatch: pytest.MonkeyPatch) -> None:
     before = LayerParameter, schema.message("LayerParameter")
-    dialect.deactivate(fork.name)
+    with monkeypatch.context() as patch:
+        patch.setattr(known, "_added", {})
+        add(MADE_UP)
+        parse_net_text("layer { warp_param {} }", "f")
     assert (LayerParameter, schema.message("LayerParameter")) == before
-    assert dialect.active() == []
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError, match=r'^f:2:2: LayerParameter has no field "warp_param"'):
         parse_net_text("layer {\n warp_param {} }", "f")
-    assert str(caught.value) == (
-        'f:2:2: LayerParameter has no field "warp_param"; dialect "madeup" has "warp_param"; add --plugin madeup'
-    )
-    dialect.activate(fork)
-    assert dialect.active() == ["madeup"]
-    parse_net_text("layer { warp_param {} }", "f")
 
 
-def test_an_unknown_type_or_field_is_an_error_with_the_dialects_that_have_it() -> None:
-    dialect.announce(
-        Dialect("one", "extend LayerParameter { optional int32 lens = 700; }", ("Lens",), "add --plugin one")
-    )
-    dialect.announce(Dialect("two", "extend LayerParameter { optional int32 lens = 800; }", ("Lens",)))
-    both = ("one", "two")
-    assert dialect.dialects_with_type("Lens") == both
-    assert dialect.dialects_with_field("caffe.LayerParameter", "lens") == both
-    assert dialect.advice_for("Lens", both) == 'dialects "one" and "two" have "Lens"; add --plugin one'
-    assert dialect.dialects_with_field("caffe.PoolingParameter", "lens") == ()
-    assert dialect.dialects_with_type("ReLU") == ()
-    assert dialect.advice_for("ReLU", ()) == ""
+def test_an_unknown_type_or_field_is_an_error_with_the_dialects_that_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = Dialect("one", "extend LayerParameter { optional int32 lens = 700; }", ("Lens",), "add --plugin one")
+    two = Dialect("two", "extend LayerParameter { optional int32 lens = 800; }", ("Lens",))
+    found = known._found()
+    monkeypatch.setattr(known, "_found", lambda: {**found, "one": one, "two": two})
+    known._additions.cache_clear()
+    additions, both = known.known(), ("one", "two")
+    assert additions.types["Lens"] == both
+    assert additions.fields["caffe.LayerParameter", "lens"] == both
+    advice = 'dialects "one" and "two" have "lens"; add --plugin one, or write "# dialect: one" into the prototxt'
+    assert additions.advise("lens", both) == advice
+    assert additions.advise("ReLU", ()) == ""
+    with pytest.raises(SpecError, match=re.escape(advice)):
+        parse_net_text("layer { lens: 1 }", "f")
+    known._additions.cache_clear()
 
 
 REFUSED = {
@@ -125,19 +131,29 @@ REFUSED = {
 @pytest.mark.parametrize(("source", "message"), REFUSED.values(), ids=REFUSED.keys())
 def test_bad_declarations_are_refused(source: str, message: str) -> None:
     with pytest.raises(SpecError) as caught:
-        dialect.activate(Dialect("bad", source))
+        add(Dialect("bad", source))
     assert message in str(caught.value)
-    assert "bad" not in dialect.active()
+    assert known.added() == ()
 
 
-def test_two_dialects_with_the_same_field_are_not_active_together(fork: Dialect) -> None:
+@pytest.mark.usefixtures("fork")
+def test_two_dialects_with_the_same_field_are_not_added_to_every_net() -> None:
     rival = Dialect("rival", "extend LayerParameter { optional int32 warp_param = 950; }")
     with pytest.raises(SpecError, match=r'^rival\.proto: caffe\.LayerParameter already has a field "warp_param"$'):
-        dialect.activate(rival)
-    dialect.deactivate(fork.name)
-    dialect.activate(rival)
-    assert schema.value(LayerParameter(), "warp_param") == 0
-    dialect.deactivate("rival")
+        add(rival)
+
+
+def test_two_texts_of_two_dialects_with_the_same_field_do_not_see_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    rival = Dialect("rival", "extend LayerParameter { optional int32 warp_param = 900; }")
+    texts = {MADE_UP: "layer { warp_param { border: ZERO } }", rival: "layer { warp_param: 3 }"}
+    for dialect in (MADE_UP, rival, MADE_UP):
+        monkeypatch.setattr(known, "_added", {})
+        add(dialect)
+        (layer,) = parse_net_text(texts[dialect], "f")[0].layer
+        found = schema.value(layer, "warp_param")
+        assert found == 3 if dialect is rival else found.HasField("border")
+    (field,) = schema.given(layer)
+    assert field.descriptor.file.package == "caffe.madeup"
 
 
 def test_declarations_equal_those_compiled_by_protoc(tmp_path: Path) -> None:

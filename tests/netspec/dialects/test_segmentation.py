@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from fresh_dialects import activated_by
+from fresh_dialects import used_by
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.layers import Context, Layer
@@ -107,7 +107,7 @@ def test_values_below_127_in_edge_maps_are_zero_for_hed_and_kept_for_rcf(pairs: 
 
 def test_a_layer_type_of_hed_and_rcf_is_refused_with_the_options_to_give(pairs: Path) -> None:
     text = EDGES % (pairs, pairs)
-    assert activated_by(text) == []
+    assert used_by(text) == []
     with pytest.raises(SpecError, match='dialects "hed" and "rcf" have "ImageLabelmapData"; add --plugin hed'):
         build_net(*parse_net_text(text, "net.prototxt"))
 

@@ -8,6 +8,7 @@ import netspec
 from netspec.dialects.files import known_files
 from netspec.dialects.signatures import SIGNATURES
 from netspec.layers import layer_class
+from netspec.proto.forks import forks
 from netspec.proto.schema import LayerParameter, fields_of
 
 
@@ -16,12 +17,11 @@ def test_the_table_contains_existing_dialects_types_and_fields_only(kind: str) -
     signature = SIGNATURES[kind]
     assert {fork.dialect for fork in signature.forks} <= known_files().keys()
     assert layer_class(kind) is not None
-    for fork in signature.forks:
-        netspec.use_dialect(fork.dialect)
-    for field in (field for fork in signature.forks for field in fork.fields):
-        outer, _, inner = field.partition(".")
-        found = fields_of(LayerParameter.DESCRIPTOR)[outer]
-        assert not inner or inner in fields_of(found.descriptor.message_type)
+    own = fields_of(LayerParameter.DESCRIPTOR)
+    for outer, _, inner in (field.partition(".") for fork in signature.forks for field in fork.fields):
+        owners = () if outer in own else forks().additions().fields["caffe.LayerParameter", outer]
+        found = [forks().field(owner, "caffe.LayerParameter", outer) for owner in owners] or [own[outer]]
+        assert not inner or any(inner in fields_of(field.descriptor.message_type) for field in found)
 
 
 def test_a_layer_of_several_forks_gets_a_warning(caplog: pytest.LogCaptureFixture) -> None:

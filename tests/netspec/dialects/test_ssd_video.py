@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
-from fresh_dialects import activated_by
+from fresh_dialects import used_by
 from netspec.cli import main
 from netspec.errors import SpecError
 from netspec.net.net import Net
@@ -119,7 +119,7 @@ def test_errors_are_reported_in_one_line_with_their_place(
     monkeypatch.chdir(video.parent)
     Path("net.prototxt").write_text(LAYER % (given, 1, 4, ""))
     assert main(["check", "net.prototxt", "--data"]) == 1
-    said = [line for line in "".join(capfd.readouterr()).splitlines() if "switched on" not in line]
+    said = [line for line in "".join(capfd.readouterr()).splitlines() if "uses the dialect" not in line]
     assert said[0].startswith("net.prototxt:2:")
     assert fault in said[0]
     assert "Traceback" not in "".join(said)
@@ -143,11 +143,11 @@ def test_invalid_settings_are_refused(net_of: Callable[..., Net], video: Path) -
     ],
     ids=["video_file", "skip_frames", "num_segments", "device_id", "no_field"],
 )
-def test_fields_of_video_data_param_activate_their_dialect(
+def test_fields_of_video_data_param_show_their_dialect(
     net_of: Callable[..., Net], given: str, dialects: list[str]
 ) -> None:
     net = LAYER % (given, 1, 4, "")
-    assert activated_by(net) == dialects
+    assert used_by(net) == dialects
     if not dialects:
         with pytest.raises(SpecError, match='dialects "ssd_video" and "tsn" have "video_data_param"; add --plugin ssd'):
             net_of(net)

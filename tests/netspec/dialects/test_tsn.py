@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from fresh_dialects import activated_by
+from fresh_dialects import used_by
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.layers import Context, Layer
@@ -115,5 +115,5 @@ def test_shuffle_activates_tsn_in_data_param_only() -> None:
     """Caffe has a field shuffle too, in image_data_param and hdf5_data_param."""
     text = """layer { name: "data" type: "Data" top: "data" data_param { source: "x" %s } }
         layer { name: "image" type: "ImageData" top: "image" image_data_param { source: "x" shuffle: true } }"""
-    assert activated_by(text % "") == []
-    assert activated_by(text % "shuffle: true") == ["tsn"]
+    assert used_by(text % "") == []
+    assert used_by(text % "shuffle: true") == ["tsn"]

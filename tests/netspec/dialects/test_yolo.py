@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from fresh_dialects import activated_by
+from fresh_dialects import used_by
 from netspec.layers import Layer
 
 Build = Callable[..., Layer]
@@ -30,4 +30,4 @@ def test_output_without_detections_is_a_row_of_minus_one_per_image(build: Build)
 
 
 def test_the_layer_type_activates_the_dialect() -> None:
-    assert activated_by(f"layer {{ {V3 % 1} }}") == ["yolo"]
+    assert used_by(f"layer {{ {V3 % 1} }}") == ["yolo"]

@@ -1,7 +1,7 @@
-"""All messages and enums of Caffe's schema and of the active dialects, under the names that protoc generates.
+"""All messages and enums of Caffe's schema and of the dialects that a user added, under protoc's names.
 
 Nothing is generated, and nothing is added to protobuf's default pool, so another ``caffe_pb2`` in the process does
-not conflict with this one. If no dialect is active, the classes are those of :mod:`netspec.proto.schema`.
+not conflict with this one. Without any, the classes are those of :mod:`netspec.proto.schema`.
 Caffe: src/caffe/proto/caffe.proto
 """
 
@@ -26,7 +26,8 @@ def __getattr__(name: str) -> Any:
         return [public for public in names if not public.startswith("_")]
     if name in names:
         return names[name]
-    advice = forks().advice(name, forks().with_message(name))
+    additions = forks().additions()
+    advice = additions.advise(name, additions.messages.get(name, ()))
     hint = f"; {advice}" if advice else did_you_mean(name, list(names))
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
 
@@ -36,7 +37,7 @@ def __dir__() -> list[str]:
 
 
 def _file() -> Any:
-    """Return the descriptor of caffe.proto, with the additions of the active dialects."""
+    """Return the descriptor of caffe.proto, with the additions of the dialects that a user added."""
     return forks().schema_file() or pool.FindFileByName("caffe.proto")
 
 

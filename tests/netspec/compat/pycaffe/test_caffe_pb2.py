@@ -11,8 +11,7 @@ from google.protobuf import descriptor_pool, text_format
 from netspec.compat.pycaffe.net_spec import layers, params
 from netspec.compat.pycaffe.proto import caffe_pb2
 from netspec.compat.scripts import old_names
-from netspec.dialects import use_dialect
-from netspec.dialects.registry import deactivate
+from netspec.dialects import known, use_dialect
 from netspec.proto import schema
 
 
@@ -94,9 +93,9 @@ def test_bytes_of_a_dialect_can_be_read_as_a_net(ssd: None) -> None:
     assert list(schema.value(read, "permute_param").order) == [0, 2]
 
 
-def test_without_the_dialect_its_messages_do_not_exist(ssd: None) -> None:
+def test_without_the_dialect_its_messages_do_not_exist(ssd: None, monkeypatch: pytest.MonkeyPatch) -> None:
     before = caffe_pb2.LayerParameter
-    deactivate("ssd")
+    monkeypatch.setattr(known, "_added", {})
     assert caffe_pb2.LayerParameter is schema.LayerParameter
     assert not hasattr(caffe_pb2, "LabelMap")
     use_dialect("ssd")
