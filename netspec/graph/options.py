@@ -28,7 +28,8 @@ class BuildOptions:
     - ``rank``, ``ranks``: the index and number of nets that train in parallel. Data layers read their share of records.
     - ``data_seed``: the seed of data layers, the same for all ranks. None: ``seed``.
     - ``exact``: which sums are bit-identical to Caffe's: "none", "small" or "all" (netspec/exact/__init__.py).
-    - ``accumulate_in_place``: layers add their gradients to ``grad`` themselves, like Caffe
+    - ``accumulate_in_place``: layers add their gradients to ``grad`` themselves, like Caffe, also of frozen blobs
+      whose gradients Caffe computes
       (netspec/exact/accumulate.py). Hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP do not see them.
     - ``speed``: the code that makes the net faster (:class:`netspec.run.speed.Speed`), or None.
     - ``passes``: the optimizations of ``speed`` for a net of phase TEST without gradients (netspec/fast/steps.py).

@@ -144,12 +144,14 @@ def _shared_multipliers(net: NetParameter, source: SourceMap) -> dict[str, tuple
 class Backward:
     """Where Caffe computes gradients: ``layers[i]``, whether layer i does, and ``bottoms[i][j]``, for which bottoms.
 
-    ``computed`` is ``bottoms`` with those added that get a gradient because their layer ignores propagate_down.
+    ``written`` is ``bottoms`` with those added that get a gradient because their layer ignores propagate_down.
+    ``computed`` is ``written`` without those added whose gradient nobody reads.
     """
 
     layers: tuple[bool, ...]
     bottoms: tuple[tuple[bool, ...], ...]
     computed: tuple[tuple[bool, ...], ...]
+    written: tuple[tuple[bool, ...], ...]
 
 
 def plan_backward(
@@ -201,15 +203,19 @@ def plan_backward(
         bottom_needs = [
             [need or j not in label_bottoms[i] for j, need in enumerate(needs)] for i, needs in enumerate(bottom_needs)
         ]
+    written = [
+        tuple(need or (layer_needs[i] and j in ignoring[i]) for j, need in enumerate(needs))
+        for i, needs in enumerate(bottom_needs)
+    ]
     maker_needs = {v: needs for node, needs in zip(plan.nodes, layer_needs, strict=True) for v in node.tops}
-    computed = tuple(
+    computed = [
         tuple(
-            need or (layer_needs[i] and j in ignoring[i] and maker_needs.get(node.bottoms[j], False))
-            for j, need in enumerate(bottom_needs[i])
+            need or (writes and maker_needs.get(v, False))
+            for need, writes, v in zip(bottom_needs[i], written[i], node.bottoms, strict=True)
         )
         for i, node in enumerate(plan.nodes)
-    )
-    return Backward(tuple(layer_needs), tuple(tuple(needs) for needs in bottom_needs), computed)
+    ]
+    return Backward(tuple(layer_needs), tuple(tuple(needs) for needs in bottom_needs), tuple(computed), tuple(written))
 
 
 def unblocked(plan: Plan, backward: Backward) -> Plan:

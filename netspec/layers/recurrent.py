@@ -34,6 +34,7 @@ class Recurrent(Layer):
     ignores = frozenset({"recurrent_param.debug_info"})
     state_names: ClassVar[tuple[str, ...]]
     changes_itself = True
+    ignores_frozen = True  # the gradients are those of the separate net, which does not know lr_mult
     how: AsTorch  # the arithmetic of the current forward pass
     gates: ClassVar[int] = 1  # number of inputs of a hidden unit
 

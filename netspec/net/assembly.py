@@ -18,13 +18,14 @@ from google.protobuf.message import Message
 
 from netspec import log
 from netspec.errors import Report, SpecError, Where
-from netspec.files.limits import amount, is_out_of_memory, memory
+from netspec.files.limits import LIMIT, amount, is_out_of_memory, memory, read_amount
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import AUTOMATIC, Backward, Node, Param, Plan, plan_backward
 from netspec.layers import class_of, unknown_type
 from netspec.layers.contract.base import Layer, Shape, shape_string
 from netspec.layers.contract.context import Context, Random, device_of
 from netspec.layers.contract.fillers import READS
+from netspec.net.frozen import compute_caffes_gradients, needs_backward
 from netspec.proto.forks import forks
 from netspec.proto.schema import TEST
 from netspec.run.eager import last_uses
@@ -207,13 +208,13 @@ class Assembly:
 
     def _finish(self, layers: list[Layer]) -> Backward:
         """Return which layers need backward computation, by Caffe's rules. Log the end of Caffe's Net::Init."""
-        learns = []
-        for node, layer in zip(self._plan.nodes, layers, strict=True):
-            learns.append(any(_spec(node, layer, j).lr_mult for j in range(len(layer.blobs))))
+        learns = [needs_backward(self._plan, i, layer) for i, layer in enumerate(layers)]
         has_loss = [[bool(w) for w in weights] for weights in self.loss_weights]
         labels = [layer.label_bottoms for layer in layers]
         ignoring = [layer.ignores_propagate_down for layer in layers]
         backward = plan_backward(self._plan, learns, has_loss, labels, ignoring)
+        if self.options.accumulate_in_place:
+            compute_caffes_gradients(self._plan, layers, backward)
         for node, needs in zip(reversed(self._plan.nodes), reversed(backward.layers), strict=True):
             if needs:
                 log.info("net.cpp:200", f"{node.name} needs backward computation.")
@@ -348,9 +349,11 @@ class MemoryNeed:
 
 
 def limit_on(device: torch.device, limit: int | None = None) -> int:
-    """Return how many bytes a net may need on a device: ``limit`` if given, or else the device's memory."""
+    """Return how many bytes a net may need on a device: ``limit`` if given, or that of the process, or the device's."""
     if limit is not None:
         return limit
+    if given := os.environ.get(LIMIT):
+        return read_amount(given)
     return torch.cuda.mem_get_info(device)[1] if device.type == "cuda" else memory()
 
 

@@ -24,6 +24,7 @@ from netspec.exact.blas import one_thread
 from netspec.graph.plan import AUTOMATIC
 from netspec.layers.utility.live_blobs import Blob
 from netspec.layers.utility.python import Python
+from netspec.layers.utility.shape import Flatten
 from netspec.net.net import Net
 from netspec.run.walk import Step, walk
 
@@ -77,7 +78,8 @@ class BlobRunner:
             self.names.append(plan.blobs[node.tops[j]] if j < len(node.tops) else AUTOMATIC)
             if "data" in layer.shares:
                 blob.data_memory = self.blobs[bottoms[0]].data_memory
-            if "diff" in layer.shares:
+            # Flatten shares it in its backward pass.
+            if "diff" in layer.shares and (self.net.backward_plan.layers[i] or not isinstance(layer, Flatten)):
                 blob.diff_memory = self.blobs[bottoms[0]].diff_memory
         made = PythonStep if isinstance(layer, Python) else LayerStep
         return made(self.net, i, self.blobs, bottoms, tops)

@@ -47,7 +47,7 @@ class LayerStep:
         self.losses = [(top, weight) for top, weight in weights if weight]
         self.constants = self.layer.filled_once()
         self.reads = self.layer.gradient_reads
-        self.reached, self.wanted = net.backward_plan.layers[i], tuple(net.backward_plan.computed[i])
+        self.reached, self.wanted = net.backward_plan.layers[i], net.backward_plan.written[i]
         self._speed, self._device = net.options.speed, net.device
         self.records = self._is_asked() and not (self.reads or self.layer.shares)
         self.keeps_bottom = "kept" in self.reads and self._is_asked()

@@ -41,6 +41,7 @@ class WholeRun:
             or runner.overwrites_shared()
             or any(len(part.members) > 1 for part in net.eager.parts())
             or any("kept" in step.reads for step in runner.steps)
+            or net.backward_plan.written != net.backward_plan.computed
         )
 
     def run(self) -> Passed | None:

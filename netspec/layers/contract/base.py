@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -67,6 +68,8 @@ class Layer(torch.nn.Module):
     ignores: frozenset[str] = frozenset()  # those of ``reads`` that have no effect, e.g. "data_param.scale"
     shares: frozenset[str] = frozenset()  # "data", "diff": what its tops share with its bottom in Caffe's memory
     counted_axis: ClassVar[int | None] = None  # the axis of the tops with a size that is known only after forward
+    ignores_frozen: ClassVar[bool] = False  # computes the gradients of all blobs, also of those with lr_mult: 0
+    held: frozenset[int] = frozenset()  # blobs whose gradient another layer computes, but not this one
     # whether its tops have the shapes that ``reshape`` returned, except in ``counted_axis``
     fixed_shapes: ClassVar[bool] = True
     reads_data: ClassVar[bool] = False  # its tops are records: inputs of an exported net
@@ -126,6 +129,21 @@ class Layer(torch.nn.Module):
             object.__setattr__(self, name, value)
         else:
             super().__setattr__(name, value)
+
+    @override
+    def _apply(self, fn: Any, *arguments: Any, **named: Any) -> Any:
+        """Move the layer to another device, or change its precision. Its tensors other than blobs are moved too."""
+        super()._apply(fn, *arguments, **named)
+        before = torch.empty(0, device=self.context.device)
+        if (device := fn(before).device) != before.device:
+            self.context = replace(self.context, options=replace(self.context.options, device=str(device)))
+            for name, value in list(vars(self).items()):
+                if isinstance(value, torch.Tensor):
+                    setattr(self, name, value.to(device))
+                elif isinstance(value, (list, tuple)) and any(isinstance(each, torch.Tensor) for each in value):
+                    moved = [each.to(device) if isinstance(each, torch.Tensor) else each for each in value]
+                    setattr(self, name, type(value)(moved))
+        return self
 
     def construct(self) -> None:
         """Do what Caffe does in the layer's constructor, if it shows in the log."""
@@ -304,7 +322,7 @@ class Layer(torch.nn.Module):
 
     def blob(self, index: int) -> torch.Tensor:
         """Return learnable blob ``index`` in this layer's shape (a PERMISSIVE sharer's owner may have another)."""
-        tensor = self.blobs[index]
+        tensor = values_of(self.blobs[index]) if index in self.held else self.blobs[index]
         return tensor if tensor.shape == self.blob_shapes[index] else tensor.view(self.blob_shapes[index])
 
     def param_spec(self, j: int, given: Param | None) -> Param:

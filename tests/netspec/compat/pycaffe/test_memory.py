@@ -348,6 +348,69 @@ def test_backward_reads_values_that_scripts_wrote(net_of: Callable[..., caffe.Ne
     assert (net.blobs["data"].diff[0, 1:] == 6).all()
 
 
+DATA = """
+layer { name: "d" type: "DummyData" top: "x" top: "cont" dummy_data_param {
+  shape { dim: 3 dim: 2 dim: 4 dim: 5 } shape { dim: 3 dim: 2 }
+  data_filler { type: "gaussian" } data_filler { type: "gaussian" } } }
+"""
+RECURRENT = 'recurrent_param { num_output: 2 weight_filler { type: "xavier" } }'
+SQUARES = (
+    'layer { name: "end" type: "Reduction" bottom: "y" top: "end" loss_weight: 1 reduction_param { operation: SUMSQ } }'
+)
+WRITES_DIFFS_OF_DATA = {
+    "BatchNorm": 'type: "BatchNorm" bottom: "x"',
+    "LSTM": f'type: "LSTM" bottom: "x" bottom: "cont" {RECURRENT}',
+    "RNN": f'type: "RNN" bottom: "x" bottom: "cont" {RECURRENT}',
+}
+
+
+@pytest.mark.parametrize("layer", WRITES_DIFFS_OF_DATA)
+def test_layers_that_ignore_propagate_down_write_the_diff_of_data(layer: str, net_of: Callable[..., caffe.Net]) -> None:
+    text = DATA + f'layer {{ name: "it" {WRITES_DIFFS_OF_DATA[layer]} top: "y" }}' + SQUARES
+    net = net_of(text, caffe.TRAIN)
+    net.forward()
+    net.backward()
+    assert net.blobs["x"].diff.any()
+    assert not net.blobs["cont"].diff.any()
+    frozen = net_of(
+        text.replace('top: "y"', 'top: "y" param { lr_mult: 0 } param { lr_mult: 0 } param { lr_mult: 0 }'), caffe.TRAIN
+    )
+    frozen.forward()
+    frozen.backward()
+    assert bool(frozen.blobs["x"].diff.any()) == (layer == "RNN")  # its other blobs learn
+
+
+@pytest.mark.parametrize("layer", ["Softmax", "MVN", "LRN", "BatchNorm", "Im2col", "ReLU"])
+def test_propagate_down_false_keeps_a_diff_at_zero_if_the_layer_heeds_it(
+    layer: str, net_of: Callable[..., caffe.Net]
+) -> None:
+    """No layer below gets a gradient, and Caffe does not run its backward pass."""
+    text = f"""
+layer {{ name: "low" type: "Scale" bottom: "x" top: "low" }}
+layer {{ name: "it" type: "{layer}" bottom: "low" top: "y" propagate_down: false
+  convolution_param {{ kernel_size: 2 }} }}
+"""
+    net = net_of(DATA + text + SQUARES, caffe.TRAIN)
+    net.forward()
+    net.backward()
+    assert net.blobs["low"].diff.any() == (layer != "ReLU")
+    assert not net.params["low"][0].diff.any()
+
+
+def test_flatten_of_data_shares_no_diff(net_of: Callable[..., caffe.Net]) -> None:
+    """Caffe shares it in the backward pass, which does not run here; Reshape shares it from the start."""
+    for layer, shared in (("Flatten", False), ("Reshape", True)):
+        text = f"""
+layer {{ name: "it" type: "{layer}" bottom: "x" top: "flat" reshape_param {{ shape {{ dim: 3 dim: -1 }} }} }}
+layer {{ name: "bn" type: "BatchNorm" bottom: "flat" top: "y" }}
+"""
+        net = net_of(DATA + text + SQUARES, caffe.TRAIN)
+        net.forward()
+        net.backward()
+        assert net.blobs["flat"].diff.any()
+        assert net.blobs["x"].diff.any() == shared
+
+
 def test_layers_without_gradients_are_skipped(net_of: Callable[..., caffe.Net]) -> None:
     net = net_of(PYRAMID.replace("force_backward: true", ""), caffe.TEST)
     net.forward(data=image(1, 3, 12, 12))
