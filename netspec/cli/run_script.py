@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from netspec.cli.arguments import add_limit, add_plugin
+from netspec.files.limits import LIMIT
 from netspec.log import VARIABLE
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.parser import NO_LOG, Commands
@@ -68,6 +69,8 @@ def _run(arguments: argparse.Namespace) -> None:
         raise WrongUsage("the following arguments are required: SCRIPT, or -m MODULE")
     if arguments.minloglevel is not None:
         os.environ[VARIABLE] = str(arguments.minloglevel)
+    if arguments.limit is not None:
+        os.environ[LIMIT] = str(arguments.limit)
     options = Options(arguments.shadow_caffe, arguments.python2)
     name, *own = arguments.program
     if arguments.write_py3:

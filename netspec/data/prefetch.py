@@ -27,8 +27,7 @@ class Feed(Generic[T]):
         self._ahead = ahead
         self._workers, self._at_once = workers, at_once
         self._pool: ThreadPoolExecutor | None = None
-        self._pending: deque[Future[Outcomes[T]]] = deque()
-        self._made: deque[tuple[T | None, BaseException | None]] = deque()
+        self._pending: deque[tuple[int, Future[Outcomes[T]]]] = deque()  # with the first iteration of each
         self.position = 0  #: the iteration of the next batch
         self.waited = 0.0  #: total seconds in calls of ``next``
 
@@ -42,28 +41,30 @@ class Feed(Generic[T]):
 
     def _next(self) -> T:
         position = self.position
-        self.position += 1
-        if not self._ahead:
-            return self._make(position, 1)[0]
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(self._workers, thread_name_prefix="prefetch")
-        while True:
-            requested = len(self._made) + self._at_once * len(self._pending)
-            if requested > self._ahead:
-                break
-            self._pending.append(self._pool.submit(_try_make, self._make, position + requested, self._at_once))
-        if not self._made:
-            self._made.extend(self._pending.popleft().result())
-        made, fault = self._made.popleft()
+        made, fault = self._made_ahead(position) if self._ahead else _try_make(self._make, position, 1)[0]
+        # Ctrl-C may interrupt any of these lines. It loses no batch, because this one alone counts them.
+        self.position = position + 1
         if fault is not None:
             raise fault
         return made  # pyright: ignore[reportReturnType]
 
+    def _made_ahead(self, position: int) -> tuple[T | None, BaseException | None]:
+        """Return the batch of an iteration, or the exception, from the threads. Have the next ones made."""
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self._workers, thread_name_prefix="prefetch")
+        while self._pending and self._pending[0][0] + self._at_once <= position:
+            self._pending.popleft()
+        end = self._pending[-1][0] + self._at_once if self._pending else position
+        while end - position <= self._ahead:
+            self._pending.append((end, self._pool.submit(_try_make, self._make, end, self._at_once)))
+            end += self._at_once
+        first, outcomes = self._pending[0]
+        return outcomes.result()[position - first]
+
     def restart(self, position: int = 0) -> None:
         """Continue at iteration ``position``; discard batches made in advance."""
-        self._made.clear()
         while self._pending:
-            self._pending.popleft().cancel()
+            self._pending.popleft()[1].cancel()
         self.position = position
 
     def close(self) -> None:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -204,18 +205,23 @@ class SpreadProducts(ParameterSums):
         return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None
 
 
-_rounded: dict[int, tuple[torch.Tensor, torch.Tensor]] | None = None  # by id, a weight and its rounded copy
+class _Rounded(threading.local):
+    """The copies of one thread, which computes one training at a time: by id, a weight and its rounded copy."""
+
+    weights: dict[int, tuple[torch.Tensor, torch.Tensor]] | None = None
+
+
+_rounded = _Rounded()
 
 
 @contextmanager
 def weights_rounded_once() -> Iterator[None]:
     """A block in which :func:`rounded_weight` makes one copy of each weight. Weights must not change in it."""
-    global _rounded
-    before, _rounded = _rounded, {}
+    before, _rounded.weights = _rounded.weights, {}
     try:
         yield
     finally:
-        _rounded = before
+        _rounded.weights = before
 
 
 def rounded_weight(weight: torch.Tensor) -> torch.Tensor | None:
@@ -226,11 +232,12 @@ def rounded_weight(weight: torch.Tensor) -> torch.Tensor | None:
     kind = weight.device.type
     if kind not in ("cpu", "cuda") or not torch.is_autocast_enabled(kind) or weight.dtype != torch.float32:
         return None
-    if _rounded is None:
+    weights = _rounded.weights
+    if weights is None:
         return weight.to(torch.get_autocast_dtype(kind))
-    if id(weight) not in _rounded:
-        _rounded[id(weight)] = weight, weight.to(torch.get_autocast_dtype(kind))
-    return _rounded[id(weight)][1]
+    if id(weight) not in weights:
+        weights[id(weight)] = weight, weight.to(torch.get_autocast_dtype(kind))
+    return weights[id(weight)][1]
 
 
 class SummedConvolutions(ParameterSums):

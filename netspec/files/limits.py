@@ -13,10 +13,12 @@ import zlib
 from pathlib import Path
 
 ALWAYS_ALLOWED = 1 << 28  # bytes that a file of any size may declare
+LIMIT = "NETSPEC_LIMIT"  # the variable by which ``netspec run --limit`` reaches the processes of a program
 MOST_PACKED = 100  # times a file's size: real data is compressed 2 to 20 times, a malicious file 1000 times
 
 OUT_OF_MEMORY = "out of memory; this machine has "  # how a command ends; netspec/inspect/logs reads it
-
+# What torch says; a user's layer may say "cannot allocate" of something else.
+_OF_TORCH = ("DefaultCPUAllocator", "out of memory", "size calculation overflowed", "integer multiplication overflow")
 _UNITS = {"": 0, "k": 10, "m": 20, "g": 30, "t": 40}
 _CONTAINER = Path("/sys/fs/cgroup/memory.max")  # Linux: the limit of a container, a number or "max"
 
@@ -60,7 +62,7 @@ def _memory_of_windows() -> int:
 def is_out_of_memory(fault: BaseException) -> bool:
     """Return whether an exception means that memory ran out, or a size is impossible. Torch raises RuntimeError."""
     if isinstance(fault, RuntimeError):
-        return any(word in str(fault) for word in ("allocate", "calculation overflowed", "multiplication overflow"))
+        return any(words in str(fault) for words in _OF_TORCH)
     return isinstance(fault, MemoryError)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -127,6 +128,17 @@ class Net(torch.nn.Module):
         super().__setstate__(state)
         self._passes = _Passes()
         self._set_runners()
+
+    @override
+    def _apply(self, fn: Any, *arguments: Any, **named: Any) -> Any:
+        """Move the net to another device, or change its precision, as torch's ``to`` and ``double`` want."""
+        super()._apply(fn, *arguments, **named)
+        before = torch.empty(0, device=self.device)
+        if (device := fn(before).device) != before.device:
+            self.device = device
+            self.options = replace(self.options, device=str(device))
+            self._set_runners()
+        return self
 
     def __repr__(self) -> str:
         """Return the net as a table of its layers."""

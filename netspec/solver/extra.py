@@ -2,13 +2,15 @@
 
 Caffe saves neither its position in the data nor its random numbers. In netspec, all random numbers depend only on the
 seed and the iteration. The file has the seeds, the positions in the data, the state that layers keep between passes,
-and the losses that ``average_loss`` still needs. It also has the settings that affect the results, and the sizes and
-hashes of the weights and the state that belong to it (netspec/net/extra_file.py). Caffe does not read it.
+the losses that ``average_loss`` still needs, and the loss scale of fp16. It also has the settings that affect the
+results, and the sizes and hashes of the weights and the state that belong to it (netspec/net/extra_file.py). Caffe does
+not read it.
 """
 
 from __future__ import annotations
 
 import base64
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -139,12 +141,14 @@ Remembered = dict[str, dict[str, Any]]  # index of the layer -> name -> JSON val
 class Extra:
     """The contents of the file.
 
-    ``seed`` is the solver's. ``losses`` are the last ``average_loss`` losses. ``nets`` has the state of the layers of
-    the training nets of all ranks, then of the test nets (netspec/layers/contract/base.py).
+    ``seed`` is the solver's. ``losses`` are the last ``average_loss`` losses. ``loss_scale`` is ``LossScale.state``
+    (netspec/solver/precision.py). ``nets`` has the state of the layers of the training nets of all ranks, then of the
+    test nets (netspec/layers/contract/base.py).
     """
 
     seed: int
     losses: list[float]
+    loss_scale: list[float]
     nets: list[Remembered]
     settings: Settings
     weights: Digest
@@ -183,6 +187,7 @@ def read_extra(state: str | Path) -> Extra | None:
         return Extra(
             whole_number(found["seed"], "seed"),
             [_loss(loss) for loss in _list(found["losses"])],
+            _loss_scale(_list(found.get("loss_scale", []))),  # older files lack it
             [_checked_states(net) for net in _list(found["nets"])],
             {str(name): dict(settings) for name, settings in found["settings"].items()},
             Digest.read(found["weights"]),
@@ -245,6 +250,12 @@ def _loss(value: Any) -> float:
     if type(value) not in (int, float):  # may be NaN with ``--nan warn``
         raise ValueError(f"found loss {shown(value)}, expected a number")
     return float(value)
+
+
+def _loss_scale(value: list[Any]) -> list[float]:
+    if value and not (len(value) == 2 and all(type(each) in (int, float) and 0 <= each < math.inf for each in value)):
+        raise ValueError(f"found loss_scale {shown(value)}, expected two numbers")
+    return value
 
 
 def _checked_states(value: Any) -> Remembered:

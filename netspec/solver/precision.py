@@ -9,7 +9,7 @@
 # pyright: reportPrivateImportUsage=false
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
@@ -49,6 +49,17 @@ class LossScale:
     def __init__(self, precision: str) -> None:
         self.factor = FIRST_SCALE if precision == FP16 else 1.0
         self._scales, self._good = precision == FP16, 0
+
+    @property
+    def state(self) -> list[float]:
+        """What a resumed training needs: the factor, and the iterations without overflow; [] except for fp16."""
+        return [self.factor, self._good] if self._scales else []
+
+    def resume(self, state: Sequence[float]) -> None:
+        """Restore ``state``. Without one, as that of a training in another precision, start from the beginning."""
+        if self._scales:
+            self.factor, good = state or (FIRST_SCALE, 0)
+            self._good = int(good)
 
     def of(self, loss: torch.Tensor) -> torch.Tensor:
         """Return the scaled loss."""

@@ -69,7 +69,15 @@ class Snapshots:
             State(training.iteration, model, training.current_step, history),
             before=lambda unfinished: write_extra(
                 extra_path(state),
-                Extra(training.seed, list(training.losses), states, settings, weights, Digest.of(unfinished)),
+                Extra(
+                    training.seed,
+                    list(training.losses),
+                    training.scale.state,
+                    states,
+                    settings,
+                    weights,
+                    Digest.of(unfinished),
+                ),
             ),
         )
         training.last_snapshot = state
@@ -115,6 +123,7 @@ class Snapshots:
         for net in (training.net, *training.test_nets):
             net.restart_data()
         training.replicas.restart_data()
+        training.scale.resume([] if extra is None else extra.loss_scale)
         if extra is None:
             log.logger.info(f"{path} is from Caffe: the data starts at its first record, with different random numbers")
         else:

@@ -101,7 +101,7 @@ def extra(path: Path) -> None:
     arrays = [{"shape": [1, 2], "float32": "AACAPwAAAEA="}] * 2
     carried = {"0": {"next": 7}, "3": {"state": arrays}}
     settings = {"solver": {"base_lr": 0.5, "stepvalue": [3, 9]}, "train net": {"data_param.source": "db"}}
-    write_extra(path, Extra(1, [0.5, 0.25], [carried, {}], settings, Digest(3, "ab"), Digest(4, "cd")))
+    write_extra(path, Extra(1, [0.5, 0.25], [65536, 3], [carried, {}], settings, Digest(3, "ab"), Digest(4, "cd")))
 
 
 def unhashed(data: bytes) -> bytes:

@@ -102,7 +102,7 @@ NOT_STARTED = {
     "lmdb_build": {"pairs": "tests/lmdb_build/test_cli.py", "mnist": "needs MNIST", "cifar": "needs CIFAR-10"},
     "loopclosure": {},
 }
-SHARED = {"verbose", "plugin", "limit"}  # read before the command itself
+SHARED = {"verbose", "plugin"}  # read before the command itself
 HIDDEN = argparse.SUPPRESS
 FROZEN = ROOT / "tests" / "laws" / "options.txt"
 PROGRAMS = ("netspec", "lmdb_build", "loopclosure")

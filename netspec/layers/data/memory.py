@@ -134,7 +134,7 @@ class MemoryData(Layer):
             message = "batch_size, channels, height and width must all be given and above 0"
             raise self.error(message, "memory_data_param")
         self._arrays: tuple[torch.Tensor, torch.Tensor] | None = None
-        self._next, self._device = 0, self.context.device
+        self._next = 0
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return self.shape, self.shape[:1]
@@ -174,4 +174,4 @@ class MemoryData(Layer):
         assert self._arrays is not None
         here = slice(self._next, self._next + self.shape[0])
         self._next = here.stop % len(self._arrays[0])
-        return tuple([array[here].to(self._device) for array in self._arrays])
+        return tuple([array[here].to(self.context.device) for array in self._arrays])

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import concurrent.futures._base
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any
 
 import pytest
@@ -110,3 +112,33 @@ def test_the_interpreter_exits_with_an_open_feed() -> None:
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "end\n", "")
+
+
+@pytest.mark.parametrize(("ahead", "at_once"), [(0, 1), (2, 1), (8, 4)])
+def test_an_interrupted_wait_loses_no_batch(ahead: int, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C while ``next`` waits for a thread: the next call returns the batch that was waited for."""
+    interrupts = iter([False, True, False, True, True, False] + [False] * 20)
+
+    class Interrupted(Future[Any]):
+        def result(self, timeout: float | None = None) -> Any:
+            if next(interrupts):
+                raise KeyboardInterrupt
+            return super().result(timeout)
+
+    def make(first: int, count: int) -> list[int]:
+        if not ahead and next(interrupts):
+            raise KeyboardInterrupt
+        return list(range(first, first + count))
+
+    monkeypatch.setattr(concurrent.futures._base, "Future", Interrupted)
+    feed = Feed(make, ahead, 2, at_once)
+    found: list[int] = []
+    stopped = 0
+    while len(found) < 12:
+        try:
+            found.append(feed.next())
+        except KeyboardInterrupt:
+            stopped += 1
+            assert feed.position == len(found)
+    assert (found, stopped) == (list(range(12)), 3)
+    feed.close()

@@ -1,6 +1,8 @@
 """Trainings in other numbers than float32: what stays float32, and how far their losses are from Caffe's."""
 
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import torch
 
 from golden_cases import train
 from netspec.errors import SpecError
+from netspec.exact.products import rounded_weight
 from netspec.load import load_solver
 from netspec.solver import training
 from netspec.solver.precision import BF16, FIRST_SCALE, FP16, FP32, PATIENCE, TF32, LossScale, computing
@@ -57,6 +60,65 @@ def test_float32_on_gpus_does_not_use_tf32(precision: str) -> None:
     with computing(precision, torch.device("cpu")):
         assert [library.allow_tf32 for library in libraries] == [precision == TF32] * 2
     assert [library.allow_tf32 for library in libraries] == before
+
+
+def test_threads_have_copies_of_weights_of_their_own() -> None:
+    """Two trainings in bf16 whose passes overlap: no copy outlives the passes of its thread."""
+    inside, left = threading.Barrier(2), threading.Barrier(2)
+    weight = torch.full((3,), 1.001)
+
+    def run(first: bool) -> list[bool]:
+        with computing(BF16, torch.device("cpu")):
+            inside.wait(60)
+            mine = rounded_weight(weight)
+            same = mine is rounded_weight(weight)
+            if not first:
+                left.wait(60)  # the other thread has left its block
+                same = same and mine is rounded_weight(weight)
+        if first:
+            left.wait(60)
+        with torch.autocast("cpu", torch.bfloat16):
+            return [same, rounded_weight(weight) is not rounded_weight(weight)]
+
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(run, [True, False])) == [[True, True]] * 2
+
+
+FP16_OVERFLOWS = """
+layer { name: "d" type: "DummyData" top: "x" top: "y"
+  dummy_data_param { shape { dim: 64 dim: 64 } data_filler { value: 1 } data_filler { value: 1000 } } }
+layer { name: "ip" type: "InnerProduct" bottom: "x" top: "ip"
+  inner_product_param { num_output: 64 weight_filler { type: "constant" value: 0.1 } } }
+layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "y" top: "loss" }
+"""
+
+
+@pytest.mark.parametrize("precision", [FP32, BF16, FP16])
+def test_a_training_resumes_with_its_loss_scale(
+    precision: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each overflow of the first iterations halves the scale; without it, they would overflow again."""
+    monkeypatch.chdir(tmp_path)
+    Path("net.prototxt").write_text(FP16_OVERFLOWS)
+    Path("solver.prototxt").write_text('net: "net.prototxt" base_lr: 0.001 lr_policy: "fixed" max_iter: 16')
+    whole = load_solver("solver.prototxt", precision=precision)
+    whole.step(8)
+    _, state = whole.snapshot()
+    at_8 = whole.scale.state
+    whole.step(8)
+    resumed = load_solver("solver.prototxt", precision=precision, snapshot=state)
+    assert resumed.scale.state == at_8
+    resumed.step(8)
+    assert resumed.scale.state == whole.scale.state
+    for mine, theirs in zip(resumed.net.learnable, whole.net.learnable, strict=True):
+        assert torch.equal(mine.parameter, theirs.parameter)
+    if precision == FP16:
+        assert whole.scale.factor < FIRST_SCALE
+        whole.restore(state)
+        assert whole.scale.state == at_8
+        Path(f"{state}.extra").unlink()  # as of Caffe
+        whole.restore(state)
+        assert whole.scale.state == [FIRST_SCALE, 0]
 
 
 def test_an_unknown_precision_is_refused(work_in: Callable[..., Path]) -> None:

@@ -54,6 +54,29 @@ def test_a_scripts_own_excepthook_is_called(run: Run) -> None:
     assert run("s.py", rc=1, s=source).stdout == "mine bad\n"
 
 
+def test_a_net_above_the_limit_is_refused(run: Run) -> None:
+    """Also in a process that the script starts."""
+    net = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 64 dim: 3 dim: 128 dim: 128 } } }'
+    script = """
+import multiprocessing, sys
+
+def build(path):
+    import caffe
+    caffe.Net(path, caffe.TEST)
+
+if __name__ == "__main__":
+    worker = multiprocessing.get_context("spawn").Process(target=build, args=("net.prototxt",))
+    worker.start()
+    worker.join()
+    print("worker", worker.exitcode)
+    build("net.prototxt")
+"""
+    for limit, status in (("1MiB", 1), ("1GiB", 0)):
+        done = run("--limit", limit, "s.py", rc=status, s=script, files={"net.prototxt": net})
+        assert done.stdout == f"worker {status}\n"
+        assert done.stderr.count("the net needs at least 12 MiB") == 2 * status
+
+
 def test_wrong_usage_and_missing_files_are_one_line(run: Run) -> None:
     assert "SCRIPT, or -m MODULE" in run(rc=2).stderr
     missing = "none.py: cannot be read: No such file or directory; relative paths start from "

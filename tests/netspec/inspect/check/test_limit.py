@@ -88,6 +88,48 @@ def test_nets_above_the_limit_are_refused_by_every_command(
     assert sum(filled) < 100 * MIB / 8
 
 
+@pytest.mark.parametrize(
+    ("said", "is_memory"),
+    [
+        ("[enforce fail at alloc_cpu.cpp:124] err == 0. DefaultCPUAllocator: can't allocate memory: you tried", True),
+        ("CUDA out of memory. Tried to allocate 2.00 GiB", True),
+        ("Storage size calculation overflowed with sizes=[4611686018427387904, 2]", True),
+        ("numel: integer multiplication overflow", True),
+        ("cannot allocate a worker: the pool is closed", False),
+    ],
+)
+def test_only_torchs_own_words_mean_that_memory_ran_out(said: str, is_memory: bool) -> None:
+    assert limits.is_out_of_memory(RuntimeError(said)) == is_memory
+
+
+def test_torch_still_says_so_in_these_words() -> None:
+    for size in (2**62, 2**45):
+        with pytest.raises(RuntimeError) as fault:
+            torch.empty(size, 2)
+        assert limits.is_out_of_memory(fault.value), str(fault.value)
+
+
+@pytest.mark.parametrize("method", ["setup", "forward"])
+def test_the_error_of_a_layer_of_a_plugin_is_shown(
+    method: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("mine.py").write_text(f"""
+from netspec.layers import Layer, register
+
+@register("BrokenByPool")
+class Broken(Layer):
+    def reshape(self, bottom_shapes):
+        return bottom_shapes
+
+    def {method}(self, *bottoms):
+        raise RuntimeError("cannot allocate a worker: the pool is closed")
+""")
+    Path("net.prototxt").write_text(CHAIN.replace("TanH", "BrokenByPool"))
+    assert main(["time", "--model", "net.prototxt", "--iterations", "1", "--plugin", "mine.py"]) == 1
+    expected = f"mine.py:10: in {method}: RuntimeError: cannot allocate a worker: the pool is closed"
+    assert capsys.readouterr().err.splitlines()[-1] == expected
+
+
 DATA_LAYERS = {
     "a batch": ("image_data_param { batch_size: 400000000 }", "found shape (400000000, 3, 40, 40)"),
     "a size": ("image_data_param { new_height: 4000000000 new_width: 4000000000 }", "found shape (1, 3, 4000000000,"),
