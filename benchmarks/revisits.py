@@ -21,9 +21,10 @@ from benchmarks.drives import GAP, NEAR, OVERLAP, SOFT_DEG
 from benchmarks.pages import RESULTS
 from benchmarks.settings import Cache
 from loopclosure.descriptors.similarity import similarity_matrix
+from loopclosure.detector.decision import RECENT
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.verification import Agreement, Between, GeometricCheck, LocalFeatures, Pairs
-from loopclosure.methods.auto import answer, find_matches
+from loopclosure.methods.auto import PRECISION, answer, find_matches
 from loopclosure.methods.base import earlier
 from loopclosure.methods.candidates import Compared
 from loopclosure.methods.contradiction import temporal
@@ -44,7 +45,7 @@ OVERLAPS = 0.25, 0.05  # of the footprint of a drone's image that another sees: 
 DESK_GAP = 90  # frames, 3 s: a hand-held camera turns to and fro
 HALVES = {"nordland_1": slice(596), "nordland_2": slice(596, None)}
 FLOORS = {"3 to 12": range(3, 13), "13 to 23": range(13, 24)}
-FILE = RESULTS / "revisits.json"
+FILE, SUMMARY = RESULTS / "revisits.json", RESULTS / "revisits-summary.json"
 
 
 @dataclass(frozen=True)
@@ -201,7 +202,8 @@ def _answered(compared: Compared, cache: Cache, queries: Sequence[Path], referen
 
 def online(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
     """Return the match of each frame (N,), -1 without one, as ``LoopDetector`` with a geometric check decides."""
-    detector = LoopDetector(check=Known(pairs=cache.pairs), exclude_recent=real.gap or None)
+    recent = real.gap or min(RECENT, len(rows) // 4)
+    detector = LoopDetector(check=Known(pairs=cache.pairs), exclude_recent=recent)
     images: Sequence[Any] = real.images
     found = [detector.add_descriptor(row, image=image) for row, image in zip(rows, images, strict=True)]
     return np.array([-1 if result.accepted is None else result.accepted for result in found])
@@ -223,8 +225,8 @@ def judged(real: Real, match: np.ndarray, how: str) -> dict[str, Any]:
     for angle, same in (("15", real.rule), ("45", real.wide)):
         loops = np.any(same & count, axis=1)
         right = int(np.count_nonzero(same[queries, match[queries]]))
-        row |= {f"with a loop, {angle}": int(np.count_nonzero(loops)), f"right, {angle}": right}
-        row |= {f"recall, {angle}": round(right / int(loops.sum()), 3) if loops.any() else None}
+        row |= {f"with a loop {angle}": int(np.count_nonzero(loops)), f"right {angle}": right}
+        row |= {f"recall {angle}": round(right / int(loops.sum()), 3) if loops.any() else None}
     return row
 
 
@@ -245,3 +247,13 @@ def measure(data: Path, work: Path, only: Sequence[str], say: Callable[[str], No
         names = list(_drives(data))
         ordered = sorted(rows.values(), key=lambda row: (list(HOW).index(row["how"]), names.index(row["drive"])))
         results.write(FILE, ordered, words)
+        results.write(SUMMARY, [summary(ordered, how) for how in HOW], words)
+
+
+def summary(rows: Sequence[dict[str, Any]], how: str) -> dict[str, Any]:
+    """Return on how many drives that nothing was chosen on the matches are precise, and their mean recall."""
+    judges = [row for row in rows if row["how"] == how and not row["chosen on"]]
+    precise = [row["accepted"] - row["right 45"] <= (1 - PRECISION) * row["accepted"] for row in judges]
+    recalls = [row["recall 45"] for row in judges if row["recall 45"] is not None]
+    mean = round(float(np.mean(recalls)), 2) if recalls else None
+    return {"how": how, "precise drives": f"{sum(precise)} of {len(precise)}", "mean recall 45": mean}

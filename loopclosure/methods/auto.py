@@ -146,7 +146,7 @@ def _results(searched: Searched, decision: Decision) -> list[LoopResult]:
     given, matches, stamps = searched.given, searched.matches, searched.stamps
     rejected = np.where(matches.tried, "not verified", "below threshold")
     verdicts = np.where(decision.loops, "accepted", np.where(matches.there, rejected, "no candidate")).tolist()
-    why = [said.why(row, matches, searched.lines, decision) for row in range(len(verdicts))]
+    why = [said.why(row, given, matches, searched.lines, decision) for row in range(len(verdicts))]
     results, looked_at = [], given.references[matches.match]
     frames = places(given, matches, decision.loops).tolist()
     for query, (row, match) in enumerate(zip(given.stands, frames, strict=True)):

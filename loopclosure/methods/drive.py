@@ -209,6 +209,7 @@ class _Comparison:
                     candidates=[(self.references[match], score) for match, score in result.candidates],
                     accepted=None if result.accepted is None else self.references[result.accepted],
                     inliers=None if number % step else result.inliers,
+                    reason=result.reason if step == 1 else "",  # it counts compared frames
                     stamp=None if np.isnan(stamp) else stamp,
                     score_of="sequence" if self.searched.matches.by_lines else "image",
                 )

@@ -76,6 +76,7 @@ class Best:
     targets  its score, -inf without one
     alone    the score of the line through the best single image, -inf without one
     decoys   the best score of a line elsewhere, -inf without one
+    other    the reference of that line
     owner    how many queries away that is which fits the match best
     middle   the score of the middle of the line
     chance   what such a short line scores by chance
@@ -85,6 +86,7 @@ class Best:
     targets: np.ndarray
     alone: np.ndarray
     decoys: np.ndarray
+    other: np.ndarray
     owner: np.ndarray
     middle: np.ndarray
     chance: np.ndarray
@@ -201,8 +203,11 @@ def search(given: Candidates, among: Pool, course: Course) -> Lines:
     chances = np.maximum(0, among.decoys.sum(axis=1) - crossed).sum()
     odds = max(1.0, among.found.sum() / max(1, chances))
     targets = np.where(np.isfinite(best.decoys), best.targets, -np.inf)  # of what has no decoy nothing is known
-    match = among.found.shape[1] - 1 - best.match if course.backwards else best.match
-    return Lines(course, replace(best, targets=targets, match=np.where(np.isneginf(targets), -1, match)), near, odds)
+    match, other = best.match, best.other
+    if course.backwards:
+        match, other = (among.found.shape[1] - 1 - of for of in (match, other))
+    match = np.where(np.isneginf(targets), -1, match)
+    return Lines(course, replace(best, targets=targets, match=match, other=other), near, odds)
 
 
 def _search_rows(among: Pool, sequence: SequenceSettings, rows: range, single: np.ndarray) -> Best:
@@ -225,6 +230,7 @@ def _search_rows(among: Pool, sequence: SequenceSettings, rows: range, single: n
         own.max(axis=1),
         own[numbers, single[rows.start : rows.stop]],
         decoys.max(axis=1),
+        decoys.argmax(axis=1),
         np.array(owner),
         middle[numbers, match],
         np.array(chance),

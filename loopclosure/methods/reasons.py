@@ -71,8 +71,8 @@ def total(results: Sequence[LoopResult], given: Candidates) -> str:
     return f"nothing here tells loops from chance: none is accepted ({tried})"
 
 
-def why(query: int, matches: Matches, lines: Lines | None, decision: Decision) -> str:
-    """Return what decided about the match of one query: its sequence or its points."""
+def why(query: int, given: Candidates, matches: Matches, lines: Lines | None, decision: Decision) -> str:
+    """Return what decided about the match of one query: its sequence, and against which other place, or its points."""
     points = ""
     if matches.tried[query]:
         inliers, evidence = matches.inliers[query], matches.evidence[query]
@@ -82,7 +82,10 @@ def why(query: int, matches: Matches, lines: Lines | None, decision: Decision) -
         points += ", but only a part of those that match" if decision.part[query] else ""
     if lines is None or not matches.by_lines:
         return points
-    sequence = f"sequence: {lines.best.targets[query]:.2f}, elsewhere {lines.best.decoys[query]:.2f}"
+    sequence = f"sequence: {lines.best.targets[query]:.2f}"
+    if np.isfinite(lines.best.decoys[query]):
+        away = abs(int(given.references[lines.best.other[query]] - given.references[matches.match[query]]))
+        sequence += f", the next best {lines.best.decoys[query]:.2f}, {away} frames away"
     if decision.by_line[query]:
         return sequence
     if decision.fell[query]:

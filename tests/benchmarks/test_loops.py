@@ -67,12 +67,12 @@ def test_real_drives_are_judged_by_two_rules_and_only_by_pairs_that_count() -> N
     match = np.full(12, -1)
     match[8:] = 7, 1, 5, 0
     row = revisits.judged(real, match, "detect")
-    assert {name: row[name] for name in ("frames", "accepted", "right, 15", "right, 45")} == {
+    assert {name: row[name] for name in ("frames", "accepted", "right 15", "right 45")} == {
         "frames": 12,
         "accepted": 3,
-        "right, 15": 1,
-        "right, 45": 2,
+        "right 15": 1,
+        "right 45": 2,
     }
-    assert (row["recall, 15"], row["recall, 45"], row["with a loop, 45"]) == (1.0, 1.0, 2)
+    assert (row["recall 15"], row["recall 45"], row["with a loop 45"]) == (1.0, 1.0, 2)
     assert revisits.judged(real, match, "map query")["accepted"] == 3
     assert [part.tolist() for part in real.third(1)] == [[4, 5, 6, 7], [0, 1, 2, 3, 8, 9, 10, 11]]
