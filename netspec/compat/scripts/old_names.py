@@ -20,7 +20,6 @@ from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
 from typing import Any
 
-from netspec.compat.scripts.as_python2 import py2_bytes
 from netspec.compat.scripts.operations import TRANSLATED
 from netspec.files.drives import relative
 from netspec.log import VARIABLE
@@ -142,11 +141,8 @@ def remedy(fault: BaseException) -> str:
     text = str(fault)
     frames = reversed(traceback.extract_tb(fault.__traceback__))
     frame = next((each for each in frames if each.filename in TRANSLATED), None)
-    if frame and isinstance(fault, (TypeError, UnicodeError)):
-        return (
-            f"{frame.filename}:{frame.lineno} is Python 2 code, which does not distinguish text from bytes, or 2.0 "
-            "from 2; convert explicitly, for example with text.encode(), data.decode() or int(x)"
-        )
+    if frame and (advice := _advice_for_python2(fault, text)):
+        return f"{frame.filename}:{frame.lineno} is Python 2 code that cannot be translated: {advice}"
     np = sys.modules.get("numpy")
     one_element = "only 0-dimensional arrays can be converted", "setting an array element with a sequence"
     if np and _is_too_new(np) and text.startswith(one_element):
@@ -159,6 +155,31 @@ def remedy(fault: BaseException) -> str:
         name = relative(fault.filename, os.path.dirname(str(caffe.__file__)))
         if not name.startswith(os.pardir):
             return f"this is python/caffe/{name} of Caffe's sources: put a copy at {fault.filename}"
+    return ""
+
+
+_ADVICE = {  # what an error says, and what to write in the line
+    "'cmp'": "cmp is gone; write (a > b) - (a < b), and sort with key=functools.cmp_to_key(function)",
+    "positional argument": "for a list, write sort(key=functools.cmp_to_key(function)); else leave out the argument",
+    "expected 1 argument": "write sorted(values, key=functools.cmp_to_key(function))",
+    "not supported between instances": "different types have no order; compare with None first, or convert",
+    "'bytes' object has no attribute 'encode'": "write codecs.encode(data, 'base64'), or leave out .encode",
+    "'str' object has no attribute 'decode'": "text is decoded already; leave out .decode",
+    "slice indices": "write int(x) for a number with a point",
+    "single integer": "write int(x) for a number with a point",
+    "as an integer": "write int(x) for a number with a point",
+    "__format__": "write str(x) for what is formatted",
+}
+
+
+def _advice_for_python2(fault: BaseException, text: str) -> str:
+    """Return what to write instead of the code that raised an error; "" for errors of other kinds."""
+    if isinstance(fault, (AttributeError, NameError, TypeError)):
+        for said, advice in _ADVICE.items():
+            if said in text:
+                return advice
+    if isinstance(fault, (TypeError, UnicodeError)):
+        return "text and bytes differ; write text.encode() for bytes, data.decode() for text, b'...' for a literal"
     return ""
 
 
@@ -179,7 +200,7 @@ def _fromstring(np: Any) -> Callable[..., Any]:
     def fromstring(string: Any, dtype: Any = float, count: int = -1, *, sep: str = "", **named: Any) -> Any:
         if sep:
             return text(string, dtype, count, sep=sep, **named)
-        return np.frombuffer(py2_bytes(string), dtype, count).copy()
+        return np.frombuffer(string, dtype, count).copy()
 
     return fromstring
 
@@ -423,7 +444,7 @@ def _pickle(pickle: Any) -> None:
     """Allow pickles of Python 2 with any bytes in strings, and files opened as text."""
     load, loads, dump = pickle.load, pickle.loads, pickle.dump
     pickle.load = lambda file, **named: load(getattr(file, "buffer", file), **{"encoding": "latin1", **named})
-    pickle.loads = lambda data, **named: loads(py2_bytes(data), **{"encoding": "latin1", **named})
+    pickle.loads = lambda data, **named: loads(data, **{"encoding": "latin1", **named})
     pickle.dump = lambda obj, file, *form, **named: dump(obj, getattr(file, "buffer", file), *form, **named)
 
 

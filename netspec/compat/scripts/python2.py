@@ -1,9 +1,11 @@
 """Recognizes Python 2, and translates it to Python 3 that computes the same.
 
-The translation is 2to3's (lib2to3 where Python still has it, else fissix, its fork), and adds what that leaves out:
-the quotient of whole numbers is rounded down, ``round`` gives a float and rounds halves away from zero, files and
-``StringIO`` take and give text and bytes (netspec/compat/scripts/as_python2.py). Imports of a package's own modules by
-bare name are resolved at run time, because only then it is known what is imported as a package.
+The translation is 2to3's (lib2to3 where Python still has it, else fissix, its fork), and adds what public programs for
+Caffe need: the quotient of whole numbers is rounded down, ``round`` gives a float and rounds halves away from zero,
+files are opened with Python 2's modes, and ``StringIO`` is a file of bytes (netspec/compat/scripts/as_python2.py).
+Imports of a package's own modules by bare name are resolved at run time, because only then it is known what is imported
+as a package. What else differs, such as text and bytes or the order of different types, mostly ends in an error;
+old_names.py then says in which line, and what to write there.
 """
 
 from __future__ import annotations
@@ -17,7 +19,6 @@ import io
 import re
 import tokenize
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 from netspec.compat.scripts import as_python2
@@ -175,12 +176,10 @@ def _name(node: ast.AST) -> str:
 
 # ---- Translating ----
 
-_BUILTINS_OF_2 = ("cmp", "file", "open", "round")  # those that are others in Python 2
-_HELPERS = (*_BUILTINS_OF_2, "py2_div", "py2_idiv", "reduce", "intern", "reload")  # what import_helpers imports
+_BUILTINS_OF_2 = ("file", "open", "round")  # those that are others in Python 2
+_HELPERS = (*_BUILTINS_OF_2, "py2_div", "py2_divisor", "reduce", "intern", "reload")  # what import_helpers imports
 _HOME = "netspec.compat.scripts.as_python2"
 _ALONE = "as_python2"  # by this name a translation that needs no netspec imports from itself
-_FILES = ("file", "open", _ALONE)  # what needs the functions and classes of files
-_BYTES_IN_TEXT = re.compile(r"(?<!\\)((?:\\\\)*)\\x([89a-fA-F][0-9a-fA-F])")
 
 
 @functools.cache
@@ -203,8 +202,6 @@ def translated(data: bytes, path: str, alone: bool = False) -> str:
     except Exception as fault:  # each part of 2to3 has errors of its own
         raise SyntaxError(f"this is neither Python 3 nor Python 2: {fault}") from None
     helpers = [] if "division" in tree.future_features else _floor_quotients(tree, package)
-    if "unicode_literals" not in tree.future_features:
-        _mark_bytes(tree, package)
     helpers += _used_builtins(tree)
     return _with_helpers(str(tree), helpers) if alone else str(tree)
 
@@ -217,25 +214,19 @@ def _translator() -> str:
 
 @functools.cache
 def _tool(package: str, home: str) -> Any:
-    """Return 2to3, which takes files in memory from the module ``home``."""
+    """Return 2to3, which takes StringIO from the module ``home``."""
     refactor = importlib.import_module(f"{package}.refactor")
     fixers = refactor.get_fixers_from_package(f"{package}.fixes")
     without = ["import"]
-    if home == _HOME:  # these insert a line; "sorted" is done by netspec/compat/scripts/operations.py
-        without += ["reduce", "intern", "reload", "sorted"]
+    if home == _HOME:  # these insert a line, which import_helpers does not
+        without += ["reduce", "intern", "reload"]
+    without += ["sorted"]  # it takes a.sort(0) of an array for a comparison
     without = [f"{package}.fixes.fix_{name}" for name in without]
     tool = refactor.RefactoringTool([name for name in fixers if name not in without])
     for fixer in (*tool.pre_order, *tool.post_order):
         if type(fixer).__name__ == "FixImports":
             fixer.mapping = {**fixer.mapping, "StringIO": home, "cStringIO": home}
-        if type(fixer).__name__ == "FixSorted":
-            fixer.match = functools.partial(_sorts_a_list, fixer.match)
     return tool
-
-
-def _sorts_a_list(match: Callable[[Any], Any], node: Any) -> Any:
-    """Return what ``match`` returns for a call of sort, but False for NumPy's: ``np.sort(a)`` and ``a.sort(0)``."""
-    return match(node) if not re.search(r"^(np|numpy)\b|\.sort\(\s*-?\d", str(node).strip()) else False
 
 
 def _encoding(data: bytes) -> str:
@@ -295,21 +286,12 @@ def _floor_quotients(tree: Any, package: str) -> list[str]:
                     left = pytree.Node(syms.term, [left, operator, right])
             parent_slot.replace(left)
         elif node.type == syms.expr_stmt and operators == ["/="] and not _is_float(node.children[2]):
-            target, _, value = list(node.children)
+            value = node.children[2]
             value.remove()
-            node.children[1].value = "="
-            again = target.clone()
-            again.prefix = " "
-            node.append_child(call("idiv", again, value))
+            used.add("py2_divisor")
+            value.prefix = ""
+            node.append_child(util.Call(util.Name("py2_divisor"), [value], prefix=" "))
     return sorted(used)
-
-
-def _mark_bytes(tree: Any, package: str) -> None:
-    """Write bytes above 127 in strings as those of a file are read: they are bytes again where those are due."""
-    kind = importlib.import_module(f"{package}.pgen2.token").STRING
-    for leaf in tree.leaves():
-        if leaf.type == kind and leaf.value[0] in "\"'" and "\\x" in leaf.value:
-            leaf.value = _BYTES_IN_TEXT.sub(r"\1\\udc\2", leaf.value)
 
 
 def _is_float(node: Any) -> bool:
@@ -351,14 +333,18 @@ def _with_helpers(text: str, helpers: list[str]) -> str:
     """Return a text with helpers, behind the docstring and the imports from __future__."""
     if not helpers:
         return text
-    named = {name for name in helpers if name not in _FILES}
-    if any(name.startswith("py2_") for name in helpers):
-        named.add("py2_is_whole")
-    if named != set(helpers) - {"py2_is_whole"}:
-        named |= {"py2_bytes", "py2_text", "Py2Bytes", "file", "StringIO", "open"}
+    more = {
+        **dict.fromkeys(("py2_div", "py2_divisor"), ("py2_is_whole",)),
+        **dict.fromkeys(("file", "open"), ("open", "py2_bytes", "py2_writer")),
+        _ALONE: ("StringIO", "py2_bytes"),
+    }
+    named = {*helpers, *(name for helper in helpers for name in more.get(helper, ()))} - {"file"}
     functions = [value for name, value in vars(as_python2).items() if name in named]  # in the order of the file
     parts = [inspect.getsource(function) for function in functions]
-    line = "\n\n".join(["import builtins\nimport io\nimport math\nimport numbers\nimport sys\n", *parts])
+    line = "\n\n".join(
+        ["import builtins\nimport decimal\nimport io\nimport math\nimport numbers\nimport sys\n", *parts]
+    )
+    line += "\n\nfile = open\n" if "file" in helpers else ""
     line += f"\n\nsys.modules[{_ALONE!r}] = sys.modules[__name__]\n\n" if _ALONE in helpers else "\n\n"
     tree = ast.parse(text)
     first = _head(tree)

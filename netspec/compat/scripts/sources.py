@@ -217,27 +217,15 @@ def _generated(data: bytes, path: str) -> CodeType:
     return compile(_GENERATED.format(file.encode("latin1") if isinstance(file, str) else file), path, "exec")
 
 
-#: Functions of these modules, and methods of these names, take bytes.
-_TAKE_BYTES = ("base64", "binascii", "hashlib", "struct", "zlib")
-_METHODS_WITH_BYTES = ("FromString", "MergeFromString", "ParseFromString")
-_WITH_SIZES = ("empty", "ones", "reshape", "resize", "zeros")  # functions that take sizes by position
-
-
 class _Mending(ast.NodeTransformer):
-    """Replaces what Python 3 or NumPy refuses, or does differently, by calls of netspec/compat/scripts/operations.py.
+    """Replaces what NumPy refuses, or does differently, by calls of netspec/compat/scripts/operations.py.
 
-    These are ``a.tostring()``, ``"%f" % a`` and ``float(a)`` for one element; in Python 2 also text instead of bytes,
-    comparisons of different types, ``sort(cmp)``, and floats as sizes and in slices.
+    These are ``a.tostring()``, ``"%f" % a`` and ``float(a)`` for one element; in Python 2 also ``a == None``,
+    ``a == []`` and floats in slices.
     """
 
     def __init__(self, is_python2: bool) -> None:
         self.is_python2 = is_python2
-        self.with_bytes = {"bytearray"}  # and what is imported from the modules above
-
-    def visit_ImportFrom(self, node: ast.ImportFrom) -> ast.AST:
-        if node.module in _TAKE_BYTES:
-            self.with_bytes.update(alias.asname or alias.name for alias in node.names)
-        return node
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
         self.generic_visit(node)
@@ -248,21 +236,6 @@ class _Mending(ast.NodeTransformer):
             node.args = [a if isinstance(a, ast.Starred) else _calling("number", a) for a in node.args]
         elif isinstance(function, ast.Attribute) and not node.args and not node.keywords:
             function.attr = RENAMED_METHODS.get(name, name)
-        return ast.copy_location(self._of_python2(node, name, of), node) if self.is_python2 else node
-
-    def _of_python2(self, node: ast.Call, name: str, of: str) -> ast.Call:
-        function, keywords = node.func, node.keywords
-        is_method = isinstance(function, ast.Attribute)
-        if is_method and name in ("decode", "encode") and not keywords:
-            return _calling(name, function.value, *node.args)
-        if is_method and name == "format" and (node.args or keywords):
-            return _calling(name, function.value, *node.args, keywords=keywords)
-        if (is_method and name == "sort" and (node.args or keywords)) or (not is_method and name == "sorted"):
-            return _calling("sort", function, *node.args, keywords=keywords)
-        if of in _TAKE_BYTES or name in (_METHODS_WITH_BYTES if is_method else self.with_bytes):
-            return _calling("bytes", function, *node.args, keywords=keywords)
-        if name in _WITH_SIZES or {"shape", "size"} & {keyword.arg for keyword in keywords}:
-            return _calling("sized", function, *node.args, keywords=keywords)
         return node
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
@@ -285,12 +258,11 @@ class _Mending(ast.NodeTransformer):
         self.generic_visit(node)
         name, right = type(node.ops[0]).__name__.lower(), node.comparators[0]
         is_bare = isinstance(right, ast.List) or (isinstance(right, ast.Constant) and right.value is None)
-        known = ("lt", "lte", "gt", "gte", *(("eq", "noteq") if is_bare else ()))
-        if self.is_python2 and len(node.ops) == 1 and name in known:
-            return ast.copy_location(_calling(re.sub("te$", "e", name), node.left, right), node)
+        if self.is_python2 and len(node.ops) == 1 and is_bare and name in ("eq", "noteq"):
+            return ast.copy_location(_calling(name, node.left, right), node)
         return node
 
 
-def _calling(name: str, *arguments: ast.expr, keywords: Sequence[ast.keyword] = ()) -> ast.Call:
+def _calling(name: str, *arguments: ast.expr) -> ast.Call:
     """Return a call of one of the functions of netspec/compat/scripts/operations.py."""
-    return ast.Call(ast.Name(REPLACEMENT.format(name), ast.Load()), list(arguments), list(keywords))
+    return ast.Call(ast.Name(REPLACEMENT.format(name), ast.Load()), list(arguments), [])
