@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from loopclosure.cli.data_set import recording_of, typed, warn_of_unreadable
+from loopclosure.closing.close import constraint
+from loopclosure.closing.measure import Loop, cells, errors_said, measure
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
@@ -24,8 +26,10 @@ from loopclosure.index.index import INDEXES
 from loopclosure.methods.auto import PRECISION
 from loopclosure.methods.drive import Request, last_session, later_threshold, whole_drive
 from loopclosure.methods.features import WhitenBy
+from loopclosure.places import intrinsics
 from loopclosure.places.frames import live_frames
 from loopclosure.places.image_sequence import ImageSequence
+from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.source import DETECTED, FRAMES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
@@ -133,6 +137,11 @@ def _add_detect(commands: Commands) -> None:
         metavar="FILE",
         help="poses (TUM, KITTI, EuRoC); frames far apart by these poses are never a loop",
     )
+    parser.add_argument(
+        "--camera",
+        metavar="NUMBERS",
+        help=f"{intrinsics.FORM}: measures the relative pose of each loop, if the source has no calibration",
+    )
     parser.add_argument("--save", metavar="F.npz", help="write the detector to this file, for --resume")
     parser.add_argument(
         "--rerun", metavar="F.rrd", help="write images, scores and loops for the Rerun viewer (rerun.io)"
@@ -183,7 +192,11 @@ def _detect(a: argparse.Namespace) -> None:
         names += recording.names
         if a.rerun:
             write_detected(Path(a.rerun), recording, results, bar)
-    write_loops_csv(out / "loops.csv", detector.loops, detector.stamps, names)
+    loops, relatives = [], None
+    if recording is not None and (camera := _camera(a, recording)) is not None:
+        loops = _measured(detector, recording, camera)
+        relatives = {loop.query: cells(loop.relative) for loop in loops if loop.relative is not None}
+    write_loops_csv(out / "loops.csv", detector.loops, detector.stamps, names, relatives=relatives)
     write_whole(out / "chosen.txt", "\n".join(reasons) + "\n")
     # Drawing takes a second to import.
     from loopclosure.report.drive import write_drive
@@ -192,21 +205,23 @@ def _detect(a: argparse.Namespace) -> None:
     write_drive(out / "report.html", results, reasons, recording, a.command_line)
     if recording is not None and len(recording.unreadable) > read:
         warn(f"{len(recording.unreadable) - read} images cannot be read; the report shows no pairs with them")
-    loops = sum(result.accepted is not None for result in results)
-    print(f"{loops} loops in {len(results)} frames: {out / 'loops.csv'}; report: {out / 'report.html'}")
+    count = sum(result.accepted is not None for result in results)
+    print(f"{count} loops in {len(results)} frames: {out / 'loops.csv'}; report: {out / 'report.html'}")
     print("\n".join(reasons))
     if engine := getattr(net, "engine", ""):
         print(f"descriptors: {a.describe}, computed by {engine}")
     poses, odometry = detector.poses, detector.odometry
-    measured = np.isfinite(odometry).any()
-    if measured or np.isfinite(poses).any():
-        left_out = write_g2o(
-            out / "loops.g2o", odometry if measured else poses, detector.loops, run.from_poses(detector)
-        )
-        note = f"; loops without a known relative pose, left out: {left_out}" if left_out else ""
-        print(f"pose graph of the {'odometry' if measured else 'known poses'}{note}: {out / 'loops.g2o'}")
+    driven = np.isfinite(odometry).any()
+    if driven or np.isfinite(poses).any():
+        of_loop = {(loop.query, loop.match): constraint(loop.relative) for loop in loops if loop.relative is not None}
+        relative = run.from_poses(detector) if not driven and relatives is None else lambda *ends: of_loop.get(ends)
+        left_out = write_g2o(out / "loops.g2o", odometry if driven else poses, detector.loops, relative)
+        note = f"; loops without a measured relative pose, left out: {left_out}" if left_out else ""
+        print(f"pose graph of the {'odometry' if driven else 'known poses'}{note}: {out / 'loops.g2o'}")
     if np.isfinite(poses).any():
         print(run.judged_by_poses(detector))
+        if said := errors_said(loops, poses):
+            print(said)
     if a.save:
         detector.save(a.save)
     if ended is not None:
@@ -228,6 +243,23 @@ def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResu
         except KeyboardInterrupt as end:
             return results, end
     return results, None
+
+
+def _camera(a: argparse.Namespace, recording: ImageSequence) -> Intrinsics | None:
+    """Return the camera that measures loops; None if it is not known, or the images cannot be read again."""
+    if not recording.paths:
+        return None
+    return intrinsics.from_text(a.camera) if a.camera else recording.camera
+
+
+def _measured(detector: LoopDetector, recording: ImageSequence, camera: Intrinsics) -> list[Loop]:
+    """Return the loops within this drive, numbered as by the detector, with their relative poses."""
+    first = len(detector) - len(recording)
+    found = [(loop.query_id - first, loop.accepted - first) for loop in detector.loops if loop.accepted is not None]
+    own = [Loop(query, match) for query, match in found if match >= 0]
+    return [
+        Loop(loop.query + first, loop.match + first, loop.relative) for loop in measure(recording, own, camera, bar)
+    ]
 
 
 def _odometry(path: str, source: str, recording: ImageSequence) -> np.ndarray:
@@ -381,6 +413,6 @@ def _query(a: argparse.Namespace) -> None:
         results = run.run_detector(Visitor(detector), recording, progress=bar)
     recording = warn_of_unreadable(recording)
     loops = [result for result in results if result]
-    write_loops_csv(out / "loops.csv", loops, recording.stamps, recording.names, detector.stamps, known.names)
+    write_loops_csv(out / "loops.csv", loops, recording.stamps, recording.names, (detector.stamps, known.names))
     print(run.verdicts_said(results))
     print(f"{len(loops)} of {len(results)} frames are in the map: {out / 'loops.csv'}")

@@ -9,8 +9,10 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from loopclosure.closing.relative import LEAST_INLIERS, Relative, View, relative_view
+from loopclosure.closing.relative import LEAST_INLIERS, METRIC, ROTATION_ONLY, Relative, View, relative_view
+from loopclosure.detector.export import relative_pose
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_bgr, read_depth
@@ -23,6 +25,7 @@ from netspec.files.whole_file import safe_cell
 
 # Images are not reduced: a larger image gives a better pose.
 CHECK = GeometricCheck(max_features=1000, min_inliers=LEAST_INLIERS, most_side=1_000_000)
+LEAST_BASELINE_M = 0.1  # with less between two cameras, the true direction is as uncertain as the true poses
 KEPT_VIEWS = 500  # images with cached features
 
 
@@ -88,6 +91,41 @@ def measure(
         matches = CHECK.matches(match.local, query.local)
         measured.append(Loop(loop.query, loop.match, relative_view(match, query, matches)))
     return measured
+
+
+def cells(relative: Relative) -> list[object]:
+    """Return the cells of ``loopclosure.detector.export.RELATIVE`` in loops.csv; empty where nothing is known."""
+    length = float(np.linalg.norm(relative.pose[:3]))
+    toward = [f"{value:.6f}" for value in relative.pose[:3] / length] if length > 0 else [""] * 3
+    sigmas = ("", "")
+    if relative.sigmas is not None:
+        sigmas = f"{relative.sigmas[0]:.4g}", f"{np.rad2deg(relative.sigmas[1]):.4g}"
+    metric = f"{length:.6f}" if relative.kind == METRIC else ""
+    return [relative.kind, *(f"{v:.6f}" for v in relative.pose[3:]), *toward, metric, relative.inliers, *sigmas]
+
+
+def errors_said(loops: Sequence[Loop], poses: np.ndarray) -> str:
+    """Return a sentence with the median errors of measured loops by the true poses (N, 7); empty if none is known."""
+    turns, directions, shifts = [], [], []
+    for loop in loops:
+        both = poses[[loop.match, loop.query]]
+        if loop.relative is None or not np.isfinite(both).all():
+            continue
+        true, found = relative_pose(*both), loop.relative.pose
+        turn = Rotation.from_quat(true[3:]).inv() * Rotation.from_quat(found[3:])
+        turns.append(np.rad2deg(turn.magnitude()))
+        far = np.linalg.norm(true[:3])
+        if loop.relative.kind == METRIC:
+            shifts.append(np.linalg.norm(found[:3] - true[:3]))
+        if loop.relative.kind != ROTATION_ONLY and far > LEAST_BASELINE_M:
+            cosine = found[:3] @ true[:3] / far / np.linalg.norm(found[:3])
+            directions.append(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))
+    if not turns:
+        return ""
+    parts = [f"rotation {np.median(turns):.2g} degrees"]
+    parts += [f"direction {np.median(directions):.2g} degrees (of {len(directions)})"] if directions else []
+    parts += [f"translation {np.median(shifts):.2g} m (of {len(shifts)})"] if shifts else []
+    return f"median errors of the {len(turns)} measured loops, by the true poses: {', '.join(parts)}"
 
 
 def _frame(row: dict[str, str], end: str, numbers: dict[str, int], path: Path, line: int) -> int:

@@ -45,11 +45,14 @@ class Relative:
     pose     (7,) tx ty tz qx qy qz qw; "up to scale": the translation has length 1; "rotation only": it is 0
     kind     "metric", "up to scale" or "rotation only"
     inliers  matches that agree with it
+    sigmas   standard deviations of its translation in meters and of its rotation in radians, from the residuals of the
+             points; None if it is not metric. They do not contain errors of the calibration or of the depth
     """
 
     pose: np.ndarray
     kind: str
     inliers: int
+    sigmas: tuple[float, float] | None = None
 
 
 def relative_view(match: View, query: View, matches: np.ndarray) -> Relative | None:
@@ -62,6 +65,11 @@ def relative_view(match: View, query: View, matches: np.ndarray) -> Relative | N
         return None
     pixels = match.local.points[matches[:, 0]], query.local.points[matches[:, 1]]
     in_match, in_query = match.camera.rays(pixels[0]), query.camera.rays(pixels[1])
+    ahead = np.isfinite(in_match).all(axis=1) & np.isfinite(in_query).all(axis=1)
+    if np.count_nonzero(ahead) < LEAST_INLIERS:
+        return None
+    pixels = pixels[0][ahead], pixels[1][ahead]
+    in_match, in_query = in_match[ahead], in_query[ahead]
     focal = np.sqrt(query.camera.fx * query.camera.fy)
     directions = ((match, pixels[0], in_match, in_query), (query, pixels[1], in_query, in_match))
     for view, points, rays, other in directions:
@@ -71,8 +79,8 @@ def relative_view(match: View, query: View, matches: np.ndarray) -> Relative | N
         known = depths > 0
         found = _from_depth(rays[known], depths[known], other[known], focal)
         if found is not None:
-            rotation, translation, inliers = found  # from this view to the other
-            return Relative(_pose(rotation, translation, inverse=view is match), METRIC, inliers)
+            rotation, translation, inliers, sigmas = found  # from this view to the other
+            return Relative(_pose(rotation, translation, inverse=view is match), METRIC, inliers, sigmas)
     return _from_color(in_match, in_query, focal)
 
 
@@ -88,8 +96,11 @@ def _depth_at(depth: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _from_depth(
     rays: np.ndarray, depths: np.ndarray, seen: np.ndarray, focal: float
-) -> tuple[np.ndarray, np.ndarray, int] | None:
-    """Return rotation and translation that take the points rays * depths (N,) to where they are ``seen`` (N, 2)."""
+) -> tuple[np.ndarray, np.ndarray, int, tuple[float, float]] | None:
+    """Return the motion that takes the points rays * depths (N,) to where they are ``seen`` (N, 2).
+
+    It is a rotation (3, 3), a translation (3,), the number of points that agree, and the sigmas of :class:`Relative`.
+    """
     if len(rays) < LEAST_INLIERS:
         return None
     points = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
@@ -102,7 +113,25 @@ def _from_depth(
         return None
     kept = inliers[:, 0].astype(np.intp)
     rotation, translation = cv2.solvePnPRefineLM(points[kept], seen[kept], np.eye(3), None, rotation, translation)
-    return cv2.Rodrigues(rotation)[0], translation[:, 0], len(kept)
+    return (
+        cv2.Rodrigues(rotation)[0],
+        translation[:, 0],
+        len(kept),
+        _sigmas(points[kept], seen[kept], rotation, translation),
+    )
+
+
+def _sigmas(points: np.ndarray, seen: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> tuple[float, float]:
+    """Return the standard deviations of a translation in meters and a rotation in radians, of one axis on the average.
+
+    The covariance is s^2 (J^T J)^-1, with the Jacobian J of the projections and the variance s^2 of their residuals.
+    """
+    projected, jacobian = cv2.projectPoints(points, rotation, translation, np.eye(3), None)
+    residuals = (projected.reshape(-1, 2) - seen).ravel()
+    variance = float(residuals @ residuals) / max(len(residuals) - 6, 1)
+    covariance = variance * np.linalg.pinv(jacobian[:, :6].T @ jacobian[:, :6])  # rotation first
+    turn, shift = (float(np.sqrt(np.trace(covariance[part, part]) / 3)) for part in (slice(0, 3), slice(3, 6)))
+    return shift, turn
 
 
 def _from_color(in_match: np.ndarray, in_query: np.ndarray, focal: float) -> Relative | None:

@@ -21,6 +21,7 @@ from netspec.files.whole_file import write_csv, write_whole
 
 VERTEX, EDGE, VERTEX_2D, EDGE_2D = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_SE2", "EDGE_SE2"
 PLANE = np.array([0, 1, 5])  # x, y and the rotation about z, in the 6-vector of a pose error
+RELATIVE = ("relative", "qx", "qy", "qz", "qw", "dx", "dy", "dz", "length_m", "agreeing", "sigma_m", "sigma_deg")
 LOOPS = (
     "query_id",
     "match_id",
@@ -33,7 +34,8 @@ LOOPS = (
     "score_of",
 )
 
-RelativePose = Callable[[int, int], np.ndarray | None]
+# A pose (7,) of the query in the frame of the match and its information (6, 6), or None.
+RelativePose = Callable[[int, int], tuple[np.ndarray, np.ndarray] | None]
 
 
 @dataclass(frozen=True)
@@ -64,19 +66,21 @@ def write_loops_csv(
     loops: Sequence[LoopResult],
     stamps: np.ndarray | None = None,
     names: Sequence[str] | None = None,
-    match_stamps: np.ndarray | None = None,
-    match_names: Sequence[str] | None = None,
+    matched: tuple[np.ndarray | None, Sequence[str]] | None = None,
+    relatives: Mapping[int, Sequence[object]] | None = None,
 ) -> None:
     """Write one row per loop: query_id, match_id, score, inliers, and stamps (N,) in seconds and names (N) if known.
 
     The last column says whether the score is one of images or of sequences.
 
-    ``match_stamps`` and ``match_names`` (M) are given if the matches are frames of another drive.
+    matched    the stamps and names (M) of the matches, if they are frames of another drive
+    relatives  query_id -> the cells of the columns RELATIVE: the measured pose of the query in the frame of its match
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    every = (stamps, stamps if match_names is None else match_stamps)
-    all_names = (names, names if match_names is None else match_names)
+    others = (stamps, names) if matched is None else matched
+    every, all_names = (stamps, others[0]), (names, others[1])
+    unknown = [""] * len(RELATIVE)
     rows = []
     for loop in loops:
         assert loop.accepted is not None
@@ -85,7 +89,9 @@ def write_loops_csv(
         names_of_ends = ["" if of is None else of[i] for of, i in zip(all_names, ends, strict=True)]
         inliers = "" if loop.inliers is None else loop.inliers
         rows.append([*ends, f"{loop.score:.9g}", inliers, *times, *names_of_ends, loop.score_of])
-    write_csv(path, LOOPS, rows, "surrogateescape")
+        if relatives is not None:
+            rows[-1] += relatives.get(loop.query_id, unknown)
+    write_csv(path, (*LOOPS, *(RELATIVE if relatives is not None else ())), rows, "surrogateescape")
 
 
 def write_g2o(path: str | Path, poses: np.ndarray, loops: Sequence[LoopResult], relative: RelativePose) -> int:
@@ -93,7 +99,8 @@ def write_g2o(path: str | Path, poses: np.ndarray, loops: Sequence[LoopResult], 
 
     poses     (N, 7) poses of the frames, tx ty tz qx qy qz qw, as the robot estimates them; NaN if not known. They are
               the vertices, and consecutive poses give the odometry edges.
-    relative  (query_id, match_id) -> pose (7,) of the query in the frame of the match, or None. It must be measured
+    relative  (query_id, match_id) -> pose (7,) of the query in the frame of the match and its information (6, 6), or
+              None. It must be measured
               (by the images, depth, or motion capture), and never come from the robot's poses, because the loop is
               to correct their drift. Loops without it are left out.
     """
@@ -108,11 +115,11 @@ def write_g2o(path: str | Path, poses: np.ndarray, loops: Sequence[LoopResult], 
     with_pose = set(known)
     for loop in loops:
         assert loop.accepted is not None
-        step = relative(loop.query_id, loop.accepted)
-        if step is None or not {loop.query_id, loop.accepted} <= with_pose:
+        edge = relative(loop.query_id, loop.accepted)
+        if edge is None or not {loop.query_id, loop.accepted} <= with_pose:
             left_out += 1
             continue
-        edges.append((loop.accepted, loop.query_id, step, LOOP_SIGMAS.information()))
+        edges.append((loop.accepted, loop.query_id, *edge))
     write_pose_graph(path, {i: poses[i] for i in known}, edges)
     return left_out
 

@@ -18,7 +18,7 @@ from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.whitening import Whitening
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import Describe, LoopDetector
-from loopclosure.detector.export import RelativePose, relative_pose
+from loopclosure.detector.export import LOOP_SIGMAS, RelativePose, relative_pose
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
@@ -107,9 +107,9 @@ def from_poses(detector: LoopDetector) -> RelativePose:
     """Return a function that computes relative poses from absolute poses (motion capture)."""
     poses = detector.poses
 
-    def relative(query: int, match: int) -> np.ndarray | None:
+    def relative(query: int, match: int) -> tuple[np.ndarray, np.ndarray] | None:
         both = poses[[match, query]]
-        return relative_pose(*both) if np.all(np.isfinite(both)) else None
+        return (relative_pose(*both), LOOP_SIGMAS.information()) if np.all(np.isfinite(both)) else None
 
     return relative
 

@@ -13,13 +13,18 @@ from loopclosure.errors import InputError
 from netspec.files.opencv import cv2
 
 FORM = "FX,FY,CX,CY or FX,FY,CX,CY,K1,K2,P1,P2 or FX,FY,CX,CY,K1,K2,P1,P2,K3"
+FISHEYE = "equidistant"  # the name of the model in sensor.yaml, in CameraInfo and in calibration.txt
+PINHOLE = ("radial-tangential", "radtan", "plumb_bob", "rational_polynomial", "")
+FARTHEST = 20.0  # of a point in the plane at depth 1: 87 degrees from the axis
+COUNTS = (0, 4, 5, 8)  # of OpenCV's coefficients for a pinhole camera; a fisheye has 4
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera: focal lengths and principal point in pixels, OpenCV's distortion (k1 k2 p1 p2 [k3]).
+    """A camera: focal lengths and principal point in pixels, OpenCV's distortion (k1 k2 p1 p2 [k3 [k4 k5 k6]]).
 
-    ``size`` is the (width, height) in pixels of the calibrated images, None if not known.
+    ``size`` is the (width, height) in pixels of the calibrated images, None if not known. A ``fisheye`` has the
+    equidistant model with k1 k2 k3 k4 (Kannala and Brandt, PAMI 2006), as TUM-VI.
     """
 
     fx: float
@@ -28,6 +33,7 @@ class Intrinsics:
     cy: float
     distortion: tuple[float, ...] = ()
     size: tuple[int, int] | None = None
+    fisheye: bool = False
 
     def of_size(self, width: int, height: int) -> Intrinsics:
         """Return the camera for images scaled to this size; integer coordinates are pixel centers."""
@@ -38,10 +44,22 @@ class Intrinsics:
         return replace(self, fx=self.fx * x, fy=self.fy * y, cx=cx, cy=cy, size=(width, height))
 
     def rays(self, points: np.ndarray) -> np.ndarray:
-        """Convert pixels (N, 2) to undistorted points (N, 2) in the plane at depth 1."""
+        """Convert pixels (N, 2) to undistorted points (N, 2) in the plane at depth 1.
+
+        Pixels of a fisheye that look sideways or back have no such point; they are NaN.
+        """
         matrix = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
         pixels = np.asarray(points, np.float64).reshape(-1, 1, 2)
-        return cv2.undistortPoints(pixels, matrix, np.array(self.distortion or (0.0,) * 4)).reshape(-1, 2)
+        bent = np.array(self.distortion or (0.0,) * 4)
+        if not self.fisheye:
+            return cv2.undistortPoints(pixels, matrix, bent).reshape(-1, 2)
+        if not len(pixels):
+            return np.zeros((0, 2))
+        points = cv2.fisheye.undistortPoints(pixels, matrix, bent).reshape(-1, 2)
+        # OpenCV limits the distance from the center, as it is drawn, to that of a right angle.
+        drawn = np.linalg.norm((pixels[:, 0] - (self.cx, self.cy)) / (self.fx, self.fy), axis=1, keepdims=True)
+        ahead = (drawn < np.pi / 2) & (np.abs(points).max(axis=1, keepdims=True) < FARTHEST)
+        return np.where(ahead, points, np.nan)
 
 
 def from_text(text: str) -> Intrinsics:
@@ -56,14 +74,16 @@ def write_calibration(path: Path, camera: Intrinsics) -> None:
     """Write ``calibration.txt``, which :func:`read_intrinsics` reads."""
     size = camera.size or (0, 0)
     numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *size, *camera.distortion]
-    head = "# fx fy cx cy width height" + (" k1 k2 p1 p2 k3"[: 3 * len(camera.distortion)])
-    path.write_text(f"{head}\n{' '.join(f'{number:.9g}' for number in numbers)}\n", encoding="utf-8")
+    names = " k1 k2 k3 k4 model" if camera.fisheye else " k1 k2 p1 p2 k3 k4 k5 k6"[: 3 * len(camera.distortion)]
+    row = " ".join([*(f"{number:.9g}" for number in numbers), *([FISHEYE] if camera.fisheye else [])])
+    path.write_text(f"# fx fy cx cy width height{names}\n{row}\n", encoding="utf-8")
 
 
 def read_intrinsics(path: Path, camera: str = "") -> Intrinsics:
     """Read a calibration: ``sensor.yaml``, ``calib.txt`` (with ``camera``, P0 to P3), or ``calibration.txt``.
 
-    ``calibration.txt`` has one row: fx fy cx cy width height, followed by k1 k2 p1 p2 [k3] if there is distortion.
+    ``calibration.txt`` has one row: fx fy cx cy width height, followed by k1 k2 p1 p2 [k3 [k4 k5 k6]] if there is
+    distortion, or by k1 k2 k3 k4 and the word "equidistant" for a fisheye.
     Raises InputError for other files.
     """
     try:
@@ -72,19 +92,23 @@ def read_intrinsics(path: Path, camera: str = "") -> Intrinsics:
         raise InputError("cannot be read as text; expected the camera's calibration", path) from None
     if path.suffix == ".yaml":
         model = re.search(r"^distortion_model\s*:\s*(\S+)", text, re.MULTILINE)
-        if model and model[1] not in ("radial-tangential", "radtan", "plumb_bob"):
-            raise InputError(f"distortion model {model[1]} is not supported; expected radial-tangential", path)
+        fisheye = model is not None and model[1] == FISHEYE
+        if model and not fisheye and model[1] not in PINHOLE:
+            expected = f"expected radial-tangential or {FISHEYE}"
+            raise InputError(f"distortion model {model[1]} is not supported; {expected}", path)
         size = yaml_numbers(text, "resolution", 2, path)
         inner = yaml_numbers(text, "intrinsics", 4, path)
-        return _checked(inner, yaml_numbers(text, "distortion_coefficients", 4, path), size, path)
+        found = _checked(inner, yaml_numbers(text, "distortion_coefficients", 4, path), size, path)
+        return replace(found, fisheye=fisheye)
     if camera:
         matrix = kitti_projection(text, camera, path)
         return _checked([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], [], None, path)
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    numbers = _floats(rows[0]) if len(rows) == 1 else []
-    if len(numbers) not in (6, 10, 11):
+    fisheye = len(rows) == 1 and rows[0][-1] == FISHEYE
+    numbers = _floats(rows[0][:-1] if fisheye else rows[0]) if len(rows) == 1 else []
+    if len(numbers) - 6 not in ((4,) if fisheye else COUNTS):
         raise InputError("expected one row: fx fy cx cy width height, and k1 k2 p1 p2 [k3] with distortion", path)
-    return _checked(numbers[:4], numbers[6:], numbers[4:6], path)
+    return replace(_checked(numbers[:4], numbers[6:], numbers[4:6], path), fisheye=fisheye)
 
 
 def yaml_numbers(text: str, key: str, count: int, path: Path) -> list[float]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.places.intrinsics import Intrinsics
+from loopclosure.places.intrinsics import COUNTS, FISHEYE, PINHOLE, Intrinsics
 from loopclosure.places.pixels import compressed_pixels, raw_pixels
 
 
@@ -16,14 +16,15 @@ def image_of(message: Any) -> np.ndarray:
 
 
 def camera_of(message: Any) -> Intrinsics | None:
-    """Return the camera of a CameraInfo; None if it is not calibrated, or not a pinhole camera."""
+    """Return the camera of a CameraInfo; None if it is not calibrated, or of another model than pinhole and fisheye."""
     k, d = (message.K, message.D) if hasattr(message, "K") else (message.k, message.d)  # ROS 1, 2
-    pinhole = message.distortion_model in ("plumb_bob", "") and len(d) in (0, 4, 5)
-    if not (k[0] > 0 and pinhole):
+    fisheye = message.distortion_model in (FISHEYE, "fisheye") and len(d) == 4
+    pinhole = message.distortion_model in PINHOLE and len(d) in COUNTS
+    if not (k[0] > 0 and (pinhole or fisheye)):
         return None
-    bent = tuple(float(value) for value in d) if np.any(d) else ()
+    bent = tuple(float(value) for value in d) if np.any(d) or fisheye else ()
     size = (int(message.width), int(message.height))
-    return Intrinsics(float(k[0]), float(k[4]), float(k[2]), float(k[5]), bent, size)
+    return Intrinsics(float(k[0]), float(k[4]), float(k[2]), float(k[5]), bent, size, fisheye)
 
 
 def pose_of(message: Any) -> np.ndarray:

@@ -15,8 +15,9 @@ from loopclosure.closing.close import (
     turn_rmse_deg,
 )
 from loopclosure.closing.graph import Edge, State, _Graph, solve
-from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, View, relative_view
-from loopclosure.detector.export import LOOP_SIGMAS, relative_pose
+from loopclosure.closing.measure import Loop, cells, errors_said
+from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, Relative, View, _from_depth, relative_view
+from loopclosure.detector.export import LOOP_SIGMAS, RELATIVE, relative_pose
 from loopclosure.detector.verification import LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.places.intrinsics import Intrinsics, from_text
@@ -202,3 +203,41 @@ def test_loops_at_one_position_are_reported(ends: list[tuple[int, int]], spot: b
     edges = [Edge(first, second, poses[0], np.eye(6)) for first, second in ends]
     closed = Closed(np.arange(41), poses, poses, [], edges, [], np.ones(len(edges), bool), 0)
     assert ("the path between them goes up to 19.5 m away" in one_spot(closed)) == spot
+
+
+def test_the_standard_deviations_of_a_metric_pose_are_those_of_its_errors() -> None:
+    rng, focal = np.random.default_rng(4), 260.0
+    points = rng.uniform([-2, -1.5, 2], [2, 1.5, 6], (80, 3))
+    step, turn = np.array([0.4, -0.1, 0.3]), TURN.as_matrix()
+    seen = points @ turn.T + step
+    shifts, turns, sigmas = [], [], []
+    for _ in range(40):
+        noise = rng.normal(0, 0.5 / focal, (80, 2))
+        found = _from_depth(points[:, :2] / points[:, 2:], points[:, 2], seen[:, :2] / seen[:, 2:] + noise, focal)
+        assert found is not None
+        rotation, translation, _, sigma = found
+        shifts.append(translation - step)
+        turns.append((Rotation.from_matrix(rotation) * TURN.inv()).as_rotvec())
+        sigmas.append(sigma)
+    shift, angle = np.mean(sigmas, axis=0)
+    assert shift == pytest.approx(np.sqrt(np.mean(np.square(shifts))), rel=0.25)
+    assert angle == pytest.approx(np.sqrt(np.mean(np.square(turns))), rel=0.25)
+
+
+def test_a_measured_loop_is_a_row_of_the_table_and_judged_by_true_poses() -> None:
+    true = np.array([[0, 0, 0, 0, 0, 0, 1.0], [3, 0, 4, *TURN.as_quat()]])
+    turned = (TURN * Rotation.from_euler("y", 2, degrees=True)).as_quat()
+    metric = Relative(np.array([3, 0, 4.1, *TURN.as_quat()]), METRIC, 60, (0.01, np.deg2rad(0.3)))
+    scaled = Relative(np.array([0.6, 0, 0.8, *turned]), UP_TO_SCALE, 40)
+    turn = Relative(np.array([0, 0, 0, *TURN.as_quat()]), ROTATION_ONLY, 50)
+    rows = [dict(zip(RELATIVE, cells(each), strict=True)) for each in (metric, scaled, turn)]
+    assert [row["length_m"] for row in rows] == ["5.080354", "", ""]
+    assert [(row["dx"], row["dz"]) for row in rows] == [("0.590510", "0.807030"), ("0.600000", "0.800000"), ("", "")]
+    assert [(row["sigma_m"], row["sigma_deg"]) for row in rows] == [("0.01", "0.3"), ("", ""), ("", "")]
+    assert [row["agreeing"] for row in rows] == [60, 40, 50]
+    loops = [Loop(1, 0, each) for each in (metric, scaled, turn, None)]
+    said = errors_said(loops, true)
+    assert said.startswith("median errors of the 3 measured loops, by the true poses: rotation ")
+    assert said.endswith(" degrees, direction 0.34 degrees (of 2), translation 0.1 m (of 1)")
+    assert "rotation 2 degrees, direction" in errors_said([loops[1]], true)
+    assert errors_said(loops, np.full((2, 7), np.nan)) == ""

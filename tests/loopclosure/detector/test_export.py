@@ -42,7 +42,10 @@ def test_relative_pose_is_the_inverse_times_the_other(poses):
 def test_g2o_edges_chain_the_vertices(tmp_path, poses):
     path = tmp_path / "out" / "graph.g2o"
     left_out = write_g2o(
-        path, poses, [loop(3, 0), loop(3, 1)], lambda q, m: relative_pose(poses[m], poses[q]) if m == 0 else None
+        path,
+        poses,
+        [loop(3, 0), loop(3, 1)],
+        lambda q, m: (relative_pose(poses[m], poses[q]), np.eye(6)) if m == 0 else None,
     )
     assert left_out == 1
     vertices, edges = {}, []
@@ -68,7 +71,9 @@ def test_information_is_the_inverse_of_squared_sigmas():
 
 def test_frames_without_a_pose_have_no_vertex(tmp_path, poses):
     poses[1] = np.nan
-    left_out = write_g2o(tmp_path / "g.g2o", poses, [loop(3, 1)], lambda q, m: np.array([0, 0, 0, 0, 0, 0, 1.0]))
+    left_out = write_g2o(
+        tmp_path / "g.g2o", poses, [loop(3, 1)], lambda q, m: (np.array([0, 0, 0, 0, 0, 0, 1.0]), np.eye(6))
+    )
     lines = (tmp_path / "g.g2o").read_text().splitlines()
     assert left_out == 1
     assert [line.split()[1] for line in lines if line.startswith("VERTEX")] == ["0", "2", "3"]
