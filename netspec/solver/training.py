@@ -102,9 +102,7 @@ class Training:
         log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
         log.write(lines)
         self.seed = self._chosen_seed()
-        rule = update.find_rule(param.type)
-        assert rule is not None, "check_settings refuses unknown types"
-        self.rule = rule
+        self.rule = update.RULES[param.type]
         self.scores: list[Outputs] = []
         self.losses: deque[float] = deque(maxlen=param.average_loss)
         self._build_nets(*described)

@@ -214,22 +214,16 @@ RULES: dict[str, Rule] = {
 }
 
 
-def find_rule(type_name: str) -> Rule | None:
-    """Return the rule of a solver's ``type``, in upper or lower case; None if the type is unknown."""
-    return {name.lower(): rule for name, rule in RULES.items()}.get(type_name.lower())
-
-
 def rule_faults(param: Any, node: Position) -> Iterator[SpecError]:
     """Yield the errors that the constructors of Caffe's solvers detect."""
-    rule = find_rule(param.type)
+    rule = RULES.get(param.type)  # capitals count, as in Caffe
     if rule is None:
         message = f'unknown solver type "{param.type}", expected one of {", ".join(RULES)}'
         yield SpecError(message + did_you_mean(param.type, list(RULES)), node.find("type"))
         return
-    name = next(name for name in RULES if RULES[name] is rule)
     if param.momentum and not rule.momentum:
-        yield SpecError(f"momentum cannot be used with {name}; remove it", node.find("momentum"))
-    if name == "RMSProp" and not 0 <= param.rms_decay < 1:
+        yield SpecError(f"momentum cannot be used with {param.type}; remove it", node.find("momentum"))
+    if param.type == "RMSProp" and not 0 <= param.rms_decay < 1:
         yield SpecError(f"rms_decay {param.rms_decay:g}, expected at least 0 and less than 1", node.find("rms_decay"))
 
 

@@ -252,5 +252,5 @@ def get_solver(solver_file: FilePath) -> Solver:
     param, node = parse_solver(solver_file)
     for fault in rule_faults(param, node):
         raise fault
-    named = {cls.type_name.lower(): cls for cls in _SOLVERS}
-    return named[param.type.lower()](solver_file)
+    named = {cls.type_name: cls for cls in _SOLVERS}
+    return named[param.type](solver_file)

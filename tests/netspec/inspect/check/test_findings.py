@@ -166,7 +166,7 @@ def test_a_training_without_snapshots_is_found(advice: Callable[..., list[str]])
         ("gamma: 0.1", ["3:1: gamma has no effect with type SGD and lr_policy fixed; remove it"]),
         ("stepvalue: 10 stepvalue: 20", ["3:1: stepvalue has no effect with type SGD and lr_policy fixed; remove it"]),
         ('type: "Adam" momentum2: 0.9 delta: 1e-8', []),
-        ('type: "adagrad" delta: 1e-8', []),
+        ('type: "AdaGrad" delta: 1e-8', []),
         ('type: "RMSProp" rms_decay: 0.9 momentum2: 0.9',
          ["3:32: momentum2 has no effect with type RMSProp and lr_policy fixed; remove it"]),
     ],
