@@ -105,7 +105,7 @@ def _upgrade_net_proto_text(arguments: argparse.Namespace) -> None:
     from netspec.proto.text import read_net, write_text
 
     if is_net_binary(arguments.input):
-        from netspec.export.formats.recovered import recover_net
+        from netspec.inspect.recovered import recover_net
 
         net, _ = recover_net(arguments.input, dict(arguments.shape))
     elif arguments.shape:

@@ -222,6 +222,11 @@ def _variants() -> dict[str, Case]:
             "blocks",
             x=MAPS,
         ),
+        "LRN with k": _case(
+            "LRN",
+            given("x", 2, 4, 3, 3) + layer("LRN", "x", "y", "lrn_param { alpha: 0.5 k: 1.5 local_size: 3 }"),
+            x=MAPS,
+        ),
         "Pooling, windows beyond the map": _case(
             "Pooling",
             given("x", 2, 4, 3, 3) + layer("Pooling", "x", "y", "pooling_param { kernel_size: 1 stride: 3 }"),

@@ -22,7 +22,7 @@ from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import values_of
 from netspec.net.net import Net
 
-OPSET, IR_VERSION = 21, 10  # ONNX 1.16 (2024), which all current runtimes read
+OPSET, IR_VERSION = 17, 8  # ONNX 1.12 (2022); older readers know it, and onnx2torch nothing newer
 LARGEST = 2**31 - 2**24  # bytes of weights: protobuf's limit, with room for the graph
 LARGE, PAGE = (
     1024,

@@ -7,7 +7,6 @@ from netspec.export.layers import (
     data,
     loss,
     normalization,
-    powers,
     recurrent,
     scale,
     utility,

@@ -18,7 +18,11 @@ class LRNExport(Exporter):
         param = self.layer.param.lrn_param
         size, reach = param.local_size, param.local_size // 2
         if param.norm_region == ACROSS_CHANNELS:
-            return graph.node("LRN", *bottoms, size=size, alpha=param.alpha, beta=param.beta, bias=param.k)
+            if param.k == int(param.k):
+                return graph.node("LRN", *bottoms, size=size, alpha=param.alpha, beta=param.beta, bias=param.k)
+            # OpenVINO 2026.4 rounds k down.
+            top = graph.node("LRN", *bottoms, size=size, alpha=param.alpha / param.k, beta=param.beta, bias=1.0)
+            return graph.node("Mul", top, graph.constant(param.k**-param.beta))
         squares = graph.node("Mul", *bottoms, *bottoms)
         window = {"kernel_shape": [size] * 2, "pads": [reach] * 4, "count_include_pad": 1}
         mean = graph.node("Mul", graph.node("AveragePool", squares, **window), graph.constant(param.alpha))
@@ -43,11 +47,11 @@ class MVNExport(Exporter):
         missing = list(range(len(self.layer.bottom_shapes[0]), 4))
         if missing:
             data = graph.node("Unsqueeze", data, graph.constant(missing))
-        axes = graph.constant(list(range(1 if param.across_channels else 2, 4)))
-        top = graph.node("Sub", data, graph.node("ReduceMean", data, axes, keepdims=1))
+        axes = list(range(1 if param.across_channels else 2, 4))
+        top = graph.node("Sub", data, graph.node("ReduceMean", data, axes=axes, keepdims=1))
         if not param.normalize_variance:
             return top
-        variance = graph.node("ReduceMean", graph.node("Mul", top, top), axes, keepdims=1)
+        variance = graph.node("ReduceMean", graph.node("Mul", top, top), axes=axes, keepdims=1)
         return graph.node("Div", top, graph.node("Add", graph.node("Sqrt", variance), graph.constant(param.eps)))
 
     def to_torch(self, code: TorchCode, x: Expression) -> Expression:

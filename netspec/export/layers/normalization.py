@@ -64,5 +64,5 @@ def onnx_normalized(graph: OnnxGraph, data: str, axes: int, eps: float) -> str:
 def _onnx_channel_means(graph: OnnxGraph, data: str, axes: int) -> str:
     # One after the other, since means over nonadjacent axes are wrong in OpenCV 5.0.
     for part in ([0], list(range(2, axes))):
-        data = graph.node("ReduceMean", data, graph.constant(part), keepdims=1) if part else data
+        data = graph.node("ReduceMean", data, axes=part, keepdims=1) if part else data
     return data

@@ -56,9 +56,11 @@ class ReductionExport(Exporter):
             data = graph.node("Abs", data)
         elif p.operation == layer.SUMSQ:
             data = graph.node("Mul", data, data)
-        axes = graph.constant(list(range(layer.axis, len(layer.bottom_shapes[0]))))
-        op = "ReduceMean" if p.operation == layer.MEAN else "ReduceSum"
-        top = graph.node(op, data, axes, keepdims=0)
+        axes = list(range(layer.axis, len(layer.bottom_shapes[0])))
+        if p.operation == layer.MEAN:
+            top = graph.node("ReduceMean", data, axes=axes, keepdims=0)
+        else:
+            top = graph.node("ReduceSum", data, graph.constant(axes), keepdims=0)
         return top if p.coeff == 1 else graph.node("Mul", top, graph.constant(p.coeff))
 
     def to_torch(self, code: TorchCode, x: Expression) -> Expression:
@@ -147,7 +149,7 @@ class SliceExport(Exporter):
         if graph.sizes(0)[layer.axis] is not None:
             return graph.nodes("Split", *bottoms, graph.constant(layer.sizes), outputs=layer.num_tops, axis=layer.axis)
         if not points:
-            return graph.nodes("Split", *bottoms, outputs=layer.num_tops, axis=layer.axis, num_outputs=layer.num_tops)
+            return graph.nodes("Split", *bottoms, outputs=layer.num_tops, axis=layer.axis)
         axis = graph.constant([layer.axis])
         return [
             graph.node("Slice", *bottoms, graph.constant([start]), graph.constant([end]), axis)

@@ -16,13 +16,13 @@ from typing import Any
 from netspec import log
 from netspec.errors import ForkFault, SpecError
 from netspec.export.formats.inputs import wrong_given_shapes
-from netspec.export.formats.recovered import recover_net
 from netspec.files.limits import memory
 from netspec.graph.filter import with_state, with_train_state
 from netspec.graph.options import BuildOptions
 from netspec.inspect.check import net_rules, solver_rules  # noqa: F401, they register their rules
 from netspec.inspect.check.findings import NET, PLAN, SETTINGS, SOLVER, TEXT, Finding, findings, not_ignored
 from netspec.inspect.check.forks import gathered, others, python_layers, unknown_types
+from netspec.inspect.recovered import recover_net
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights
@@ -56,7 +56,7 @@ def check_file(
 ) -> list[Checked]:
     """Check a net for a phase, level and stages; or a solver and all its nets (level and stages: the training net's).
 
-    For a .caffemodel, the net inside it is checked (:func:`netspec.export.formats.recovered.recover_net`).
+    For a .caffemodel, the net inside it is checked (:func:`netspec.inspect.recovered.recover_net`).
 
     ``weights`` are paths separated by commas, for the start of a training; they replace those of the solver. A file
     that cannot be read gives one result without a net. On a device other than "meta" a net gets memory, as

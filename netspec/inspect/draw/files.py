@@ -7,13 +7,13 @@ from pathlib import Path
 
 from netspec import log
 from netspec.errors import SpecError
-from netspec.export.formats.recovered import recover_net
 from netspec.files.whole_file import write_whole
 from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.diagram import Diagram, diagram_of
 from netspec.inspect.draw.dot import dot_of
 from netspec.inspect.draw.graphviz import render
 from netspec.inspect.draw.page import net_page
+from netspec.inspect.recovered import recover_net
 from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap

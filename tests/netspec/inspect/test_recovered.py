@@ -12,7 +12,7 @@ import torch
 
 import netspec
 from netspec.errors import SpecError
-from netspec.export.formats.recovered import recover_net
+from netspec.inspect.recovered import recover_net
 from netspec.net.weights import net_to_proto
 from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import BlobProto, Datum, LayerParameter, NetParameter, V1LayerParameter
