@@ -246,9 +246,7 @@ def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResu
 
 
 def _camera(a: argparse.Namespace, recording: ImageSequence) -> Intrinsics | None:
-    """Return the camera that measures loops; None if it is not known, or the images cannot be read again."""
-    if not recording.paths:
-        return None
+    """Return the camera that measures loops; None if it is not known."""
     return intrinsics.from_text(a.camera) if a.camera else recording.camera
 
 
@@ -281,6 +279,8 @@ def _checked_options(a: argparse.Namespace) -> dict[str, str]:
         raise WrongUsage("expected the frames, or --video")
     if a.video and (a.features or a.least_precision is not None):
         raise WrongUsage(f"--{'features' if a.features else 'least-precision'} needs a complete recording, not --video")
+    if a.video and a.camera:
+        raise WrongUsage("--camera measures loops in images that are read again, which those of --video are not")
     if a.rerun:
         check_rerun()
     if a.resume and (_changes(a) or a.verify):

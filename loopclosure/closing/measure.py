@@ -73,21 +73,34 @@ def read_loops(path: Path, frames: ImageSequence) -> list[Loop]:
 def measure(
     sequence: ImageSequence, loops: Sequence[Loop], camera: Intrinsics, progress: Progress = silent
 ) -> list[Loop]:
-    """Measure the pose of each loop's query in the frame of its match, from depth if it is available."""
+    """Measure the pose of each loop's query in the frame of its match, from depth if it is available.
+
+    A loop of an image that cannot be read is not measured.
+    """
+
+    wanted = {end for loop in loops for end in (loop.query, loop.match)}
+    # A video is read once, in order.
+    of_video = {} if sequence.paths else {i: _view(CHECK, camera, image) for i, image, _ in sequence.frames(wanted)}
 
     @lru_cache(KEPT_VIEWS)
     def view(frame: int) -> View:
+        if not sequence.paths:
+            return of_video[frame]
         image = read_bgr(sequence.paths[frame])
         height, width = image.shape[:2]
         depths = sequence.depths
         file, depth = None if depths is None else depths[frame], None
         if file is not None:
             depth = cv2.resize(read_depth(file).astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
-        return View(CHECK.describe(image), camera.of_size(width, height), depth)
+        return _view(CHECK, camera, image, depth)
 
     measured = []
     for loop in progress(loops, "measuring loops", len(loops)):
-        match, query = view(loop.match), view(loop.query)
+        try:
+            match, query = view(loop.match), view(loop.query)
+        except InputError:
+            measured.append(Loop(loop.query, loop.match))
+            continue
         matches = CHECK.matches(match.local, query.local)
         measured.append(Loop(loop.query, loop.match, relative_view(match, query, matches)))
     return measured
@@ -126,6 +139,10 @@ def errors_said(loops: Sequence[Loop], poses: np.ndarray) -> str:
     parts += [f"direction {np.median(directions):.2g} degrees (of {len(directions)})"] if directions else []
     parts += [f"translation {np.median(shifts):.2g} m (of {len(shifts)})"] if shifts else []
     return f"median errors of the {len(turns)} measured loops, by the true poses: {', '.join(parts)}"
+
+
+def _view(check: GeometricCheck, camera: Intrinsics, image: np.ndarray, depth: np.ndarray | None = None) -> View:
+    return View(check.describe(image), camera.of_size(image.shape[1], image.shape[0]), depth)
 
 
 def _frame(row: dict[str, str], end: str, numbers: dict[str, int], path: Path, line: int) -> int:

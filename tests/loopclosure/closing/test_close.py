@@ -3,6 +3,7 @@
 import csv
 import io
 import re
+import shutil
 from contextlib import redirect_stdout
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.cli import main
-from loopclosure.closing.measure import read_loops
+from loopclosure.closing.measure import Loop, measure, read_loops
 from loopclosure.detector.export import relative_pose
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
@@ -207,3 +208,13 @@ def test_missing_loops_are_reported_with_a_limit(tmp_path: Path, monkeypatch: py
     assert str(fault.value) == f"{expected}; relative paths start from {tmp_path}"
     with pytest.raises(InputError, match=f'; "{tmp_path}" has no "gone"$'):
         read_loops(tmp_path / "gone" / "loops.csv", ImageSequence.of_files([Path("a.png")]))
+
+
+def test_a_loop_of_an_image_that_cannot_be_read_is_not_measured(walk: Path, tmp_path: Path) -> None:
+    sequence = read_sequence(walk)
+    assert sequence.camera is not None
+    files = [shutil.copy(path, tmp_path) for path in sequence.paths[:40]]
+    Path(files[0]).write_bytes(b"")
+    frames = ImageSequence.of_files([Path(file) for file in files])
+    found = measure(frames, [Loop(30, 0), Loop(1, 2)], sequence.camera)
+    assert [(loop.query, loop.match, loop.relative is None) for loop in found] == [(30, 0, True), (1, 2, False)]
