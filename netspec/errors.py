@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 from typing import Any
 
 
@@ -53,15 +54,35 @@ _CONTROLS = [
 _ESCAPES = {code: repr(chr(code))[1:-1] for code in _CONTROLS}
 
 
+class Code(Enum):
+    """What an error is, for code that must tell it from others. Sentences are for people, and may change."""
+
+    UNKNOWN_TYPE = auto()  # details: the layer type
+    UNKNOWN_BOTTOM = auto()  # details: the blob
+    CHANNELS = auto()  # of a bottom do not fit the filters
+    INPUTS = auto()  # of inner products; details: how many were found and expected
+    LABELS = auto()  # details: how many labels and predictions
+    SHAPES = auto()  # of bottoms differ
+    SHAPES_BESIDE_AXIS = auto()  # of bottoms that are joined differ in other axes
+    NO_KERNEL_SIZE = auto()
+    NOT_BINARY = auto()  # no message of protobuf in a file; details: the message that was expected
+    UNWRITABLE = auto()  # details: the reason
+
+
 class SpecError(ValueError):
     """An error in a user's file: what was found, what was expected, what to do, and where.
 
-    ``str(error)`` is one line that begins with ``file:line:column: `` (``file: `` if there is no line).
+    ``str(error)`` is one line that begins with ``file:line:column: `` (``file: `` if there is no line). ``code`` is
+    None for an error that no code asks for.
     """
 
-    def __init__(self, message: str, where: Where | None = None) -> None:
+    def __init__(
+        self, message: str, where: Where | None = None, code: Code | None = None, details: tuple[object, ...] = ()
+    ) -> None:
         self.message = message
         self.where = where
+        self.code = code
+        self.details = details
         super().__init__(printable(f"{where}: {message}" if where else message))
 
 

@@ -18,3 +18,16 @@ def read_cases(path: str) -> dict[str, dict[str, str]]:
         found = re.findall(r"^--- (.*)\n((?:(?!--- ).*\n)*?)(?=--- |\Z)", parts, re.M)
         cases[name] = {part: text[:-1] for part, text in found}
     return cases
+
+
+def read_table(path: str) -> list[dict[str, str]]:
+    """Return the rows of a table in a file below tests/: columns between ``|``, named by the first; ``-`` is ""."""
+    lines = [line for line in (_FOLDER / path).read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    names = [name.strip() for name in lines[0].split("|")]
+    rows = [[cell.strip() for cell in line.split("|", len(names) - 1)] for line in lines[1:]]
+    return [{name: "" if cell == "-" else cell for name, cell in zip(names, row, strict=True)} for row in rows]
+
+
+def sizes(text: str) -> list[tuple[int, ...]]:
+    """Return the shapes of ``2x3 4x5x6``; ``()`` is a shape without axes."""
+    return [() if shape == "()" else tuple(map(int, shape.split("x"))) for shape in text.split()]

@@ -23,7 +23,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from netspec.errors import SpecError, Where, printable
+from netspec.errors import Code, SpecError, Where, printable
 
 try:
     import fcntl
@@ -51,7 +51,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     written.
     """
     if "\0" in str(path):
-        raise _fault(f"cannot be written: {NO_NUL}", path)
+        raise _unwritable(NO_NUL, path)
     real = Path(os.path.realpath(path))
     try:
         if real.exists() and not real.is_file() and not real.is_dir():
@@ -72,7 +72,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
             sync_folder(real.parent)
     except OSError as fault:
         reason = os.strerror(fault.errno) if fault.errno else fault  # h5py's own message is a paragraph
-        raise _fault(f"cannot be written: {reason}", path) from None
+        raise _unwritable(reason, path) from None
 
 
 def write_whole(path: str | Path, content: str | bytes, errors: str = "strict") -> None:
@@ -153,7 +153,7 @@ def only_one(path: str | Path, advice: str) -> Iterator[None]:
                 raise _fault("is not a lock file of netspec; move it away", path) from None
             held, locked = _open_locked(path, os.O_RDWR)
     except OSError as fault:
-        raise _fault(f"cannot be written: {fault.strerror}", path) from None
+        raise _unwritable(fault.strerror, path) from None
     try:
         os.lseek(held, 0, os.SEEK_SET)
         owner = _MARK.fullmatch(os.read(held, 100))
@@ -351,3 +351,7 @@ def _copied_to(device: Path) -> Iterator[Path]:
 
 def _fault(message: str, path: str | Path) -> Exception:
     return SpecError(message, Where(str(path)))
+
+
+def _unwritable(reason: object, path: str | Path) -> Exception:
+    return SpecError(f"cannot be written: {reason}", Where(str(path)), Code.UNWRITABLE, (reason,))

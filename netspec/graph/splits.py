@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from netspec.errors import SpecError, did_you_mean
+from netspec.errors import Code, SpecError, did_you_mean
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.upgrade.rewrite import copy_without
@@ -86,7 +86,8 @@ def _count_uses(
                         f": {maker} makes it {remedy}" if maker else f"{hint or ';'} available: {_last_names(latest)}"
                     )
                     where = source.at(i, "bottom", j, layer=layer.name, type=layer.type)
-                    source.report(SpecError(f'unknown bottom blob "{blob}"{known}', where))
+                    message = f'unknown bottom blob "{blob}"{known}'
+                    source.report(SpecError(message, where, Code.UNKNOWN_BOTTOM, (blob,)))
                 continue
             producer[i, j] = latest[blob]
             uses[latest[blob]] += 1

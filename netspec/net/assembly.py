@@ -17,7 +17,7 @@ import torch
 from google.protobuf.message import Message
 
 from netspec import log
-from netspec.errors import Report, SpecError, Where
+from netspec.errors import Code, Report, SpecError, Where
 from netspec.files.limits import LIMIT, amount, is_out_of_memory, memory, read_amount
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import AUTOMATIC, Backward, Node, Param, Plan, plan_backward
@@ -95,7 +95,7 @@ class Assembly:
         log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
         cls = class_of(param, self.options)
         if cls is None:
-            self._report(SpecError(unknown_type(node.type), this.at("type")))
+            self._report(SpecError(unknown_type(node.type), this.at("type"), Code.UNKNOWN_TYPE, (node.type,)))
             return None
         if any(v not in self._values for v in node.bottoms):
             return None  # an error upstream was reported

@@ -113,7 +113,7 @@ def check_weights(path: Path) -> None:
     try:
         digest = Digest.read(read_content(extra)["weights"])
     except SpecError as fault:
-        log.logger.warning(f"{fault.where}: {fault.message.partition(';')[0]}: {path.name} was not checked against it")
+        log.logger.warning(f"{fault}; {path.name} was not checked against it")
         return
     except FAULTS:
         return

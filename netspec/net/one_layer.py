@@ -11,7 +11,7 @@ import torch
 from typing_extensions import override
 
 from netspec import log
-from netspec.errors import SpecError
+from netspec.errors import Code, SpecError
 from netspec.exact import SMALL
 from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, Random, class_of, unknown_type
@@ -83,7 +83,7 @@ def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int |
     options = replace(context.options, dialects=tuple(sorted(forks().dialects_of(net))))
     cls = class_of(param, options)
     if cls is None:
-        raise SpecError(unknown_type(param.type), at("type"))
+        raise SpecError(unknown_type(param.type), at("type"), Code.UNKNOWN_TYPE, (param.type,))
     param.bottom.extend(f"bottom{i}" for i in range(len(param.bottom), len(shapes)))
     if tops is None:
         fewest = len(shapes) if cls.same_tops else cls.tops[0]

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from netspec.errors import Report, SpecError, raise_fault
+from netspec.errors import Code, Report, SpecError, raise_fault
 from netspec.exact import ALL, NONE
 from netspec.files.whole_file import whole_file, why_unwritable
 from netspec.graph.plan import Node
@@ -66,7 +66,7 @@ def check_prefix(param: Any, node: Position, report: Report = raise_fault, *, tr
                 unfinished.write_bytes(b"tried")
             probe.unlink()
         except SpecError as fault:
-            reason = fault.message.removeprefix("cannot be written: ")
+            reason = str(fault.details[0]) if fault.code is Code.UNWRITABLE else fault.message
     if reason:
         begins = "" if probe.is_absolute() else f"; relative paths start from {Path.cwd()}"
         advice = f"make sure that the directory exists and is writable{begins}"

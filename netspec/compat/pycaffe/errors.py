@@ -6,42 +6,32 @@ Exceptions of the code of a Python layer, while a net is built, are raised uncha
 from __future__ import annotations
 
 import importlib
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from netspec.errors import SpecError
+from netspec.errors import Code, SpecError
 
 _LABELS = (
-    "outer_num_ * inner_num_ == bottom[1]->count() ({1} vs. {0}) Number of labels must match number of predictions; "
+    "Check failed: outer_num_ * inner_num_ == bottom[1]->count() ({1} vs. {0}) "
+    "Number of labels must match number of predictions; "
     "e.g., if softmax axis == 1 and prediction shape is (N, C, H, W), label count (number of labels) must be N*H*W, "
     "with integer values in {{0, 1, ..., C-1}}."
 )
-#: Our messages, and the check in Caffe that fails for the same fault.
-_CHECKS = [
-    (r'unknown layer type "(.*?)"', "registry.count(type) == 1 (0 vs. 1) Unknown layer type: {0}"),
-    (
-        r"has (\d+) values from axis \d+ on, expected (\d+)",
-        "K_ == new_K ({1} vs. {0}) Input size incompatible with inner product parameters.",
-    ),
-    (
-        r"does not fit the filters, made for (\d+) channels",
-        "bottom[0]->shape(channel_axis_) == channels_ Input size incompatible with convolution kernel.",
-    ),
-    (r"found (\d+) labels, shape .* for (\d+) predictions", _LABELS),
-    (
-        r"expected equal shapes except along axis",
-        "top_shape[j] == bottom[i]->shape(j) All inputs must have the same shape, except at concat_axis.",
-    ),
-    (r"expected equal shapes$", "bottom[0]->shape() == bottom[i]->shape()"),
-    (r"kernel_size .* is missing", "kernel_shape_data[i] > 0 Filter dimensions must be nonzero."),
-    (
-        r"expected a binary NetParameter",
-        "ReadProtoFromBinaryFile(param_file, param) Failed to parse NetParameter file: {file}",
-    ),
-]
-_WORDS = [(r'unknown bottom blob "(.*?)"', "Unknown bottom blob '{0}' (layer '{layer}'")]
+#: What Caffe says where an error has this code. The numbers are those of the error's details.
+_WORDS = {
+    Code.UNKNOWN_TYPE: "Check failed: registry.count(type) == 1 (0 vs. 1) Unknown layer type: {0}",
+    Code.INPUTS: "Check failed: K_ == new_K ({1} vs. {0}) Input size incompatible with inner product parameters.",
+    Code.CHANNELS: "Check failed: bottom[0]->shape(channel_axis_) == channels_ "
+    "Input size incompatible with convolution kernel.",
+    Code.LABELS: _LABELS,
+    Code.SHAPES_BESIDE_AXIS: "Check failed: top_shape[j] == bottom[i]->shape(j) "
+    "All inputs must have the same shape, except at concat_axis.",
+    Code.SHAPES: "Check failed: bottom[0]->shape() == bottom[i]->shape()",
+    Code.NO_KERNEL_SIZE: "Check failed: kernel_shape_data[i] > 0 Filter dimensions must be nonzero.",
+    Code.NOT_BINARY: "Check failed: ReadProtoFromBinaryFile(param_file, param) Failed to parse {0} file: {file}",
+    Code.UNKNOWN_BOTTOM: "Unknown bottom blob '{0}' (layer '{layer}')",
+}
 
 
 class CheckError(SpecError):
@@ -68,11 +58,7 @@ def caffes_errors() -> Iterator[None]:
 def _caffes_words(fault: SpecError) -> str | None:
     where = fault.where
     known = {"file": where.file if where else "", "layer": where.layer if where else ""}
-    for table, prefix, end in ((_CHECKS, "Check failed: ", ""), (_WORDS, "", ")")):
-        for pattern, words in table:
-            if found := re.search(pattern, fault.message):
-                return prefix + words.format(*found.groups(), **known) + end
-    return None
+    return _WORDS[fault.code].format(*fault.details, **known) if fault.code in _WORDS else None
 
 
 DISTRIBUTIONS = {"skimage": "scikit-image", "pydot": "pydot", "fissix": "fissix"}

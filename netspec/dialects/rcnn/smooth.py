@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from netspec.dialects.registry import added_value
 from netspec.dialects.signatures import fork_of
+from netspec.errors import Code
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.loss.base import VALID, Loss, normalization_mode, normalizer
@@ -91,7 +92,7 @@ class SmoothL1Loss(Loss):
         for i, shape in enumerate(full):
             if shape != full[0]:
                 message = f"found bottoms of shapes {bottom_shapes[0]} and {bottom_shapes[i]}, expected equal shapes"
-                raise self.error(message, "bottom", i)
+                raise self.error(message, "bottom", i, code=Code.SHAPES)
         return [(), (full[0][0], 1, *full[0][2:])][: self.num_tops]
 
     def forward(

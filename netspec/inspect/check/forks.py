@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from netspec.errors import ForkFault, SpecError
+from netspec.errors import Code, ForkFault, SpecError
 from netspec.layers import class_of, layer_class, unknown_type
 from netspec.proto.forks import forks
 from netspec.proto.schema import NetParameter
@@ -47,7 +47,7 @@ def others(faults: Sequence[SpecError], unknown: Sequence[SpecError]) -> list[Sp
     """Return the faults without those that an unknown field or type in the same layer may have caused."""
     positions = {(fault.where.file, fault.where.layer) for fault in unknown if fault.where and fault.where.layer}
     own = [fault for fault in faults if fault.where and (fault.where.file, fault.where.layer) in positions]
-    return [fault for fault in faults if fault not in own or fault.message.startswith("unknown bottom blob")]
+    return [fault for fault in faults if fault not in own or fault.code is Code.UNKNOWN_BOTTOM]
 
 
 def _as_one(faults: list[SpecError]) -> SpecError:

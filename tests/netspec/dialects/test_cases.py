@@ -1,22 +1,22 @@
 """Layers of dialects: their numbers (tests/dialect_numbers.py), and what they refuse (cases/refused.txt)."""
 
 import copy
-import os
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 import torch
 
-from case_files import read_cases
+from case_files import read_table, sizes
+from contexts import context
 from dialect_numbers import GIVEN, NUMBERS, Case, Draw
 from netspec.dialects import use_dialect
-from netspec.errors import SpecError
+from netspec.errors import SpecError, Where
 from netspec.layers import Context, Layer
 from netspec.net.one_layer import make_layer
 from netspec.proto.schema import TEST, TRAIN
 
-REFUSED = read_cases("netspec/dialects/cases/refused.txt")
+REFUSED = read_table("netspec/dialects/cases/refused.txt")
 
 
 def bottom(given: Draw | str, rng: np.random.Generator) -> torch.Tensor:
@@ -72,10 +72,17 @@ def test_layer_results_equal_those_of_plain_loops(case: Case, gradcheck: Callabl
         gradcheck(layer, *bottoms, fixed=fixed)
 
 
-@pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
+@pytest.mark.parametrize(
+    "case", REFUSED, ids=[f"{i} {case['dialect']} {case['field']}" for i, case in enumerate(REFUSED)]
+)
 def test_invalid_fields_and_bottoms_are_refused_at_their_place(case: dict[str, str]) -> None:
-    shapes = [tuple(map(int, line.split())) for line in case["bottoms"].splitlines()]
     use_dialect(case["dialect"])
-    with pytest.raises(SpecError) as fault:
-        make_layer(case["layer"], shapes, Context(TRAIN if "phase" in case else TEST), int(case.get("tops", 1)))
-    assert str(fault.value) == case["fault"].replace("FOLDER", os.getcwd())
+    where = context(phase=TRAIN if case["phase"] else TEST, at=lambda *path: Where(".".join(map(str, path))))
+    with pytest.raises(SpecError) as caught:
+        make_layer(case["layer"], sizes(case["bottoms"]), where, int(case["tops"] or 1))
+    fault = caught.value
+    assert (fault.where.file if fault.where else "", fault.code.name if fault.code else "") == (
+        case["field"],
+        case["code"],
+    )
+    assert len(str(fault).splitlines()) == 1

@@ -2,21 +2,22 @@
 
 import pytest
 
-from case_files import read_cases
+from case_files import read_table, sizes
 from contexts import context
 from netspec.errors import SpecError, Where
 from netspec.net.one_layer import make_layer
 
-CASES = read_cases("netspec/layers/cases/refused.txt")
+CASES = read_table("netspec/layers/cases/refused.txt")
 
 
 def at(*path: str | int) -> Where:
     return Where(".".join(map(str, path)))
 
 
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+@pytest.mark.parametrize("case", CASES, ids=[f"{i} {case['field']}" for i, case in enumerate(CASES)])
 def test_an_invalid_field_or_bottom_is_refused_at_its_place(case: dict[str, str]) -> None:
-    shapes = [tuple(map(int, line.split())) for line in case["bottoms"].splitlines()]
-    with pytest.raises(SpecError) as fault:
-        make_layer(case["layer"], shapes, context(at=at), int(case.get("tops", 1)))
-    assert str(fault.value) == case["fault"]
+    with pytest.raises(SpecError) as caught:
+        make_layer(case["layer"], sizes(case["bottoms"]), context(at=at), int(case["tops"] or 1))
+    fault = caught.value
+    assert (str(fault.where or ""), fault.code.name if fault.code else "") == (case["field"], case["code"])
+    assert str(fault).splitlines() == [f"{case['field']}: {fault.message}" if case["field"] else fault.message]
