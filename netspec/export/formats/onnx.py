@@ -16,7 +16,7 @@ import torch
 from netspec.errors import SpecError
 from netspec.export.exporter import exported, layer_notes, refusal
 from netspec.export.formats.preprocess import Preprocess
-from netspec.export.formats.shapes import Fixed, NetShapes, Sizes, settled
+from netspec.export.formats.shapes import LayerShapes, NetShapes, settled
 from netspec.files.whole_file import whole_file, write_whole
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import values_of
@@ -269,7 +269,7 @@ class _Steps:
         return self.node("Cast", value, to=CAST_TO[dtype])
 
 
-class OnnxGraph(_Steps):
+class OnnxGraph(_Steps, LayerShapes):
     """The ONNX graph that is being written, as one layer sees it. Values are known by name.
 
     Bottoms and tops are known by their index in the layer. Sizes that the caller of the exported net may choose are
@@ -292,17 +292,6 @@ class OnnxGraph(_Steps):
         value = self.plan_node.tops[top]
         return self.writer.add_input(value, self.writer.net.plan.blobs[value])
 
-    def sizes(self, bottom: int) -> Sizes:
-        """Return the shape of a bottom."""
-        return self.shapes.sizes(self.plan_node.bottoms[bottom])
-
-    def size(self, bottom: int, axis: int, why: str) -> int:
-        """Return the size of an axis of a bottom; if it was free, it is fixed, and the user sees ``why``."""
-        value = self.plan_node.bottoms[bottom]
-        if self.shapes.chosen(value, axis):
-            raise Fixed(value, axis, f'layer "{self.name}" ({self.layer.type}): {why}')
-        return self.shapes.built[value][axis]
-
     def reshape_to_top(self, value: str, top: int = 0) -> str:
         """Return the value in the shape of a top of the layer, whatever the free sizes are."""
         number = self.plan_node.tops[top] if top < len(self.plan_node.tops) else -1
@@ -318,9 +307,7 @@ class OnnxGraph(_Steps):
                 continue
             found = self._like(number, axis)
             if found is None and inferred:
-                raise Fixed(
-                    number, axis, f'layer "{self.name}" ({self.layer.type}): more than one size of its shape is unknown'
-                )
+                raise self.fixed(number, axis, "more than one size of its shape is unknown")
             inferred = inferred or found is None
             parts.append(found or self.constant([-1]))
         return self.node("Reshape", value, self.node("Concat", *parts, axis=0))

@@ -12,6 +12,8 @@ from typing import TypeVar
 
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where
+from netspec.graph.plan import Node
+from netspec.layers.contract.base import Layer
 from netspec.net.net import Net
 
 Sizes = tuple[int | None, ...]  # a shape; None where the size is known only when the exported net runs
@@ -87,6 +89,29 @@ class Fixed(Exception):
     def __init__(self, value: int, axis: int, why: str) -> None:
         super().__init__(why)
         self.value, self.axis, self.why = value, axis, why
+
+
+class LayerShapes:
+    """The shapes of the bottoms of the layer that is written now."""
+
+    layer: Layer
+    plan_node: Node
+    shapes: NetShapes
+
+    def sizes(self, bottom: int) -> Sizes:
+        """Return the shape of a bottom; None for a size that is known only when the exported net runs."""
+        return self.shapes.sizes(self.plan_node.bottoms[bottom])
+
+    def size(self, bottom: int, axis: int, why: str) -> int:
+        """Return the size of an axis of a bottom; if it was free, it is fixed, and the user sees ``why``."""
+        value = self.plan_node.bottoms[bottom]
+        if self.shapes.chosen(value, axis):
+            raise self.fixed(value, axis, why)
+        return self.shapes.built[value][axis]
+
+    def fixed(self, value: int, axis: int, why: str) -> Fixed:
+        """Return what to raise where the size of an axis must be fixed."""
+        return Fixed(value, axis, f'layer "{self.plan_node.name}" ({self.layer.type}): {why}')
 
 
 def settled(net: Net, write: Callable[[NetShapes], T]) -> tuple[T, NetShapes]:

@@ -11,7 +11,7 @@ import torch
 
 from netspec.export.exporter import exported, refusal
 from netspec.export.expression import Expression, Stored, Submodule, Value, parts
-from netspec.export.formats.shapes import Fixed, NetShapes, Sizes
+from netspec.export.formats.shapes import LayerShapes, NetShapes
 from netspec.export.formats.source import legal, unique
 from netspec.graph.plan import origins
 from netspec.layers.contract.base import Layer
@@ -46,7 +46,7 @@ def write_definition(net: Net, shapes: NetShapes) -> Definition:
     """Return the definition of a net. Raises SpecError if a layer cannot be exported."""
     code = TorchCode(net, shapes)
     for layer, node in zip(net.layers, net.plan.nodes, strict=True):
-        code.layer, code.node = layer, node
+        code.layer, code.plan_node = layer, node
         bottoms = tuple(code.values[v] for v in node.bottoms)
         tops = bottoms[:1] if layer in code.absorbed else _write_layer(layer, code, bottoms)
         code.add(node.tops, tops)
@@ -62,11 +62,8 @@ def _write_layer(layer: Layer, code: TorchCode, bottoms: tuple[Value, ...]) -> E
     return write(code, *bottoms) if write is not None else plain.of(layer, bottoms)
 
 
-class TorchCode:
+class TorchCode(LayerShapes):
     """The PyTorch module that is being written, as the layer sees it that is written now."""
-
-    layer: Layer
-    node: Any
 
     def __init__(self, net: Net, shapes: NetShapes) -> None:
         self.net, self.shapes = net, shapes
@@ -86,7 +83,7 @@ class TorchCode:
         """
         absorbed = [blob for after, by in self.absorbed.items() if by is self.layer for blob in after.blobs]
         blobs = (*self.layer.blobs, *absorbed)
-        return self._added(Submodule(self.node.name, cls, args, options, dict(state), blobs))
+        return self._added(Submodule(self.plan_node.name, cls, args, options, dict(state), blobs))
 
     def parameter(self, index: int, shape: Sequence[int] | None = None, name: str = "") -> Stored:
         """Return a learnable blob as a parameter of the module itself, in this shape.
@@ -95,11 +92,11 @@ class TorchCode:
         """
         blob = self.layer.blob(index)
         shaped = blob if shape is None else blob.reshape(tuple(shape))
-        return self._added(Stored(f"{self.node.name} {name}".strip(), shaped, True, (self.layer.blobs[index],)))
+        return self._added(Stored(f"{self.plan_node.name} {name}".strip(), shaped, True, (self.layer.blobs[index],)))
 
     def buffer(self, values: torch.Tensor) -> Stored:
         """Return constants that are stored with the weights."""
-        return self._added(Stored(self.node.name, values, learned=False))
+        return self._added(Stored(self.plan_node.name, values, learned=False))
 
     def _added(self, stored: Any) -> Any:
         known = next((other for other in self._stored if stored.same_as(other)), None)
@@ -112,30 +109,16 @@ class TorchCode:
 
         The layer that is written now computes what that one does, which passes its bottom on.
         """
-        readers = self._readers[self.node.tops[0]]
+        readers = self._readers[self.plan_node.tops[0]]
         after = readers[0] if len(readers) == 1 else None
         if after is None or not suits(after):
             return None
         self.absorbed[after] = self.layer
         return after
 
-    def sizes(self, bottom: int) -> Sizes:
-        """Return the shape of a bottom; None for a size that is known only when the exported net runs."""
-        return self.shapes.sizes(self.node.bottoms[bottom])
-
-    def size(self, bottom: int, axis: int, why: str) -> int:
-        """Return the size of an axis of a bottom; if it was free, it is fixed, and the user sees ``why``."""
-        value = self.node.bottoms[bottom]
-        if self.shapes.chosen(value, axis):
-            raise self._fixed(value, axis, why)
-        return self.shapes.built[value][axis]
-
-    def _fixed(self, value: int, axis: int, why: str) -> Fixed:
-        return Fixed(value, axis, f'layer "{self.node.name}" ({self.layer.type}): {why}')
-
     def reshape_to_top(self, x: Expression, bottom: int = 0, top: int = 0) -> Expression:
         """Return a bottom's value in the shape of a top of the layer, whatever the free sizes are."""
-        shapes, source, target = self.shapes, self.node.bottoms[bottom], self.node.tops[top]
+        shapes, source, target = self.shapes, self.plan_node.bottoms[bottom], self.plan_node.tops[top]
         before, after, sizes = shapes.built[source], shapes.built[target], shapes.sizes(target)
         if before == after:
             return x
@@ -149,14 +132,14 @@ class TorchCode:
         if sizes.count(None) <= 1 and len(made) > 1:
             return x.reshape(*(-1 if size is None else size for size in sizes))
         if made.count(None) > 1:
-            raise self._fixed(target, head + made.index(None), "it is reshaped")
+            raise self.fixed(target, head + made.index(None), "it is reshaped")
         if last > head:
             x = x.flatten(head, last) if tail else x.flatten(*([head] if head else []))
         return x if len(made) == 1 else x.unflatten(head, tuple(-1 if size is None else size for size in made))
 
     def input(self, top: int) -> Value:
         """Return a new argument of ``forward``, for a top that its caller gives."""
-        value = self.values[self.node.tops[top]]
+        value = self.values[self.plan_node.tops[top]]
         self.definition.inputs.append(value.number)
         return value
 
