@@ -22,6 +22,7 @@ from netspec.files.limits import is_out_of_memory
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import Seen, blobs_of
+from netspec.run.overwritten import Overwritten
 from netspec.run.parts import Part
 from netspec.run.recorded import Backward, Kernels, recorded
 from netspec.run.walk import losses_of
@@ -70,8 +71,7 @@ class TrainingStep:
     """Runs a net that trains forward and backward.
 
     ``loss_weights[i][j]`` is the loss weight of top j of layer i, and ``weighted(top, weight)`` returns what the top
-    adds to the loss. ``overwritten[i]``: the gradient of layer i reads memory that a later layer overwrites in place
-    (netspec/run/eager.py).
+    adds to the loss. ``overwritten[i]``: layer i, if its gradient reads memory that is overwritten in place.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class TrainingStep:
         plan: Plan,
         parts: Sequence[Part],
         loss_weights: Sequence[Sequence[float]],
-        overwritten: Sequence[bool],
+        overwritten: Sequence[Overwritten | None],
         weighted: Callable[[torch.Tensor, float], torch.Tensor],
     ) -> None:
         self._plan, self._parts, self._loss_of = plan, list(parts), losses_of(loss_weights)
@@ -209,8 +209,8 @@ class TrainingStep:
         return self._plan.nodes[i].tops or (len(self._plan.blobs) + i,)
 
     def _kernels(self, part: Part, wanted: tuple[bool, ...]) -> Kernels:
-        if self._overwritten[part.first]:
-            return self._overwritten_kernels(part.first)
+        if reader := self._overwritten[part.first]:
+            return self._overwritten_kernels(reader, self._plan.nodes[part.first].bottoms)
         whole = all(
             layer.blob(j) is blob and blob.is_contiguous()
             for layer in part.members
@@ -219,17 +219,14 @@ class TrainingStep:
         how = Learning(wanted, tuple(blob.grad if blob.requires_grad else None for blob in part.blobs))
         return (whole and learning_kernels(part.layer, how)) or recorded(part.layer.run, wanted, part.blobs)
 
-    def _overwritten_kernels(self, i: int) -> Kernels:
+    def _overwritten_kernels(self, reader: Overwritten, bottoms: Sequence[int]) -> Kernels:
         """Return the kernels of a layer whose gradient reads what later layers wrote into the memory of its blobs."""
-        node, layer = self._plan.nodes[i], self._layers[i]
-        final = self._plan.final[node.tops[0]]
-        held = node.in_place[0] and bool(layer.gradient_reads & {"bottom", "sign"})
 
-        def forward(*bottoms: torch.Tensor) -> torch.Tensor:
-            return layer.run(*bottoms)[0]
+        def forward(*given: torch.Tensor) -> torch.Tensor:
+            return reader.layer.run(*given)[0]
 
         def backward(diff: torch.Tensor) -> tuple[torch.Tensor, ...]:
-            top = self._values[final]
-            return layer.gradients_from_memory([top] if held else [self._values[v] for v in node.bottoms], top, diff)
+            values = self._values
+            return reader.gradients([values[v] for v in bottoms], values[reader.final], diff)
 
         return Kernels(forward, backward)

@@ -1,22 +1,15 @@
-"""Runs the layers of a net one by one, with gradients by autograd. Some layers run together with the next ones.
-
-Caffe's backward reads bottom and top from memory. If a later layer has overwritten them in place, it reads that layer's
-result. For example, if an in-place Sigmoid follows an in-place ReLU, every value is positive, and the ReLU passes every
-gradient. Nets were trained with these gradients, so they are computed here too. It matters only for layers with a
-backward pass that reads overwritten data; other layers keep a copy or a mask. ``gradient_reads`` of a layer lists what
-its backward reads: the "bottom", only the "sign" of the bottom (which its own top has too), or the "top".
-"""
+"""Runs the layers of a net one by one, with gradients by autograd. Some layers run together with the next ones."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 
-from netspec.graph.plan import Node, Plan
+from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
+from netspec.run.overwritten import Memory, overwritten
 from netspec.run.parts import Part, parts_of
 from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
 
@@ -33,7 +26,7 @@ class Eager:
         self.plan, self.layers, self.loss_weights, self.exact = plan, list(layers), loss_weights, exact
         self._losses = losses_of(loss_weights)
         self._last_uses = last_uses(plan)
-        self.overwritten = [is_overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
+        self.overwritten = [overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
         self._runs_alone = self._must_run_alone()
         self._lines: dict[frozenset[int], list[Step]] = {}  # by what is kept, of the last run
 
@@ -104,11 +97,10 @@ class Eager:
         plan, memories = self.plan, dict[int, Memory]()
 
         def visit(step: Step, bottoms: list[torch.Tensor]) -> Any:
-            if self.overwritten[step.node]:
-                node, layer = plan.nodes[step.node], self.layers[step.node]
-                memory = memories.setdefault(plan.final[node.tops[0]], Memory())
-                given = [x.detach() if stop else x for x, stop in zip(bottoms, node.blocked, strict=True)]
-                tops = run_overwritten(layer, given, memory, node.in_place[0])
+            if reader := self.overwritten[step.node]:
+                blocked = plan.nodes[step.node].blocked
+                given = [x.detach() if stop else x for x, stop in zip(bottoms, blocked, strict=True)]
+                tops = reader.run(given, memories.setdefault(reader.final, Memory()))
             else:
                 tops = step.run(*bottoms)
             for v, top in zip(step.tops, tops, strict=False):
@@ -129,42 +121,3 @@ def last_uses(plan: Plan) -> list[list[int]]:
     for v, i in last.items():
         ends[i].append(v)
     return ends
-
-
-@dataclass
-class Memory:
-    """The contents of a part of Caffe's memory at the end of the forward pass."""
-
-    data: torch.Tensor | None = None
-
-
-def is_overwritten(layer: Layer, node: Node, plan: Plan) -> bool:
-    """Return whether the layer's backward reads data that this layer, or a later one, has overwritten."""
-    reads = layer.gradient_reads
-    if not reads:
-        return False
-    in_place, later = node.in_place[0], plan.final[node.tops[0]] != node.tops[0]
-    return ("bottom" in reads and in_place) or ("sign" in reads and in_place and later) or ("top" in reads and later)
-
-
-def run_overwritten(
-    layer: Layer, bottoms: Sequence[torch.Tensor], memory: Memory, in_place: bool
-) -> tuple[torch.Tensor, ...]:
-    """Run a layer; its gradient reads ``memory`` as its top and, if it is in place, as its bottom."""
-    held = in_place and bool(layer.gradient_reads & {"bottom", "sign"})
-    return (_Overwritten.apply(layer, memory, held, *bottoms),)
-
-
-class _Overwritten(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, layer: Layer, memory: Memory, bottom_is_held: bool, *bottoms: torch.Tensor) -> torch.Tensor:
-        ctx.layer, ctx.memory, ctx.bottom_is_held = layer, memory, bottom_is_held
-        if not bottom_is_held:
-            ctx.save_for_backward(*bottoms)
-        return layer.run(*bottoms)[0]
-
-    @staticmethod
-    def backward(ctx: Any, diff: torch.Tensor) -> Any:
-        held = ctx.memory.data
-        bottoms = (held,) if ctx.bottom_is_held else ctx.saved_tensors
-        return None, None, None, *ctx.layer.gradients_from_memory(bottoms, held, diff)

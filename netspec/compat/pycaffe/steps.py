@@ -28,6 +28,7 @@ from netspec.layers.utility.live_blobs import Blob
 from netspec.layers.utility.pycaffe_shim import importable
 from netspec.layers.utility.python import Python
 from netspec.net.net import Net
+from netspec.run.overwritten import Overwritten, reader_of_memory
 from netspec.run.recorded import recorded
 
 
@@ -48,6 +49,7 @@ class LayerStep:
         self.constants = self.layer.filled_once()
         self.reads = self.layer.gradient_reads
         self.reached, self.wanted = net.backward_plan.layers[i], net.backward_plan.written[i]
+        self._reader = reader_of_memory(self.layer, self.node, net.plan) if self.reads else None
         self._speed, self._device = net.options.speed, net.device
         self.records = self._is_asked() and not (self.reads or self.layer.shares)
         self.keeps_bottom = "kept" in self.reads and self._is_asked()
@@ -177,8 +179,8 @@ class LayerStep:
             return
         tops = zip(self.tops, self.layer.top_shapes, strict=True)
         diffs = [top.diff_memory.tensor(_shape_of(top, made)) for top, made in tops]
-        if self.reads:
-            self._backward_from_memory(diffs[0])
+        if self._reader:
+            self._backward_from_memory(self._reader, diffs[0])
         elif self._is_asked():
             tape = self._present_tape()
             found = tape.backward(*diffs)
@@ -190,7 +192,7 @@ class LayerStep:
             if asked:
                 blob.diff_memory.put(not_shared(torch.zeros_like(leaf) if diff is None else diff, taken))
 
-    def _backward_from_memory(self, diff: torch.Tensor) -> None:
+    def _backward_from_memory(self, reader: Overwritten, diff: torch.Tensor) -> None:
         """Compute the gradients from the present data, as Caffe does."""
         if not any(self.wanted):
             return
@@ -199,7 +201,7 @@ class LayerStep:
         values = [top if blob is first else blob.data_memory.tensor(blob.shape) for blob in self.bottoms]
         if self._bottom is not None and self._is_shaped_like(self.bottoms[0], self._bottom):
             values = [self._bottom]
-        found = self.layer.gradients_from_memory(values, top, diff)
+        found = reader.gradients(values, top, diff)
         for blob, gradient, asked in zip(self.bottoms, found, self.wanted, strict=True):
             if asked:
                 blob.diff_memory.put(gradient)
