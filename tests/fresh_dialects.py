@@ -1,8 +1,11 @@
 """Dialects for one test."""
 
+import sys
+
 import pytest
 
 from netspec.dialects import known
+from netspec.dialects.files import OF_FILES
 from netspec.layers import layer_class
 from netspec.layers.contract import registry
 from netspec.proto.forks import forks
@@ -14,6 +17,8 @@ def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a test add dialects for every net; afterwards there are none."""
     assert known.added() == ()
     monkeypatch.setattr(known, "_added", {})
+    for module in [name for name in sys.modules if name.startswith(OF_FILES)]:
+        del sys.modules[module]  # another test's file of the same name
 
 
 def used_by(text: str) -> list[str]:

@@ -205,7 +205,8 @@ def fork_of(case: Case) -> Iterator[None]:
     if not case.dialect:
         yield
         return
-    with pytest.MonkeyPatch.context() as patch, contextmanager(fresh_dialects)(patch):
+    with pytest.MonkeyPatch.context() as patch:
+        fresh_dialects(patch)
         use_dialect(case.dialect)
         yield
 

@@ -17,7 +17,6 @@ import torch
 
 import netspec
 from netspec.export.engines.choice import user_folder
-from netspec.files import whole_file
 from netspec.graph.options import BuildOptions
 from netspec.layers import layer_types
 from netspec.net.net import Net
@@ -461,11 +460,3 @@ def test_missing_layers_are_a_warning_or_with_strict_an_error(run: Run, edited: 
 
 
 # What other systems lack is said once, and the command goes on
-def test_a_training_without_file_locks(
-    run: Callable[..., Any], edited: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(whole_file, "fcntl", None)
-    changes = ("max_iter: 60", "max_iter: 1", "snapshot_after_train: false", "snapshot_after_train: true")
-    result = run("train", edited("sgd_step/solver.prototxt", *changes))
-    assert result.status == 0
-    assert result.err.count("no file locks here: nothing stops another training") == 1
