@@ -21,7 +21,6 @@ from benchmarks.drives import GAP, NEAR, OVERLAP, SOFT_DEG
 from benchmarks.pages import RESULTS
 from benchmarks.settings import Cache
 from loopclosure.descriptors.similarity import similarity_matrix
-from loopclosure.detector.decision import RECENT
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.verification import Agreement, Between, GeometricCheck, LocalFeatures, Pairs
 from loopclosure.methods.auto import PRECISION, answer, find_matches
@@ -134,7 +133,8 @@ def _drone(folder: Path) -> Real:
     with np.load(folder / "overlap.npz") as kept:
         overlap = np.maximum(kept["overlap"], kept["overlap"].T)
     images = list(read_sequence(folder, "tum").paths)
-    return Real("", images, *(overlap >= least for least in OVERLAPS), _pairs_before(len(images), 15), gap=15)
+    rule, wide = (overlap >= least for least in OVERLAPS)
+    return Real("", images, rule, wide, _pairs_before(len(images), 15), gap=15)
 
 
 def _tower(folder: Path, floors: Sequence[int], rank: int) -> Real:
@@ -188,8 +188,8 @@ def as_query(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
         scores = similarity_matrix(rows[inside], rows[others])
         before = temporal(similarity_matrix(rows[inside]))
         compared = Compared(scores, np.ones(scores.shape, bool), True, temporal=before)
-        images = ([real.images[i] for i in frames] for frames in (inside, others))
-        found = _answered(compared, cache, *images)
+        queries, references = ([real.images[i] for i in frames] for frames in (inside, others))
+        found = _answered(compared, cache, queries, references)
         match[inside] = np.where(found >= 0, others[found], -1)
     return match
 
@@ -202,8 +202,7 @@ def _answered(compared: Compared, cache: Cache, queries: Sequence[Path], referen
 
 def online(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
     """Return the match of each frame (N,), -1 without one, as ``LoopDetector`` with a geometric check decides."""
-    recent = real.gap or min(RECENT, len(rows) // 4)
-    detector = LoopDetector(check=Known(pairs=cache.pairs), exclude_recent=recent)
+    detector = LoopDetector(check=Known(pairs=cache.pairs))
     images: Sequence[Any] = real.images
     found = [detector.add_descriptor(row, image=image) for row, image in zip(rows, images, strict=True)]
     return np.array([-1 if result.accepted is None else result.accepted for result in found])

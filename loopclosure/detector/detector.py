@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.decision import DetectorSettings, LoopResult, Runs, result_of
 from loopclosure.detector.frames import Frames, Local, LocalOnDisk, Points, points_of
 from loopclosure.detector.verification import SURE, GeometricCheck, LocalFeatures
@@ -31,9 +32,12 @@ from netspec.files.arrays import check_array, from_json, read_npz
 from netspec.files.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]
+UNLIKE = 40  # frames, each of which is compared with an unlike one; then every second frame is, and so on
+AMONG = 9  # frames of which the least similar one is unlike
 LEAST_STEPS = 20  # scores of consecutive frames that are needed to choose a threshold
 PART = "enough points agree, but only a part of those that match"
 ALIKE = "places look alike: of most frames with enough points, only a part of those that match agrees"
+VISIT = "the place was not left in between"
 FORMAT = 1  # of the file that save writes
 SAVED = "a file that LoopDetector.save wrote"
 
@@ -92,6 +96,7 @@ class LoopDetector:
         self._steps: list[float] = []  # the score of each frame with the one before it
         self._runs: Runs = []  # of the last frame
         self._last = np.zeros((0, 0), np.float32)  # the descriptor of the last frame
+        self._unlike: list[tuple[float, int]] = []  # scores of unlike pairs of frames, and their points in common
         self._whole, self._part = 0, 0  # frames with enough points, of which most agree, or only a part
 
     def __len__(self) -> int:
@@ -155,6 +160,7 @@ class LoopDetector:
         self._keep(row, stamp, path, local)
         if result.accepted is not None:
             self.loops.append(result)
+        self._compare_unlike(row, local)
         self._whole += result.accepted is not None or result.reason == ALIKE
         self._part += result.reason == PART
         return result
@@ -256,6 +262,7 @@ class LoopDetector:
             "check": None if self.check is None else asdict(self.check),
             "runs": self._runs,
             "agreed": [self._whole, self._part],
+            "unlike": self._unlike,
             "loops": [asdict(loop) for loop in self.loops],
             "sessions": self._sessions,
         }
@@ -292,6 +299,7 @@ class LoopDetector:
             detector._settle()
             detector._steps = detector._all_steps()
             detector._whole, detector._part = map(int, about.get("agreed", (0, 0)))
+            detector._unlike = [(float(score), int(points)) for score, points in about.get("unlike", [])]
             detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
             detector.loops = [result_of(found, len(detector)) for found in about["loops"]]
         except SpecError as fault:
@@ -447,14 +455,52 @@ class LoopDetector:
         most, reason = 0, ""
         for number, value in steady:
             found = self.check.agreement(local, self._frames.local[number])
-            if inliers := self.check.sure(found):
+            if inliers := self.check.sure(found, self._points):
+                if not self._left(number):
+                    most, reason = inliers, VISIT
+                    continue
                 if self._alike:
                     return result("not verified", inliers=inliers, reason=ALIKE)
                 return result("accepted", number, value, inliers)
             most = max(most, found.inliers)
-            if self.check.evidence(found) >= SURE:
+            if self.check.evidence(found, self._points) >= SURE:
                 reason = PART
         return result("not verified", inliers=most, reason=reason)
+
+    @property
+    def _points(self) -> float:
+        """The mean number of points that unlike pairs have in common, of those below their own number needed 0.
+
+        These are the less similar half of those compared: at the start of a drive no frame is unlike.
+        """
+        unlike = sorted(self._unlike)[: (len(self._unlike) + 1) // 2]
+        return sum(points for _, points in unlike) / max(1, len(unlike))
+
+    def _compare_unlike(self, row: np.ndarray, local: LocalFeatures | None) -> None:
+        """Verify the last frame with the least similar of some earlier ones: a bridge's towers are seen all along."""
+        last = len(self) - 1
+        if self.check is None or local is None or last < LEAST_STEPS or last % (1 + len(self._unlike) // UNLIKE):
+            return
+        some = np.linspace(0, last - 1, AMONG).round().astype(int).tolist()
+        rows = [self.descriptors_of(number, number + 1).reshape(row.shape) for number in some]
+        scores = [float(self._score(other, row)) for other in rows]
+        least = some[int(np.argmin(scores))]
+        self._unlike.append((min(scores), self.check.enough(self.check.agreement(local, self._frames.local[least]))))
+
+    def _left(self, number: int) -> bool:
+        """Whether the place of a frame was left since, if no setting says how old a frame must be.
+
+        It was if two frames in a row differ from it as much as half of all frames do. On a straight road frames stay
+        alike for long; that is no loop.
+        """
+        settings, count = self.settings, len(self)
+        if settings.exclude_recent is not None or settings.exclude_seconds or number < self._sessions[-1]:
+            return True
+        rows = self.descriptors_of(self._sessions[-1], count)
+        own = rows[number - self._sessions[-1]]
+        scores = similarity_matrix(own[None], rows, settings.metric, settings.views)[0]
+        away = scores[number - self._sessions[-1] :] <= np.median(scores)
+        return bool(np.any(away[1:] & away[:-1]))
 
     @property
     def _alike(self) -> bool:

@@ -174,15 +174,18 @@ class GeometricCheck:
         """Return the inliers of an agreement; 0 if there are fewer than this check needs."""
         return found.inliers if found.inliers >= (self.min_inliers or found.needed) else 0
 
-    def evidence(self, found: Agreement) -> float:
-        """Return the inliers of an agreement divided by the number that this check needs; 1 is enough."""
-        return found.inliers / (self.min_inliers or found.needed)
+    def evidence(self, found: Agreement, unlike: float = 0.0) -> float:
+        """Return the inliers of an agreement divided by the number that this check needs; 1 is enough.
 
-    def sure(self, found: Agreement) -> int:
+        unlike  how many inliers pairs of different places have: so many more are needed
+        """
+        return found.inliers / ((self.min_inliers or found.needed) + unlike)
+
+    def sure(self, found: Agreement, unlike: float = 0.0) -> int:
         """Return the inliers of an agreement if they outweigh a low score; 0 otherwise."""
         if self.min_inliers:
             return self.enough(found)
-        return found.inliers if self.evidence(found) >= SURE and found.whole else 0
+        return found.inliers if self.evidence(found, unlike) >= SURE and found.whole else 0
 
     def __post_init__(self) -> None:
         if (

@@ -111,7 +111,7 @@ class Geometry:
 
     def evidence(self, agreement: Agreement) -> float:
         """Return the inliers of an agreement divided by the number needed: against chance and dissimilar pairs."""
-        return agreement.inliers / ((self.check.min_inliers or agreement.needed) + self.points)
+        return self.check.evidence(agreement, self.points)
 
     def among_queries(self, two: bool) -> Agree | None:
         """Return a function: how many points of two queries agree; None if that cannot be told of ``two`` traverses."""

@@ -8,7 +8,7 @@ import pytest
 from loopclosure.descriptors.similarity import similarity_matrix, top_k
 from loopclosure.detector.detector import DetectorSettings, LoopDetector
 from loopclosure.detector.frames import FIRST_CAPACITY
-from loopclosure.detector.verification import GeometricCheck
+from loopclosure.detector.verification import Agreement, GeometricCheck, LocalFeatures
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion
@@ -85,6 +85,36 @@ def test_frames_are_excluded_by_number_only_if_nothing_says_how_old_they_must_be
     places = np.random.default_rng(1).normal(size=(30, 16))
     detector = LoopDetector(threshold=-0.1, **settings)
     assert sum(bool(detector.add_descriptor(places[k % 30], float(k))) for k in range(45)) == loops
+
+
+@pytest.mark.parametrize(
+    ("settings", "turns", "everywhere", "accepted"),
+    [
+        ({}, False, False, False),
+        ({}, True, False, True),
+        ({"exclude_recent": 50}, False, False, True),
+        ({"exclude_seconds": 5.0}, False, False, True),
+        ({}, True, True, False),
+    ],
+)
+def test_a_loop_online_is_a_place_that_was_left(settings, turns, everywhere, accepted, monkeypatch):
+    """After a town, the same hills are seen along a straight road; that is a loop only after a turn.
+
+    It is none if the same points are seen everywhere, as those of the towers of a bridge.
+    """
+    if not everywhere:
+        monkeypatch.setattr(LoopDetector, "_compare_unlike", lambda *_: None)
+    monkeypatch.setattr(GeometricCheck, "agreement", lambda *_: Agreement(60, 50, 20))
+    monkeypatch.setattr(GeometricCheck, "describe", lambda *_: LocalFeatures(np.zeros((0, 2)), np.zeros((0, 128))))
+    rng = np.random.default_rng(0)
+    town, straight = rng.normal(size=(100, 16)), rng.normal(size=16) + 0.1 * rng.normal(size=(60, 16))
+    rows = np.concatenate([town, straight, rng.normal(size=(10 * turns, 16)), straight[:1]])
+    image = np.zeros((2, 2), np.uint8)
+    detector = LoopDetector(check=GeometricCheck(), top_k=1, **settings)
+    results = [detector.add_descriptor(row, float(number), image=image) for number, row in enumerate(rows)]
+    assert bool(results[-1]) == accepted
+    if not turns and not accepted:
+        assert (results[-1].verdict, results[-1].reason) == ("not verified", "the place was not left in between")
 
 
 def test_consistency_requires_earlier_frames_to_agree():
