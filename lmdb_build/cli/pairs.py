@@ -26,6 +26,7 @@ from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import benchmark_parts
 from loopclosure.places.source import (
+    LAYOUT_LINES,
     LAYOUTS,
     PAIRED,
     POSE_FORM_HELP,
@@ -48,11 +49,10 @@ NEEDED = {
     "folders": ("references",),
     "index": ("group", "track", "time"),
 }
-_LAYOUT_LINES = "\n".join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]...
 
 One or more sequences with poses (KIND may be omitted; it is then detected from the files):
-{_LAYOUT_LINES}
+{LAYOUT_LINES}
   with poses=FILE, {POSES_HELP},
   and pose-form: {POSE_FORM_HELP}; topic, pose-topic: the topics to read from a bag with several
 Or one source of another kind:

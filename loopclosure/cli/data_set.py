@@ -15,6 +15,7 @@ from loopclosure.places.sequences import benchmark_parts, layout_of
 from loopclosure.places.source import (
     DETECTED,
     EVALUATED,
+    LAYOUT_LINES,
     LAYOUTS,
     POSE_FORM_HELP,
     POSES_HELP,
@@ -30,11 +31,10 @@ from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import above_zero
 
-_LAYOUT_LINES = "\n".join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]..., for example tum:desk,stop=50%,stride=2.
 
 Ground truth from poses (KIND may be omitted; it is then detected from the files):
-{_LAYOUT_LINES}
+{LAYOUT_LINES}
   images:     a folder or list of images, with poses=FILE, or with truth=MASK, which marks frames of the same place
 Other ground truth:
   fabmap:     FAB-MAP's New College or City Centre; truth=, coordinates=, camera={"|".join(CAMERAS)} (default: both)

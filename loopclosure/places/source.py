@@ -124,6 +124,7 @@ LAYOUTS = {
     "bag": "a ROS 1 or ROS 2 bag",
     "video": "a video (with poses)",
 }
+LAYOUT_LINES = "\n".join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.items())
 POSES_HELP = "camera poses in the format of TUM, KITTI or EuRoC, instead of the sequence's own"
 POSE_FORM_HELP = (
     f"format of the poses, if not detected from the file: one or more of "
