@@ -86,10 +86,10 @@ class Dialects(Forks):
         return dialects_of(net)
 
     @override
-    def rewritten(self, net: Any, dialects: Collection[str]) -> tuple[Any, Sequence[str]]:
+    def rewritten(self, plan: Any, dialects: Collection[str]) -> tuple[Any, Sequence[str]]:
         from netspec.dialects.segmentation.crops import with_aligned_crops
 
-        return with_aligned_crops(net, dialects)
+        return with_aligned_crops(plan, dialects)
 
     @override
     def doubts(self, layers: Any) -> Mapping[str, int]:

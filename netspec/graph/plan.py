@@ -7,10 +7,11 @@ Caffe: Net::Init, AppendTop, AppendBottom, AppendParam (src/caffe/net.cpp).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 from netspec.errors import SpecError
+from netspec.proto.forks import forks
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 
@@ -48,6 +49,7 @@ class Plan:
 
     ``blobs[v]`` is the name of value ``v``; ``outputs`` maps names, in Caffe's order, to values;
     ``final[v]`` is the value that finally replaces ``v`` in Caffe's memory, from the last in-place layer.
+    ``dialects`` are the forks of Caffe that the net uses, and ``warnings`` tell what they change (:func:`of_forks`).
     """
 
     net: NetParameter
@@ -56,6 +58,15 @@ class Plan:
     blobs: tuple[str, ...]
     outputs: dict[str, int]
     final: tuple[int, ...]
+    dialects: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def of_forks(plan: Plan, dialects: Collection[str]) -> Plan:
+    """Return the plan with the fields that its forks mean: ``dialects``, those its text names, and those it uses."""
+    used = {*dialects, *plan.source.dialects, *forks().dialects_of(plan.net)}
+    rewritten, warnings = forks().rewritten(plan, used)
+    return replace(rewritten, dialects=tuple(sorted(used)), warnings=tuple(warnings))
 
 
 def make_plan(net: NetParameter, source: SourceMap) -> Plan:

@@ -1,4 +1,6 @@
-"""Makes the layers of a plan in order, connects shared parameters, and determines which layers run backward.
+"""Makes the layers of a plan, first their shapes, then their memory, and determines which layers run backward.
+
+All layers are made before any blob has memory, so a net that needs too much is refused before it takes any.
 
 Caffe: Net::Init (src/caffe/net.cpp). Names such as net.cpp:124 in the log calls are the lines of that file that
 print the same.
@@ -8,9 +10,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -31,7 +32,6 @@ from netspec.proto.schema import TEST
 from netspec.run.eager import last_uses
 
 BYTES = 4  # of a number: float32
-UNCHECKED_SHARE = 8  # the need of the whole net is computed only once its layers have taken 1/8 of the limit
 
 #: Fields that every layer has and that the net reads, not the layer.
 COMMON = frozenset(
@@ -57,17 +57,15 @@ class Learnable:
 class Assembly:
     """The layers of a plan, and what the net needs to run them.
 
-    ``plan`` is the given plan with what its forks rewrite. ``layers[i]`` belongs to node i. If errors are collected
-    rather than raised, faulty layers are missing. ``shapes`` has the shape of each blob, and ``loss_weights[i][j]`` is
-    the loss weight of top j of layer i. ``backward`` says which layers need backward computation; it is None if a layer
-    is missing. ``options`` are the given options, with the dialects of the net added.
+    ``layers[i]`` belongs to node i. If errors are collected rather than raised, faulty layers are missing. ``shapes``
+    has the shape of each blob, and ``loss_weights[i][j]`` is the loss weight of top j of layer i. ``backward`` says
+    which layers need backward computation; it is None if a layer is missing. ``options`` are the given options, with
+    the dialects of the net added.
     """
 
     def __init__(self, plan: Plan, options: BuildOptions) -> None:
-        dialects = {*options.dialects, *plan.source.dialects, *forks().dialects_of(plan.net)}
-        self.options = replace(options, dialects=tuple(sorted(dialects)))
-        plan, self._warnings = forks().rewritten(plan, self.options.dialects)
-        self.plan = self._plan = plan
+        self.options = replace(options, dialects=plan.dialects)
+        self.plan = plan
         self._report = plan.source.report
         self.layers: dict[int, Layer] = {}
         self.shapes: dict[str, Shape] = {}
@@ -76,22 +74,26 @@ class Assembly:
         self.need = MemoryNeed(plan, last_uses(plan))
         self.backward: Backward | None = None
         self.random = Random(int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed)
-        self._device = device_of(options.device)
+        device = device_of(options.device)
+        on_meta = device.type == "meta"
         self._values: dict[int, Shape] = {}
         self._memory = 0  # as Caffe counts it
-        self._whole_checked, self._whole_fault = False, None  # whether the whole net needs too much memory
+        self._shared: dict[tuple[int, int], tuple[int, int]] = {}  # (layer, blob) -> those of the owner of its memory
         for i in range(len(plan.nodes)):
             if layer := self._make_layer(i):
                 self._set_up(i, layer)
-        if self._device.type != "meta" and (fault := self.need.fault(limit_on(self._device, options.limit))):
+        fault = None if on_meta else self.need.fault(limit_on(device, options.limit))
+        if fault:
             self._report(fault)
+        for i, layer in self.layers.items() if not fault else ():
+            self._allocate(i, layer)
         if len(self.layers) == len(plan.nodes):
             self.backward = self._finish(list(self.layers.values()))
 
     def _make_layer(self, i: int) -> Layer | None:
         """Return layer ``i``, or None if it or a layer that it depends on has a fault. The fault is reported."""
-        node, param = self._plan.nodes[i], self._plan.net.layer[i]
-        this = _LayerInNet(self._plan, i, partial(self._take, i))
+        node, param = self.plan.nodes[i], self.plan.net.layer[i]
+        this = _LayerInNet(self.plan, i)
         log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
         cls = class_of(param, self.options)
         if cls is None:
@@ -99,30 +101,26 @@ class Assembly:
             return None
         if any(v not in self._values for v in node.bottoms):
             return None  # an error upstream was reported
-        phase = self._plan.net.state.phase
-        context = Context(phase, self.options, self.random, this.at, self._report, this.created, this.take)
+        phase = self.plan.net.state.phase
+        context = Context(phase, self.options, self.random, this.at, self._report, this.created, allocates=False)
         try:
             layer = cls(param, [self._values[v] for v in node.bottoms], context)
         except SpecError as fault:
             self._report(fault)
             return None
         except (MemoryError, RuntimeError) as fault:
-            if not is_out_of_memory(fault):
-                raise
-            message = f"its blobs need more memory than available: this machine has {amount(memory())}"
-            raise SpecError(message, this.at()) from None
-        this.take_from = None
+            raise self._out_of_memory(i, fault) from None
         return layer
 
     def _set_up(self, i: int, layer: Layer) -> None:
         """Record and log the tops of layer ``i``, and connect its parameters."""
-        node = self._plan.nodes[i]
+        node = self.plan.nodes[i]
         weights = _loss_weights(layer, self._report)
         self.layers[i] = layer
         self.loss_weights.append(weights)
         for v, shape in zip(node.tops, layer.top_shapes, strict=False):
             self._values[v] = shape
-            self.shapes[self._plan.blobs[v]] = shape
+            self.shapes[self.plan.blobs[v]] = shape
         log.info("net.cpp:124", f"Setting up {node.name}")
         for shape, weight in zip(layer.top_shapes, weights, strict=True):
             self._memory += math.prod(shape) * 4
@@ -130,100 +128,80 @@ class Assembly:
             if weight:
                 log.info("net.cpp:134", f"    with loss weight {log.number(weight)}")
         log.info("net.cpp:139", f"Memory required for data: {self._memory}")
-        owned = len(self.learnable)
-        self._adopt_params(i, layer)
-        self.need.add(i, layer, BYTES * sum(item.parameter.numel() for item in self.learnable[owned:]))
+        self.need.add(i, layer, self._check_params(i, layer))
 
-    def _take(self, i: int, size: int) -> None:
-        """Check, before layer ``i`` takes ``size`` bytes of memory, that it may.
-
-        Raises SpecError if the layer or the whole net needs too much. The need of the whole net is computed only once
-        the layers have taken 1 / UNCHECKED_SHARE of the limit.
-        """
-        if self._device.type == "meta":
-            return
-        limit = limit_on(self._device, self.options.limit)
-        if self.need.total + size <= limit // UNCHECKED_SHARE:
-            return
-        if not self._whole_checked:
-            self._whole_checked, self._whole_fault = True, self._need_of_whole_net().fault(limit)
-        if self._whole_fault:
-            raise self._whole_fault
-        if self.need.parameters + size > limit:
-            raise SpecError(
-                f"needs {amount(size)} of memory in addition to {self.need}; {limit_text(limit)}",
-                _LayerInNet(self._plan, i).at(),
-            )
-
-    def _need_of_whole_net(self) -> MemoryNeed:
-        """Return the need of all layers, by building the net a second time on the device meta, without data.
-
-        Layers that are made take their memory at once, so this must be known before they are made.
-        """
-        options = replace(
-            self.options,
-            device="meta",
-            open_data=False,
-            write_files=False,
-            given_shapes={**self.options.given_shapes, **self.shapes},
-            allow_python=False,
-        )
-        silent = replace(self._plan, source=self._plan.source.reporting_to(lambda fault: None))
-        with log.silent():
-            return Assembly(silent, options).need
-
-    def _adopt_params(self, i: int, layer: Layer) -> None:
-        """Replace the shared parameters of layer ``i`` by those of their owners; add the others to ``learnable``."""
-        node = self._plan.nodes[i]
+    def _check_params(self, i: int, layer: Layer) -> int:
+        """Report wrong params of layer ``i``, log which are shared, and return the bytes of the others."""
+        node = self.plan.nodes[i]
         if len(node.params) > len(layer.blobs):
             message = f"found {len(node.params)} param {{ }}, expected at most {len(layer.blobs)}, one per blob"
             self._report(layer.error(message, "param", len(layer.blobs)))
+        owned = 0
+        for j, here in enumerate(layer.blob_shapes):
+            spec = _spec(node, layer, j)
+            if spec.owner is None:
+                owned += BYTES * math.prod(here)
+                continue
+            owner = self.layers.get(spec.owner[0])  # None: an error in it was reported, as too many param { } were
+            if owner is None or spec.owner[1] >= len(owner.blobs):
+                continue
+            there = owner.blob_shapes[spec.owner[1]]
+            owner_name = self.plan.nodes[spec.owner[0]].name
+            if math.prod(here) == math.prod(there) if spec.permissive else here == there:
+                self._shared[i, j] = spec.owner
+                owner = f"owned by layer '{owner_name}', param index {spec.owner[1]}"
+                log.info("net.cpp:467", f"Sharing parameters '{spec.name}' {owner}")
+                continue
+            rule = "equal counts" if spec.permissive else "equal shapes (share_mode: STRICT)"
+            message = (
+                f'cannot share param "{spec.name}" owned by layer "{owner_name}", param index {spec.owner[1]}: '
+                f"found shape {shape_string(here)} here and {shape_string(there)} there, expected {rule}"
+            )
+            self._report(layer.error(message, "param", j))
+        return owned
+
+    def _allocate(self, i: int, layer: Layer) -> None:
+        """Give the blobs of layer ``i`` their memory: that of the owner, if shared. The others are learnable."""
+        node = self.plan.nodes[i]
+        try:
+            layer.allocate()
+        except (MemoryError, RuntimeError) as fault:
+            raise self._out_of_memory(i, fault) from None
         for j in range(len(layer.blobs)):
             spec = _spec(node, layer, j)
             if spec.owner is None:
                 parameter = layer.blobs[j]
-                parameter.requires_grad_(spec.lr_mult != 0 or self._plan.net.force_backward)
+                parameter.requires_grad_(spec.lr_mult != 0 or self.plan.net.force_backward)
                 self.learnable.append(Learnable(parameter, spec.lr_mult, spec.decay_mult, node.name, j))
-                continue
-            owner_index, owner_blob = spec.owner
-            if owner_index not in self.layers:
-                continue  # an error in the owner was reported
-            owner = self.layers[owner_index]
-            if owner_blob >= len(owner.blobs):
-                continue  # the owner has too many param { }, which was reported
-            here, there = layer.blob_shapes[j], owner.blob_shapes[owner_blob]
-            owner_name = self._plan.nodes[owner_index].name
-            fits = math.prod(here) == math.prod(there) if spec.permissive else here == there
-            if not fits:
-                rule = "equal counts" if spec.permissive else "equal shapes (share_mode: STRICT)"
-                message = (
-                    f'cannot share param "{spec.name}" owned by layer "{owner_name}", param index {owner_blob}: '
-                    f"found shape {shape_string(here)} here and {shape_string(there)} there, expected {rule}"
-                )
-                self._report(layer.error(message, "param", j))
-                continue
-            layer.blobs[j] = owner.blobs[owner_blob]
-            owner = f"owned by layer '{owner_name}', param index {owner_blob}"
-            log.info("net.cpp:467", f"Sharing parameters '{spec.name}' {owner}")
+            elif (i, j) in self._shared:
+                owner, of_owner = self._shared[i, j]
+                layer.blobs[j] = self.layers[owner].blobs[of_owner]
+
+    def _out_of_memory(self, i: int, fault: BaseException) -> BaseException:
+        """Return the error for a layer that got no memory; any other error is returned unchanged."""
+        if not is_out_of_memory(fault):
+            return fault
+        message = f"its blobs need more memory than available: this machine has {amount(memory())}"
+        return SpecError(message, _LayerInNet(self.plan, i).at())
 
     def _finish(self, layers: list[Layer]) -> Backward:
         """Return which layers need backward computation, by Caffe's rules. Log the end of Caffe's Net::Init."""
-        learns = [needs_backward(self._plan, i, layer) for i, layer in enumerate(layers)]
+        learns = [needs_backward(self.plan, i, layer) for i, layer in enumerate(layers)]
         has_loss = [[bool(w) for w in weights] for weights in self.loss_weights]
         labels = [layer.label_bottoms for layer in layers]
         ignoring = [layer.ignores_propagate_down for layer in layers]
-        backward = plan_backward(self._plan, learns, has_loss, labels, ignoring)
+        backward = plan_backward(self.plan, learns, has_loss, labels, ignoring)
         if self.options.accumulate_in_place:
-            compute_caffes_gradients(self._plan, layers, backward)
-        for node, needs in zip(reversed(self._plan.nodes), reversed(backward.layers), strict=True):
+            compute_caffes_gradients(self.plan, layers, backward)
+        for node, needs in zip(reversed(self.plan.nodes), reversed(backward.layers), strict=True):
             if needs:
                 log.info("net.cpp:200", f"{node.name} needs backward computation.")
             else:
                 log.info("net.cpp:202", f"{node.name} does not need backward computation.")
-        for name in self._plan.outputs:
+        for name in self.plan.outputs:
             log.info("net.cpp:244", f"This network produces output {name}")
         log.info("net.cpp:257", "Network initialization done.")
-        for line in (*self._warnings, *doubtful_layers(self._plan, layers), *unused_fields(self._plan, layers)):
+        for line in (*self.plan.warnings, *doubtful_layers(self.plan, layers), *unused_fields(self.plan, layers)):
             log.warning("net.cpp:257", line)
         return backward
 
@@ -231,23 +209,18 @@ class Assembly:
 class _LayerInNet:
     """What layer ``i`` must know about its net: its position in the file, and its blobs for the log.
 
-    ``take_from`` is called with the bytes that the layer takes. The class has slots and no reference to the Assembly,
-    because a net may have very many layers.
+    The class has slots and no reference to the Assembly, because a net may have very many layers.
     """
 
-    __slots__ = ("_i", "_plan", "take_from")
+    __slots__ = ("_i", "_plan")
 
-    def __init__(self, plan: Plan, i: int, take_from: Callable[[int], None] | None = None) -> None:
-        self._plan, self._i, self.take_from = plan, i, take_from
+    def __init__(self, plan: Plan, i: int) -> None:
+        self._plan, self._i = plan, i
 
     def at(self, *path: str | int) -> Where:
         """Return the position in the prototxt of a field of the layer."""
         node = self._plan.nodes[self._i]
         return self._plan.source.at(self._i, *path, layer=node.name, type=node.type)
-
-    def take(self, size: int) -> None:
-        if self.take_from:
-            self.take_from(size)
 
     def created(self, tops: int) -> None:
         """Log the layer's bottoms and tops. ``tops`` may be more than the prototxt names: a loss adds one."""

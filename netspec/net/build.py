@@ -14,7 +14,7 @@ from netspec import log
 from netspec.files.memory import no_collection
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
-from netspec.graph.plan import make_plan
+from netspec.graph.plan import make_plan, of_forks
 from netspec.graph.splits import insert_splits
 from netspec.layers.contract.registry import source_of
 from netspec.net.net import Net
@@ -54,7 +54,7 @@ def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOpti
     for layer in split.layer:
         if not layer.HasField("phase"):
             layer.phase = split.state.phase
-    built = Net(make_plan(split, source), options)
+    built = Net(of_forks(make_plan(split, source), options.dialects), options)
     written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])
     if written.layer:  # weights in the prototxt itself
         copy_weights(built, written, source.file)

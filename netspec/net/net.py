@@ -85,8 +85,7 @@ class Net(torch.nn.Module):
             log.warning("net.cpp:53", warning)
         assembly = Assembly(plan, options)
         self.options = assembly.options
-        self.plan = plan = assembly.plan
-        self.param = plan.net
+        self.plan, self.param = plan, plan.net
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
         self.layers: Any = torch.nn.ModuleList(assembly.layers.values())

@@ -117,9 +117,9 @@ class Forks:
         """Return the dialects whose fields and layer types a net uses, and those of ``everywhere``."""
         return set()
 
-    def rewritten(self, net: "Any", dialects: "Collection[str]") -> "tuple[Any, Sequence[str]]":
-        """Return a Plan whose layers have the fields that its forks mean, and warnings."""
-        return net, ()
+    def rewritten(self, plan: "Any", dialects: "Collection[str]") -> "tuple[Any, Sequence[str]]":
+        """Return a new Plan whose layers have the fields that these dialects mean, and warnings."""
+        return plan, ()
 
     def doubts(self, layers: "Any") -> "Mapping[str, int]":
         """Return warnings about layers whose type exists in several forks, if the net does not show which is meant.

@@ -1,7 +1,9 @@
 """The base class of layers: a module built from a LayerParameter and the shapes of its bottoms.
 
-A layer is complete when its constructor returns: its learnable blobs exist and are filled. ``top_shapes`` has the
-shapes that ``forward`` will return; they are computed by integer arithmetic only.
+A layer is made in two phases. Its constructor checks everything, and computes by integer arithmetic ``top_shapes``, the
+shapes that ``forward`` will return, and those of its learnable blobs, which are on torch's device "meta". ``allocate``
+gives them memory and fills them; a net calls it once it knows that the memory is enough. Without a net, the constructor
+does.
 
 A new layer, also of a dialect, needs ``reshape`` and ``forward``, and ``setup`` if it has settings or learnable blobs.
 ``construct`` and ``ReadingLayer.open`` exist only for the order of the log: Caffe opens a database in a layer's
@@ -115,12 +117,15 @@ class Layer(torch.nn.Module):
         self.num_tops: int = max(len(param.top), self.tops[0] if self.is_loss else 0)
         self.blobs = _NO_BLOBS
         self.blob_shapes: list[Shape] = []
+        self._fillings: list[tuple[Any, float]] = []  # of the blobs: a FillerParameter or None, and a value
         self.construct()
         self.context.created(self.num_tops)
         self.refuse(self._wrong_counts())
         self.setup()
         self.top_shapes: list[Shape] = self._reshaped(self.bottom_shapes)
         self._shapes_checked = False  # whether a pass at the present shapes gave tops of ``top_shapes``
+        if self.context.allocates:
+            self.allocate()
 
     @override
     def __setattr__(self, name: str, value: Any) -> None:
@@ -303,22 +308,33 @@ class Layer(torch.nn.Module):
                 raise
 
     def add_blob(self, shape: Sequence[int], filler: Any = None, value: float = 0.0) -> None:
-        """Append a learnable blob, filled by a FillerParameter, or with ``value`` where ``filler`` is None."""
-        axes, device = self.possible(shape), self.context.device
-        self.context.take(4 * math.prod(axes))
-        data: torch.Tensor | None = None
+        """Append a learnable blob, filled by a FillerParameter, or with ``value`` where ``filler`` is None.
+
+        It has no memory before :meth:`allocate`.
+        """
+        axes = self.possible(shape)
         if filler is not None:
             try:
-                if device.type == "meta":
-                    fillers.check(filler, axes)
-                else:
-                    data = fillers.fill(filler, axes, self.context.random.on("cpu")).to(device)
+                fillers.check(filler, axes)
             except ValueError as fault:
                 self.context.report(self.error(str(fault), *self._path_to(filler)))
+                filler = None
         if not self.blobs:
             self.blobs = torch.nn.ParameterList()
-        self.blobs.append(Learned(fillers.constant(axes, value, device) if data is None else data))
-        self.blob_shapes.append(tuple(shape))
+        self.blobs.append(Learned(torch.empty(axes, device="meta")))
+        self.blob_shapes.append(axes)
+        self._fillings.append((filler, value))
+
+    def allocate(self) -> None:
+        """Give the learnable blobs memory on the net's device, and fill them in order."""
+        device, fillings = self.context.device, self._fillings
+        self._fillings = []
+        for j, (filler, value) in enumerate(fillings if device.type != "meta" else ()):
+            if filler is None:
+                data = fillers.constant(self.blob_shapes[j], value, device)
+            else:
+                data = fillers.draw(filler, self.blob_shapes[j], self.context.random.on("cpu")).to(device)
+            self.blobs[j] = Learned(data)
 
     def blob(self, index: int) -> torch.Tensor:
         """Return learnable blob ``index`` in this layer's shape (a PERMISSIVE sharer's owner may have another)."""

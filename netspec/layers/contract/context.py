@@ -96,8 +96,8 @@ class Context:
     report: Report = raise_fault
     # called after ``construct`` with the number of tops, for the order of the log
     created: Callable[[int], None] = lambda tops: None
-    # called with a number of bytes before they are allocated; may raise SpecError
-    take: Callable[[int], None] = lambda size: None
+    # whether the constructor allocates the blobs; a net does it when it knows that the memory is enough
+    allocates: bool = True
 
     @property
     def device(self) -> torch.device:

@@ -17,18 +17,12 @@ from netspec.errors import did_you_mean
 FAN_IN, FAN_OUT, AVERAGE = 0, 1, 2  # caffe.proto: enum FillerParameter.VarianceNorm
 
 
-def fill(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    """Return a float32 CPU tensor of ``shape``, filled by ``filler``, a FillerParameter.
+def draw(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
+    """Return a float32 CPU tensor of ``shape``, filled by ``filler``, a FillerParameter that :func:`check` accepted.
 
     The distributions are Caffe's, but the numbers differ, because Caffe's random generator depends on its version of
-    Boost. Raises ValueError like :func:`check`.
+    Boost.
     """
-    check(filler, shape)
-    return draw(filler, shape, generator)
-
-
-def draw(filler: Any, shape: Shape, generator: torch.Generator) -> torch.Tensor:
-    """Do the same as :func:`fill`, without the check."""
     return _FILLERS[filler.type].draw(filler, shape, generator)
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from netspec import log
 from netspec.errors import SpecError
@@ -70,10 +70,14 @@ class DummyData(Layer):
         given = list(self.param.dummy_data_param.data_filler)
         self._fillers = self._one_a_top(given or [FillerParameter()], "data_filler")
         self.refuse(self._wrong_fillers())
-        on_meta = self.context.device.type == "meta"
-        constant = [filler.type == "constant" and not on_meta for filler in self._fillers]
-        self.context.take(4 * sum(math.prod(shape) for shape, kept in zip(self.shapes, constant, strict=True) if kept))
-        self._constants = [self._fill(i, torch.Generator()) if kept else None for i, kept in enumerate(constant)]
+        self._constants: list[torch.Tensor | None] = [None] * self.num_tops
+
+    @override
+    def allocate(self) -> None:
+        """Fill the constant tops."""
+        if self.context.device.type != "meta":
+            constant = [filler.type == "constant" for filler in self._fillers]
+            self._constants = [self._fill(i, torch.Generator()) if kept else None for i, kept in enumerate(constant)]
 
     def _wrong_fillers(self) -> Iterator[SpecError]:
         for i, (filler, shape) in enumerate(zip(self._fillers, self.shapes, strict=True)):

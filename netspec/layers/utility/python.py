@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from typing_extensions import override
 
 from netspec import log
 from netspec.errors import SpecError, did_you_mean
@@ -82,7 +83,14 @@ class Python(Layer):
         self._call("setup", self.bottom, self.top)
         for blob in self.code.blobs:
             self.add_blob(blob.shape)
-            self.blobs[-1].data.copy_(torch.from_numpy(blob.data))
+
+    @override
+    def allocate(self) -> None:
+        """Fill the blobs with what the code's setup wrote to its own."""
+        super().allocate()
+        for mine, blob in zip(self.blobs, self.code.blobs if self.code else (), strict=False):
+            if mine.device.type != "meta":
+                mine.data.copy_(torch.from_numpy(blob.data))
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         if self.code is None:

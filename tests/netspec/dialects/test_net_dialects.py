@@ -8,10 +8,12 @@ import torch
 
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
+from netspec.graph.plan import make_plan, of_forks
 from netspec.layers.vision.convolution import Convolution
 from netspec.net.net import Net
 from netspec.net.weights import load_weights
 from netspec.proto.schema import NetParameter
+from netspec.proto.text import parse_net_text
 
 PLAIN = """
 layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1 dim: 9 dim: 9 } } }
@@ -132,6 +134,13 @@ def test_crop_without_offsets_aligns_its_bottoms_in_hed_only(
     lines = [record.getMessage() for record in caplog.records if "without crop_param" in record.getMessage()]
     assert len(lines) == bool(said)
     assert all(said in line for line in lines)
+
+
+def test_a_plan_is_not_changed_by_its_forks() -> None:
+    plan = make_plan(*parse_net_text(conv(35), "f"))
+    first, second = of_forks(plan, ()), of_forks(plan, ())
+    assert [layer.HasField("crop_param") for layer in (plan.net.layer[-1], first.net.layer[-1])] == [False, True]
+    assert first.warnings == second.warnings != ()
 
 
 def test_crop_offsets_of_hed_equal_those_of_coord_map(net_of: Callable[..., Net]) -> None:

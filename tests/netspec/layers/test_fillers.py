@@ -10,7 +10,7 @@ import pytest
 import torch
 from google.protobuf import text_format
 
-from netspec.layers.contract.fillers import fill
+from netspec.layers.contract import fillers
 from netspec.proto.schema import FillerParameter
 
 SHAPE = (200, 50, 2, 2)  # fan_in 200, fan_out 800
@@ -19,7 +19,8 @@ SHAPE = (200, 50, 2, 2)  # fan_in 200, fan_out 800
 def draw(text: str, shape: tuple[int, ...] = SHAPE, seed: int = 1) -> np.ndarray:
     filler = FillerParameter()
     text_format.Parse(text, filler)
-    values = fill(filler, shape, torch.Generator().manual_seed(seed))
+    fillers.check(filler, shape)
+    values = fillers.draw(filler, shape, torch.Generator().manual_seed(seed))
     assert values.dtype == torch.float32
     assert tuple(values.shape) == shape
     return values.numpy()
