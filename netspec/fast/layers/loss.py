@@ -12,9 +12,9 @@ import torch
 import torch.nn.functional as F
 
 from netspec.exact import SMALL_ITEM
+from netspec.exact.blas import routine
 from netspec.fast.entry import Entry
 from netspec.fast.kernels import Learning
-from netspec.fast.orders import class_sums
 from netspec.layers.loss.base import normalizer
 from netspec.layers.loss.scores import FLT_MIN, SoftmaxWithLoss
 from netspec.run.recorded import Kernels
@@ -72,10 +72,19 @@ def _prepared_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], t
         np.maximum.reduce(given, 1, out=largest, keepdims=True)
         np.subtract(given, largest, exponents.real)  # never above 0: see libm.exp
         np.exp(exponents, powers)
-        np.divide(powers.real, class_sums(powers.real)[:, None], values)
+        np.divide(powers.real, _class_sums(powers.real)[:, None], values)
         return p
 
     return run
+
+
+def _class_sums(values: np.ndarray) -> np.ndarray:
+    """Return the sums (N, inner) over axis 1 of values (N, classes, inner), by a call of gemv for each item."""
+    sums = np.zeros((len(values), values.shape[2]), values.dtype)
+    add_up, ones = routine("gemv", values), np.ones(values.shape[1], values.dtype)
+    for item, total in zip(values, sums, strict=True):
+        add_up(1.0, item.T, ones, 1.0, total, 0, 1, 0, 1, 0, 1)
+    return sums
 
 
 def _prepared_cross_entropy(
