@@ -20,6 +20,7 @@ CORNER, CENTER_SIZE, CORNER_SIZE = 1, 2, 3  # ssd.py: enum PriorBoxParameter.Cod
 NO_MATCH, LEFT_OUT = -1, -2  # special values instead of the index of a matched box
 LEAST_OVERLAP = 1e-6  # smaller overlaps count as none
 LEAST_SIZE = 1e-5  # suppress_all ignores smaller boxes
+BLOCK = 32  # boxes that are compared with all others at once
 
 
 def as_array(tensor: torch.Tensor) -> Array:
@@ -158,14 +159,18 @@ def suppress(boxes: Array, threshold: float, eta: float = 1.0) -> list[int]:
     """
     limit = np.float32(threshold)
     kept: list[int] = []
-    most = np.zeros(len(boxes), np.float32)
-    for i in range(len(boxes)):
-        if most[i] > limit:
-            continue
-        kept.append(i)
-        most = np.maximum(most, overlaps(boxes[i], boxes))
-        if eta < 1 and limit > 0.5:
-            limit *= np.float32(eta)
+    left, most = np.arange(len(boxes)), np.zeros(len(boxes), np.float32)
+    while len(left):  # a block of rows costs little more than one row
+        table = overlaps(boxes[left[:BLOCK], None], boxes[left])
+        for row, covered in enumerate(table):
+            if most[row] > limit:
+                continue
+            kept.append(int(left[row]))
+            most = np.maximum(most, covered)
+            if eta < 1 and limit > 0.5:
+                limit *= np.float32(eta)
+        stay = ~(most[BLOCK:] > limit)
+        left, most = left[BLOCK:][stay], most[BLOCK:][stay]
     return kept
 
 

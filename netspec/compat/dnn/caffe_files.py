@@ -16,6 +16,7 @@ from netspec.exact import NONE
 from netspec.files.kinds import unreadable
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
+from netspec.graph.speed import speed
 from netspec.layers.contract.base import Shape
 from netspec.net.build import build_filtered
 from netspec.net.net import Net
@@ -56,7 +57,7 @@ class CaffeFiles:
 
         SSD's layers are computed as in OpenCV (netspec/compat/dnn/opencv_layers.py).
         """
-        options = BuildOptions(device, exact=NONE)
+        options = BuildOptions(device, exact=NONE, speed=speed())
         with log.silent():  # warnings about fields without effect; OpenCV has none
             net = build_filtered(self._reshaped(shapes), self.source, options)
         for i, layer in enumerate(net.layers):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from netspec.dialects import use_dialect
-from netspec.dialects.boxes import CENTER_SIZE, decode, suppress
+from netspec.dialects.boxes import CENTER_SIZE, decode, overlaps, suppress
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer
 from netspec.load import load_solver
@@ -178,3 +178,17 @@ def test_infinite_boxes_do_not_suppress_other_boxes(bound: float) -> None:
     assert suppress(np.array([without, plain, without, plain], np.float32), 0.45) == [0, 1, 2]
     codes = np.array([[bound, -bound, bound, bound]], np.float32)
     assert not np.isfinite(decode(codes, np.array([plain], np.float32), None, CENTER_SIZE)).all()
+
+
+@pytest.mark.parametrize(("threshold", "eta"), [(0.45, 1.0), (0.3, 1.0), (0.9, 0.9)])
+def test_boxes_in_blocks_are_kept_as_one_by_one(threshold: float, eta: float) -> None:
+    random = np.random.default_rng(0)
+    corners = random.uniform(0, 0.6, (150, 2))
+    boxes = np.concatenate([corners, corners + random.uniform(0.05, 0.4, (150, 2))], 1).astype(np.float32)
+    limit, kept = np.float32(threshold), list[int]()
+    for i in range(len(boxes)):
+        if all(overlaps(boxes[k], boxes[i]) <= limit for k in kept):
+            kept.append(i)
+            limit *= np.float32(eta) if eta < 1 and limit > 0.5 else np.float32(1)
+    assert 32 < len(kept) < 150
+    assert suppress(boxes, threshold, eta) == kept

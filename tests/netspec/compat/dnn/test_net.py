@@ -7,10 +7,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 
 import netspec
 from dnn_program import HERE
 from netspec import dnn
+from netspec.fast.prepared import Prepared
 
 DATA = np.random.RandomState(0).rand(1, 3, 20, 20).astype(np.float32)
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 3 dim: 8 dim: 8 } } }\n'
@@ -160,6 +162,19 @@ def test_parameters_are_read_and_written() -> None:
     np.testing.assert_allclose(net.forward("conv2"), before + 1, rtol=0, atol=1e-5)
     with pytest.raises(dnn.DnnError, match=r"found an array of shape \(3,\), expected \(12,\)"):
         net.setParam("conv2", 1, [1, 2, 3])
+
+
+def test_a_whole_pass_runs_prepared_kernels_with_the_current_parameters() -> None:
+    net, outputs = read("classify"), list[np.ndarray]()
+    for _ in range(2):
+        net.setInput(DATA)
+        outputs.append(net.forward())
+        with torch.inference_mode():
+            by_layer = net._walk(len(net._caffe.net.plan.nodes) - 1)
+        np.testing.assert_allclose(outputs[-1], by_layer[max(by_layer)].numpy(), rtol=0, atol=1e-6)
+        net.setParam("conv2", 0, net.getParam("conv2", 0) * np.linspace(0, 2, 12).reshape(12, 1, 1, 1))
+    assert isinstance(net._caffe.net.runners[0], Prepared)
+    assert np.abs(outputs[0] - outputs[1]).max() > 1e-3
 
 
 def test_inputs_are_renamed() -> None:
