@@ -203,7 +203,7 @@ def _answered(compared: Compared, cache: Cache, queries: Sequence[Path], referen
 def online(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
     """Return the match of each frame (N,), -1 without one, as ``LoopDetector`` with a geometric check decides."""
     detector = LoopDetector(check=Known(pairs=cache.pairs))
-    images: Sequence[Any] = real.images
+    images: list[Any] = [*real.images]  # the check knows images by their paths
     found = [detector.add_descriptor(row, image=image) for row, image in zip(rows, images, strict=True)]
     return np.array([-1 if result.accepted is None else result.accepted for result in found])
 
