@@ -117,7 +117,7 @@ class LoopCloser:
             elif not self._moved(relative_pose(graph.odometry[-1], pose)):
                 return None
         try:
-            found = self.detector.add(image, stamp, pose)
+            found = self.detector.add(image, stamp, odometry=pose)
         except InputError as fault:
             self.warn(f"the image at {stamp:.6f} is left out: {fault.message}")
             return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -132,9 +133,9 @@ def load_describe(specification: str, options: dict[str, str] | None = None) -> 
 
     A name without a colon is an entry point in the group ``loopclosure.describers`` of an installed package. It is
     always called with ``options``.
-    A class, or a function if there are options, is called with ``options`` as keywords and must return the ``describe``
-    function. A module must belong to an installed package; a file in the working directory runs only if its path is
-    given.
+    A class, a function if there are options, and a function that cannot take one image are called with ``options`` as
+    keywords and must return the ``describe`` function.
+    A module must belong to an installed package; a file in the working directory runs only if its path is given.
     """
     options = options or {}
     if re.fullmatch(NAME, specification):
@@ -150,9 +151,20 @@ def load_describe(specification: str, options: dict[str, str] | None = None) -> 
         if not hasattr(target, part):
             raise InputError(f'"{module_name}" has no "{name}" (--describe {specification})')
         target = getattr(target, part)
-    if options or isinstance(target, type):
+    if options or isinstance(target, type) or not _takes_an_image(_callable(target, specification)):
         return _called(target, specification, options)
     return _callable(target, specification)
+
+
+def _takes_an_image(function: Describe) -> bool:
+    """Return whether a function can be called with one argument; True where that is not known."""
+    try:
+        inspect.signature(function).bind(None)
+    except TypeError:
+        return False
+    except ValueError:  # a function in C may have no signature
+        return True
+    return True
 
 
 def _called(target: Any, specification: str, options: dict[str, str]) -> Describe:

@@ -197,6 +197,8 @@ def test_keyframes_are_apart_by_a_step_or_a_turn() -> None:
         closer.add(picture(second), second, pose)
     assert closer.path()[0].tolist() == [0, 2, 4]
     np.testing.assert_allclose(closer.path()[1], [at(0), at(1.1), at(1.1, 31)], atol=1e-12)
+    assert np.isnan(closer.detector.poses).all(), "odometry is not a true pose"
+    np.testing.assert_allclose(closer.detector.odometry[:, :3], [at(0)[:3], at(1.1)[:3], at(1.1)[:3]], atol=1e-12)
 
 
 def test_faults_of_a_sensor_are_warned_of_and_left_out() -> None:

@@ -85,6 +85,8 @@ def test_describe_by_name(tmp_path, monkeypatch):
         "def make(power, name='x'):\n    return lambda image: image.mean(axis=(0, 1)) ** power\n\n\n"
         "class Row:\n    def __init__(self, row=0):\n        self.row = row\n\n"
         "    def __call__(self, image):\n        return image[self.row, 0]\n\n\n"
+        "def mean():\n    return flat\n\n\n"
+        "def pair(first, second):\n    return first\n\n\n"
         "number = 3\n\n\n"
         "def refuse(power):\n    raise ValueError(f'{power} is not a power')\n\n\n"
         "def absent(file):\n    return open(file)\n"
@@ -96,7 +98,9 @@ def test_describe_by_name(tmp_path, monkeypatch):
     assert load_describe(f"{tmp_path}/my_describe.py:make", {"power": "2"})(image).tolist() == [12.25] * 3
     assert load_describe("my_describe.py:Row", {})(image).tolist() == [3] * 3
     assert load_describe("my_describe.py:Row", {"row": "1"})(image).tolist() == [5] * 3
+    assert load_describe("my_describe.py:mean", {})(image).tolist() == [3.5] * 3
     for specification, options, sentence in (
+        ("my_describe.py:pair", {}, "--describe my_describe.py:pair: .*missing 2 required"),
         ("my_describe.py", {}, "expected module:function or FILE.py:function"),
         ("my_describe:flat", {}, "lies in the working directory, not in an installed package; .* ./my_describe.py"),
         ("gone.py:f", {}, "cannot import"),

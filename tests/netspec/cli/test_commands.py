@@ -457,6 +457,3 @@ def test_missing_layers_are_a_warning_or_with_strict_an_error(run: Run, edited: 
         assert result.status == 0, result.err
         assert result.err.count(f"{lacks}; they keep the values of their fillers") == 1
         assert run(*command, "--strict").fault == f"{lacks}; without strict they keep their fillers' values"
-
-
-# What other systems lack is said once, and the command goes on
