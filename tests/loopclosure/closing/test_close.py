@@ -140,7 +140,7 @@ def test_odometry_from_a_file(
         ("--drift 2 --loops NONE", 1, "no such file; expected the loops.csv"),
         ("--drift 2 --loops WALK/rgb.txt", 1, "is not a table of loops"),
         ("--drift 2 --loops FAR", 1, 'far.csv:2:1: no frame has the number "900"; there are 90'),
-        ("--drift 2 --loops NAMED", 1, 'named.csv:2:1: no image of the sequence has the name "x.jpg"'),
+        ("--drift 2 --loops NAMED", 1, 'named.csv:2:1: no selected image of the sequence has the name "x.jpg"'),
         ("--drift 200 --loops LOOPS", 1, "a drift of 200 %; expected"),
         ("--drift 2 --loops LOOPS --camera 1,2,3", 1, "expected FX,FY,CX,CY"),
         ("--drift 2 --loops LOOPS --odometry-form tum", 2, "--odometry-form needs --odometry"),
