@@ -12,7 +12,7 @@ from typing_extensions import override
 from netspec.dialects import registry, use_dialect
 from netspec.dialects.blocks.settings import SettingsRates
 from netspec.dialects.files import find_file
-from netspec.dialects.known import added, known
+from netspec.dialects.known import added, dialect_of_module, known
 from netspec.dialects.known import dialect as find
 from netspec.errors import SpecError, Where
 from netspec.proto.forks import Additions, Forks, Rates
@@ -69,9 +69,12 @@ class Dialects(Forks):
 
     @override
     def adopt(self, cls: Any, module: str) -> bool:
-        from netspec.dialects.layers import adopt
+        owner = dialect_of_module(module)
+        if owner:
+            from netspec.dialects.layers import adopt
 
-        return adopt(cls, module)
+            adopt(cls, owner)
+        return bool(owner)
 
     @override
     def class_of(self, param: LayerParameter, dialects: Collection[str], runs_python: bool) -> Any:

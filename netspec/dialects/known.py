@@ -30,9 +30,9 @@ def dialect(name: str) -> Dialect:
     return _added.get(name) or _found()[name]
 
 
-def add(name: Dialect) -> None:
+def add(given: Dialect) -> None:
     """Add a dialect for every net."""
-    _added[name.name] = name
+    _added[given.name] = given
 
 
 def to_add(given: Dialect) -> Dialect | None:

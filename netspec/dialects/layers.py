@@ -47,12 +47,9 @@ def replace(type_name: str, *reads: str, where: Condition = lambda param: True) 
     return add
 
 
-def adopt(cls: type[Layer], module: str) -> bool:
-    """Keep a class that a module registers; return whether it is the module of a dialect."""
-    owner = dialect_of_module(module)
-    if owner:
-        _classes.setdefault(cls.type, {})[owner] = cls
-    return bool(owner)
+def adopt(cls: type[Layer], owner: str) -> None:
+    """Keep a class that the module of a dialect registers."""
+    _classes.setdefault(cls.type, {})[owner] = cls
 
 
 def class_of(param: LayerParameter, dialects: Collection[str], runs_python: bool) -> type[Layer] | None:
