@@ -18,7 +18,10 @@ from netspec.terminal.parser import Commands, Parser
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
 FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
 SMALL, PROGRAMS_FOR_SMALL = ("tiny", "lenet", "cifar10_quick", "pnet"), ("netspec", "pycaffe", "pytorch")
-TRAINING = ("netspec", "netspec-bf16", "pytorch", "pycaffe")
+TRAINING = (
+    *("netspec", "netspec-bf16", "pycaffe"),
+    *("pytorch", "pytorch-bf16", "pytorch-channels_last", "pytorch-channels_last-bf16"),
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -95,9 +95,9 @@ def task_of(case: Case, threads: int) -> dict[str, Any]:
 
 
 def _worker(case: Case, program: str, task: dict[str, Any], suffix: str, separate_python: str | None) -> Contestant:
-    if program == "pytorch" and case.twin is None:
-        return _Absent(program, "there is no twin of this net; --twin names one that fits")
     name, options = parts(program)
+    if name == "pytorch" and case.twin is None:
+        return _Absent(program, "there is no twin of this net; --twin names one that fits")
     return Worker(program, python_of(program, separate_python), {**task, **options, "program": name + suffix})
 
 

@@ -174,7 +174,7 @@ def pycaffe_training(task: Task) -> Run:
 
 
 def pytorch_training(task: Task) -> Run:
-    """Train the twin with torch's SGD on a batch in memory."""
+    """Train the twin with torch's SGD on a batch in memory; in bf16 by autocast, and perhaps in channels_last."""
     import torch
 
     from benchmarks import twins
@@ -183,19 +183,22 @@ def pytorch_training(task: Task) -> Run:
     torch.backends.cudnn.allow_tf32 = False  # as in netspec
     twin = twins.net(task["twin"]).train()
     twins.load(twin, task["caffemodel"])
-    twin.to(task["device"])
+    layout = torch.channels_last if task["engine"] == "channels_last" else torch.contiguous_format
+    twin.to(task["device"]).to(memory_format=layout)
     loss_of = twins.Classified(twin) if task["twin"] in twins.CLASSIFIERS else twins.Pairs(twin)
     groups = twins.parameter_groups(twin, task["rate"], task["decay"])
     optimizer = torch.optim.SGD(groups, lr=task["rate"], momentum=task["momentum"])
     data, labels = (torch.from_numpy(value).to(task["device"]) for value in _inputs(task).values())
+    data = data.contiguous(memory_format=layout)
 
     def run() -> dict[str, Any]:
         optimizer.zero_grad()
-        loss = loss_of(data, labels)
+        with torch.autocast(torch.device(task["device"]).type, torch.bfloat16, enabled=task["precision"] == "bf16"):
+            loss = loss_of(data, labels)
         loss.backward()
         optimizer.step()
         _finish(task)
-        return {"loss": loss.detach().cpu()}
+        return {"loss": loss.detach().float().cpu()}
 
     return run
 
