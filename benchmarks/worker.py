@@ -184,7 +184,7 @@ def pytorch_training(task: Task) -> Run:
     twin = twins.net(task["twin"]).train()
     twins.load(twin, task["caffemodel"])
     layout = torch.channels_last if task["engine"] == "channels_last" else torch.contiguous_format
-    twin.to(task["device"]).to(memory_format=layout)
+    twin.to(task["device"]).to(memory_format=layout)  # pyright: ignore[reportCallIssue]  not in its overloads
     loss_of = twins.Classified(twin) if task["twin"] in twins.CLASSIFIERS else twins.Pairs(twin)
     groups = twins.parameter_groups(twin, task["rate"], task["decay"])
     optimizer = torch.optim.SGD(groups, lr=task["rate"], momentum=task["momentum"])
