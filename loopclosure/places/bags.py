@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from loopclosure.errors import InputError
 from loopclosure.places.bag_files import bag_paths, check_spans
 from loopclosure.places.intrinsics import Intrinsics
-from loopclosure.places.messages import camera_of, image_of, pose_of, seconds
+from loopclosure.places.messages import camera_of, image_of, pixels_of, pose_of, seconds
+from loopclosure.places.pixels import bits_of
 from loopclosure.places.pose_files import moved
 from loopclosure.places.stamps import mended
 from loopclosure.places.trajectory import NORM_TOLERANCE
@@ -99,13 +100,23 @@ class Bag:
         A stamp may be 0 or go back; see :meth:`mended`.
         """
         with _reading(self.path):
-            for received, message in self._messages(self.topics.images):
-                self.frame = message.header.frame_id
-                try:
-                    image = image_of(message)
-                except InputError as fault:
-                    raise InputError(f"{self.topics.images} has {fault.message}", self.path) from None
-                yield seconds(message.header.stamp), received, image
+            try:
+                least = self._bits()
+                for received, message in self._messages(self.topics.images):
+                    self.frame = message.header.frame_id
+                    yield seconds(message.header.stamp), received, image_of(message, least)
+            except InputError as fault:
+                raise InputError(f"{self.topics.images} has {fault.message}", self.path) from None
+
+    def _bits(self) -> int:
+        """Return how many bits the brightest of the images uses."""
+        most = 8
+        for _, message in self._messages(self.topics.images):
+            pixels = pixels_of(message)
+            if pixels.dtype == np.uint8:
+                break
+            most = max(most, bits_of(pixels))
+        return most
 
     def image_stamps(self) -> np.ndarray:
         """Return the stamps (N,) of the images in seconds, without decoding them."""

@@ -9,6 +9,7 @@ import time
 from collections.abc import Generator, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.places.bag_files import is_bag
 from loopclosure.places.bags import bag_frames
-from loopclosure.places.pixels import eight_bits
+from loopclosure.places.pixels import bits_of, eight_bits
 from netspec.files.environment import environment
 from netspec.files.image_list import list_images
 from netspec.files.kinds import is_cut_png, nearest_existing, unreadable
@@ -25,6 +26,7 @@ from netspec.files.opencv import cv2
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 
 DEPTH_PER_M = 5000  # of depth images, as TUM RGB-D has them
+BESIDE = 16  # images of a folder that show how many bits its camera uses
 
 
 @dataclass(frozen=True)
@@ -75,10 +77,28 @@ def image_paths(source: str | Path) -> list[Path]:
 def read_bgr(path: str | Path) -> np.ndarray:
     """Read an image (H, W, 3) uint8, BGR. Raises InputError if it cannot be read.
 
-    Of 16 bits, those that the image uses are kept: see :func:`~loopclosure.places.pixels.eight_bits`.
+    Of 16 bits, those that it or images beside it use are kept: see :func:`~loopclosure.places.pixels.eight_bits`.
     """
-    image = eight_bits(read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
+    image, path = read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), Path(path)
+    if image.dtype == np.uint16:
+        return eight_bits(image, _bits_beside(path.parent, _letters(path.name)))
     return image if image.dtype == np.uint8 else read_pixels(path, cv2.IMREAD_COLOR)
+
+
+def _letters(name: str) -> str:
+    """Return a name without its digits, in which the images of one camera differ."""
+    return re.sub(r"\d", "", name)
+
+
+@lru_cache(64)
+def _bits_beside(folder: Path, letters: str) -> int:
+    """Return how many bits some images in a folder use, of those with these letters in their names."""
+    files = sorted(file for file in folder.iterdir() if _letters(file.name) == letters)
+    most = 8
+    for file in files[:: max(1, len(files) // BESIDE)]:
+        with suppress(InputError):  # whoever reads that image says so
+            most = max(most, bits_of(read_pixels(file, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)))
+    return most
 
 
 def read_pixels(path: str | Path, mode: int) -> np.ndarray:

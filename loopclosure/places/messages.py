@@ -7,12 +7,20 @@ from typing import Any
 import numpy as np
 
 from loopclosure.places.intrinsics import COUNTS, FISHEYE, PINHOLE, Intrinsics
-from loopclosure.places.pixels import compressed_pixels, raw_pixels
+from loopclosure.places.pixels import compressed_pixels, eight_bits, raw_pixels
 
 
-def image_of(message: Any) -> np.ndarray:
-    """Return the image (H, W, 3) uint8 BGR of an Image or CompressedImage. Raises InputError for other encodings."""
+def pixels_of(message: Any) -> np.ndarray:
+    """Return the pixels (H, W, 3) BGR, uint8 or uint16, of an Image or CompressedImage.
+
+    Raises InputError for other encodings.
+    """
     return raw_pixels(message) if hasattr(message, "encoding") else compressed_pixels(message)
+
+
+def image_of(message: Any, least: int = 8) -> np.ndarray:
+    """Return the image (H, W, 3) uint8 BGR of a message; of 16 bits, those that it uses, and at ``least`` so many."""
+    return eight_bits(pixels_of(message), least)
 
 
 def camera_of(message: Any) -> Intrinsics | None:

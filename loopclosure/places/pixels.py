@@ -1,4 +1,4 @@
-"""Converts images of any encoding to BGR of 8 bits, as cv_bridge names the encodings of ROS."""
+"""Converts images of any encoding to BGR, and those of 16 bits to 8, as cv_bridge names the encodings of ROS."""
 
 from __future__ import annotations
 
@@ -34,20 +34,27 @@ PLANAR = {"nv12": cv2.COLOR_YUV2BGR_NV12, "nv21": cv2.COLOR_YUV2BGR_NV21}
 _NAMES = {name.lower(): name for name in (*ENCODINGS, *PACKED, *PLANAR)}
 
 
-def eight_bits(image: np.ndarray) -> np.ndarray:
+def bits_of(image: np.ndarray) -> int:
+    """Return how many bits the values of an image use: cameras of 10, 12 or 14 bits write the low bits of 16."""
+    brightest = int(image.max(initial=0))
+    return next(bits for bits in BITS if brightest < 1 << bits)
+
+
+def eight_bits(image: np.ndarray, least: int = 8) -> np.ndarray:
     """Convert pixels of 16 bits to 8 bits.
 
-    Cameras of 10, 12 or 14 bits write the low bits: the least of these that holds the brightest pixel is the range.
+    least  how many bits other images of the same camera use: a dark image uses fewer, and must stay dark
     """
     if image.dtype != np.uint16:
         return image
-    brightest = int(image.max(initial=0))
-    bits = next(bits for bits in BITS if brightest < 1 << bits)
-    return (image >> (bits - 8)).astype(np.uint8)
+    return (image >> (max(least, bits_of(image)) - 8)).astype(np.uint8)
 
 
 def raw_pixels(message: Any) -> np.ndarray:
-    """Return the pixels (H, W, 3) uint8 BGR of a message Image. Raises InputError if it is not known, or too short."""
+    """Return the pixels (H, W, 3) BGR, uint8 or uint16, of a message Image.
+
+    Raises InputError if its encoding is not known, or if it is too short.
+    """
     name = _NAMES.get(message.encoding.strip().lower())
     if name is None:
         raise InputError(f'images in "{message.encoding}"; known: {", ".join(_NAMES.values())}')
@@ -70,10 +77,11 @@ def raw_pixels(message: Any) -> np.ndarray:
 
 
 def compressed_pixels(message: Any) -> np.ndarray:
-    """Return the pixels (H, W, 3) uint8 BGR of a message CompressedImage. Raises InputError if it cannot be decoded.
+    """Return the pixels (H, W, 3) BGR, uint8 or uint16, of a message CompressedImage.
 
     Its ``format`` is "jpeg", or "ENCODING; jpeg compressed TARGET": the pixels were converted to TARGET, or are still
     in ENCODING if there is none. A mosaic of Bayer's is then coded as a gray image.
+    Raises InputError if it cannot be decoded.
     """
     before, _, after = message.format.partition(";")
     target = after.rpartition("compressed")[2].strip().lower()
@@ -89,6 +97,6 @@ def compressed_pixels(message: Any) -> np.ndarray:
 
 
 def _bgr(image: np.ndarray, colors: str) -> np.ndarray:
-    """Convert pixels (H, W, channels) to BGR of 8 bits."""
+    """Convert pixels (H, W, channels) to BGR."""
     code = TO_BGR[colors]
-    return np.ascontiguousarray(eight_bits(image if code is None else cv2.cvtColor(image, code)))
+    return np.ascontiguousarray(image if code is None else cv2.cvtColor(image, code))

@@ -48,6 +48,13 @@ def test_a_bag_becomes_a_sequence(name: str, ros: int, encoding: str, tmp_path: 
     assert extract(bag, tmp_path / "frames").said == f"{bag}: its frames are in {extracted.folder} already"
 
 
+def test_a_dark_image_of_16_bits_stays_dark(tmp_path: Path) -> None:
+    with open_bag(Bag(tmp_path / "a.bag", 1, "mono16", count=4).file) as bag:
+        for i, (_, _, image) in enumerate(bag.images()):
+            gray = np.asarray(cv2.cvtColor(picture(i), cv2.COLOR_BGR2GRAY))
+            np.testing.assert_array_equal(image[..., 0], gray >> 3 if i % 2 else gray)
+
+
 def opened(file: Path, out: Path, **settings: str) -> ImageSequence:
     return open_sequence(Source("", file, {name.replace("_", "-"): text for name, text in settings.items()}), out)[0]
 

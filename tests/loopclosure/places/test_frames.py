@@ -1,5 +1,6 @@
 """Sources of frames: order, selection, and errors for broken ones."""
 
+import csv
 import os
 import subprocess
 import sys
@@ -207,8 +208,9 @@ def test_detect_watches_a_video(tmp_path, capsys) -> None:
     assert main([*line, "--out", str(tmp_path / "out"), "--save", str(tmp_path / "d.npz")]) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[:4] == [f"frame {12 + i}, {12 + i}.0 s: shows the place of frame {i}" for i in range(4)]
-    rows = (tmp_path / "out" / "loops.csv").read_text().splitlines()[1:]
-    assert [row.split(",")[-2:] for row in rows][0:1] == [["frame 12", "frame 0"]]
+    with (tmp_path / "out" / "loops.csv").open(encoding="utf-8") as table:
+        first = next(csv.DictReader(table))
+    assert (first["query_name"], first["match_name"]) == ("frame 12", "frame 0")
     assert main(["detect", *THUMBNAILS, "--out", str(tmp_path)]) == 2
     assert "expected the frames, or --video" in capsys.readouterr().err
 

@@ -122,6 +122,15 @@ def test_an_image_of_16_bits_keeps_the_bits_that_it_uses(bits: int, suffix: str,
     np.testing.assert_array_equal(read_bgr(tmp_path / f"a{suffix}"), cv2.cvtColor(wanted, cv2.COLOR_GRAY2BGR))
 
 
+def test_a_dark_image_beside_a_bright_one_stays_dark(tmp_path: Path) -> None:
+    """Of one camera of 12 bits; a depth image in the same folder uses 16 bits, and says nothing about its images."""
+    bright, dark = (np.full(GRAY.shape, value, np.uint16) for value in (4000, 160))
+    for name, image in (("image_1", bright), ("image_2", dark), ("depth_1", bright * 16)):
+        assert cv2.imwrite(str(tmp_path / f"{name}.png"), image)
+    assert [read_bgr(tmp_path / f"image_{number}.png").max() for number in (1, 2)] == [250, 10]
+    assert [image_of(message("mono16", image), least=12).max() for image in (bright, dark)] == [250, 10]
+
+
 def test_images_of_8_bits_are_read_as_before(tmp_path: Path) -> None:
     for name, image in (("a.png", PICTURE), ("b.png", GRAY)):
         assert cv2.imwrite(str(tmp_path / name), image)
