@@ -63,9 +63,10 @@ class Feed(Generic[T]):
 
     def restart(self, position: int = 0) -> None:
         """Continue at iteration ``position``; discard batches made in advance."""
-        while self._pending:
-            self._pending.popleft()[1].cancel()
+        pending, self._pending = self._pending, deque()  # at once: Ctrl-C must not leave a part of them
         self.position = position
+        for _, outcomes in pending:
+            outcomes.cancel()
 
     def close(self) -> None:
         """Stop the threads; a later ``next()`` starts them again."""

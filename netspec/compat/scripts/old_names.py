@@ -158,27 +158,31 @@ def remedy(fault: BaseException) -> str:
     return ""
 
 
+# Not "expected str, bytes or os.PathLike object, not NoneType": there, text would do as well.
+_OF_BYTES = re.compile(r"bytes(?!.* or )|encod")
 _ADVICE = {  # what an error says, and what to write in the line
     "'cmp'": "cmp is gone; write (a > b) - (a < b), and sort with key=functools.cmp_to_key(function)",
-    "positional argument": "for a list, write sort(key=functools.cmp_to_key(function)); else leave out the argument",
-    "expected 1 argument": "write sorted(values, key=functools.cmp_to_key(function))",
+    "sort() takes": "write sort(key=functools.cmp_to_key(function))",
+    "sorted expected": "write sorted(values, key=functools.cmp_to_key(function))",
     "not supported between instances": "different types have no order; compare with None first, or convert",
     "'bytes' object has no attribute 'encode'": "write codecs.encode(data, 'base64'), or leave out .encode",
     "'str' object has no attribute 'decode'": "text is decoded already; leave out .decode",
     "slice indices": "write int(x) for a number with a point",
     "single integer": "write int(x) for a number with a point",
     "as an integer": "write int(x) for a number with a point",
+    "slices, not float": "write int(x) for a number with a point",
+    "only integers, slices": "write int(x) for a number with a point",  # an IndexError of NumPy
     "__format__": "write str(x) for what is formatted",
 }
 
 
 def _advice_for_python2(fault: BaseException, text: str) -> str:
     """Return what to write instead of the code that raised an error; "" for errors of other kinds."""
-    if isinstance(fault, (AttributeError, NameError, TypeError)):
+    if isinstance(fault, (AttributeError, IndexError, NameError, TypeError)):
         for said, advice in _ADVICE.items():
             if said in text:
                 return advice
-    if isinstance(fault, (TypeError, UnicodeError)):
+    if isinstance(fault, UnicodeError) or (isinstance(fault, TypeError) and _OF_BYTES.search(text)):
         return "text and bytes differ; write text.encode() for bytes, data.decode() for text, b'...' for a literal"
     return ""
 

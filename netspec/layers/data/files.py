@@ -258,10 +258,6 @@ class Data(ReadingLayer):
             p = self.param.data_param
             self._reader = self.attempt(open_reader, p.source, BACKENDS[p.backend], self.where)
 
-    @classmethod
-    def source_of(cls, param: Any) -> str:
-        return value(param, cls.group).source
-
     def open(self) -> Source | None:
         p, reader = self.param.data_param, self._reader
         transformer = self.attempt(self.transformer)
@@ -304,10 +300,6 @@ class ImageData(ReadingLayer):
             yield self.error("new_height and new_width must be given together", self.group)
         yield from super().wrong_settings()
         yield from contradictions(self.param.transform_param, self.context.at)
-
-    @classmethod
-    def source_of(cls, param: Any) -> str:
-        return value(param, cls.group).source
 
     def open(self) -> Source | None:
         """Read the list; its first image sets the shape."""
@@ -363,10 +355,6 @@ class WindowData(ReadingLayer):
             message = f"context_pad {p.context_pad} on both sides leaves no pixels of crop_size {crop}"
             yield self.error(message, self.group, "context_pad")
         yield from wrong_means(self.param.transform_param, self.context.at)
-
-    @classmethod
-    def source_of(cls, param: Any) -> str:
-        return value(param, cls.group).source
 
     def open(self) -> Source | None:
         from netspec.data.windows import WindowSource, read_window_file, window_mean

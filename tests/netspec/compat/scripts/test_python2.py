@@ -263,6 +263,8 @@ def test_round_keeps_nan_and_the_sign_of_zero() -> None:
         ("b'a'.encode('base64')", "write codecs.encode(data, 'base64')"),
         ("import numpy; numpy.zeros(2.0)", "write int(x)"),
         ("range(2.0)", "write int(x)"),
+        ("[2, 1][1.0]", "write int(x)"),
+        ("import numpy; numpy.zeros(2)[1.0]", "write int(x)"),
         ("'{:4}'.format(None)", "write str(x)"),
     ],
 )
@@ -270,6 +272,11 @@ def test_what_cannot_be_translated_is_refused_with_its_line(line: str, advice: s
     last = run("--python2", "s.py", s=f"print 1\n{line}\n", rc=1).stderr.splitlines()[-1]
     assert "s.py:2 is Python 2 code that cannot be translated: " in last
     assert advice in last
+
+
+@pytest.mark.parametrize("line", ["1 + None", "(lambda a: a)(1, 2)", "len(5)", "[] + ()", "open(None)", "int(None)"])
+def test_faults_of_the_program_itself_get_no_advice(line: str, run: Run) -> None:
+    assert "cannot be translated" not in run("--python2", "s.py", s=f"print 1\n{line}\n", rc=1).stderr
 
 
 @pytest.mark.parametrize("case", [name for name, case in CASES.items() if "prints" in case])
