@@ -18,6 +18,7 @@ from netspec.terminal.parser import Commands, Parser
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
 FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
 SMALL, PROGRAMS_FOR_SMALL = ("tiny", "lenet", "cifar10_quick", "pnet"), ("netspec", "pycaffe", "pytorch")
+WHOLE = ("mtcnn", "ssd300", "files", "classifier", "training", "start")
 TRAINING = (
     *("netspec", "netspec-bf16", "pycaffe"),
     *("pytorch", "pytorch-bf16", "pytorch-channels_last", "pytorch-channels_last-bf16"),
@@ -40,6 +41,7 @@ def parser() -> Parser:
     _add_train(commands)
     _add_small(commands)
     _add_start(commands)
+    _add_whole(commands)
     _add_waiting(commands)
     _add_growth(commands)
     _add_feeding(commands)
@@ -330,6 +332,24 @@ def _start(arguments: argparse.Namespace) -> None:
         for name in arguments.nets:
             with forward_case(name, 1, arguments.weights, onnx=False) as case:
                 yield starts_of(case, arguments.programs, separate_python, arguments.rounds)
+
+    _report(arguments, rows)
+
+
+def _add_whole(commands: Commands) -> None:
+    parser = commands.add_parser("programs", help="time whole programs: detectors, files, a training, a start")
+    parser.set_defaults(function=_whole, programs=["opencv4"])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"programs to time: {', '.join(WHOLE)} (default: all)")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="numbers of threads (default: 1 2)")
+    parser.add_argument("--rounds", type=int, default=3, help="number of rounds (default: 3)")
+    _add_json(parser)
+
+
+def _whole(arguments: argparse.Namespace) -> None:
+    from benchmarks.whole import How, measure
+
+    def rows(separate_python: str | None) -> Iterator[list[Row]]:
+        return measure(arguments.names or WHOLE, How(arguments.threads, arguments.rounds, separate_python))
 
     _report(arguments, rows)
 

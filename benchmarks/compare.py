@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,6 +58,14 @@ def _rows(
         for one in contestants:
             one.close()
     _show_progress(case, threads, rounds, rounds)
+    return rows_of_times(case, threads, contestants, times, what)
+
+
+def rows_of_times(
+    case: Case, threads: int, contestants: Sequence[Contestant], times: Mapping[str, Sequence[Pass]], what: str
+) -> list[Row]:
+    """Return a row for each contestant; ``times``: those that were measured, by name."""
+    able = [one for one in contestants if not one.fault]
     expected = next((one.outputs for one in able if one.name == "netspec"), None)
     seconds = {name: [clock for clock, _ in passes] for name, passes in times.items()}
     rows = []

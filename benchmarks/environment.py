@@ -11,7 +11,7 @@ from netspec.errors import SpecError
 
 FOLDER = ROOT / ".venv-bench"
 PACKAGES = (
-    "opencv-python-headless==4.12.0.88",  # the last OpenCV 4 that has a wheel
+    "opencv-python-headless==4.14.0.94",  # the last OpenCV 4
     "onnxruntime>=1.20",
     "openvino>=2024.6",
 )

@@ -92,7 +92,8 @@ def _solver(folder: str) -> str:
     return str(path)
 
 
-def _picture(random: np.random.Generator, channels: int, height: int, width: int) -> np.ndarray:
+def smooth_noise(random: np.random.Generator, channels: int, height: int, width: int) -> np.ndarray:
+    """Return an image (H, W, channels) of uint8 that a JPEG file needs as many bytes for as for a photograph."""
     import cv2
 
     coarse = random.integers(0, 256, (-(-height // 8), -(-width // 8), channels), np.uint8)
@@ -155,7 +156,7 @@ def _write(
     source = str(folder / "records")
     with Writer(source, backend) as writer:
         for k in range(count):
-            picture = _picture(random, channels, height, width)
+            picture = smooth_noise(random, channels, height, width)
             writer.put(b"%08d" % k, datum(picture, k % classes).SerializeToString())
     for layer in net.layer:
         if layer.type == "Data":
@@ -171,7 +172,7 @@ def _files(net: Any, folder: Path, shape: Any, count: int) -> None:
     lines = []
     for k in range(count):
         path = folder / f"{k}.jpg"
-        cv2.imwrite(str(path), _picture(random, channels, *FILE_SIZE))
+        cv2.imwrite(str(path), smooth_noise(random, channels, *FILE_SIZE))
         lines.append(f"{path} {k % classes}\n")
     (folder / "images.txt").write_text("".join(lines))
     for layer in net.layer:

@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from benchmarks.detectors import HEADS
 from benchmarks.zoo import GOOGLENET, MOBILENET, RESNET50, SQUEEZENET
 
 
@@ -126,6 +127,26 @@ def onet() -> nn.Module:
     maps = (*_conv_prelu(3, 32, 3), _pool_ceil(3), *_conv_prelu(32, 64, 3), _pool_ceil(3))
     maps = (*maps, *_conv_prelu(64, 64, 3), _pool_ceil(2), *_conv_prelu(64, 128, 2))
     return _Windows(*maps, nn.Flatten(), nn.Linear(1152, 256), nn.PReLU(256), nn.Linear(256, 2))
+
+
+class Heads(nn.Module):
+    """A net of MTCNN's with all its heads."""
+
+    def __init__(self, windows: nn.Module, widths: Sequence[int]) -> None:
+        super().__init__()
+        *maps, scores = next(windows.children()).children()
+        self.maps, heads = nn.Sequential(*maps), [scores]
+        for width in widths:
+            if isinstance(scores, nn.Conv2d):
+                heads.append(nn.Conv2d(scores.in_channels, width, 1))
+            elif isinstance(scores, nn.Linear):
+                heads.append(nn.Linear(scores.in_features, width))
+        self.heads = nn.ModuleList(heads)
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Return the scores (N, 2, ...) and the other heads' numbers."""
+        x = self.maps(x)
+        return [head(x) for head in self.heads]
 
 
 class LeNet(nn.Module):
@@ -402,6 +423,11 @@ def net(name: str) -> nn.Module:
     tower, _, neurons = name.rpartition("/")[2].rpartition("_")
     small = name.startswith("small/")
     return TOWERS[tower](int(neurons), 64 if small else 224, normalized=small)
+
+
+def with_heads(name: str) -> nn.Module:
+    """Return the twin of benchmarks.detectors.mtcnn."""
+    return Heads(net(name), HEADS[name])
 
 
 def load(twin: nn.Module, caffemodel: str | Path) -> None:

@@ -12,7 +12,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
@@ -233,13 +233,13 @@ def _inputs(task: Task) -> dict[str, np.ndarray]:
         return {name: arrays[name] for name in arrays.files}
 
 
-def main() -> None:
+def main(programs: Mapping[str, Callable[[Task], Run]] = PROGRAMS) -> None:
     """Answer requests until stdin ends."""
     task = json.loads(sys.argv[1])
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # output of libraries goes to stderr
     try:
-        run = PROGRAMS[task["program"]](task)
+        run = programs[task["program"]](task)
         np.savez(task["result"], allow_pickle=False, **{name: np.array(value) for name, value in run().items()})
     except Exception as fault:
         print(json.dumps({"fault": f"{type(fault).__name__}: {' '.join(str(fault).split())}"}), file=answers)

@@ -17,87 +17,87 @@ UNDECAYED, STATISTICS = {"lr_mult": 1, "decay_mult": 0}, {"lr_mult": 0, "decay_m
 
 def lenet(n: Any) -> str:
     """LeCun et al. 1998, as in Caffe's MNIST example."""
-    top = _pool(n, "pool1", _conv(n, "conv1", "data", 20, 5), 2)
-    top = _pool(n, "pool2", _conv(n, "conv2", top, 50, 5), 2)
-    return _full(n, "ip2", _relu(n, "relu1", _full(n, "ip1", top, 500)), 10)
+    top = pool(n, "pool1", conv(n, "conv1", "data", 20, 5), 2)
+    top = pool(n, "pool2", conv(n, "conv2", top, 50, 5), 2)
+    return _full(n, "ip2", relu(n, "relu1", _full(n, "ip1", top, 500)), 10)
 
 
 def tiny(n: Any) -> str:
     """Three layers of at most 20 numbers, as in reinforcement learning and tutorials."""
-    top = _relu(n, "relu1", _full(n, "ip1", "data", 20))
-    top = _add(n, "TanH", "tanh2", _full(n, "ip2", top, 20))
+    top = relu(n, "relu1", _full(n, "ip1", "data", 20))
+    top = add(n, "TanH", "tanh2", _full(n, "ip2", top, 20))
     return _full(n, "ip3", top, 10)
 
 
 def pnet(n: Any) -> str:
     """Zhang et al. 2016, MTCNN: the first net, on one window; whether it shows a face."""
-    top = _pool(n, "pool1", _prelu(n, "prelu1", _conv(n, "conv1", "data", 10, 3)), 2)
-    top = _prelu(n, "prelu2", _conv(n, "conv2", top, 16, 3))
-    top = _prelu(n, "prelu3", _conv(n, "conv3", top, 32, 3))
-    return _conv(n, "conv4", top, 2, 1)
+    top = pool(n, "pool1", _prelu(n, "prelu1", conv(n, "conv1", "data", 10, 3)), 2)
+    top = _prelu(n, "prelu2", conv(n, "conv2", top, 16, 3))
+    top = _prelu(n, "prelu3", conv(n, "conv3", top, 32, 3))
+    return conv(n, "conv4", top, 2, 1)
 
 
 def rnet(n: Any) -> str:
     """MTCNN's second net, on one window; whether it shows a face."""
-    top = _pool(n, "pool1", _prelu(n, "prelu1", _conv(n, "conv1", "data", 28, 3)), 3)
-    top = _pool(n, "pool2", _prelu(n, "prelu2", _conv(n, "conv2", top, 48, 3)), 3)
-    top = _prelu(n, "prelu4", _full(n, "conv4", _prelu(n, "prelu3", _conv(n, "conv3", top, 64, 2)), 128))
+    top = pool(n, "pool1", _prelu(n, "prelu1", conv(n, "conv1", "data", 28, 3)), 3)
+    top = pool(n, "pool2", _prelu(n, "prelu2", conv(n, "conv2", top, 48, 3)), 3)
+    top = _prelu(n, "prelu4", _full(n, "conv4", _prelu(n, "prelu3", conv(n, "conv3", top, 64, 2)), 128))
     return _full(n, "conv5-1", top, 2)
 
 
 def onet(n: Any) -> str:
     """MTCNN's third net, on one window; whether it shows a face."""
-    top = _pool(n, "pool1", _prelu(n, "prelu1", _conv(n, "conv1", "data", 32, 3)), 3)
-    top = _pool(n, "pool2", _prelu(n, "prelu2", _conv(n, "conv2", top, 64, 3)), 3)
-    top = _pool(n, "pool3", _prelu(n, "prelu3", _conv(n, "conv3", top, 64, 3)), 2)
-    top = _prelu(n, "prelu5", _full(n, "conv5", _prelu(n, "prelu4", _conv(n, "conv4", top, 128, 2)), 256))
+    top = pool(n, "pool1", _prelu(n, "prelu1", conv(n, "conv1", "data", 32, 3)), 3)
+    top = pool(n, "pool2", _prelu(n, "prelu2", conv(n, "conv2", top, 64, 3)), 3)
+    top = pool(n, "pool3", _prelu(n, "prelu3", conv(n, "conv3", top, 64, 3)), 2)
+    top = _prelu(n, "prelu5", _full(n, "conv5", _prelu(n, "prelu4", conv(n, "conv4", top, 128, 2)), 256))
     return _full(n, "conv6-1", top, 2)
 
 
 def cifar10_quick(n: Any) -> str:
     """Caffe's quick net for CIFAR-10."""
-    top = _relu(n, "relu1", _pool(n, "pool1", _conv(n, "conv1", "data", 32, 5, pad=2), 3))
+    top = relu(n, "relu1", pool(n, "pool1", conv(n, "conv1", "data", 32, 5, pad=2), 3))
     for k, width in ((2, 32), (3, 64)):
-        top = _average(n, f"pool{k}", _relu(n, f"relu{k}", _conv(n, f"conv{k}", top, width, 5, pad=2)))
+        top = _average(n, f"pool{k}", relu(n, f"relu{k}", conv(n, f"conv{k}", top, width, 5, pad=2)))
     return _full(n, "ip2", _full(n, "ip1", top, 64), 10)
 
 
 def cifar10_full(n: Any) -> str:
     """Caffe's full net for CIFAR-10: LRN within channels."""
     within = {"local_size": 3, "alpha": 5e-5, "beta": 0.75, "norm_region": 1}
-    top = _relu(n, "relu1", _pool(n, "pool1", _conv(n, "conv1", "data", 32, 5, pad=2), 3))
-    top = _add(n, "LRN", "norm1", top, lrn_param=within)
-    top = _average(n, "pool2", _relu(n, "relu2", _conv(n, "conv2", top, 32, 5, pad=2)))
-    top = _add(n, "LRN", "norm2", top, lrn_param=within)
-    top = _average(n, "pool3", _relu(n, "relu3", _conv(n, "conv3", top, 64, 5, pad=2)))
+    top = relu(n, "relu1", pool(n, "pool1", conv(n, "conv1", "data", 32, 5, pad=2), 3))
+    top = add(n, "LRN", "norm1", top, lrn_param=within)
+    top = _average(n, "pool2", relu(n, "relu2", conv(n, "conv2", top, 32, 5, pad=2)))
+    top = add(n, "LRN", "norm2", top, lrn_param=within)
+    top = _average(n, "pool3", relu(n, "relu3", conv(n, "conv3", top, 64, 5, pad=2)))
     return _full(n, "ip1", top, 10)
 
 
 def alexnet(n: Any) -> str:
     """Krizhevsky et al. 2012: two groups, LRN before pooling."""
-    top = _lrn(n, "norm1", _relu(n, "relu1", _conv(n, "conv1", "data", 96, 11, stride=4)))
-    top = _pool(n, "pool1", top, 3)
-    top = _lrn(n, "norm2", _relu(n, "relu2", _conv(n, "conv2", top, 256, 5, pad=2, group=2)))
-    top = _pool(n, "pool2", top, 3)
-    top = _relu(n, "relu3", _conv(n, "conv3", top, 384, 3, pad=1))
-    top = _relu(n, "relu4", _conv(n, "conv4", top, 384, 3, pad=1, group=2))
-    top = _relu(n, "relu5", _conv(n, "conv5", top, 256, 3, pad=1, group=2))
-    top = _pool(n, "pool5", top, 3)
+    top = _lrn(n, "norm1", relu(n, "relu1", conv(n, "conv1", "data", 96, 11, stride=4)))
+    top = pool(n, "pool1", top, 3)
+    top = _lrn(n, "norm2", relu(n, "relu2", conv(n, "conv2", top, 256, 5, pad=2, group=2)))
+    top = pool(n, "pool2", top, 3)
+    top = relu(n, "relu3", conv(n, "conv3", top, 384, 3, pad=1))
+    top = relu(n, "relu4", conv(n, "conv4", top, 384, 3, pad=1, group=2))
+    top = relu(n, "relu5", conv(n, "conv5", top, 256, 3, pad=1, group=2))
+    top = pool(n, "pool5", top, 3)
     for k in (6, 7):
-        top = _dropout(n, f"drop{k}", _relu(n, f"relu{k}", _full(n, f"fc{k}", top, 4096)), 0.5)
+        top = _dropout(n, f"drop{k}", relu(n, f"relu{k}", _full(n, f"fc{k}", top, 4096)), 0.5)
     return _full(n, "fc8", top, 1000)
 
 
 def googlenet(n: Any) -> str:
     """Szegedy et al. 2014, without the side classifiers."""
-    top = _relu(n, "conv1_relu", _conv(n, "conv1", "data", 64, 7, stride=2, pad=3))
-    top = _lrn(n, "norm1", _pool(n, "pool1", top, 3))
-    top = _relu(n, "conv2_reduce_relu", _conv(n, "conv2_reduce", top, 64, 1))
-    top = _lrn(n, "norm2", _relu(n, "conv2_relu", _conv(n, "conv2", top, 192, 3, pad=1)))
-    top = _pool(n, "pool2", top, 3)
+    top = relu(n, "conv1_relu", conv(n, "conv1", "data", 64, 7, stride=2, pad=3))
+    top = _lrn(n, "norm1", pool(n, "pool1", top, 3))
+    top = relu(n, "conv2_reduce_relu", conv(n, "conv2_reduce", top, 64, 1))
+    top = _lrn(n, "norm2", relu(n, "conv2_relu", conv(n, "conv2", top, 192, 3, pad=1)))
+    top = pool(n, "pool2", top, 3)
     for name, *widths in GOOGLENET:
-        top = _pool(n, name, top, 3) if not widths else _inception(n, f"inception_{name}", top, widths)
-    top = _add(n, "Pooling", "pool5", top, pooling_param={"pool": "AVE", "kernel_size": 7, "stride": 1})
+        top = pool(n, name, top, 3) if not widths else _inception(n, f"inception_{name}", top, widths)
+    top = add(n, "Pooling", "pool5", top, pooling_param={"pool": "AVE", "kernel_size": 7, "stride": 1})
     return _full(n, "classifier", _dropout(n, "drop5", top, 0.4), 1000)
 
 
@@ -118,18 +118,16 @@ GOOGLENET: tuple[tuple[Any, ...], ...] = (  # 1x1, reduced for 3x3, 3x3, reduced
 
 def resnet50(n: Any) -> str:
     """He et al. 2015: 50 layers, the stride in a block's first convolution."""
-    top = _pool(
-        n, "pool1", _relu(n, "conv1_relu", _normalized(n, "conv1", "data", 64, 7, stride=2, pad=3, bias=True)), 3
-    )
+    top = pool(n, "pool1", relu(n, "conv1_relu", _normalized(n, "conv1", "data", 64, 7, stride=2, pad=3, bias=True)), 3)
     for stage, (blocks, width) in enumerate(RESNET50, 2):
         for k in range(blocks):
             name, stride = f"res{stage}{'abcdef'[k]}", 2 if stage > 2 and not k else 1
             shortcut = top if k else _normalized(n, f"{name}_branch1", top, 4 * width, 1, stride=stride)
-            top = _relu(n, f"{name}_2a_relu", _normalized(n, f"{name}_branch2a", top, width, 1, stride=stride))
-            top = _relu(n, f"{name}_2b_relu", _normalized(n, f"{name}_branch2b", top, width, 3, pad=1))
+            top = relu(n, f"{name}_2a_relu", _normalized(n, f"{name}_branch2a", top, width, 1, stride=stride))
+            top = relu(n, f"{name}_2b_relu", _normalized(n, f"{name}_branch2b", top, width, 3, pad=1))
             top = _normalized(n, f"{name}_branch2c", top, 4 * width, 1)
-            top = _relu(n, f"{name}_relu", _sum(n, name, shortcut, top))
-    top = _add(n, "Pooling", "pool5", top, pooling_param={"pool": "AVE", "kernel_size": 7, "stride": 1})
+            top = relu(n, f"{name}_relu", _sum(n, name, shortcut, top))
+    top = add(n, "Pooling", "pool5", top, pooling_param={"pool": "AVE", "kernel_size": 7, "stride": 1})
     return _full(n, "fc1000", top, 1000)
 
 
@@ -138,18 +136,18 @@ RESNET50 = ((3, 64), (4, 128), (6, 256), (3, 512))  # blocks and width of each s
 
 def mobilenet(n: Any) -> str:
     """Sandler et al. 2018: MobileNet v2, with plain ReLU as in its Caffe files."""
-    top = _relu(n, "relu1", _normalized(n, "conv1", "data", 32, 3, stride=2, pad=1))
+    top = relu(n, "relu1", _normalized(n, "conv1", "data", 32, 3, stride=2, pad=1))
     width = 32
     for number, (expansion, wide, stride) in enumerate(MOBILENET, 1):
         name, inner = f"block{number}", expansion * width
-        inside = _relu(n, f"{name}_expand_relu", _normalized(n, f"{name}_expand", top, inner, 1))
+        inside = relu(n, f"{name}_expand_relu", _normalized(n, f"{name}_expand", top, inner, 1))
         inside = _normalized(n, f"{name}_depthwise", inside, inner, 3, stride=stride, pad=1, group=inner)
-        inside = _normalized(n, f"{name}_linear", _relu(n, f"{name}_depthwise_relu", inside), wide, 1)
+        inside = _normalized(n, f"{name}_linear", relu(n, f"{name}_depthwise_relu", inside), wide, 1)
         top = _sum(n, f"{name}_sum", top, inside) if stride == 1 and wide == width else inside
         width = wide
-    top = _relu(n, "conv_last_relu", _normalized(n, "conv_last", top, 1280, 1))
-    top = _add(n, "Pooling", "pool_last", top, pooling_param={"pool": "AVE", "global_pooling": True})
-    return _conv(n, "classifier", top, 1000, 1)
+    top = relu(n, "conv_last_relu", _normalized(n, "conv_last", top, 1280, 1))
+    top = add(n, "Pooling", "pool_last", top, pooling_param={"pool": "AVE", "global_pooling": True})
+    return conv(n, "classifier", top, 1000, 1)
 
 
 MOBILENET = (  # expansion, width, stride: where the public Caffe files have the strides
@@ -175,17 +173,17 @@ MOBILENET = (  # expansion, width, stride: where the public Caffe files have the
 
 def squeezenet(n: Any) -> str:
     """Iandola et al. 2016: SqueezeNet 1.1."""
-    top = _pool(n, "pool1", _relu(n, "conv1_relu", _conv(n, "conv1", "data", 64, 3, stride=2)), 3)
+    top = pool(n, "pool1", relu(n, "conv1_relu", conv(n, "conv1", "data", 64, 3, stride=2)), 3)
     for k, (squeezed, expanded) in enumerate(SQUEEZENET, 2):
         name = f"fire{k}"
-        inside = _relu(n, f"{name}_squeeze_relu", _conv(n, f"{name}_squeeze", top, squeezed, 1))
-        ones = _relu(n, f"{name}_expand1_relu", _conv(n, f"{name}_expand1", inside, expanded, 1))
-        threes = _relu(n, f"{name}_expand3_relu", _conv(n, f"{name}_expand3", inside, expanded, 3, pad=1))
-        top = _add(n, "Concat", f"{name}_concat", ones, threes)
+        inside = relu(n, f"{name}_squeeze_relu", conv(n, f"{name}_squeeze", top, squeezed, 1))
+        ones = relu(n, f"{name}_expand1_relu", conv(n, f"{name}_expand1", inside, expanded, 1))
+        threes = relu(n, f"{name}_expand3_relu", conv(n, f"{name}_expand3", inside, expanded, 3, pad=1))
+        top = add(n, "Concat", f"{name}_concat", ones, threes)
         if k in (3, 5):
-            top = _pool(n, f"pool{k}", top, 3)
-    top = _relu(n, "conv10_relu", _conv(n, "conv10", _dropout(n, "drop9", top, 0.5), 1000, 1))
-    top = _add(n, "Pooling", "pool10", top, pooling_param={"pool": "AVE", "global_pooling": True})
+            top = pool(n, f"pool{k}", top, 3)
+    top = relu(n, "conv10_relu", conv(n, "conv10", _dropout(n, "drop9", top, 0.5), 1000, 1))
+    top = add(n, "Pooling", "pool10", top, pooling_param={"pool": "AVE", "global_pooling": True})
     return top
 
 
@@ -210,8 +208,8 @@ ZOO: dict[str, tuple[Callable[[Any], str], tuple[int, int, int]]] = {  # the lay
 def deploy(name: str) -> Any:
     """Return the NetParameter for deployment: input ``data``, output ``prob``."""
     n, (layers, image) = NetParameter(name=name), ZOO[name]
-    _add(n, "Input", "data", input_param={"shape": [{"dim": [1, *image]}]})
-    _add(n, "Softmax", "prob", layers(n))
+    add(n, "Input", "data", input_param={"shape": [{"dim": [1, *image]}]})
+    add(n, "Softmax", "prob", layers(n))
     return n
 
 
@@ -220,74 +218,77 @@ def training(name: str, source: str, batch: int) -> Any:
     n, (layers, _) = NetParameter(name=name), ZOO[name]
     reads = {"source": source, "batch_size": batch, "backend": "LMDB"}
     scaled = {"mean_value": [128], "scale": 1 / 128}
-    _add(n, "Data", "data", data_param=reads, transform_param=scaled)
+    add(n, "Data", "data", data_param=reads, transform_param=scaled)
     n.layer[0].top.append("label")
-    _add(n, "SoftmaxWithLoss", "loss", layers(n), "label")
+    add(n, "SoftmaxWithLoss", "loss", layers(n), "label")
     return n
 
 
-def _add(n: Any, kind: str, name: str, *bottoms: str, in_place: bool = False, **fields: Any) -> str:
+def add(n: Any, kind: str, name: str, *bottoms: str, in_place: bool = False, **fields: Any) -> str:
     """Add a layer with one top, named as the layer, or as the bottom with ``in_place``; return the top."""
     top = bottoms[0] if in_place else name
     n.layer.add(name=name, type=kind, bottom=bottoms, top=[top], **fields)
     return top
 
 
-def _conv(n: Any, name: str, bottom: str, width: int, size: int, bias: bool = True, **others: int) -> str:
-    param = {key: [value] if key in ("stride", "pad") else value for key, value in others.items()}
+def conv(n: Any, name: str, bottom: str, width: int, size: int, bias: bool = True, **others: int) -> str:
+    """Add a convolution; ``others``: stride, pad, dilation, group. Return its top."""
+    param = {key: [value] if key in ("stride", "pad", "dilation") else value for key, value in others.items()}
     param |= {"num_output": width, "kernel_size": [size], "bias_term": bias, "weight_filler": {"type": "msra"}}
     learned = [WEIGHTS, BIAS] if bias else [WEIGHTS]
-    return _add(n, "Convolution", name, bottom, param=learned, convolution_param=param)
+    return add(n, "Convolution", name, bottom, param=learned, convolution_param=param)
 
 
 def _normalized(n: Any, name: str, bottom: str, width: int, size: int, bias: bool = False, **others: int) -> str:
     """Return a convolution's top, normalized and scaled in place."""
-    top = _conv(n, name, bottom, width, size, bias, **others)
-    _add(n, "BatchNorm", f"{name}_bn", top, in_place=True, param=[STATISTICS] * 3)
+    top = conv(n, name, bottom, width, size, bias, **others)
+    add(n, "BatchNorm", f"{name}_bn", top, in_place=True, param=[STATISTICS] * 3)
     scales = {"bias_term": True}
-    return _add(n, "Scale", f"{name}_scale", top, in_place=True, param=[UNDECAYED] * 2, scale_param=scales)
+    return add(n, "Scale", f"{name}_scale", top, in_place=True, param=[UNDECAYED] * 2, scale_param=scales)
 
 
 def _full(n: Any, name: str, bottom: str, width: int) -> str:
     param = {"num_output": width, "weight_filler": {"type": "xavier"}}
-    return _add(n, "InnerProduct", name, bottom, param=[WEIGHTS, BIAS], inner_product_param=param)
+    return add(n, "InnerProduct", name, bottom, param=[WEIGHTS, BIAS], inner_product_param=param)
 
 
-def _relu(n: Any, name: str, bottom: str) -> str:
-    return _add(n, "ReLU", name, bottom, in_place=True)
+def relu(n: Any, name: str, bottom: str) -> str:
+    """Add a ReLU in place; return its top."""
+    return add(n, "ReLU", name, bottom, in_place=True)
 
 
 def _prelu(n: Any, name: str, bottom: str) -> str:
-    return _add(n, "PReLU", name, bottom, in_place=True)
+    return add(n, "PReLU", name, bottom, in_place=True)
 
 
 def _dropout(n: Any, name: str, bottom: str, ratio: float) -> str:
-    return _add(n, "Dropout", name, bottom, in_place=True, dropout_param={"dropout_ratio": ratio})
+    return add(n, "Dropout", name, bottom, in_place=True, dropout_param={"dropout_ratio": ratio})
 
 
 def _lrn(n: Any, name: str, bottom: str) -> str:
-    return _add(n, "LRN", name, bottom, lrn_param={"local_size": 5, "alpha": 1e-4, "beta": 0.75})
+    return add(n, "LRN", name, bottom, lrn_param={"local_size": 5, "alpha": 1e-4, "beta": 0.75})
 
 
-def _pool(n: Any, name: str, bottom: str, size: int, stride: int = 2, pad: int = 0) -> str:
-    return _add(n, "Pooling", name, bottom, pooling_param={"kernel_size": size, "stride": stride, "pad": pad})
+def pool(n: Any, name: str, bottom: str, size: int, stride: int = 2, pad: int = 0) -> str:
+    """Add a max pooling; return its top."""
+    return add(n, "Pooling", name, bottom, pooling_param={"kernel_size": size, "stride": stride, "pad": pad})
 
 
 def _average(n: Any, name: str, bottom: str) -> str:
-    return _add(n, "Pooling", name, bottom, pooling_param={"pool": "AVE", "kernel_size": 3, "stride": 2})
+    return add(n, "Pooling", name, bottom, pooling_param={"pool": "AVE", "kernel_size": 3, "stride": 2})
 
 
 def _sum(n: Any, name: str, *bottoms: str) -> str:
-    return _add(n, "Eltwise", name, *bottoms)
+    return add(n, "Eltwise", name, *bottoms)
 
 
 def _inception(n: Any, name: str, bottom: str, widths: list[int]) -> str:
     one, reduce3, three, reduce5, five, pooled = widths
-    parts = [_relu(n, f"{name}_1x1_relu", _conv(n, f"{name}_1x1", bottom, one, 1))]
-    top = _relu(n, f"{name}_3x3_reduce_relu", _conv(n, f"{name}_3x3_reduce", bottom, reduce3, 1))
-    parts.append(_relu(n, f"{name}_3x3_relu", _conv(n, f"{name}_3x3", top, three, 3, pad=1)))
-    top = _relu(n, f"{name}_5x5_reduce_relu", _conv(n, f"{name}_5x5_reduce", bottom, reduce5, 1))
-    parts.append(_relu(n, f"{name}_5x5_relu", _conv(n, f"{name}_5x5", top, five, 5, pad=2)))
-    top = _pool(n, f"{name}_pool", bottom, 3, stride=1, pad=1)
-    parts.append(_relu(n, f"{name}_pooled_relu", _conv(n, f"{name}_pooled", top, pooled, 1)))
-    return _add(n, "Concat", f"{name}_output", *parts)
+    parts = [relu(n, f"{name}_1x1_relu", conv(n, f"{name}_1x1", bottom, one, 1))]
+    top = relu(n, f"{name}_3x3_reduce_relu", conv(n, f"{name}_3x3_reduce", bottom, reduce3, 1))
+    parts.append(relu(n, f"{name}_3x3_relu", conv(n, f"{name}_3x3", top, three, 3, pad=1)))
+    top = relu(n, f"{name}_5x5_reduce_relu", conv(n, f"{name}_5x5_reduce", bottom, reduce5, 1))
+    parts.append(relu(n, f"{name}_5x5_relu", conv(n, f"{name}_5x5", top, five, 5, pad=2)))
+    top = pool(n, f"{name}_pool", bottom, 3, stride=1, pad=1)
+    parts.append(relu(n, f"{name}_pooled_relu", conv(n, f"{name}_pooled", top, pooled, 1)))
+    return add(n, "Concat", f"{name}_output", *parts)
