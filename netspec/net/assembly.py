@@ -322,11 +322,17 @@ class MemoryNeed:
 
 
 def limit_on(device: torch.device, limit: int | None = None) -> int:
-    """Return how many bytes a net may need on a device: ``limit`` if given, or that of the process, or the device's."""
+    """Return how many bytes a net may need on a device: ``limit`` if given, or that of the process, or the device's.
+
+    Raises SpecError if that of the process is no size.
+    """
     if limit is not None:
         return limit
     if given := os.environ.get(LIMIT):
-        return read_amount(given)
+        try:
+            return read_amount(given)
+        except ValueError as fault:
+            raise SpecError(str(fault), Where(LIMIT)) from None
     return torch.cuda.mem_get_info(device)[1] if device.type == "cuda" else memory()
 
 

@@ -194,11 +194,16 @@ def test_a_pass_above_the_limit_is_refused(text: str, capsys: pytest.CaptureFixt
     assert said.startswith('net.prototxt:2:1: layer "conv" (Convolution): its pass needs more memory than available; ')
 
 
-def test_limit_on_a_gpu_is_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limit_on_a_gpu_is_its_memory_or_that_of_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1, 20 * MIB))
     assert limit_on(torch.device("cuda", 1)) == 20 * MIB
     assert limit_on(torch.device("cpu")) == limits.memory()
     assert limit_on(torch.device("cuda"), 3 * MIB) == 3 * MIB
+    monkeypatch.setenv(limits.LIMIT, "4MiB")
+    assert limit_on(torch.device("cuda")) == 4 * MIB
+    monkeypatch.setenv(limits.LIMIT, "much")
+    with pytest.raises(SpecError, match=r"^NETSPEC_LIMIT: found 'much', expected a size, e.g. 16GiB$"):
+        limit_on(torch.device("cpu"))
 
 
 def test_a_net_above_the_limit_of_its_device_is_refused_before_filling(
