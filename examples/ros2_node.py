@@ -96,7 +96,7 @@ class LoopClosure(Node):
     def begin(self, image):
         camera, mount = camera_of(self.camera), self.mount
         if camera is None:
-            raise InputError("camera_info has no calibration of a pinhole camera yet")
+            raise InputError("camera_info has no calibration yet of a pinhole or fisheye camera")
         if not any(mount[3:]):
             mount = pose_of(self.buffer.lookup_transform(self.odom_frames[1], image.header.frame_id, Time()))
         limits = {"exclude_seconds": self.set["recent"], "in_memory": self.set["kept"]}

@@ -11,7 +11,7 @@ from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.masks import CAMERAS
 from loopclosure.places.overlap import FOV_DEG, ViewOverlap
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.sequences import benchmark_parts, layout_of
+from loopclosure.places.sequences import GROUNDTRUTH, benchmark_parts, layout_of
 from loopclosure.places.source import (
     DETECTED,
     EVALUATED,
@@ -182,6 +182,8 @@ def _check_truth(source: Source, kind: str) -> None:
     path = source.path
     plain = not kind and not is_recording(path) and "poses" not in source.settings and not layout_of(path, "")
     if plain and path.is_dir() and not (path / "rgb.txt").exists():
+        if (path / GROUNDTRUTH).is_file():
+            raise InputError(f"has {GROUNDTRUTH}, but no rgb.txt; expected the time and the file of each image", path)
         expected = "add ,poses=FILE, or write images:FOLDER,truth=MASK; the command detect needs no ground truth"
         raise InputError(f"has no ground truth of which frames show the same place; {expected}", path)
 

@@ -51,9 +51,9 @@ class DetectorSettings:
     metric              "euclidean" (score = minus the distance) or "cosine"
     views               the number of views of an image in a descriptor, one after the other; the score of two
                         frames is the score of their two most similar views
-    exclude_recent      frames i - exclude_recent .. i - 1 are not candidates of frame i; None: 0 where
-                        exclude_seconds says how old a candidate must be. Where neither does, 50, and of frames that
-                        the geometric check accepts those whose place was left in between
+    exclude_recent      frames i - exclude_recent .. i - 1 are not candidates of frame i. None: 0 if exclude_seconds
+                        is given, else 50; in the latter case the geometric check also accepts no frame whose place
+                        the camera has not left since
     exclude_seconds     frames less than this many seconds old are not candidates either
     top_k               how many candidates are examined
     threshold           a candidate needs score >= threshold. None: the geometric check decides alone; without a check,

@@ -26,7 +26,7 @@ from netspec.files.opencv import cv2
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 
 DEPTH_PER_M = 5000  # of depth images, as TUM RGB-D has them
-BESIDE = 16  # images of a folder that show how many bits its camera uses
+BESIDE = 16  # at most so many images of a folder show how many bits its camera uses
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def _bits_beside(folder: Path, letters: str) -> int:
     """Return how many bits some images in a folder use, of those with these letters in their names."""
     files = sorted(file for file in folder.iterdir() if _letters(file.name) == letters)
     most = 8
-    for file in files[:: max(1, len(files) // BESIDE)]:
+    for file in files[:: -(-len(files) // BESIDE)]:
         with suppress(InputError):  # whoever reads that image says so
             most = max(most, bits_of(read_pixels(file, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)))
     return most

@@ -259,6 +259,14 @@ def test_an_error_is_one_line_with_status_1(line, sentence, two_laps, two_laps_f
     assert sentence.replace("FEATURES", str(two_laps_features)) in printed
 
 
+def test_a_folder_with_poses_but_no_times_of_its_images_says_what_is_missing(tmp_path, capsys):
+    (tmp_path / "a.png").write_bytes(b"")
+    (tmp_path / "groundtruth.txt").write_text("0 0 0 0 0 0 0 1\n")
+    assert main(["evaluate", str(tmp_path), "--method", "thumbnails", "--out", str(tmp_path / "out")]) == 1
+    expected = f"{tmp_path}: has groundtruth.txt, but no rgb.txt; expected the time and the file of each image"
+    assert expected in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("sentence", "line"),
     [

@@ -51,8 +51,8 @@ def test_a_bag_becomes_a_sequence(name: str, ros: int, encoding: str, tmp_path: 
 def test_a_dark_image_of_16_bits_stays_dark(tmp_path: Path) -> None:
     with open_bag(Bag(tmp_path / "a.bag", 1, "mono16", count=4).file) as bag:
         for i, (_, _, image) in enumerate(bag.images()):
-            gray = np.asarray(cv2.cvtColor(picture(i), cv2.COLOR_BGR2GRAY))
-            np.testing.assert_array_equal(image[..., 0], gray >> 3 if i % 2 else gray)
+            gray = np.asarray(cv2.cvtColor(picture(i), cv2.COLOR_BGR2GRAY), np.uint8)
+            np.testing.assert_array_equal(image[..., 0], gray // 8 if i % 2 else gray)
 
 
 def opened(file: Path, out: Path, **settings: str) -> ImageSequence:
