@@ -142,3 +142,17 @@ def test_an_interrupted_wait_loses_no_batch(ahead: int, at_once: int, monkeypatc
             assert feed.position == len(found)
     assert (found, stopped) == (list(range(12)), 3)
     feed.close()
+
+
+def test_an_interrupted_restart_leaves_no_batch_of_later_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(future: Future[object]) -> bool:
+        raise KeyboardInterrupt
+
+    feed = Feed(lambda first, count: list(range(first, first + count)), ahead=3, workers=1)
+    assert feed.next() == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(Future, "cancel", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            feed.restart(7)
+    assert [feed.next(), feed.next()] == [7, 8]
+    feed.close()
