@@ -25,8 +25,8 @@ from typing import IO, Any
 
 from loopclosure.report.table_one import read_runs, text_table, write_report
 from netspec import log
+from netspec.cli.scores import Score, read_scores
 from netspec.errors import SpecError, Where
-from netspec.files.scores import Score, read_scores
 from netspec.files.whole_file import write_whole
 from netspec.graph.filter import filter_net, with_state
 from netspec.proto.schema import TEST, TRAIN

@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lmdb_build.pairs.list_file import common_folder
 from lmdb_build.pairs.runs import folder_runs, index_runs, join_runs
 from lmdb_build.views import Batches, Changes, write_views
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.errors import InputError
 from loopclosure.places.source import Source, read_source
-from netspec.files.drives import common_folder
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar
 from netspec.terminal.parser import Commands, above_zero, seed

@@ -19,7 +19,7 @@ from lmdb_build.pairs.by_list import (
 )
 from lmdb_build.pairs.by_pose import NEGATIVES, PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import SPLITS, PairSource
-from lmdb_build.pairs.list_file import join_lists, root_of, write_contact_sheet
+from lmdb_build.pairs.list_file import common_folder, join_lists, root_of, write_contact_sheet
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
@@ -37,7 +37,7 @@ from loopclosure.places.source import (
     read_source,
 )
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
-from netspec.files.drives import common_folder, relative
+from netspec.files.paths import relative
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands, above_zero, seed

@@ -28,7 +28,7 @@ from lmdb_build.picture import write_warped
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.errors import InputError
 from loopclosure.progress import Progress, silent
-from netspec.files.drives import relative
+from netspec.files.paths import relative
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ A name that contains blanks, or begins with ``#``, is in double quotes.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -17,9 +18,9 @@ from numpy.typing import NDArray
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_bgr
 from netspec.errors import SpecError
-from netspec.files.drives import common_folder, relative
 from netspec.files.kinds import unreadable
 from netspec.files.opencv import cv2
+from netspec.files.paths import relative
 from netspec.files.whole_file import write_whole
 
 ROOT_FOLDER = (
@@ -28,6 +29,18 @@ ROOT_FOLDER = (
 
 
 _WORD = re.compile(r'"([^"]*)"|(\S+)')
+
+
+def common_folder(paths: Sequence[Path]) -> Path:
+    """Return the innermost folder that contains all of the paths, which are absolute.
+
+    Raises SpecError if they are on different drives, as they can be on Windows.
+    """
+    try:
+        return Path(os.path.commonpath(paths))
+    except ValueError:
+        named = ", ".join(map(str, dict.fromkeys(paths)))
+        raise SpecError(f"{named}: are on different drives, so they have no common folder; move one of them") from None
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.source import DETECTED, FRAMES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
-from netspec.files.own_folder import inside
+from netspec.files.paths import inside
 from netspec.files.whole_file import write_whole
 from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from loopclosure.closing.graph import Edge, solve
 from loopclosure.closing.measure import Loop
 from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, Relative
+from loopclosure.csv_file import write_csv
 from loopclosure.detector.export import LOOP_SIGMAS, relative_pose, write_pose_graph
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import MAX_DISTANCE_M
 from loopclosure.places.trajectory import Trajectory, write_trajectory
-from netspec.files.whole_file import write_csv
 
 # The standard deviations of a step of odometry: a share of its length and of its rotation angle, plus a constant.
 STEP_SHARE, STEP_M, TURN_SHARE, TURN_RAD = 0.02, 0.002, 0.02, 0.002

@@ -20,10 +20,10 @@ from scipy.sparse import csgraph
 from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.graph import Edge, Solution, solve, squares_of
+from loopclosure.csv_file import write_csv
 from loopclosure.detector.export import EDGE, EDGE_2D, PLANE, VERTEX, VERTEX_2D, write_pose_graph
 from loopclosure.errors import InputError
 from netspec.files.kinds import unreadable
-from netspec.files.whole_file import write_csv
 
 Array = NDArray[np.float64]
 

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.relative import LEAST_INLIERS, METRIC, ROTATION_ONLY, Relative, View, relative_view
+from loopclosure.csv_file import safe_cell
 from loopclosure.detector.export import relative_pose
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
@@ -21,7 +22,6 @@ from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.progress import Progress, silent
 from netspec.files.kinds import nearest_existing
 from netspec.files.opencv import cv2
-from netspec.files.whole_file import safe_cell
 
 # Images are not reduced: a larger image gives a better pose.
 CHECK = GeometricCheck(max_features=1000, min_inliers=LEAST_INLIERS, most_side=1_000_000)

@@ -15,10 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from loopclosure.csv_file import write_csv
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion
 from loopclosure.progress import Progress, silent
-from netspec.files.whole_file import whole_file, write_csv
+from netspec.files.whole_file import whole_file
 
 METRICS = ("euclidean", "cosine")
 # 1024 x 16384 scores in float32 are 64 MiB, for a sequence of any length.

@@ -27,8 +27,9 @@ from loopclosure.detector.frames import Frames, Local, LocalOnDisk, Points, poin
 from loopclosure.detector.verification import SURE, GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.index.index import Index, open_index
+from loopclosure.stored import check_array, from_json
 from netspec.errors import SpecError
-from netspec.files.arrays import check_array, from_json, read_npz
+from netspec.files.arrays import read_npz
 from netspec.files.whole_file import whole_file
 
 Describe = Callable[[np.ndarray], np.ndarray]

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from loopclosure.csv_file import write_csv
 from loopclosure.detector.decision import LoopResult
 from loopclosure.errors import InputError
-from netspec.files.whole_file import write_csv, write_whole
+from netspec.files.whole_file import write_whole
 
 VERTEX, EDGE, VERTEX_2D, EDGE_2D = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_SE2", "EDGE_SE2"
 PLANE = np.array([0, 1, 5])  # x, y and the rotation about z, in the 6-vector of a pose error

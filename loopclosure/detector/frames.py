@@ -15,7 +15,7 @@ import numpy as np
 
 from loopclosure.detector.verification import LocalFeatures
 from loopclosure.index.index import Index
-from netspec.files.arrays import Rows, check_array
+from loopclosure.stored import Rows, check_array
 
 FIRST_CAPACITY = 256  # frames; doubled when full
 NO_ROWS = np.zeros((0, 0), np.float32)

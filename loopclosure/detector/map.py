@@ -32,8 +32,9 @@ from loopclosure.errors import InputError
 from loopclosure.index.index import INDEXES, open_index
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.progress import Progress, silent
-from netspec.files.arrays import Rows, check_array, read_npz, regular
-from netspec.files.own_folder import inside
+from loopclosure.stored import Rows, check_array, regular
+from netspec.files.arrays import read_npz
+from netspec.files.paths import inside
 from netspec.files.whole_file import only_one, whole_file, whole_folder, write_whole
 
 FORMAT = 2

@@ -22,9 +22,9 @@ from loopclosure.places.pose_files import PoseForm, moved, read_poses
 from loopclosure.places.pose_table import matrix_fault, seconds_of
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, content_lines, number
 from netspec.errors import SpecError
-from netspec.files.drives import relative
 from netspec.files.image_list import list_images
 from netspec.files.kinds import nearest_existing
+from netspec.files.paths import relative
 
 GROUNDTRUTH, ODOMETRY = "groundtruth.txt", "odometry.txt"
 QUERIES = ("query", "queries", "Query", "Queries")

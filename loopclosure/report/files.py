@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from loopclosure.csv_file import write_csv
 from loopclosure.evaluate import RECALL_AT, SOFT_ZONE, Evaluation, Outcome
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, BestMatches, PrecisionRecall
-from netspec.files.whole_file import write_csv, write_whole
+from netspec.files.whole_file import write_whole
 from netspec.terminal.output import in_columns
 
 # The largest number of points of a curve in report.json; curve_*.csv has all points.

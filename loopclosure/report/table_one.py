@@ -17,8 +17,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
+from loopclosure.csv_file import write_csv
 from loopclosure.errors import InputError
-from netspec.files.whole_file import whole_file, write_csv
+from netspec.files.whole_file import whole_file
 from netspec.terminal.output import in_columns
 
 # Qiu et al., IEEE IV 2018, Table I. The paper gives neither the threshold nor the recall.

@@ -17,10 +17,11 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, silent, timed
+from loopclosure.stored import check_array, from_json
 from loopclosure.words.chow_liu import LOWER_BOUND, WordTree, learn_tree
 from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans, sequential_clusters
 from netspec.errors import SpecError
-from netspec.files.arrays import check_array, from_json, read_npz
+from netspec.files.arrays import read_npz
 from netspec.files.whole_file import whole_file
 
 FORMAT = 1

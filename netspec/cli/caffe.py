@@ -33,8 +33,8 @@ from netspec.cli.arguments import (
     run_by,
     stages,
 )
+from netspec.cli.scores import Score, Scores, Snapshot, read_scores
 from netspec.errors import SpecError
-from netspec.files.scores import Score, Scores, Snapshot, read_scores
 from netspec.proto.binary import check_readable, split_paths
 from netspec.terminal.commands import DONE, FAULT, WrongUsage
 from netspec.terminal.parser import Commands

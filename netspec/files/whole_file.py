@@ -7,23 +7,21 @@ folder: there, a file next to it, ``.NAME.XXXXXXXX.lock``, is locked.
 
 from __future__ import annotations
 
-import csv
 import errno
-import io
 import logging
 import os
 import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from netspec.errors import Code, SpecError, Where, printable
+from netspec.errors import Code, SpecError, Where
 
 try:
     import fcntl
@@ -37,8 +35,6 @@ _MARK = re.compile(rb"a lock of netspec, held by process (\d+)\n")
 # No links, no waiting for pipes, no conversion of line ends.
 _AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 _FAR = 0x7FFFFFFF  # Windows: a locked byte cannot be read, so one behind every content is locked
-_UNSEEN = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")  # control characters except tabs and line ends
-_FORMULA = tuple("=+-@\t\r\n")  # first characters of formulas in spreadsheets
 _swept: set[Path] = set()
 
 
@@ -82,30 +78,6 @@ def write_whole(path: str | Path, content: str | bytes, errors: str = "strict") 
     """
     with whole_file(path) as unfinished:
         unfinished.write_bytes(content.encode("utf-8", errors) if isinstance(content, str) else content)
-
-
-def write_csv(path: str | Path, head: Sequence[str], rows: Iterable[Sequence[object]], errors: str = "strict") -> None:
-    """Write a table as CSV, with the cells of :func:`safe_cell`; ``errors`` as in :func:`write_whole`."""
-    text = io.StringIO()
-    csv.writer(text).writerows([head, *([safe_cell(value) for value in row] for row in rows)])
-    write_whole(path, text.getvalue(), errors)
-
-
-def safe_cell(value: object) -> object:
-    """Return the cell of a table for a value. A string that a spreadsheet would evaluate gets an apostrophe.
-
-    Control characters, which could control a terminal, are escaped. Bytes that are not UTF-8 are kept.
-    """
-    if not isinstance(value, str):
-        return value
-    text = _UNSEEN.sub(lambda found: printable(found[0]), value)
-    if text[:1] not in _FORMULA:
-        return text
-    try:
-        float(text)
-    except ValueError:
-        return f"'{text}"
-    return text
 
 
 @contextmanager

@@ -17,8 +17,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 
 from netspec.errors import SpecError, printable
-from netspec.files.drives import relative
 from netspec.files.limits import OUT_OF_MEMORY, amount, is_out_of_memory, memory
+from netspec.files.paths import relative
 from netspec.log import INTERRUPTED, SEVERITIES, VARIABLE
 from netspec.terminal.output import logging_to
 

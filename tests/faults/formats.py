@@ -32,6 +32,7 @@ from loopclosure.places.pose_files import read_poses
 from loopclosure.words.chow_liu import learn_tree
 from loopclosure.words.vocabulary import Extractor, Vocabulary
 from loopclosure.words.word_model import WordModel
+from netspec.cli.scores import Score, Scores, Snapshot, read_scores
 from netspec.data.database import open_reader
 from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
 from netspec.data.hdf5 import Hdf5Source
@@ -41,7 +42,6 @@ from netspec.data.windows import read_window_file
 from netspec.errors import SpecError, raise_fault
 from netspec.export.formats.preprocess import read_mean_option
 from netspec.files.image_list import list_images
-from netspec.files.scores import Score, Scores, Snapshot, read_scores
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net

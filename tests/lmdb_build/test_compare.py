@@ -19,8 +19,8 @@ import pytest
 import forked
 from lmdb_build.cli import main, parser
 from lmdb_build.compare import best_snapshot, read_entry
+from netspec.cli.scores import read_scores
 from netspec.errors import SpecError
-from netspec.files.scores import read_scores
 from paths import GOLDEN, ROOT
 
 pytestmark = pytest.mark.slow

@@ -21,7 +21,7 @@ from types import ModuleType
 from typing import Any
 
 from netspec.compat.scripts.operations import TRANSLATED
-from netspec.files.drives import relative
+from netspec.files.paths import relative
 from netspec.log import VARIABLE
 
 

@@ -18,7 +18,7 @@ from typing import Any
 from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
-from netspec.files.own_folder import inside
+from netspec.files.paths import inside
 from netspec.files.whole_file import whole_folder
 from netspec.proto.forks import forks
 

@@ -17,7 +17,7 @@ from netspec.errors import SpecError
 from netspec.export.engines.cache import entry, key_of
 from netspec.export.engines.choice import Choice
 from netspec.export.engines.runners import MODEL, RUNNERS, Arrays, Runner, Unable, open_runner, reason
-from netspec.files.own_folder import inside
+from netspec.files.paths import inside
 from netspec.files.whole_file import write_whole
 from netspec.graph.options import FP32
 

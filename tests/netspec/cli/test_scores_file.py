@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from netspec.cli.scores import Score, Scores, Snapshot, read_scores
 from netspec.errors import SpecError
-from netspec.files.scores import Score, Scores, Snapshot, read_scores
 
 SCORES = Scores(
     [Score(0, 0, {"loss": [0.5], "accuracy": [0.1, 0.2]}), Score(5, 0, {"loss": [0.25]}), Score(5, 1, {"loss": [1.0]})],
