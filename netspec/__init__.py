@@ -57,7 +57,7 @@ def _find_forks() -> "_forks.Forks | None":
     return Dialects()
 
 
-def _find_speed() -> "Any":
+def _find_speed() -> "_speed.Speed | None":
     """Return the object that makes nets faster, or None if netspec/fast is not installed."""
     import importlib.util
 

@@ -1,4 +1,4 @@
-"""The implementation of :class:`netspec.run.speed.Speed`.
+"""The implementation of :class:`netspec.graph.speed.Speed`.
 
 Its methods import what they need. So a command whose net is run by another engine does not load torch.
 """

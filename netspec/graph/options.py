@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING
 
 from netspec.errors import check_choice, several
 from netspec.exact import CHOICES as EXACT
 from netspec.exact import SMALL
+
+if TYPE_CHECKING:
+    from netspec.graph.speed import Speed
 
 TORCH, ONNXRUNTIME, OPENVINO = ENGINES = ("torch", "onnxruntime", "openvino")  # engines
 FP32, BF16 = PRECISIONS = ("fp32", "bf16")  # number formats
@@ -31,7 +34,7 @@ class BuildOptions:
     - ``accumulate_in_place``: layers add their gradients to ``grad`` themselves, like Caffe, also of frozen blobs
       whose gradients Caffe computes
       (netspec/exact/accumulate.py). Hooks on parameters, ``torch.autograd.grad`` and wrappers like DDP do not see them.
-    - ``speed``: the code that makes the net faster (:class:`netspec.run.speed.Speed`), or None.
+    - ``speed``: the code that makes the net faster (:class:`netspec.graph.speed.Speed`), or None.
     - ``passes``: the optimizations of ``speed`` for a net of phase TEST without gradients (netspec/fast/steps.py).
     - ``strict``: whether weights files must contain every layer of the net.
     - ``limit``: the maximum memory of the net, in bytes. None: the memory of its device.
@@ -53,7 +56,7 @@ class BuildOptions:
     ranks: int = 1
     exact: str = SMALL
     accumulate_in_place: bool = False
-    speed: Any = None
+    speed: Speed | None = None
     passes: Collection[str] = PASSES
     strict: bool = False
     limit: int | None = None

@@ -1,13 +1,54 @@
-"""Access to netspec/fast, which is optional. This file imports nothing, because netspec/__init__.py imports it."""
+"""The interface through which a net gets faster code. netspec/fast implements it. Results must not change.
+
+This file imports nothing, because netspec/__init__.py imports it.
+"""
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import Any
+    from collections.abc import Callable, Collection, Sequence
+    from typing import Any, Protocol
 
-find: "Callable[[], Any]" = lambda: None  # noqa: E731  # set by netspec/__init__.py
+    class Speed(Protocol):
+        """Makes faster runners and kernels for a net, of ``eager``, its runner with autograd (netspec/run/eager.py)."""
+
+        def prepared(self, eager: Any, passes: Collection[str]) -> Any:
+            """Return a Runner without gradients. ``passes`` are the allowed ones of netspec/graph/options.py."""
+            ...
+
+        def trainer(self, eager: Any, largest: float | None) -> Any:
+            """Return a Trainer (netspec/run/walk.py), or the reason, a string, why there is none.
+
+            ``largest`` is the largest number of elements in all tops of a net trained this way; None: a default.
+            """
+            ...
+
+        def reads_at_once(self, decode: Callable[[Any], Any]) -> Callable[[Sequence[bytes]], Any]:
+            """Return a function that reads many raw Datums together. ``decode`` returns the array (C, H, W) of one.
+
+            See :class:`netspec.data.sources.DatabaseSource`.
+            """
+            ...
+
+        def is_fresh(self, layer: Any) -> bool:
+            """Return whether the top of a prepared layer has its own memory, not that of a bottom."""
+            ...
+
+        def learns(self, layer: Any) -> bool:
+            """Return whether :meth:`kernels` returns kernels for a layer with its current shapes."""
+            ...
+
+        def kernels(self, layer: Any, wanted: Sequence[bool], sums: Sequence[Any]) -> Any:
+            """Return the Kernels (netspec/run/recorded.py) of a layer for its current shapes, or None.
+
+            ``wanted[i]``: whether the gradient of bottom i is computed. ``sums[j]``: the tensor to which the gradient
+            of learnable blob j is added. Bottoms may change between the calls, so backward reads them again.
+            """
+            ...
 
 
-def speed() -> "Any":
-    """Return netspec/fast for ``BuildOptions.speed`` (:class:`netspec.run.speed.Speed`); None if it is missing."""
+find: "Callable[[], Speed | None]" = lambda: None  # noqa: E731  # set by netspec/__init__.py
+
+
+def speed() -> "Speed | None":
+    """Return netspec/fast for ``BuildOptions.speed``; None if it is missing."""
     return find()

@@ -27,8 +27,7 @@ from netspec.net.assembly import Assembly
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST
 from netspec.run.eager import Eager
-from netspec.run.speed import Trainer
-from netspec.run.walk import Runner
+from netspec.run.walk import Runner, Trainer
 
 Array = np.ndarray | torch.Tensor
 
@@ -106,8 +105,8 @@ class Net(torch.nn.Module):
         """Make the runners. The first one that can run a pass runs it; the last, ``eager``, can run any."""
         options = self.options
         self.eager = Eager(self.plan, list(self.layers), self.loss_weights, options.exact)
-        prepares = options.speed and options.passes and self.phase == TEST
-        self.prepared: Any = options.speed.prepared(self.eager, options.passes) if prepares else None
+        speed = options.speed if options.passes and self.phase == TEST else None
+        self.prepared: Any = speed and speed.prepared(self.eager, options.passes)
         self._trainer: Trainer | str | None = None  # made at the first pass that trains
         self.largest_trained: float | None = None  # the most numbers in all tops for which a trainer is made
         self.runners: list[Runner] = [runner for runner in (self.prepared, self.eager) if runner]

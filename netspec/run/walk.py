@@ -39,6 +39,27 @@ class Runner(Protocol):
         ...
 
 
+class Trainer(Protocol):
+    """Runs a net forward and backward.
+
+    If ``keeps`` is set, ``passed`` contains the values of the last pass and their gradients, by value number.
+    """
+
+    keeps: bool
+    passed: tuple[list[Any], list[Any]] | None
+
+    def is_watched(self) -> bool:
+        """Return whether a layer or blob has hooks, which only autograd calls."""
+        ...
+
+    def run(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Run the net forward and backward. Return the weighted sum of its losses, a scalar, and the output blobs.
+
+        The gradients of the learnable blobs are added to ``grad``. The loss is valid until the next call.
+        """
+        ...
+
+
 Visit = Callable[[Step, list[torch.Tensor]], Any]  # runs a step on its bottoms, and returns its tops
 
 

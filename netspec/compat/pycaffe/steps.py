@@ -161,7 +161,7 @@ class LayerStep:
 
     def _kernels(self) -> LayerKernels | None:
         """Return the layer's kernels for its present shapes, or None if autograd must record it."""
-        if not self.has_kernels:
+        if not self.has_kernels or self._speed is None:
             return None
         layer, prepared = self.layer, self._layer_kernels
         shapes, blobs = [blob.shape for blob in self.bottoms], list(layer.blobs)
