@@ -21,7 +21,7 @@ from netspec.exact import ALL
 from netspec.exact.machine import other_bits
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Plan, unblocked
-from netspec.layers.contract.base import Layer
+from netspec.layers.contract.base import Layer, State
 from netspec.layers.contract.context import device_of
 from netspec.net.assembly import Assembly
 from netspec.net.table import table
@@ -88,6 +88,7 @@ class Net(torch.nn.Module):
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
         self.layers: Any = torch.nn.ModuleList(assembly.layers.values())
+        self._positions = _Positions(self.layers)
         self.shapes = ByName("blob", assembly.shapes)
         self.loss_weights, self.learnable = assembly.loss_weights, assembly.learnable
         self.need, self.random = assembly.need, assembly.random
@@ -114,17 +115,19 @@ class Net(torch.nn.Module):
     def replace_layer(self, i: int, layer: Layer) -> None:
         """Replace layer ``i`` by a layer with the same blobs and shapes."""
         self.layers[i] = layer
+        self._positions = _Positions(self.layers)
         self._set_runners()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the runners."""
-        gone = {"runners", "eager", "prepared", "_trainer", "_passes"}
+        gone = {"runners", "eager", "prepared", "_trainer", "_passes", "_positions"}
         return {name: value for name, value in self.__dict__.items() if name not in gone}
 
     @override
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._passes = _Passes()
+        self._positions = _Positions(self.layers)
         self._set_runners()
 
     @override
@@ -172,13 +175,13 @@ class Net(torch.nn.Module):
 
     def forward_loss(self, /, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""
-        with self._passes.lock:
+        with self._passes.lock, self._positions:
             given, kept = self.input_tensors(inputs), self._values_to_keep()
             loss, values = next(found for runner in self.runners if (found := runner.run(given, kept)) is not None)
             blobs = self.plan.blobs
             self._passes.of_thread.blobs = self._passes.last = {blobs[v]: values[v] for v in sorted(kept)}
-        outputs = {name: values[v] for name, v in self.plan.outputs.items()}
-        return (torch.zeros((), device=self.device) if loss is None else loss), outputs
+            outputs = {name: values[v] for name, v in self.plan.outputs.items()}
+            return (torch.zeros((), device=self.device) if loss is None else loss), outputs
 
     @property
     def blobs(self) -> dict[str, torch.Tensor]:
@@ -194,10 +197,10 @@ class Net(torch.nn.Module):
         trainer = self.trainer()
         if trainer is None or self.keep or trainer.is_watched():
             return None
-        with self._passes.lock:
+        with self._passes.lock, self._positions:
             loss, outputs = trainer.run()
             self._passes.of_thread.blobs = self._passes.last = outputs
-        return loss, outputs
+            return loss, outputs
 
     def trainer(self) -> Trainer | None:
         """Return the trainer that :meth:`forward_backward` runs, or None if there is none. It is made once."""
@@ -294,6 +297,7 @@ class Net(torch.nn.Module):
         if taker is None:
             message = "set_input_arrays needs a MemoryData layer, and this net has none; call net(blob=array)"
             raise SpecError(message, Where(self.plan.source.file))
+        self._positions.go_back()
         taker.set_input_arrays(data, np.zeros(len(data), np.float32) if labels is None else labels)
 
     def missing_inputs(self) -> Iterator[SpecError]:
@@ -302,6 +306,7 @@ class Net(torch.nn.Module):
 
     def restart_data(self) -> None:
         """Make every data layer start again at its first record."""
+        self._positions.go_back()
         for layer in self.layers:
             layer.restart()
 
@@ -321,3 +326,29 @@ class _Passes:
 
     def __reduce__(self) -> Any:
         return _Passes, ()
+
+
+class _Positions:
+    """A block for a pass. If Ctrl-C interrupts it, no data layer counts its records: the next pass reads them again.
+
+    Further Ctrl-C may interrupt any line here. What was not restored then is restored at the start of the next block.
+    """
+
+    def __init__(self, layers: Iterable[Layer]) -> None:
+        self._layers = [layer for layer in layers if layer.reads_data]
+        self._before: list[tuple[Layer, State]] = []  # from the start of the pass; [] once it is done
+
+    def __enter__(self) -> None:
+        self.go_back()
+        self._before = [(layer, layer.running_state()) for layer in self._layers]
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and not issubclass(kind, Exception):
+            self.go_back()
+        self._before = []  # an error counts, so that the next pass does not read the same bad record
+
+    def go_back(self) -> None:
+        """Return to the records of a pass that was interrupted, if there is one."""
+        for layer, state in self._before:
+            layer.resume(state)
+        self._before = []

@@ -1,17 +1,18 @@
 from __future__ import annotations
 
-import concurrent.futures._base
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
+from contextlib import suppress
 from typing import Any
 
+import numpy as np
 import pytest
 
 from netspec.data.prefetch import Feed
+from netspec.net.net import Net
 from paths import ROOT
 
 
@@ -114,45 +115,75 @@ def test_the_interpreter_exits_with_an_open_feed() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "end\n", "")
 
 
-@pytest.mark.parametrize(("ahead", "at_once"), [(0, 1), (2, 1), (8, 4)])
-def test_an_interrupted_wait_loses_no_batch(ahead: int, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C while ``next`` waits for a thread: the next call returns the batch that was waited for."""
-    interrupts = iter([False, True, False, True, True, False] + [False] * 20)
+def interrupted(call: Callable[[], Any], line: int, *files: str) -> Any:
+    """Return the result of a call, with KeyboardInterrupt raised before the given line that it runs in the files."""
+    left = line
 
-    class Interrupted(Future[Any]):
-        def result(self, timeout: float | None = None) -> Any:
-            if next(interrupts):
+    def trace(frame: Any, event: str, _: Any) -> Any:
+        nonlocal left
+        if not frame.f_code.co_filename.endswith(files):
+            return None
+        if event == "line":
+            left -= 1
+            if left == 0:
                 raise KeyboardInterrupt
-            return super().result(timeout)
+        return trace
 
-    def make(first: int, count: int) -> list[int]:
-        if not ahead and next(interrupts):
-            raise KeyboardInterrupt
-        return list(range(first, first + count))
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        return call()
+    finally:
+        sys.settrace(before)
 
-    monkeypatch.setattr(concurrent.futures._base, "Future", Interrupted)
-    feed = Feed(make, ahead, 2, at_once)
-    found: list[int] = []
-    stopped = 0
-    while len(found) < 12:
-        try:
-            found.append(feed.next())
-        except KeyboardInterrupt:
-            stopped += 1
-            assert feed.position == len(found)
-    assert (found, stopped) == (list(range(12)), 3)
+
+@pytest.mark.parametrize(("ahead", "at_once"), [(0, 1), (2, 1), (8, 4)])
+def test_a_batch_is_lost_only_after_it_was_counted(ahead: int, at_once: int) -> None:
+    """Ctrl-C at each line of ``next``: the position and the batches agree, and threads still work."""
+    feed = Feed(each(lambda i: i), ahead, 2, at_once)
+    assert feed.next() == 0  # the threads run
+    for line in range(1, 80):
+        before = feed.position
+        for _ in range(3):
+            try:
+                assert interrupted(feed.next, line, "data/prefetch.py") == feed.position - 1
+            except KeyboardInterrupt:
+                assert feed.position - before <= 3
+        after = feed.position
+        assert feed.next() == after
     feed.close()
 
 
-def test_an_interrupted_restart_leaves_no_batch_of_later_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(future: Future[object]) -> bool:
-        raise KeyboardInterrupt
-
+@pytest.mark.parametrize("line", range(1, 40))
+def test_an_interrupted_restart_leaves_no_batch_of_later_iterations(line: int) -> None:
     feed = Feed(lambda first, count: list(range(first, first + count)), ahead=3, workers=1)
     assert feed.next() == 0
-    with monkeypatch.context() as patch:
-        patch.setattr(Future, "cancel", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            feed.restart(7)
-    assert [feed.next(), feed.next()] == [7, 8]
+    for first in (7, 2):
+        with suppress(KeyboardInterrupt):
+            interrupted(lambda first=first: feed.restart(first), line, "data/prefetch.py")
+        feed.restart(first)
+        with suppress(KeyboardInterrupt):
+            interrupted(feed.next, line, "data/prefetch.py")
+        after = feed.position
+        assert [feed.next(), feed.next()] == [after, after + 1]
     feed.close()
+
+
+def test_an_interrupted_pass_counts_no_records(net_of: Callable[..., Net]) -> None:
+    """Also with an interrupt at each line, and again while the position is restored."""
+    net = net_of(
+        'layer { name: "m" type: "MemoryData" top: "d" top: "l" '
+        "memory_data_param { batch_size: 1 channels: 1 height: 1 width: 1 } }"
+    )
+    net.set_input_arrays(np.zeros((1000, 1, 1, 1), np.float32), np.arange(1000, dtype=np.float32))
+    expected = 0
+    for line in range(1, 120):
+        for again in (line, 3, line):
+            try:
+                label = int(interrupted(net, again, "net/net.py", "data/memory.py")["l"])
+            except KeyboardInterrupt:
+                continue
+            assert label == expected
+            expected += 1
+        assert int(net()["l"]) == expected
+        expected += 1
