@@ -33,13 +33,8 @@ from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_pl
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import Poses
 
-FIRST = (
-    "kitchen",
-    "fr1_rpy",
-    "nordland_1",
-    "tower, floors 3 to 12",
-    "tower, floors 3 to 12, second walks",
-)  # chosen on
+FIRST = ("kitchen", "fr1_rpy", "nordland_1", "tower, floors 3 to 12")  # drives with these names were chosen on
+FIRST_ONLINE = (*FIRST, "road: ")  # the online detector's last rules were added after two of the roads had wrong loops
 OVERLAPS = 0.25, 0.05  # of the footprint of a drone's image that another sees: the same place, and no mistake
 DESK_GAP = 90  # frames, 3 s: a hand-held camera turns to and fro
 HALVES = {"nordland_1": slice(596), "nordland_2": slice(596, None)}
@@ -219,7 +214,8 @@ def judged(real: Real, match: np.ndarray, how: str) -> dict[str, Any]:
         count &= parts[:, None] != parts
     queries = np.flatnonzero(match >= 0)
     queries = queries[count[queries, match[queries]]]
-    row: dict[str, Any] = {"how": how, "drive": real.name, "chosen on": "yes" if real.name in FIRST else ""}
+    chosen = real.name.startswith(FIRST_ONLINE if how == "online" else FIRST)
+    row: dict[str, Any] = {"how": how, "drive": real.name, "chosen on": "yes" if chosen else ""}
     row |= {"frames": len(match), "accepted": len(queries)}
     for angle, same in (("15", real.rule), ("45", real.wide)):
         loops = np.any(same & count, axis=1)
@@ -250,7 +246,7 @@ def measure(data: Path, work: Path, only: Sequence[str], say: Callable[[str], No
 
 
 def summary(rows: Sequence[dict[str, Any]], how: str) -> dict[str, Any]:
-    """Return on how many drives that nothing was chosen on the matches are precise, and their mean recall."""
+    """Return on how many drives the matches are precise, and their mean recall, without drives that were chosen on."""
     judges = [row for row in rows if row["how"] == how and not row["chosen on"]]
     precise = [row["accepted"] - row["right 45"] <= (1 - PRECISION) * row["accepted"] for row in judges]
     recalls = [row["recall 45"] for row in judges if row["recall 45"] is not None]

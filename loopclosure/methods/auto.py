@@ -1,9 +1,8 @@
 """Loops without settings: ``auto+METHOD`` on the command line, and what ``loopclosure detect`` does.
 
 The scores of METHOD are searched for sequences, and decoys tell which matches are loops
-(:mod:`loopclosure.methods.decoys`). Matches are verified by geometry where that can work here: it must find many of the
-matches and none of the pairs that the scores call unlike. Then what is verified is a loop even where sequences tell
-nothing, and a sequence without a verified pair is rejected.
+(:mod:`loopclosure.methods.decoys`). Points of the images confirm single matches, also where sequences tell nothing, and
+reject sequences of which too few matches are verified. docs/methods.md has the formulas and the constants.
 """
 
 from __future__ import annotations

@@ -12,10 +12,9 @@ from scipy.sparse.csgraph import connected_components
 from loopclosure.detector.verification import SURE
 from loopclosure.methods.contradiction import Visits
 from loopclosure.methods.geometry import Matches
-from loopclosure.methods.lines import LEAST_ACCEPTED, Course, Lines
+from loopclosure.methods.lines import LENGTHS, Course, Lines
 
 WINDOW = 5  # references to each side of a line, and at least so many queries along it, where a loop has neighbors
-MOST = 0.5  # of the matches between two loops are on one line with them, where it goes on between them
 LEAST_VERIFIED = 3  # fewer verified matches of a stretch do not tell whether they agree only in part
 UNLIKELY = 0.05  # that so many matches in a row are not verified, at the share that is
 
@@ -65,7 +64,7 @@ def decide(matches: Matches, lines: Lines | None, scores: np.ndarray, visits: Vi
 def of_lines(matches: Matches, lines: Lines, pairs: np.ndarray) -> np.ndarray:
     """Return the queries (Q,) with an accepted line, of enough on a stretch, and those next to them above chance."""
     label = stretches(matches.line, pairs)
-    many = np.bincount(label, matches.line)[label] >= LEAST_ACCEPTED
+    many = np.bincount(label, matches.line)[label] >= LENGTHS[0]
     seeds = matches.line & (many | (np.bincount(label, matches.verified & matches.line)[label] > 0))
     return grown(seeds, lines.above_decoys & (matches.match == lines.best.match), pairs)
 
@@ -130,7 +129,7 @@ def fallen(
 
 
 def between(loops: np.ndarray, match: np.ndarray, course: Course) -> np.ndarray:
-    """Return the queries (Q,) between two loops of one line whose matches are on it, as at least half of them are.
+    """Return the queries (Q,) between two loops of one line whose matches are on it.
 
     Nothing leads a match there but the place itself, though its score is no greater than chance makes some.
     """
@@ -139,8 +138,7 @@ def between(loops: np.ndarray, match: np.ndarray, course: Course) -> np.ndarray:
         way, moved = last - first, match[last] - match[first]
         if way > 1 and _on_course(moved, way, course):
             line = match[first] + moved * np.arange(1, way) / way
-            on = np.abs(match[first + 1 : last] - line) <= WINDOW
-            filled[first + 1 : last] = on & (np.mean(on) >= MOST)
+            filled[first + 1 : last] = np.abs(match[first + 1 : last] - line) <= WINDOW
     return filled
 
 

@@ -22,10 +22,8 @@ SPEEDS = (0.5, 2.0, 0.25, 4.0)  # references for a query, tried where neither th
 LEAST_PIECES = 25  # pieces of the length of a line, of queries times of references, that show what chance does
 TAIL = 0.1  # share of the decoys that the tail is fitted to, and at least so many:
 LEAST_TAIL = 5
-LEAST_ACCEPTED = 10  # fewer matches than this cannot be told from one chance line
 # A shorter line is preferred to a longer one that accepts only this much more: it ends nearer to where a loop ends.
 NEARLY = 0.95
-REACH = 4  # queries before and after one that may fit its match better
 MIDDLE = 4  # steps in the middle of a line
 
 
@@ -77,7 +75,6 @@ class Best:
     alone    the score of the line through the best single image, -inf without one
     decoys   the best score of a line elsewhere, -inf without one
     other    the reference of that line
-    owner    how many queries away that is which fits the match best
     middle   the score of the middle of the line
     chance   what such a short line scores by chance
     """
@@ -87,7 +84,6 @@ class Best:
     alone: np.ndarray
     decoys: np.ndarray
     other: np.ndarray
-    owner: np.ndarray
     middle: np.ndarray
     chance: np.ndarray
 
@@ -113,11 +109,9 @@ class Lines:
 
     def accepted(self, precision: float) -> np.ndarray:
         """Return which best matches (Q,) are loops by their lines; none if they are too few to tell."""
-        together = max(REACH, self.course.length / 2)
-        least = threshold(self.best.targets, self.best.decoys, precision, together, self.odds)
+        least = threshold(self.best.targets, self.best.decoys, precision, self.course.length / 2, self.odds)
         accepted = self.near & (self.best.targets >= least)
-        enough = max(LEAST_ACCEPTED, self.course.length)
-        return accepted if np.count_nonzero(accepted) >= enough else np.zeros_like(accepted)
+        return accepted if np.count_nonzero(accepted) >= self.course.length else np.zeros_like(accepted)
 
     @property
     def above_decoys(self) -> np.ndarray:
@@ -198,7 +192,7 @@ def search(given: Candidates, among: Pool, course: Course) -> Lines:
     best = Best.joined([_search_rows(among, course.sequence, rows, single) for rows in blocks])
     # A line that lies partly past the end of a loop has one wholly inside within half its length.
     whole = maximum_filter1d(np.maximum(best.targets, best.chance), 2 * (course.length // 2) + 1)
-    near = (best.middle >= (best.chance + whole) / 2) & (np.abs(best.owner) <= max(REACH, 1 / course.speed))
+    near = best.middle >= (best.chance + whole) / 2
     crossed = 2 * course.length + 1 if among.reverse else 0
     chances = np.maximum(0, among.decoys.sum(axis=1) - crossed).sum()
     odds = max(1.0, among.found.sum() / max(1, chances))
@@ -213,11 +207,8 @@ def search(given: Candidates, among: Pool, course: Course) -> Lines:
 def _search_rows(among: Pool, sequence: SequenceSettings, rows: range, single: np.ndarray) -> Best:
     """Return the best lines of some queries; ``single`` (Q,): the best single image of each query."""
     reach, numbers = sequence.length, np.arange(len(rows))
-    around = range(max(0, rows.start - reach), min(rows.stop + reach, len(among.found)))
-    found = _scores(among.distances, among.found, sequence, around)
-    own = found[rows.start - around.start :][: len(rows)]
+    own = _scores(among.distances, among.found, sequence, rows)
     match = own.argmax(axis=1)
-    owner = [_owner(found[:, column], row - around.start, reach) for row, column in zip(rows, match, strict=True)]
     middle = _scores(among.distances, among.found, replace(sequence, length=MIDDLE), rows)
     chance = [np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in middle]
     if among.reverse:
@@ -231,7 +222,6 @@ def _search_rows(among: Pool, sequence: SequenceSettings, rows: range, single: n
         own[numbers, single[rows.start : rows.stop]],
         decoys.max(axis=1),
         decoys.argmax(axis=1),
-        np.array(owner),
         middle[numbers, match],
         np.array(chance),
     )
@@ -243,13 +233,6 @@ def _scores(distances: np.ndarray, which: np.ndarray, sequence: SequenceSettings
     window = np.where(which[first:last], distances[first:last], np.nan)
     costs = trajectory_costs(window, sequence, range(rows.start - first, rows.stop - first))
     return np.where(which[rows.start : rows.stop] & np.isfinite(costs), -costs, -np.inf)
-
-
-def _owner(column: np.ndarray, row: int, reach: int) -> int:
-    """Return how far away from ``row`` the greatest of the scores (n,) within ``reach`` is."""
-    first = max(0, row - reach)
-    around = column[first : row + reach + 1]
-    return 0 if column[row] == around.max() else first + int(around.argmax()) - row
 
 
 def best_lines(given: Candidates, among: Pool, precision: float) -> Lines | None:
