@@ -12,9 +12,15 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from netspec.errors import InputError
-from netspec.files.arrays import opened, read_header
+from netspec.files.arrays import opened, read_array, read_header
 
 T = TypeVar("T")
+
+
+def read_npy(path: str | Path, expected: str) -> np.ndarray:
+    """Return the array of an .npy file. Raises InputError, with ``expected``, for any other file."""
+    with opened(Path(path), expected) as stream:
+        return read_array(stream, os.fstat(stream.fileno()).st_size)
 
 
 class Rows:

@@ -8,8 +8,6 @@ gives it.
 from __future__ import annotations
 
 import logging
-import os
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
@@ -18,9 +16,6 @@ from typing_extensions import override
 from netspec.errors import printable
 
 logger = logging.getLogger("netspec")
-SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)  # glog's 0 to 3
-INTERRUPTED = "interrupted"  # how a command ends after a signal; netspec/inspect/logs reads it
-VARIABLE = "GLOG_minloglevel"  # the environment variable with the lowest severity to log
 
 
 class _OneLine(logging.Filter):
@@ -86,18 +81,6 @@ def write(records: Iterable[logging.LogRecord]) -> None:
     """Log records that were held back."""
     for record in records:
         logger.handle(record)
-
-
-class GlogFormatter(logging.Formatter):
-    """Format records as glog did when Caffe was written: four fields, separated by spaces, before the message."""
-
-    @override
-    def format(self, record: logging.LogRecord) -> str:
-        moment = time.localtime(record.created)
-        micros = int(record.created % 1 * 1e6)
-        stamp = f"{time.strftime('%m%d %H:%M:%S', moment)}.{micros:06d}"
-        site = getattr(record, "site", f"{record.filename}:{record.lineno}")
-        return f"{record.levelname[0]}{stamp} {os.getpid():5d} {site}] {record.getMessage()}"
 
 
 def number(value: float) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from fresh_dialects import fresh_dialects
-from netspec.files.memory import no_collection
+from netspec.files.limits import no_collection
 
 LIBRARIES = (
     "PYTEST",

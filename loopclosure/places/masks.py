@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_pixels
 from loopclosure.places.mat_file import read_mat
+from loopclosure.stored import read_npy
 from netspec.errors import SpecError
-from netspec.files.arrays import read_npy
 from netspec.files.kinds import nearest_existing, unreadable
 from netspec.files.opencv import cv2
 

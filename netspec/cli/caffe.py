@@ -210,7 +210,7 @@ def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | N
 
 def _newest(prefix: str) -> Path | None:
     """Return the newest whole snapshot of a prefix; None, with a line in the log, where there is none."""
-    from netspec.solver.extra import newest_pair
+    from netspec.cli.resume import newest_pair
 
     found = newest_pair(prefix)
     if found is None:

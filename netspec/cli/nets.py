@@ -21,7 +21,7 @@ from netspec.cli.arguments import (
     options,
 )
 from netspec.errors import SpecError, printable
-from netspec.files.memory import no_collection
+from netspec.files.limits import no_collection
 from netspec.files.whole_file import write_whole
 from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import PHASES, TEST, TRAIN

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from netspec.cli.arguments import add_limit, add_plugin
 from netspec.files.limits import LIMIT
-from netspec.log import VARIABLE
 from netspec.terminal.commands import WrongUsage, refuse
+from netspec.terminal.output import VARIABLE
 from netspec.terminal.parser import NO_LOG, Commands
 
 NAME = "run"

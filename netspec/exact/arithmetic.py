@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import libm, losses, lrn, sums
+from netspec.exact.blas import applies, is_recorded
 from netspec.exact.by_torch import (
     Floor,
     Standardization,
@@ -44,7 +45,6 @@ from netspec.exact.products import (
     SummedConvolutions,
     convolution,
 )
-from netspec.exact.switch import applies, is_recorded
 from netspec.exact.vectors import ChosenRows, SummedProducts, VectorProducts
 
 Function = Callable[[torch.Tensor], torch.Tensor]

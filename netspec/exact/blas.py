@@ -18,6 +18,7 @@ import numpy as np
 import scipy
 import torch
 
+from netspec.exact import ALL, SMALL
 from netspec.files.environment import environment
 
 with environment({"KMP_DUPLICATE_LIB_OK": "True"}):  # importing it sets this variable permanently
@@ -55,6 +56,21 @@ _IN_DOUBLE = 32  # OpenBLAS' dot sums up fewer products than this in double, one
 def suits_blas(tensor: torch.Tensor) -> bool:
     """Return whether the functions of this module accept a tensor: on the CPU, float32 or float64, not empty."""
     return tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64) and tensor.numel() > 0
+
+
+def applies(exact: str, values: torch.Tensor, small: bool = False) -> bool:
+    """Return whether to use Caffe's order: if ``exact`` is "all", or if it is "small" and the work is ``small``.
+
+    Never while operations are recorded, because Caffe's order is computed with numpy, which cannot be recorded.
+    """
+    if exact != ALL and not (small and exact == SMALL):
+        return False
+    return suits_blas(values) and not is_recorded()
+
+
+def is_recorded() -> bool:
+    """Return whether operations are recorded (traced or compiled), not only run."""
+    return torch.compiler.is_compiling() or torch.jit.is_tracing()  # pyright: ignore[reportPrivateImportUsage]
 
 
 def array(values: torch.Tensor) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from netspec.exact.switch import is_recorded
+from netspec.exact.blas import is_recorded
 
 FEWEST = 3  # with fewer channels, channels_last is not faster
 

@@ -20,15 +20,14 @@ import torch
 
 from netspec.data.blobs import Shape
 from netspec.exact import ALL
-from netspec.exact.blas import one_thread
-from netspec.exact.switch import is_recorded
+from netspec.exact.blas import is_recorded, one_thread
 from netspec.fast import steps as planned
 from netspec.fast.fold import absorbed_by, roles_of
 from netspec.fast.folding import Absorbed, absorbing
 from netspec.fast.kernels import Inference, Kernel, with_activation
 from netspec.fast.steps import Schedule, schedule
 from netspec.fast.table import entry_of, folds_of, inference_kernel, is_fresh
-from netspec.files.memory import give_back_freed_memory
+from netspec.files.limits import give_back_freed_memory
 from netspec.graph.options import PACK
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer

@@ -51,12 +51,6 @@ def read_npz(path: str | Path, expected: str) -> dict[str, np.ndarray]:
         return unpack(io.BytesIO(data), len(data))
 
 
-def read_npy(path: str | Path, expected: str) -> np.ndarray:
-    """Return the array of an .npy file. Raises InputError, with ``expected``, for any other file."""
-    with opened(Path(path), expected) as stream:
-        return _read(stream, os.fstat(stream.fileno()).st_size)
-
-
 def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:
     """Return the arrays of an open .npz file of ``stored`` bytes. Raises the exceptions of zipfile and NumPy."""
     with zipfile.ZipFile(packed) as archive:
@@ -67,7 +61,7 @@ def unpack(packed: IO[bytes], stored: int) -> dict[str, np.ndarray]:
         arrays: dict[str, np.ndarray] = {}
         for entry in entries:
             with archive.open(entry) as stream:
-                arrays[entry.filename.removesuffix(".npy")] = _read(stream, entry.file_size)
+                arrays[entry.filename.removesuffix(".npy")] = read_array(stream, entry.file_size)
         return arrays
 
 
@@ -87,7 +81,7 @@ def read_header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np
     return shape, by_columns, dtype
 
 
-def _read(stream: IO[bytes], size: int) -> np.ndarray:
+def read_array(stream: IO[bytes], size: int) -> np.ndarray:
     """Return the .npy array of ``size`` bytes in a stream."""
     shape, by_columns, dtype = read_header(stream, size)
     count = math.prod(shape)

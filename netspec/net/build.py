@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from netspec import log
-from netspec.files.memory import no_collection
+from netspec.files.limits import no_collection
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import make_plan, of_forks

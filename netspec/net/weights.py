@@ -24,7 +24,7 @@ from netspec.data import blobs
 from netspec.errors import Report, SpecError, Where, several
 from netspec.files.hdf5 import layer_groups, new_hdf5, open_hdf5
 from netspec.files.kinds import head_of, is_safetensors, unreadable
-from netspec.files.memory import give_back_freed_memory
+from netspec.files.limits import give_back_freed_memory
 from netspec.files.whole_file import write_whole
 from netspec.layers.contract.base import Layer, shape_string
 from netspec.net.extra_file import check_weights

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import base64
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,14 +19,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from netspec import log
-from netspec.errors import SpecError, Where
+from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
 from netspec.net.assembly import WITHOUT_EFFECT
 from netspec.net.extra_file import FAULTS, Digest, damaged, extra_text, read_content, shown, whole_number
 from netspec.net.net import Net
 from netspec.proto.schema import given
-from netspec.solver.snapshot import find_learned_net, read_state
 
 Settings = dict[str, dict[str, Any]]  # for the solver and for each net: name -> JSON value
 MOST_LISTED = 6
@@ -206,38 +203,6 @@ def check_pair(state: str | Path, weights: Path | None, extra: Extra) -> None:
     for path, stamp in ((weights, extra.weights), (Path(state), extra.state)):
         if path is not None:
             stamp.check(path, extra_path(state))
-
-
-def newest_pair(prefix: str) -> Path | None:
-    """Return the newest state with a prefix that is complete, together with its weights.
-
-    The log names incomplete snapshots. Returns None if there is no snapshot. Raises SpecError if there are
-    snapshots but none is complete, since a new training would overwrite them silently.
-    """
-    passed = 0
-    for state in _newest_first(prefix):
-        try:
-            found = find_learned_net(read_state(state), state)
-            extra = read_extra(state)
-            if extra is not None:
-                check_pair(state, found, extra)
-            return state
-        except (SpecError, OSError) as fault:
-            log.logger.warning(f"skipped: {fault}")
-            passed += 1
-    if passed:
-        found = f'none of the {passed} snapshots with the prefix "{prefix}" is complete'
-        message = f"{found}; move them away to start from the beginning"
-        raise SpecError(f"{message}, or give one with --snapshot", Where(prefix))
-    return None
-
-
-def _newest_first(prefix: str) -> Iterator[Path]:
-    start = Path(f"{prefix}_iter_")
-    pattern = re.compile(re.escape(start.name) + r"(\d+)\.solverstate(\.h5)?")
-    found = [(match, path) for path in start.parent.glob("*") if (match := pattern.fullmatch(path.name))]
-    for _, path in sorted(found, key=lambda pair: (int(pair[0][1]), pair[1].name), reverse=True):
-        yield path
 
 
 def _list(value: Any) -> list[Any]:

@@ -17,10 +17,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 
 from netspec.errors import SpecError, printable
-from netspec.files.limits import OUT_OF_MEMORY, amount, is_out_of_memory, memory
+from netspec.files.limits import amount, is_out_of_memory, memory
 from netspec.files.paths import relative
-from netspec.log import INTERRUPTED, SEVERITIES, VARIABLE
-from netspec.terminal.output import logging_to
+from netspec.terminal.output import INTERRUPTED, OUT_OF_MEMORY, SEVERITIES, VARIABLE, logging_to
 
 DONE, FAULT, WRONG_USAGE = 0, 1, 2  # exit statuses; a signal's is 128 + its number: 130, 143
 SOMETHING, UNREADABLE = 1, 2  # of commands that compare or advise: something was found; a file cannot be read

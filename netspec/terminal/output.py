@@ -12,10 +12,28 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
+from typing_extensions import override
+
 from netspec import log
 from netspec.errors import printable
 
+SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)  # glog's 0 to 3
+INTERRUPTED = "interrupted"  # how a command ends after a signal; netspec/inspect/logs reads it
+VARIABLE = "GLOG_minloglevel"  # the environment variable with the lowest severity to log
+OUT_OF_MEMORY = "out of memory; this machine has "  # how a command ends; netspec/inspect/logs reads it
 Item = TypeVar("Item")
+
+
+class GlogFormatter(logging.Formatter):
+    """Format records as glog did when Caffe was written: four fields, separated by spaces, before the message."""
+
+    @override
+    def format(self, record: logging.LogRecord) -> str:
+        moment = time.localtime(record.created)
+        micros = int(record.created % 1 * 1e6)
+        stamp = f"{time.strftime('%m%d %H:%M:%S', moment)}.{micros:06d}"
+        site = getattr(record, "site", f"{record.filename}:{record.lineno}")
+        return f"{record.levelname[0]}{stamp} {os.getpid():5d} {site}] {record.getMessage()}"
 
 
 def bar(items: Iterable[Item], stage: str, total: int | None = None, unit: str = "") -> Iterable[Item]:

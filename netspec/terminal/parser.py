@@ -15,15 +15,15 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from netspec import log
 from netspec.errors import did_you_mean
 from netspec.files.version import version
 from netspec.terminal.commands import FAULT
+from netspec.terminal.output import GlogFormatter
 
 TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
 
 # Defaults of a command (``parser.set_defaults``) for its log.
-CAFFES_LOG = {"log_level": logging.INFO, "log_form": log.GlogFormatter()}
+CAFFES_LOG = {"log_level": logging.INFO, "log_form": GlogFormatter()}
 QUIET = {"log_level": logging.WARNING, "log_form": logging.Formatter("warning: %(message)s")}
 NO_LOG = {"log_level": logging.WARNING, "log_form": None}
 

@@ -8,6 +8,7 @@ import sys
 from typing import Any
 
 from netspec import log
+from netspec.terminal import output
 
 
 class _Stderr(logging.StreamHandler):
@@ -15,7 +16,7 @@ class _Stderr(logging.StreamHandler):
 
     def __init__(self) -> None:
         logging.Handler.__init__(self)
-        self.setFormatter(log.GlogFormatter())
+        self.setFormatter(output.GlogFormatter())
 
     @property
     def stream(self) -> Any:
@@ -30,7 +31,7 @@ def start() -> None:
     if _handler not in log.logger.handlers:
         log.logger.addHandler(_handler)
         log.logger.propagate = False
-    _set_level(os.environ.get(log.VARIABLE, "0"))
+    _set_level(os.environ.get(output.VARIABLE, "0"))
 
 
 def stop() -> None:
@@ -56,6 +57,6 @@ def _set_level(level: int | str) -> None:
         number = int(level)
     except ValueError:
         number = 0
-    chosen = log.SEVERITIES[min(max(number, 0), 3)]
+    chosen = output.SEVERITIES[min(max(number, 0), 3)]
     _handler.setLevel(chosen)
     log.logger.setLevel(chosen)

@@ -22,7 +22,7 @@ from typing import Any
 
 from netspec.compat.scripts.operations import TRANSLATED
 from netspec.files.paths import relative
-from netspec.log import VARIABLE
+from netspec.terminal.output import VARIABLE
 
 
 def install(also: Mapping[str, Callable[[Any], None]], quiet: bool = False) -> None:

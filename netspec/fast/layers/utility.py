@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from netspec.exact import switch
+from netspec.exact import blas
 from netspec.fast.entry import Entry
 from netspec.fast.kernels import Inference, Kernel, Learning, with_activation
 from netspec.layers.utility.arithmetic import Eltwise, Softmax
@@ -39,7 +39,7 @@ def _split(layer: Split, how: Inference) -> Kernel:
 
 def _learn_split(layer: Split, how: Learning) -> Kernels:
     """Return kernels that add gradients in Caffe's order if sums are exact, or as autograd does: the last one first."""
-    order = 1 if layer.num_tops > 2 and switch.applies(layer.context.options.exact, torch.empty(1)) else -1
+    order = 1 if layer.num_tops > 2 and blas.applies(layer.context.options.exact, torch.empty(1)) else -1
     tops = layer.num_tops
 
     def backward(*diffs: torch.Tensor | None) -> torch.Tensor:

@@ -16,8 +16,8 @@ import numpy as np
 
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
-from netspec.files.limits import OUT_OF_MEMORY
-from netspec.log import INTERRUPTED, number
+from netspec.log import number
+from netspec.terminal.output import INTERRUPTED, OUT_OF_MEMORY
 
 _POINTS_OF_WINDOW = 25  # a curve is smoothed over this share of its points
 _USUAL, _MANY = 98, 20  # the percentage of values to show, and the minimum number of values for it

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch.nn import functional as F
 
+from netspec.exact.blas import is_recorded
 from netspec.exact.layout import channels_side_by_side
-from netspec.exact.switch import is_recorded
 
 CEIL, FLOOR = 0, 1  # caffe.proto: enum PoolingParameter.RoundMode
 Pair = tuple[int, int]

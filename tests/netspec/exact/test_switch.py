@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.switch import applies
+from netspec.exact.blas import applies
 
 CONVOLUTION = """
     layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 1 dim: 4 dim: 4 } } }

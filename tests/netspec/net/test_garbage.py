@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from netspec.errors import SpecError
-from netspec.files.memory import no_collection
+from netspec.files.limits import no_collection
 from netspec.net.net import Net
 
 UNKNOWN = 'layer { name: "relu" type: "ReLU" bottom: "nothing" top: "relu" }'

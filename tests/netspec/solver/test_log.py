@@ -12,6 +12,7 @@ import torch
 from netspec import load_net, log
 from netspec.load import load_solver
 from netspec.solver.testing import Tally, score_lines
+from netspec.terminal import output
 
 
 @pytest.fixture
@@ -19,7 +20,7 @@ def lines(tmp_path: Path) -> Iterator[Callable[[], list[str]]]:
     """Return a function that returns what was logged so far, in the form of the command line."""
     path = tmp_path / "netspec.log"
     handler = logging.FileHandler(path)
-    handler.setFormatter(log.GlogFormatter())
+    handler.setFormatter(output.GlogFormatter())
     log.logger.addHandler(handler)
     level = log.logger.level
     log.logger.setLevel(logging.INFO)

@@ -14,8 +14,9 @@ import pytest
 import torch
 
 import forked
+from netspec.cli.resume import newest_pair
 from netspec.load import load_solver
-from netspec.solver.extra import newest_pair, read_extra
+from netspec.solver.extra import read_extra
 from netspec.solver.solver import Solver
 from paths import GOLDEN
 

@@ -14,12 +14,13 @@ import pytest
 
 import netspec
 from netspec.cli import main
+from netspec.cli.resume import newest_pair
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
 from netspec.errors import SpecError
 from netspec.load import load_solver
 from netspec.net.extra_file import extra_text
-from netspec.solver.extra import changes, extra_path, newest_pair, read_extra
+from netspec.solver.extra import changes, extra_path, read_extra
 from netspec.solver.snapshot import State, read_state, write_state
 from netspec.solver.solver import Solver
 from netspec.solver.update import RULES
