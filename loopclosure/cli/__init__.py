@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from loopclosure.cli import close, detect, evaluate
+from loopclosure.cli import map as maps
 from netspec.terminal.commands import run
 from netspec.terminal.parser import QUIET, Commands, Parser, program
 
@@ -19,7 +20,6 @@ def parser() -> Parser:
     """Return the parser of all commands."""
     made = program("loopclosure", "Evaluate, detect and close loops.")
     commands = Commands(made, **QUIET)
-    for module in (evaluate, detect, close):
+    for module in (evaluate, detect, close, maps):
         module.add_commands(commands)
-    detect.add_map_commands(commands)
     return made

@@ -1,10 +1,9 @@
-"""``loopclosure detect`` and ``loopclosure map``: loops within a drive, and between several drives."""
+"""``loopclosure detect``: loops within a drive."""
 
 from __future__ import annotations
 
 import argparse
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +18,7 @@ from loopclosure.detector import run
 from loopclosure.detector.decision import RECENT, DetectorSettings, LoopResult
 from loopclosure.detector.detector import Describe, LoopDetector
 from loopclosure.detector.export import write_g2o, write_loops_csv
-from loopclosure.detector.map import EXTRACTED, Map, checked_name
 from loopclosure.detector.verification import GeometricCheck
-from loopclosure.detector.visitor import Visitor
-from loopclosure.index.index import INDEXES
 from loopclosure.methods.auto import PRECISION
 from loopclosure.methods.drive import Request, last_session, later_threshold, whole_drive
 from loopclosure.methods.features import WhitenBy
@@ -33,7 +29,6 @@ from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.source import DETECTED, FRAMES, TOPICS
 from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
-from netspec.files.paths import inside
 from netspec.files.whole_file import write_whole
 from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
@@ -49,14 +44,6 @@ ONLINE = ("top_k", "consistency", "consistency_window")
 def add_commands(commands: Commands) -> None:
     """Add ``detect``."""
     _add_detect(commands)
-
-
-def add_map_commands(commands: Commands) -> None:
-    """Add ``map`` and its commands."""
-    known_map = commands.add_group("map", help="keep a map of several drives on disk: build it, add to it, query it")
-    _add_build(known_map)
-    _add_add(known_map)
-    _add_query(known_map)
 
 
 def _add_detect(commands: Commands) -> None:
@@ -320,99 +307,3 @@ def _detector(a: argparse.Namespace, describe: Describe | None, views: int) -> L
     if a.verify or ((a.video or a.save) and a.threshold is None):
         check = GeometricCheck()
     return LoopDetector(describe, check=check, views=views, **changes)
-
-
-def _add_map(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("map", metavar="MAP", help="the map's folder")
-
-
-def _add_index(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--index",
-        default="exact",
-        metavar="NAME",
-        help="exact, faiss, or Milvus: FILE.db or http://HOST:PORT (default: %(default)s)",
-    )
-
-
-def _add_build(commands: Commands) -> None:
-    parser = commands.add_parser("build", help="build a map of one or several drives")
-    parser.set_defaults(function=_build)
-    _add_map(parser)
-    parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as for detect")
-    _add_index(parser)
-    parser.add_argument(
-        "--describe", default="default", metavar="NAME", help="the net, default or small (default: %(default)s)"
-    )
-
-
-def _build(a: argparse.Namespace) -> None:
-    describe = run.load_describe(checked_name(a.describe))
-    recordings = _recordings(a, 0)  # before the map is made, in case a name is mistyped
-    _add_all(Map.create(a.map, a.describe), describe, recordings, a.index)
-
-
-def _add_add(commands: Commands) -> None:
-    parser = commands.add_parser("add", help="add drives to a map and find the loops between all its drives")
-    parser.set_defaults(function=_add)
-    _add_map(parser)
-    parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as for detect")
-    _add_index(parser)
-
-
-def _add(a: argparse.Namespace) -> None:
-    into = Map(a.map)
-    _add_all(into, run.load_describe(into.describer), _recordings(a, len(into.sessions)), a.index)
-
-
-def _recordings(a: argparse.Namespace, first: int) -> list[ImageSequence]:
-    """Open all sources of a command, which become session ``first`` of the map and those after it."""
-    folders = [inside(a.map, EXTRACTED, f"{number:06d}") for number in range(first, first + len(a.source))]
-    return [recording_of(text, folder) for text, folder in zip(a.source, folders, strict=True)]
-
-
-def _add_all(into: Map, describe: Describe, recordings: list[ImageSequence], index: str) -> None:
-    for recording in recordings:
-        before, number = len(into), len(into.sessions)
-        results = into.add(recording, describe, index, bar, _decided)
-        warn_of_unreadable(recording)
-        loops = [result.accepted for result in results if result.accepted is not None]
-        between = sum(frame < before for frame in loops)
-        summary = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
-        print(f"session {number:06d}: {summary}: {into.folder / f'{number:06d}' / 'loops.csv'}")
-    sessions = len(into.sessions)
-    print(f"{len(into)} frames in {sessions} session{'s' * (sessions != 1)}: {into.folder}")
-
-
-def _decided(detector: LoopDetector, own: bool = True) -> list[LoopResult]:
-    found = last_session(detector, own=own, progress=bar)
-    for limit in found.limits:
-        warn(limit)
-    print("\n".join(reason for reason in found.reasons if reason not in found.limits))
-    return found.results
-
-
-def _add_query(commands: Commands) -> None:
-    parser = commands.add_parser("query", help="find the frames of a drive in a map, without adding them")
-    parser.set_defaults(function=_query)
-    _add_map(parser)
-    parser.add_argument("source", metavar="SOURCE", help="frames, as for detect")
-    _add_index(parser)
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for loops.csv")
-
-
-def _query(a: argparse.Namespace) -> None:
-    known, out = Map(a.map), Path(a.out)
-    recording = recording_of(a.source, out / "frames")
-    detector, before = known.detector(run.load_describe(known.describer), a.index), len(known)
-    if a.index in INDEXES:  # in memory: the frames are added to the detector, not to the map
-        run.remember_all(detector, recording, progress=bar)
-        results = _decided(detector, own=False)
-        results = [replace(result, query_id=result.query_id - before) for result in results]
-    else:
-        results = run.run_detector(Visitor(detector), recording, progress=bar)
-    recording = warn_of_unreadable(recording)
-    loops = [result for result in results if result]
-    write_loops_csv(out / "loops.csv", loops, recording.stamps, recording.names, (detector.stamps, known.names))
-    print(run.verdicts_said(results))
-    print(f"{len(loops)} of {len(results)} frames are in the map: {out / 'loops.csv'}")

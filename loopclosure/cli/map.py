@@ -1,0 +1,125 @@
+"""``loopclosure map``: a map of several drives, and where the frames of a drive are in it."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from loopclosure.cli.data_set import recording_of, warn_of_unreadable
+from loopclosure.detector import run
+from loopclosure.detector.decision import LoopResult
+from loopclosure.detector.detector import Describe, LoopDetector
+from loopclosure.detector.export import write_loops_csv
+from loopclosure.detector.map import EXTRACTED, Map, checked_name
+from loopclosure.detector.visitor import Visitor
+from loopclosure.index.index import INDEXES
+from loopclosure.methods.drive import last_session
+from loopclosure.places.image_sequence import ImageSequence
+from netspec.files.paths import inside
+from netspec.terminal.output import bar, warn
+from netspec.terminal.parser import Commands
+
+
+def add_commands(commands: Commands) -> None:
+    """Add ``map`` and its commands."""
+    known_map = commands.add_group("map", help="keep a map of several drives on disk: build it, add to it, query it")
+    _add_build(known_map)
+    _add_add(known_map)
+    _add_query(known_map)
+
+
+def _add_map(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("map", metavar="MAP", help="the map's folder")
+
+
+def _add_index(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--index",
+        default="exact",
+        metavar="NAME",
+        help="exact, faiss, or Milvus: FILE.db or http://HOST:PORT (default: %(default)s)",
+    )
+
+
+def _add_build(commands: Commands) -> None:
+    parser = commands.add_parser("build", help="build a map of one or several drives")
+    parser.set_defaults(function=_build)
+    _add_map(parser)
+    parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as for detect")
+    _add_index(parser)
+    parser.add_argument(
+        "--describe", default="default", metavar="NAME", help="the net, default or small (default: %(default)s)"
+    )
+
+
+def _build(a: argparse.Namespace) -> None:
+    describe = run.load_describe(checked_name(a.describe))
+    recordings = _recordings(a, 0)  # before the map is made, in case a name is mistyped
+    _add_all(Map.create(a.map, a.describe), describe, recordings, a.index)
+
+
+def _add_add(commands: Commands) -> None:
+    parser = commands.add_parser("add", help="add drives to a map and find the loops between all its drives")
+    parser.set_defaults(function=_add)
+    _add_map(parser)
+    parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as for detect")
+    _add_index(parser)
+
+
+def _add(a: argparse.Namespace) -> None:
+    into = Map(a.map)
+    _add_all(into, run.load_describe(into.describer), _recordings(a, len(into.sessions)), a.index)
+
+
+def _recordings(a: argparse.Namespace, first: int) -> list[ImageSequence]:
+    """Open all sources of a command, which become session ``first`` of the map and those after it."""
+    folders = [inside(a.map, EXTRACTED, f"{number:06d}") for number in range(first, first + len(a.source))]
+    return [recording_of(text, folder) for text, folder in zip(a.source, folders, strict=True)]
+
+
+def _add_all(into: Map, describe: Describe, recordings: list[ImageSequence], index: str) -> None:
+    for recording in recordings:
+        before, number = len(into), len(into.sessions)
+        results = into.add(recording, describe, index, bar, _decided)
+        warn_of_unreadable(recording)
+        loops = [result.accepted for result in results if result.accepted is not None]
+        between = sum(frame < before for frame in loops)
+        summary = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
+        print(f"session {number:06d}: {summary}: {into.folder / f'{number:06d}' / 'loops.csv'}")
+    sessions = len(into.sessions)
+    print(f"{len(into)} frames in {sessions} session{'s' * (sessions != 1)}: {into.folder}")
+
+
+def _decided(detector: LoopDetector, own: bool = True) -> list[LoopResult]:
+    found = last_session(detector, own=own, progress=bar)
+    for limit in found.limits:
+        warn(limit)
+    print("\n".join(reason for reason in found.reasons if reason not in found.limits))
+    return found.results
+
+
+def _add_query(commands: Commands) -> None:
+    parser = commands.add_parser("query", help="find the frames of a drive in a map, without adding them")
+    parser.set_defaults(function=_query)
+    _add_map(parser)
+    parser.add_argument("source", metavar="SOURCE", help="frames, as for detect")
+    _add_index(parser)
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for loops.csv")
+
+
+def _query(a: argparse.Namespace) -> None:
+    known, out = Map(a.map), Path(a.out)
+    recording = recording_of(a.source, out / "frames")
+    detector, before = known.detector(run.load_describe(known.describer), a.index), len(known)
+    if a.index in INDEXES:  # in memory: the frames are added to the detector, not to the map
+        run.remember_all(detector, recording, progress=bar)
+        results = _decided(detector, own=False)
+        results = [replace(result, query_id=result.query_id - before) for result in results]
+    else:
+        results = run.run_detector(Visitor(detector), recording, progress=bar)
+    recording = warn_of_unreadable(recording)
+    loops = [result for result in results if result]
+    write_loops_csv(out / "loops.csv", loops, recording.stamps, recording.names, (detector.stamps, known.names))
+    print(run.verdicts_said(results))
+    print(f"{len(loops)} of {len(results)} frames are in the map: {out / 'loops.csv'}")
