@@ -17,7 +17,7 @@ from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
 from loopclosure.detector.decision import RECENT, DetectorSettings, LoopResult
 from loopclosure.detector.detector import Describe, LoopDetector
-from loopclosure.detector.export import write_g2o, write_loops_csv
+from loopclosure.detector.export import RELATIVE, write_g2o, write_loops_csv
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.methods.auto import PRECISION
 from loopclosure.methods.drive import Request, last_session, later_threshold, whole_drive
@@ -179,11 +179,11 @@ def _detect(a: argparse.Namespace) -> None:
         names += recording.names
         if a.rerun:
             write_detected(Path(a.rerun), recording, results, bar)
-    loops, relatives = [], None
+    loops, measured = [], None
     if recording is not None and (camera := _camera(a, recording)) is not None:
         loops = _measured(detector, recording, camera)
-        relatives = {loop.query: cells(loop.relative) for loop in loops if loop.relative is not None}
-    write_loops_csv(out / "loops.csv", detector.loops, detector.stamps, names, relatives=relatives)
+        measured = RELATIVE, {loop.query: cells(loop.relative) for loop in loops if loop.relative is not None}
+    write_loops_csv(out / "loops.csv", detector.loops, detector.stamps, names, measured=measured)
     write_whole(out / "chosen.txt", "\n".join(reasons) + "\n")
     # Drawing takes a second to import.
     from loopclosure.report.drive import write_drive
@@ -201,7 +201,7 @@ def _detect(a: argparse.Namespace) -> None:
     driven = np.isfinite(odometry).any()
     if driven or np.isfinite(poses).any():
         of_loop = {(loop.query, loop.match): constraint(loop.relative) for loop in loops if loop.relative is not None}
-        relative = run.from_poses(detector) if not driven and relatives is None else lambda *ends: of_loop.get(ends)
+        relative = run.from_poses(detector) if not driven and measured is None else lambda *ends: of_loop.get(ends)
         left_out = write_g2o(out / "loops.g2o", odometry if driven else poses, detector.loops, relative)
         note = f"; loops without a measured relative pose, left out: {left_out}" if left_out else ""
         print(f"pose graph of the {'odometry' if driven else 'known poses'}{note}: {out / 'loops.g2o'}")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from loopclosure.cli.data_set import recording_of, warn_of_unreadable
+from loopclosure.closing.locate import LOCATED, Located, Locator, located_said, place_errors_said
 from loopclosure.detector import run
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import Describe, LoopDetector
@@ -120,6 +122,25 @@ def _query(a: argparse.Namespace) -> None:
         results = run.run_detector(Visitor(detector), recording, progress=bar)
     recording = warn_of_unreadable(recording)
     loops = [result for result in results if result]
-    write_loops_csv(out / "loops.csv", loops, recording.stamps, recording.names, (detector.stamps, known.names))
+    found, said = _located(known, recording, loops)
+    measured = LOCATED, {frame: each.cells() for frame, each in found.items()}
+    write_loops_csv(
+        out / "loops.csv", loops, recording.stamps, recording.names, (detector.stamps, known.names), measured
+    )
     print(run.verdicts_said(results))
     print(f"{len(loops)} of {len(results)} frames are in the map: {out / 'loops.csv'}")
+    print("\n".join(said), end="\n" if said else "")
+
+
+def _located(known: Map, recording: ImageSequence, loops: Sequence[LoopResult]) -> tuple[dict[int, Located], list[str]]:
+    """Return where the camera was for each loop, and sentences about it."""
+    if not loops:
+        return {}, []
+    if recording.camera is None:
+        return {}, ["not located: the source of the query has no calibration of its camera"]
+    locator = Locator(known, recording.camera)
+    found = locator.locate_all(recording, loops, bar)
+    said = located_said(found, loops, locator)
+    if recording.poses is not None and (errors := place_errors_said(found, recording.poses)):
+        said.append(errors)
+    return found, said

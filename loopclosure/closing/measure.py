@@ -16,12 +16,12 @@ from loopclosure.csv_file import safe_cell
 from loopclosure.detector.export import relative_pose
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
-from loopclosure.places.frames import read_bgr, read_depth
+from loopclosure.places.depth import read_depths
+from loopclosure.places.frames import read_bgr
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.progress import Progress, silent
 from netspec.files.kinds import nearest_existing
-from netspec.files.opencv import cv2
 
 # Images are not reduced: a larger image gives a better pose.
 CHECK = GeometricCheck(max_features=1000, min_inliers=LEAST_INLIERS, most_side=1_000_000)
@@ -80,19 +80,14 @@ def measure(
 
     wanted = {end for loop in loops for end in (loop.query, loop.match)}
     # A video is read once, in order.
-    of_video = {} if sequence.paths else {i: _view(CHECK, camera, image) for i, image, _ in sequence.frames(wanted)}
+    of_video = {} if sequence.paths else {i: view_of(CHECK, camera, image) for i, image, _ in sequence.frames(wanted)}
 
     @lru_cache(KEPT_VIEWS)
     def view(frame: int) -> View:
         if not sequence.paths:
             return of_video[frame]
-        image = read_bgr(sequence.paths[frame])
-        height, width = image.shape[:2]
-        depths = sequence.depths
-        file, depth = None if depths is None else depths[frame], None
-        if file is not None:
-            depth = cv2.resize(read_depth(file).astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
-        return _view(CHECK, camera, image, depth)
+        depth = None if sequence.depths is None else sequence.depths[frame]
+        return view_of(CHECK, camera, read_bgr(sequence.paths[frame]), depth)
 
     measured = []
     for loop in progress(loops, "measuring loops", len(loops)):
@@ -141,8 +136,14 @@ def errors_said(loops: Sequence[Loop], poses: np.ndarray) -> str:
     return f"median errors of the {len(turns)} measured loops, by the true poses: {', '.join(parts)}"
 
 
-def _view(check: GeometricCheck, camera: Intrinsics, image: np.ndarray, depth: np.ndarray | None = None) -> View:
-    return View(check.describe(image), camera.of_size(image.shape[1], image.shape[0]), depth)
+def view_of(check: GeometricCheck, camera: Intrinsics, image: np.ndarray, depth: Path | None = None) -> View:
+    """Return the points of an image (H, W, 3) uint8 BGR, with the file of its depth if there is one.
+
+    Raises InputError if the depth cannot be read.
+    """
+    local = check.describe(image)
+    depths = None if depth is None else read_depths(depth, local.points, local.size)
+    return View(local, camera.of_size(*local.size), depths)
 
 
 def _frame(row: dict[str, str], end: str, numbers: dict[str, int], path: Path, line: int) -> int:

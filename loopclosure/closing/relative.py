@@ -25,17 +25,18 @@ CONFIDENCE = 0.999
 # SIFT points are accurate to about a pixel. If a rotation leaves a smaller residual, there is no usable translation.
 LEAST_PARALLAX_PX = 2.0
 SEED = 1
-# Neighboring pixels are on the same surface if their depths differ by less than this factor.
-ONE_SURFACE = 1.05
 
 
 @dataclass(frozen=True)
 class View:
-    """An image: its ``local`` features, its ``camera``, and its depth (H, W) in meters, 0 = not known, or None."""
+    """An image: its ``local`` features, its ``camera``, and the depths (K,) of its points in meters, or None.
+
+    A depth is the distance along the axis of the camera; 0 where not known.
+    """
 
     local: LocalFeatures
     camera: Intrinsics
-    depth: np.ndarray | None = None
+    depths: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -68,30 +69,19 @@ def relative_view(match: View, query: View, matches: np.ndarray) -> Relative | N
     ahead = np.isfinite(in_match).all(axis=1) & np.isfinite(in_query).all(axis=1)
     if np.count_nonzero(ahead) < LEAST_INLIERS:
         return None
-    pixels = pixels[0][ahead], pixels[1][ahead]
-    in_match, in_query = in_match[ahead], in_query[ahead]
+    matches, in_match, in_query = matches[ahead], in_match[ahead], in_query[ahead]
     focal = np.sqrt(query.camera.fx * query.camera.fy)
-    directions = ((match, pixels[0], in_match, in_query), (query, pixels[1], in_query, in_match))
+    directions = ((match, matches[:, 0], in_match, in_query), (query, matches[:, 1], in_query, in_match))
     for view, points, rays, other in directions:
-        if view.depth is None:
+        if view.depths is None:
             continue
-        depths = _depth_at(view.depth, points)
+        depths = view.depths[points]
         known = depths > 0
         found = _from_depth(rays[known], depths[known], other[known], focal)
         if found is not None:
             rotation, translation, inliers, sigmas = found  # from this view to the other
             return Relative(_pose(rotation, translation, inverse=view is match), METRIC, inliers, sigmas)
     return _from_color(in_match, in_query, focal)
-
-
-def _depth_at(depth: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the depth (N,) at pixels (N, 2); 0 where it is not known or at the edge of a surface."""
-    height, width = depth.shape
-    at = np.rint(points).astype(np.intp)
-    at = at[:, 1].clip(0, height - 1), at[:, 0].clip(0, width - 1)
-    around = np.ones((3, 3), np.uint8)
-    low, high = cv2.erode(depth, around)[at], cv2.dilate(depth, around)[at]
-    return np.where((low > 0) & (high < ONE_SURFACE * low), depth[at], 0)
 
 
 def _from_depth(

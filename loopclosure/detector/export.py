@@ -68,20 +68,21 @@ def write_loops_csv(
     stamps: np.ndarray | None = None,
     names: Sequence[str] | None = None,
     matched: tuple[np.ndarray | None, Sequence[str]] | None = None,
-    relatives: Mapping[int, Sequence[object]] | None = None,
+    measured: tuple[Sequence[str], Mapping[int, Sequence[object]]] | None = None,
 ) -> None:
     """Write one row per loop: query_id, match_id, score, inliers, and stamps (N,) in seconds and names (N) if known.
 
     The last column says whether the score is one of images or of sequences.
 
     matched    the stamps and names (M) of the matches, if they are frames of another drive
-    relatives  query_id -> the cells of the columns RELATIVE: the measured pose of the query in the frame of its match
+    measured   the names of further columns, such as RELATIVE, and query_id -> their cells; no row: nothing is known
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     others = (stamps, names) if matched is None else matched
     every, all_names = (stamps, others[0]), (names, others[1])
-    unknown = [""] * len(RELATIVE)
+    columns, cells = measured or ((), {})
+    unknown = [""] * len(columns)
     rows = []
     for loop in loops:
         assert loop.accepted is not None
@@ -89,10 +90,9 @@ def write_loops_csv(
         times = ["" if of is None or np.isnan(of[i]) else f"{of[i]:.6f}" for of, i in zip(every, ends, strict=True)]
         names_of_ends = ["" if of is None else of[i] for of, i in zip(all_names, ends, strict=True)]
         inliers = "" if loop.inliers is None else loop.inliers
-        rows.append([*ends, f"{loop.score:.9g}", inliers, *times, *names_of_ends, loop.score_of])
-        if relatives is not None:
-            rows[-1] += relatives.get(loop.query_id, unknown)
-    write_csv(path, (*LOOPS, *(RELATIVE if relatives is not None else ())), rows, "surrogateescape")
+        more = cells.get(loop.query_id, unknown)
+        rows.append([*ends, f"{loop.score:.9g}", inliers, *times, *names_of_ends, loop.score_of, *more])
+    write_csv(path, (*LOOPS, *columns), rows, "surrogateescape")
 
 
 def write_g2o(path: str | Path, poses: np.ndarray, loops: Sequence[LoopResult], relative: RelativePose) -> int:

@@ -36,9 +36,13 @@ class Points:
     points: np.ndarray | Rows
     descriptors: np.ndarray | Rows
 
+    def part(self, frame: int) -> slice:
+        """Return where the points of one frame are among all points."""
+        return slice(int(self.ends[frame - 1]) if frame else 0, int(self.ends[frame]))
+
     def of(self, frame: int) -> LocalFeatures:
         """Return the local features of one frame."""
-        part = slice(int(self.ends[frame - 1]) if frame else 0, int(self.ends[frame]))
+        part = self.part(frame)
         width, height = self.sizes[frame].tolist()
         return LocalFeatures(self.points[part], self.descriptors[part], (width, height))
 

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,9 @@ from loopclosure.detector.run import NAME, remember_all, run_detector, views_of
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.index.index import INDEXES, open_index
+from loopclosure.places.depth import read_depths
 from loopclosure.places.image_sequence import ImageSequence
+from loopclosure.places.intrinsics import Intrinsics, read_intrinsics, write_calibration
 from loopclosure.progress import Progress, silent
 from loopclosure.stored import Rows, check_array, regular
 from netspec.files.arrays import read_npz
@@ -50,19 +53,31 @@ Decide = Callable[[LoopDetector], list[LoopResult]]
 # Fingerprints of the nets of versions 0.2.0 and 0.3.0; their maps do not contain them.
 OLDER = {"default": "63cb899e0703cb96", "small": "2e195dd29a635c6c"}
 MAPPED = ("rows", "points", "descriptors")  # arrays in files of their own, read where they are used
-SESSION_FILES = ("frames.npz", *(f"{name}.npy" for name in MAPPED), "loops.csv")
+# Where the source has them: the camera, and the depth of each point.
+CALIBRATION, DEPTHS = "calibration.txt", "depths.npy"
+SESSION_FILES = ("frames.npz", *(f"{name}.npy" for name in MAPPED), DEPTHS, CALIBRATION, "loops.csv")
 PROJECTION_FILE = "projection.npz"
 EXTRACTED, LOCK = "frames", ".lock"  # images from bags, and the lock of an add; map.json does not list them
 
 
 @dataclass(frozen=True)
 class Session:
-    """A session of N frames: their names, and the arrays in its files."""
+    """A session of N frames: their names, and the arrays in its files.
+
+    camera  None if the source has no calibration, and in maps of earlier versions, which did not store it
+    depths  (P,) float32, of all points in meters, 0 where not known; None without depth images
+    """
 
     folder: Path
     names: list[str]
     arrays: dict[str, Any]
     points: Points
+    camera: Intrinsics | None = None
+    depths: Rows | None = None
+
+    def depths_of(self, frame: int) -> np.ndarray | None:
+        """Return the depths (K,) of the points of one frame."""
+        return None if self.depths is None else self.depths[self.points.part(frame)]
 
     def blocks(self, start: int = 0, projection: Whitening | None = None, views: int = 1) -> Iterator[np.ndarray]:
         """Yield the descriptors (n, views D) float32 from frame ``start`` on; the projection applies to each view."""
@@ -164,6 +179,14 @@ class Map:
     def __len__(self) -> int:
         return sum(len(session.names) for session in self.sessions)
 
+    def session_of(self, frame: int) -> tuple[Session, int]:
+        """Return the session of a frame of the map, and the number of the frame in it."""
+        for session in self.sessions:
+            if frame < len(session.names):
+                return session, frame
+            frame -= len(session.names)
+        raise InputError("has no such frame", self.folder)
+
     @property
     def names(self) -> list[str]:
         """The names of all frames, SESSION/NAME."""
@@ -244,6 +267,10 @@ class Map:
         try:
             with whole_folder(folder) as unfinished:
                 np.save(unfinished / "rows.npy", np.array(described.kept))
+                if recording.depths is not None:
+                    np.save(unfinished / DEPTHS, _depths(recording.depths, points_of(arrays, len(recording))))
+                if recording.camera is not None:
+                    write_calibration(unfinished / CALIBRATION, recording.camera)
                 np.save(unfinished / "points.npy", arrays.pop("points"))
                 np.save(unfinished / "descriptors.npy", arrays.pop("descriptors"))
                 about = {"source": np.array(str(recording.source)), "fingerprint": np.array(described.fingerprint)}
@@ -363,6 +390,17 @@ def checked_name(describer: str) -> str:
     return describer
 
 
+def _depths(files: Sequence[Path | None], points: Points) -> np.ndarray:
+    """Return the depths (P,) of all points of a session, 0 where not known or where the file cannot be read."""
+    found = np.zeros(points.points.shape[0], np.float32)
+    for frame, file in enumerate(files):
+        local = points.of(frame)
+        with suppress(InputError):
+            if file is not None:
+                found[points.part(frame)] = read_depths(file, local.points, local.size)
+    return found
+
+
 def _read_session(folder: Path) -> Session:
     arrays: dict[str, Any] = read_npz(regular(folder / "frames.npz", SESSION), SESSION)
     arrays |= {name: Rows(folder / f"{name}.npy", SESSION) for name in MAPPED}
@@ -372,6 +410,11 @@ def _read_session(folder: Path) -> Session:
         check_array(arrays, "rows", "f", (count, arrays["rows"].size // count), finite=False)
         check_array(arrays, "stamps", "f", (count,), finite=False)
         check_array(arrays, "poses", "f", (count, 7), finite=False)
-        return Session(folder, names, arrays, points_of(arrays, count, finite=False))
+        points, depths, calibration = points_of(arrays, count, finite=False), folder / DEPTHS, folder / CALIBRATION
+        known = Rows(depths, SESSION) if depths.exists() else None
+        if known is not None:
+            check_array({"depths": known}, "depths", "f", (int(points.ends[-1]),), finite=False)
+        camera = read_intrinsics(regular(calibration, SESSION)) if calibration.exists() else None
+        return Session(folder, names, arrays, points, camera, known)
     except (ValueError, LookupError, TypeError, ArithmeticError) as error:
         raise InputError(f"cannot be read ({error}); expected {SESSION}", folder) from None

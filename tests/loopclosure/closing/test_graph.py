@@ -20,6 +20,7 @@ from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, Rel
 from loopclosure.detector.export import LOOP_SIGMAS, RELATIVE, relative_pose
 from loopclosure.detector.verification import LocalFeatures
 from loopclosure.errors import InputError
+from loopclosure.places.depth import depth_at
 from loopclosure.places.intrinsics import Intrinsics, from_text
 
 LAPS, PER_LAP = 3, 40
@@ -133,11 +134,11 @@ def views(step: np.ndarray, depth: bool = False) -> tuple[View, View, np.ndarray
         image = np.zeros((240, 320), np.float32)
         for (x, y), z in zip(np.rint(at).astype(int), seen[:, 2], strict=True):
             image[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] = z
-        maps.append(image if depth else None)
+        maps.append(depth_at(image, pixels[-1]) if depth else None)
     matches = np.stack([np.arange(POINTS)] * 2, axis=1)
     matches[:WRONG, 1] = np.roll(matches[:WRONG, 1], 7)
     none = np.zeros((POINTS, 128), np.uint8)
-    first, second = (View(LocalFeatures(at, none), CAMERA, image) for at, image in zip(pixels, maps, strict=True))
+    first, second = (View(LocalFeatures(at, none), CAMERA, z) for at, z in zip(pixels, maps, strict=True))
     return first, second, matches
 
 
