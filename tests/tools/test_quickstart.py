@@ -38,7 +38,8 @@ def project(tmp_path: Path) -> Path:
 
 
 def quickstart(project: Path, folder: Path) -> subprocess.CompletedProcess[str]:
-    own = {name: value for name, value in os.environ.items() if name != "VENV"}  # which names this run's environment
+    # These describe the environment of this run of the tests, not the one of the project.
+    own = {name: value for name, value in os.environ.items() if name not in ("VENV", "NEEDS")}
     command = [project / "tools" / "quickstart"]
     return subprocess.run(command, cwd=folder, env=own, capture_output=True, text=True, check=False)
 
