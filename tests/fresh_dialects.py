@@ -15,7 +15,10 @@ from netspec.proto.text import parse_net_text
 
 def fresh_dialects(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a test add dialects for every net; afterwards there are none."""
+    from netspec.compat.pycaffe.proto import caffe_pb2
+
     assert known.added() == ()
+    monkeypatch.setattr(caffe_pb2, "_of_net", ())
     monkeypatch.setattr(known, "_added", {})
     for module in [name for name in sys.modules if name.startswith(OF_FILES)]:
         del sys.modules[module]  # another test's file of the same name

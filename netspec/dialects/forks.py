@@ -57,10 +57,10 @@ class Dialects(Forks):
         return registry.field(find(dialect), message, name)
 
     @override
-    def schema_file(self) -> Any:
+    def schema_file(self, dialects: Collection[str] = ()) -> Any:
         from netspec.dialects.merged import merged_file
 
-        return merged_file(tuple(find(name) for name in sorted(added())))
+        return merged_file(tuple(find(name) for name in sorted({*added(), *dialects})))
 
     @override
     def sources(self) -> list[tuple[str, str, str]]:

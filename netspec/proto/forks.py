@@ -92,8 +92,8 @@ class Forks:
         """Return the field with which a dialect extends a message, or the values of the enum of its field."""
         raise NotImplementedError
 
-    def schema_file(self) -> "Any":
-        """Return the descriptor of caffe.proto with the additions of ``everywhere``; None if there are none."""
+    def schema_file(self, dialects: "Collection[str]" = ()) -> "Any":
+        """Return the descriptor of caffe.proto with what ``everywhere`` and dialects add; None if there are none."""
         return None
 
     def sources(self) -> "list[tuple[str, str, str]]":

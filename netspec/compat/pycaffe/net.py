@@ -19,6 +19,7 @@ from netspec.compat.pycaffe import mode
 from netspec.compat.pycaffe.blob_runner import BlobRunner
 from netspec.compat.pycaffe.errors import caffes_errors
 from netspec.compat.pycaffe.named import Named
+from netspec.compat.pycaffe.proto import caffe_pb2
 from netspec.errors import did_you_mean, several
 from netspec.graph.filter import with_state
 from netspec.layers.utility import pycaffe_shim
@@ -96,6 +97,7 @@ class Net:
 
     def _set_net(self, net: core.Net) -> None:
         mode.follow_seed(net.random)
+        caffe_pb2._of_net = net.plan.dialects
         self.runner = runner = BlobRunner(net)
         names = [node.name for node in net.plan.nodes]
         self._layer_names = names

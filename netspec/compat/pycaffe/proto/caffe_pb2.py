@@ -1,4 +1,7 @@
-"""All messages and enums of Caffe's schema and of the dialects that a user added, under protoc's names.
+"""All messages and enums of Caffe's schema and of dialects, under protoc's names.
+
+The dialects are those that a user added, and those of the net that was loaded last: a fork's program loads a net and
+then reads ``caffe_pb2.LabelMap()``, which its own Caffe has.
 
 Nothing is generated, and nothing is added to protobuf's default pool, so another ``caffe_pb2`` in the process does
 not conflict with this one. Without any, the classes are those of :mod:`netspec.proto.schema`.
@@ -16,6 +19,8 @@ from google.protobuf.internal.enum_type_wrapper import EnumTypeWrapper
 from netspec.errors import did_you_mean
 from netspec.proto.forks import forks
 from netspec.proto.schema import pool
+
+_of_net: tuple[str, ...] = ()  # the dialects of the net that was loaded last
 
 
 def __getattr__(name: str) -> Any:
@@ -37,8 +42,8 @@ def __dir__() -> list[str]:
 
 
 def _file() -> Any:
-    """Return the descriptor of caffe.proto, with the additions of the dialects that a user added."""
-    return forks().schema_file() or pool.FindFileByName("caffe.proto")
+    """Return the descriptor of caffe.proto, with the additions of the dialects."""
+    return forks().schema_file(_of_net) or pool.FindFileByName("caffe.proto")
 
 
 @cache
