@@ -13,6 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from importlib import import_module
 from typing import Any
 
@@ -190,10 +191,11 @@ def pytorch_training(task: Task) -> Run:
     optimizer = torch.optim.SGD(groups, lr=task["rate"], momentum=task["momentum"])
     data, labels = (torch.from_numpy(value).to(task["device"]) for value in _inputs(task).values())
     data = data.contiguous(memory_format=layout)
+    kind = torch.device(task["device"]).type
 
     def run() -> dict[str, Any]:
         optimizer.zero_grad()
-        with torch.autocast(torch.device(task["device"]).type, torch.bfloat16, enabled=task["precision"] == "bf16"):
+        with torch.autocast(kind, torch.bfloat16) if task["precision"] == "bf16" else nullcontext():
             loss = loss_of(data, labels)
         loss.backward()
         optimizer.step()

@@ -23,7 +23,7 @@ from loopclosure.places.pose_table import matrix_fault, seconds_of
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, content_lines, number
 from netspec.errors import SpecError
 from netspec.files.image_list import list_images
-from netspec.files.kinds import nearest_existing
+from netspec.files.kinds import nearest_existing, unreadable
 from netspec.files.paths import relative
 
 GROUNDTRUTH, ODOMETRY = "groundtruth.txt", "odometry.txt"
@@ -220,10 +220,18 @@ def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
 
 def _mount(sensor: Path) -> np.ndarray:
     """Return the pose of the camera in the body (4, 4) from a ``sensor.yaml``. Raises InputError if it is not one."""
-    mount = np.array(yaml_numbers(sensor.read_text(encoding="utf-8-sig"), "data", 16, sensor)).reshape(4, 4)
+    mount = np.array(yaml_numbers(_calibration(sensor), "data", 16, sensor)).reshape(4, 4)
     if fault := matrix_fault(mount[:3, :3]):
         raise InputError(f"the camera's pose in the body, T_BS: {fault}", sensor)
     return mount
+
+
+def _calibration(path: Path) -> str:
+    """Return the text of a calibration, whose comments may be in any encoding. Raises InputError if unreadable."""
+    try:
+        return path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as fault:
+        raise InputError(unreadable(path, fault, "the camera's calibration"), path) from fault
 
 
 def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
@@ -252,8 +260,7 @@ def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
     mount = np.eye(4)
     try:
         if calibration.is_file():
-            text = calibration.read_text(encoding="utf-8-sig", errors="replace")
-            matrix = kitti_projection(text, projection, calibration)
+            matrix = kitti_projection(_calibration(calibration), projection, calibration)
             mount[:3, 3] = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
     except InputError as fault:
         return replace(sequence, pose_fault=fault)

@@ -62,3 +62,15 @@ def test_usage(tmp_path: Path) -> None:
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (1, "usage: install.py [--cpu]\n")
     assert not (tmp_path / "venv").exists()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs bash and the programs of .venv/bin")
+def test_what_a_script_needs_is_not_what_its_programs_need(tmp_path: Path) -> None:
+    (tmp_path / "bin").mkdir()
+    for name in ("bin/netspec", "installed-dev"):
+        (tmp_path / name).touch()
+    script = f'NEEDS=dev; VENV="{tmp_path}"; source "{ROOT}/tools/setup.sh"; env'
+    own = {name: value for name, value in os.environ.items() if name not in ("VENV", "NEEDS")}
+    done = subprocess.run(["bash", "-c", script], env=own, capture_output=True, text=True, check=True)
+    assert f"PATH={tmp_path}/bin:" in done.stdout
+    assert not {"VENV", "NEEDS"} & {line.partition("=")[0] for line in done.stdout.splitlines()}

@@ -87,6 +87,17 @@ def test_an_unknown_distortion_is_no_camera(tmp_path: Path) -> None:
     same_path(sequence.poses, path())
 
 
+def test_a_comment_in_another_encoding_leaves_the_poses(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path)
+    sensor = folder / "mav0/cam0/sensor.yaml"
+    text = sensor.read_bytes()
+    sensor.write_bytes("# Z\u00fcrich\n".encode("latin-1") + text)
+    same_path(read_sequence(folder).with_poses().poses, path())
+    sensor.write_bytes(text.replace(b"data: [0,", b"data: [\xff,"))
+    with pytest.raises(InputError, match=r"sensor\.yaml"):
+        read_sequence(folder).with_poses()
+
+
 @pytest.mark.parametrize("value", ["99999999999999999999", "1e999", "nan", "0.5"])
 def test_without_a_mount_there_are_no_poses(value: str, tmp_path: Path) -> None:
     folder = write_euroc(tmp_path)
