@@ -10,7 +10,7 @@ import numpy as np
 from google.protobuf import text_format
 
 from case_files import read_cases
-from dialect_numbers import GIVEN, NUMBERS
+from dialect_numbers import NUMBERS
 from laws.examples import EXAMPLES
 
 Shape = tuple[int, ...]
@@ -48,17 +48,16 @@ def _of_example(kind: str) -> Case:
 
 
 def _of_dialects() -> dict[str, Case]:
-    """Return the examples of the forks' layers: every entry of dialect_numbers."""
+    """Return the examples of the forks' layers: every pass of dialect_numbers."""
     found = {}
     for i, case in enumerate(NUMBERS):
-        rng = np.random.default_rng(5)
-        bottoms = [GIVEN[b] if isinstance(b, str) else b(rng) for b in (*case.bottoms, *case.fixed)]
+        bottoms = case.arrays(np.random.default_rng(5))
         values = {f"x{k}": np.asarray(x, np.float32) for k, x in enumerate(bottoms)}
         inputs = "".join(given(name, *x.shape) for name, x in values.items())
         tops = 0 if " top:" in case.layer else case.tops
         ends = " ".join([*(f'bottom: "{name}"' for name in values), *(f'top: "y{k}"' for k in range(tops))])
-        kind = case.layer.split('"')[1]
-        found[f"{kind} {i}"] = Case(kind, f'{inputs}layer {{ name: "it" {ends} {case.layer} }}\n', values, case.dialect)
+        text = f'{inputs}layer {{ name: "it" {ends} {case.layer} }}\n'
+        found[f"{case.type_name} {i}"] = Case(case.type_name, text, values, case.dialect)
     return found
 
 

@@ -1,7 +1,7 @@
-"""Layers of dialects: their numbers (tests/dialect_numbers.py), and what they refuse (cases/refused.txt)."""
+"""Layers of dialects: their numbers (cases/numbers.txt), and what they refuse (cases/refused.txt)."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ import torch
 
 from case_files import read_table, sizes
 from contexts import context
-from dialect_numbers import GIVEN, NUMBERS, Case, Draw
+from dialect_numbers import NUMBERS, Case
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError, Where
 from netspec.layers import Context, Layer
@@ -17,11 +17,6 @@ from netspec.net.one_layer import make_layer
 from netspec.proto.schema import TEST, TRAIN
 
 REFUSED = read_table("netspec/dialects/cases/refused.txt")
-
-
-def bottom(given: Draw | str, rng: np.random.Generator) -> torch.Tensor:
-    """Return an array of GIVEN, or one that is drawn."""
-    return torch.tensor(GIVEN[given] if isinstance(given, str) else given(rng), dtype=torch.float32)
 
 
 def coefficients(like: torch.Tensor) -> torch.Tensor:
@@ -37,7 +32,7 @@ def weighted_sum(values: torch.Tensor) -> tuple[float, float]:
 def run_case(case: Case) -> tuple[list[tuple[float, float]], Layer, list[torch.Tensor], tuple[int, ...]]:
     """Run a case; return its results, the layer, its bottoms, and which of these get no gradient."""
     rng = np.random.default_rng(5)
-    bottoms = [bottom(given, rng) for given in (*case.bottoms, *case.fixed)]
+    bottoms = [torch.tensor(x, dtype=torch.float32) for x in case.arrays(rng)]
     use_dialect(case.dialect)
     layer = make_layer(case.layer, [tuple(each.shape) for each in bottoms], Context(case.phase), case.tops)
     for blob in layer.blobs:
@@ -55,13 +50,7 @@ def run_case(case: Case) -> tuple[list[tuple[float, float]], Layer, list[torch.T
     return found, layer, [each.detach() for each in bottoms], tuple(range(len(case.bottoms), len(bottoms)))
 
 
-def names(cases: Sequence[Case]) -> list[str]:
-    """Return ids: the number and the type of each layer."""
-    types = [case.layer.split('"')[1] for case in cases]
-    return [f"{i} {type_name}" for i, type_name in enumerate(types)]
-
-
-@pytest.mark.parametrize("case", NUMBERS, ids=names(NUMBERS))
+@pytest.mark.parametrize("case", NUMBERS, ids=[f"{i} {case.type_name}" for i, case in enumerate(NUMBERS)])
 def test_layer_results_equal_those_of_plain_loops(case: Case, gradcheck: Callable[..., None]) -> None:
     found, layer, bottoms, fixed = run_case(case)
     line = " ".join(f"{value:.7g}" for value, _ in found)

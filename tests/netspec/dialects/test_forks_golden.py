@@ -167,7 +167,7 @@ def table(monkeypatch: pytest.MonkeyPatch, margin: float = 1) -> list[tuple[str,
         worst[kind] = max(worst.get(kind, 0.0), off)
         forks.setdefault(kind, []).append(fork)
     owners = layer_types()
-    loops = {case.layer.split('"')[1] for case in NUMBERS}
+    loops = {case.type_name for case in NUMBERS}
     groups: dict[tuple[str, ...], list[str]] = {}
     for kind in sorted({*forks, *owners}):
         how = ", ".join(sorted(set(forks.get(kind, ())))) or ("a loop" if kind in loops else "its formula")
