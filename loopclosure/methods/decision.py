@@ -10,9 +10,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from loopclosure.detector.verification import SURE
+from loopclosure.lines.course import Course
 from loopclosure.methods.contradiction import Visits
 from loopclosure.methods.geometry import Matches
-from loopclosure.methods.lines import LENGTHS, Course, Lines
+from loopclosure.methods.lines import LENGTHS, Lines
 
 WINDOW = 5  # references to each side of a line, and at least so many queries along it, where a loop has neighbors
 LEAST_VERIFIED = 3  # fewer verified matches of a stretch do not tell whether they agree only in part

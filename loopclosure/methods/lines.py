@@ -12,38 +12,19 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
+from loopclosure.lines.chance import threshold
+from loopclosure.lines.course import VELOCITIES, Course
+from loopclosure.lines.trajectories import SequenceSettings, trajectory_costs
 from loopclosure.methods.base import BLOCK
 from loopclosure.methods.candidates import Candidates
-from loopclosure.methods.seqslam import SequenceSettings, standardize, trajectory_costs
+from loopclosure.methods.seqslam import standardize
 
 LENGTHS = (10, 30)  # steps of a line
-VELOCITIES = (0.8, 1.2, 0.1)  # least, greatest and step, as shares of the speed
 SPEEDS = (0.5, 2.0, 0.25, 4.0)  # references for a query, tried where neither the ratio of the lengths nor 1 finds any
 LEAST_PIECES = 25  # pieces of the length of a line, of queries times of references, that show what chance does
-TAIL = 0.1  # share of the decoys that the tail is fitted to, and at least so many:
-LEAST_TAIL = 5
 # A shorter line is preferred to a longer one that accepts only this much more: it ends nearer to where a loop ends.
 NEARLY = 0.95
 MIDDLE = 4  # steps in the middle of a line
-
-
-@dataclass(frozen=True)
-class Course:
-    """How lines run: steps of a line, references for a query, and whether the references are passed backwards."""
-
-    length: int
-    speed: float = 1.0
-    backwards: bool = False
-
-    @property
-    def sequence(self) -> SequenceSettings:
-        """The search for such lines, among references in the order in which they are passed."""
-        slowest, fastest, step = (self.speed * velocity for velocity in VELOCITIES)
-        return SequenceSettings(self.length, slowest, fastest, step, contrast=0)
-
-    def __str__(self) -> str:
-        s, back = self.sequence, ", backwards" if self.backwards else ""
-        return f"sequences of {s.length} frames, at {s.slowest:.3g} to {s.fastest:.3g} times the speed{back}"
 
 
 @dataclass(frozen=True)
@@ -118,30 +99,6 @@ class Lines:
         """Which queries (Q,) have a line that is better than every decoy."""
         decoys = self.best.decoys
         return self.near & (self.best.targets > decoys.max(initial=-np.inf)) & np.isfinite(decoys).any()
-
-
-def threshold(
-    targets: np.ndarray, decoys: np.ndarray, precision: float, together: float = 1.0, odds: float = 1.0
-) -> float:
-    """Return the least score t such that of the targets >= t the share of wrong ones is at most 1 - ``precision``.
-
-    targets, decoys  (Q,) best scores of each query, -inf without one; a wrong target is distributed as a decoy
-    together         how many neighboring decoys tell no more than one
-    odds             chances of a wrong target for each of a decoy
-
-    Above a level the decoys are taken to fall exponentially (the peaks over a threshold of extreme-value theory), with
-    a scale that is widened by the uncertainty of the few independent decoys there are.
-    """
-    decoys = np.sort(decoys[np.isfinite(decoys)])[::-1]
-    scores = np.sort(targets[np.isfinite(targets)])[::-1]
-    tail = max(LEAST_TAIL, int(TAIL * len(decoys)))
-    if len(decoys) < 4 * LEAST_TAIL:
-        return np.inf
-    level = decoys[tail]
-    scale = (decoys[:tail] - level).mean() * (1 + np.sqrt(together / tail)) + 1e-12
-    wrong = np.where(scores > level, odds * tail / len(decoys) * np.exp(-np.maximum(scores - level, 0) / scale), 1.0)
-    good = np.flatnonzero(len(scores) * wrong <= (1 - precision) * np.arange(1, len(scores) + 1))
-    return float(scores[good[-1]]) if len(good) else np.inf
 
 
 def pool(given: Candidates, elsewhere: np.ndarray) -> Pool:

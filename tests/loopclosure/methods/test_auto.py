@@ -14,6 +14,8 @@ from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import verdicts_said
 from loopclosure.detector.verification import Agreement, Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
+from loopclosure.lines.chance import threshold
+from loopclosure.lines.course import Course
 from loopclosure.methods import drive as whole
 from loopclosure.methods import lines
 from loopclosure.methods.auto import answer, find_matches, places
@@ -22,7 +24,6 @@ from loopclosure.methods.candidates import Candidates, Compared, candidates, far
 from loopclosure.methods.decision import between, contradicted, neighbors
 from loopclosure.methods.decoys import floor_age
 from loopclosure.methods.geometry import Geometry, Matches
-from loopclosure.methods.lines import Course, threshold
 from loopclosure.methods.named import make_method
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.progress import silent

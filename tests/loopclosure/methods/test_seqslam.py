@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from loopclosure.errors import InputError
+from loopclosure.lines.trajectories import SequenceSettings, trajectory_costs
 from loopclosure.methods.base import Images, MethodContext, MethodResult, earlier
 from loopclosure.methods.named import make_method
 from loopclosure.methods.seqslam import (
     SeqSlam,
-    SequenceSettings,
     enhance_contrast,
     least_cost_matches,
     standardize,
-    trajectory_costs,
 )
 from loopclosure.progress import Progress, silent
 

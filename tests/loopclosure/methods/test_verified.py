@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from loopclosure.detector.verification import Agreement, GeometricCheck
+from loopclosure.lines.trajectories import SequenceSettings
 from loopclosure.methods.base import Images, MethodContext, MethodResult
 from loopclosure.methods.named import make_method
-from loopclosure.methods.seqslam import SeqSlam, SequenceSettings
+from loopclosure.methods.seqslam import SeqSlam
 from loopclosure.methods.verified import Verified, on_trajectories
 from loopclosure.progress import silent
 from tests.loopclosure.conftest import blots

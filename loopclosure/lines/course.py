@@ -1,0 +1,28 @@
+"""How lines of similar pairs run: their length, their speed and their direction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from loopclosure.lines.trajectories import SequenceSettings
+
+VELOCITIES = (0.8, 1.2, 0.1)  # least, greatest and step, as shares of the speed
+
+
+@dataclass(frozen=True)
+class Course:
+    """How lines run: steps of a line, references for a query, and whether the references are passed backwards."""
+
+    length: int
+    speed: float = 1.0
+    backwards: bool = False
+
+    @property
+    def sequence(self) -> SequenceSettings:
+        """The search for such lines, among references in the order in which they are passed."""
+        slowest, fastest, step = (self.speed * velocity for velocity in VELOCITIES)
+        return SequenceSettings(self.length, slowest, fastest, step, contrast=0)
+
+    def __str__(self) -> str:
+        s, back = self.sequence, ", backwards" if self.backwards else ""
+        return f"sequences of {s.length} frames, at {s.slowest:.3g} to {s.fastest:.3g} times the speed{back}"
