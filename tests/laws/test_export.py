@@ -1,7 +1,4 @@
-"""Every layer type of Caffe and of the forks computes the same in each format, or is refused with a reason.
-
-The table of refusals in docs/export.md is REFUSED.
-"""
+"""Every layer type of Caffe and of the forks computes the same in each format, or is refused with a reason."""
 
 import importlib.util
 import operator
@@ -262,17 +259,6 @@ def test_every_layer_of_a_fork_has_a_case_or_reads_data() -> None:
             use_dialect(dialect)
     rest = [kind for kind in layer_types() if kind not in KINDS]
     assert not [kind for kind in rest if not getattr(layer_class(kind), "reads_data", False)]
-
-
-def test_the_table_of_refusals_is_in_the_documentation() -> None:
-    names = {ONNX: "ONNX", TORCH: "PyTorch, pt2"}
-    lines = ["| layers | when | not in | reason |", "|---|---|---|---|"]
-    for each in REFUSED:
-        kinds = ", ".join(each.kinds.split())
-        targets = "any" if len(each.targets) == 2 else names[each.targets[0]]
-        lines.append(f"| {kinds} | {each.when} | {targets} | {each.reason} |")
-    table = "\n".join(lines)
-    assert table in (ROOT / "docs" / "export.md").read_text(), table
 
 
 def test_exporters_are_registered_for_existing_classes() -> None:
