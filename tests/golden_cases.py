@@ -12,6 +12,7 @@ from pathlib import Path
 import lmdb
 import numpy as np
 import torch
+from typing_extensions import override
 
 import netspec
 from netspec.exact import CHOICES
@@ -22,6 +23,7 @@ from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import PHASES, Datum
 from netspec.proto.text import parse_net
+from netspec.solver.training import Callback
 from paths import GOLDEN
 
 Arrays = Mapping[str, np.ndarray]
@@ -177,12 +179,24 @@ def _gradient(tensor: torch.Tensor) -> np.ndarray:
     return np.zeros(tuple(tensor.shape), np.float32) if tensor.grad is None else tensor.grad.cpu().numpy()
 
 
+class Losses(Callback):
+    """Keeps the loss of each iteration of a solver."""
+
+    def __init__(self, solver: netspec.Solver) -> None:
+        self._solver = solver
+        self.found: list[float] = []
+        solver.callbacks.append(self)
+
+    @override
+    def on_iteration(self) -> None:
+        self.found.append(self._solver.loss)
+
+
 def train(solver: netspec.Solver, iterations: int) -> list[float]:
     """Run some iterations of a solver; return the loss of each."""
-    losses: list[float] = []
-    solver.on_iteration = lambda: losses.append(solver.loss)
+    losses = Losses(solver)
     solver.step(iterations)
-    return losses
+    return losses.found
 
 
 def lay_out_examples(folder: Path) -> Path:

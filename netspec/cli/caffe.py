@@ -8,7 +8,7 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,7 +33,7 @@ from netspec.cli.arguments import (
     run_by,
     stages,
 )
-from netspec.cli.scores import Score, Scores, Snapshot, read_scores
+from netspec.cli.scores import Score, Scores
 from netspec.errors import SpecError
 from netspec.proto.binary import check_readable, split_paths
 from netspec.terminal.commands import DONE, FAULT, WrongUsage
@@ -140,7 +140,7 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
     """Train, and return the exit status."""
     from tqdm import tqdm
 
-    from netspec.cli.board import board, writer_class
+    from netspec.cli.callbacks import ProgressBar, board, writer_class
     from netspec.solver.processes import Lost
 
     if arguments.tensorboard and processes.is_root:
@@ -156,13 +156,12 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
         total, first = solver.param.max_iter, solver.iteration
         hidden = not sys.stderr.isatty() or not processes.is_root
         bar = tqdm(total=total, initial=first, bar_format=BAR, disable=hidden, leave=False)
-        with _sole_writer(solver) if processes.is_root else nullcontext(), bar:
-            solver.on_iteration = lambda: (bar.update(1), bar.set_postfix_str(f"loss {solver.loss:.4g}", refresh=False))
-            writes_board = arguments.tensorboard and processes.is_root
-            board_of_solver = board(solver, arguments.tensorboard) if writes_board else nullcontext()
+        with bar, ExitStack() as stack:
+            solver.callbacks.append(ProgressBar(solver, bar))
+            if arguments.tensorboard and processes.is_root:
+                solver.callbacks.append(stack.enter_context(board(solver, arguments.tensorboard)))
             try:
-                with board_of_solver:
-                    solver.solve()
+                solver.solve()
             except Lost as fault:  # reported here: torchrun ends this process as soon as signals work again
                 kept = (
                     f"the last snapshot is {solver.last_snapshot}" if solver.last_snapshot else "no snapshot was taken"
@@ -186,6 +185,7 @@ def _as_caffe() -> bool:
 
 def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | None], processes: Processes) -> Solver:
     """Return the solver, resumed where that is asked for."""
+    from netspec.cli.callbacks import ScoresFile
     from netspec.proto.text import parse_solver
     from netspec.solver.options import TrainingOptions
     from netspec.solver.solver import make_solver
@@ -204,7 +204,7 @@ def _load(arguments: argparse.Namespace, path: str, action: Callable[[], str | N
     chosen = TrainingOptions(build, gpus, arguments.nan, arguments.precision, processes, action)
     solver = make_solver(param, node, chosen, arguments.weights, arguments.snapshot)
     if arguments.scores and processes.is_root:
-        _keep_scores(solver, arguments.scores, resumed=bool(arguments.snapshot))
+        solver.callbacks.append(ScoresFile(solver, arguments.scores, resumed=bool(arguments.snapshot)))
     return solver
 
 
@@ -216,35 +216,6 @@ def _newest(prefix: str) -> Path | None:
     if found is None:
         log.logger.info(f'no snapshot to resume from with the prefix "{prefix}": the training starts')
     return found
-
-
-def _sole_writer(solver: Solver) -> AbstractContextManager[None]:
-    """Refuse a second training that would write snapshots of the same names."""
-    from netspec.files.whole_file import only_one
-
-    if not (solver.param.snapshot or solver.param.snapshot_after_train):
-        return nullcontext()
-    solver.check_prefix()
-    prefix = solver.param.snapshot_prefix
-    folder, name = os.path.split(prefix)
-    lock = os.path.join(folder, f".{name}.lock")
-    return only_one(lock, f'give each training a snapshot_prefix of its own, not "{prefix}" to both')
-
-
-def _keep_scores(solver: Solver, path: str, resumed: bool) -> None:
-    """Make the solver write its scores; a resumed training keeps the earlier ones."""
-    scores = read_scores(path).before(solver.iteration) if resumed and Path(path).exists() else Scores()
-    scores.write(path)
-
-    def tested(net: int) -> None:
-        scores.tests.append(Score(solver.iteration, net, solver.scores[net]))
-        scores.write(path)
-
-    def saved(model: str) -> None:
-        scores.snapshots.append(Snapshot(solver.iteration, model))
-        scores.write(path)
-
-    solver.on_test, solver.on_snapshot = tested, saved
 
 
 class _Signals:

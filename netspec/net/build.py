@@ -62,14 +62,13 @@ def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOpti
 
 
 def check_sources(net: NetParameter, source: SourceMap, options: BuildOptions) -> None:
-    """Raise SpecError for the first data layer of a net's ``state`` whose source does not exist.
+    """Raise SpecError for the first data layer of a filtered net whose source does not exist.
 
     Building the whole net would raise the same error, but perhaps after a long log.
     """
-    with log.silent():
-        net, source = filter_net(net, source)
-        for i, layer in enumerate(net.layer):
-            path = source_of(layer)
-            if path and not os.path.exists(path):
-                only = NetParameter(layer=[layer], state=net.state)
+    for i, layer in enumerate(net.layer):
+        path = source_of(layer)
+        if path and not os.path.exists(path):
+            only = NetParameter(layer=[layer], state=net.state)
+            with log.silent():
                 build_filtered(only, source.with_layers([source.layers[i]]), options)  # the layer raises the error

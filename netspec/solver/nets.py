@@ -5,12 +5,15 @@ Caffe: Solver::InitTrainNet, Solver::InitTestNets (src/caffe/solver.cpp)
 
 from __future__ import annotations
 
+import logging
 import os
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
+from netspec import log
 from netspec.errors import Report, SpecError, raise_fault
 from netspec.files.kinds import nearest_existing
-from netspec.graph.filter import in_state
+from netspec.graph.filter import filter_net, in_state
 from netspec.proto.schema import TEST, TRAIN, NetParameter, NetState, SolverParameter
 from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.text import parse_net
@@ -23,12 +26,22 @@ _Read = tuple[str, NetParameter, SourceMap]
 
 @dataclass(frozen=True)
 class SolverNet:
-    """A net of a solver with its ``state``, not yet filtered. ``origin`` describes its source as in Caffe's log."""
+    """A net of a solver with its ``state``. ``origin`` describes its source as in Caffe's log.
+
+    ``lines`` are what Caffe logs when the net is filtered, of a net that is.
+    """
 
     label: str
     origin: str
     net: NetParameter
     source: SourceMap
+    lines: Sequence[logging.LogRecord] = ()
+
+    def filtered(self) -> SolverNet:
+        """Return the net with only the layers of its state. Raises SpecError."""
+        with log.held_back() as lines:
+            net, source = filter_net(self.net, self.source)
+        return replace(self, net=net, source=source, lines=lines)
 
 
 def seed_of(seed: int, label: str) -> int:

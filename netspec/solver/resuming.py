@@ -5,6 +5,9 @@ Caffe: Solver::Snapshot, Solver::Restore (src/caffe/solver.cpp), SGDSolver::Rest
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +16,12 @@ import torch
 
 from netspec import log
 from netspec.errors import SpecError, Where
+from netspec.files.whole_file import only_one
 from netspec.net.extra_file import Digest
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import SolverParameter
 from netspec.solver import nets
-from netspec.solver.checks import bad_parameter, divided_sums
+from netspec.solver.checks import bad_parameter, check_prefix, divided_sums
 from netspec.solver.extra import (
     Extra,
     Settings,
@@ -41,6 +45,22 @@ class Snapshots:
     def __init__(self, training: Training, tests: Tests) -> None:
         self._training, self._tests = training, tests
 
+    @contextmanager
+    def sole_writer(self) -> Iterator[None]:
+        """Within the block, refuse another process that would write snapshots of the same names, if this one will.
+
+        Raises SpecError if there is one already, or if the snapshot_prefix is not writable.
+        """
+        training, param = self._training, self._training.param
+        if not training.is_root or not (param.snapshot or param.snapshot_after_train):
+            yield
+            return
+        check_prefix(param, training.node)
+        folder, name = os.path.split(param.snapshot_prefix)
+        lock = os.path.join(folder, f".{name}.lock")
+        with only_one(lock, f'give each training a snapshot_prefix of its own, not "{param.snapshot_prefix}" to both'):
+            yield
+
     def take(self) -> tuple[str, str]:
         """Write the weights and the state; return their paths, ``PREFIX_iter_N.caffemodel`` and ``.solverstate``.
 
@@ -55,7 +75,7 @@ class Snapshots:
         stem = f"{training.param.snapshot_prefix}_iter_{training.iteration}"
         model, state = f"{stem}.caffemodel{ending}", f"{stem}.solverstate{ending}"
         states = self._running_states()
-        if not training.options.processes.is_root:
+        if not training.is_root:
             training.last_snapshot = state
             return model, state
         log.info("solver.cpp:474" if hdf5 else "solver.cpp:464", f"Snapshotting to {form} file {model}")
@@ -81,7 +101,8 @@ class Snapshots:
             ),
         )
         training.last_snapshot = state
-        training.on_snapshot(model)
+        for callback in training.callbacks:
+            callback.on_snapshot(model)
         return model, state
 
     def _running_states(self) -> list[dict[str, dict[str, Any]]]:

@@ -75,11 +75,16 @@ class Solver(Training):
         return learning_rate(self.param, self.iteration, next_step(self.param, self.iteration, self.current_step))
 
     def solve(self) -> None:
-        """Train up to max_iter, then log the loss and test again if the settings require it."""
+        """Train up to max_iter, then log the loss and test again if the settings require it.
+
+        Raises SpecError if another process trains with the same snapshot_prefix (see Snapshots.sole_writer).
+        """
+        with self._snapshots.sole_writer():
+            self._solve()
+
+    def _solve(self) -> None:
         log.info("solver.cpp:289", f"Solving {self.net.name}")
         log.info("solver.cpp:290", f"Learning Rate Policy: {self.param.lr_policy}")
-        if self.param.snapshot_after_train:
-            self.check_prefix()
         self.step(self.param.max_iter - self.iteration)
         if self.param.snapshot_after_train and not self.is_due(self.param.snapshot):
             self.snapshot()
@@ -109,13 +114,13 @@ class Solver(Training):
         self.losses_before = ()
         self._display.begin()
         with waiting_interrupts() as interrupt:
-            for self.to_come in reversed(range(iterations)):
-                self._iterate()
+            for to_come in reversed(range(iterations)):
+                self._iterate(to_come)
                 if self.stopped:
                     return
                 interrupt()
 
-    def _iterate(self) -> None:
+    def _iterate(self, to_come: int) -> None:
         """Run one iteration, including the tests before it and the snapshot after it."""
         if self.is_due(self.param.test_interval) and (self.iteration > 0 or self.param.test_initialization):
             self.test_all()
@@ -123,23 +128,26 @@ class Solver(Training):
                 return
         for net in (self.net, *self.replicas.nets):
             net.random.begin(f"iteration {self.iteration}")
-        self.on_start()
-        loss, outputs = self._accumulate()
+        for callback in self.callbacks:
+            callback.on_start()
+        loss, outputs = self._accumulate(to_come)
         self.losses.append(loss)
         if not math.isfinite(loss):
             self.report_nan(f"the loss is {loss}")
         if self.is_due(self.param.display):
             self._display.show(outputs)
-        self.on_gradients()
+        for callback in self.callbacks:
+            callback.on_gradients_ready()
         self.apply_update()
-        self.on_iteration()
+        for callback in self.callbacks:
+            callback.on_iteration()
         request = self.options.processes.agree(self.options.action())
         if self.is_due(self.param.snapshot) or request == "snapshot":
             self.snapshot()
         if request == "stop":
             self.stopped = True
 
-    def _accumulate(self) -> tuple[float, Blobs]:
+    def _accumulate(self, to_come: int) -> tuple[float, Blobs]:
         """Sum the gradients of iter_size runs; return the mean of their losses, and the outputs of the last."""
         self.clear_gradients()
         self.replicas.clear()
@@ -148,7 +156,7 @@ class Solver(Training):
         for _ in range(self.param.iter_size):
             wanted = self.param.debug_info and self.is_due(self.param.display)
             with self.debugged(self.net) if wanted else nullcontext():
-                loss, outputs = self.forward_backward()
+                loss, outputs = self.forward_backward(to_come)
             self.replicas.backward(self.options.precision, self.scale)
             total += np.float32(loss.item())
         self._reduce()

@@ -98,6 +98,8 @@ class Tests:
     def run(self, snapshot: Callable[[], object]) -> None:
         """Run every test net for its test_iter batches with the current weights; ``snapshot`` is taken on request."""
         training = self._training
+        if not training.is_root:
+            return
         training.scores = [{} for _ in training.test_nets]
         self.states_before = tuple(running_state(net) for net in training.test_nets)
         for i in range(len(training.test_nets)):
@@ -128,7 +130,8 @@ class Tests:
             log.info("solver.cpp:401", f"Test loss: {number(tally.loss)}")
         training.scores[i] = tally.scores
         log_scores("solver.cpp:414", "Test", tally.scores, net.output_loss_weights)
-        training.on_test(i)
+        for callback in training.callbacks:
+            callback.on_test(i)
 
 
 def log_scores(site: str, phase: str, scores: Outputs, weights: dict[str, float]) -> None:

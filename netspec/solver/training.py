@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
@@ -17,7 +17,7 @@ import torch
 from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.layers.contract.context import device_of
-from netspec.net.build import build_net, check_sources
+from netspec.net.build import build_filtered, check_sources
 from netspec.net.net import Net
 from netspec.net.weights import MOST_BYTES, binary_bytes, load_weights, too_large
 from netspec.proto.binary import check_readable, split_paths
@@ -52,24 +52,40 @@ _CREATING = {
 }
 
 
+class Callback:
+    """What a training calls while it runs. A subclass replaces the methods that it needs.
+
+    Caffe: Solver::Callback (include/caffe/solver.hpp), which has the first two
+    """
+
+    def on_start(self) -> None:
+        """Called before the passes of each iteration."""
+
+    def on_gradients_ready(self) -> None:
+        """Called between the passes of an iteration and its update."""
+
+    def on_iteration(self) -> None:
+        """Called after the update of an iteration, which is counted then."""
+
+    def on_test(self, net: int) -> None:
+        """Called after a test of the test net with this number; its scores are in ``scores`` of the solver."""
+
+    def on_snapshot(self, model: str) -> None:
+        """Called after a snapshot, with the path of the weights."""
+
+
 class Training:
     """The nets, options and progress of a training, which all parts of a solver share.
 
     ``iteration`` is the number of updates done. ``net`` is the training net, and ``test_nets`` are the others.
-    ``scores`` has the mean of each output element in the last test of each test net. ``on_start()`` is called before
-    the passes of each iteration, ``on_gradients()`` before the update, ``on_iteration()`` after it, ``on_test(i)``
-    after a test of test net i, and ``on_snapshot(model)`` after a snapshot, with the path of the weights.
-    ``last_snapshot`` is the path of the last state of this run, or "".
+    ``scores`` has the mean of each output element in the last test of each test net. ``callbacks`` are called in their
+    order. ``last_snapshot`` is the path of the last state of this run, or "".
     """
 
     param: Any
     node: Position
     options: TrainingOptions
-    on_start: Callable[[], object] = staticmethod(lambda: None)
-    on_gradients: Callable[[], object] = staticmethod(lambda: None)
-    on_iteration: Callable[[], object] = staticmethod(lambda: None)
-    on_test: Callable[[int], object] = staticmethod(lambda i: None)
-    on_snapshot: Callable[[str], object] = staticmethod(lambda model: None)
+    callbacks: list[Callback]
 
     net: Net
     test_nets: list[Net]
@@ -84,18 +100,18 @@ class Training:
     losses: deque[float]
     losses_before: tuple[float, ...] = ()  # from before a training was resumed
     _reported_nan = False
-    _prefix_is_checked = False
 
     def __init__(self, param: Any, node: Position | None = None, options: TrainingOptions | None = None) -> None:
         """Build the nets of a solver from ``proto.text.parse_solver``. Raises SpecError."""
         self.param, self.node, self.options = param, node or Position(Where("<solver>")), options or TrainingOptions()
+        self.callbacks = []
         check_settings(param, self.node)
-        if param.snapshot:
-            self.check_prefix()
+        if param.snapshot and self.is_root:
+            check_prefix(param, self.node)
         check_readable(self._weights())
         with log.held_back() as lines:  # report missing files before Caffe's log, which is long
-            described = nets.solver_nets(param, self.node)
-            for part in described if self.options.processes.is_root else described[:1]:
+            filtered = [described.filtered() for described in nets.solver_nets(param, self.node)]
+            for part in filtered if self.is_root else filtered[:1]:
                 check_sources(part.net, part.source, self.options.build)
         self.devices = self._chosen_devices()
         self.device = self.devices[0]
@@ -105,21 +121,20 @@ class Training:
         self.rule = update.RULES[param.type]
         self.scores: list[Outputs] = []
         self.losses: deque[float] = deque(maxlen=param.average_loss)
-        self._build_nets(*described)
+        self._build_nets(*filtered)
         self._check_size()
         self._warn_of_settings()
         self.blocks = Blocks(self.net.learnable, self.rule.sets)
         self.scale = LossScale(self.options.precision)
 
-    def check_prefix(self) -> None:
-        """Raise SpecError for a snapshot_prefix that is not writable; only the root tries it, once."""
-        if not self._prefix_is_checked and self.options.processes.is_root:
-            check_prefix(self.param, self.node)
-            self._prefix_is_checked = True
-
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Refuse to be copied or pickled. Raises TypeError."""
         raise TypeError("a Solver cannot be copied or pickled; use snapshot() and load_solver(snapshot=...)")
+
+    @property
+    def is_root(self) -> bool:
+        """Whether this process tests and takes snapshots."""
+        return self.options.processes.is_root
 
     @property
     def history(self) -> list[torch.Tensor]:
@@ -168,7 +183,7 @@ class Training:
             log.info("solver.cpp:190", f"Creating test net (#{i}) specified by {test.origin}")
             self.test_nets.append(self.build(test, test.label, self.device))
 
-    def build(self, described: nets.SolverNet, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> Net:
+    def build(self, filtered: nets.SolverNet, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> Net:
         """Build a net and load the weights to start from.
 
         Each ``role`` has its own random numbers, except for the records: nets that train in parallel share their order.
@@ -184,7 +199,8 @@ class Training:
             accumulate_in_place=True,
             passes=(),
         )
-        net = build_net(described.net, described.source, options)
+        log.write(filtered.lines)
+        net = build_filtered(filtered.net, filtered.source, options)
         files = self._weights()
         for path in files:
             log.info("solver.cpp:72", f"Finetuning from {path}")
@@ -224,8 +240,11 @@ class Training:
         """Run a net forward; return its loss and outputs."""
         return net.forward_loss()
 
-    def forward_backward(self) -> tuple[torch.Tensor, Blobs]:
-        """Run the training net forward and backward; return its loss and outputs."""
+    def forward_backward(self, to_come: int) -> tuple[torch.Tensor, Blobs]:
+        """Run the training net forward and backward; return its loss and outputs.
+
+        ``to_come`` is the number of iterations of this call of ``step`` after the current one.
+        """
         if self.options.precision == FP32 and (done := self.net.forward_backward()):
             return done
         with computing(self.options.precision, self.device):

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from fake_gpu import GPUS, NAME, POSSIBLE, FakeTensor, fake_gpu, gpu
+from golden_cases import train
 from netspec.inspect.features.describer import Describer
 from netspec.load import load_solver
 from paths import GOLDEN
@@ -57,9 +58,7 @@ def test_training_testing_snapshots_and_resuming(
     work_in(f"train/{case}")
     solver = load_solver(f"{case}/solver.prototxt", weights=f"{case}/init.caffemodel", device=device)
     golden = np.load(f"{case}/trajectory.npz")["loss"]
-    found = []
-    solver.on_iteration = lambda: found.append(solver.loss)
-    solver.step(8)
+    found = train(solver, 8)
     record_property("losses off by", float(np.abs(found / golden[:8] - 1).max()))
     np.testing.assert_allclose(found, golden[:8], rtol=1e-3)
     assert {item.parameter.device.type for item in solver.net.learnable} == {torch.device(device).type}

@@ -24,10 +24,12 @@ from netspec.graph.options import BuildOptions
 from netspec.graph.speed import speed
 from netspec.layers.utility.python import Python
 from netspec.net import net as core
+from netspec.proto.source_map import Position
 from netspec.proto.text import parse_solver
 from netspec.solver import solver as core_solver
 from netspec.solver.nets import TRAIN_NET
 from netspec.solver.options import TrainingOptions
+from netspec.solver.training import Callback
 from netspec.solver.update import rule_faults
 
 Outputs = dict[str, torch.Tensor]
@@ -50,12 +52,17 @@ class _Training(core_solver.Solver):
             for layer in self.net.layers
         )
 
+    @property
     @override
-    def build(self, described: Any, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> core.Net:
+    def is_root(self) -> bool:
+        return mode.root_solver()
+
+    @override
+    def build(self, filtered: Any, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> core.Net:
         if role == TRAIN_NET and mode.multiprocess():
             rank, ranks = mode.solver_rank(), mode.solver_count()
             role = f"rank {rank}" if rank else role
-        return super().build(described, role, device, rank, ranks)
+        return super().build(filtered, role, device, rank, ranks)
 
     @override
     def check_inputs(self) -> None:
@@ -68,14 +75,14 @@ class _Training(core_solver.Solver):
         super().clear_gradients()
 
     @override
-    def forward_backward(self) -> tuple[torch.Tensor, Outputs]:
+    def forward_backward(self, to_come: int) -> tuple[torch.Tensor, Outputs]:
         """Run forward and backward. The blobs are filled in the last pass of several, and if ``is_watched``."""
         runner = self.shown[self.net].runner
         if not self.is_watched and not self.param.debug_info:
             passed = None
             if self._whole:
                 passed = self._whole.run()
-            elif self.to_come:  # other passes of this call of step() follow
+            elif to_come:
                 passed = self.net.forward_backward()
             if passed:
                 return passed
@@ -102,16 +109,25 @@ class _Training(core_solver.Solver):
         super().apply_update()
 
     @override
-    def test_all(self) -> None:
-        """Run the tests, in the root process only."""
-        if mode.root_solver():
-            super().test_all()
+    def snapshot(self) -> tuple[str, str]:
+        """Write a snapshot. Scripts may have written to the values."""
+        self.shown[self.net].runner.upload()
+        return super().snapshot()
+
+
+class _Functions(Callback):
+    """Two functions of a script."""
+
+    def __init__(self, on_start: Callable[[], object], on_gradients_ready: Callable[[], object]) -> None:
+        self._on_start, self._on_gradients_ready = on_start, on_gradients_ready
 
     @override
-    def snapshot(self) -> tuple[str, str]:
-        """Write a snapshot, in the root process only."""
-        self.shown[self.net].runner.upload()
-        return super().snapshot() if mode.root_solver() else ("", "")
+    def on_start(self) -> None:
+        self._on_start()
+
+    @override
+    def on_gradients_ready(self) -> None:
+        self._on_gradients_ready()
 
 
 class Solver:
@@ -127,19 +143,18 @@ class Solver:
         cls.type_name = type_name or cls.type_name
 
     def __init__(self, solver_file: FilePath) -> None:
-        solver_file = os.fsdecode(solver_file)
-        param, node = parse_solver(solver_file)
+        param, node = parse_solver(os.fsdecode(solver_file))
         if self.type_name:
             param.type = self.type_name
+        self._build(param, node)
+
+    def _build(self, param: Any, node: Position) -> None:
         with caffes_errors():
             build = BuildOptions(seed=mode.solver_seed(), allow_python=True, exact=mode.exact(), speed=speed())
             # nan: the training continues, as in Caffe; a script may check the loss itself
             options = TrainingOptions(build, [mode.device()], nan="warn")
             self._training = _Training(param, node, options)
-        self._callbacks: list[tuple[Callable[[], object], Callable[[], object]]] = []
         self._counted = False
-        self._training.on_start = lambda: self._call(0)
-        self._training.on_gradients = lambda: self._call(1)
 
     @property
     def net(self) -> Net:
@@ -209,14 +224,11 @@ class Solver:
         An object with the methods ``on_start`` and ``on_gradients_ready`` may replace both, as :class:`NCCL` does.
         """
         self._training.is_watched = True
-        whole = on_gradients_ready is None
-        self._callbacks.append(
-            (on_start.on_start, on_start.on_gradients_ready) if whole else (on_start, on_gradients_ready)
-        )
-
-    def _call(self, which: int) -> None:
-        for pair in self._callbacks:
-            pair[which]()
+        if on_gradients_ready is None:
+            functions = _Functions(on_start.on_start, on_start.on_gradients_ready)
+        else:
+            functions = _Functions(on_start, on_gradients_ready)
+        self._training.callbacks.append(functions)
 
 
 class SGDSolver(Solver, type_name="SGD"):
@@ -248,9 +260,11 @@ _SOLVERS = (SGDSolver, NesterovSolver, AdaGradSolver, RMSPropSolver, AdaDeltaSol
 
 def get_solver(solver_file: FilePath) -> Solver:
     """Return a solver of the type in the file."""
-    solver_file = os.fsdecode(solver_file)
-    param, node = parse_solver(solver_file)
+    param, node = parse_solver(os.fsdecode(solver_file))
     for fault in rule_faults(param, node):
         raise fault
     named = {cls.type_name: cls for cls in _SOLVERS}
-    return named[param.type](solver_file)
+    cls = named[param.type]
+    solver = cls.__new__(cls)
+    solver._build(param, node)
+    return solver

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from golden_cases import train
 from netspec.fast.training import TrainingStep
 from netspec.load import load_solver
 from netspec.solver.solver import Solver
@@ -36,9 +37,7 @@ def test_training_kernels_equal_autograd(tmp_path: Path, net: str, exact: str, m
         solver = made(tmp_path, NETS[net], exact, more)
         if not prepares:
             solver.net._trainer = "as by autograd"
-        losses = []
-        solver.on_iteration = lambda losses=losses, solver=solver: losses.append(solver.loss)
-        solver.step(4)
+        losses = train(solver, 4)
         outputs = {name: values.clone() for name, values in solver.net.blobs.items()}
         assert is_prepared(solver) == prepares
         weights = [item.parameter.detach().clone() for item in solver.net.learnable]

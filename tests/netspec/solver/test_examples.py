@@ -69,8 +69,8 @@ def _watched(solver: Solver, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, 
     """Return a list that gets the outputs of each training pass of a solver."""
     forward_backward, outputs = solver.forward_backward, []
 
-    def keep() -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        loss, blobs = forward_backward()
+    def keep(to_come: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        loss, blobs = forward_backward(to_come)
         outputs.append({name: blob.item() for name, blob in blobs.items()})
         return loss, blobs
 

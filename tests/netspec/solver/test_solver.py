@@ -7,15 +7,19 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from typing_extensions import override
 
 from case_files import read_cases
+from golden_cases import Losses, train
 from netspec.errors import SpecError
+from netspec.files.whole_file import only_one
 from netspec.load import load_solver
 from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter
 from netspec.solver import update
 from netspec.solver.snapshot import read_state
 from netspec.solver.solver import Solver
+from netspec.solver.training import Callback
 
 NET = """
 name: "tiny"
@@ -52,7 +56,13 @@ def weights(solver: Solver) -> list[torch.Tensor]:
 def seen_tests(solver: Solver, run: Callable[[], None]) -> list[tuple[int, int]]:
     """The (iteration, test net) of each test of a run."""
     found: list[tuple[int, int]] = []
-    solver.on_test = lambda i: found.append((solver.iteration, i))
+
+    class Seen(Callback):
+        @override
+        def on_test(self, net: int) -> None:
+            found.append((solver.iteration, net))
+
+    solver.callbacks.append(Seen())
     run()
     return found
 
@@ -86,16 +96,36 @@ def test_test_compute_loss_prints_the_mean_loss(make, caplog: pytest.LogCaptureF
     assert [float(line.split()[-1]) for line in shown] == pytest.approx(solver.scores[0]["loss"], rel=1e-4)
 
 
+# What it calls
+
+
+def test_callbacks_are_called_in_order(make) -> None:
+    """In their order, each at its time; ``iteration`` counts an update before ``on_iteration``."""
+    called: list[tuple[str, str, int]] = []
+    solver = make("snapshot: 2 test_iter: 1 test_interval: 2")
+
+    class Noted(Callback):
+        def __init__(self, name: str) -> None:
+            for method in ("on_start", "on_gradients_ready", "on_iteration", "on_test", "on_snapshot"):
+                note = lambda *_, at=method: called.append((name, at, solver.iteration))  # noqa: E731
+                setattr(self, method, note)
+
+    solver.callbacks += [Noted("first"), Noted("second")]
+    solver.step(2)
+    expected = [("on_test", 0)]
+    expected += [("on_start", 0), ("on_gradients_ready", 0), ("on_iteration", 1)]
+    expected += [("on_start", 1), ("on_gradients_ready", 1), ("on_iteration", 2), ("on_snapshot", 2)]
+    assert called == [(name, at, count) for at, count in expected for name in ("first", "second")]
+
+
 # What the loss is
 
 
 def test_the_averaged_loss_restarts_with_each_step(make):
     solver = make("average_loss: 2", net=NET.replace('type: "gaussian" std: 1 } data', "value: 2 } data"))
     single = make("", net=NET.replace('type: "gaussian" std: 1 } data', "value: 2 } data"))
-    raw, shown = [], []
-    single.on_iteration = lambda: raw.append(single.loss)
-    solver.on_iteration = lambda: shown.append(solver.loss)
-    single.step(5)
+    raw = train(single, 5)
+    shown = Losses(solver).found
     solver.step(3)
     solver.step(2)
     assert shown == pytest.approx([raw[0], (raw[0] + raw[1]) / 2, (raw[1] + raw[2]) / 2, raw[3], (raw[3] + raw[4]) / 2])
@@ -269,6 +299,15 @@ def test_the_prefix_of_the_last_snapshot_is_checked_before_training(make):
     assert solver.iteration == 0
 
 
+def test_solve_refuses_a_second_training_with_the_same_prefix(make):
+    solver = make('max_iter: 2 snapshot_prefix: "s"')
+    with only_one(".s.lock", ""), pytest.raises(SpecError, match=r'^\.s\.lock: is locked .* not "s" to both'):
+        solver.solve()
+    assert solver.iteration == 0
+    solver.solve()
+    assert not Path(".s.lock").exists()
+
+
 def test_the_check_of_the_prefix_leaves_no_file(make):
     make("snapshot: 1")
     assert sorted(path.name for path in Path().iterdir()) == ["net.prototxt", "s.prototxt"]
@@ -303,6 +342,15 @@ layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "label" top: "lo
 """
 
 
+def call_before_updates(solver: Solver, function: Callable[[], object]) -> None:
+    class Calling(Callback):
+        @override
+        def on_gradients_ready(self) -> None:
+            function()
+
+    solver.callbacks.append(Calling())
+
+
 @pytest.mark.parametrize("where", ["after the gradients", "between two updates"])
 def test_an_interrupt_waits_for_the_end_of_the_iteration(make, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
     """After Ctrl-C in Python, a training can continue as if nothing had happened."""
@@ -322,7 +370,7 @@ def test_an_interrupt_waits_for_the_end_of_the_iteration(make, monkeypatch: pyte
             signal.raise_signal(signal.SIGINT)
 
     if where == "after the gradients":
-        solver.on_gradients = interrupt
+        call_before_updates(solver, interrupt)
     else:
         move = update.move
         monkeypatch.setattr(update, "move", lambda *arguments: (move(*arguments), interrupt()))
@@ -341,7 +389,7 @@ def test_a_second_interrupt_ends_the_iteration_immediately(make) -> None:
         signal.raise_signal(signal.SIGINT)
         pytest.fail("the second one is kept too")
 
-    solver.on_gradients = interrupt_twice
+    call_before_updates(solver, interrupt_twice)
     with pytest.raises(KeyboardInterrupt):
         solver.step(1)
     assert solver.iteration == 0
@@ -353,7 +401,7 @@ def test_the_interrupt_handler_of_a_program_is_kept(make, monkeypatch: pytest.Mo
     before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
     try:
         solver = make()
-        solver.on_gradients = lambda: signal.raise_signal(signal.SIGINT)
+        call_before_updates(solver, lambda: signal.raise_signal(signal.SIGINT))
         solver.step(2)
     finally:
         signal.signal(signal.SIGINT, before)
