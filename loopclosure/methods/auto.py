@@ -61,27 +61,25 @@ class Answer:
 class Searched:
     """What the scores of compared frames tell, before any pair is verified: steps 1 to 3.
 
-    stamps    (N,) seconds of the queries of the whole drive, NaN or None where not known
-    age_said  a sentence about which pairs show different places; empty for two traverses
+    said      sentences about which pairs are candidates, and which show different places
     temporal  (N, A) the score of each query with those before it; None: not known
     """
 
-    stamps: np.ndarray | None
     given: Candidates
     lines: Lines | None
     matches: Matches
-    age_said: str
+    said: list[str]
     temporal: np.ndarray | None = None
 
     @property
     def line_scores(self) -> np.ndarray:
-        """The score of the best line of each query (N,), -inf without one."""
+        """The score of the best line of each query of the whole drive (N,), -inf without one."""
         none = np.full(len(self.given.queries), -np.inf)
-        return (none if self.lines is None else self.lines.best.targets)[self.given.stands]
+        return (none if self.lines is None else self.lines.score)[self.given.stands]
 
     @property
     def image_scores(self) -> np.ndarray:
-        """The score of the best single candidate of each query (N,), -inf without one."""
+        """The score of the best single candidate of each query of the whole drive (N,), -inf without one."""
         return self.given.best[self.given.stands]
 
 
@@ -93,7 +91,7 @@ def find_matches(compared: Compared, precision: float = PRECISION) -> Searched:
     decoys, age_said = elsewhere(given)
     lines = best_lines(given, pool(given, decoys), precision)
     before = compared.temporal if compared.two else temporal(compared.scores)
-    return Searched(compared.stamps, given, lines, Matches.of(given, lines, precision), age_said, before)
+    return Searched(given, lines, Matches.of(given, lines), [*filter(None, [given.said, age_said])], before)
 
 
 def answer(
@@ -103,7 +101,7 @@ def answer(
     worth: np.ndarray | None = None,
     progress: Progress = silent,
 ) -> Answer:
-    """Decide which best matches are loops.
+    """Decide which best matches are loops: steps 4 and 5.
 
     check, agree  verification of a query and a reference, by number; None: there are no images. A
                   :class:`~loopclosure.detector.verification.Between` leaves out what is fixed in the images
@@ -116,12 +114,12 @@ def answer(
         if worth is not None:
             rows = np.bincount(given.stands, worth, len(rows)) > 0
         geometry = Geometry.of(given, check, agree, rows)
-        verify(given, lines, matches, rows, geometry, progress)
-        visits = _visits(searched, geometry)
+        matches = verify(given, lines, matches, rows, geometry, progress)
+        visits = Visits.of(searched.temporal, geometry, given.two)
     decision = decide(matches, lines, given.scores, visits)
-    results = _results(searched, decision)
+    results = _results(given, lines, matches, decision)
     reasons = [
-        *filter(None, [given.said, searched.age_said]),
+        *searched.said,
         said.sequences(lines if matches.by_lines else None, given.far),
         said.verification(matches, geometry),
         *said.doubts(matches, decision),
@@ -130,38 +128,19 @@ def answer(
     return Answer(results, reasons)
 
 
-def _visits(searched: Searched, geometry: Geometry) -> Visits | None:
-    """Return what frames of one visit have in common; None if they cannot be compared."""
-    agree = geometry.among_queries(searched.given.two)
-    if agree is None or searched.temporal is None:
-        return None
-    return Visits(
-        searched.temporal, lambda a, b: geometry.evidence(agree(a, b)) >= 1, (geometry.common, geometry.tried)
-    )
-
-
-def _results(searched: Searched, decision: Decision) -> list[LoopResult]:
+def _results(given: Candidates, lines: Lines | None, matches: Matches, decision: Decision) -> list[LoopResult]:
     """Return the result of each query of the whole drive: that of the frame that stands for it."""
-    given, matches, stamps = searched.given, searched.matches, searched.stamps
     rejected = np.where(matches.tried, "not verified", "below threshold")
     verdicts = np.where(decision.loops, "accepted", np.where(matches.there, rejected, "no candidate")).tolist()
-    why = [said.why(row, given, matches, searched.lines, decision) for row in range(len(verdicts))]
-    results, looked_at = [], given.references[matches.match]
-    frames = places(given, matches, decision.loops).tolist()
-    for query, (row, match) in enumerate(zip(given.stands, frames, strict=True)):
-        score, inliers, verdict = float(matches.score[row]), int(matches.inliers[row]), verdicts[row]
-        stamp = np.nan if stamps is None else float(stamps[query])
+    why = [said.why(row, given, matches, lines, decision) for row in range(len(verdicts))]
+    results, found = [], places(given, matches, decision.loops).tolist()
+    for query, (row, match) in enumerate(zip(given.stands.tolist(), found, strict=True)):
+        verdict, score, inliers = verdicts[row], float(matches.score[row]), int(matches.inliers[row])
+        candidates = [(match, score)] if match >= 0 else []
+        accepted = match if verdict == "accepted" else None
+        looked_at = matches.tried[row] and given.numbers(row, int(matches.match[row])) == (query, match)
         results.append(
-            LoopResult(
-                query,
-                [(match, score)] if match >= 0 else [],
-                match if verdict == "accepted" else None,
-                verdict,
-                score,
-                inliers if inliers >= 0 and (query, match) == (given.queries[row], looked_at[row]) else None,
-                None if np.isnan(stamp) else stamp,
-                why[row],
-            )
+            LoopResult(query, candidates, accepted, verdict, score, inliers if looked_at else None, reason=why[row])
         )
     return results
 

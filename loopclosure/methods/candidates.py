@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from loopclosure.methods.base import BLOCK, earlier
+from loopclosure.methods.base import BLOCK
 from loopclosure.places.same_place import MAX_DISTANCE_M
 
 DRIFT = 0.1  # of the distance traveled: more than the usual error of odometry
@@ -26,15 +26,14 @@ MOVES = 0.9  # the quantile of differences at which the search for the usual one
 class Compared:
     """Compared frames, and other information about them.
 
-    scores   (Q, R), higher = more similar; queries and references are each in the order of time
-    allowed  (Q, R) bool: pairs that may be loops
-    two      two traverses; False: one drive, compared with itself
-    far      (Q, R) bool: pairs that are far apart by odometry; None without odometry
-    visit    for one drive: a reference is a candidate if it is more than this many frames older; None: found
-             automatically
-    stamps   (Q,) seconds of the queries, NaN or None where not known
+    scores    (Q, R), higher = more similar; queries and references are each in the order of time
+    allowed   (Q, R) bool: pairs that may be loops
+    two       two traverses; False: one drive, compared with itself
+    far       (Q, R) bool: pairs that are far apart by odometry; None without odometry
+    visit     for one drive: a reference is a candidate if it is more than this many frames older; None: found
+              automatically
     temporal  (Q, A) the score of each query with the query before it, the one before that, ...; NaN where there is
-             none. Of one drive they are found in ``scores``; None: not known
+              none. Of one drive they are found in ``scores``; None: not known
     """
 
     scores: np.ndarray
@@ -42,7 +41,6 @@ class Compared:
     two: bool
     far: np.ndarray | None = None
     visit: int | None = None
-    stamps: np.ndarray | None = None
     temporal: np.ndarray | None = None
 
 
@@ -68,10 +66,6 @@ class Candidates:
     far: np.ndarray | None = None
     said: str = ""
 
-    def known(self, queries: slice | int = slice(None)) -> np.ndarray:
-        """Return the scores of the candidates of queries (n, R), or of one query (R,), -inf for other pairs."""
-        return np.where(self.allowed[queries], self.scores[queries], -np.inf)
-
     @cached_property
     def there(self) -> np.ndarray:
         """Whether each query (Q,) has a candidate."""
@@ -80,22 +74,24 @@ class Candidates:
     @cached_property
     def single(self) -> np.ndarray:
         """The candidate (Q,) of each query with the best score; arbitrary if it has none."""
-        blocks = (slice(first, first + BLOCK) for first in range(0, len(self.queries) or 1, BLOCK))
-        return np.concatenate([self.known(block).argmax(axis=1) for block in blocks])
+        rows = zip(self.allowed, self.scores, strict=True)
+        return np.array([np.where(allowed, scores, -np.inf).argmax() for allowed, scores in rows], int)
 
     @cached_property
     def best(self) -> np.ndarray:
         """The score (Q,) of ``single``; -inf for a query that has no candidate."""
-        if not self.scores.size:
-            return np.full(len(self.queries), -np.inf)
-        return np.where(self.there, self.scores[np.arange(len(self.scores)), self.single], -np.inf)
+        best = np.full(len(self.queries), -np.inf)
+        best[self.there] = self.scores[self.there, self.single[self.there]]
+        return best
+
+    def numbers(self, query: int, reference: int) -> tuple[int, int]:
+        """Return the numbers of two frames, given by row and column, in the whole drive."""
+        return int(self.queries[query]), int(self.references[reference])
 
 
 def candidates(compared: Compared) -> Candidates:
     """Return the pairs that can be loops."""
     scores, allowed, two, far = compared.scores, compared.allowed, compared.two, compared.far
-    if not two and compared.visit is not None:
-        allowed = allowed & earlier(len(scores), compared.visit)
     queries = moved(scores)
     references = moved(scores.T) if two else queries
     stands = np.searchsorted(queries, np.arange(len(scores)), side="right") - 1
@@ -103,11 +99,12 @@ def candidates(compared: Compared) -> Candidates:
         part = np.ix_(queries, references)
         scores, allowed, far = scores[part], allowed[part], None if far is None else far[part]
     allowed, said = allowed & np.isfinite(scores), ""
+    if not two and compared.visit is not None:
+        allowed &= queries[:, None] > queries + compared.visit
+        said = f"one visit to a place lasts {compared.visit} frames, as given"
     if far is not None:
         far, allowed = allowed & far, allowed & ~far
-    if compared.visit is not None:
-        said = f"one visit to a place lasts {compared.visit} frames, as given"
-    elif not two:
+    if not two and compared.visit is None:
         back, lasted = _returned(scores, allowed, queries)
         allowed &= back
         said = f"one visit to a place lasts {np.median(lasted):.0f} frames (median), {lasted.max()} at most"
@@ -159,17 +156,17 @@ def _returned(scores: np.ndarray, allowed: np.ndarray, frames: np.ndarray) -> tu
         return allowed, np.full(count, count)
     usual = np.median(scores[allowed], overwrite_input=True)
     left, entered = np.full(count, count), np.full(count, -1)
-    for first in range(0, count - AWAY + 1, BLOCK):
-        rows = numbers[first : min(first + BLOCK, count - AWAY + 1), None]
-        # From frame i on away from frame j.
-        away = np.logical_and.reduce([scores[first + k : first + k + len(rows)] <= usual for k in range(AWAY)])
-        after, before = away & (rows > numbers), away & (rows + AWAY <= numbers)
-        left = np.where((left == count) & after.any(axis=0), first + after.argmax(axis=0), left)
-        entered = np.where(before.any(axis=0), rows[-1] - before[::-1].argmax(axis=0), entered)
+    for place, frame_scores in enumerate(scores.T):
+        differs = np.convolve(frame_scores <= usual, np.ones(AWAY, int), "valid") == AWAY
+        away = np.flatnonzero(differs)  # there and AWAY - 1 frames later
+        before, after = np.searchsorted(away, (place - AWAY, place), side="right")
+        if after < len(away):
+            left[place] = away[after]
+        if before:
+            entered[place] = away[before - 1]
     # A turn of the road ends the visit of what was straight ahead within a second: no visit is shorter than is usual.
     left = np.maximum(left, numbers + int(np.median(left - numbers)))
-    back = numbers[:, None] >= left + AWAY
-    back &= numbers < entered[:, None]
+    back = (numbers[:, None] >= left + AWAY) & (numbers < entered[:, None])
     return back, frames[np.minimum(left, count - 1)] - frames
 
 

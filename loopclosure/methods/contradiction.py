@@ -14,6 +14,8 @@ from functools import cached_property
 import numpy as np
 from scipy.special import betaln
 
+from loopclosure.methods.geometry import Geometry
+
 AGES = 100  # frames: the greatest age of a frame of the same visit
 SAMPLE = 40  # pairs of frames of one visit
 AGAINST = 0.01  # a stretch falls if the ratio of the likelihoods is less
@@ -41,6 +43,15 @@ class Visits:
     verified: Callable[[int, int], bool]
     unlike: tuple[int, int]
 
+    @classmethod
+    def of(cls, temporal: np.ndarray | None, geometry: Geometry, two: bool) -> Visits | None:
+        """Return the visits of the queries; None if these cannot be compared with one another."""
+        agree = geometry.among_queries(two)
+        if agree is None or temporal is None:
+            return None
+        unlike = int(np.count_nonzero(geometry.unlike)), len(geometry.unlike)
+        return cls(temporal, lambda a, b: geometry.evidence(agree(a, b)) >= 1, unlike)
+
     @cached_property
     def together(self) -> int:
         """How many frames in a row tell no more than one: the age at which half of the similarity has gone."""
@@ -65,9 +76,8 @@ class Visits:
         if 2 * verified >= tried:
             return False
         counts = np.array([verified, tried - verified]) / self.together
-        return _log_likelihood(counts, *self.as_similar(similarity)) - _log_likelihood(counts, *self.unlike) < np.log(
-            AGAINST
-        )
+        one, two = (_log_likelihood(counts, *seen) for seen in (self.as_similar(similarity), self.unlike))
+        return bool(one - two < np.log(AGAINST))
 
 
 def _log_likelihood(counts: np.ndarray, hits: int, tries: int) -> float:

@@ -54,79 +54,83 @@ def decide(matches: Matches, lines: Lines | None, scores: np.ndarray, visits: Vi
     if not matches.by_lines:
         return Decision(grown(sure, matches.verified, pairs), nothing, nothing, part, alike)
     found = of_lines(matches, lines, pairs)
-    fell = contradicted(found, matches.verified, matches.tried, pairs, lines.course.length)
-    fell |= fallen(found & ~fell, matches, pairs, scores, visits)
+    fell = fallen(found, matches, pairs, lines.course.length, scores, visits)
     by_line = found & ~fell
-    by_line |= between(by_line, lines.best.match, lines.course) & (matches.match == lines.best.match)
+    by_line |= between(by_line, lines.match, lines.course) & (matches.match == lines.match)
     loops = grown(by_line | (sure & ~fell), lines.near & matches.verified & ~fell, pairs)
     return Decision(loops, by_line, fell, part, alike)
 
 
 def of_lines(matches: Matches, lines: Lines, pairs: np.ndarray) -> np.ndarray:
     """Return the queries (Q,) with an accepted line, of enough on a stretch, and those next to them above chance."""
-    label = stretches(matches.line, pairs)
-    many = np.bincount(label, matches.line)[label] >= LENGTHS[0]
-    seeds = matches.line & (many | (np.bincount(label, matches.verified & matches.line)[label] > 0))
-    return grown(seeds, lines.above_decoys & (matches.match == lines.best.match), pairs)
+    found = np.zeros_like(matches.line)
+    for queries in stretches(matches.line, pairs):
+        found[queries] = len(queries) >= LENGTHS[0] or matches.verified[queries].any()
+    return grown(found, lines.above_decoys & (matches.match == lines.match), pairs)
+
+
+def fallen(
+    found: np.ndarray, matches: Matches, pairs: np.ndarray, length: int, scores: np.ndarray, visits: Visits | None
+) -> np.ndarray:
+    """Return the loops (Q,) of lines of this length that points speak against: ends of stretches, and whole ones."""
+    kept, tried = np.zeros_like(found), found & matches.tried
+    usual = float(np.mean(matches.verified[tried])) if tried.any() else 0.0
+    for queries in stretches(found, pairs):
+        queries = _up_to_verified(queries, matches, length, usual)
+        kept[queries] = not _against(queries, matches, scores, visits)
+    return found & ~kept
+
+
+def _up_to_verified(queries: np.ndarray, matches: Matches, length: int, usual: float) -> np.ndarray:
+    """Return the queries (n,) of a stretch without runs at its ends in which none is verified, though some should be.
+
+    So many should be as in the rest of the stretch, or as is ``usual`` if none is. A run longer than a line is several
+    lines, which tell enough; a shorter one may be the end of the line through the last place of a loop. Matches whose
+    verification was not tried count neither for nor against.
+    """
+
+    def missing(run: np.ndarray, share: float) -> bool:
+        return len(run) <= length and (1 - share) ** np.count_nonzero(matches.tried[run]) < UNLIKELY
+
+    verified = np.flatnonzero(matches.verified[queries])
+    if not len(verified):
+        return queries[:0] if missing(queries, usual) else queries
+    first, end = verified[0], verified[-1] + 1
+    share = len(verified) / np.count_nonzero(matches.tried[queries[first:end]])
+    first = first if missing(queries[:first], share) else 0
+    end = end if missing(queries[end:], share) else len(queries)
+    return queries[first:end]
+
+
+def _against(queries: np.ndarray, matches: Matches, scores: np.ndarray, visits: Visits | None) -> bool:
+    """Return whether points speak against all matches of a stretch, the ``queries`` (n,).
+
+    Either too few are verified for one place, or of those that are, most agree only in part.
+    """
+    tried = queries[matches.tried[queries]]
+    verified = tried[matches.verified[tried]]
+    if len(verified) >= LEAST_VERIFIED and 2 * np.count_nonzero(matches.whole[verified]) < len(verified):
+        return True
+    if visits is None or not len(tried):
+        return False
+    similarity = float(np.median(scores[tried, matches.match[tried]]))
+    return visits.contradict(similarity, len(verified), len(tried))
 
 
 def grown(loops: np.ndarray, possible: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Return loops (Q,) with those of the ``possible`` ones that are neighbors of loops, and neighbors of these."""
-    loops = loops.copy()
-    earlier, later = pairs.T
-    while True:
-        beside = np.zeros_like(loops)
-        beside[later[loops[earlier]]] = True
-        beside[earlier[loops[later]]] = True
-        more = possible & beside & ~loops
-        if not more.any():
-            return loops
-        loops |= more
+    grown = loops.copy()
+    for queries in stretches(loops | possible, pairs):
+        grown[queries] = loops[queries].any()
+    return grown
 
 
-def contradicted(
-    loops: np.ndarray, verified: np.ndarray, tried: np.ndarray, pairs: np.ndarray, length: int
-) -> np.ndarray:
-    """Return the loops (Q,) of lines that their points contradict.
-
-    These are runs of matches, at an end of a stretch or all of it, of which none is verified though so many should be:
-    at the share of the stretch that is, or of all stretches where none is. A run longer than a line is several
-    lines, which tell enough; a shorter one may be the end of the line through the last place of a loop. Matches whose
-    verification was not ``tried`` count neither for nor against.
-    """
-    stretch = stretches(loops, pairs)
-    against = np.zeros_like(loops)
-    overall = np.mean(verified[loops & tried]) if np.any(loops & tried) else 0.0
-    for number in np.unique(stretch[loops]):
-        queries = np.flatnonzero(loops & (stretch == number))
-        found = np.flatnonzero(verified[queries])
-        if len(found):
-            within = queries[found[0] : found[-1] + 1]
-            share, runs = len(found) / np.count_nonzero(tried[within]), (queries[: found[0]], queries[found[-1] + 1 :])
-        else:
-            share, runs = overall, (queries,)
-        for run in runs:
-            if len(run) <= length and (1 - share) ** np.count_nonzero(tried[run]) < UNLIKELY:
-                against[run] = True
-    return against
-
-
-def fallen(
-    loops: np.ndarray, matches: Matches, pairs: np.ndarray, scores: np.ndarray, visits: Visits | None
-) -> np.ndarray:
-    """Return the loops (Q,) of stretches whose points speak against all of it.
-
-    Either too few are verified for one place, or of those that are, most agree only in part.
-    """
-    stretch, against = stretches(loops, pairs), np.zeros_like(loops)
-    for number in np.unique(stretch[loops]):
-        queries = np.flatnonzero(loops & (stretch == number))
-        tried = queries[matches.tried[queries]]
-        verified = tried[matches.verified[tried]]
-        in_part = len(verified) >= LEAST_VERIFIED and 2 * np.count_nonzero(matches.whole[verified]) < len(verified)
-        similarity = float(np.median(scores[tried, matches.match[tried]])) if len(tried) else 0.0
-        against[queries] = in_part or (visits is not None and visits.contradict(similarity, len(verified), len(tried)))
-    return against
+def stretches(loops: np.ndarray, pairs: np.ndarray) -> list[np.ndarray]:
+    """Return the queries of each stretch of loops (Q,): loops that are neighbors, and neighbors of these."""
+    linked = pairs[loops[pairs].all(axis=1)]
+    links = coo_matrix((np.ones(len(linked)), linked.T), shape=(len(loops), len(loops)))
+    numbers, queries = connected_components(links, directed=False)[1], np.flatnonzero(loops)
+    return [queries[numbers[queries] == number] for number in np.unique(numbers[queries])]
 
 
 def between(loops: np.ndarray, match: np.ndarray, course: Course) -> np.ndarray:
@@ -141,13 +145,6 @@ def between(loops: np.ndarray, match: np.ndarray, course: Course) -> np.ndarray:
             line = match[first] + moved * np.arange(1, way) / way
             filled[first + 1 : last] = np.abs(match[first + 1 : last] - line) <= WINDOW
     return filled
-
-
-def stretches(loops: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Return the number of the stretch of each query (Q,): loops that are neighbors, or neighbors of these."""
-    linked = pairs[loops[pairs].all(axis=1)]
-    links = coo_matrix((np.ones(len(linked)), linked.T), shape=(len(loops), len(loops)))
-    return connected_components(links, directed=False)[1]
 
 
 def neighbors(match: np.ndarray, course: Course) -> np.ndarray:

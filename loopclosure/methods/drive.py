@@ -188,7 +188,7 @@ class _Comparison:
         visit = None if request.visit is None else request.visit // step
         allowed = np.ones((len(queries), len(references)), bool) if two else _earlier(stamps[::step], request.seconds)
         before = _before(detector, queries) if two else None
-        compared = Compared(_compared(detector, queries, references), allowed, two, far, visit, stamps[::step], before)
+        compared = Compared(_compared(detector, queries, references), allowed, two, far, visit, before)
         return cls(queries, references, stamps, find_matches(compared, request.precision))
 
     def decided(

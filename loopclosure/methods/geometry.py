@@ -7,6 +7,7 @@ The number of inliers that chance explains is computed for each pair from the nu
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,14 +44,12 @@ class Matches:
     few: np.ndarray
 
     @classmethod
-    def of(cls, given: Candidates, lines: Lines | None, precision: float) -> Matches:
+    def of(cls, given: Candidates, lines: Lines | None) -> Matches:
         """Return the match of each query by its line, or, where lines tell nothing, its best candidate."""
         count = len(given.queries)
         match, score, line = np.where(given.there, given.single, -1), given.best, np.zeros(count, bool)
-        if lines is not None and np.any(accepted := lines.accepted(precision)):
-            there = lines.best.match >= 0
-            match = np.where(there, lines.best.match, match)
-            score, line = np.where(there, lines.best.targets, -np.inf), accepted
+        if lines is not None and lines.loops.any():
+            match, score, line = np.where(lines.match < 0, match, lines.match), lines.score, lines.loops
         whole, few = np.zeros((2, count), bool)
         return cls(match, score, line, np.full(count, -1), np.zeros(count), whole, few)
 
@@ -81,18 +80,13 @@ class Geometry:
 
     check   the geometric check
     agree   a function: how many points of a query and a reference agree
-    common  how many dissimilar pairs agree: the stripes of a curb repeat, and a desk is in all images of it
-    points  the mean number of their points that agree, of those pairs that do not agree 0
-    tried   the number of dissimilar pairs that were examined
-    hidden  the share of the images that is ignored
+    unlike  how many points of each of some dissimilar pairs (n,) agree, 0 if chance explains them: the stripes of a
+            curb repeat, and a desk is in all images of it
     """
 
     check: GeometricCheck
     agree: Agree
-    common: int = 0
-    points: float = 0.0
-    tried: int = 0
-    hidden: float = 0.0
+    unlike: np.ndarray
 
     @classmethod
     def of(cls, given: Candidates, check: GeometricCheck, agree: Agree, rows: np.ndarray) -> Geometry:
@@ -100,18 +94,19 @@ class Geometry:
 
         rows  (Q,) bool: the queries to verify
         """
-        unlike = _numbers(given, _unlike(given, rows))
-        hidden = 0.0
+        unlike = _unlike(given, rows)
         if isinstance(agree, Between) and unlike:
-            agree = agree.without_fixed(unlike + _numbers(given, _left(given, rows)))
-            hidden = agree.hidden
-        inliers = np.array([check.enough(agree(query, reference)) for query, reference in unlike])
-        points = float(np.mean(inliers)) if len(inliers) else 0.0
-        return cls(check, agree, int(np.count_nonzero(inliers)), points, len(inliers), hidden)
+            agree = agree.without_fixed(unlike + _newest(given, rows))
+        return cls(check, agree, np.array([check.enough(agree(*pair)) for pair in unlike], int))
+
+    @property
+    def hidden(self) -> float:
+        """The share of the images that is ignored."""
+        return self.agree.hidden if isinstance(self.agree, Between) else 0.0
 
     def evidence(self, agreement: Agreement) -> float:
         """Return the inliers of an agreement divided by the number needed: against chance and dissimilar pairs."""
-        return self.check.evidence(agreement, self.points)
+        return self.check.evidence(agreement, float(self.unlike.mean()) if len(self.unlike) else 0.0)
 
     def among_queries(self, two: bool) -> Agree | None:
         """Return a function: how many points of two queries agree; None if that cannot be told of ``two`` traverses."""
@@ -120,60 +115,55 @@ class Geometry:
         return None if two else self.agree
 
 
-def _sample(numbers: np.ndarray) -> np.ndarray:
-    """Return at most ``SAMPLE`` of the numbers, evenly spread."""
-    if not len(numbers):
-        return numbers
-    return numbers[np.unique(np.linspace(0, len(numbers) - 1, SAMPLE).round().astype(int))]
-
-
-def _numbers(given: Candidates, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return pairs (row, column) by their numbers in the whole drive."""
-    return [(int(given.queries[query]), int(given.references[reference])) for query, reference in pairs]
+def _sample(queries: np.ndarray) -> np.ndarray:
+    """Return at most ``SAMPLE`` of the queries (Q,) bool, evenly spread, by number."""
+    numbers = np.flatnonzero(queries)
+    return numbers[np.unique(np.linspace(0, len(numbers) - 1, SAMPLE if len(numbers) else 0).round().astype(int))]
 
 
 def _unlike(given: Candidates, rows: np.ndarray) -> list[tuple[int, int]]:
-    """Return pairs that are dissimilar by their scores."""
-    known, pairs = given.known(), []
-    for query in _sample(np.flatnonzero(rows & (np.count_nonzero(np.isfinite(known), axis=1) >= 8))):
-        order = np.argsort(known[query], kind="stable")
-        candidates = order[np.isfinite(known[query, order])]
+    """Return the numbers of pairs that are dissimilar by their scores."""
+    pairs = []
+    for query in _sample(rows & (np.count_nonzero(given.allowed, axis=1) >= 8)).tolist():
+        candidates = np.flatnonzero(given.allowed[query])
+        order = candidates[np.argsort(given.scores[query, candidates], kind="stable")]
         # A pair from the least similar quarter of the query, of another rank for each query.
-        pairs.append((int(query), int(candidates[int(query) % max(1, len(candidates) // 4)])))
+        pairs.append(given.numbers(query, int(order[query % (len(order) // 4)])))
     return pairs
 
 
-def _left(given: Candidates, rows: np.ndarray) -> list[tuple[int, int]]:
+def _newest(given: Candidates, rows: np.ndarray) -> list[tuple[int, int]]:
     """Return queries of one drive, each with its newest candidate: most likely another place in the same light."""
-    if given.two:
-        return []
-    queries = _sample(np.flatnonzero(given.there & rows))
-    return [(int(query), int(np.flatnonzero(given.allowed[query])[-1])) for query in queries]
+    queries = [] if given.two else _sample(given.there & rows).tolist()
+    return [given.numbers(query, int(np.flatnonzero(given.allowed[query])[-1])) for query in queries]
 
 
 def verify(
-    given: Candidates, lines: Lines | None, matches: Matches, rows: np.ndarray, geometry: Geometry, progress: Progress
-) -> None:
+    given: Candidates, lines: Lines | None, found: Matches, rows: np.ndarray, geometry: Geometry, progress: Progress
+) -> Matches:
     """Verify the match of each query, or else its best single image or line, which then becomes its match.
 
     rows  (Q,) bool: the queries to verify
     """
-    there, instead, alone = np.flatnonzero(matches.there & rows), given.single, None
+    matches, second, score = deepcopy(found), given.single, given.best
     if lines is not None and matches.by_lines:
-        alone = lines.best.alone
+        score = lines.alone
     elif lines is not None:
-        instead = np.where(lines.best.match >= 0, lines.best.match, instead)
+        second = np.where(lines.match >= 0, lines.match, second)
+        score = given.scores[np.arange(len(second)), second]
+    there = np.flatnonzero(matches.there & rows).tolist()
     for query in progress(there, "verification", len(there)):
+        tried = [(int(matches.match[query]), matches.score[query])]
         # The lamps of a tunnel repeat: one verified image does not overrule an accepted sequence.
-        other = matches.match if matches.line[query] else instead
-        for reference in dict.fromkeys((int(matches.match[query]), int(other[query]))):
-            agreement = geometry.agree(int(given.queries[query]), int(given.references[reference]))
+        if not matches.line[query] and second[query] != matches.match[query]:
+            tried.append((int(second[query]), score[query]))
+        for reference, of_reference in tried:
+            agreement = geometry.agree(*given.numbers(query, reference))
             matches.inliers[query] = geometry.check.enough(agreement)
             matches.evidence[query] = geometry.evidence(agreement)
             matches.whole[query] = agreement.whole
             matches.few[query] = agreement.matches < LEAST_MATCHES
             if matches.inliers[query]:
-                if reference != matches.match[query]:
-                    matches.match[query] = reference
-                    matches.score[query] = given.scores[query, reference] if alone is None else alone[query]
+                matches.match[query], matches.score[query] = reference, of_reference
                 break
+    return matches

@@ -6,8 +6,9 @@ columns are standardized: a query that is like everything, and a pass in another
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
@@ -47,58 +48,49 @@ class Pool:
         return Pool(self.distances[:, ::-1], self.found[:, ::-1], self.decoys[:, ::-1], self.reverse)
 
 
-@dataclass(frozen=True)
-class Best:
-    """The best line of each query (Q,).
+class Best(NamedTuple):
+    """The best line of each query (n,).
 
-    match    its reference, -1 without one
-    targets  its score, -inf without one
-    alone    the score of the line through the best single image, -inf without one
-    decoys   the best score of a line elsewhere, -inf without one
-    other    the reference of that line
-    middle   the score of the middle of the line
-    chance   what such a short line scores by chance
+    match   its reference
+    score   of the line, -inf without one
+    alone   the score of the line through the best single image, -inf without one
+    decoy   the best score of a line elsewhere, -inf without one
+    other   the reference of that line
+    middle  the score of the middle of the line
+    chance  what such a short line scores by chance
     """
 
     match: np.ndarray
-    targets: np.ndarray
+    score: np.ndarray
     alone: np.ndarray
-    decoys: np.ndarray
+    decoy: np.ndarray
     other: np.ndarray
     middle: np.ndarray
     chance: np.ndarray
 
-    @classmethod
-    def joined(cls, parts: list[Best]) -> Best:
-        """Return the lines of consecutive blocks of queries as one."""
-        return cls(*(np.concatenate([getattr(part, of.name) for part in parts]) for of in fields(cls)))
-
 
 @dataclass(frozen=True)
 class Lines:
-    """What a search found.
+    """The best line of each query (Q,), as in :class:`Best`; ``match`` is -1 without one.
 
-    near  whether the place itself is on the line (Q,). Where a loop ends, the line through its last place is the best
-          one for a while
-    odds  from how many pairs a line was chosen, as a multiple of those that its decoy was chosen from
+    near   whether the place itself is on the line. Where a loop ends, the line through its last place is the best one
+           for a while
+    loops  which best matches are loops by their lines; none if they are too few to tell
     """
 
     course: Course
-    best: Best
+    match: np.ndarray
+    score: np.ndarray
+    alone: np.ndarray
+    decoy: np.ndarray
+    other: np.ndarray
     near: np.ndarray
-    odds: float
-
-    def accepted(self, precision: float) -> np.ndarray:
-        """Return which best matches (Q,) are loops by their lines; none if they are too few to tell."""
-        least = threshold(self.best.targets, self.best.decoys, precision, self.course.length / 2, self.odds)
-        accepted = self.near & (self.best.targets >= least)
-        return accepted if np.count_nonzero(accepted) >= self.course.length else np.zeros_like(accepted)
+    loops: np.ndarray
 
     @property
     def above_decoys(self) -> np.ndarray:
         """Which queries (Q,) have a line that is better than every decoy."""
-        decoys = self.best.decoys
-        return self.near & (self.best.targets > decoys.max(initial=-np.inf)) & np.isfinite(decoys).any()
+        return self.near & (self.score > self.decoy.max(initial=-np.inf)) & np.isfinite(self.decoy).any()
 
 
 def pool(given: Candidates, elsewhere: np.ndarray) -> Pool:
@@ -116,72 +108,76 @@ def _standardized(given: Candidates, which: np.ndarray) -> np.ndarray:
     return standardize(distances, usual=True)
 
 
-def courses(among: Pool, two: bool) -> Iterator[list[Course]]:
-    """Yield groups of courses, those of a group the shortest first: one speed and direction.
+def best_lines(given: Candidates, among: Pool, precision: float) -> Lines | None:
+    """Return the search that finds the most loops at this precision, the shortest lines if none finds any.
 
     One drive is passed at its own speed. Of two traverses one may be a part of the other, at any speed: the ratio of
-    their lengths is the speed only if both cover the whole route.
+    their lengths is the speed only if both cover the whole route. None if the drive is too short for lines.
     """
     queries, references = np.count_nonzero(among.decoys.any(axis=1)), among.found.shape[1]
     whole = references / max(1, len(among.found))
-    tried = [whole] if two else []
-    for speed in [*tried, 1.0, *(SPEEDS if two else ())]:
-        if speed != whole and any(VELOCITIES[0] <= speed / other <= VELOCITIES[1] for other in tried):
-            continue  # searched already
-        tried.append(speed)
-        for backwards in (False, True):
-            group = [
-                Course(length, speed, backwards)
-                for length in LENGTHS
-                if queries * references / speed >= LEAST_PIECES * length**2
-                and min(queries, references / speed) >= length
-            ]
-            if group:
-                yield group
+    usual = [1.0] if not given.two else [whole] if _same_speed(1.0, whole) else [whole, 1.0]
+    unusual = [speed for speed in SPEEDS if given.two and not any(_same_speed(speed, other) for other in usual)]
+    chosen, most, enough = None, 0, NEARLY * np.count_nonzero(given.there)
+    for speeds in (usual, unusual):
+        for speed, backwards, length in product(speeds, (False, True), LENGTHS):
+            passed = references / speed  # steps
+            if queries * passed < LEAST_PIECES * length**2 or min(queries, passed) < length:
+                continue
+            found = search(given, among, Course(length, speed, backwards), precision)
+            count = np.count_nonzero(found.loops)
+            if chosen is None or NEARLY * count > most:
+                chosen, most = found, count
+            if most and most >= enough:
+                return chosen  # no other can find more
+        if most:
+            break
+    return chosen
 
 
-def search(given: Candidates, among: Pool, course: Course) -> Lines:
-    """Find the best line of each query, and its decoy."""
+def _same_speed(one: float, other: float) -> bool:
+    """Return whether lines at one speed are searched at the other too."""
+    return VELOCITIES[0] <= one / other <= VELOCITIES[1]
+
+
+def search(given: Candidates, among: Pool, course: Course, precision: float) -> Lines:
+    """Find the best line of each query and its decoy, and which of them are loops at this precision."""
+    references = np.arange(among.found.shape[1])
     single = given.single
     if course.backwards:
-        among, single = among.backwards(), among.found.shape[1] - 1 - single
+        among, references, single = among.backwards(), references[::-1], references[::-1][single]
     blocks = [range(first, min(first + BLOCK, len(single))) for first in range(0, len(single), BLOCK)]
-    best = Best.joined([_search_rows(among, course.sequence, rows, single) for rows in blocks])
+    parts = [_search_rows(among, course.sequence, rows, single) for rows in blocks]
+    best = Best(*map(np.concatenate, zip(*parts, strict=True)))
     # A line that lies partly past the end of a loop has one wholly inside within half its length.
-    whole = maximum_filter1d(np.maximum(best.targets, best.chance), 2 * (course.length // 2) + 1)
+    whole = maximum_filter1d(np.maximum(best.score, best.chance), 2 * (course.length // 2) + 1)
     near = best.middle >= (best.chance + whole) / 2
     crossed = 2 * course.length + 1 if among.reverse else 0
     chances = np.maximum(0, among.decoys.sum(axis=1) - crossed).sum()
-    odds = max(1.0, among.found.sum() / max(1, chances))
-    targets = np.where(np.isfinite(best.decoys), best.targets, -np.inf)  # of what has no decoy nothing is known
-    match, other = best.match, best.other
-    if course.backwards:
-        match, other = (among.found.shape[1] - 1 - of for of in (match, other))
-    match = np.where(np.isneginf(targets), -1, match)
-    return Lines(course, replace(best, targets=targets, match=match, other=other), near, odds)
+    odds = max(1.0, among.found.sum() / max(1, chances))  # pairs that a line was chosen from, for each of a decoy
+    score = np.where(np.isfinite(best.decoy), best.score, -np.inf)  # of what has no decoy nothing is known
+    loops = near & (score >= threshold(score, best.decoy, precision, course.length / 2, odds))
+    if np.count_nonzero(loops) < course.length:
+        loops = np.zeros_like(loops)
+    match = np.where(np.isneginf(score), -1, references[best.match])
+    return Lines(course, match, score, best.alone, best.decoy, references[best.other], near, loops)
 
 
 def _search_rows(among: Pool, sequence: SequenceSettings, rows: range, single: np.ndarray) -> Best:
     """Return the best lines of some queries; ``single`` (Q,): the best single image of each query."""
-    reach, numbers = sequence.length, np.arange(len(rows))
-    own = _scores(among.distances, among.found, sequence, rows)
-    match = own.argmax(axis=1)
+    numbers = np.arange(len(rows))
+    scores = _scores(among.distances, among.found, sequence, rows)
+    match = scores.argmax(axis=1)
     middle = _scores(among.distances, among.found, replace(sequence, length=MIDDLE), rows)
     chance = [np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in middle]
     if among.reverse:
         decoys = _scores(among.distances[:, ::-1], among.decoys[:, ::-1], sequence, rows)[:, ::-1]
-        decoys[np.abs(np.arange(decoys.shape[1]) - match[:, None]) <= reach] = -np.inf
+        decoys[np.abs(np.arange(decoys.shape[1]) - match[:, None]) <= sequence.length] = -np.inf
     else:
         decoys = _scores(among.distances, among.decoys, sequence, rows)
-    return Best(
-        match,
-        own.max(axis=1),
-        own[numbers, single[rows.start : rows.stop]],
-        decoys.max(axis=1),
-        decoys.argmax(axis=1),
-        middle[numbers, match],
-        np.array(chance),
-    )
+    alone = scores[numbers, single[rows.start : rows.stop]]
+    decoy, other = decoys.max(axis=1), decoys.argmax(axis=1)
+    return Best(match, scores.max(axis=1), alone, decoy, other, middle[numbers, match], np.array(chance))
 
 
 def _scores(distances: np.ndarray, which: np.ndarray, sequence: SequenceSettings, rows: range) -> np.ndarray:
@@ -190,22 +186,3 @@ def _scores(distances: np.ndarray, which: np.ndarray, sequence: SequenceSettings
     window = np.where(which[first:last], distances[first:last], np.nan)
     costs = trajectory_costs(window, sequence, range(rows.start - first, rows.stop - first))
     return np.where(which[rows.start : rows.stop] & np.isfinite(costs), -costs, -np.inf)
-
-
-def best_lines(given: Candidates, among: Pool, precision: float) -> Lines | None:
-    """Return the search that finds the most loops at this precision, the shortest lines if none finds any.
-
-    None if the drive is too short for lines.
-    """
-    chosen, most, there = None, 0, np.count_nonzero(given.there)
-    for group in courses(among, given.two):
-        if group[0].speed in SPEEDS and most:
-            break
-        for course in group:
-            if most and there * NEARLY <= most:
-                return chosen  # no other can find more
-            found = search(given, among, course)
-            count = np.count_nonzero(found.accepted(precision))
-            if chosen is None or count * NEARLY > most:
-                chosen, most = found, count
-    return chosen

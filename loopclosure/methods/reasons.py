@@ -31,7 +31,7 @@ def verification(matches: Matches, geometry: Geometry | None) -> str:
     tried, same = np.count_nonzero(matches.tried), np.count_nonzero(matches.inliers > 0)
     few = np.count_nonzero(matches.few & (matches.inliers <= 0))
     unknown = f"; {few} frames cannot be verified" if few else ""
-    unlike = f"{geometry.common} of {geometry.tried} unlike pairs"
+    unlike = f"{np.count_nonzero(geometry.unlike)} of {len(geometry.unlike)} unlike pairs"
     hidden = f" ({100 * geometry.hidden:.1f} % of the image never changes, and is left out)" if geometry.hidden else ""
     return f"verification: {same} of {tried} matches and {unlike} show the same points{hidden}{unknown}"
 
@@ -82,10 +82,10 @@ def why(query: int, given: Candidates, matches: Matches, lines: Lines | None, de
         points += ", but only a part of those that match" if decision.part[query] else ""
     if lines is None or not matches.by_lines:
         return points
-    sequence = f"sequence: {lines.best.targets[query]:.2f}"
-    if np.isfinite(lines.best.decoys[query]):
-        away = abs(int(given.references[lines.best.other[query]] - given.references[matches.match[query]]))
-        sequence += f", the next best {lines.best.decoys[query]:.2f}, {away} frames away"
+    sequence = f"sequence: {lines.score[query]:.2f}"
+    if np.isfinite(lines.decoy[query]):
+        away = abs(int(given.references[lines.other[query]] - given.references[matches.match[query]]))
+        sequence += f", the next best {lines.decoy[query]:.2f}, {away} frames away"
     if decision.by_line[query]:
         return sequence
     if decision.fell[query]:

@@ -21,7 +21,7 @@ from loopclosure.methods import lines
 from loopclosure.methods.auto import answer, find_matches, places
 from loopclosure.methods.base import Images, MethodContext, MethodResult
 from loopclosure.methods.candidates import Candidates, Compared, candidates, far_apart, moved
-from loopclosure.methods.decision import between, contradicted, neighbors
+from loopclosure.methods.decision import between, fallen, neighbors
 from loopclosure.methods.decoys import floor_age
 from loopclosure.methods.geometry import Geometry, Matches
 from loopclosure.methods.named import make_method
@@ -157,24 +157,35 @@ def test_a_loop_ends_with_its_last_verified_match(elsewhere):
     assert not found.accepted[90:].any()
 
 
+def on_one_line(match, verified, tried=None):
+    """Matches that are all loops by their lines."""
+    tried = np.ones(len(match), bool) if tried is None else tried
+    nothing, points = np.zeros(len(match), bool), np.where(tried, 50 * verified, -1)
+    return Matches(match, np.ones(len(match)), match >= 0, points, 2.0 * verified, ~nothing, nothing)
+
+
+def spoken_against(matches, length):
+    """Which of the loops points speak against, where nothing is known of frames of one visit."""
+    pairs, scores = neighbors(matches.match, Course(length)), np.zeros((len(matches.match), 200))
+    return fallen(matches.line, matches, pairs, length, scores, None)
+
+
 @pytest.mark.parametrize("start", [50, 65])
 def test_the_end_of_a_line_counts_only_if_its_points_may_have_been_missed(start):
     """Up to there each match, or each fifth, is verified; after it none, for less than the length of a line."""
     match, verified = np.arange(70), np.arange(70) % 5 == 0
-    pairs, loops = neighbors(match, Course(30)), np.ones(70, bool)
     verified[start:] = False
-    every = np.ones(70, bool)
-    assert contradicted(loops, verified, every, pairs, 30).any() == (start == 50)
-    assert np.array_equal(contradicted(loops, match < start, every, pairs, 30), match >= start)
+    assert spoken_against(on_one_line(match, verified), 30).any() == (start == 50)
+    assert np.array_equal(spoken_against(on_one_line(match, match < start), 30), match >= start)
 
 
 def test_a_short_line_without_a_verified_match_counts_only_where_few_are():
     match = np.concatenate([np.arange(40), np.full(20, -1), 100 + np.arange(8)])
-    pairs, loops, numbers = neighbors(match, Course(10)), match >= 0, np.arange(68)
-    every = np.ones(68, bool)
-    assert np.array_equal(contradicted(loops, (numbers < 40), every, pairs, 10), numbers >= 60)
-    assert not contradicted(loops, (numbers < 40) & (numbers % 8 == 0), every, pairs, 10)[60:].any()
-    assert not contradicted(loops, (numbers < 40), numbers < 60, pairs, 10).any(), "none of the eight was tried"
+    numbers = np.arange(68)
+    assert np.array_equal(spoken_against(on_one_line(match, numbers < 40), 10), numbers >= 60)
+    assert not spoken_against(on_one_line(match, (numbers < 40) & (numbers % 8 == 0)), 10)[60:].any()
+    untried = on_one_line(match, numbers < 40, numbers < 60)
+    assert not spoken_against(untried, 10).any(), "none of the eight was tried"
 
 
 @pytest.mark.parametrize("jump", [0, 60])
