@@ -70,7 +70,7 @@ def forward_case(
 
     with TemporaryDirectory(prefix="bench-") as folder:
         case = Case(name, batch, Path(folder), name if name in CATALOG else twin)
-        case.prototxt.write_text(write_text(_with_batch(_deploy(name), batch)))
+        case.prototxt.write_text(write_text(with_batch(deploy_of(name), batch)))
         net = netspec.load_net(case.prototxt, "TEST", weights, seed=0)
         if weights is None:
             randomize(net)
@@ -124,7 +124,8 @@ def training_case(name: str, batch: int) -> Iterator[Case]:
         yield case
 
 
-def _deploy(name: str) -> Any:
+def deploy_of(name: str) -> Any:
+    """Return the NetParameter for deployment of a net of the catalog, or of the prototxt at this path."""
     from netspec.proto.text import read_net
 
     if name in ZOO:
@@ -153,7 +154,8 @@ def record(name: str) -> tuple[tuple[int, int, int], int]:
     return (6, size, size), 2
 
 
-def _with_batch(message: Any, batch: int) -> Any:
+def with_batch(message: Any, batch: int) -> Any:
+    """Return a NetParameter after setting the batch size of its inputs."""
     for layer in message.layer:
         if layer.type == "Input":
             for shape in layer.input_param.shape:

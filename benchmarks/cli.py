@@ -42,6 +42,7 @@ def parser() -> Parser:
     _add_small(commands)
     _add_start(commands)
     _add_whole(commands)
+    _add_fast(commands)
     _add_waiting(commands)
     _add_growth(commands)
     _add_feeding(commands)
@@ -352,6 +353,32 @@ def _whole(arguments: argparse.Namespace) -> None:
         return measure(arguments.names or WHOLE, How(arguments.threads, arguments.rounds, separate_python))
 
     _report(arguments, rows)
+
+
+def _add_fast(commands: Commands) -> None:
+    parser = commands.add_parser("fast", help="time nets with and without each part of netspec/fast, in one thread")
+    parser.set_defaults(function=_fast)
+    parser.add_argument(
+        "nets", nargs="*", metavar="NET", help="nets of the catalog, or prototxts (default: nets that people run)"
+    )
+    parser.add_argument("--pairs", type=int, default=21, help="most pairs of turns for each part (default: 21)")
+    parser.add_argument(
+        "--seconds", type=float, default=8, help="time limit for each part; 5 pairs are run (default: 8)"
+    )
+    _add_json(parser)
+
+
+def _fast(arguments: argparse.Namespace) -> None:
+    import torch
+
+    from benchmarks import fast
+
+    torch.set_num_threads(1)
+    rows: list[dict[str, Any]] = []
+    for row in fast.measure(arguments.nets, fast.Limits(arguments.pairs, arguments.seconds)):
+        print("{what} {net} {batch}: {part} {CPU ms:.3g} ms, {without / with:.3f}".format(**row), flush=True)
+        rows.append(row)
+        _keep(arguments, rows)
 
 
 def _compare(

@@ -94,14 +94,14 @@ def _prepared(name: str) -> Iterator[dict[str, Any]]:
         task: dict[str, Any] = {"folder": str(folder), "files": files, "image": files[0]}
         if name == "mtcnn":
             heads = {net: [f"head{k}" for k in range(2, 2 + len(widths))] for net, widths in HEADS.items()}
-            yield {**task, "heads": heads, "nets": {net: _net(folder, net, mtcnn(net)) for net in HEADS}}
+            yield {**task, "heads": heads, "nets": {net: net_files(folder, net, mtcnn(net)) for net in HEADS}}
         elif name == "ssd300":
-            yield {**task, "nets": {name: _net(folder, name, ssd300(), _like_trained)}}
+            yield {**task, "nets": {name: net_files(folder, name, ssd300(), like_trained)}}
         else:
             from netspec.proto.text import write_text
 
             text = write_text(deploy("squeezenet"))
-            yield {**task, "nets": {"squeezenet": _net(folder, "squeezenet", text)}}
+            yield {**task, "nets": {"squeezenet": net_files(folder, "squeezenet", text)}}
 
 
 def _training(case: Case) -> dict[str, Any]:
@@ -123,7 +123,9 @@ def _pictures(folder: Path, count: int) -> list[str]:
     return files
 
 
-def _net(folder: Path, name: str, text: str, finish: Callable[[Any, dict[str, Any]], None] = calm) -> tuple[str, str]:
+def net_files(
+    folder: Path, name: str, text: str, finish: Callable[[Any, dict[str, Any]], None] = calm
+) -> tuple[str, str]:
     """Write a net with random weights; return the paths of the prototxt and of the weights."""
     import netspec
 
@@ -137,7 +139,7 @@ def _net(folder: Path, name: str, text: str, finish: Callable[[Any, dict[str, An
     return str(prototxt), str(caffemodel)
 
 
-def _like_trained(net: Any, inputs: dict[str, Any]) -> None:
+def like_trained(net: Any, inputs: dict[str, Any]) -> None:
     """Scale the heads of SSD so that most places show the background, and about a hundredth of the scores count."""
     import torch
 

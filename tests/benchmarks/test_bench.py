@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import netspec
-from benchmarks import environment, feeding, growth, whole
+from benchmarks import environment, fast, feeding, growth, whole
 from benchmarks.cli import WHOLE, main
 from benchmarks.detectors import ssd300
 from benchmarks.report import Row, table
@@ -110,6 +110,22 @@ def test_forward_passes_are_compared(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert written["machine"]["cores"] > 0
     assert written["date"] > "2026"
     assert written["command"].startswith("tools/bench forward lenet --with netspec")
+
+
+@pytest.mark.slow
+def test_parts_of_fast_are_timed_with_and_without(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fast, "TRAINING", {"tiny": 2})
+    monkeypatch.setattr(fast, "TURN_S", 0)
+    out = tmp_path / "fast.json"
+    assert main(["fast", "pnet", "tiny", "--pairs", "1", "--json", str(out)]) == 0
+    rows = json.loads(out.read_text())["rows"]
+    found = {(row["what"], row["net"], row["kind"], row["part"]) for row in rows}
+    assert found >= {("forward", "pnet", "kernel", "PReLU"), ("training", "tiny", "kernel", "InnerProduct")}
+    assert {part for _, net, kind, part in found if (net, kind) == ("pnet", "pass")} >= {"fold", "pack", "all of fast"}
+    assert all(row["CPU ms"] > 0 and row["without / with"] > 0 for row in rows)
+    assert "training tiny 2: all of fast " in capsys.readouterr().out
 
 
 @pytest.mark.slow
