@@ -126,13 +126,17 @@ def vector_product(weight: torch.Tensor, bias: torch.Tensor | None) -> Callable[
     """Return a function that multiplies one vector (1, K) with weights (num_output, K), on several threads.
 
     Torch uses one thread, which cannot read large weights at the full speed of memory. Here the rows of the weights are
-    divided into parts, one for each thread. The result has the same bits if each part begins at a multiple of four
-    rows, because MKL sums up four rows at a time. This is checked with an example first.
+    divided into parts, one or two for each thread. Every part begins at a multiple of four rows, because BLAS sums up
+    several rows at a time. In which order it adds is its own choice in either way, as in every product that is not
+    exact (netspec/exact).
     """
     count, length = weight.shape
-    same_bits: dict[int, bool] = {}  # by number of parts
 
-    def divided(vector: torch.Tensor, parts: int) -> torch.Tensor:
+    def kernel(vector: torch.Tensor) -> torch.Tensor:
+        threads = torch.get_num_threads()
+        parts = min(2 * threads, count // _LEAST_ROWS)
+        if threads == 1 or parts < 2:
+            return F.linear(vector, weight, bias)
         step = count // (4 * parts) * 4
         # The last part has more rows. All parts compute as many, and the others' surplus is dropped.
         rows_of_last = count - (parts - 1) * step
@@ -140,14 +144,6 @@ def vector_product(weight: torch.Tensor, bias: torch.Tensor | None) -> Callable[
         found = torch.bmm(vector.expand(parts, 1, length), rows)[:, 0]
         top = torch.cat([found[:-1, :step].reshape(-1), found[-1]]).view(1, count)
         return top if bias is None else top.add_(bias)
-
-    def kernel(vector: torch.Tensor) -> torch.Tensor:
-        threads = torch.get_num_threads()
-        parts = min(2 * threads, count // _LEAST_ROWS) if threads > 1 else 1
-        if parts > 1 and parts not in same_bits:
-            probe = torch.linspace(-1, 1, length).view(1, length)
-            same_bits[parts] = torch.equal(divided(probe, parts), F.linear(probe, weight, bias))
-        return divided(vector, parts) if same_bits.get(parts) else F.linear(vector, weight, bias)
 
     by_mkl = torch.backends.mkl.is_available() and suits(weight) and weight.is_contiguous()
     if by_mkl and weight.numel() >= _LEAST_DIVIDED:
