@@ -96,7 +96,12 @@ class Prepared:
         self._seen: dict[int, Seen] = {}
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
-        """Run the net on the values ``given``. Return None if torch records gradients or a graph.
+        """Run the net on the values ``given``. Return None if torch records gradients or a graph."""
+        found = self.run_in_any_layout(given, kept)
+        return found and (found[0], {v: value.contiguous() for v, value in found[1].items()})
+
+    def run_in_any_layout(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
+        """Run the net like :meth:`run`. The returned values may be in channels_last, as kernels make them.
 
         Layers without bottoms run first, because the shapes of records are known only after data layers have run.
         """
@@ -109,7 +114,7 @@ class Prepared:
             term = walk(sequence.steps, values, self._exact)
         origin = sequence.schedule.origin
         loss = term if loss is None else loss if term is None else loss + term
-        return loss, {v: values[origin[v]].contiguous() for v in kept}
+        return loss, {v: values[origin[v]] for v in kept}
 
     def sequence_for(self, given: tuple[Given, ...], kept: frozenset[int]) -> KernelSequence:
         """Return the kernels for values of these shapes and types. Make them if there are none, or if blobs changed."""

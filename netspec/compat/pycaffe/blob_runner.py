@@ -190,7 +190,7 @@ class BlobRunner:
         """Run the whole net with prepared kernels (netspec/fast/prepared.py), and put the results into the blobs."""
         assert self.net.prepared is not None
         given = {v: self.blobs[b].data_memory.tensor(self.blobs[b].shape) for v, b in self._inputs}
-        found = self.net.prepared.run(given, self._final_values)
+        found = self.net.prepared.run_in_any_layout(given, self._final_values)
         assert found is not None, "a pass of pycaffe records no gradients"
         loss, values = found
         taken = storages(list(given.values())) if self._hand_on else set[int]()

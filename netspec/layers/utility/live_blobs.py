@@ -1,8 +1,8 @@
 """Blobs for pycaffe: ``data`` and ``diff`` are numpy views of memory that is kept from pass to pass.
 
 The memory grows and never shrinks: a blob of a smaller shape uses its front. A view shows what the next pass writes.
-Copying every blob into that memory would slow down each pass. So a tensor that a layer returns is kept, and it is only
-copied, or becomes the memory itself, when a view is needed.
+Copying every blob into that memory would slow down each pass. So a tensor that a layer returns is kept as it is, also
+in channels_last. It is only copied, or becomes the memory itself, when a view is needed.
 
 Caffe: include/caffe/blob.hpp, src/caffe/syncedmem.cpp, python/caffe/_caffe.cpp
 """
@@ -69,6 +69,7 @@ class Memory:
     def holder(self, count: int) -> torch.Tensor:
         """Return the tensor that holds the first ``count`` numbers. They have not moved while it is the same tensor."""
         if self._fresh is not None and self._fresh.numel() == count:
+            self._fresh = self._fresh.contiguous()
             return self._fresh
         flat = self._settled(count)
         if self.device.type == "cpu":
@@ -87,7 +88,7 @@ class Memory:
             self._fresh = None
             write(self._flat, tensor)
         else:
-            self._fresh = tensor.contiguous()
+            self._fresh = tensor
             if self._seen() is None:
                 self._flat = None
 
@@ -110,9 +111,11 @@ class Memory:
         self.reserve(count)
         fresh, self._fresh = self._fresh, None
         if self._flat is None:
-            if fresh is not None and self._is_all(fresh):
-                self._flat = fresh.detach().view(-1)
-                return self._flat
+            if fresh is not None:
+                fresh = fresh.contiguous()
+                if self._is_all(fresh):
+                    self._flat = fresh.detach().view(-1)
+                    return self._flat
             self._flat = torch.zeros(self.capacity, dtype=self.dtype)
         if fresh is not None:
             write(self._flat, fresh)

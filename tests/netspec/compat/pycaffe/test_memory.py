@@ -37,6 +37,39 @@ def test_outputs_are_views_that_the_next_pass_changes(net_of: Callable[..., caff
     assert np.shares_memory(first, second)
 
 
+LARGE = """
+input: "data" input_shape { dim: 2 dim: 16 dim: 24 dim: 24 }
+layer { name: "conv" type: "Convolution" bottom: "data" top: "conv"
+  convolution_param { num_output: 32 kernel_size: 3 weight_filler { type: "msra" } } }
+layer { name: "pool" type: "Pooling" bottom: "conv" top: "pool" pooling_param { kernel_size: 2 stride: 2 } }
+layer { name: "flat" type: "Flatten" bottom: "pool" top: "flat" }
+"""
+
+
+def test_blobs_that_kernels_make_in_channels_last_are_caffes_arrays(net_of: Callable[..., caffe.Net]) -> None:
+    """Such blobs are only copied when they are read: at once, in a later pass, or by a layer that runs alone."""
+    net = net_of(LARGE)
+    core = netspec.load_net("net.prototxt")
+    for mine, params in zip(net.params.values(), core.params.values(), strict=True):
+        for blob, parameter in zip(mine, params, strict=True):
+            blob.data[...] = parameter.detach().numpy()
+    core.keep, views = "all", dict[str, np.ndarray]()
+    for seed in range(3):
+        data = np.random.default_rng(seed).standard_normal((2, 16, 24, 24), np.float32)
+        with torch.no_grad():
+            core(data=data)
+        net.forward(data=data)
+        if seed == 1:
+            views = {name: blob.data for name, blob in net.blobs.items()}
+            assert all(view.flags.c_contiguous for view in views.values())
+        for name, view in views.items():
+            np.testing.assert_array_equal(view, core.blobs[name])
+    again = net_of(LARGE)
+    again.share_with(net)
+    again.forward(data=net.blobs["data"].data)
+    np.testing.assert_array_equal(again.forward(start="pool", end="pool")["pool"], views["pool"])
+
+
 def test_smaller_shapes_use_the_start_of_the_memory(net_of: Callable[..., caffe.Net]) -> None:
     """A public MTCNN demo keeps the outputs of all scales: the last one overwrites the front of the others."""
     net = net_of(PYRAMID)
