@@ -284,18 +284,6 @@ def test_im2col_gradient_is_the_derivative(build, gradcheck) -> None:
     gradcheck(layer, torch.randn(2, 2, 6, 5))
 
 
-def test_an_empty_top_and_bottoms_of_different_shapes_are_refused(build) -> None:
-    text = 'type: "{}" convolution_param {{ num_output: 1 {} }}'
-    with pytest.raises(SpecError, match=r"^convolution_param: the filter does not fit: .*a map of 0 x 3 "):
-        build(text.format("Convolution", "kernel_size: 4"), (1, 1, 3, 6))
-    with pytest.raises(SpecError, match="does not fit"):
-        build(text.format("Deconvolution", "kernel_size: 1 pad: 2"), (1, 1, 4, 4))
-    with pytest.raises(SpecError, match=r"^bottom\.1: all bottoms must have the same shape"):
-        build(text.format("Convolution", "kernel_size: 1"), (1, 1, 4, 4), (1, 1, 4, 5), tops=2)
-    with pytest.raises(SpecError, match="1 top blob"):
-        build(text.format("Convolution", "kernel_size: 1"), (1, 1, 4, 4), (1, 1, 4, 4))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "window"),

@@ -51,11 +51,3 @@ layer {{ name: "it" type: "Reduction" bottom: "x" top: "y" reduction_param {{ ax
     found = net(x=torch.zeros(2, 0))["y"]
     assert torch.equal(found.isnan(), torch.tensor([operation == "MEAN"] * 2))
     assert torch.equal(found.nan_to_num(), torch.zeros(2))
-
-
-def test_spp_refuses_maps_without_pixels(net_of: Callable[..., Net]) -> None:
-    with pytest.raises(ValueError, match="found maps of 0 x 4 pixels, expected at least one"):
-        net_of("""
-layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 dim: 3 dim: 0 dim: 4 } } }
-layer { name: "it" type: "SPP" bottom: "x" top: "y" spp_param { pyramid_height: 2 } }
-""")
