@@ -17,7 +17,6 @@ from netspec.terminal.parser import Commands, Parser
 
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
 FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe", "memory")
-SMALL, PROGRAMS_FOR_SMALL = ("tiny", "lenet", "cifar10_quick", "pnet"), ("netspec", "pycaffe", "pytorch")
 WHOLE = ("mtcnn", "ssd300", "files", "classifier", "training", "start")
 TRAINING = (
     *("netspec", "netspec-bf16", "pycaffe"),
@@ -39,11 +38,8 @@ def parser() -> Parser:
     commands = Commands(made, log_level=logging.WARNING)
     _add_forward(commands)
     _add_train(commands)
-    _add_small(commands)
-    _add_start(commands)
     _add_whole(commands)
     _add_fast(commands)
-    _add_waiting(commands)
     _add_growth(commands)
     _add_feeding(commands)
     _add_settings(commands)
@@ -76,12 +72,6 @@ def _add_nets(parser: argparse.ArgumentParser) -> None:
 def _add_nets_or_prototxts(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list), or a prototxt")
     parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
-
-
-def _add_plot(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--plot", metavar="FILE", help="draw the ratios of netspec's times to the others', as .png or .svg"
-    )
 
 
 def _add_programs(parser: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
@@ -199,7 +189,6 @@ def _add_forward(commands: Commands) -> None:
     _add_nets_or_prototxts(parser)
     parser.add_argument("--twin", help="net of the catalog whose PyTorch version the prototxt equals")
     _add_common(parser, FORWARD, (*ENGINES, "pytorch", "opencv4"))
-    _add_plot(parser)
 
 
 def _forward(arguments: argparse.Namespace) -> None:
@@ -217,7 +206,6 @@ def _add_train(commands: Commands) -> None:
     parser.set_defaults(function=_train)
     _add_nets(parser)
     _add_common(parser, TRAINING, ("netspec", "pytorch"))
-    _add_plot(parser)
     parser.add_argument("--device", default="cpu", help="torch device for netspec and pytorch (default: cpu)")
 
 
@@ -227,50 +215,6 @@ def _train(arguments: argparse.Namespace) -> None:
     if arguments.device != "cpu" and ("pycaffe" in arguments.programs or arguments.caffe):
         raise WrongUsage("only netspec and pytorch can be timed on a device other than the CPU")
     _compare(arguments, training_case, training=True, device=arguments.device)
-
-
-def _add_small(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "small", help="time small nets at several batch sizes: training iterations, then forward passes"
-    )
-    parser.set_defaults(function=_small)
-    parser.add_argument(
-        "nets", nargs="*", metavar="NET", default=SMALL, help=f"nets of the catalog (default: {' '.join(SMALL)})"
-    )
-    _add_common(parser, PROGRAMS_FOR_SMALL, PROGRAMS_FOR_SMALL)
-    parser.set_defaults(batch=[1, 4, 16, 64])
-
-
-def _small(arguments: argparse.Namespace) -> None:
-    from benchmarks.case import forward_case, training_case
-
-    print("training")
-    trained = _compare(arguments, training_case, training=True)
-    print("\nforward")
-    _compare(arguments, partial(forward_case, onnx=False), training=False, before=trained)
-
-
-def _add_waiting(commands: Commands) -> None:
-    parser = commands.add_parser("waiting", help="time two simultaneous trainings under several OpenMP wait settings")
-    parser.set_defaults(function=_waiting)
-    _add_nets(parser)
-    parser.add_argument(
-        "--waits",
-        nargs="+",
-        default=["", "OMP_WAIT_POLICY=PASSIVE", "GOMP_SPINCOUNT=2000"],
-        metavar="VARIABLE=VALUE",
-        help="settings to compare",
-    )
-    parser.add_argument("--batch", type=int, default=32, help="batch size (default: 32)")
-    parser.add_argument("--threads", type=int, default=2, help="threads of each training (default: 2)")
-    parser.add_argument("--rounds", type=int, default=7, help="number of rounds (default: 7)")
-
-
-def _waiting(arguments: argparse.Namespace) -> None:
-    from benchmarks.waiting import compare
-
-    for name in arguments.nets:
-        compare(name, arguments.waits, arguments.batch, arguments.threads, arguments.rounds)
 
 
 def _add_feeding(commands: Commands) -> None:
@@ -316,25 +260,6 @@ def _keep(arguments: argparse.Namespace, rows: Sequence[Any], described: Any = N
 
     if arguments.json:
         results.write(arguments.json, rows, arguments.words, described)
-
-
-def _add_start(commands: Commands) -> None:
-    parser = commands.add_parser("start", help="time processes that load a net and describe one image")
-    parser.set_defaults(function=_start)
-    _add_nets_or_prototxts(parser)
-    _add_programs(parser, (*ENGINES, "opencv4"), (*ENGINES[:3], "opencv4"))
-
-
-def _start(arguments: argparse.Namespace) -> None:
-    from benchmarks.case import forward_case
-    from benchmarks.compare import starts_of
-
-    def rows(separate_python: str | None) -> Iterator[list[Row]]:
-        for name in arguments.nets:
-            with forward_case(name, 1, arguments.weights, onnx=False) as case:
-                yield starts_of(case, arguments.programs, separate_python, arguments.rounds)
-
-    _report(arguments, rows)
 
 
 def _add_whole(commands: Commands) -> None:
@@ -386,8 +311,7 @@ def _compare(
     case_of: Callable[[str, int], Any],
     training: bool,
     device: str = "cpu",
-    before: Sequence[Row] = (),
-) -> list[Row]:
+) -> None:
     from benchmarks.compare import Comparison, rows_of
 
     def rows(separate_python: str | None) -> Iterator[list[Row]]:
@@ -400,21 +324,16 @@ def _compare(
                     for threads in arguments.threads:
                         yield rows_of(case, threads, how)
 
-    return _report(arguments, rows, before)
+    _report(arguments, rows)
 
 
-def _report(
-    arguments: argparse.Namespace, rows_of: Callable[[str | None], Iterator[list[Row]]], before: Sequence[Row] = ()
-) -> list[Row]:
-    """Print a table for each list of rows, and the programs that could not run; write and return all rows.
-
-    ``before``: rows that were measured earlier, for the same output files.
-    """
+def _report(arguments: argparse.Namespace, rows_of: Callable[[str | None], Iterator[list[Row]]]) -> None:
+    """Print a table for each list of rows, and the programs that could not run; write all rows."""
     from benchmarks import environment, report, results
     from benchmarks.compare import IN_SEPARATE_ENVIRONMENT
 
     separate_python = environment.python() if set(arguments.programs) & set(IN_SEPARATE_ENVIRONMENT) else None
-    described, rows = results.machine(separate_python), list(before)
+    described, rows = results.machine(separate_python), []
     for found in rows_of(separate_python):
         rows += found
         print(report.table(found), flush=True)
@@ -422,6 +341,3 @@ def _report(
             if row.fault:
                 print(f"{row.name}: {row.fault}", file=sys.stderr)
         _keep(arguments, [report.columns(row) for row in rows], described)
-    if getattr(arguments, "plot", None):
-        report.draw(arguments.plot, rows)
-    return rows

@@ -8,11 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from benchmarks.case import DECAY, MOMENTUM, RATE, Case
 from benchmarks.report import REFERENCES, Row
-from benchmarks.rounds import CaffeProgram, Contestant, Pass, Starter, Worker, difference, measure, ratio
+from benchmarks.rounds import CaffeProgram, Contestant, Pass, Worker, difference, measure, ratio
 
 IN_SEPARATE_ENVIRONMENT = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")
 
@@ -45,20 +43,14 @@ def rows_of(case: Case, threads: int, how: Comparison) -> list[Row]:
     contestants = [_worker(case, program, task, suffix, how.separate_python) for program in how.programs]
     if how.caffe:
         contestants.append(CaffeProgram(how.caffe, task, training=how.training))
-    return _rows(case, threads, contestants, how.rounds, "training" if how.training else "forward", how.limit)
-
-
-def _rows(
-    case: Case, threads: int, contestants: Sequence[Contestant], rounds: int, what: str, limit: float = math.inf
-) -> list[Row]:
     able = [one for one in contestants if not one.fault]
     try:
-        times = measure(able, rounds, lambda k: _show_progress(case, threads, k, rounds), limit)
+        times = measure(able, how.rounds, lambda k: _show_progress(case, threads, k, how.rounds), how.limit)
     finally:
         for one in contestants:
             one.close()
-    _show_progress(case, threads, rounds, rounds)
-    return rows_of_times(case, threads, contestants, times, what)
+    _show_progress(case, threads, how.rounds, how.rounds)
+    return rows_of_times(case, threads, contestants, times, "training" if how.training else "forward")
 
 
 def rows_of_times(
@@ -119,22 +111,6 @@ def parts(program: str) -> tuple[str, dict[str, str]]:
 def python_of(program: str, separate_python: str | None) -> str:
     """Return the path of the Python that has the library that a program needs."""
     return separate_python if separate_python and program in IN_SEPARATE_ENVIRONMENT else sys.executable
-
-
-def starts_of(case: Case, programs: Sequence[str], separate_python: str | None, rounds: int) -> list[Row]:
-    """Return a row for each program: the seconds of a process that loads the net and describes one image."""
-    import cv2
-
-    image = case.folder / "image.png"
-    with np.load(case.inputs) as arrays:
-        shape = arrays[arrays.files[0]].shape
-    cv2.imwrite(str(image), np.random.default_rng(0).integers(0, 256, (*shape[2:], 3), np.uint8))
-    task = {**task_of(case, 0), "image": str(image), "shape": shape}
-    contestants: list[Contestant] = []
-    for program in programs:
-        name, options = parts(program)
-        contestants.append(Starter(program, python_of(program, separate_python), {**task, **options, "program": name}))
-    return _rows(case, 0, contestants, rounds, "start")
 
 
 class _Absent:

@@ -1,4 +1,4 @@
-"""Prints and draws the results of a benchmark."""
+"""Prints the results of a benchmark."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 REFERENCES = ("pytorch", "opencv4", "caffe")
@@ -18,7 +17,7 @@ class Row:
 
     ``seconds`` (wall clock) and ``computing`` (CPU time of all threads) are times of a pass, one per round. ``ratios``
     and ``spent`` are their ratios to the references. ``peak`` is the peak memory of the process in MB. ``what`` was
-    timed: "forward", "training", "start" or "program".
+    timed: "forward", "training" or "program".
     """
 
     net: str
@@ -67,35 +66,3 @@ def _cell(name: str, value: Any) -> str:
         return "-"
     form = {"MB": ".0f", "off by": ".0e"}.get(name, ".2f")
     return f"{value:{form}}" if isinstance(value, float) else str(value)
-
-
-def draw(path: str | Path, rows: Sequence[Row], program: str = "netspec") -> None:
-    """Draw the CPU time of one program, divided by that of each reference: a row for each net and batch.
-
-    The suffix of the name is .png or .svg. Rows without a ratio are left out.
-    """
-    from matplotlib.figure import Figure
-
-    from netspec.files.figures import COLORS, GRID, PALE
-    from netspec.inspect.draw.style import write_figure
-
-    shown = [row for row in rows if row.name == program and row.spent]
-    figure = Figure(figsize=(7.2, 1.0 + 0.21 * max(1, len(shown))), layout="constrained")
-    axis = figure.add_subplot()
-    for name, color, mark in zip(REFERENCES, COLORS, "oD^", strict=False):
-        found = [(row.spent[name], k) for k, row in enumerate(shown) if name in row.spent]
-        if found:
-            axis.plot(*zip(*found, strict=True), mark, color=color, label=f"CPU time / {name}'s", clip_on=False)
-    axis.axvline(1, color=PALE, linewidth=1)
-    several = len({row.threads for row in shown}) > 1
-    labels = [f"{row.net}, batch {row.batch}{f', {row.threads} threads' if several else ''}" for row in shown]
-    axis.set_yticks(range(len(shown)), labels, fontsize=8)
-    axis.set(xscale="log", ylim=(len(shown) - 0.5, -0.5))
-    ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if axis.get_xlim()[0] <= tick <= axis.get_xlim()[1]]
-    axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    axis.minorticks_off()
-    axis.grid(axis="y", color=GRID)
-    axis.set_axisbelow(True)
-    axis.set_title(f"{program}: left of 1 is faster", fontsize=9, loc="left")
-    figure.legend(fontsize=8, frameon=False, loc="outside lower center", ncols=3)
-    write_figure(figure, path)

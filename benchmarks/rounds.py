@@ -76,22 +76,14 @@ class Worker:
             with np.load(result) as arrays:
                 self.outputs = {key: arrays[key] for key in arrays.files}
 
-    def tell(self, passes: int) -> None:
-        """Start ``passes`` passes."""
+    def turn(self, passes: int) -> list[Pass]:
+        """See :class:`Contestant`."""
         assert self.process.stdin is not None
         print(passes, file=self.process.stdin, flush=True)
-
-    def answer(self) -> list[Pass]:
-        """Wait for the passes and return their times."""
         answer = self._read_line()
         if isinstance(answer, dict):
             raise SpecError(f"{self.name}: {answer['fault']}")
         return [(clock, computing) for clock, computing in answer]
-
-    def turn(self, passes: int) -> list[Pass]:
-        """See :class:`Contestant`."""
-        self.tell(passes)
-        return self.answer()
 
     def close(self) -> None:
         """See :class:`Contestant`."""
@@ -115,42 +107,6 @@ def _peak(process: int) -> float | None:
     path = Path(f"/proc/{process}/status")
     found = re.search(r"VmHWM:\s+(\d+) kB", path.read_text()) if path.is_file() else None
     return int(found[1]) / 1e3 * 1.024 if found else None
-
-
-class Starter:
-    """Processes of benchmarks/start.py, one after the other; the time of importing torch is subtracted."""
-
-    peak: float | None = None
-
-    def __init__(self, name: str, python: str, task: Mapping[str, Any]) -> None:
-        self.name, self.fault = name, ""
-        self.outputs: dict[str, np.ndarray] = {}
-        result = Path(task["folder"]) / f"{name}.npz"
-        self._command = [python, "-m", "benchmarks.start", json.dumps({**task, "result": str(result)})]
-        try:
-            self.turn(1)  # which also fills the cache
-        except SpecError as fault:
-            self.fault = str(fault)
-        else:
-            with np.load(result) as arrays:
-                self.outputs = {key: arrays[key] for key in arrays.files}
-
-    def turn(self, passes: int) -> list[Pass]:
-        """See :class:`Contestant`."""
-        return [self._start() for _ in range(passes)]
-
-    def _start(self) -> Pass:
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        began = time.perf_counter()
-        done = subprocess.run(self._command, env=environment, capture_output=True, text=True, check=False)
-        seconds = time.perf_counter() - began
-        if done.returncode:
-            raise SpecError((done.stderr.strip().splitlines() or ["it failed"])[-1])
-        printed = json.loads(done.stdout)
-        return seconds - printed["torch"], printed["computing"]
-
-    def close(self) -> None:
-        """See :class:`Contestant`."""
 
 
 class Command:
