@@ -1,7 +1,6 @@
 """The commands, called as ``netspec`` calls them: effects, messages and exit status."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import lmdb
 import numpy as np
 import pytest
 import torch
@@ -22,7 +20,7 @@ from netspec.layers import layer_types
 from netspec.net.net import Net
 from netspec.proto.schema import NetParameter
 from netspec.proto.text import read_net, read_solver
-from paths import GOLDEN, ROOT
+from paths import ROOT
 
 NET = "sgd_step/train_val.prototxt"
 SOLVER = "sgd_step/solver.prototxt"
@@ -286,26 +284,6 @@ def test_typos_are_reported_with_suggestions(run: Run, edited: Edit) -> None:
     )
 
 
-def test_invalid_databases_are_reported(run: Run, edited: Edit) -> None:
-    lmdb.open("empty_lmdb").close()
-    Path("hollow_lmdb").mkdir()
-    Path("net.prototxt").write_text(Path(NET).read_text())
-
-    def fault(source: str) -> str:
-        Path("net.prototxt").write_text(Path(edited(NET, "pairs/train_lmdb", source)).read_text())
-        return run("train", edited(SOLVER, NET, "net.prototxt"), "--weights", INIT).fault
-
-    place = 'net.prototxt:9:16: layer "pair_data" (Data): database '
-    assert fault("nowhere") == f'{place}"nowhere" does not exist; relative paths start from {os.getcwd()}'
-    assert fault("empty_lmdb") == f'{place}"empty_lmdb" is empty: it contains no records'
-    assert fault("hollow_lmdb").startswith(f'{place}"hollow_lmdb" is a folder without data.mdb')
-    assert fault(f"{GOLDEN}/images/lmdb_gray").startswith(
-        'net.prototxt:26:30: layer "slice_pair" (Slice): found slice_point [1]'
-    )
-    shutil.copytree(GOLDEN / "images" / "lmdb_plain", "colour_lmdb")
-    assert "cannot share param " in fault("colour_lmdb")
-
-
 @pytest.mark.parametrize(
     ("kind", "says"),
     [
@@ -366,13 +344,6 @@ def test_missing_and_invalid_weights_are_refused(run: Run) -> None:
         "nowhere.solverstate: cannot be read"
     )
     assert run("train", SOLVER, "--snapshot", INIT).fault.startswith(f"{INIT}: ")
-
-
-def test_an_invalid_prototxt_is_refused(run: Run) -> None:
-    assert run("test", "--model", INIT, "--weights", INIT).fault.startswith(f"{INIT}:2:1: unexpected character 0x08")
-    assert run("check", "nowhere.prototxt").fault.startswith(
-        "nowhere.prototxt: cannot be read: No such file or directory; "
-    )
 
 
 def test_a_net_with_inputs_cannot_be_trained(run: Run, edited: Edit) -> None:

@@ -119,63 +119,47 @@ def test_a_replaced_database_is_read_again(tmp_path: Path) -> None:
 # What is wrong with a source, in one line at the place that names it
 
 
-def make_nothing(path: Path) -> None:
-    pass
-
-
-def make_file(path: Path) -> None:
-    path.write_bytes(b"")
-
-
-def make_empty_folder(path: Path) -> None:
-    path.mkdir()
-
-
-def make_never_written(path: Path) -> None:
-    path.mkdir()
-    (path / "data.mdb").write_bytes(b"")
-
-
-def make_no_lmdb(path: Path) -> None:
-    path.mkdir()
-    (path / "data.mdb").write_bytes(b"hello" * 4000)
-
-
-def make_without_records(path: Path) -> None:
-    write(path, {})
-
-
-def make_cut_short(path: Path) -> None:
-    write(path, {b"%08d" % i: bytes(3000) for i in range(100)})
-    os.truncate(path / "data.mdb", 100_000)
-
-
 def make_leveldb(path: Path) -> None:
     path.mkdir()
     (path / "CURRENT").write_text("MANIFEST-000002\n")
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("contents", "message"),
     [
-        (make_nothing, "does not exist"),
-        (make_file, "is a file"),
-        (make_empty_folder, "without data.mdb"),
-        (make_never_written, "empty data.mdb"),
-        (make_no_lmdb, "has a data.mdb that is not an LMDB"),
-        (make_without_records, "is empty: it contains no records"),
-        (make_cut_short, "is truncated"),
-        (make_leveldb, "has backend LEVELDB, not LMDB; set backend: LEVELDB"),
+        (None, "does not exist"),
+        (b"a file", "is a file"),
+        ({}, "without data.mdb"),
+        ({"data.mdb": b""}, "empty data.mdb"),
+        ({"data.mdb": b"hello" * 4000}, "has a data.mdb that is not an LMDB"),
+        ({"CURRENT": b"MANIFEST-000002\n"}, "has backend LEVELDB, not LMDB; set backend: LEVELDB"),
     ],
+    ids=str,
 )
-def test_an_invalid_source_is_refused_in_one_line(tmp_path: Path, make: object, message: str) -> None:
-    assert callable(make)
-    make(tmp_path / "db")
+def test_an_invalid_source_is_refused_in_one_line(
+    tmp_path: Path, contents: bytes | dict[str, bytes] | None, message: str
+) -> None:
+    if isinstance(contents, bytes):
+        (tmp_path / "db").write_bytes(contents)
+    elif contents is not None:
+        (tmp_path / "db").mkdir()
+        for name, data in contents.items():
+            (tmp_path / "db" / name).write_bytes(data)
     with pytest.raises(SpecError) as fault:
         open_reader(str(tmp_path / "db"), "lmdb", PLACE)
     assert str(fault.value).startswith(f'net.prototxt:7:3: database "{tmp_path}/db" ')
     assert message in str(fault.value)
     assert "\n" not in str(fault.value)
+
+
+def test_a_database_without_records_or_truncated_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "none", {})
+    with pytest.raises(SpecError, match="is empty: it contains no records"):
+        open_reader(str(tmp_path / "none"))
+    write(tmp_path / "cut", {b"%08d" % i: bytes(3000) for i in range(100)})
+    os.truncate(tmp_path / "cut" / "data.mdb", 100_000)
+    with pytest.raises(SpecError, match="is truncated"):
+        open_reader(str(tmp_path / "cut"))
 
 
 def test_an_lmdb_with_backend_leveldb_gets_advice() -> None:

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from fresh_dialects import used_by
-from netspec.errors import SpecError
 from netspec.layers import Layer, activation
 from netspec.layers.vision import pooling
 from netspec.net.build import build_net
@@ -79,12 +78,6 @@ def test_how_the_blobs_of_batch_norm_are_learned(fields: str, given: str, expect
         layer {{ name: "y" type: "BatchNorm" bottom: "x" top: "y" {given} batch_norm_param {{ {fields} }} }}"""
     net = build_net(*parse_net_text(text, "n.prototxt"))
     assert [(each.lr_mult, each.decay_mult) for each in net.learnable] == expected
-
-
-def test_intels_batch_norm_refuses_to_train_its_statistics(build: Build) -> None:
-    text = "type: 'BatchNorm' param { lr_mult: 1 } batch_norm_param { filler { value: 1 } }"
-    with pytest.raises(SpecError, match="statistics, not learned"):
-        build("nvidia", text, (2, 3))
 
 
 def test_nvidias_statistics_are_moving_averages(build: Build) -> None:

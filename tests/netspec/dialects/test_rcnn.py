@@ -41,7 +41,7 @@ def test_a_pixel_can_belong_to_two_bins_of_roi_pooling(build: Build) -> None:
 
 
 @pytest.mark.parametrize(("dialect", "kind"), [("rcnn", "ROIPooling"), ("rfcn", "PSROIPooling")])
-def test_regions_of_a_missing_image_or_a_wrong_shape_are_refused(build: Build, dialect: str, kind: str) -> None:
+def test_regions_of_a_missing_image_are_refused(build: Build, dialect: str, kind: str) -> None:
     settings = {
         "ROIPooling": "roi_pooling_param { pooled_h: 1 pooled_w: 1 }",
         "PSROIPooling": "psroi_pooling_param { spatial_scale: 1 output_dim: 1 group_size: 1 }",
@@ -49,10 +49,6 @@ def test_regions_of_a_missing_image_or_a_wrong_shape_are_refused(build: Build, d
     layer = build(dialect, f"type: '{kind}' {settings[kind]}", (2, 1, 3, 3), (1, 5))
     with pytest.raises(SpecError, match="found a region in image 2, expected 0 to 1"):
         layer.run(torch.zeros(2, 1, 3, 3), torch.tensor([[2.0, 0, 0, 1, 1]]))
-    with pytest.raises(SpecError, match=r"expected \(R, 5\): image, x1, y1, x2, y2"):
-        build(dialect, f"type: '{kind}' {settings[kind]}", (2, 1, 3, 3), (1, 6))
-    with pytest.raises(SpecError, match=r"expected 4 axes \(N, C, H, W\)"):
-        build(dialect, f"type: '{kind}' {settings[kind]}", (2, 1, 3), (1, 5))
 
 
 def test_fields_read_by_a_dialects_layers_get_no_warning(caplog: pytest.LogCaptureFixture) -> None:

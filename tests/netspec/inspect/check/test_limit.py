@@ -162,15 +162,6 @@ def test_data_layers_above_the_limit_are_refused(command: str, kind: str, capsys
     assert said in last
 
 
-def test_a_blob_of_33_axes_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    Path("net.prototxt").write_text(
-        f'layer {{ name: "data" type: "Input" top: "data" input_param {{ shape {{ {"dim: 1 " * 33} }} }} }}'
-    )
-    assert main(["check", "net.prototxt"]) == 1
-    said = 'net.prototxt:1:1: layer "data" (Input): found a blob of 33 axes, expected at most 32\n'
-    assert capsys.readouterr().err == said
-
-
 def test_an_image_that_cannot_be_resized_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def no_memory(*arguments: object, **named: object) -> None:
         raise cv2.error("Failed to allocate")
@@ -326,12 +317,6 @@ def test_the_number_of_suggestions_is_limited(net_of: Callable[..., Net], monkey
     monkeypatch.setattr(splits, "did_you_mean", lambda blob, known: asked.append(blob) or "")
     net_of(unknown(100), report=lambda fault: None)
     assert len(asked) == splits.MOST_HINTS
-
-
-def test_a_pyramid_with_too_many_windows_is_refused(net_of: Callable[..., Net]) -> None:
-    spp = 'layer { name: "s" type: "SPP" bottom: "data" top: "s" spp_param { pyramid_height: 4000000000 } }'
-    with pytest.raises(SpecError, match="pyramid_height must be at most 16, so that an int can count its windows"):
-        net_of(INPUT + spp)
 
 
 def test_windows_reports_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
