@@ -1,4 +1,4 @@
-"""Measures how cost grows with layers, pairs in a database, or frames of a sequence.
+"""Measures how cost grows with layers, the batch, pairs in a database, or frames of a sequence.
 
 Each size is measured in a separate process, ``python -m benchmarks.growth KIND SIZE``, to get its peak memory. Times
 are CPU times of one thread, which other load hardly changes.
@@ -6,6 +6,7 @@ are CPU times of one thread, which other load hardly changes.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import subprocess
@@ -35,6 +36,7 @@ layer {{ name: "relu{i}" type: "ReLU" bottom: "x{k}" top: "x{k}" }}"""
 DATA = 'layer { name: "data" type: "Input" top: "x0" input_param { shape { dim: 1 dim: 4 dim: 8 dim: 8 } } }'
 LOSS = """
 layer {{ name: "loss" type: "Reduction" bottom: "x{i}" top: "loss" loss_weight: 1 }}"""
+TRAINED = "small/siamese_resnet27_256"
 WALK = 300  # frames; more descriptors are made by perturbing theirs
 QUERIES, AT_ONCE = 50, 4096  # frames searched for, and added at a time
 SAME_PLACE = 0.3  # distance of two descriptors of one place, as a share of that of two places
@@ -77,6 +79,23 @@ def layers(size: int) -> Found:
         "pass, s": passed,
         "pass, ms per layer": 1e3 * passed / count,
     }
+
+
+def batch(size: int) -> Found:
+    """Train the paper's small ResNet with ``size`` pairs per iteration."""
+    import torch
+
+    import netspec
+    from benchmarks.case import training_case
+
+    torch.set_num_threads(1)
+    with training_case(TRAINED, size) as case:
+        _forget_peak()
+        solver = netspec.load_solver(case.solver, case.caffemodel, device="cpu")
+        solver.step(1)
+        spent = _least(lambda: solver.step(1), 3)
+        solver.close()
+    return {"iteration, s": spent, "iteration, ms per pair": 1e3 * spent / size}
 
 
 def pairs(size: int) -> Found:
@@ -206,6 +225,7 @@ class Kind:
 
 KINDS: Mapping[str, Kind] = {
     "layers": Kind("layers", (125, 250, 500, 1000, 2000), layers),
+    "batch": Kind("pairs per iteration", (1, 2, 4, 8, 16, 32, 64), batch),
     "pairs": Kind("pairs in an LMDB", (1000, 10_000, 100_000, 1_000_000), pairs),
     "frames": Kind("frames", (1000, 10_000, 100_000, 1_000_000), frames),
     "keyframes": Kind("frames in the detector", (100, 1000, 10_000), keyframes),
@@ -277,6 +297,13 @@ def _peak() -> float:
         return float("nan")
     (line,) = (line for line in status.splitlines() if line.startswith("VmHWM:"))
     return int(line.split()[1]) / 1e3
+
+
+def _forget_peak() -> None:
+    """Return freed memory to the system and reset the peak memory, if the system supports it."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).malloc_trim(0)
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 def _number(value: float) -> str:

@@ -182,9 +182,10 @@ def test_growth_is_measured_kept_and_drawn(tmp_path: Path, capsys: pytest.Captur
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "size"), [("layers", 1002), ("frames", 30), ("keyframes", 9)])
+@pytest.mark.parametrize(("kind", "size"), [("layers", 1002), ("batch", 1), ("frames", 30), ("keyframes", 9)])
 def test_each_kind_of_growth_has_its_figures(kind: str, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """In this process, which has torch already."""
+    monkeypatch.setattr(growth, "TRAINED", "lenet")
     monkeypatch.setattr(growth, "LAP", 2)
     found = growth.KINDS[kind].measure(size)
     assert found
