@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from lmdb_build.cli import main
-from lmdb_build.databases import _Workers, read_pairs, read_single_list
+from lmdb_build.databases import _Workers, read_pairs
 from netspec.data.database import open_reader
 from netspec.data.datum import datum_to_array, parse_datum
-from netspec.errors import SpecError
 from optional_packages import leveldb
 from paths import ROOT
 
@@ -261,10 +260,6 @@ def test_an_invalid_label_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtu
     )
 
 
-def test_a_missing_list_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    check_refused(tmp_path, capsys, convert_pairs_lmdb, [PNG, f"{tmp_path}/nix"], "cannot be read: No such file")
-
-
 def test_an_existing_database_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str], pair_list: str) -> None:
     (tmp_path / "db").mkdir()
     check_refused(tmp_path, capsys, convert_pairs_lmdb, [PNG, pair_list], "already exists")
@@ -276,18 +271,6 @@ def test_an_existing_database_is_kept(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_wrong_usage_is_status_2(tmp_path: Path, pair_list: str, flags: list[str]) -> None:
     assert convert_pairs_lmdb([*flags, PNG, pair_list, f"{tmp_path}/db"]) == 2
     assert sorted(os.listdir(tmp_path)) == ["pairs.txt"]
-
-
-@pytest.mark.parametrize(("read", "text"), [(read_pairs, "a.png b.png 2"), (read_single_list, "a.png cat")])
-def test_both_kinds_of_lists_raise_the_same_type_of_error(tmp_path: Path, read: object, text: str) -> None:
-    assert callable(read)
-    (tmp_path / "l").write_text(f"# a comment\n{text}\n")
-    with pytest.raises(SpecError, match=f"^{tmp_path}/l:2:") as fault:
-        read(f"{tmp_path}/l")
-    assert fault.value.where
-    assert (fault.value.where.file, fault.value.where.line) == (f"{tmp_path}/l", 2)
-    with pytest.raises(SpecError, match="cannot be read"):
-        read(f"{tmp_path}/nowhere")
 
 
 # compute_image_mean, and the scripts in tools/

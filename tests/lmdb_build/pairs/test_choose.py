@@ -140,21 +140,19 @@ def test_sequences_can_be_given_to_splits_by_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("named", "words"),
+    ("lengths", "named", "words"),
     [
-        ({"val": ["s1"]}, "name the sequences of all splits but one; not named: train, test"),
-        ({"val": ["s9"], "test": ["s1"]}, 'no sequence has the name "s9"; there are: s0, s1, s2'),
-        ({"val": ["s1"], "test": ["s1"]}, 'sequence "s1" is named for two splits'),
+        ((9, 9, 9), {"val": ["s1"]}, "name the sequences of all splits but one; not named: train, test"),
+        ((9, 9, 9), {"val": ["s9"], "test": ["s1"]}, 'no sequence has the name "s9"; there are: s0, s1, s2'),
+        ((9, 9, 9), {"val": ["s1"], "test": ["s1"]}, 'sequence "s1" is named for two splits'),
+        ((50,), None, "1 sequence cannot be split by sequence into train and val and test"),
     ],
 )
-def test_unknown_sequence_names_are_refused(named: dict[str, list[str]], words: str) -> None:
+def test_sequences_that_cannot_be_split_are_refused(
+    lengths: tuple[int, ...], named: dict[str, list[str]] | None, words: str
+) -> None:
     with pytest.raises(InputError, match=words):
-        split_by_group(pose_source(), {"train": 0.5, "val": 0.25, "test": 0.25}, 1, named)
-
-
-def test_fewer_sequences_than_splits_are_refused() -> None:
-    with pytest.raises(InputError, match="1 sequence cannot be split by sequence into train and val"):
-        split_by_group(pose_source((50,)), {"train": 0.5, "val": 0.5}, 1)
+        split_by_group(pose_source(lengths), {"train": 0.5, "val": 0.25, "test": 0.25}, 1, named)
 
 
 def test_too_few_pairs_are_an_error_with_their_number(tmp_path: Path) -> None:

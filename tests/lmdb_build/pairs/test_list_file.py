@@ -72,27 +72,23 @@ class TestFile:
         assert read_settings(path)["rule"] == "2 m: 15 deg"
 
     @pytest.mark.parametrize(
-        ("line", "place", "words"),
+        ("contents", "said"),
         [
-            ("a.png b.png", ":2:1: ", "expected two images and a label"),
-            ("a.png b.png 2", ":2:13: ", 'not "2"'),
-            ("a.png b c.png 1", ":2:1: ", "expected two images and a label"),
+            (b"# head\na.png b.png\n", ":2:1: found 'a.png b.png', expected two images and a label"),
+            (b"# head\na.png b.png 2\n", ":2:13: "),
+            (b"# head\na.png b c.png 1\n", ":2:1: "),
+            (b"# nothing\n", ": lists no pair"),
+            (b"\x89PNG\r\n\x1a\n\0\0", ": is not a text file"),
+            (None, ": cannot be read: No such file"),
         ],
     )
-    def test_an_invalid_line_is_reported(self, tmp_path: Path, line: str, place: str, words: str) -> None:
+    def test_an_invalid_list_is_reported_with_its_line(self, tmp_path: Path, contents: bytes | None, said: str) -> None:
         path = tmp_path / "list.txt"
-        path.write_text(f"# head\n{line}\n")
+        if contents is not None:
+            path.write_bytes(contents)
         with pytest.raises(InputError) as caught:
             read_pair_list(path)
-        assert str(caught.value).startswith(f"{path}{place}")
-        assert words in str(caught.value)
-
-    def test_an_empty_and_a_missing_list(self, tmp_path: Path) -> None:
-        (tmp_path / "list.txt").write_text("# nothing\n")
-        with pytest.raises(InputError, match="lists no pair"):
-            read_pair_list(tmp_path / "list.txt")
-        with pytest.raises(InputError, match=r"none\.txt: cannot be read: No such file"):
-            read_pair_list(tmp_path / "none.txt")
+        assert str(caught.value).startswith(f"{path}{said}")
 
     def test_a_name_with_spaces_is_quoted(self, tmp_path: Path) -> None:
         path = tmp_path / "list.txt"
@@ -105,12 +101,6 @@ class TestFile:
         write_pair_list(path, [(os.fsdecode(b"caf\xe9.png"), "b.png", 1)], {})
         assert b"caf\xe9.png b.png 1\n" in path.read_bytes()
         assert os.fsencode(read_pair_list(path)[0].first) == b"caf\xe9.png"
-
-    def test_a_binary_file_is_refused(self, tmp_path: Path) -> None:
-        path = tmp_path / "list.txt"
-        path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0")
-        with pytest.raises(InputError, match="not a text file"):
-            read_pair_list(path)
 
     def test_a_name_that_a_list_cannot_contain_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(InputError, match="cannot list the image"):
@@ -148,18 +138,16 @@ class TestWarp:
             contents.append([(photos / pair.second).read_bytes() for pair in pairs])
         assert contents[0] == contents[1]
 
-    def test_warped_images_must_be_below_the_root(self, photos: Path) -> None:
+    def test_warped_images_must_be_below_the_root_and_originals_must_exist(self, photos: Path) -> None:
         source = singles_source(photos / "photos", photos / "photos")
         plan = Plan({"train": 4}, by="group", warp_share=1.0)
         with pytest.raises(InputError, match="warped images must be below the root folder"):
             build_lists(source, plan, photos / "photos", photos / "out")
-
-    def test_a_missing_image_is_reported(self, photos: Path) -> None:
         source = singles_source(photos / "photos", photos)
         for path in (photos / "photos").iterdir():
             path.unlink()
         with pytest.raises(InputError, match=r"photos/\d\.png: cannot be read: No such file"):
-            build_lists(source, Plan({"train": 4}, by="group", warp_share=1.0), photos, photos / "o")
+            build_lists(source, plan, photos, photos / "o")
 
 
 class TestHardNegatives:

@@ -271,13 +271,6 @@ def test_evaluate(two_laps, files, tmp_path, capsys):
     assert min(averages[1]) > 0.99
 
 
-def test_evaluate_reports_errors_in_one_line(two_laps, files, capsys):
-    method = f"features:{files}/laps.npz:whiten={files}/laps.npz"
-    assert main(["evaluate", str(two_laps), "--out", str(files / "report"), "--method", method]) == 1
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "laps.npz: 40 of 40 test images are training images too" in line
-
-
 def test_detect(two_laps, files, tmp_path):
     words = ["detect", str(two_laps), "--features", str(files / "laps.npz"), "--exclude-recent", "10"]
     words += ["--threshold", "-0.9", "--out", str(tmp_path)]

@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import pytest
@@ -57,11 +59,19 @@ def test_the_number_of_features_is_limited_and_color_becomes_gray() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"), [({"kind": "surf"}, '"surf"; known: sift, orb'), ({"max_features": 0}, "is 0")]
+    ("make", "message"),
+    [
+        (lambda: Extractor(kind="surf"), '"surf"; known: sift, orb'),
+        (lambda: Extractor(max_features=0), "is 0"),
+        (lambda: kmeans(unit_vectors(7), 8), "7 descriptors cannot make 8 words"),
+        (lambda: sequential_clusters(np.zeros((0, 128), np.float32), 0.6), "no descriptors to cluster"),
+        (lambda: sequential_clusters(unit_vectors(4), 0.0), "must be positive"),
+        (lambda: BagOfWords(np.ones(3), "chi2"), '"chi2" of the bag of words; known: l1, cosine'),
+    ],
 )
-def test_impossible_extractors_are_refused(settings: dict, message: str) -> None:
+def test_impossible_settings_and_descriptors_are_refused(make: Callable[[], object], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        Extractor(**settings)
+        make()
 
 
 def test_nearest_center_across_blocks() -> None:
@@ -87,11 +97,6 @@ def test_kmeans_finds_clusters_and_follows_the_seed() -> None:
     spread = np.linalg.norm(points - centers[nearest_centers(points, centers)], axis=1)
     assert spread.mean() < 0.2
     np.testing.assert_array_equal(centers, kmeans(points, 10, seed=1))
-
-
-def test_kmeans_needs_as_many_descriptors_as_words() -> None:
-    with pytest.raises(InputError, match="7 descriptors cannot make 8 words"):
-        kmeans(unit_vectors(7), 8)
 
 
 def founders_one_by_one(descriptors: np.ndarray, radius: float) -> list[int]:
@@ -138,13 +143,6 @@ def test_one_cluster_where_all_are_near() -> None:
     np.testing.assert_allclose(sequential_clusters(descriptors, 0.1), descriptors[:1], atol=1e-6)
 
 
-def test_clustering_without_descriptors_is_refused() -> None:
-    with pytest.raises(InputError, match="no descriptors to cluster"):
-        sequential_clusters(np.zeros((0, 128), np.float32), 0.6)
-    with pytest.raises(InputError, match="must be positive"):
-        sequential_clusters(unit_vectors(4), 0.0)
-
-
 TRAINING = np.array([[1, 2, 0, 0], [1, 0, 3, 0], [4, 1, 0, 0], [1, 0, 0, 0]])
 
 
@@ -183,8 +181,3 @@ def test_an_image_without_words_has_similarity_0(metric: str) -> None:
     words = np.array([[0, 0, 0, 0], [0, 2, 0, 1], [5, 0, 0, 0]])  # the last has only a word that all images have
     similarity = BagOfWords.learn(TRAINING, metric).similarity(words, words)
     np.testing.assert_allclose(similarity, [[0, 0, 0], [0, 1, 0], [0, 0, 0]], atol=1e-12)
-
-
-def test_an_unknown_metric() -> None:
-    with pytest.raises(InputError, match='"chi2" of the bag of words; known: l1, cosine'):
-        BagOfWords(np.ones(3), "chi2")

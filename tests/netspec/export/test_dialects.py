@@ -89,34 +89,6 @@ def test_roi_pooling_computes_the_same_in_onnxruntime_and_is_refused_for_pytorch
         source_module(net)
 
 
-@pytest.mark.parametrize(
-    ("dialect", "layer", "shapes"),
-    [
-        (
-            "rfcn",
-            "type: 'PSROIPooling' psroi_pooling_param { spatial_scale: 0.5 output_dim: 2 group_size: 2 }",
-            {"x": (1, 8, 6, 6), "rois": (3, 5)},
-        ),
-        (
-            "ssd",
-            "type: 'MultiBoxLoss' multibox_loss_param { num_classes: 3 }",
-            {"loc": (1, 8), "conf": (1, 6), "prior": (1, 2, 8), "truth": (1, 1, 1, 8)},
-        ),
-    ],
-    ids=["PSROIPooling", "MultiBoxLoss"],
-)
-def test_a_layer_that_cannot_be_exported_is_refused_at_its_place(
-    dialect: str, layer: str, shapes: dict[str, Shape], net_of: Callable[..., Net]
-) -> None:
-    use_dialect(dialect)
-    net = net_of(net_text(layer, shapes))
-    for target, write in (("ONNX", onnx_model), ("PyTorch", source_module)):
-        with pytest.raises(
-            SpecError, match=rf'^net.prototxt:\d+:1: layer "it" \(\w+\): cannot be exported to {target}: '
-        ):
-            write(net)
-
-
 def detections(
     net_of: Callable[..., Net], settings: str, images: int, priors: int, kinds: int
 ) -> tuple[Net, dict[str, np.ndarray]]:

@@ -328,32 +328,24 @@ def test_a_wrong_shape_is_refused_and_changes_nothing(tmp_path: Path):
     np.testing.assert_array_equal(blobs_of(net)["ip"][0], before)
 
 
-def test_a_wrong_number_of_blobs_is_refused(tmp_path: Path):
+def test_a_wrong_number_of_blobs_or_a_wrong_shape_is_refused(tmp_path: Path):
     proto = net_to_proto(net_of(TOWERS))
     del proto.layer[1].blobs[1:]
     with pytest.raises(SpecError, match="incompatible number of blobs for layer 'ip': 1 in the file, 2 in the net"):
         load_weights(net_of(TOWERS), written(tmp_path, proto))
-
-
-def test_hdf5_files_with_missing_added_or_reshaped_blobs_are_refused(tmp_path: Path):
     path = tmp_path / "w.caffemodel.h5"
-    net = net_of(TOWERS)
-    save_weights(net, path)
-    with h5py.File(path, "r+") as file:
-        del file["data/ip/1"]
-    with pytest.raises(SpecError, match="incompatible number of blobs for layer 'ip': 1 in the file, 2 in the net"):
-        load_weights(net, path)
-    save_weights(net, path)
-    with h5py.File(path, "r+") as file:
-        file.create_dataset("data/ip/2", data=[1.0])
-    with pytest.raises(SpecError, match="incompatible number of blobs for layer 'ip': 3 in the file, 2 in the net"):
-        load_weights(net, path)
-    save_weights(net, path)
-    with h5py.File(path, "r+") as file:
-        del file["data/ip/1"]
-        file.create_dataset("data/ip/1", data=np.zeros((1, 4), np.float32))
-    with pytest.raises(SpecError, match=r"Source param shape is 1 4 \(4\); target param shape is 4 \(4\)"):
-        load_weights(net, path)
+    for contents, said in (
+        ({}, "incompatible number of blobs for layer 'ip': 1 in the file, 2 in the net"),
+        ({"1": np.zeros(4), "2": np.zeros(1)}, "incompatible number of blobs for layer 'ip': 3 in the file, 2 in"),
+        ({"1": np.zeros((1, 4))}, r"Source param shape is 1 4 \(4\); target param shape is 4 \(4\)"),
+    ):
+        save_weights(net_of(TOWERS), path)
+        with h5py.File(path, "r+") as file:
+            del file["data/ip/1"]
+            for name, values in contents.items():
+                file[f"data/ip/{name}"] = values.astype(np.float32)
+        with pytest.raises(SpecError, match=said):
+            load_weights(net_of(TOWERS), path)
 
 
 def test_the_format_is_detected_from_the_content(tmp_path: Path):
@@ -363,21 +355,11 @@ def test_the_format_is_detected_from_the_content(tmp_path: Path):
     load_weights(net, tmp_path / "w.caffemodel")
 
 
-def test_files_without_weights_are_refused(tmp_path: Path):
-    net = net_of(TOWERS)
-    with pytest.raises(SpecError, match=r"nowhere\.caffemodel: cannot be read: No such file"):
-        load_weights(net, tmp_path / "nowhere.caffemodel")
-    (tmp_path / "text.caffemodel").write_text("layer { }\n" * 20)
-    with pytest.raises(SpecError, match=r"text\.caffemodel: expected a binary NetParameter, found text"):
-        load_weights(net, tmp_path / "text.caffemodel")
+def test_an_hdf5_file_without_weights_is_refused(tmp_path: Path):
     with h5py.File(tmp_path / "state.h5", "w") as file:
         file.create_group("history")
     with pytest.raises(SpecError, match=r"state\.h5: .*no group /data"):
-        load_weights(net, tmp_path / "state.h5")
-    torn = net_to_proto(net)
-    torn.layer[1].blobs[1].data.append(1)
-    with pytest.raises(SpecError, match=r'layer "ip", blob 1: found 5 numbers in data, expected 4 for shape \(4,\)'):
-        load_weights(net, written(tmp_path, torn))
+        load_weights(net_of(TOWERS), tmp_path / "state.h5")
 
 
 def test_saving_in_a_missing_folder_is_refused(tmp_path: Path):

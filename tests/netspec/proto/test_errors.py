@@ -6,7 +6,7 @@ import pytest
 
 from case_files import read_cases
 from netspec.errors import SpecError
-from netspec.proto.text import parse_net_text, parse_solver_text, read_net, read_solver
+from netspec.proto.text import parse_net_text, parse_solver_text, read_net
 
 FAULTS = read_cases("netspec/proto/cases/errors.txt")
 
@@ -62,15 +62,6 @@ def test_a_string_over_several_lines_is_suspected_only_near_by() -> None:
     with pytest.raises(SpecError) as caught:
         parse_net_text("name: 'two\nlines'\n\n\nlayr {}", "f")
     assert "closing quote" not in str(caught.value)
-
-
-@pytest.mark.parametrize("read", [read_net, read_solver])
-def test_files_that_cannot_be_read(read: object, tmp_path: Path) -> None:
-    assert callable(read)
-    with pytest.raises(SpecError, match=r"absent\.prototxt: cannot be read: No such file or directory$"):
-        read(tmp_path / "absent.prototxt")
-    with pytest.raises(SpecError, match=r"cannot be read: Is a directory$"):
-        read(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -209,46 +209,27 @@ def test_look_embedding_draws_descriptors_of_extract(run: Run) -> None:
     assert run("look", "embedding", "f.npz", "--out", "y.png").status == 0
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("look", "filters", WEIGHTS, "--layer", "conv3"), 'no layer "conv3" with filters; did you mean "conv'),
-        (("look", "filters", "none.caffemodel"), "none.caffemodel: cannot be read: No such file"),
-        (("look", "maps", *NET, "--blob", "no", "--image", "a.png"), 'no blob "no"'),
-        (("look", "maps", *NET, "--blob", "conv1", "--image", "no.png"), "no.png: cannot be read"),
-        (
-            ("look", "embedding", "a.png"),
-            "a.png: cannot be read (File is not a zip file); expected a features.npz written by netspec extract",
-        ),
-        (
-            ("look", "embedding", "cut.npz"),
-            "cut.npz: cannot be read (File is not a zip file); expected a features.npz written by netspec extract",
-        ),
-        (("look", "embedding", "no.npz"), "no.npz: no such file; expected a features.npz written by netspec extract"),
-        (
-            ("look", "embedding", "f.npz", "--array", "fea"),
-            'f.npz: has no descriptors "fea"; did you mean "feat"? it has: feat',
-        ),
-        (("look", "embedding", "f.npz", "--images", "pairs"), "pairs: contains no images"),
-    ],
-    ids=[
-        "unknown_layer",
-        "missing_weights",
-        "unknown_blob",
-        "missing_image",
-        "not_an_npz",
-        "truncated_npz",
-        "missing_npz",
-        "unknown_array",
-        "no_images",
-    ],
-)
-def test_invalid_arguments_of_look_are_refused(run: Run, words: tuple[object, ...], said: str) -> None:
+NO_NPZ = "cannot be read (File is not a zip file); expected a features.npz written by netspec extract"
+INVALID = {
+    "unknown_layer": (f"filters {WEIGHTS} --layer conv3", 'no layer "conv3" with filters; did you mean "conv'),
+    "missing_weights": ("filters none.caffemodel", "none.caffemodel: cannot be read: No such file"),
+    "unknown_blob": (f"maps {' '.join(NET)} --blob no --image a.png", 'no blob "no"'),
+    "missing_image": (f"maps {' '.join(NET)} --blob conv1 --image no.png", "no.png: cannot be read"),
+    "not_an_npz": ("embedding a.png", f"a.png: {NO_NPZ}"),
+    "truncated_npz": ("embedding cut.npz", f"cut.npz: {NO_NPZ}"),
+    "missing_npz": ("embedding no.npz", "no.npz: no such file; expected a features.npz written by netspec extract"),
+    "unknown_array": ("embedding f.npz --array fea", 'f.npz: has no descriptors "fea"; did you mean "feat"?'),
+    "no_images": ("embedding f.npz --images pairs", "pairs: contains no images"),
+}
+
+
+@pytest.mark.parametrize(("words", "said"), INVALID.values(), ids=INVALID)
+def test_invalid_arguments_of_look_are_refused(run: Run, words: str, said: str) -> None:
     cv2.imwrite("a.png", image(0, (30, 40, 3)))
     np.savez("f.npz", feat=np.zeros((3, 2), np.float32))
     Path("cut.npz").write_bytes(Path("f.npz").read_bytes()[:150])
     shutil.rmtree("none", ignore_errors=True)
-    assert said in run(*words, "--out", "x.png").fault
+    assert said in run("look", *words.split(), "--out", "x.png").fault
     assert not Path("x.png").exists()
 
 
