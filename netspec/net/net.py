@@ -88,7 +88,7 @@ class Net(torch.nn.Module):
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
         self.layers: Any = torch.nn.ModuleList(assembly.layers.values())
-        self._positions = _Positions(self.layers)
+        self.positions = Positions(self.layers)
         self.shapes = ByName("blob", assembly.shapes)
         self.loss_weights, self.learnable = assembly.loss_weights, assembly.learnable
         self.need, self.random = assembly.need, assembly.random
@@ -115,19 +115,19 @@ class Net(torch.nn.Module):
     def replace_layer(self, i: int, layer: Layer) -> None:
         """Replace layer ``i`` by a layer with the same blobs and shapes."""
         self.layers[i] = layer
-        self._positions = _Positions(self.layers)
+        self.positions = Positions(self.layers)
         self._set_runners()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the runners."""
-        gone = {"runners", "eager", "prepared", "_trainer", "_passes", "_positions"}
+        gone = {"runners", "eager", "prepared", "_trainer", "_passes", "positions"}
         return {name: value for name, value in self.__dict__.items() if name not in gone}
 
     @override
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._passes = _Passes()
-        self._positions = _Positions(self.layers)
+        self.positions = Positions(self.layers)
         self._set_runners()
 
     @override
@@ -175,7 +175,7 @@ class Net(torch.nn.Module):
 
     def forward_loss(self, /, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""
-        with self._passes.lock, self._positions:
+        with self._passes.lock, self.positions:
             given, kept = self.input_tensors(inputs), self._values_to_keep()
             loss, values = next(found for runner in self.runners if (found := runner.run(given, kept)) is not None)
             blobs = self.plan.blobs
@@ -197,7 +197,7 @@ class Net(torch.nn.Module):
         trainer = self.trainer()
         if trainer is None or self.keep or trainer.is_watched():
             return None
-        with self._passes.lock, self._positions:
+        with self._passes.lock, self.positions:
             loss, outputs = trainer.run()
             self._passes.of_thread.blobs = self._passes.last = outputs
             return loss, outputs
@@ -297,7 +297,7 @@ class Net(torch.nn.Module):
         if taker is None:
             message = "set_input_arrays needs a MemoryData layer, and this net has none; call net(blob=array)"
             raise SpecError(message, Where(self.plan.source.file))
-        self._positions.go_back()
+        self.positions.go_back()
         taker.set_input_arrays(data, np.zeros(len(data), np.float32) if labels is None else labels)
 
     def missing_inputs(self) -> Iterator[SpecError]:
@@ -306,7 +306,7 @@ class Net(torch.nn.Module):
 
     def restart_data(self) -> None:
         """Make every data layer start again at its first record."""
-        self._positions.go_back()
+        self.positions.go_back()
         for layer in self.layers:
             layer.restart()
 
@@ -328,7 +328,7 @@ class _Passes:
         return _Passes, ()
 
 
-class _Positions:
+class Positions:
     """A block for a pass. If Ctrl-C interrupts it, no data layer counts its records: the next pass reads them again.
 
     Further Ctrl-C may interrupt any line here. What was not restored then is restored at the start of the next block.

@@ -146,10 +146,11 @@ class BlobRunner:
         """Run layers ``start`` to ``end`` (inclusive). Return the weighted sum of their losses, a scalar."""
         self.upload()
         hooked = self.hooks["before_forward"] or self.hooks["after_forward"]
-        if self._prepares and (start, end) == (0, len(self.steps) - 1) and not hooked:
-            return self._forward_prepared()
-        with one_thread() if self._in_one_thread else nullcontext():
-            loss = walk(self._passes("forward", range(start, end + 1)), {}, self.net.options.exact)
+        with self.net.positions:
+            if self._prepares and (start, end) == (0, len(self.steps) - 1) and not hooked:
+                return self._forward_prepared()
+            with one_thread() if self._in_one_thread else nullcontext():
+                loss = walk(self._passes("forward", range(start, end + 1)), {}, self.net.options.exact)
         return self._no_loss if loss is None else loss
 
     def _passes(self, which: str, numbers: Iterable[int]) -> Iterator[Step]:

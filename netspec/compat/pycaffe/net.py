@@ -310,6 +310,7 @@ class Net:
         if not layer.takes_arrays:
             kind = f'it is "{self._layer_names[0]}" ({layer.type})'
             raise RuntimeError(f"set_input_arrays may only be called if the first layer is a MemoryDataLayer; {kind}")
+        self.runner.net.positions.go_back()
         layer.set_input_arrays(data, labels)
 
     _set_input_arrays = set_input_arrays  # the name in Caffe's compiled part

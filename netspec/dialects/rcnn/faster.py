@@ -21,7 +21,7 @@ from netspec.dialects.rcnn.proposals import all_anchors, base_anchors
 from netspec.dialects.rcnn.smooth import four
 from netspec.errors import SpecError
 from netspec.files.opencv import cv2
-from netspec.layers.contract.base import Layer, Shape
+from netspec.layers.contract.base import Layer, Shape, State
 
 RATIOS, SCALES = (0.5, 1, 2), (8, 16, 32)
 # The minibatch of anchors: its size, its maximum share of objects, and the overlaps of an object and of background.
@@ -264,6 +264,7 @@ class RoIData(_Sampling):
 
     bottoms, tops = (0, 0), (3, None)
     fixed_shapes = False  # images have different sizes
+    reads_data = True
 
     def setup(self) -> None:
         if self.num_tops != 3:
@@ -286,6 +287,12 @@ class RoIData(_Sampling):
 
     def restart(self) -> None:
         self.waiting = []
+
+    def running_state(self) -> State:
+        return {"waiting": " ".join(map(str, self.waiting))}
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        self.waiting = [int(i) for i in state["waiting"].split()]
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         given = self.context.options.given_shapes

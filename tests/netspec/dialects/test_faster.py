@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -207,6 +208,26 @@ def test_set_roidb_passes_images_boxes_and_attributes(tmp_path: Path) -> None:
     net.forward()
     assert net.blobs["data"].data.shape == (1, 3, 600, 800)
     assert net.blobs["gt_boxes"].data.tolist() == [[10, 20, 300, 400, 2]]
+
+
+def test_an_interrupted_pass_leaves_its_image_to_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = PYTHON.format("roi_data_layer.layer", "RoIDataLayer", "'num_classes': 4")
+    (tmp_path / "net.prototxt").write_text(f'layer {{ name: "d" top: "data" top: "im_info" top: "gt_boxes" {text} }}')
+    monkeypatch.setattr(faster, "SHORTEST", 12)
+    entries = []
+    for k in range(4):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((12, 16, 3)))
+        entries.append({"image": tmp_path / f"{k}.png", "boxes": [[0, 0, 9, 9]], "gt_classes": [k + 1]})
+    core, other = (caffe.Net(str(tmp_path / "net.prototxt"), caffe.TRAIN) for _ in range(2))
+    for net, run in ((core, core.runner.net), (other, other.forward)):
+        net.layers[0].set_roidb(entries)
+        seen = [run()["gt_boxes"][0, 4]]
+        with monkeypatch.context() as patched:
+            patched.setattr(faster, "scaled", Mock(side_effect=KeyboardInterrupt))
+            with pytest.raises(KeyboardInterrupt):
+                run()
+        seen += [float(run()["gt_boxes"][0, 4]) for _ in range(3)]
+        assert sorted(map(int, seen)) == [1, 2, 3, 4]
 
 
 @pytest.mark.slow

@@ -635,6 +635,29 @@ def test_a_failed_check_has_caffes_message_and_the_location(
     assert case["check"] in str(fault.value)
 
 
+def test_an_interrupted_pass_leaves_its_records_to_the_next(net_of: Callable[..., caffe.Net]) -> None:
+    net = net_of(
+        """layer { name: "m" type: "MemoryData" top: "d" top: "l"
+             memory_data_param { batch_size: 1 channels: 1 height: 1 width: 1 } }
+           layer { name: "p" type: "Power" bottom: "d" top: "p" }"""
+    )
+    net.set_input_arrays(np.zeros((9, 1, 1, 1), np.float32), np.arange(9, dtype=np.float32))
+    interrupt: list[int] = []
+
+    def stop(layer: int) -> None:
+        if layer in interrupt:
+            raise KeyboardInterrupt
+
+    assert net.forward()["l"] == 0
+    net.before_forward(stop)
+    interrupt[:] = [1]
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            net.forward()
+    interrupt.clear()
+    assert net.forward()["l"] == 1
+
+
 def test_a_failed_check_of_a_pass_has_caffes_message(net_of: Callable[..., caffe.Net], tmp_path: Path) -> None:
     net = net_of(X + FOUR)
     net.blobs["x"].reshape(2, 3, 9, 9)
