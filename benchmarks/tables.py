@@ -6,6 +6,7 @@ not measure stay as they are.
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -37,11 +38,21 @@ TITLES = {
     "ESSEX3IN1": "ESSEX3IN1",
     "SPED": "SPED",
 }
-# By the names in the tables. F is the file of the included net's descriptors, W the file of words, V that of VLAD.
+# Visual words depend on the images that they are learned from. Those of the office tower serve every set. These are of
+# the same kind of place as a set, and of no place in it: the kitchen of 7-Scenes, two office corridors, another
+# synthetic house, and streets.
+KINDS = {"fr1_rpy": "kitchen", "corridor_loop": "corridors", "walk": "house", "ESSEX3IN1": "streets", "SPED": "streets"}
+CORRIDORS = ("office_corridor_rc", "rc_office_corridor")
+HOUSE = 900_002
+# By the names in the tables. F is the file of the included net's descriptors, W the file of words, V that of VLAD, O
+# that of words of ORB, S that of words of the same kind of place. Words of ORB with a check of the geometry stand for
+# what DBoW2 and DBoW3 do in many SLAM systems; there is no wheel of these.
 METHODS = {
     "gray thumbnails, 32x24": "thumbnails",
     "bag of SIFT words, tf-idf": "bow:model=W",
+    "bag of ORB words, tf-idf": "bow:kind=orb,model=O",
     "FAB-MAP 2.0": "fabmap:model=W",
+    "FAB-MAP 2.0, words of the same kind of place": "fabmap:model=S",
     "VLAD of 64 SIFT words": "vlad:model=V",
     "HOG, 256x256": "hog",
     "like CoHOG, 256x256": "cohog",
@@ -52,10 +63,11 @@ METHODS = {
     "verified, SeqSLAM on the net": "verified+seqslam+features:F",
     "auto, on the net": "auto+features:F",
     "verified+FAB-MAP": "verified+fabmap:model=W",
+    "verified+bag of ORB words": "verified+bow:kind=orb,model=O",
 }
 TABLES = {
     "accuracy": [name for name in METHODS if not name.startswith(("verified", "auto"))],
-    "recall": ["FAB-MAP 2.0", *[name for name in METHODS if "net" in name], "verified+FAB-MAP"],
+    "recall": [name for name in METHODS if any(word in name for word in ("ORB", "FAB-MAP", "net"))],
 }
 AUTO = "auto, on the net"
 
@@ -73,6 +85,25 @@ def data_set(name: str, data: Path, work: Path) -> DataSet:
     return load_place_pairs(data / "place_pairs" / {"SPED": "SPED_Test"}.get(name, name))
 
 
+def tower_images(folder: Path) -> list[Path]:
+    """Return the images of the office tower in the order of its index."""
+    with (folder / "index.csv").open(encoding="utf-8") as table:
+        return [folder / row["image"] for row in csv.DictReader(table)]
+
+
+def same_kind(kind: str, data: Path, work: Path) -> list[Path]:
+    """Return the training images of one of ``KINDS``, some hundreds."""
+    if kind == "house":
+        return list(read_sequence(walked(work, Walk(400, 160, 120, laps=3, seed=HOUSE)), "tum").paths)
+    if kind == "kitchen":
+        return image_paths(data / "seven_scenes" / "redkitchen" / "rgb")[::2]
+    with (data / "sequences" / "index.csv").open(encoding="utf-8") as table:
+        places = {row["name"]: row["environment"] for row in csv.DictReader(table)}
+    roads = [name for name, place in places.items() if place.startswith(("road", "outdoor, street"))]
+    names = CORRIDORS if kind == "corridors" else roads
+    return [path for name in names for path in image_paths(data / "sequences" / name)[::2]]
+
+
 def measure(
     data: Path,
     work: Path,
@@ -84,19 +115,28 @@ def measure(
     """Measure methods on data sets and update the figures; ``words`` are the arguments of the command."""
     work.mkdir(parents=True, exist_ok=True)
     figures = {kind: _stored_rows(kind) for kind in TABLES}
-    words_needed = any(METHODS[name][-1] in "WV" for name in methods or METHODS)
-    train = image_paths(data / "ie_tower")[::4] if words_needed else []
+    needed = {METHODS[name][-1] for name in methods or METHODS}
+    tower = tower_images(data / "ie_tower")[::4] if needed & {*"WVO"} else []
     for name in sets or SETS:
         held = data_set(name, data, work)
         cache = Cache(work / "kept" / f"{name}.pickle")
         images = [*held.queries.paths, *(() if held.references is None else held.references.paths)]
-        np.savez(work / f"{name}.npz", features=cache.descriptors(images), names=[str(image) for image in images])
+        if "F" in needed:
+            np.savez(work / f"{name}.npz", features=cache.descriptors(images), names=[str(image) for image in images])
         context = MethodContext(held.exclude_frames, pairs=cache.pairs)
         for label in methods or METHODS:
             if name in PAIRS and (label not in TABLES["accuracy"] or "SeqSLAM" in label):
                 continue
-            file = work / {"F": f"{name}.npz", "W": "words.npz", "V": "vlad.npz"}.get(METHODS[label][-1], "")
-            spec = re.sub(r"\b[FWV]$", str(file), METHODS[label])
+            files = {
+                "F": f"{name}.npz",
+                "W": "words.npz",
+                "V": "vlad.npz",
+                "O": "orb.npz",
+                "S": f"words_{KINDS[name]}.npz",
+            }
+            letter = METHODS[label][-1]
+            spec = re.sub(r"\b[FWVOS]$", str(work / files.get(letter, "")), METHODS[label])
+            train = same_kind(KINDS[name], data, work) if letter == "S" else tower
             outcome = judge(label, make_method(spec, context), held, train)
             for kind, value in _figures(label, outcome, name):
                 say(f"{name}, {label}, {kind}: {value}")

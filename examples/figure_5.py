@@ -1,18 +1,22 @@
-"""The paper's Figure 5 on your own sequences: a net, FAB-MAP 2.0 and thumbnails find the loops of one walk.
+"""The paper's Figure 5 on your own sequences: nets, FAB-MAP 2.0 and thumbnails find the loops of one walk.
 
-python3 figure_5.py SEQUENCE_1 SEQUENCE_2 --weights table_1/.../siamese_resnet27_512_iter_3000.caffemodel
-    --vocabulary OTHER_PLACE --out figure_5
+python3 figure_5.py SEQUENCE_1 SEQUENCE_2 --vocabulary OTHER_PLACE OFFICES --out figure_5
+    --weights table_1/all_rooms/X/seed_1/X_iter_500.caffemodel table_1/without_HALL/X/seed_1/X_iter_600.caffemodel
 
 The sequences show one place, in the layout of TUM RGB-D, with poses in one frame of reference. The last fifth of each,
-which table_1.py keeps for tests, becomes a part of one walk.
-FAB-MAP's vocabulary and tree are learned from images of another place. The report in OUT/report has the matrix of
-true loops, the matrix of each method, and precision against recall; the last lines have the times of the methods.
+which table_1.py keeps for tests, becomes a part of one walk. --start 0 shows whole sequences: for weights that were
+trained without this place. FAB-MAP's vocabulary and tree are learned from images of another place; with several, each
+is a method of its own. A match is right less than 2 m and 15 degrees away, as in the paper, and also less than 45.
+The reports in OUT/report_15 and OUT/report_45 have the matrix of true loops, the matrix of each method, and precision
+against recall; OUT/table.json and the last lines have R@1, average precision, and the times of the methods.
 Run it in a clone, or in a folder with a copy of the clone's folder prototxt.
 """
 
 import argparse
 import csv
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from table_1 import run
@@ -21,6 +25,7 @@ from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import Trajectory, write_rgb_list, write_trajectory
 
 PAUSE_S = 60  # between two sequences of the walk
+ANGLES = (15, 45)  # degrees, below which two views less than 2 m apart are of one place
 
 
 def parse() -> argparse.Namespace:
@@ -28,7 +33,7 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="+", type=Path)
     parser.add_argument("--net", default="siamese_resnet27_512", help="folder in prototxt/normalized (%(default)s)")
-    parser.add_argument("--weights", required=True, help="trained weights of the net")
+    parser.add_argument("--weights", nargs="+", required=True, help="trained weights of the net, made by table_1.py")
     parser.add_argument(
         "--start",
         type=float,
@@ -36,7 +41,12 @@ def parse() -> argparse.Namespace:
         help="share of each sequence that is left out, since table_1.py trained and chose on it (default: 0.8)",
     )
     parser.add_argument("--size", type=int, default=64, help="side of the images in pixels (default: 64)")
-    parser.add_argument("--vocabulary", required=True, help="folder or sequence with images of another place")
+    parser.add_argument(
+        "--exclude-seconds", default="10", help="frames that are nearer in time are no loop (default: 10)"
+    )
+    parser.add_argument(
+        "--vocabulary", nargs="+", required=True, help="folders, lists or sequences with images of other places"
+    )
     parser.add_argument("--out", type=Path, default=Path("figure_5"), help="folder for all files (default: figure_5)")
     return parser.parse_args()
 
@@ -63,6 +73,45 @@ def join(folders: list[Path], out: Path, start_share: float) -> None:
     write_trajectory(out / "groundtruth.txt", Trajectory(times[there], known[there, :3], known[there, 3:]))
 
 
+def describe(arguments: argparse.Namespace, walk: Path) -> list[str]:
+    """Write the descriptors of the walk by each file of weights; return the methods that compare them.
+
+    A method has the name of the folder that table_1.py keeps the weights in, such as all_rooms.
+    """
+    net = Path("prototxt", "normalized", arguments.net, "deploy.prototxt")
+    shape = f"data=1,3,{arguments.size},{arguments.size}"
+    methods = []
+    for weights in arguments.weights:
+        trained_on = Path(weights).resolve().parents[2].name
+        features = arguments.out / f"{trained_on}.npz"
+        extract = ["netspec", "extract", net, "--weights", weights, "--blob", "feat", "--shape", shape]
+        extract += ["--mean", "128,128,128", "--scale", 1 / 128, "--images", walk / "rgb.txt", "--out", features]
+        run(*extract)
+        methods.append(f"{arguments.net}, {trained_on}=features:{features}")
+    return methods
+
+
+def learn(arguments: argparse.Namespace, walk: Path) -> list[str]:
+    """Learn each vocabulary; return the methods that use them, named by the folders of their images."""
+    methods = []
+    for images in arguments.vocabulary:
+        name = Path(images.partition(",")[0]).stem
+        method = f"FAB-MAP 2.0, words of {name}=fabmap:model={arguments.out / name}.words.npz"
+        run("loopclosure", "evaluate", walk, "--train", images, "--method", method, "--out", arguments.out / name)
+        methods.append(method)
+    return methods
+
+
+def rows(report: Path, angle: int) -> dict[str, dict[str, Any]]:
+    """Return R@1 and the average precision of all pairs of each method in a report, named with the angle."""
+    found = {}
+    for method in json.loads((report / "report.json").read_text())["methods"]:
+        figures = method["figures"]
+        best, pairs = figures["best match of each query"], figures["all pairs"]
+        found[method["name"]] = {f"R@1, {angle}": best["recall at 1"], f"AP, {angle}": pairs["average precision"]}
+    return found
+
+
 def show_times(path: Path) -> None:
     """Print the times of ``loopclosure evaluate`` for an image and for all images, and the paper's."""
     with path.open() as file:
@@ -75,18 +124,23 @@ def show_times(path: Path) -> None:
 def main() -> None:
     """Make the figure."""
     arguments = parse()
-    walk, features = arguments.out / "walk", arguments.out / "features.npz"
+    walk = arguments.out / "walk"
     join(arguments.sequence, walk, arguments.start)
-    net = Path("prototxt", "normalized", arguments.net, "deploy.prototxt")
-    shape = f"data=1,3,{arguments.size},{arguments.size}"
-    extract = ["netspec", "extract", net, "--weights", arguments.weights, "--blob", "feat", "--shape", shape]
-    extract += ["--mean", "128,128,128", "--scale", 1 / 128, "--images", walk / "rgb.txt", "--out", features]
-    run(*extract)
-    evaluate = ["loopclosure", "evaluate", walk, "--train", arguments.vocabulary, "--out", arguments.out / "report"]
-    for method in (f"features:{features}", "fabmap", "thumbnails"):
-        evaluate += ["--method", method]
-    run(*evaluate)
-    show_times(arguments.out / "report" / "times.csv")
+    methods = [*describe(arguments, walk), *learn(arguments, walk), "thumbnails"]
+    table: dict[str, dict[str, Any]] = {}
+    for angle in ANGLES:
+        report = arguments.out / f"report_{angle}"
+        evaluate = ["loopclosure", "evaluate", walk, "--out", report, "--max-angle", angle]
+        evaluate += ["--exclude-seconds", arguments.exclude_seconds]
+        run(*evaluate, *(word for method in methods for word in ("--method", method)))
+        for name, figures in rows(report, angle).items():
+            table.setdefault(name, {"method": name}).update(figures)
+    (arguments.out / "table.json").write_text(json.dumps(list(table.values()), indent=1))
+    show_times(arguments.out / f"report_{ANGLES[0]}" / "times.csv")
+    for cells in table.values():
+        print(
+            ", ".join(f"{name}: {cell:.3f}" if isinstance(cell, float) else f"{cell}" for name, cell in cells.items())
+        )
 
 
 if __name__ == "__main__":

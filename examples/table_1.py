@@ -22,7 +22,7 @@ from importlib import import_module
 from pathlib import Path
 from statistics import mean
 
-from loopclosure.report.table_one import intervals, read_runs
+from loopclosure.report.table_one import PAPER, intervals, read_runs
 
 NETS = ("siamese_8", "siamese_128", "siamese_resnet27_256", "siamese_resnet27_512")
 ALL = "all rooms"
@@ -112,7 +112,7 @@ def write_net(arguments: argparse.Namespace, net: str, pairs: Path, folder: Path
         text = text.replace(old, new)
     (folder / "train_val.prototxt").write_text(text)
     text = Path("prototxt", "normalized", net, "solver.prototxt").read_text()
-    part = max(1, arguments.iterations // 12)
+    part = max(1, arguments.iterations // 6)
     for name, value in {
         "net": f'"{folder / "train_val.prototxt"}"',
         "test_iter": -(-arguments.validation // TEST_BATCH),
@@ -132,20 +132,28 @@ def write_net(arguments: argparse.Namespace, net: str, pairs: Path, folder: Path
 
 
 def train(arguments: argparse.Namespace, pairs: Path, test: Path, out: Path) -> None:
-    """Train each net with each seed on some pairs, and judge it on the validation pairs and the test pairs."""
+    """Train each net with each seed on some pairs, and judge two snapshots on the validation and the test pairs.
+
+    The two are that of the lowest validation loss and the last one, which may be the same.
+    """
     for seed in range(1, arguments.seeds + 1):
         for net in arguments.nets:
             folder = out / net / f"seed_{seed}"
+            solver = folder / "solver.prototxt"
+            on = () if arguments.gpu is None else ("--gpu", arguments.gpu)
             if not (folder / "runs.json").exists():
-                solver = write_net(arguments, net, pairs, folder, seed)
-                on = () if arguments.gpu is None else ("--gpu", arguments.gpu)
-                on += ("--precision", arguments.precision)
-                run("lmdb-build", "compare", solver, "--resume", "--test", test, *on, "--out", folder)
+                write_net(arguments, net, pairs, folder, seed)
+                how = ("--resume", "--precision", arguments.precision)
+                run("lmdb-build", "compare", solver, *how, "--test", test, *on, "--out", folder)
+            best = json.loads((folder / "runs.json").read_text())[0]["iteration"]
+            if best != arguments.iterations and not (folder / "last" / "runs.json").exists():
+                how = ("--no-train", "--snapshot", "last")
+                run("lmdb-build", "compare", solver, *how, "--test", test, *on, "--out", folder / "last")
 
 
-def row(trained_on: str, net: str, files: list[Path]) -> dict[str, object]:
+def row(trained_on: str, net: str, snapshot: str, files: list[Path]) -> dict[str, object]:
     """Return the table's row of a net: means over the runs of its seeds, and 95 % intervals by bootstrap over pairs."""
-    cells: dict[str, object] = {"net": net, "trained on": trained_on, "seeds": len(files)}
+    cells: dict[str, object] = {"net": net, "trained on": trained_on, "snapshot": snapshot, "seeds": len(files)}
     for judged in ("validation", "test"):
         runs = [read_runs(file, judged)[0] for file in files]
         ends = intervals(runs)
@@ -154,6 +162,8 @@ def row(trained_on: str, net: str, files: list[Path]) -> dict[str, object]:
             cells[f"{judged} {name}"] = (
                 f"{mean(getattr(run.metrics, field) for run in runs):.3f} ({low:.3f} to {high:.3f})"
             )
+    cells["iteration"] = ", ".join(str(run.iteration) for run in runs)
+    cells["precision in the paper"] = PAPER[NETS.index(net)][1]
     return cells
 
 
@@ -175,8 +185,9 @@ def main() -> None:
     rows = []
     for name, folder in folders.items():
         for net in NETS:
-            if files := sorted((folder / net).glob("seed_*/runs.json")):
-                rows.append(row(name, net, files))
+            if best := sorted((folder / net).glob("seed_*/runs.json")):
+                last = [last if (last := file.parent / "last" / "runs.json").exists() else file for file in best]
+                rows += [row(name, net, "best", best), row(name, net, "last", last)]
     (out / "table.json").write_text(json.dumps(rows, indent=1))
     for cells in ({name: name for name in rows[0]}, *rows):
         print(*(f"{cell!s:<24}" for cell in cells.values()))

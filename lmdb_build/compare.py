@@ -121,6 +121,7 @@ class Choices:
     test       databases of test pairs, one for each data layer of a net; () for none
     gpu        netspec's ``--gpu``
     precision  of the trainings, netspec's ``--precision``
+    snapshot   which one is evaluated: "best", that of the lowest validation loss, or "last"
     """
 
     train: bool = True
@@ -128,12 +129,13 @@ class Choices:
     test: tuple[str, ...] = ()
     gpu: str = ""
     precision: str = "fp32"
+    snapshot: str = "best"
 
 
 def compare(
     solvers: Sequence[str], out: Path, choices: Choices, say: Say, step: Step = lambda *_: None
 ) -> tuple[str, list[Path]]:
-    """Train the nets of the solvers and evaluate the best snapshot of each; return the tables and the report's files.
+    """Train the nets of the solvers and evaluate a snapshot of each; return the tables and the report's files.
 
     ``say`` is called with messages, ``step`` with the progress of each training. Raises SpecError or InputError for
     faults in the files.
@@ -169,15 +171,15 @@ def _judged(entry: Entry, out: Path, choices: Choices, say: Say) -> dict[str, An
     gpu = choices.gpu.replace("all", "0").partition(",")[0]
     saved, losses = _snapshots(entry, out)
     for iteration, path in saved.items():
-        if iteration not in losses:
+        if iteration not in losses and choices.snapshot == "best":
             scores = out / f"{entry.stem}.{iteration}.scores.json"
             words = ["test", "--model", entry.net, "--weights", str(path), "--iterations", str(entry.tests)]
             _netspec([*words, "--scores", str(scores), *_on(gpu)], out / f"{entry.stem}.test.log", say)
             losses[iteration] = _loss(entry, read_scores(scores).tests[0], scores)
-    best = best_snapshot(list(saved), losses)
+    chosen = max(saved) if choices.snapshot == "last" else best_snapshot(list(saved), losses)
     run: dict[str, Any] = {
         "name": entry.name,
-        "iteration": best,
+        "iteration": chosen,
         "losses": sorted(losses.items()),
         "descriptors": entry.bottoms[:2],
         "label": entry.bottoms[2],
@@ -186,9 +188,9 @@ def _judged(entry: Entry, out: Path, choices: Choices, say: Say) -> dict[str, An
     if choices.test:
         databases["test"] = choices.test
     for kind, sources in databases.items():
-        say(f"Distances of the {kind} pairs: {entry.name}, iteration {best}")
+        say(f"Distances of the {kind} pairs: {entry.name}, iteration {chosen}")
         features = out / f"{entry.stem}.{kind}.npz"
-        words = ["extract", "--model", entry.net, "--weights", str(saved[best]), "--phase", "TEST"]
+        words = ["extract", "--model", entry.net, "--weights", str(saved[chosen]), "--phase", "TEST"]
         words += ["--blob", *entry.bottoms, "--out", str(features)]
         for layer, database in zip(entry.sources["validation"], sources, strict=True):
             words += ["--source", f"{layer}={database}"]

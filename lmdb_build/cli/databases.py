@@ -257,6 +257,13 @@ def _add_compare(commands: Commands) -> None:
         choices=["fp32", "tf32", "bf16", "fp16"],
         help="precision of the trainings; the nets are evaluated in fp32 (default: %(default)s)",
     )
+    parser.add_argument(
+        "--snapshot",
+        default="best",
+        choices=["best", "last"],
+        help="evaluate the snapshot with the lowest validation loss (best), or that of the last iteration "
+        "(default: %(default)s)",
+    )
 
 
 def _left(done: int, to_do: int, seconds: float) -> str:
@@ -293,7 +300,9 @@ def _compare(arguments: argparse.Namespace) -> None:
             shown.close()
 
     databases = tuple(arguments.test)
-    choices = Choices(arguments.train, arguments.resume, databases, arguments.gpu, arguments.precision)
+    choices = Choices(
+        arguments.train, arguments.resume, databases, arguments.gpu, arguments.precision, arguments.snapshot
+    )
     tables, files = compare(arguments.solver, arguments.out, choices, say, step)
     print(tables)
     for path in files:

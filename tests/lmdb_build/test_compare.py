@@ -102,6 +102,8 @@ def test_compare_trains_and_evaluates_the_best_validated_snapshot(
     before = row("out")
     assert main(["compare", SOLVER, "--out", "out", "--no-train"]) == 0
     assert row("out")["iteration"] == before["iteration"]
+    assert main(["compare", SOLVER, "--out", "out", "--no-train", "--snapshot", "last"]) == 0
+    assert row("out")["iteration"] == "10"
     for path in Path("sgd_step").glob("ref_iter_*"):
         path.unlink()
     assert main(["compare", SOLVER, "--out", "out", "--no-train"]) == 1
