@@ -71,15 +71,19 @@ def load_net(
         limit=limit,
     )
     files = several(weights)
-    if (engine, precision) == (TORCH, FP32):
-        return build.load_net(path, phase_of(phase), options, files)
-    if find_spec("netspec.export") is None:
-        raise SpecError(f'engine "{engine}" needs netspec/export, which is not installed')
-    from netspec.export.engines.choice import Choice
+    choice = None
+    if (engine, precision) != (TORCH, FP32):
+        if find_spec("netspec.export") is None:
+            raise SpecError(f'engine "{engine}" needs netspec/export, which is not installed')
+        from netspec.export.engines.choice import Choice
+
+        choice = Choice.of(engine, precision, cache)
+    net = build.load_net(path, phase_of(phase), options, files)
+    if choice is None:
+        return net
     from netspec.export.engines.net import with_engine
 
-    choice = Choice.of(engine, precision, cache)
-    return with_engine(build.load_net(path, phase_of(phase), options, files), choice, path, files)
+    return with_engine(net, choice, path, files)
 
 
 def load_solver(

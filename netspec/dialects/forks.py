@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,10 +90,11 @@ class Dialects(Forks):
         return dialects_of(net)
 
     @override
-    def rewritten(self, plan: Any, dialects: Collection[str]) -> tuple[Any, Sequence[str]]:
+    def applied_to(self, plan: Any, dialects: Collection[str]) -> Any:
         from netspec.dialects.segmentation.crops import with_aligned_crops
 
-        return with_aligned_crops(plan, dialects)
+        used = {*dialects, *plan.source.dialects, *self.dialects_of(plan.net)}
+        return with_aligned_crops(replace(plan, dialects=tuple(sorted(used))))
 
     @override
     def doubts(self, layers: Any) -> Mapping[str, int]:

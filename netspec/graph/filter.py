@@ -15,9 +15,9 @@ from netspec.proto.schema import (
     NetStateRule,
     PhaseValue,
     SolverParameter,
+    copy_without,
 )
 from netspec.proto.source_map import SourceMap
-from netspec.proto.upgrade.rewrite import copy_without
 
 
 def in_state(net: NetParameter, *states: NetState) -> NetParameter:
@@ -47,8 +47,7 @@ def with_train_state(solver: SolverParameter, level: int | None, stages: Iterabl
 
 def filter_net(net: NetParameter, source: SourceMap) -> tuple[NetParameter, SourceMap]:
     """Return the net with only the layers that its ``state`` includes."""
-    filtered = copy_without(net, {"layer"})
-    kept, left_out = [], dict[str, tuple[str, str]]()
+    kept, left_out = list[int](), dict[str, tuple[str, str]]()
     for index, layer in enumerate(net.layer):
         if layer.include and layer.exclude:
             where = source.at(index, "exclude", layer=layer.name, type=layer.type)
@@ -56,13 +55,14 @@ def filter_net(net: NetParameter, source: SourceMap) -> tuple[NetParameter, Sour
                 SpecError("found both include and exclude rules, expected only one kind; remove the other", where)
             )
         if _included(net.state, layer):
-            filtered.layer.add().CopyFrom(layer)
-            kept.append(source.layers[index])
+            kept.append(index)
         else:
             line = source.layers[index].where.line
             maker = f'layer "{layer.name}"{f" of line {line}" if line else ""}'
             left_out.update(dict.fromkeys(layer.top, (maker, _remedy(net.state, layer))))
-    return filtered, replace(source.with_layers(kept), left_out=left_out)
+    filtered = copy_without(net, {"layer"})
+    filtered.layer.extend(net.layer[index] for index in kept)
+    return filtered, replace(source.with_layers(source.layers[index] for index in kept), left_out=left_out)
 
 
 def _remedy(state: NetState, layer: LayerParameter) -> str:

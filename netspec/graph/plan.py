@@ -7,11 +7,10 @@ Caffe: Net::Init, AppendTop, AppendBottom, AppendParam (src/caffe/net.cpp).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from netspec.errors import SpecError
-from netspec.proto.forks import forks
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 
@@ -49,7 +48,9 @@ class Plan:
 
     ``blobs[v]`` is the name of value ``v``; ``outputs`` maps names, in Caffe's order, to values;
     ``final[v]`` is the value that finally replaces ``v`` in Caffe's memory, from the last in-place layer.
-    ``dialects`` are the forks of Caffe that the net uses, and ``warnings`` tell what they change (:func:`of_forks`).
+    ``ends[i]`` are the values that are no longer needed once node ``i`` has run.
+    ``dialects`` are the forks of Caffe that the net uses, and ``warnings`` say what they changed
+    (``Forks.applied_to``).
     """
 
     net: NetParameter
@@ -58,15 +59,9 @@ class Plan:
     blobs: tuple[str, ...]
     outputs: dict[str, int]
     final: tuple[int, ...]
+    ends: tuple[tuple[int, ...], ...]
     dialects: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-
-
-def of_forks(plan: Plan, dialects: Collection[str]) -> Plan:
-    """Return the plan with the fields that its forks mean: ``dialects``, those its text names, and those it uses."""
-    used = {*dialects, *plan.source.dialects, *forks().dialects_of(plan.net)}
-    rewritten, warnings = forks().rewritten(plan, used)
-    return replace(rewritten, dialects=tuple(sorted(used)), warnings=tuple(warnings))
 
 
 def make_plan(net: NetParameter, source: SourceMap) -> Plan:
@@ -119,7 +114,8 @@ def make_plan(net: NetParameter, source: SourceMap) -> Plan:
         blocked = tuple(not down for down in propagate)
         nodes.append(Node(layer.name, layer.type, bottoms, tuple(tops), tuple(in_place), tuple(params), blocked))
     outputs = {name: current[name] for name in sorted(available)}
-    return Plan(net, source, tuple(nodes), tuple(blobs), outputs, _last_values(nodes, len(blobs)))
+    final = _last_values(nodes, len(blobs))
+    return Plan(net, source, tuple(nodes), tuple(blobs), outputs, final, _last_uses(nodes))
 
 
 def _last_values(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
@@ -130,6 +126,15 @@ def _last_values(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
             if replaces and node.bottoms[j] >= 0:
                 final[node.bottoms[j]] = final[node.tops[j]]
     return tuple(final)
+
+
+def _last_uses(nodes: Sequence[Node]) -> tuple[tuple[int, ...], ...]:
+    """Return, by node, the values that no later node reads."""
+    last = {v: i for i, node in enumerate(nodes) for v in (*node.tops, *node.bottoms)}
+    ends: list[list[int]] = [[] for _ in nodes]
+    for v, i in last.items():
+        ends[i].append(v)
+    return tuple(map(tuple, ends))
 
 
 def _shared_multipliers(net: NetParameter, source: SourceMap) -> dict[str, tuple[float, float]]:

@@ -10,9 +10,8 @@ from collections import Counter
 from collections.abc import Mapping
 
 from netspec.errors import Code, SpecError, did_you_mean
-from netspec.proto.schema import NetParameter
+from netspec.proto.schema import NetParameter, copy_without
 from netspec.proto.source_map import SourceMap
-from netspec.proto.upgrade.rewrite import copy_without
 
 SPLIT = "Split"
 Top = tuple[int, int]  # layer index, top index

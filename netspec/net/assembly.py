@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from netspec import log
 from netspec.errors import Code, Report, SpecError, Where
 from netspec.files.limits import LIMIT, amount, is_out_of_memory, memory, read_amount
 from netspec.graph.options import BuildOptions
-from netspec.graph.plan import AUTOMATIC, Backward, Node, Param, Plan, plan_backward
+from netspec.graph.plan import AUTOMATIC, Backward, Node, Param, Plan, plan_backward, unblocked
 from netspec.layers import class_of, unknown_type
 from netspec.layers.contract.base import Layer, Shape, shape_string
 from netspec.layers.contract.context import Context, Random, device_of
@@ -29,7 +29,6 @@ from netspec.layers.contract.fillers import READS
 from netspec.net.frozen import compute_caffes_gradients, needs_backward
 from netspec.proto.forks import forks
 from netspec.proto.schema import TEST
-from netspec.run.eager import last_uses
 
 BYTES = 4  # of a number: float32
 
@@ -71,7 +70,7 @@ class Assembly:
         self.shapes: dict[str, Shape] = {}
         self.loss_weights: list[list[float]] = []
         self.learnable: list[Learnable] = []  # a shared blob is there once
-        self.need = MemoryNeed(plan, last_uses(plan))
+        self.need = MemoryNeed(plan)
         self.backward: Backward | None = None
         self.random = Random(int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed)
         device = device_of(options.device)
@@ -191,6 +190,7 @@ class Assembly:
         labels = [layer.label_bottoms for layer in layers]
         ignoring = [layer.ignores_propagate_down for layer in layers]
         backward = plan_backward(self.plan, learns, has_loss, labels, ignoring)
+        self.plan = unblocked(self.plan, backward)
         if self.options.accumulate_in_place:
             compute_caffes_gradients(self.plan, layers, backward)
         for node, needs in zip(reversed(self.plan.nodes), reversed(backward.layers), strict=True):
@@ -265,10 +265,10 @@ class MemoryNeed:
     ahead. Gradients, the solver's history and the work memory of kernels are not counted.
     """
 
-    def __init__(self, plan: Plan, last_uses: Sequence[Sequence[int]]) -> None:
+    def __init__(self, plan: Plan) -> None:
         self.parameters = self.tops = self.ahead = 0
         self._plan = plan
-        self._ends = last_uses if plan.net.state.phase == TEST else [()] * len(plan.nodes)
+        self._ends = plan.ends if plan.net.state.phase == TEST else [()] * len(plan.nodes)
         self._home: dict[int, int] = {}  # value -> the value that owns its memory
         self._sizes: dict[int, int] = {}
         self._users: dict[int, int] = {}  # how many values that are still needed are in the memory of a value

@@ -14,11 +14,12 @@ from netspec import log
 from netspec.files.limits import no_collection
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
-from netspec.graph.plan import make_plan, of_forks
+from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits
 from netspec.layers.contract.registry import source_of
 from netspec.net.net import Net
 from netspec.net.weights import copy_weights, load_weights
+from netspec.proto.forks import forks
 from netspec.proto.schema import TEST, NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
@@ -33,7 +34,9 @@ def load_net(
     """
     options = options or BuildOptions()
     net, source = parse_net(path)
-    built = build_net(with_state(net, phase, options.level, options.stages), source, options)
+    net = with_state(net, phase, options.level, options.stages)
+    net, source = filter_net(net, source)
+    built = build_filtered(net, source, options)
     if files := list(weights):
         load_weights(built, files, options.strict)
     return built
@@ -41,8 +44,8 @@ def load_net(
 
 def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None = None) -> Net:
     """Build a net; only the layers of its ``state`` are kept. ``source`` has the positions of its parts in the file."""
-    options = options or BuildOptions()
-    return build_filtered(*filter_net(net, source), options)
+    net, source = filter_net(net, source)
+    return build_filtered(net, source, options or BuildOptions())
 
 
 @no_collection()
@@ -54,7 +57,9 @@ def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOpti
     for layer in split.layer:
         if not layer.HasField("phase"):
             layer.phase = split.state.phase
-    built = Net(of_forks(make_plan(split, source), options.dialects), options)
+    plan = make_plan(split, source)
+    plan = forks().applied_to(plan, options.dialects)
+    built = Net(plan, options)
     written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])
     if written.layer:  # weights in the prototxt itself
         copy_weights(built, written, source.file)

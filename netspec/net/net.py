@@ -20,7 +20,7 @@ from netspec.errors import SpecError, Where, check_blobs, did_you_mean
 from netspec.exact import ALL
 from netspec.exact.machine import other_bits
 from netspec.graph.options import BuildOptions
-from netspec.graph.plan import Plan, unblocked
+from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer, State
 from netspec.layers.contract.context import device_of
 from netspec.net.assembly import Assembly
@@ -84,7 +84,7 @@ class Net(torch.nn.Module):
             log.warning("net.cpp:53", warning)
         assembly = Assembly(plan, options)
         self.options = assembly.options
-        self.plan, self.param = plan, plan.net
+        self.plan, self.param = assembly.plan, plan.net
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
         self.layers: Any = torch.nn.ModuleList(assembly.layers.values())
@@ -99,7 +99,6 @@ class Net(torch.nn.Module):
         ]
         if assembly.backward is not None:  # otherwise errors were collected, and the net will not run
             self.backward_plan = assembly.backward
-            self.plan = unblocked(plan, assembly.backward)
             self._set_runners()
 
     def _set_runners(self) -> None:

@@ -8,7 +8,7 @@ imports nothing, so every other file can import it.
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
     from typing import Any
 
@@ -117,9 +117,12 @@ class Forks:
         """Return the dialects whose fields and layer types a net uses, and those of ``everywhere``."""
         return set()
 
-    def rewritten(self, plan: "Any", dialects: "Collection[str]") -> "tuple[Any, Sequence[str]]":
-        """Return a new Plan whose layers have the fields that these dialects mean, and warnings."""
-        return plan, ()
+    def applied_to(self, plan: "Any", dialects: "Collection[str]") -> "Any":
+        """Return a new Plan with its dialects: the given ones, those that its text names, and those that it uses.
+
+        Its layers have the fields that these dialects mean, and its ``warnings`` say what they changed.
+        """
+        return plan
 
     def doubts(self, layers: "Any") -> "Mapping[str, int]":
         """Return warnings about layers whose type exists in several forks, if the net does not show which is meant.

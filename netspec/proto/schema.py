@@ -7,14 +7,17 @@ contains the command to compile it. ``caffe_pb2.pyi`` is generated with it, for 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import Message
 
 from netspec.errors import SpecError
+
+M = TypeVar("M", bound=Message)
 
 PACKAGE = "caffe"
 SCOPE = "FieldsOf"  # the fields that a fork adds to a message are declared inside one of this name and the message's
@@ -128,6 +131,16 @@ class Field:
         else:
             setattr(message, self.name, value)
 
+    def assign(self, message: Message, value: Any) -> None:
+        """Set the field, whatever its type; of a repeated one, add one or several values."""
+        if self.repeated:
+            several = not isinstance(value, (str, bytes, int, float, Message))
+            self.get(message).extend(value if several else [value])
+        elif isinstance(value, Message):
+            self.get(message).CopyFrom(value)
+        else:
+            self.set(message, value)
+
     def present(self, message: Message) -> bool:
         """Return whether a value was given."""
         if self.repeated:
@@ -184,6 +197,15 @@ def given(message: Message) -> list[Field]:
     for descriptor in descriptors:
         found.append(_of_forks[descriptor.full_name] if descriptor.is_extension else own[descriptor.name])
     return found
+
+
+def copy_without(message: M, leave_out: Collection[str]) -> M:
+    """Return a copy of a message without some of its fields; these are never copied, not even temporarily."""
+    result = type(message)()
+    for field in given(message):
+        if field.name not in leave_out:
+            field.assign(result, field.get(message))
+    return result
 
 
 def same_field(field: Field, message: Message) -> Field | None:

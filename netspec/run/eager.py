@@ -17,17 +17,16 @@ from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
 class Eager:
     """Runs the layers of a plan. Every net can be run this way.
 
-    ``loss_weights[i][j]`` is the loss weight of layer i's top j. ``exact`` is as in netspec/exact.
+    ``loss_weights[i][j]`` is the loss weight of layer i's top j, and ``losses`` has those that are not 0. ``exact`` is
+    as in netspec/exact.
     """
 
     def __init__(
         self, plan: Plan, layers: Sequence[Layer], loss_weights: Sequence[Sequence[float]], exact: str
     ) -> None:
         self.plan, self.layers, self.loss_weights, self.exact = plan, list(layers), loss_weights, exact
-        self._losses = losses_of(loss_weights)
-        self._last_uses = last_uses(plan)
+        self.losses = losses_of(loss_weights)
         self.overwritten = [overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
-        self._runs_alone = self._must_run_alone()
         self._lines: dict[frozenset[int], list[Step]] = {}  # by what is kept, of the last run
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
@@ -54,12 +53,12 @@ class Eager:
 
     def parts(self, kept: frozenset[int] = frozenset()) -> list[Part]:
         """Return the layers in order, joined where the values ``kept`` allow it."""
-        return parts_of(self.plan, self.layers, self._runs_alone, kept)
+        return parts_of(self.plan, self.layers, self._must_run_alone(), kept)
 
     def _alone(self, i: int, kept: frozenset[int] = frozenset()) -> list[Step]:
         """Return the step that runs layer ``i`` alone. An input needs none, because its values are given."""
         node, layer = self.plan.nodes[i], self.layers[i]
-        losses, ends = self._losses[i], self._ending_values(i, i, kept)
+        losses, ends = self.losses[i], self._ending_values(i, i, kept)
         if not layer.is_input:
             return [Step(i, self._as_asked(i), node.bottoms, node.tops, losses, ends)]
         return [Step(i, lambda *tops: tops, node.tops, node.tops, losses, ends)] if losses or ends else []
@@ -79,7 +78,7 @@ class Eager:
         return run
 
     def _ending_values(self, first: int, last: int, kept: frozenset[int]) -> tuple[int, ...]:
-        return tuple(v for i in range(first, last + 1) for v in self._last_uses[i] if v not in kept)
+        return tuple(v for i in range(first, last + 1) for v in self.plan.ends[i] if v not in kept)
 
     def _must_run_alone(self) -> list[bool]:
         """Return which layers can never be joined with others."""
@@ -87,7 +86,7 @@ class Eager:
         read_again = {final[node.tops[0]] for node, is_read in zip(nodes, self.overwritten, strict=True) if is_read}
         return [
             any(node.blocked) or bool(losses) or any(final[v] in read_again for v in node.tops)
-            for node, losses in zip(nodes, self._losses, strict=True)
+            for node, losses in zip(nodes, self.losses, strict=True)
         ]
 
     def _remembering(self) -> Visit | None:
@@ -109,15 +108,3 @@ class Eager:
             return tops
 
         return visit
-
-
-def last_uses(plan: Plan) -> list[list[int]]:
-    """Return, by node, the values that are no longer needed once it has run."""
-    last: dict[int, int] = {}
-    for i, node in enumerate(plan.nodes):
-        for v in (*node.tops, *node.bottoms):
-            last[v] = i
-    ends: list[list[int]] = [[] for _ in plan.nodes]
-    for v, i in last.items():
-        ends[i].append(v)
-    return ends

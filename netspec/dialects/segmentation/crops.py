@@ -8,7 +8,7 @@ Fork: s9xie/hed, src/caffe/layers/crop_layer.cpp. The rule became BVLC's python/
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
@@ -57,17 +57,17 @@ EDGES = (
 )
 
 
-def with_aligned_crops(plan: Plan, dialects: Collection[str]) -> tuple[Plan, Sequence[str]]:
-    """Return a plan whose Crops without crop_param have offsets where HED's branch is meant, and warnings."""
+def with_aligned_crops(plan: Plan) -> Plan:
+    """Return a plan whose Crops without crop_param have offsets where HED's branch is meant, with warnings."""
     if not any(layer.type == "Crop" for layer in plan.net.layer):
-        return plan, ()
+        return plan
     net = NetParameter()
     net.CopyFrom(plan.net)
     aligned = replace(plan, net=net)
-    return aligned, list(_align(aligned, dialects))
+    return replace(aligned, warnings=tuple(_align(aligned)))
 
 
-def _align(plan: Plan, dialects: Collection[str]) -> Iterator[str]:
+def _align(plan: Plan) -> Iterator[str]:
     """Set the offsets of each Crop without crop_param as in HED's branch, if the net is made for it; yield warnings.
 
     It is if the dialect is named, or if a convolution before the Crop has more padding than its kernel, because only
@@ -80,16 +80,16 @@ def _align(plan: Plan, dialects: Collection[str]) -> Iterator[str]:
         if layer.type != "Crop" or layer.HasField("crop_param") or len(layer.bottom) != 2:
             continue
         offsets, padded = _offsets(plan, makers, i) or ([], False)
-        if any(offsets) and (padded or HED in dialects):
+        if any(offsets) and (padded or HED in plan.dialects):
             layer.crop_param.axis = 2
             layer.crop_param.offset.extend(offsets)
-        if any(offsets) and HED not in dialects:
+        if any(offsets) and HED not in plan.dialects:
             found.setdefault(ALIGNED if padded else CORNER, []).append(i)
             by.setdefault(i, " and ".join(map(str, offsets)))
     for message, crops in found.items():
         where = plan.source.at(crops[0], layer=plan.nodes[crops[0]].name, type="Crop")
         others = f" (also in {len(crops) - 1} more of these layers)" if len(crops) > 1 else ""
-        edges = any(layer.type == "SigmoidCrossEntropyLoss" for layer in plan.net.layer) and "rcf" not in dialects
+        edges = any(layer.type == "SigmoidCrossEntropyLoss" for layer in plan.net.layer) and "rcf" not in plan.dialects
         yield f"{where}: {message.format(by=by[crops[0]])}{others}{EDGES if edges else ''}"
 
 

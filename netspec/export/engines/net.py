@@ -23,7 +23,7 @@ from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias
 from netspec.net.net import Net
 from netspec.proto.schema import PHASE_NAMES, TEST
 from netspec.run.shapes import fitted
-from netspec.run.walk import Result, losses_of, walk, weighted_sum
+from netspec.run.walk import Result, walk, weighted_sum
 
 
 def write_model(net: Net, path: Path, blobs: Iterable[str] = ()) -> None:
@@ -57,20 +57,17 @@ def with_engine(net: Net, choice: Choice, path: str | Path, weights: Iterable[st
 
     Torch runs the net if it was chosen, or if the engine cannot run it; a warning says why.
     """
-    if choice.engine == TORCH:
-        warn_unable(choice, "")
-        return net
-    weights = list(weights)
     reason = ""
-    if net.phase != TEST:
+    if choice.engine != TORCH and net.phase != TEST:
         reason = f"it runs nets in phase TEST, but this net is in phase {PHASE_NAMES[net.phase]}"
-    elif net.device.type != "cpu":
+    elif choice.engine != TORCH and net.device.type != "cpu":
         reason = f"it runs on the CPU, but this net is on {net.device}"
-    if reason:
+    if choice.engine == TORCH or reason:
         warn_unable(choice, reason)
         return net
+    weights, write = list(weights), _writer(net, Path(path))
     origin = Origin([path, *weights], {"level": net.options.level or 0, "stages": tuple(net.options.stages)})
-    net.runners.insert(0, Engine(net, choice, origin if weights else None, _writer(net, Path(path))))
+    net.runners.insert(0, Engine(net, choice, origin if weights else None, write))
     return net
 
 
@@ -87,7 +84,8 @@ class Engine:
         self._plan, self._layers, self._exact = net.plan, list(net.layers), net.options.exact
         self._choice, self._from, self._write = choice, origin, write
         self._blobs = blobs_of(net.layers)
-        losses = list(zip(net.plan.nodes, losses_of(net.loss_weights), strict=True))
+        self._loaded = self._exported = Seen(self._blobs(), values=True)  # when it was loaded, and exported
+        losses = list(zip(net.plan.nodes, net.eager.losses, strict=True))
         # The values of named losses, and their weights.
         self._weighted = [(node.tops[j], w) for node, own in losses for j, w in own if j < len(node.tops)]
         # A loss without a top is no value of the model: torch computes it from its bottoms.
@@ -104,7 +102,6 @@ class Engine:
         self._built = {blob: net.shapes[blob] for blob in self._ends.values()}
         self._model: Model | None = None
         self._opened_for: tuple[str, ...] = ()  # the blobs of the model
-        self._loaded = self._exported = self._blob_state()  # the state of the learnable blobs at that time
         self._unable, self._warned = False, False
         self._fits: tuple[dict[int, Shape], dict[int, Shape]] = {}, {}  # shapes of inputs and of all values
 
@@ -156,16 +153,14 @@ class Engine:
             self._fits = given, fitted(self._plan, self._layers, given)[1]
         return self._fits[1]
 
-    def _blob_state(self) -> Seen:
-        return Seen(self._blobs(), values=True)
-
     def _current(self, blobs: tuple[str, ...]) -> Model:
         """Return the model of the net with its current parameters and these blobs."""
         if self._model is None or self._opened_for != blobs or not self._exported.are(self._blobs()):
             computed, as_loaded = [blob for blob in blobs if blob not in self._built], self._loaded.are(self._blobs())
             origin = self._origin(blobs) if as_loaded else None
             self._model = Model(self._choice, origin, lambda path: self._write(path, computed))
-            self._opened_for, self._exported = blobs, self._blob_state()  # after the export, which hands out aliases
+            self._opened_for = blobs
+            self._exported = Seen(self._blobs(), values=True)  # after the export, which hands out aliases
             if as_loaded:
                 self._loaded = self._exported
         return self._model

@@ -22,10 +22,9 @@ from netspec.graph.plan import origins
 from netspec.graph.speed import speed
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.proto.schema import NetParameter, ParamSpec
+from netspec.proto.schema import NetParameter, ParamSpec, copy_without
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import write_text
-from netspec.proto.upgrade.rewrite import copy_without
 
 
 def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool = True) -> tuple[Any, SourceMap]:

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where, check_blobs, did_you_mean
-from netspec.proto.schema import LayerParameter, NetParameter
+from netspec.proto.schema import LayerParameter, NetParameter, copy_without
 from netspec.proto.source_map import SourceMap
-from netspec.proto.upgrade.rewrite import copy_without
 
 INPUT = "Input"
 

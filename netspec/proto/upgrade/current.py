@@ -18,9 +18,17 @@ from google.protobuf.message import Message
 
 from netspec import log
 from netspec.errors import SpecError
-from netspec.proto.schema import BlobShape, LayerParameter, NetParameter, SolverParameter, V1LayerParameter, fields_of
+from netspec.proto.schema import (
+    BlobShape,
+    LayerParameter,
+    NetParameter,
+    SolverParameter,
+    V1LayerParameter,
+    copy_without,
+    fields_of,
+)
 from netspec.proto.source_map import Position, SourceMap
-from netspec.proto.upgrade.rewrite import Draft, copy_without
+from netspec.proto.upgrade.rewrite import Draft
 from netspec.proto.upgrade.v0 import needs_v0_upgrade, upgrade_v0
 
 Upgraded = tuple[NetParameter, SourceMap]

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any, TypeVar
+from typing import Any
 
 from google.protobuf.message import Message
 
 from netspec.errors import Where
 from netspec.proto.schema import Field, fields_of, given, same_field
 from netspec.proto.source_map import Position
-
-M = TypeVar("M", bound=Message)
 
 
 class Draft:
@@ -35,7 +33,7 @@ class Draft:
         self._put(fields_of(self.message.DESCRIPTOR)[name], value, positions)
 
     def _put(self, field: Field, value: Any, positions: tuple[Position, ...]) -> None:
-        _put(self.message, field, value)
+        field.assign(self.message, value)
         before = self.positions.get(field.name, ()) if field.repeated else ()
         self.positions[field.name] = (*before, *positions)
 
@@ -52,22 +50,3 @@ class Draft:
         """Return the positions of all parts."""
         inner = {name: (draft.position(),) for name, draft in self._inner.items()}
         return Position(self.where, {**self.positions, **inner})
-
-
-def _put(message: Message, field: Field, value: Any) -> None:
-    if field.repeated:
-        several = not isinstance(value, (str, bytes, int, float, Message))
-        field.get(message).extend(value if several else [value])
-    elif isinstance(value, Message):
-        field.get(message).CopyFrom(value)
-    else:
-        field.set(message, value)
-
-
-def copy_without(message: M, leave_out: Collection[str]) -> M:
-    """Return a copy of a message without some of its fields; these are never copied, not even temporarily."""
-    result = type(message)()
-    for field in given(message):
-        if field.name not in leave_out:
-            _put(result, field, field.get(message))
-    return result

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 from netspec import log
 from netspec.errors import SpecError, did_you_mean
-from netspec.proto.schema import NetParameter, V0LayerParameter, V1LayerParameter, fields_of
+from netspec.proto.schema import NetParameter, V0LayerParameter, V1LayerParameter, copy_without, fields_of
 from netspec.proto.source_map import Position, SourceMap
-from netspec.proto.upgrade.rewrite import Draft, copy_without
+from netspec.proto.upgrade.rewrite import Draft
 
 # V0's names of types are mostly V1's in lower case; a type's own parameters are named after V1's.
 _SAME = """accuracy bnll concat data dropout euclidean_loss flatten hdf5_data hdf5_output im2col infogain_loss lrn

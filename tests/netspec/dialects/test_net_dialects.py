@@ -8,10 +8,11 @@ import torch
 
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
-from netspec.graph.plan import make_plan, of_forks
+from netspec.graph.plan import make_plan
 from netspec.layers.vision.convolution import Convolution
 from netspec.net.net import Net
 from netspec.net.weights import load_weights
+from netspec.proto.forks import forks
 from netspec.proto.schema import NetParameter
 from netspec.proto.text import parse_net_text
 
@@ -138,7 +139,7 @@ def test_crop_without_offsets_aligns_its_bottoms_in_hed_only(
 
 def test_a_plan_is_not_changed_by_its_forks() -> None:
     plan = make_plan(*parse_net_text(conv(35), "f"))
-    first, second = of_forks(plan, ()), of_forks(plan, ())
+    first, second = forks().applied_to(plan, ()), forks().applied_to(plan, ())
     assert [layer.HasField("crop_param") for layer in (plan.net.layer[-1], first.net.layer[-1])] == [False, True]
     assert first.warnings == second.warnings != ()
 
