@@ -112,9 +112,7 @@ def changes(before: Settings, now: Settings) -> str:
     found = []
     for part in now:
         if part in before:
-            was, is_now = dict(before[part]), now[part]
-            if was.get("compiled") is False:  # written by versions with the option --compile
-                del was["compiled"]
+            was, is_now = before[part], now[part]
             of = "" if part == "solver" else f"{part}, "
             for name in [*is_now, *(name for name in was if name not in is_now)]:
                 if was.get(name) != is_now.get(name):

@@ -20,7 +20,7 @@ from netspec.data.datum import array_to_datum
 from netspec.errors import SpecError
 from netspec.load import load_solver
 from netspec.net.extra_file import extra_text
-from netspec.solver.extra import changes, extra_path, read_extra
+from netspec.solver.extra import extra_path, read_extra
 from netspec.solver.snapshot import State, read_state, write_state
 from netspec.solver.solver import Solver
 from netspec.solver.update import RULES
@@ -227,11 +227,6 @@ def test_changes_that_affect_results_are_reported(
     (said,) = [line for line in warnings() if line.startswith(state)]
     assert said.startswith(f"{state}.extra: the training continues, but its results will differ: ")
     assert reported in said
-
-
-def test_a_missing_compiled_setting_counts_as_false() -> None:
-    assert changes({"solver": {"compiled": False}}, {"solver": {}}) == ""
-    assert changes({"solver": {"compiled": True}}, {"solver": {}}) == "compiled is the default, was True"
 
 
 def test_a_changed_number_of_records_is_reported(warnings: Callable[[], list[str]]) -> None:
