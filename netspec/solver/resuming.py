@@ -178,7 +178,7 @@ class Snapshots:
         training = self._training
         manner: dict[str, Any] = {
             "precision": training.options.precision,
-            "exact": training.exact,
+            "exact": training.options.exact_sums,
             "device": training.device.type,
             "torch": torch.__version__,
         }

@@ -6,10 +6,13 @@ Caffe: src/caffe/solver.cpp; the sites in the log calls are the lines of that fi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from contextlib import nullcontext
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -22,7 +25,6 @@ from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Position
 from netspec.solver import update
 from netspec.solver.extra import read_extra
-from netspec.solver.interrupts import waiting_interrupts
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.options import TrainingOptions
 from netspec.solver.precision import FP16
@@ -217,3 +219,33 @@ class Solver(Training):
     def restore(self, path: str | Path) -> None:
         """Resume from a .solverstate or .solverstate.h5. Raises SpecError (see Snapshots.restore)."""
         self._snapshots.restore(path)
+
+
+@contextmanager
+def waiting_interrupts() -> Iterator[Callable[[], None]]:
+    """Delay Ctrl-C within the block. The yielded function raises KeyboardInterrupt if Ctrl-C was pressed.
+
+    So does the end of the block. A second Ctrl-C raises it immediately. In threads other than the main one, and if the
+    program has its own handler, nothing is delayed.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield lambda: None
+        return
+    received: list[int] = []
+
+    def wait(number: int, frame: FrameType | None) -> None:
+        if received:
+            signal.default_int_handler(number, frame)
+        received.append(number)
+
+    def interrupt() -> None:
+        if received:
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, wait)
+    try:
+        yield interrupt
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    interrupt()

@@ -142,11 +142,6 @@ class Training:
         return self.blocks.history
 
     @property
-    def exact(self) -> str:
-        """Which sums are bit-identical to Caffe's."""
-        return self.options.exact_sums
-
-    @property
     def loss(self) -> float:
         """The training loss, a mean over the last ``average_loss`` iterations of this call of :meth:`step`."""
         return sum(self.losses) / len(self.losses) if self.losses else 0.0
@@ -195,7 +190,7 @@ class Training:
             data_seed=self.seed if ranks > 1 else None,
             rank=rank,
             ranks=ranks,
-            exact=self.exact,
+            exact=self.options.exact_sums,
             accumulate_in_place=True,
             passes=(),
         )
