@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from netspec.solver.extra import (
     settings_of,
     write_extra,
 )
-from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
+from netspec.solver.snapshot import State, find_learned_net, has_squares, merge_shared, read_state, write_state
 from netspec.solver.testing import Tests
 from netspec.solver.training import Training
 
@@ -121,7 +122,7 @@ class Snapshots:
         training = self._training
         where = Where(str(path))
         extra = read_extra(path)
-        state = read_state(path)
+        state = self._in_current_form(read_state(path), where)
         if len(state.history) != len(training.history):
             found, expected = len(state.history), len(training.history)
             message = (
@@ -186,6 +187,24 @@ class Snapshots:
             manner["threads"] = torch.get_num_threads()
         tests = {f"test net #{i}": net for i, net in enumerate(training.test_nets)}
         return settings_of(training.param, {nets.TRAIN_NET: training.net, **tests}, manner)
+
+    def _in_current_form(self, state: State, where: Where) -> State:
+        """Return a state with one history per parameter, from one with a history for each layer that shares it."""
+        training = self._training
+        number = {id(learnable.parameter): i for i, learnable in enumerate(training.net.learnable)}
+        owners = [number[id(blob)] for layer in training.net.layers for blob in layer.blobs]
+        shapes = [shape for layer in training.net.layers for shape in layer.blob_shapes]
+        if len(state.history) == len(training.history) or len(state.history) != training.rule.sets * len(owners):
+            return state
+        if len(state.history) == 2 * len(training.history) and has_squares(state.history, training.param.type):
+            return state  # of another type: the second half is that type's second set
+        for i, theirs in enumerate(state.history):
+            mine = shapes[i % len(shapes)]
+            if not _same_shape(mine, theirs.shape):
+                raise SpecError(f"history blob {i} has shape {theirs.shape}, expected {mine}", where)
+        message = "has a history for each layer, as before August 2015; the histories of shared parameters are added"
+        log.warning("sgd_solver.cpp:336", f"{where}: {message}")
+        return replace(state, history=merge_shared(state.history, owners))
 
 
 def _same_shape(mine: tuple[int, ...], theirs: tuple[int, ...]) -> bool:

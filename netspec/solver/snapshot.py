@@ -6,7 +6,7 @@ Caffe: SGDSolver::SnapshotSolverState, RestoreSolverState (src/caffe/solvers/sgd
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,6 +60,34 @@ def _read_binary(path: str | Path) -> State:
         except ValueError as fault:
             raise SpecError(f"history blob {i}: {fault}", Where(str(path))) from None
     return State(proto.iter, proto.learned_net, proto.current_step, history)
+
+
+def has_squares(history: Sequence[np.ndarray], solver_type: str) -> bool:
+    """Return whether the second half of a history is a second set, such as Adam's squares, that the type lacks."""
+    half = len(history) // 2
+    first, second = (any((array < 0).any() for array in part) for part in (history[:half], history[half:]))
+    return not second and (first or solver_type in ("SGD", "Nesterov"))
+
+
+def merge_shared(history: list[np.ndarray], owners: Sequence[int]) -> list[np.ndarray]:
+    """Return one array for each learnable parameter, from a history with one for each layer that shares it.
+
+    Caffe wrote such a history before August 2015, when shared parameters got a single gradient. ``owners`` has, for
+    each blob of each layer, the index of its parameter. Before, each layer's gradient had its own history, and the sum
+    of their updates changed the parameter, so the histories are added. Equal ones are copies, and are counted once.
+    """
+    sets = len(history) // len(owners)
+    parts: dict[tuple[int, int], list[np.ndarray]] = {}
+    for i, array in enumerate(history):
+        parts.setdefault((i // len(owners), owners[i % len(owners)]), []).append(array)
+    assert len(parts) == sets * (max(owners) + 1), "every parameter belongs to a layer"
+    merged = []
+    for _, arrays in sorted(parts.items(), key=lambda item: item[0]):
+        first = arrays[0]
+        others = [array.reshape(first.shape) for array in arrays[1:]]
+        copies = all(np.array_equal(first, other) for other in others)
+        merged.append(first if copies else np.sum([first, *others], axis=0, dtype=first.dtype))
+    return merged
 
 
 def write_state(path: str | Path, state: State, before: Callable[[Path], object] = lambda unfinished: None) -> None:

@@ -10,7 +10,7 @@ from netspec.errors import SpecError
 from netspec.load import load_solver
 from netspec.net.weights import load_weights
 from netspec.proto.schema import BlobProto, BlobShape, SolverState
-from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
+from netspec.solver.snapshot import State, find_learned_net, merge_shared, read_state, write_state
 from netspec.solver.solver import Solver
 from paths import GOLDEN
 
@@ -211,3 +211,39 @@ def test_old_four_axis_history_fits(work_in: Callable[..., Path]):
     solver = load_solver("sgd_step/solver.prototxt", snapshot="sgd_step/old.solverstate")
     np.testing.assert_array_equal(solver.history[5].numpy(), state.history[5])
     solver.close()
+
+
+@pytest.mark.parametrize("copies", [True, False], ids=["copies", "parts"])
+def test_histories_of_shared_parameters_are_added(
+    work_in: Callable[..., Path], warnings: Callable[[], list[str]], copies: bool
+):
+    """Caffe of 2014-15: two towers of four layers each, so sixteen histories of eight parameters, with old shapes."""
+    work_in("snapshot", "sgd_step")
+    state = read_state("sgd_step/ref_iter_40.solverstate")
+    assert len(state.history) == 8
+    first, second = (1, 1) if copies else (0.25, 0.75)
+    old = SolverState(iter=40, learned_net="sgd_step/ref_iter_40.caffemodel")
+    for array in (*(first * h for h in state.history), *(second * h for h in state.history)):
+        num, channels, height, width = (1,) * (4 - array.ndim) + array.shape
+        blob = BlobProto(num=num, channels=channels, height=height, width=width, data=array.ravel().tolist())
+        old.history.append(blob)
+    Path("sgd_step/old.solverstate").write_bytes(old.SerializeToString())
+    solver = load_solver("sgd_step/solver.prototxt", snapshot="sgd_step/old.solverstate")
+    for mine, expected in zip(solver.history, state.history, strict=True):
+        torch.testing.assert_close(mine, torch.tensor(expected))
+    assert warnings() == [
+        "sgd_step/old.solverstate: has a history for each layer, as before August 2015; "
+        "the histories of shared parameters are added"
+    ]
+    old.history[9].num = 7
+    old.history[9].data.extend([0] * 6 * len(old.history[9].data))
+    Path("sgd_step/odd.solverstate").write_bytes(old.SerializeToString())
+    with pytest.raises(SpecError, match=r"odd\.solverstate: history blob 9 has shape \(7, 1, 1, 6\), expected \(6,\)"):
+        solver.restore("sgd_step/odd.solverstate")
+    solver.close()
+
+
+def test_the_second_set_of_shared_histories_follows_the_first():
+    history = [np.array([k], np.float32) for k in (1, 10, 2, 3, 30, 4)]
+    assert [array.tolist() for array in merge_shared(history, [0, 1, 0])] == [[3], [10], [7], [30]]
+    assert merge_shared([np.array([[5]], np.float32), np.array([5], np.float32)], [0, 0])[0].tolist() == [[5]]
