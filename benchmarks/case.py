@@ -149,7 +149,7 @@ def training_net(name: str, source: str, batch: int) -> Any:
 def record(name: str) -> tuple[tuple[int, int, int], int]:
     """Return the shape of a net's records, and the number of labels."""
     if name in ZOO:
-        return ZOO[name][1], 2 if name == "pnet" else 10
+        return ZOO[name][1], 2 if name in ("pnet", "rnet", "onet") else 10
     size = 64 if name in SMALL else 224
     return (6, size, size), 2
 

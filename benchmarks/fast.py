@@ -35,7 +35,7 @@ FORWARD = {  # the batch size, and the size of the image if it is not the net's 
     "lenet": (64,),
     "cifar10_quick": (100,),
 }
-TRAINING = {"lenet": 64, "cifar10_quick": 100, "rnet": 64, "small/siamese_8": 4, "alexnet": 1, "squeezenet": 1}
+TRAINING = {"lenet": 64, "cifar10_quick": 100, "pnet": 64, "rnet": 64, "siamese_8": 4, "alexnet": 4, "squeezenet": 4}
 ALL = "all of fast"
 TURN_S, FEWEST_PAIRS, WARM_UPS = 0.06, 5, 3  # CPU seconds of a turn, in which a small net runs several times
 Run = Callable[[], object]
@@ -144,11 +144,11 @@ def training_parts(net: Any) -> list[Part]:
     from netspec.fast.layers import loss
 
     whole = Part(ALL, "pass", lambda: patch.object(speed.Fast, "trainer", lambda *_: "it is not wanted"))
-    if net.trainer() is None:
-        return [whole]
-    parts = [whole, *_kernels(net, "learning")]
+    parts = [whole, *_kernels(net, "learning")] if net.trainer() else []
     unread = patch.object(speed.Fast, "reads_at_once", lambda *_: lambda records: None)
     parts.append(Part("records at once", "function", lambda: unread))
+    if not net.trainer():
+        return parts
     plain = patch.object(loss, "_prepared_softmax", lambda shape: losses.softmax)
     parts.append(Part("prepared softmax", "function", lambda: plain))
     return parts

@@ -209,7 +209,8 @@ def load_image(filename: Any, color: bool = True) -> Array:
 def resize_image(im: Array, new_dims: Extents, interp_order: int = 1) -> Array:
     """Return an image (H, W, K) resized to (height, width) by splines of the given order, without anti-aliasing.
 
-    As in Caffe, scikit-image (the extra ``pycaffe``) resizes images with K of 1 or 3, and SciPy's zoom all others.
+    The pixels are Caffe's: for images with K of 1 or 3 those of scikit-image, for all others those of SciPy's zoom.
+    Orders other than 1 need scikit-image (the extra ``pycaffe``).
     """
     height, width = (int(extent) for extent in new_dims)
     if im.shape[-1] not in (1, 3):
@@ -220,10 +221,41 @@ def resize_image(im: Array, new_dims: Extents, interp_order: int = 1) -> Array:
     low, high = im.min(), im.max()
     if not high > low:
         return np.full((height, width, im.shape[-1]), low, np.float32)
-    transform = errors.load("skimage.transform", "pycaffe", "caffe.io.resize_image")
     unit = (im - low) / (high - low)  # scikit-image expects values from 0 to 1
-    resized = transform.resize(unit, (height, width), order=interp_order, mode="constant", anti_aliasing=False)
+    if interp_order == 1 and unit.dtype in (np.float32, np.float64):
+        resized = _bilinear(unit, height, width)
+    else:
+        transform = errors.load("skimage.transform", "pycaffe", "caffe.io.resize_image")
+        resized = transform.resize(unit, (height, width), order=interp_order, mode="constant", anti_aliasing=False)
     return (resized * (high - low) + low).astype(np.float32)
+
+
+def _bilinear(image: Array, height: int, width: int) -> Array:
+    """Return an image (H, W, K) with values from 0 to 1, resized as by scikit-image, in less than half of its time.
+
+    The bits are the same: products and sums are in double, in the order of SciPy's zoom, which scikit-image calls.
+    Pixels outside are 0.
+
+    SciPy: ndimage/src/ni_interpolation.c (NI_ZoomShift)
+    """
+    framed = np.pad(image, ((1, 1), (1, 1), (0, 0)))
+    parts = [(framed.take(columns, axis=1), share[:, None]) for columns, share in _taps(image.shape[1], width)]
+    total = np.zeros((height, width, image.shape[2]))
+    for rows, by_row in _taps(image.shape[0], height):
+        for part, by_column in parts:
+            pixels = part.take(rows, axis=0) * by_row[:, None, None]
+            pixels *= by_column
+            total += pixels
+    return np.clip(total.astype(image.dtype), 0, 1)
+
+
+def _taps(size: int, wanted: int) -> list[tuple[Array, Array]]:
+    """Return the two pixels before and after each of ``wanted`` positions, as indices in a frame, and their shares."""
+    positions = (np.arange(wanted) + 0.5) * (size / wanted) - 0.5
+    before = np.floor(positions)
+    share = positions - before
+    first = before.astype(int) + 1  # the frame starts one pixel earlier
+    return [(first, 1.0 - share), (first + 1, share)]
 
 
 def oversample(images: Sequence[Array] | Array, crop_dims: Extents) -> Array:

@@ -195,16 +195,17 @@ def test_images_are_loaded_as_scikit_image_does(tmp_path: Path) -> None:
     assert caffe.io.load_image(str(tmp_path / "rgb.png"), False).shape == (7, 9, 1)
 
 
-@pytest.mark.parametrize("size", [(4, 5), (20, 30)])
+@pytest.mark.parametrize("kind", [np.uint8, np.float32, np.float64])
+@pytest.mark.parametrize("size", [(4, 5), (20, 30), (9, 11), (1, 40), (27, 3)])
 @pytest.mark.parametrize("channels", [1, 3])
-def test_images_are_resized_as_scikit_image_does(size: tuple[int, int], channels: int) -> None:
+def test_images_are_resized_to_the_bits_of_scikit_image(size: tuple[int, int], channels: int, kind: Any) -> None:
     transform = pytest.importorskip("skimage.transform")
-    image = (RANDOM.rand(9, 11, channels) * 300 - 20).astype(np.float32)
-    got = caffe.io.resize_image(image, size)
-    assert got.shape == (*size, channels)
-    assert got.dtype == np.float32
-    expected = transform.resize(image, size, order=1, mode="constant", anti_aliasing=False, cval=image.min())
-    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-3)
+    for order in (1, 3):
+        image = (RANDOM.rand(9, 11, channels) * 255).astype(kind)
+        low, span = image.min(), image.max() - image.min()
+        unit = transform.resize((image - low) / span, size, order=order, mode="constant", anti_aliasing=False)
+        got = caffe.io.resize_image(image, size, order)
+        np.testing.assert_array_equal(got, (unit * span + low).astype(np.float32), strict=True)
 
 
 def test_a_constant_image_and_one_of_other_channels() -> None:
@@ -218,7 +219,7 @@ def test_a_constant_image_and_one_of_other_channels() -> None:
 def test_without_scikit_image_one_line_gives_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("skimage", "skimage.io", "skimage.transform"):
         monkeypatch.setitem(sys.modules, name, None)
-    for call in (lambda: caffe.io.load_image("x.png"), lambda: caffe.io.resize_image(np.eye(3)[..., None], (2, 2))):
+    for call in (lambda: caffe.io.load_image("x.png"), lambda: caffe.io.resize_image(np.eye(3)[..., None], (2, 2), 3)):
         with pytest.raises(ImportError, match=r"^caffe\.io\.\w+ needs scikit-image: pip install scikit-image, or "):
             call()
 
