@@ -20,7 +20,6 @@ from netspec.export.formats.shapes import NetShapes
 from netspec.export.formats.source import class_name
 from netspec.export.formats.torch import torch_source
 from netspec.net.net import Net
-from netspec.run.walk import Step, walk
 
 ONNX_EXTRA = "the onnx extra is not installed: pip install 'netspec-caffe[onnx]'"
 Arrays = Mapping[str, np.ndarray]
@@ -70,24 +69,6 @@ def trained(net: Net, seed: int = 1) -> Net:
                 uniform(blob, -reach, reach)
             else:
                 uniform(blob, *((0.5, 1.0) if blob is layer.blobs[0] else (-0.1, 0.1)))
-    return net
-
-
-def calibrated(net: Net, inputs: Arrays) -> Net:
-    """Set the statistics of BatchNorm layers to those of these inputs, so that deep nets do not saturate."""
-    values = net.input_tensors(inputs)
-
-    def visit(step: Step, bottoms: list[torch.Tensor]) -> Any:
-        layer = net.layers[step.node]
-        if layer.type == "BatchNorm":
-            data = bottoms[0].transpose(0, 1).flatten(1)
-            layer.blobs[0].copy_(data.mean(1))
-            layer.blobs[1].copy_(data.var(1, correction=0) + 1e-3)
-            layer.blobs[2].fill_(1)
-        return step.run(*bottoms)
-
-    with torch.no_grad():
-        walk(net.eager.one_by_one(), values, net.options.exact, visit)
     return net
 
 

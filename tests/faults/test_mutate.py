@@ -1,4 +1,4 @@
-"""mutate.py and texts.py, which damage files and texts at random, with few tries."""
+"""mutate.py, texts.py and kill.py, which damage files and texts and kill commands at random, with few tries."""
 
 import sys
 from pathlib import Path
@@ -30,3 +30,12 @@ def test_texts_with_randomly_replaced_words_are_refused_in_one_line(tmp_path: Pa
     done = forked.run(forked.script, Path(__file__).with_name("texts.py"), ["--tries", "50"], folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count(": 50 texts, no fault\n") > 8
+
+
+def test_killed_commands_leave_complete_files_and_no_process(tmp_path: Path) -> None:
+    kills = "2"  # one at any time, one while a file is written
+    done = forked.run(forked.script, Path(__file__).with_name("kill.py"), ["--kills", kills], folder=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) >= 8
+    assert all("0 broken or lost, 0 orphans, 0 leftovers" in line for line in lines)
