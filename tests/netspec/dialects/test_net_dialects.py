@@ -56,39 +56,24 @@ layer { name: "n" type: "FocalLoss" bottom: "conv" bottom: "l" top: "n" focal_lo
 TWO_TOPS = NORMALIZE.replace('top: "n"', 'top: "n" top: "l"')
 
 
-@pytest.mark.parametrize(
-    ("text", "others"),
-    [
-        (NORMALIZE, '"ssd" (a learned scale'),
-        ("# dialect: happynear\n" + NORMALIZE, ""),
-        (TWO_TOPS, ""),
-        (BN, '"blocks" (of PSPNet and TSN'),
-        ("  # dialect: tsn\n" + BN, ""),
-        (BN + INTERP, ""),
-        (BN.replace("}", "bn_param { bn_mode: LEARN } }"), ""),
-        (SMOOTH % "loss_weight: 1", '"rcnn" (divided by N;'),
-        (FOCAL % "alpha: 0.25", '"happynear" ((alpha - p)^gamma), not of "rcnn"'),
-        (FOCAL % "alpha: 1", ""),
-        ("# dialect: rcnn\n" + FOCAL % "alpha: 0.25", ""),
-        (SMOOTH % "loss_weight: 1 smooth_l1_loss_param { sigma: 1 }", ""),
-        (SMOOTH % "loss_weight: 1 loss_param { normalization: NONE }", ""),
-    ],
-    ids=[
-        "Normalize",
-        "Normalize_with_comment",
-        "Normalize_with_two_tops",
-        "BN",
-        "BN_with_comment",
-        "BN_with_Interp",
-        "BN_with_bn_mode",
-        "SmoothL1Loss",
-        "FocalLoss_alpha",
-        "FocalLoss_alpha_1",
-        "FocalLoss_with_comment",
-        "SmoothL1Loss_with_sigma",
-        "SmoothL1Loss_with_normalization",
-    ],
-)
+OF_SEVERAL_FORKS = {
+    "Normalize": (NORMALIZE, '"ssd" (a learned scale'),
+    "Normalize_with_comment": ("# dialect: happynear\n" + NORMALIZE, ""),
+    "Normalize_with_two_tops": (TWO_TOPS, ""),
+    "BN": (BN, '"blocks" (of PSPNet and TSN'),
+    "BN_with_comment": ("  # dialect: tsn\n" + BN, ""),
+    "BN_with_Interp": (BN + INTERP, ""),
+    "BN_with_bn_mode": (BN.replace("}", "bn_param { bn_mode: LEARN } }"), ""),
+    "SmoothL1Loss": (SMOOTH % "loss_weight: 1", '"rcnn" (divided by N;'),
+    "FocalLoss_alpha": (FOCAL % "alpha: 0.25", '"happynear" ((alpha - p)^gamma), not of "rcnn"'),
+    "FocalLoss_alpha_1": (FOCAL % "alpha: 1", ""),
+    "FocalLoss_with_comment": ("# dialect: rcnn\n" + FOCAL % "alpha: 0.25", ""),
+    "SmoothL1Loss_with_sigma": (SMOOTH % "loss_weight: 1 smooth_l1_loss_param { sigma: 1 }", ""),
+    "SmoothL1Loss_with_normalization": (SMOOTH % "loss_weight: 1 loss_param { normalization: NONE }", ""),
+}
+
+
+@pytest.mark.parametrize(("text", "others"), OF_SEVERAL_FORKS.values(), ids=OF_SEVERAL_FORKS)
 def test_a_layer_of_several_forks_gets_a_warning_unless_the_file_shows_the_fork(
     net_of: Callable[..., Net], caplog: pytest.LogCaptureFixture, text: str, others: str
 ) -> None:

@@ -176,43 +176,26 @@ def test_clip_without_max_is_refused(build) -> None:
 # The gradients that Caffe computes from overwritten memory (netspec/run/eager.py): bottom and top are arbitrary.
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ('type: "ReLU"', lambda b, t: b > 0),
-        ('type: "ReLU" relu_param { negative_slope: 0.1 }', lambda b, t: np.where(b > 0, 1, 0.1)),
-        ('type: "ELU" elu_param { alpha: 2 }', lambda b, t: np.where(b > 0, 1, 2 + t)),
-        ('type: "Sigmoid"', lambda b, t: t * (1 - t)),
-        ('type: "TanH"', lambda b, t: 1 - t**2),
-        ('type: "Power" power_param { power: 3 scale: 2 shift: 1 }', lambda b, t: 6 * t / (2 * b + 1)),
-        ('type: "Power" power_param { power: 3 scale: 2 }', lambda b, t: 3 * t / b),
-        ('type: "Power" power_param { power: 2 scale: 2 shift: 1 }', lambda b, t: 4 * (2 * b + 1)),
-        ('type: "Power" power_param { scale: 2 shift: 1 }', lambda b, t: 0 * b + 2),
-        ('type: "Power" power_param { power: 0 }', lambda b, t: 0 * b),
-        ('type: "Exp" exp_param { base: 2 scale: 3 shift: 1 }', lambda b, t: t * 3 * math.log(2)),
-        ('type: "Log" log_param { base: 2 scale: 3 shift: 5 }', lambda b, t: 3 / math.log(2) / (3 * b + 5)),
-        ('type: "BNLL"', lambda b, t: sigmoid(b)),
-        ('type: "Swish" swish_param { beta: 2 }', lambda b, t: 2 * t + sigmoid(2 * b) * (1 - 2 * t)),
-        ('type: "Clip" clip_param { min: -0.5 max: 0.75 }', lambda b, t: (b >= -0.5) & (b <= 0.75)),
-    ],
-    ids=[
-        "ReLU",
-        "ReLU_slope",
-        "ELU",
-        "Sigmoid",
-        "TanH",
-        "Power_3",
-        "Power_3_without_shift",
-        "Power_2",
-        "Power_1",
-        "Power_0",
-        "Exp",
-        "Log",
-        "BNLL",
-        "Swish",
-        "Clip",
-    ],
-)
+GRADIENTS = {
+    "ReLU": ('type: "ReLU"', lambda b, t: b > 0),
+    "ReLU_slope": ('type: "ReLU" relu_param { negative_slope: 0.1 }', lambda b, t: np.where(b > 0, 1, 0.1)),
+    "ELU": ('type: "ELU" elu_param { alpha: 2 }', lambda b, t: np.where(b > 0, 1, 2 + t)),
+    "Sigmoid": ('type: "Sigmoid"', lambda b, t: t * (1 - t)),
+    "TanH": ('type: "TanH"', lambda b, t: 1 - t**2),
+    "Power_3": ('type: "Power" power_param { power: 3 scale: 2 shift: 1 }', lambda b, t: 6 * t / (2 * b + 1)),
+    "Power_3_without_shift": ('type: "Power" power_param { power: 3 scale: 2 }', lambda b, t: 3 * t / b),
+    "Power_2": ('type: "Power" power_param { power: 2 scale: 2 shift: 1 }', lambda b, t: 4 * (2 * b + 1)),
+    "Power_1": ('type: "Power" power_param { scale: 2 shift: 1 }', lambda b, t: 0 * b + 2),
+    "Power_0": ('type: "Power" power_param { power: 0 }', lambda b, t: 0 * b),
+    "Exp": ('type: "Exp" exp_param { base: 2 scale: 3 shift: 1 }', lambda b, t: t * 3 * math.log(2)),
+    "Log": ('type: "Log" log_param { base: 2 scale: 3 shift: 5 }', lambda b, t: 3 / math.log(2) / (3 * b + 5)),
+    "BNLL": ('type: "BNLL"', lambda b, t: sigmoid(b)),
+    "Swish": ('type: "Swish" swish_param { beta: 2 }', lambda b, t: 2 * t + sigmoid(2 * b) * (1 - 2 * t)),
+    "Clip": ('type: "Clip" clip_param { min: -0.5 max: 0.75 }', lambda b, t: (b >= -0.5) & (b <= 0.75)),
+}
+
+
+@pytest.mark.parametrize(("text", "expected"), GRADIENTS.values(), ids=GRADIENTS)
 def test_caffes_gradient_is_computed_from_the_given_bottom_and_top(build, text: str, expected) -> None:
     bottom = torch.tensor([-1.5, -0.4, 0.25, 0.75, 2.0], dtype=torch.double)
     top = torch.tensor([0.3, -0.2, 0.5, 1.5, -4.0], dtype=torch.double)

@@ -193,27 +193,22 @@ WINDOWS = 'name: "d" type: "WindowData" top: "data" top: "label" window_data_par
 IMAGE_BATCH, GREY_BATCH, LABELS = [(8, 3, 6, 6), (8,)], [(8, 1, 5, 4), (8,)], [(2, 5), (2,)]
 
 
-@pytest.mark.parametrize(
-    ("text", "given", "expected"),
-    [
-        (DATA, {"data": (2, 5)}, LABELS),  # the label follows
-        (DATA, {"data": (2, 5), "label": (2, 1)}, [(2, 5), (2, 1)]),
-        (DATA + CUT, {}, IMAGE_BATCH),
-        (LIST % "batch_size: 8 new_height: 5 new_width: 4 is_color: false", {}, GREY_BATCH),
-        (LIST % "batch_size: 8 new_height: 5 new_width: 4" + "transform_param { crop_size: 6 }", {}, IMAGE_BATCH),
-        (ROWS, {"data": (2, 5), "label": (2,)}, LABELS),
-        (WINDOWS + "transform_param { crop_size: 6 }", {}, IMAGE_BATCH),
-    ],
-    ids=[
-        "Data_given",
-        "Data_and_label_given",
-        "Data_cropped",
-        "ImageData_resized",
-        "ImageData_cropped",
-        "HDF5Data_given",
-        "WindowData_cropped",
-    ],
-)
+WITHOUT_DATA = {
+    "Data_given": (DATA, {"data": (2, 5)}, LABELS),  # the label follows
+    "Data_and_label_given": (DATA, {"data": (2, 5), "label": (2, 1)}, [(2, 5), (2, 1)]),
+    "Data_cropped": (DATA + CUT, {}, IMAGE_BATCH),
+    "ImageData_resized": (LIST % "batch_size: 8 new_height: 5 new_width: 4 is_color: false", {}, GREY_BATCH),
+    "ImageData_cropped": (
+        LIST % "batch_size: 8 new_height: 5 new_width: 4" + "transform_param { crop_size: 6 }",
+        {},
+        IMAGE_BATCH,
+    ),
+    "HDF5Data_given": (ROWS, {"data": (2, 5), "label": (2,)}, LABELS),
+    "WindowData_cropped": (WINDOWS + "transform_param { crop_size: 6 }", {}, IMAGE_BATCH),
+}
+
+
+@pytest.mark.parametrize(("text", "given", "expected"), WITHOUT_DATA.values(), ids=WITHOUT_DATA)
 def test_shapes_are_known_without_data(text: str, given: Mapping[str, tuple[int, ...]], expected: list) -> None:
     assert data_layer(text, open_data=False, given_shapes=given, device="meta").top_shapes == expected
 

@@ -111,37 +111,23 @@ def test_equal_seeds_give_equal_values_and_other_seeds_other_values() -> None:
         assert (first != draw(f'type: "{kind}"', seed=4)).any()
 
 
-@pytest.mark.parametrize(
-    ("text", "shape", "words"),
-    [
-        ('type: "xaviar"', SHAPE, 'unknown filler "xaviar"; did you mean "xavier"?'),
-        ('type: "gaussian" std: 0', SHAPE, "std > 0, found 0"),
-        ('type: "gaussian" std: -1', SHAPE, "std > 0, found -1"),
-        ('type: "gaussian" sparse: -2', SHAPE, "sparse >= 0"),
-        ('type: "gaussian" sparse: 201', SHAPE, "sparse <= shape[0] = 200, found 201"),
-        ('type: "xavier" sparse: 3', SHAPE, 'filler "xavier" does not support sparse'),
-        ('type: "uniform" min: 1 max: 0', SHAPE, "min <= max"),
-        ('type: "bilinear"', (4, 1, 3, 4), "square filters, found shape (4, 1, 3, 4)"),
-        ('type: "bilinear"', (4, 9), "4-D blob"),
-        ('type: "msra"', (), "at least one axis"),
-        ('type: "positive_unitball"', (), "at least one axis"),
-        ("value: 1", (3, 0), "empty blob"),
-    ],
-    ids=[
-        "unknown",
-        "gaussian_std_0",
-        "gaussian_std_negative",
-        "gaussian_sparse_negative",
-        "gaussian_sparse_too_large",
-        "xavier_sparse",
-        "uniform_min_above_max",
-        "bilinear_not_square",
-        "bilinear_two_axes",
-        "msra_scalar",
-        "positive_unitball_scalar",
-        "constant_empty",
-    ],
-)
+INVALID = {
+    "unknown": ('type: "xaviar"', SHAPE, 'unknown filler "xaviar"; did you mean "xavier"?'),
+    "gaussian_std_0": ('type: "gaussian" std: 0', SHAPE, "std > 0, found 0"),
+    "gaussian_std_negative": ('type: "gaussian" std: -1', SHAPE, "std > 0, found -1"),
+    "gaussian_sparse_negative": ('type: "gaussian" sparse: -2', SHAPE, "sparse >= 0"),
+    "gaussian_sparse_too_large": ('type: "gaussian" sparse: 201', SHAPE, "sparse <= shape[0] = 200, found 201"),
+    "xavier_sparse": ('type: "xavier" sparse: 3', SHAPE, 'filler "xavier" does not support sparse'),
+    "uniform_min_above_max": ('type: "uniform" min: 1 max: 0', SHAPE, "min <= max"),
+    "bilinear_not_square": ('type: "bilinear"', (4, 1, 3, 4), "square filters, found shape (4, 1, 3, 4)"),
+    "bilinear_two_axes": ('type: "bilinear"', (4, 9), "4-D blob"),
+    "msra_scalar": ('type: "msra"', (), "at least one axis"),
+    "positive_unitball_scalar": ('type: "positive_unitball"', (), "at least one axis"),
+    "constant_empty": ("value: 1", (3, 0), "empty blob"),
+}
+
+
+@pytest.mark.parametrize(("text", "shape", "words"), INVALID.values(), ids=INVALID)
 def test_invalid_fillers_are_refused_with_the_reason(text: str, shape: tuple[int, ...], words: str) -> None:
     with pytest.raises(ValueError, match=r"^[^\n]+$") as error:
         draw(text, shape)

@@ -34,31 +34,20 @@ def test_flatten_joins_axes(build, text: str, bottom: tuple, top: tuple) -> None
     assert torch.equal(layer.run(counting(*bottom))[0], counting(*top))
 
 
-@pytest.mark.parametrize(
-    ("text", "bottom", "top"),
-    [
-        ("shape { dim: 2 dim: 8 }", (2, 8, 1, 1), (2, 8)),
-        ("shape { dim: 0 dim: -1 }", (2, 3, 4), (2, 12)),  # 0 copies, -1 is inferred
-        ("shape { dim: 0 dim: 0 dim: -1 dim: 2 }", (2, 3, 4), (2, 3, 2, 2)),
-        ("shape { dim: -1 }", (2, 3, 4), (24,)),
-        ("shape { dim: 3 dim: 1 } axis: 1 num_axes: 1", (2, 3, 4), (2, 3, 1, 4)),
-        ("shape { dim: 1 } axis: -1 num_axes: 0", (2, 3), (2, 3, 1)),  # -1: after the last
-        ("shape { dim: 1 } axis: 0 num_axes: 0", (2, 3), (1, 2, 3)),
-        ("axis: 1 num_axes: 1", (2, 1, 3), (2, 3)),  # no shape: the axes go
-        ("shape { dim: -1 dim: 0 } axis: 1", (2, 6, 2), (2, 6, 2)),  # 0 copies the axis of its own place
-    ],
-    ids=[
-        "sizes",
-        "copied_and_inferred",
-        "inferred_in_the_middle",
-        "one_axis",
-        "replaced_axis",
-        "inserted_last",
-        "inserted_first",
-        "removed_axis",
-        "copied_from_axis",
-    ],
-)
+RESHAPED = {
+    "sizes": ("shape { dim: 2 dim: 8 }", (2, 8, 1, 1), (2, 8)),
+    "copied_and_inferred": ("shape { dim: 0 dim: -1 }", (2, 3, 4), (2, 12)),  # 0 copies, -1 is inferred
+    "inferred_in_the_middle": ("shape { dim: 0 dim: 0 dim: -1 dim: 2 }", (2, 3, 4), (2, 3, 2, 2)),
+    "one_axis": ("shape { dim: -1 }", (2, 3, 4), (24,)),
+    "replaced_axis": ("shape { dim: 3 dim: 1 } axis: 1 num_axes: 1", (2, 3, 4), (2, 3, 1, 4)),
+    "inserted_last": ("shape { dim: 1 } axis: -1 num_axes: 0", (2, 3), (2, 3, 1)),  # -1: after the last
+    "inserted_first": ("shape { dim: 1 } axis: 0 num_axes: 0", (2, 3), (1, 2, 3)),
+    "removed_axis": ("axis: 1 num_axes: 1", (2, 1, 3), (2, 3)),  # no shape: the axes go
+    "copied_from_axis": ("shape { dim: -1 dim: 0 } axis: 1", (2, 6, 2), (2, 6, 2)),  # 0 copies its own axis
+}
+
+
+@pytest.mark.parametrize(("text", "bottom", "top"), RESHAPED.values(), ids=RESHAPED)
 def test_reshape_replaces_axes(build, text: str, bottom: tuple, top: tuple) -> None:
     layer = build(f'type: "Reshape" reshape_param {{ {text} }}', bottom)
     assert layer.top_shapes == [top]

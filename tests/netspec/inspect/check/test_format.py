@@ -23,37 +23,26 @@ def test_an_unformatted_net_becomes_the_formatted_file() -> None:
     assert format_text(typed, "f") == formed
 
 
-@pytest.mark.parametrize(
-    ("text", "formed"),
-    [
-        ("", ""),
-        ("\n\n# only this\n\n", "# only this\n"),
-        ("a:1\r\nb:2\r\n", "a: 1\nb: 2\n"),
-        ("a: 'say \"no\"' 'x'", 'a: \'say "no"\' "x"\n'),
-        ("a: - # minus\n 1", "# minus\na: -1\n"),
-        ("a # one\n : # two\n 1 # three\n ; # four\nb: 2", "# one\n# two\n# three\na: 1  # four\nb: 2\n"),
-        ("a { # open\n b: 1 }", "a {  # open\n  b: 1\n}\n"),
-        ("a: [ {b: 1}, {b: 2} ]", "a { b: 1 }\na { b: 2 }\n"),
-        ("a: []", "a: []\n"),
-        ("a {}", "a { }\n"),
-        ("a { b { c: 1\n } d: 2 }", "a {\n  b {\n    c: 1\n  }\n  d: 2\n}\n"),
-        ("a: 1 # é\udcff\n", "a: 1  # é\udcff\n"),
-    ],
-    ids=[
-        "empty",
-        "comment_only",
-        "windows_lines",
-        "quotes",
-        "comment_in_a_number",
-        "comments_everywhere",
-        "comment_after_brace",
-        "list_of_messages",
-        "empty_list",
-        "empty_message",
-        "nested_messages",
-        "not_utf8",
-    ],
-)
+SMALL_TEXTS = {
+    "empty": ("", ""),
+    "comment_only": ("\n\n# only this\n\n", "# only this\n"),
+    "windows_lines": ("a:1\r\nb:2\r\n", "a: 1\nb: 2\n"),
+    "quotes": ("a: 'say \"no\"' 'x'", 'a: \'say "no"\' "x"\n'),
+    "comment_in_a_number": ("a: - # minus\n 1", "# minus\na: -1\n"),
+    "comments_everywhere": (
+        "a # one\n : # two\n 1 # three\n ; # four\nb: 2",
+        "# one\n# two\n# three\na: 1  # four\nb: 2\n",
+    ),
+    "comment_after_brace": ("a { # open\n b: 1 }", "a {  # open\n  b: 1\n}\n"),
+    "list_of_messages": ("a: [ {b: 1}, {b: 2} ]", "a { b: 1 }\na { b: 2 }\n"),
+    "empty_list": ("a: []", "a: []\n"),
+    "empty_message": ("a {}", "a { }\n"),
+    "nested_messages": ("a { b { c: 1\n } d: 2 }", "a {\n  b {\n    c: 1\n  }\n  d: 2\n}\n"),
+    "not_utf8": ("a: 1 # é\udcff\n", "a: 1  # é\udcff\n"),
+}
+
+
+@pytest.mark.parametrize(("text", "formed"), SMALL_TEXTS.values(), ids=SMALL_TEXTS)
 def test_format_text_of_small_texts(text: str, formed: str) -> None:
     assert format_text(text, "f") == formed
     assert format_text(formed, "f") == formed

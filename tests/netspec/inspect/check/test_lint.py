@@ -90,29 +90,19 @@ def test_a_net_of_one_phase_is_checked_in_that_phase() -> None:
     assert found(DUMMY.replace('top: "t"', 'top: "t" include { phase: TRAIN }') + CONV + IP + LOSS) == []
 
 
-@pytest.mark.parametrize(
-    ("settings", "lines"),
-    [
-        ('lr_policy: "step" stepsize: 100 gamma: 0.1', ["step-after-end 6:19"]),
-        ('lr_policy: "step" stepsize: 99 gamma: 0.1', []),
-        ('lr_policy: "multistep" stepvalue: 9 stepvalue: 100 gamma: 0.1', ["step-after-end 6:37"]),
-        ('lr_policy: "fixed" gamma: 1', ["no-effect 6:20"]),
-        ('lr_policy: "fixed" test_iter: 1 test_interval: 101', ["test-after-end 6:33"]),
-        ('lr_policy: "fixed" # lint: ignore=no-effect\ngamma: 1', ["no-effect 7:1"]),
-        ('lr_policy: "fixed"\ngamma: 1  # lint: ignore=other, no-effect', ["unknown-rule 7:11"]),
-        ('lr_policy: "fixed"\n# why\n# lint: ignore=no-effect\n\ngamma: 1', []),
-    ],
-    ids=[
-        "step_at_the_end",
-        "step_before_the_end",
-        "multistep_at_the_end",
-        "no_effect",
-        "test_after_the_end",
-        "comment_at_the_wrong_line",
-        "comment_with_an_unknown_rule",
-        "comment_above",
-    ],
-)
+OF_SOLVERS = {
+    "step_at_the_end": ('lr_policy: "step" stepsize: 100 gamma: 0.1', ["step-after-end 6:19"]),
+    "step_before_the_end": ('lr_policy: "step" stepsize: 99 gamma: 0.1', []),
+    "multistep_at_the_end": ('lr_policy: "multistep" stepvalue: 9 stepvalue: 100 gamma: 0.1', ["step-after-end 6:37"]),
+    "no_effect": ('lr_policy: "fixed" gamma: 1', ["no-effect 6:20"]),
+    "test_after_the_end": ('lr_policy: "fixed" test_iter: 1 test_interval: 101', ["test-after-end 6:33"]),
+    "comment_at_the_wrong_line": ('lr_policy: "fixed" # lint: ignore=no-effect\ngamma: 1', ["no-effect 7:1"]),
+    "comment_of_another_rule": ('lr_policy: "fixed"\ngamma: 1  # lint: ignore=other, no-effect', ["unknown-rule 7:11"]),
+    "comment_above": ('lr_policy: "fixed"\n# why\n# lint: ignore=no-effect\n\ngamma: 1', []),
+}
+
+
+@pytest.mark.parametrize(("settings", "lines"), OF_SOLVERS.values(), ids=OF_SOLVERS)
 def test_each_rule_for_solvers_finds_its_mistake_and_is_ignored_by_comment(settings: str, lines: list[str]) -> None:
     assert found(SOUND, settings) == lines
 
