@@ -207,11 +207,7 @@ def test_a_missing_image_is_reported_with_its_line(
         ("text.png 0.png 1", [], 'l:1:1: image "{root}/text.png" cannot be decoded as an image'),
         ("text.png 0.png 1", ["-encoded"], 'l:1:1: image "{root}/text.png" cannot be decoded as an image'),
         ("0.png small.png 1", [], "set -resize_width and -resize_height"),
-        (
-            "0.png 0.png 1\nsmall.png small.png 1",
-            ["-check_size"],
-            'l:2:1: "small.png" gives 6 x 5 x 5, but the first line gives 6 x',
-        ),
+        ("0.png 0.png 1\nsmall.png small.png 1", ["-check_size"], 'l:2:1: "small.png" gives 6 x 5 x 5, but'),
         ("0.png 0 1", ["-encoded"], 'l:1:1: image "{root}/0" has no extension that gives its format; set -encode_type'),
         ("0.png 0.png 1", ["-encode_type=abc"], 'cannot be encoded as "abc"'),
         ("0.png 1.png", [], "l:1:1: found '0.png 1.png', expected two images and a label"),

@@ -246,10 +246,7 @@ def expanded(line: str, **names: object) -> list[str]:
         ("no such file", "similarity NOWHERE.npz --out OUT"),
         ("cannot be written", "similarity FEATURES --out OUT/no/folder.npy"),
         ("FEATURES: File exists", "detect LAPS --threshold 0.5 --out FEATURES"),
-        (
-            "cannot exclude 0 frames, nan s; expected 0 or more",
-            "evaluate LAPS --exclude-seconds nan --method thumbnails --out OUT",
-        ),
+        ("cannot exclude 0 frames, nan s", "evaluate LAPS --exclude-seconds nan --method thumbnails --out OUT"),
     ],
 )
 def test_an_error_is_one_line_with_status_1(line, sentence, two_laps, two_laps_features, tmp_path, capsys):
@@ -273,24 +270,15 @@ def test_a_folder_with_poses_but_no_times_of_its_images_says_what_is_missing(tmp
         ('a sequence has no setting "camera"', "evaluate LAPS,camera=left --method thumbnails --out OUT"),
         ("needs ,truth=MASK", "evaluate images:LAPS --method thumbnails --out OUT"),
         ("--fov is for sequences with poses, not for ", "evaluate pairs:LAPS --fov 60 --method thumbnails --out OUT"),
-        (
-            "--exclude-frames cannot be used with references",
-            "evaluate LAPS,references=LAPS --exclude-seconds 3 --method thumbnails --out OUT",
-        ),
+        ("--exclude-frames cannot", "evaluate LAPS,references=LAPS --exclude-seconds 3 --method thumbnails --out OUT"),
         ("expected KEY=VALUE", "detect LAPS --threshold 1 --with width --out OUT"),
         ("--with is for --describe", "detect LAPS --threshold 1 --features FEATURES --with width=8 --out OUT"),
         ("leave out all others", "detect LAPS --resume OUT --metric cosine --out OUT"),
         ("--top-k needs --threshold", "detect LAPS --top-k 3 --out OUT"),
         ("--verify needs --threshold", "detect LAPS --verify --out OUT"),
-        (
-            "--odometry cannot be used with --threshold, --resume or --video, which decide frame by frame",
-            "detect LAPS --threshold 1 --odometry O --out OUT",
-        ),
+        ("--odometry cannot be used with --threshold", "detect LAPS --threshold 1 --odometry O --out OUT"),
         ("--exclude-frames and --exclude-seconds need --top-k", "similarity FEATURES --exclude-frames 3 --out OUT"),
-        (
-            "cannot be used with --references",
-            "similarity FEATURES --references FEATURES --top-k 1 --exclude-frames 3 --out OUT",
-        ),
+        ("with --references", "similarity FEATURES --references FEATURES --top-k 1 --exclude-frames 3 --out OUT"),
     ],
 )
 def test_contradictory_options_are_one_line_with_status_2(

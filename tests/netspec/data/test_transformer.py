@@ -104,11 +104,7 @@ def test_force_color_and_force_gray_are_for_encoded_images(caplog: pytest.LogCap
         ({"mean_value": [1, 2]}, "mean_value", "found 2 mean_value for 3 channels, expected 1 or 3"),
         ({"mean_value": [1], "mean_file": "x"}, "mean_value", "mean_file and mean_value cannot both be set"),
         ({"force_color": True, "force_gray": True}, "force_gray", "force_color and force_gray cannot both be set"),
-        (
-            {"mean_file": "nowhere.binaryproto"},
-            "mean_file",
-            'mean file "nowhere.binaryproto" cannot be read: No such file',
-        ),
+        ({"mean_file": "nowhere"}, "mean_file", 'mean file "nowhere" cannot be read: No such file'),
     ],
 )
 def test_contradictory_settings_are_refused_with_their_location(fields: dict, place: str, message: str) -> None:

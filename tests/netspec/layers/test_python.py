@@ -196,12 +196,7 @@ def test_a_missing_attribute_of_module_caffe_is_reported(
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        (
-            "TimesTen",
-            {"module": "nowhere"},
-            'cannot import module "nowhere" (looked for in the current directory and PYTHONPATH): ModuleNotFoundError: '
-            "No module named 'nowhere'",
-        ),
+        ("TimesTen", {"module": "nowhere"}, 'cannot import module "nowhere" (looked for in the current directory and'),
         ("TimesTwn", {}, 'layers_of_mine.py) has no class "TimesTwn"; did you mean "TimesTen"?'),
         ("NoLayer", {}, "layers_of_mine.NoLayer is not a caffe.Layer"),
         ("Euclidean", {}, "layers_of_mine.Euclidean.setup: Exception: Need two inputs to compute distance. ("),

@@ -28,20 +28,10 @@ def net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Net:
 @pytest.mark.parametrize(
     ("find", "says"),
     [
-        pytest.param(
-            lambda net: net.blobs["porb"], 'no blob "porb" in this net; did you mean "prob"? it has: ', id="blobs"
-        ),
-        pytest.param(lambda net: net.shapes["x"], 'no blob "x" in this net; it has: data, score, prob', id="shapes"),
-        pytest.param(
-            lambda net: net.blobs["score"],
-            'blob "score" was not kept; set net.keep = "all", or ["score"], and run the net',
-            id="a blob that was not kept",
-        ),
-        pytest.param(
-            lambda net: net.params["data"],
-            'no layer with learnable blobs "data" in this net; it has: ip',
-            id="params",
-        ),
+        (lambda net: net.blobs["porb"], 'no blob "porb" in this net; did you mean "prob"? it has: '),
+        (lambda net: net.shapes["x"], 'no blob "x" in this net; it has: data, score, prob'),
+        (lambda net: net.blobs["score"], 'blob "score" was not kept; set net.keep = "all", or ["score"], and run the'),
+        (lambda net: net.params["data"], 'no layer with learnable blobs "data" in this net; it has: ip'),
     ],
 )
 def test_an_unknown_name_is_a_key_error_with_known_names(net: Net, find, says: str) -> None:

@@ -55,10 +55,7 @@ def test_there_is_no_limit_of_64_megabytes(tmp_path: Path) -> None:
     [
         (b"", "the file is empty, expected a binary NetParameter"),
         (b'name: "net"\nlayer {}\n', "expected a binary NetParameter, found text"),
-        (
-            b"\x89HDF\r\n\x1a\n" + bytes(100),
-            "expected a binary NetParameter, found an HDF5 file; its name should end in .h5",
-        ),
+        (b"\x89HDF\r\n\x1a\n" + bytes(100), "found an HDF5 file; its name should end in .h5"),
         (struct.pack("<BB", 10, 200), "found another kind of data, or a truncated file"),
         (b"\x68\x01", "found another kind of data, or a truncated file"),
     ],

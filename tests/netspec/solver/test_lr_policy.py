@@ -2,6 +2,7 @@ import re
 
 import pytest
 
+from case_files import read_table
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Position
@@ -18,78 +19,18 @@ NODE = Position(
 )
 
 
-@pytest.mark.parametrize(
-    ("text", "iterations", "expected"),
-    [
-        pytest.param("lr_policy: 'fixed' base_lr: 0.5", [0, 9], [0.5, 0.5], id="fixed"),
-        pytest.param(
-            "lr_policy: 'step' base_lr: 0.5 gamma: 0.5 stepsize: 10",
-            [0, 9, 10, 19, 20],
-            [0.5, 0.5, 0.25, 0.25, 0.125],
-            id="step",
-        ),
-        pytest.param("lr_policy: 'exp' base_lr: 2 gamma: 0.5", [0, 1, 3], [2, 1, 0.25], id="exp"),
-        pytest.param("lr_policy: 'inv' base_lr: 1 gamma: 1 power: 0.5", [0, 3, 8], [1, 0.5, 0.33333333], id="inv"),
-        pytest.param(
-            "lr_policy: 'inv' base_lr: 0.01 gamma: 0.0001 power: 0.75", [5000], [0.00737788], id="inv of a small gamma"
-        ),
-        pytest.param("lr_policy: 'poly' base_lr: 1 power: 2 max_iter: 10", [0, 5, 10], [1, 0.25, 0], id="poly"),
-        pytest.param(
-            "lr_policy: 'sigmoid' base_lr: 1 gamma: 0.5 stepsize: 10",
-            [6, 10, 14],
-            [0.11920292, 0.5, 0.88079708],
-            id="sigmoid",
-        ),
-        pytest.param(
-            "lr_policy: 'multistep' base_lr: 1 gamma: 0.5 stepvalue: [2, 4]",
-            [0, 1, 2, 3, 4, 5],
-            [1, 1, 0.5, 0.5, 0.25, 0.25],
-            id="multistep",
-        ),
-        pytest.param(
-            "lr_policy: 'multistep' base_lr: 1 gamma: 0.5 stepvalue: [2, 4, 5]",
-            [10, 11, 12, 13],
-            [0.5, 0.25, 0.125, 0.125],
-            id="multistep goes up at most once an iteration, as Caffe's when resumed with its step lost",
-        ),
-        pytest.param(
-            "lr_policy: 'fixed' base_lr: 1 warmup_iter: 4 warmup_start_lr: 0.5",
-            [0, 1, 4, 9],
-            [0.5, 0.625, 1, 1],
-            id="Intel's warm-up",
-        ),
-        pytest.param(
-            "lr_policy: 'poly' power: 1 max_iter: 8 base_lr: 2 rampup_interval: 4 rampup_lr: 1",
-            [0, 2, 4],
-            [1, 1.25, 1],
-            id="NVIDIA's ramp",
-        ),
-        pytest.param(
-            "lr_policy: 'poly' power: 1 max_iter: 4 base_lr: 1 min_lr: 0.5",
-            [0, 2, 4],
-            [1, 0.75, 0.5],
-            id="NVIDIA's poly with a least rate",
-        ),
-        pytest.param(
-            "lr_policy: 'exp' gamma: 0.5 base_lr: 1 min_lr: 0.25", [0, 1, 5], [1, 0.5, 0.25], id="a least rate"
-        ),
-        pytest.param(
-            "lr_policy: 'multifixed' stagelr: 1 stagelr: 4 stageiter: 2 stageiter: 5",
-            [0, 2, 3, 5, 9],
-            [1, 1, 4, 4, 4],
-            id="multifixed, Intel's and eric612's",
-        ),
-    ],
-)
-def test_rates(text: str, iterations: list[int], expected: list[float]):
-    """The iterations are run through in order."""
-    param, node = parse_solver_text(f"net: 'n' {text}", "s.prototxt")
+RATES = {row.pop("name"): row for row in read_table("netspec/solver/cases/rates.txt")}
+
+
+@pytest.mark.parametrize("case", RATES.values(), ids=RATES)
+def test_rates(case: dict[str, str]) -> None:
+    param, node = parse_solver_text(f"net: 'n' {case['settings']}", "s.prototxt")
     assert not list(policy_faults(param, node))
     found, step = [], 0
-    for i in iterations:
+    for i in map(int, case["iterations"].split()):
         step = next_step(param, i, step)
         found.append(learning_rate(param, i, step))
-    assert found == pytest.approx(expected, rel=1e-6)
+    assert found == pytest.approx([float(rate) for rate in case["rates"].split()], rel=1e-6)
 
 
 def test_the_rate_is_rounded_to_float32():

@@ -590,11 +590,7 @@ def test_forward_backward_all(net_of: Callable[..., caffe.Net]) -> None:
         ("net.forward(data=np.ones((2, 3, 12, 12)))", ValueError, "Input is not batch sized: found shape (2, 3, 12, 1"),
         ("net.forward_all()", ValueError, "no arrays were given"),
         ("net.forward_all(data=np.ones((1, 3, 12, 12)), end='conv1')", ValueError, "be given; use forward(end=...)"),
-        (
-            "caffe.Net('n.prototxt', caffe.TEST, 'w.caffemodel')",
-            TypeError,
-            "name the weights: Net(file, phase, weights=",
-        ),
+        ("caffe.Net('n', caffe.TEST, 'w.caffemodel')", TypeError, "name the weights: Net(file, phase, weights="),
         ("net.forward(data=np.ones((1, 3, 9, 12)))", ValueError, "from shape (1,3,9,12) into shape (1,3,12,12)"),
         ("net.blobs['data'].data[...] = np.ones((1, 4, 12, 12))", ValueError, "(1,4,12,12) into shape (1,3,12,12)"),
         ("net.blobs['data'].reshape(1, -3)", ValueError, "found shape (1, -3), expected no negative size"),

@@ -90,11 +90,7 @@ def test_equal_names_are_distinguished_by_their_folders(run: Run_) -> None:
 @pytest.mark.parametrize(
     ("words", "status", "said"),
     [
-        (
-            ("no.log", "--out", "x.png"),
-            1,
-            "no.log: cannot be read: No such file or directory; relative paths start from ",
-        ),
+        (("no.log", "--out", "x.png"), 1, "no.log: cannot be read: No such file or directory"),
         ((CAFFES, "--out", "x.jpg"), 1, "x.jpg: expected a name that ends in .png, .svg, .html\n"),
         ((CAFFES, "--out", "no/x.png"), 1, "no/x.png: cannot be written: No such file or directory\n"),
         ((CAFFES, "--names", "a,b", "--out", "x.png"), 2, "found 2 --names and 1 logs"),
