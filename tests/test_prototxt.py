@@ -2,7 +2,6 @@
 
 import itertools
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,11 +12,11 @@ import torch
 import netspec
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
-from netspec.inspect.check.check import ON_META, check_file
+from netspec.inspect.check.check import check_file
 from netspec.layers import layer_class
 from netspec.load import load_net
 from netspec.net.weights import load_weights, save_weights
-from netspec.proto.schema import TEST, TRAIN, LayerParameter
+from netspec.proto.schema import TEST, LayerParameter
 from netspec.proto.text import parse_net_text, read_net, read_solver
 from paths import ROOT
 
@@ -255,20 +254,3 @@ def test_places_contains_the_net_of_256_words_and_only_caffes_layers() -> None:
     for name in ("conv1", "res6b", "words", "layout"):
         assert own[name][0].shape == theirs[name][0].shape  # they have learned further
     assert all(layer_class(layer.type).__module__.startswith("netspec.layers.") for layer in large.values())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "path",
-    sorted((ROOT / "prototxt").rglob("train_val*.prototxt")),
-    ids=lambda path: f"{path.parent.parent.name}-{path.parent.name}-{path.stem}",
-)
-def test_every_net_passes_check_and_lint(path: Path) -> None:
-    """The advice would say, among other things, that towers do not share all parameters."""
-    text = path.read_text()
-    batch = int(re.findall(r"batch_size: (\d+)", text)[0])
-    label = re.findall(r'top: "(\w+)"', text)[1]
-    shapes = {"pair_data": (batch, 6, 64, 64), label: (batch,)}
-    (checked,) = check_file(path, TRAIN, replace(ON_META, given_shapes=shapes))
-    assert not checked.faults
-    assert not checked.advice

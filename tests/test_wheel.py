@@ -94,12 +94,6 @@ def test_the_wheel_has_its_metadata(wheel: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("command", ["convert", "imageset", "mean", "compare"])
-def test_lmdb_builds_commands_are_installed(commands: Path, tmp_path: Path, command: str) -> None:
-    said = run(commands / "lmdb-build", command, "--help", cwd=tmp_path).stdout
-    assert said.startswith(f"usage: lmdb-build {command} ")
-
-
 def test_from_a_walk_to_an_lmdb_and_its_mean(commands: Path, tmp_path: Path) -> None:
     lmdb_build = commands / "lmdb-build"
     run(lmdb_build, "walk", "w", "--frames", "60", "--size", "48x36", "--laps", "2", cwd=tmp_path)

@@ -109,16 +109,6 @@ def test_every_block_has_a_known_language(document: str) -> None:
             assert not PROGRAMS.keys() & set(first), f"{block.where}: commands stand in a block without a language"
 
 
-@pytest.mark.parametrize(
-    "words",
-    [["netspec", "chekc"], ["loopclosure", "detect"], ["tools/bench", "--no-such-flag"]],
-    ids=["command", "missing_argument", "option"],
-)
-def test_parse_refuses_a_wrong_command(words: list[str]) -> None:
-    with pytest.raises(SystemExit):
-        parse(words)
-
-
 def test_shell_blocks_are_parsed_like_a_shell(tmp_path: Path) -> None:
     text = 'W=a/b\nE="netspec $W/c"  # why\nfor s in x y; do $E \\\n  --of ${s}_; done\n'
     text += 'source z && cd d\nloopclosure " e"\n'

@@ -60,17 +60,6 @@ def test_printed_commands_work_with_convert(walks: Path, tmp_path: Path, capsys:
     assert (out / "mean.binaryproto").stat().st_size > 1000
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "words", ["--different-scenes", "-different-scenes=true", "-nodifferent-scenes -different-scenes"]
-)
-def test_flags_accept_gflags_spellings(
-    walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str
-) -> None:
-    assert main(pairs(walks, "-out", str(tmp_path), "-train=20", "--val", "0", *words.split())) == 0
-    assert "nobody said" not in capsys.readouterr().err
-
-
 def test_two_houses_are_two_scenes(walks: Path) -> None:
     first, second = (next((walks / name / "rgb").iterdir()).read_bytes() for name in ("walk_1", "walk_2"))
     assert first != second

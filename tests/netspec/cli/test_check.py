@@ -102,28 +102,6 @@ def test_check_filters_by_phase_level_and_stage(run: Run) -> None:
     assert left("--stage", "b,a", "--level", "3") == ["b1", "b2", "b3"]
 
 
-def test_check_reports_all_errors_of_a_net(run: Run, edited: Edit) -> None:
-    net = edited(
-        NET,
-        'bottom: "pool1"', 'bottom: "pol1"',
-        'type: "ReLU"', 'type: "Relu"',
-        "num_output: 8 kernel_size: 5", "num_output: 8",
-        'type: "ContrastiveLoss"', 'type: "ContrastiveLos"',
-    )  # fmt: skip
-    result = run("check", net, *PAIR_SHAPE)
-    assert result.status == 1
-    assert result.out == ""
-    lines = result.err.splitlines()
-    for part in (
-        'layer "conv2" (Convolution): unknown bottom blob "pol1"; did you mean "pool1"? available: ',
-        'layer "relu1" (Relu): unknown layer type "Relu"; did you mean "ReLU"?',
-        'layer "loss" (ContrastiveLos): unknown layer type "ContrastiveLos"; did you mean "ContrastiveLoss"?',
-    ):
-        (line,) = [line for line in lines if part in line]
-        assert line.split(":")[0] == net
-        assert all(number.isdigit() for number in line.split(":")[1:3])
-
-
 def test_check_reports_all_errors_of_a_solver_and_its_nets(run: Run, edited: Edit) -> None:
     Path("net.prototxt").write_text(Path(edited(NET, 'type: "ReLU"', 'type: "Relu"')).read_text())
     solver = edited(

@@ -30,7 +30,7 @@ Edit = Callable[..., str]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("exact", ["none", "small", "all", ""])
+@pytest.mark.parametrize("exact", ["all", ""])
 @pytest.mark.parametrize(
     "words",
     [
@@ -65,18 +65,8 @@ def test_every_command_passes_exact_to_its_nets(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--solver", SOLVER, "--weights", INIT],
-        ["-solver", SOLVER, "-weights", INIT],
-        [f"--solver={SOLVER}", f"--weights={INIT}"],
-        [f"-solver={SOLVER}", f"-weights={INIT}"],
-        [SOLVER, "-weights", INIT],
-    ],
-    ids=["two dashes", "one dash", "two dashes =", "one dash =", "position"],
-)
-def test_train_accepts_all_spellings(run: Run, edited: Edit, words: list[str]) -> None:
+@pytest.mark.parametrize("words", [[f"-solver={SOLVER}", f"-weights={INIT}"], [SOLVER, "--weights", INIT]])
+def test_train_accepts_a_solver_as_an_option_or_by_position(run: Run, edited: Edit, words: list[str]) -> None:
     solver = edited(SOLVER, "max_iter: 60", "max_iter: 1", "snapshot_after_train: false", "")
     result = run("train", *[word.replace(SOLVER, solver) for word in words])
     assert result.status == 0

@@ -155,21 +155,6 @@ def test_rand_skip_passes_over_the_first_records() -> None:
     assert pairs(1, "rand_skip: 500", seed=4).keys(0) == [f"{skipped:08d}"]
 
 
-def test_a_record_of_another_shape_is_an_error_in_the_pass_that_reads_it(tmp_path: Path) -> None:
-    with Writer(str(tmp_path / "db")) as writer:
-        for i in range(20):
-            shape = (3, 8, 8) if i != 13 else (3, 8, 9)
-            writer.put(b"%08d" % i, array_to_datum(np.zeros(shape, np.uint8)).SerializeToString())
-    layer = pairs(5, source=tmp_path / "db")
-    layer.run()
-    layer.run()
-    with pytest.raises(
-        SpecError, match='record "00000013" gives 3 x 8 x 9, but the first record, "00000000", gives 3 x'
-    ):
-        layer.run()
-    layer.close()
-
-
 def test_top_of_batch_size_one_has_the_shape_of_each_image(tmp_path: Path) -> None:
     with Writer(str(tmp_path / "db")) as writer:
         for i, width in enumerate((8, 9)):

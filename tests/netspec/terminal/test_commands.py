@@ -8,7 +8,7 @@ from importlib import import_module
 
 import pytest
 
-from netspec import cli, log
+from netspec import log
 from netspec.errors import SpecError, Where
 from netspec.terminal.commands import WrongUsage, refuse, run
 from netspec.terminal.parser import Commands, Parser
@@ -81,26 +81,6 @@ def test_values_can_be_negative_numbers() -> None:
 def test_misspelled_flags_end_with_status_2(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(command(lambda arguments: None), ["convert", *words]) == 2
     assert said in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", ["train", "test", "time", "check", "extract"])
-@pytest.mark.parametrize(
-    ("words", "value"),
-    [
-        (["-allow-python-layers"], True),
-        (["--allow-python-layers=true"], True),
-        (["-noallow-python-layers"], False),
-        (["--allow-python-layers=false"], False),
-    ],
-)
-def test_commands_of_netspec_accept_boolean_flags(name: str, words: list[str], value: bool) -> None:
-    needed = {
-        "test": ["-model", "m", "-weights=w"],
-        "time": ["--model", "m"],
-        "check": ["f"],
-        "extract": ["--model=m", "-blob", "b", "-out", "o"],
-    }
-    assert cli.parser().parse_args([name, *words, *needed.get(name, [])]).allow_python_layers is value
 
 
 @pytest.mark.parametrize("module", ["netspec.cli", "lmdb_build.cli"])

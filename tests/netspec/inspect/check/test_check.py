@@ -40,27 +40,6 @@ def test_check_reports_each_error_of_a_net_once(run: Run, case: dict[str, str]) 
     assert without_warnings(run("check", "net.prototxt").err) == faults
 
 
-@pytest.mark.parametrize(
-    ("content", "kind"),
-    [
-        (b" <!DOCTYPE html><html>", "found a web page: the download failed; open it in a browser"),
-        (b"", "the file is empty, expected a binary NetParameter"),
-        (
-            b"\x0a\x03net\xa2\x06\xff\x7f cut",
-            "found its first 13 bytes only: it was truncated; copy or download it again",
-        ),
-        (b"\x0a\x03net\xa8\x1f\xff\x7f cut", "found another kind of data, or a truncated file"),
-        (b'layer { name: "a" }', "expected a binary NetParameter, found text"),
-    ],
-    ids=["web_page", "empty", "truncated", "other_data", "text"],
-)
-def test_other_files_than_weights_are_described(run: Run, content: bytes, kind: str) -> None:
-    Path("net.caffemodel").write_bytes(content)
-    (line,) = run("check", "net.caffemodel").err.splitlines()
-    assert line.startswith("net.caffemodel: ")
-    assert line.endswith(kind)
-
-
 @pytest.fixture
 def files(run: Run) -> None:
     """Write small data files, valid and invalid, into the working directory."""
