@@ -1,17 +1,212 @@
-"""Control characters in names are escaped in terminals, logs and errors."""
+"""Hostile names: files of a net contain them and execute none of them; terminals, logs and errors escape them."""
 
+import json
 import logging
+import os
+import random
+import re
+import runpy
+from collections.abc import Iterator
+from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
+import numpy as np
 import pytest
+import torch
 
+import netspec
 from loopclosure.errors import InputError
 from netspec import log
 from netspec.cli import main
-from netspec.errors import SpecError, Where
+from netspec.errors import SpecError, Where, printable
+
+TRAP = Path("PWNED")  # the file that each of these names would write if it were executed
+RUN = f"open('{TRAP}', 'w')"
+NAMES = [
+    f'x"""\n{RUN}\n"""',
+    f'"+str({RUN})+"',
+    f"'+str({RUN})+'",
+    f'\\"""\n{RUN}#',
+    f"\\'+{RUN}#",
+    f"{{{RUN}}}",
+    "{0.__class__}{missing}%s%(x)d",
+    "\x02v0\x03\x02m0\x03",
+    "a, b) + (c[",
+    "</title></script><script>alert(1)</script><img src=x onerror=alert(1)>",
+    "]]><!--&amp;",
+    "@BANDS@ @LAYERS@ @TITLE@",
+    "{{ 7 * 7 }}{% raw %}",
+    "$\\frac{x$ ${HOME} $(id) `id`",
+    "a\nb\r\n\tc\x00\x1b[31m\x7f\x85\u2028\u2029\u202e",
+    "\ufffe\uffff\U0001f600\u00e9",
+    "None",
+    "True",
+    "False",
+    "Path",
+    "F",
+    "nn",
+    "torch",
+    "check_shapes",
+    "contrastive_loss",
+    "load",
+    "forward",
+    "super",
+    "__init__",
+    "__metadata__",
+    "../../up",
+    "x" * 3000,
+    "\u0661\u0662",
+    " ",
+    "'",
+    '"',
+    "\\",
+]
+ENDINGS = {"onnx": "onnx", "torch": "py", "pt2": "pt2", "safetensors": "safetensors"}
+
+
+def quoted(name: str) -> str:
+    """Return a name as it is written in a prototxt."""
+    return '"' + "".join(f"\\{byte:03o}" for byte in name.encode()) + '"'
+
+
+def net(names: Iterator[str]) -> str:
+    """Return a net that uses these names for itself, its blobs and its layers."""
+    own, data, other, label, conv, ip, loss, *layers = (quoted(next(names)) for _ in range(14))
+    dims = "shape { dim: 2 dim: 3 dim: 6 dim: 6 }"
+    return f"""name: {own}
+layer {{ name: {layers[0]} type: "Input" top: {data} top: {other} input_param {{ {dims} }} }}
+layer {{ name: {layers[1]} type: "Input" top: {label} input_param {{ shape {{ dim: 2 }} }} }}
+layer {{ name: {layers[2]} type: "Convolution" bottom: {data} top: {conv}
+  convolution_param {{ num_output: 2 kernel_size: 3 }} }}
+layer {{ name: {layers[3]} type: "BatchNorm" bottom: {conv} top: {conv} }}
+layer {{ name: {layers[4]} type: "InnerProduct" bottom: {conv} top: {ip} inner_product_param {{ num_output: 4 }} }}
+layer {{ name: {layers[5]} type: "InnerProduct" bottom: {other} top: {loss} inner_product_param {{ num_output: 4 }} }}
+layer {{ name: {layers[6]} type: "ContrastiveLoss" bottom: {ip} bottom: {loss} bottom: {label} top: "end" }}
+layer {{ name: "split" type: "Slice" bottom: {ip} top: {quoted("tops" + "'" * 3)} top: "other top" }}
+"""
+
+
+def nets() -> Iterator[str]:
+    """Yield nets that together use each name in several places."""
+    shuffled = random.Random(0)
+    for start in range(0, len(NAMES), 9):
+        names = NAMES[start:] + NAMES[:start]
+        yield net(iter(names))
+        yield net(iter(shuffled.sample(names, 14)))
+
+
+class Page(HTMLParser):
+    """The texts of a page, and the parts that a browser would execute."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.handlers: list[str] = []
+        self.texts: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.handlers += [name for name, _ in attrs if name.startswith("on")]
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+
+def page(path: Path) -> Page:
+    found = Page()
+    found.feed(path.read_text(encoding="utf-8"))
+    assert not found.handlers
+    assert found.tags.count("script") <= 2
+    assert "img" not in found.tags
+    return found
+
+
+@pytest.fixture(autouse=True)
+def inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "system", lambda *_: pytest.fail("it ran"))
+    yield
+    assert not TRAP.exists()
+
+
+NETS = [pytest.param(text, id=f"net_{i}") for i, text in enumerate(nets())]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", NETS)
+def test_exports_of_nets_with_hostile_names_parse_and_compute_the_same(
+    text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    onnx = pytest.importorskip("onnx")
+    safetensors = pytest.importorskip("safetensors.torch")
+    Path("net.prototxt").write_text(text)
+    here = netspec.load_net("net.prototxt", seed=0)
+    netspec.save_weights(here, "net.caffemodel")
+    inputs = {name: np.random.default_rng(0).random(here.shapes[name], np.float32) for name in here.inputs}
+    with torch.no_grad():
+        expected = {name: value.numpy() for name, value in here(**inputs).items()}
+    for target, ending in ENDINGS.items():
+        words = ["export", "net.prototxt", "--to", target, "--weights", "net.caffemodel", "--out", f"{target}.{ending}"]
+        assert main(words) == 0, capsys.readouterr().err
+    runpy.run_path("torch.py", run_name="__main__")
+    given = [torch.from_numpy(value) for value in inputs.values()]
+    found = torch.export.load("pt2.pt2").module()(*given)
+    assert sorted(found) == sorted(expected)
+    assert all(np.allclose(found[name].detach(), value, atol=1e-5) for name, value in expected.items())
+    model = onnx.load("onnx.onnx")
+    onnx.checker.check_model(model)
+    assert {output.name for output in model.graph.output} == set(expected)
+    blobs = sum(len(layer.blobs) for layer in here.layers)
+    assert len(safetensors.load_file("safetensors.safetensors")) == blobs
+    words = ["fold", "net.prototxt", "--weights", "net.caffemodel", "--blob", here.outputs[-1], "--out", "folded"]
+    assert main(words) == 0, capsys.readouterr().err
+    netspec.load_net("folded.prototxt", weights="folded.caffemodel")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", NETS)
+def test_drawings_of_nets_with_hostile_names_parse(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("net.prototxt").write_text(text)
+    for ending in ("svg", "html"):
+        assert main(["draw", "net.prototxt", "--out", f"out.{ending}"]) == 0, capsys.readouterr().err
+    ElementTree.parse("out.svg")
+    script = re.search(r"^const layers = (.*);$", Path("out.html").read_text(encoding="utf-8"), re.M)
+    assert script
+    names = [layer["name"] for layer in json.loads(script[1])]
+    assert names[0] == printable(netspec.load_net("net.prototxt", seed=0).plan.nodes[0].name)
+    page(Path("out.html"))
+
+
+@pytest.mark.slow
+def test_png_drawings_of_nets_with_hostile_names_are_written(capsys: pytest.CaptureFixture[str]) -> None:
+    for text in list(nets())[::4]:
+        Path("net.prototxt").write_text(text)
+        assert main(["draw", "net.prototxt", "--out", "out.png"]) == 0, capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(0, len(NAMES), 10))
+def test_plots_of_logs_with_hostile_names_parse(first: int, capsys: pytest.CaptureFixture[str]) -> None:
+    wanted = [name.replace(",", ";") for name in NAMES[first : first + 10]]
+    start = "I1121 00:36:27.939015 12135 solver.cpp:239] "
+    for k, name in enumerate(wanted):
+        outputs = [f"{start}    Test net output #0: {printable(name)} = {value}" for value in (0.5, 0.6)]
+        lines = [f"{start}Iteration 0, Testing net (#0)", outputs[0], f"{start}Iteration 0, loss = 1.5"]
+        lines += [f"{start}Iteration 10, Testing net (#0)", outputs[1], f"{start}Iteration 10, loss = 1.25"]
+        Path(f"log{k}").write_text("\n".join(lines), encoding="utf-8")
+    logs = [f"log{k}" for k in range(len(wanted))]
+    for ending in ("svg", "html", "png"):
+        words = ["plot", *logs, "--out", f"out.{ending}", "--names", ",".join(wanted)]
+        assert main(words) == 0, capsys.readouterr().err
+    ElementTree.parse("out.svg")
+    texts = " ".join(page(Path("out.html")).texts)
+    assert all(printable(name).strip() in texts for name in wanted)
+    json.loads(re.findall(r'id="curves">(.*?)</script>', Path("out.html").read_text(encoding="utf-8"), re.S)[0])
+
 
 EVIL = "a\\033[31m\\nI1122 10:00:00.000000     1 solver.cpp:239] Iteration 99999, loss = 0\\r\\302\\233"
-NET = f"""name: "{EVIL}"
+NET_OF_EVIL = f"""name: "{EVIL}"
 layer {{ name: "{EVIL}" type: "DummyData" top: "{EVIL}" dummy_data_param {{ shape {{ dim: 2 dim: 3 }} }} }}
 layer {{ name: "ip" type: "InnerProduct" bottom: "{EVIL}" top: "ip"
   inner_product_param {{ num_output: 2 weight_filler {{ type: "xavier" }} }} }}
@@ -31,8 +226,8 @@ def test_control_characters_in_names_are_escaped_in_the_output_of_commands(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("net.prototxt").write_text(NET)
-    Path("odd.prototxt").write_text(NET.replace('bottom: "a', 'bottom: "b'))
+    Path("net.prototxt").write_text(NET_OF_EVIL)
+    Path("odd.prototxt").write_text(NET_OF_EVIL.replace('bottom: "a', 'bottom: "b'))
     Path("solver.prototxt").write_text(SOLVER)
     assert main(words.split()) == int("odd" in words)
     said = "".join(capsys.readouterr())

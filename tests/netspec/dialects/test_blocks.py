@@ -1,4 +1,4 @@
-"""Dialect blocks, the layers that many forks share: special cases beside those of test_cases.py."""
+"""Dialects blocks and layout, the layers that many forks share: special cases beside those of test_cases.py."""
 
 from collections.abc import Callable
 
@@ -138,3 +138,28 @@ def test_every_layer_documents_its_bottoms_and_tops() -> None:
             assert "bottom[" in doc or cls.bottoms == (0, 0), kind
             assert "top[" in doc, kind
             assert "Fork: " in doc, kind
+
+
+def test_merge_crop_concatenates_or_adds_the_cropped_bottom(build: Build) -> None:
+    small, large = torch.randn(2, 3, 4, 2), torch.randn(2, 3, 7, 4)
+    cut = large[:, :, 1:5, 1:3]
+    layer = build("layout", "type: 'MergeCrop'", small.shape, large.shape)
+    np.testing.assert_array_equal(run(layer, small, large), torch.cat([small, cut], 1))
+    layer = build("layout", "type: 'MergeCrop' mergecrop_param { operation: ADD }", small.shape, large.shape)
+    np.testing.assert_array_equal(run(layer, small, large), small + cut)
+    only = "type: 'MergeCrop' mergecrop_param { forward: [0, 1] }"
+    layer = build("layout", only, small.shape, large.shape)
+    np.testing.assert_array_equal(run(layer, small, large), torch.cat([torch.zeros_like(small), cut], 1))
+
+
+@pytest.mark.parametrize(
+    ("param", "learns"), [("", (True, False)), ("backward: 0 backward: 1", (False, True))], ids=["first", "second"]
+)
+def test_merge_crop_computes_the_requested_gradients(build: Build, param: str, learns: tuple[bool, bool]) -> None:
+    bottoms = [torch.randn(1, 2, 2, 2, requires_grad=True), torch.randn(1, 2, 4, 4, requires_grad=True)]
+    layer = build("layout", f"type: 'MergeCrop' mergecrop_param {{ {param} }}", (1, 2, 2, 2), (1, 2, 4, 4))
+    layer.run(*bottoms)[0].sum().backward()
+    assert tuple(bottom.grad is not None for bottom in bottoms) == learns
+    if learns[1]:
+        assert bottoms[1].grad is not None
+        assert bottoms[1].grad[0, 0].tolist() == [[0, 0, 0, 0], [0, 1, 1, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
