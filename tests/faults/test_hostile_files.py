@@ -93,9 +93,7 @@ def test_an_hdf5_file_with_a_false_size_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file.create_dataset("data", HUGE, np.float32, chunks=(1024, 1024), compression="gzip")
         file["label"] = np.zeros(3)
-    with pytest.raises(
-        SpecError, match=r"dataset /data would take 4 TiB of memory, but the file has only .* KiB; it was not read"
-    ):
+    with pytest.raises(SpecError, match="dataset /data would take 4 TiB of memory, but the file has only"):
         all_rows(tmp_path / "x.h5")
 
 

@@ -46,9 +46,7 @@ def test_an_image_of_another_size_is_reported(tmp_path: Path) -> None:
     with Writer(str(tmp_path / "db")) as writer:
         for i, width in enumerate((4, 4, 5)):
             writer.put(b"%08d" % i, array_to_datum(np.zeros((1, 3, width), np.uint8)).SerializeToString())
-    with pytest.raises(
-        SpecError, match=r'^db: record "00000002" is 1 x 3 x 5, but the first, "00000000", is 1 x 3 x 4'
-    ):
+    with pytest.raises(SpecError, match=r'^db: record "00000002" is 1 x 3 x 5, but the first, .* 1 x 3 x 4'):
         compute_mean(open_reader(str(tmp_path / "db")), PLACE)
 
 

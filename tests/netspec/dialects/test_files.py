@@ -151,9 +151,7 @@ def test_two_dialects_with_the_same_type_number_or_name_are_refused(fork: Path, 
         use_dialect(other)
     third = tmp_path / "same_number.py"
     third.write_text('DECLARATIONS = "extend LayerParameter { optional int32 even_more = 1000; }"\n')
-    with pytest.raises(
-        SpecError, match=r'number 1000 of caffe\.LayerParameter is used by "times_param" of dialect "doub'
-    ):
+    with pytest.raises(SpecError, match=r'number 1000 of caffe\.LayerParameter is used by "times_param'):
         use_dialect(third)
     namesake = tmp_path / "elsewhere" / "doubling.py"
     namesake.parent.mkdir()

@@ -187,9 +187,7 @@ def test_a_missing_attribute_of_module_caffe_is_reported(
 
     monkeypatch.setattr(pycaffe_shim, "_home", pycaffe_shim.__name__)  # as if nobody had imported netspec.pycaffe
     (tmp_path / "wants_more.py").write_text("import caffe\nnet = caffe.Net('a', 'b', caffe.TEST)\n")
-    with pytest.raises(
-        SpecError, match=r"netspec's module caffe for Python layers has no Net; it has Layer, TRAIN and TEST"
-    ):
+    with pytest.raises(SpecError, match="module caffe for Python layers has no Net; it has Layer, TRAIN and TEST"):
         python("Mine", (2,), module="wants_more")
 
 
@@ -262,7 +260,5 @@ def test_errors_in_reshape_and_a_missing_backward_name_the_method(python) -> Non
         layer.run(torch.ones(2, 3), torch.ones(2, 4))
     bottom = torch.ones(2, 3, requires_grad=True)
     top = python("Half", (2, 3)).run(bottom)[0]
-    with pytest.raises(
-        SpecError, match=r"layers_of_mine.Half.backward: AttributeError: 'Half' object has no attribute"
-    ):
+    with pytest.raises(SpecError, match=r"layers_of_mine.Half.backward: AttributeError: "):
         top.sum().backward()
