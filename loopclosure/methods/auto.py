@@ -123,7 +123,7 @@ def answer(
         said.sequences(lines if matches.by_lines else None, given.far),
         said.verification(matches, geometry),
         *said.doubts(matches, decision),
-        said.total(results, given),
+        said.total(results, given, decision.alike),
     ]
     return Answer(results, reasons)
 

@@ -17,7 +17,7 @@ from loopclosure.methods.lines import LENGTHS, Lines
 
 WINDOW = 5  # references to each side of a line, and at least so many queries along it, where a loop has neighbors
 LEAST_VERIFIED = 3  # fewer verified matches of a stretch do not tell whether they agree only in part
-UNLIKELY = 0.05  # that so many matches in a row are not verified, at the share that is
+ALIKE = 0.25  # of the matches with enough points: if more of them agree only in part, places look alike
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Decision:
     loops   these are accepted
     by_line of these, the ones whose sequence is more alike than chance; the others are by their points
     fell    matches of sequences that their points speak against
-    part    matches of which enough points agree, but only a part of those that match: places look alike
-    alike   whether places look alike so often that no single image is accepted
+    part    matches of which enough points agree, but only a part of those that match
+    alike   whether these are so many that places look alike, and no single image is accepted
     """
 
     loops: np.ndarray
@@ -46,7 +46,7 @@ def decide(matches: Matches, lines: Lines | None, scores: np.ndarray, visits: Vi
     """
     many, nothing = matches.evidence >= SURE, np.zeros(len(matches.match), bool)
     part = many & ~matches.whole
-    alike = 2 * np.count_nonzero(part) > np.count_nonzero(many)
+    alike = bool(np.count_nonzero(part) > ALIKE * np.count_nonzero(many))
     sure = nothing if alike else many & matches.whole
     if lines is None:
         return Decision(sure, nothing, nothing, part, alike)
@@ -72,38 +72,24 @@ def of_lines(matches: Matches, lines: Lines, pairs: np.ndarray) -> np.ndarray:
 def fallen(
     found: np.ndarray, matches: Matches, pairs: np.ndarray, length: int, scores: np.ndarray, visits: Visits | None
 ) -> np.ndarray:
-    """Return the loops (Q,) of lines of this length that points speak against: ends of stretches, and whole ones."""
-    kept, tried = np.zeros_like(found), found & matches.tried
-    usual = float(np.mean(matches.verified[tried])) if tried.any() else 0.0
-    for queries in stretches(found, pairs):
-        queries = _up_to_verified(queries, matches, length, usual)
-        kept[queries] = not _against(queries, matches, scores, visits)
-    return found & ~kept
+    """Return the loops (Q,) of lines of this length that points speak against: ends of stretches, and whole ones.
 
-
-def _up_to_verified(queries: np.ndarray, matches: Matches, length: int, usual: float) -> np.ndarray:
-    """Return the queries (n,) of a stretch without runs at its ends in which none is verified, though some should be.
-
-    So many should be as in the rest of the stretch, or as is ``usual`` if none is. A run longer than a line is several
-    lines, which tell enough; a shorter one may be the end of the line through the last place of a loop. Matches whose
-    verification was not tried count neither for nor against.
+    An end is a run without a verified match. One that is longer than a line is several lines, which tell enough: half a
+    drive may be in another light. A shorter one may be the end of the line through the last place of a loop.
     """
-
-    def missing(run: np.ndarray, share: float) -> bool:
-        return len(run) <= length and (1 - share) ** np.count_nonzero(matches.tried[run]) < UNLIKELY
-
-    verified = np.flatnonzero(matches.verified[queries])
-    if not len(verified):
-        return queries[:0] if missing(queries, usual) else queries
-    first, end = verified[0], verified[-1] + 1
-    share = len(verified) / np.count_nonzero(matches.tried[queries[first:end]])
-    first = first if missing(queries[:first], share) else 0
-    end = end if missing(queries[end:], share) else len(queries)
-    return queries[first:end]
+    fell = np.zeros_like(found)
+    for queries in stretches(found, pairs):
+        verified = np.flatnonzero(matches.verified[queries])
+        first, end = (verified[0], verified[-1] + 1) if len(verified) else (0, len(queries))
+        for run in (queries[:first], queries[end:]):
+            fell[run] = len(run) <= length and _against(run, matches, scores, visits)
+        rest = queries[~fell[queries]]
+        fell[rest] = _against(rest, matches, scores, visits)
+    return fell
 
 
 def _against(queries: np.ndarray, matches: Matches, scores: np.ndarray, visits: Visits | None) -> bool:
-    """Return whether points speak against all matches of a stretch, the ``queries`` (n,).
+    """Return whether points speak against all matches of a run of a stretch, the ``queries`` (n,).
 
     Either too few are verified for one place, or of those that are, most agree only in part.
     """

@@ -23,8 +23,6 @@ from loopclosure.methods.seqslam import standardize
 LENGTHS = (10, 30)  # steps of a line
 SPEEDS = (0.5, 2.0, 0.25, 4.0)  # references for a query, tried where neither the ratio of the lengths nor 1 finds any
 LEAST_PIECES = 25  # pieces of the length of a line, of queries times of references, that show what chance does
-# A shorter line is preferred to a longer one that accepts only this much more: it ends nearer to where a loop ends.
-NEARLY = 0.95
 MIDDLE = 4  # steps in the middle of a line
 
 
@@ -118,7 +116,7 @@ def best_lines(given: Candidates, among: Pool, precision: float) -> Lines | None
     whole = references / max(1, len(among.found))
     usual = [1.0] if not given.two else [whole] if _same_speed(1.0, whole) else [whole, 1.0]
     unusual = [speed for speed in SPEEDS if given.two and not any(_same_speed(speed, other) for other in usual)]
-    chosen, most, enough = None, 0, NEARLY * np.count_nonzero(given.there)
+    chosen, most, all_queries = None, 0, np.count_nonzero(given.there)
     for speeds in (usual, unusual):
         for speed, backwards, length in product(speeds, (False, True), LENGTHS):
             passed = references / speed  # steps
@@ -126,10 +124,10 @@ def best_lines(given: Candidates, among: Pool, precision: float) -> Lines | None
                 continue
             found = search(given, among, Course(length, speed, backwards), precision)
             count = np.count_nonzero(found.loops)
-            if chosen is None or NEARLY * count > most:
+            if chosen is None or count > most:
                 chosen, most = found, count
-            if most and most >= enough:
-                return chosen  # no other can find more
+            if 0 < all_queries == most:
+                return chosen
         if most:
             break
     return chosen

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from loopclosure.detector.decision import LoopResult
+from loopclosure.detector.verification import SURE
 from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.decision import Decision
 from loopclosure.methods.geometry import Geometry, Matches
@@ -40,9 +41,11 @@ def doubts(matches: Matches, decision: Decision) -> list[str]:
     """Return what makes places hard to tell apart here."""
     said = list[str]()
     if decision.alike:
+        nothing = "no image is accepted by its points alone" if decision.loops.any() else "nothing is accepted"
         said.append(
-            f"places look alike here: of {np.count_nonzero(decision.part)} matches with enough points, only a part "
-            "agrees, so no image is accepted by its points alone; --odometry tells such places apart"
+            f"places look alike here: in {np.count_nonzero(decision.part)} of "
+            f"{np.count_nonzero(matches.evidence >= SURE)} matches with enough points that agree, many others do not, "
+            f"so {nothing}; --odometry tells such places apart"
         )
     if fell := np.count_nonzero(decision.fell):
         said.append(f"{fell} matches of sequences are not accepted, because their points speak against them")
@@ -56,16 +59,18 @@ def doubts(matches: Matches, decision: Decision) -> list[str]:
     return said
 
 
-def total(results: Sequence[LoopResult], given: Candidates) -> str:
-    """Return how many queries close a loop; if none does, what to look at."""
+def total(results: Sequence[LoopResult], given: Candidates, alike: bool) -> str:
+    """Return how many queries close a loop; if none does, what to look at, unless places look ``alike``."""
     loops, queries = sum(map(bool, results)), sum(bool(result.candidates) for result in results)
     if loops:
         return f"{loops} of the {queries} frames that have a candidate close a loop"
+    if alike:
+        return f"none of the {queries} frames that have a candidate closes a loop"
     if not queries:
         return "no frame has a candidate: the camera did not come back, or the drive is too short to tell"
-    alike = np.argsort(-given.best, kind="stable")[:TRIED]
-    alike = alike[given.there[alike]]  # fewer where few frames have a candidate
-    least, ages = given.best[alike].min(), given.queries[alike] - given.references[given.single[alike]]
+    best = np.argsort(-given.best, kind="stable")[:TRIED]
+    best = best[given.there[best]]  # fewer where few frames have a candidate
+    least, ages = given.best[best].min(), given.queries[best] - given.references[given.single[best]]
     recent = "" if given.two else f" --exclude-recent {max(0, ages.min() - 1)}"
     tried = f"detect --threshold {np.floor(1e3 * least) / 1e3:g}{recent} accepts the most alike, to be looked at"
     return f"nothing here tells loops from chance: none is accepted ({tried})"
