@@ -51,6 +51,17 @@ def map_by_map(maps: torch.Tensor) -> torch.Tensor:
     return _Relaid.apply(maps, torch.contiguous_format, torch.channels_last)
 
 
+def layout_of(maps: torch.Tensor) -> torch.memory_format:
+    """Return the memory layout of maps: torch.channels_last, or torch.contiguous_format for every other."""
+    last = maps.dim() == 4 and not maps.is_contiguous() and maps.is_contiguous(memory_format=torch.channels_last)
+    return torch.channels_last if last else torch.contiguous_format
+
+
+def laid_out_like(maps: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+    """Return the gradient in the memory layout of the maps, because torch's kernels are slow if layouts differ."""
+    return diff.contiguous(memory_format=layout_of(maps))
+
+
 class _Relaid(torch.autograd.Function):
     """Return maps in another layout. Their gradient gets the layout that the maps had, so that kernels stay fast."""
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from netspec.exact.accumulate import ParameterSums
 from netspec.exact.blas import add_sums, gemm, one_thread
-from netspec.exact.layout import by_channel
+from netspec.exact.layout import by_channel, laid_out_like, layout_of
 
 Axes = tuple[int, ...]
 COLUMNS = 2**20  # numbers (4 MB): the columns of several images, which fit into a CPU's cache
@@ -224,19 +224,23 @@ def weights_rounded_once() -> Iterator[None]:
         _rounded.weights = before
 
 
-def rounded_weight(weight: torch.Tensor) -> torch.Tensor | None:
-    """Return a weight in the precision of autocast; None without autocast, or if the weight has that precision.
+def is_rounded(values: torch.Tensor) -> bool:
+    """Return whether autocast computes products with these float32 values in another precision."""
+    kind = values.device.type
+    return kind in ("cpu", "cuda") and torch.is_autocast_enabled(kind) and values.dtype == torch.float32
+
+
+def rounded_weight(weight: torch.Tensor, layout: torch.memory_format = torch.contiguous_format) -> torch.Tensor | None:
+    """Return a weight in the precision of autocast, in a memory layout; None unless autocast rounds it.
 
     Towers that share the weight, and their backward passes, use the same copy.
     """
-    kind = weight.device.type
-    if kind not in ("cpu", "cuda") or not torch.is_autocast_enabled(kind) or weight.dtype != torch.float32:
+    if not is_rounded(weight):
         return None
-    weights = _rounded.weights
-    if weights is None:
-        return weight.to(torch.get_autocast_dtype(kind))
-    if id(weight) not in weights:
-        weights[id(weight)] = weight, weight.to(torch.get_autocast_dtype(kind))
+    weights = {} if _rounded.weights is None else _rounded.weights
+    if id(weight) not in weights:  # two steps take half the time of one
+        rounded = weight.to(torch.get_autocast_dtype(weight.device.type)).contiguous(memory_format=layout)
+        weights[id(weight)] = weight, rounded
     return weights[id(weight)][1]
 
 
@@ -263,8 +267,9 @@ class SummedConvolutions(ParameterSums):
         """
         ParameterSums.keep(ctx, maps, (weight, bias), True)
         ctx.geometry, ctx.lay_out = geometry, lay_out
-        ctx.rounded = rounded_weight(weight)
-        tops = convolution(lay_out(maps), weight if ctx.rounded is None else ctx.rounded, bias, *geometry)
+        maps = lay_out(maps)
+        ctx.rounded = rounded_weight(weight, layout_of(maps))
+        tops = convolution(maps, weight if ctx.rounded is None else ctx.rounded, bias, *geometry)
         ctx.kind = tops.dtype
         return tops
 
@@ -273,15 +278,11 @@ class SummedConvolutions(ParameterSums):
     def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
         maps, weight, bias = ctx.saved_tensors
         sums = ParameterSums.sums(ctx)
-        sliding, group, transposed = ctx.geometry
-        maps_diff, *found = torch.ops.aten.convolution_backward(
-            tops_diff,
-            ctx.lay_out(maps).to(ctx.kind),
-            weight if ctx.rounded is None else ctx.rounded,
-            None if bias is None else list(bias.shape),
-            *(sliding.stride, sliding.pad, sliding.dilation, transposed, [0] * len(sliding.kernel), group),
-            ctx.needs_input_grad[:3],
-        )
+        laid = ctx.lay_out(maps).to(ctx.kind)
+        if ctx.rounded is None:
+            maps_diff, *found = _gradients(ctx, tops_diff, laid, weight, bias, ctx.needs_input_grad[:3])
+        else:
+            maps_diff, *found = _rounded_gradients(ctx, tops_diff, laid, bias)
         for total, gradient in zip(sums, found, strict=True):
             if total is not None:
                 total += gradient
@@ -290,11 +291,41 @@ class SummedConvolutions(ParameterSums):
         return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None
 
 
-def laid_out_like(maps: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-    """Return the gradient in the memory layout of the maps, because torch's kernels are slow if layouts differ."""
-    if maps.dim() == 4 and not maps.is_contiguous() and maps.is_contiguous(memory_format=torch.channels_last):
-        return diff.contiguous(memory_format=torch.channels_last)
-    return diff.contiguous()
+def _gradients(
+    ctx: Any,
+    tops_diff: torch.Tensor,
+    maps: torch.Tensor,
+    weight: torch.Tensor,
+    bias: torch.Tensor | None,
+    wanted: Sequence[bool],
+) -> tuple[torch.Tensor | None, ...]:
+    """Return the gradients of maps, weight and bias that are ``wanted``, by torch's kernel; None for the others."""
+    sliding, group, transposed = ctx.geometry
+    return torch.ops.aten.convolution_backward(
+        tops_diff,
+        maps,
+        weight,
+        None if bias is None else list(bias.shape),
+        *(sliding.stride, sliding.pad, sliding.dilation, transposed, [0] * len(sliding.kernel), group),
+        wanted,
+    )
+
+
+def _rounded_gradients(
+    ctx: Any, tops_diff: torch.Tensor, maps: torch.Tensor, bias: torch.Tensor | None
+) -> tuple[torch.Tensor | None, ...]:
+    """Return the gradients of a convolution with rounded weights.
+
+    If the filters have far more numbers than the maps, their gradient takes less time in Caffe's layout: the sums have
+    it too, and copying the maps costs little.
+    """
+    rounded, (of_maps, *of_others) = ctx.rounded, ctx.needs_input_grad[:3]
+    if layout_of(rounded) == torch.contiguous_format or 4 * maps.numel() > rounded.numel() or not of_others[0]:
+        return _gradients(ctx, tops_diff, maps, rounded, bias, (of_maps, *of_others))
+    maps_diff = _gradients(ctx, tops_diff, maps, rounded, bias, (True, False, False))[0] if of_maps else None
+    shape = torch.empty_like(rounded, memory_format=torch.contiguous_format)  # the kernel reads no values
+    found = _gradients(ctx, tops_diff.contiguous(), maps.contiguous(), shape, bias, (False, *of_others))
+    return maps_diff, *found[1:]
 
 
 def convolution(

@@ -11,6 +11,7 @@ from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.run.overwritten import Memory, overwritten
 from netspec.run.parts import Part, parts_of
+from netspec.run.towers import steps_of_towers
 from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
 
 
@@ -27,29 +28,41 @@ class Eager:
         self.plan, self.layers, self.loss_weights, self.exact = plan, list(layers), loss_weights, exact
         self.losses = losses_of(loss_weights)
         self.overwritten = [overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
-        self._lines: dict[frozenset[int], list[Step]] = {}  # by what is kept, of the last run
+        self._lines: dict[tuple[frozenset[int], bool], list[Step]] = {}  # of the last run
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
         """Run all layers on the values ``given``. Return the loss and the values; those in ``kept`` are among them."""
         values: Values = dict(given)
-        if kept not in self._lines:
-            self._lines = {kept: self._line(kept)}
-        return walk(self._lines[kept], values, self.exact, self._remembering()), values
+        key = kept, self._joins_towers()
+        if key not in self._lines:
+            self._lines = {key: self._line(*key)}
+        return walk(self._lines[key], values, self.exact, self._remembering()), values
 
     def one_by_one(self) -> list[Step]:
         """Return one step for each layer, except the inputs. No step drops a value."""
         return [step._replace(ends=()) for i in range(len(self.layers)) for step in self._alone(i)]
 
-    def _line(self, kept: frozenset[int]) -> list[Step]:
+    def _joins_towers(self) -> bool:
+        """Return whether towers run together: in a training on a CPU under autocast, which rounds anyway."""
+        return torch.is_grad_enabled() and torch.is_autocast_enabled("cpu") and not any(self.overwritten)
+
+    def _line(self, kept: frozenset[int], joins_towers: bool) -> list[Step]:
         """Return the steps of a run that keeps the values ``kept``."""
-        nodes, steps = self.plan.nodes, list[Step]()
-        for part in self.parts(kept):
-            if len(part.members) == 1:
-                steps += self._alone(part.first, kept)
-                continue
-            ends = self._ending_values(part.first, part.last, kept)
-            steps.append(Step(part.last, part.run, nodes[part.first].bottoms, nodes[part.last].tops, ends=ends))
-        return steps
+        parts = self.parts(kept)
+
+        def step_of(part: Part) -> list[Step]:
+            return self._step(part, kept)
+
+        line = steps_of_towers(self.plan, parts, self._must_run_alone(), step_of, kept) if joins_towers else None
+        return line or [step for part in parts for step in step_of(part)]
+
+    def _step(self, part: Part, kept: frozenset[int]) -> list[Step]:
+        """Return the step that runs a part."""
+        nodes = self.plan.nodes
+        if len(part.members) == 1:
+            return self._alone(part.first, kept)
+        ends = self._ending_values(part.first, part.last, kept)
+        return [Step(part.last, part.run, nodes[part.first].bottoms, nodes[part.last].tops, ends=ends)]
 
     def parts(self, kept: frozenset[int] = frozenset()) -> list[Part]:
         """Return the layers in order, joined where the values ``kept`` allow it."""

@@ -118,7 +118,7 @@ def test_towers_share_a_rounded_copy_of_their_weights(net_of, monkeypatch: pytes
     """It is made once per pass; the gradients are those that autocast brings, up to its rounding."""
     net, inputs = net_of(SIAMESE, phase=0, exact="none", accumulate_in_place=True), images()
     copies: list[torch.Tensor | None] = []
-    monkeypatch.setattr(products, "rounded_weight", lambda weight: copies.append(rounded_weight(weight)) or copies[-1])
+    monkeypatch.setattr(products, "rounded_weight", lambda *given: copies.append(rounded_weight(*given)) or copies[-1])
     for _ in range(2):
         with torch.autocast("cpu", torch.bfloat16), weights_rounded_once():
             loss, _ = net.forward_loss(**inputs)

@@ -1,0 +1,143 @@
+"""The towers of a siamese net run together in a training under autocast, with the results of separate towers."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from netspec.exact.by_torch import NormalizedBatches
+from netspec.net.net import Net
+from netspec.run.eager import Eager
+
+NET = (Path(__file__).parent / "nets" / "towers.prototxt").read_text()
+
+
+@pytest.fixture
+def together(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """Join towers in float32 too, where the results can be compared closely."""
+    monkeypatch.setattr(Eager, "_joins_towers", lambda _: True)
+    return monkeypatch
+
+
+def inputs() -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    return {"pairs": torch.randn(3, 6, 12, 12, generator=generator), "sim": torch.tensor([1.0, 0.0, 1.0])}
+
+
+def trained(net: Net) -> list[torch.Tensor]:
+    """Run forward and backward twice, as statistics add up; return the loss, the learnable blobs and the gradients."""
+    loss = torch.zeros(())
+    for _ in range(2):
+        loss, _ = net.forward_loss(**inputs())
+        loss.backward()
+    gradients = [item.parameter.grad for item in net.learnable if item.parameter.grad is not None]
+    return [loss.detach(), *(item.parameter.detach() for item in net.learnable), *gradients]
+
+
+def batches(net: Net) -> list[int]:
+    """Return the sizes of the batches that the convolutions, of both towers, get in one pass."""
+    sizes: list[int] = []
+    plain = torch.conv2d
+
+    def conv2d(maps: torch.Tensor, *others: Any) -> torch.Tensor:
+        sizes.append(len(maps))
+        return plain(maps, *others)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("torch.nn.functional.conv2d", conv2d)
+        net.forward_loss(**inputs())
+    return sizes
+
+
+@pytest.mark.parametrize("exact", ["none", "small", "all"])
+@pytest.mark.parametrize("in_place", [False, True])
+def test_joined_towers_compute_the_same_as_separate_ones(net_of, together, exact: str, in_place: bool) -> None:
+    net, separate = (net_of(NET, phase=0, exact=exact, accumulate_in_place=in_place) for _ in range(2))
+    found = trained(net)
+    assert len(net.eager._lines.popitem()[1]) < len(net.plan.nodes) - 7
+    together.setattr(Eager, "_joins_towers", lambda _: False)
+    for mine, theirs in zip(found, trained(separate), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_towers_are_joined_under_autocast_alone(net_of) -> None:
+    net = net_of(NET, phase=0, exact="none", accumulate_in_place=True)
+    assert batches(net) == [3, 3, 3, 3]
+    with torch.autocast("cpu", torch.bfloat16):
+        assert batches(net) == [6, 6]
+        with torch.no_grad():
+            assert batches(net) == [3, 3, 3, 3]
+    assert batches(net) == [3, 3, 3, 3]
+
+
+def test_joined_towers_in_bf16_differ_from_separate_ones_by_rounding(net_of, monkeypatch) -> None:
+    net, separate = (net_of(NET, phase=0, exact="none", accumulate_in_place=True) for _ in range(2))
+    with torch.autocast("cpu", torch.bfloat16):
+        found = trained(net)
+        monkeypatch.setattr(Eager, "_joins_towers", lambda _: False)
+        expected = trained(separate)
+    for mine, theirs in zip(found, expected, strict=True):
+        assert mine.dtype == torch.float32
+        torch.testing.assert_close(mine, theirs, rtol=0, atol=0.01 * float(theirs.abs().max()))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sizes"),
+    [
+        ({}, [6, 6]),
+        ({'"conv_p" param { name: "w" }': '"conv_p" param { name: "own" }'}, [3, 3, 3, 3]),
+        ({'top: "pool_p" pooling_param {': 'top: "pool_p" pooling_param { pool: AVE'}, [6, 6]),
+        ({'"ReLU" bottom: "conv': '"Dropout" bottom: "conv'}, [6, 3, 3]),
+        ({'"deep_p" type: "Convolution" bottom: "conv_p"': '"deep_p" type: "Convolution" bottom: "deep"'}, [6, 3, 3]),
+    ],
+)
+def test_only_layers_that_are_alike_are_joined(net_of, together, changes: dict[str, str], sizes: list[int]) -> None:
+    """``sizes``: the batches of all convolutions. In the last net, one of them reads what its twin computes."""
+    text = NET
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    assert sorted(batches(net_of(text, phase=0, exact="none"))) == sorted(sizes)
+
+
+def test_values_to_keep_are_those_of_each_tower(net_of, together) -> None:
+    net, separate = (net_of(NET, phase=0, exact="none") for _ in range(2))
+    net.keep = separate.keep = "all"
+    net.forward_loss(**inputs())
+    together.setattr(Eager, "_joins_towers", lambda _: False)
+    separate.forward_loss(**inputs())
+    assert list(net.blobs) == list(separate.blobs)
+    for name, value in separate.blobs.items():
+        torch.testing.assert_close(net.blobs[name], value, rtol=1e-4, atol=1e-5)
+
+
+def test_hooks_see_each_tower(net_of, together) -> None:
+    net, seen = net_of(NET, phase=0, exact="none"), []
+    for layer in net.layers:
+        if layer.param.name in ("deep", "deep_p"):
+            layer.register_forward_hook(lambda layer, _, tops: seen.append((layer.param.name, len(tops[0]))))
+    assert batches(net) == [6, 3, 3]
+    assert seen == [("deep", 3), ("deep_p", 3)]
+
+
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float32])
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+def test_batches_are_normalized_one_after_the_other(kind: torch.dtype, layout: torch.memory_format) -> None:
+    data = torch.randn(6, 4, 5, 5).to(kind).contiguous(memory_format=layout)
+    diff = torch.randn(6, 4, 5, 5).to(kind).contiguous(memory_format=layout)
+    factors, bias = torch.rand(4) + 0.5, torch.randn(4)
+    leaves = [x.clone().requires_grad_() for x in (data, factors, bias)]
+    top, means, variances = NormalizedBatches.apply(*leaves, 2, 1e-5)
+    top.backward(diff)
+    expected = [x.clone().requires_grad_() for x in (data, factors, bias)]
+    tops = []
+    for k, batch in enumerate(expected[0].chunk(2)):
+        mean, variance = torch.zeros(2, 4).unbind()
+        tops.append(torch.batch_norm(batch, expected[1], expected[2], mean, variance, True, 1.0, 1e-5, False))
+        torch.testing.assert_close(means[k], mean)
+        torch.testing.assert_close(variances[k], variance)
+    torch.testing.assert_close(top, torch.cat(tops))
+    torch.cat(tops).backward(diff)
+    for mine, theirs in zip(leaves, expected, strict=True):
+        torch.testing.assert_close(mine.grad, theirs.grad, rtol=1e-5 if kind == torch.float32 else 1e-2, atol=1e-5)
