@@ -24,11 +24,6 @@ def test_the_table_contains_existing_dialects_types_and_fields_only(kind: str) -
         assert not inner or any(inner in fields_of(field.descriptor.message_type) for field in found)
 
 
-def test_a_layer_of_several_forks_gets_a_warning(caplog: pytest.LogCaptureFixture) -> None:
-    netspec.layer('type: "DiceCoefLoss"', (2, 3), (2, 3))
-    assert "several forks define this layer type" in caplog.text
-
-
 OWN = """
 from netspec.layers import Layer, register
 
