@@ -90,7 +90,7 @@ def _close(a: argparse.Namespace) -> None:
         raise InputError(f"has no camera calibration; give --camera {intrinsics.FORM}", frames.source)
     odometry = _odometry(a, frames)[source.selection().numbers(len(frames))]
     frames = frames.taken(source.selection())
-    loops = measure(frames, read_loops(Path(a.loops), frames), camera, bar)
+    loops = measure(frames, read_loops(Path(a.loops), frames), camera, odometry, bar)
     closed = close(odometry, loops, frames.poses)
     write_closed(out, closed, frames.stamps, frames.names)
     # Imported here, since it takes seconds and only this command needs it.

@@ -242,9 +242,8 @@ def _measured(detector: LoopDetector, recording: ImageSequence, camera: Intrinsi
     first = len(detector) - len(recording)
     found = [(loop.query_id - first, loop.accepted - first) for loop in detector.loops if loop.accepted is not None]
     own = [Loop(query, match) for query, match in found if match >= 0]
-    return [
-        Loop(loop.query + first, loop.match + first, loop.relative) for loop in measure(recording, own, camera, bar)
-    ]
+    measured = measure(recording, own, camera, recording.odometry, bar)
+    return [Loop(loop.query + first, loop.match + first, loop.relative) for loop in measured]
 
 
 def _odometry(path: str, source: str, recording: ImageSequence) -> np.ndarray:

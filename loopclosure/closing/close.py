@@ -11,16 +11,21 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.graph import Edge, solve
+from loopclosure.closing.length import ODOMETRY, STEP_M, STEP_SHARE
 from loopclosure.closing.measure import Loop
-from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, Relative
+from loopclosure.closing.relative import BY_DEPTH, DEPTH, ROTATION_ONLY, STEREO, UP_TO_SCALE, Relative, across
 from loopclosure.csv_file import write_csv
-from loopclosure.detector.export import LOOP_SIGMAS, relative_pose, write_pose_graph
+from loopclosure.detector.export import LOOP_SIGMAS, Sigmas, relative_pose, write_pose_graph
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import MAX_DISTANCE_M
 from loopclosure.places.trajectory import Trajectory, write_trajectory
 
-# The standard deviations of a step of odometry: a share of its length and of its rotation angle, plus a constant.
-STEP_SHARE, STEP_M, TURN_SHARE, TURN_RAD = 0.02, 0.002, 0.02, 0.002
+# The standard deviation of the rotation of a step of odometry: a share of its angle, plus a constant.
+TURN_SHARE, TURN_RAD = 0.02, 0.002
+# Of the errors of a loop that all its points have in common, by the calibration, by the depth, or by a translation that
+# was taken for a rotation: with depth; from color alone they are LOOP_SIGMAS.
+DEPTH_SIGMAS = Sigmas(0.03, 0.01)
+FAR_M = 0.5  # the length that the translation of a loop is taken to have where it is not known
 
 
 @dataclass(frozen=True)
@@ -106,18 +111,22 @@ def information_of_step(step: np.ndarray) -> np.ndarray:
 def constraint(relative: Relative) -> tuple[np.ndarray, np.ndarray]:
     """Return the pose (7,) and the information (6, 6) of a loop's edge.
 
-    If the length of the translation is not known, the information along its direction is 0. If only the rotation is
-    known, the information of the whole translation is 0. So any program that reads g2o can use these edges.
+    The information is the inverse of the covariance of ``relative`` and of the errors that its points have in common.
+    If the length of the translation is not known, the information along its direction is 0, and the covariance is that
+    of a translation of FAR_M. If only the rotation is known, the information of the whole translation is 0. So any
+    program that reads g2o can use these edges.
     """
-    information = LOOP_SIGMAS.information()
-    pose = relative.pose.copy()
+    common = np.linalg.inv((DEPTH_SIGMAS if relative.length_by in BY_DEPTH else LOOP_SIGMAS).information())
+    pose, scale = relative.pose.copy(), np.ones(6)
+    known = np.eye(6)
     if relative.kind == ROTATION_ONLY:
-        information[:3, :3] = 0
+        known = known[:, 3:]
     elif relative.kind == UP_TO_SCALE:
-        along = Rotation.from_quat(pose[3:]).inv().apply(pose[:3])  # g2o compares in the frame of the query
-        information[:3, :3] -= np.outer(along, along) * LOOP_SIGMAS.translation_m**-2.0
+        known = across(Rotation.from_quat(pose[3:]).inv().apply(pose[:3]))  # g2o compares in the frame of the query
+        scale[:3] = FAR_M
         pose[:3] = 0
-    return pose, information
+    covariance = scale[:, None] * relative.covariance * scale + common
+    return pose, known @ np.linalg.inv(known.T @ covariance @ known) @ known.T
 
 
 def write_closed(out: Path, closed: Closed, stamps: np.ndarray | None, names: Sequence[str]) -> None:
@@ -151,8 +160,14 @@ def summary(closed: Closed) -> list[str]:
         lines.append(spot)
     if closed.not_measured:
         lines.append(f"{closed.not_measured} more left out: fewer than 20 points agree with one relative pose")
+    for by, words in (
+        (DEPTH, "depth"),
+        (STEREO, "the two images of a stereo camera"),
+        (ODOMETRY, "steps of the odometry"),
+    ):
+        if count := sum(loop.relative is not None and loop.relative.length_by == by for loop in closed.loops):
+            lines.append(f"{count} loops measured in meters, from {words}")
     meanings = {
-        METRIC: "measured in meters, from depth",
         UP_TO_SCALE: "measured from color alone: a rotation, and the direction of the translation (up to scale)",
         ROTATION_ONLY: "give a rotation only: the camera turned and hardly moved, so the translation is undetermined",
     }

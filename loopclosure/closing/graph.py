@@ -195,7 +195,7 @@ class _Graph:
         world_to_edge = (to_world[i] @ self._rotations.as_matrix()).transpose(0, 2, 1)
         turned = self._unweighted(state)[1].as_rotvec()
         turning = _inverse_left(-turned) @ to_world[j].transpose(0, 2, 1)
-        lever = world_to_edge @ _cross(state.positions[j] - state.positions[i])
+        lever = world_to_edge @ cross_matrices(state.positions[j] - state.positions[i])
         zero = np.zeros_like(lever)
         of_first = np.block([[-world_to_edge, lever], [zero, -turning]])
         of_second = np.block([[world_to_edge, zero], [zero, turning]])
@@ -231,7 +231,7 @@ def _roots(information: Array) -> Array:
     return np.sqrt(np.maximum(values, 0))[..., None] * vectors.transpose(0, 2, 1)
 
 
-def _cross(vectors: Array) -> Array:
+def cross_matrices(vectors: Array) -> Array:
     """Return the matrices (N, 3, 3) of the cross product with vectors (N, 3)."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
@@ -244,7 +244,7 @@ def _inverse_left(turns: Array) -> Array:
     Barfoot, State Estimation for Robotics, section 7.1.
     """
     angles = np.linalg.norm(turns, axis=1)
-    cross = _cross(turns)
+    cross = cross_matrices(turns)
     safe = np.where(angles < 1e-3, 1.0, angles)
     factor = np.where(angles < 1e-3, 1 / 12, 1 / safe**2 - 0.5 / (safe * np.tan(0.5 * safe)))
     return np.eye(3) - 0.5 * cross + factor[:, None, None] * (cross @ cross)

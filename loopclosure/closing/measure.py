@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from loopclosure.closing.length import neighbors, with_length
 from loopclosure.closing.relative import LEAST_INLIERS, METRIC, ROTATION_ONLY, Relative, View, relative_view
 from loopclosure.csv_file import safe_cell
 from loopclosure.detector.export import relative_pose
@@ -71,14 +73,20 @@ def read_loops(path: Path, frames: ImageSequence) -> list[Loop]:
 
 
 def measure(
-    sequence: ImageSequence, loops: Sequence[Loop], camera: Intrinsics, progress: Progress = silent
+    sequence: ImageSequence,
+    loops: Sequence[Loop],
+    camera: Intrinsics,
+    odometry: np.ndarray | None = None,
+    progress: Progress = silent,
 ) -> list[Loop]:
     """Measure the pose of each loop's query in the frame of its match, from depth if it is available.
 
-    A loop of an image that cannot be read is not measured.
+    ``odometry`` (N, 7), NaN where not known, gives the lengths that depth does not give. A loop of an image that cannot
+    be read is not measured.
     """
-
-    wanted = {end for loop in loops for end in (loop.query, loop.match)}
+    ends = {end for loop in loops for end in (loop.query, loop.match)}
+    near = {} if odometry is None else {end: neighbors(odometry, end) for end in ends}
+    wanted = ends.union(number for each in near.values() for number, _ in each)
     # A video is read once, in order.
     of_video = {} if sequence.paths else {i: view_of(CHECK, camera, image) for i, image, _ in sequence.frames(wanted)}
 
@@ -89,6 +97,11 @@ def measure(
         depth = None if sequence.depths is None else sequence.depths[frame]
         return view_of(CHECK, camera, read_bgr(sequence.paths[frame]), depth)
 
+    def around(frame: int) -> Iterator[tuple[View, float]]:
+        for number, length in near.get(frame, ()):
+            with suppress(InputError):
+                yield view(number), length
+
     measured = []
     for loop in progress(loops, "measuring loops", len(loops)):
         try:
@@ -96,8 +109,11 @@ def measure(
         except InputError:
             measured.append(Loop(loop.query, loop.match))
             continue
-        matches = CHECK.matches(match.local, query.local)
-        measured.append(Loop(loop.query, loop.match, relative_view(match, query, matches)))
+        relative = relative_view(match, query, CHECK.matches(match.local, query.local))
+        if relative is not None:
+            near_both = around(loop.match), around(loop.query)
+            relative = with_length(relative, (match, query), near_both, CHECK.matches)
+        measured.append(Loop(loop.query, loop.match, relative))
     return measured
 
 
@@ -105,11 +121,12 @@ def cells(relative: Relative) -> list[object]:
     """Return the cells of ``loopclosure.detector.export.RELATIVE`` in loops.csv; empty where nothing is known."""
     length = float(np.linalg.norm(relative.pose[:3]))
     toward = [f"{value:.6f}" for value in relative.pose[:3] / length] if length > 0 else [""] * 3
-    sigmas = ("", "")
-    if relative.sigmas is not None:
-        sigmas = f"{relative.sigmas[0]:.4g}", f"{np.rad2deg(relative.sigmas[1]):.4g}"
-    metric = f"{length:.6f}" if relative.kind == METRIC else ""
-    return [relative.kind, *(f"{v:.6f}" for v in relative.pose[3:]), *toward, metric, relative.inliers, *sigmas]
+    known, (shift, turn) = relative.kind == METRIC, relative.sigmas
+    metric = (f"{length:.6f}", f"{shift:.4g}") if known else ("", "")
+    entries = " ".join(f"{value:.6g}" for value in relative.covariance[np.triu_indices(6)])
+    rotation = [f"{value:.6f}" for value in relative.pose[3:]]
+    agreeing = [metric[0], relative.inliers, metric[1], f"{np.rad2deg(turn):.4g}"]
+    return [relative.kind, *rotation, *toward, *agreeing, relative.length_by, entries]
 
 
 def errors_said(loops: Sequence[Loop], poses: np.ndarray) -> str:

@@ -13,7 +13,7 @@ A thread of its own solves the graph, so an image is never waited for. The class
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from threading import Event, Lock, Thread
 
@@ -21,11 +21,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.close import Closed, constraint, information_of_step
-from loopclosure.closing.graph import Edge, solve
+from loopclosure.closing.graph import Edge, cross_matrices, solve
+from loopclosure.closing.length import FARTHEST, neighbors, with_length
 from loopclosure.closing.measure import Loop
-from loopclosure.closing.relative import METRIC, ROTATION_ONLY, View, relative_view
+from loopclosure.closing.relative import METRIC, View, relative_view
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.export import LOOP_SIGMAS, relative_pose
+from loopclosure.detector.export import relative_pose
 from loopclosure.errors import InputError
 from loopclosure.places.intrinsics import Intrinsics
 from netspec import log
@@ -122,7 +123,7 @@ class LoopCloser:
             self.warn(f"the image at {stamp:.6f} is left out: {fault.message}")
             return None
         number = found.query_id
-        loop = None if found.accepted is None else self._measured(number, found.accepted, image)
+        loop = None if found.accepted is None else self._measured(number, found.accepted, image, pose)
         with self._lock:
             if number and not another:
                 step = relative_pose(graph.odometry[-1], pose)
@@ -139,12 +140,24 @@ class LoopCloser:
         turn = float(Rotation.from_quat(step[3:]).magnitude())
         return float(np.linalg.norm(step[:3])) >= self.keyframes.step_m or turn >= self.keyframes.turn_rad
 
-    def _measured(self, query: int, match: int, image: np.ndarray) -> Loop | None:
+    def _measured(self, query: int, match: int, image: np.ndarray, pose: np.ndarray) -> Loop | None:
         camera = self.camera.of_size(image.shape[1], image.shape[0])
         first, second = (View(self.detector.local_features(frame), camera) for frame in (match, query))
         assert self.detector.check is not None
-        relative = relative_view(first, second, self.detector.check.matches(first.local, second.local))
-        return None if relative is None else Loop(query, match, relative)
+        matching = self.detector.check.matches
+        relative = relative_view(first, second, matching(first.local, second.local))
+        if relative is None:
+            return None
+        path = [*self._graph.odometry, pose]
+
+        def around(frame: int) -> Iterator[tuple[View, float]]:
+            begin = max(0, frame - FARTHEST)
+            near = np.array(path[begin : frame + FARTHEST + 1])
+            for number, length in neighbors(near, frame - begin):
+                yield View(self.detector.local_features(begin + number), camera), length
+
+        near_both = around(match), around(query)
+        return Loop(query, match, with_length(relative, (first, second), near_both, matching))
 
     def path(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the stamps (N,) of all keyframes, and the corrected poses (N, 7) of the robot in the map."""
@@ -155,7 +168,9 @@ class LoopCloser:
     def by_loop(self, loop: Loop) -> tuple[np.ndarray, np.ndarray]:
         """Return the pose (7,) of the robot in the map by one loop, and its covariance (6, 6): x y z, then rotation.
 
-        The position is that of the path where the length of the loop's translation is not known.
+        The covariance is that of the measured loop, about the axes of the map, as in messages of ROS; errors of the
+        corrected path come on top. The position is that of the path where the length of the loop's translation is not
+        known, and its variance is UNKNOWN there.
         """
         assert loop.relative is not None
         with self._lock:
@@ -163,9 +178,16 @@ class LoopCloser:
         pose = after(poses[loop.match], loop.relative.pose)
         if loop.relative.kind != METRIC:
             pose[:3] = poses[loop.query, :3]
-        place = UNKNOWN if loop.relative.kind == ROTATION_ONLY else LOOP_SIGMAS.translation_m**2
-        variances = [place] * 3 + [LOOP_SIGMAS.rotation_rad**2] * 3
-        return after(pose, _inverse(self.mount)), np.diag(variances)
+        robot = after(pose, _inverse(self.mount))
+        # The measured directions are those in which the edge of the loop has information.
+        values, vectors = np.linalg.eigh(constraint(loop.relative)[1])
+        variances = 1 / np.maximum(values, 1 / UNKNOWN)
+        # From the frame of the camera to the axes of the map, at the position of the robot.
+        turn = Rotation.from_quat(pose[3:]).as_matrix()
+        moving = np.eye(6)
+        moving[:3, 3:] = cross_matrices((pose[:3] - robot[:3])[None])[0]
+        moving = moving @ np.kron(np.eye(2), turn)
+        return robot, moving @ (vectors * variances) @ vectors.T @ moving.T
 
     def _corrected(self, odometry: np.ndarray) -> np.ndarray:
         return np.concatenate([self._solved, after(self.correction, odometry[len(self._solved) :])])

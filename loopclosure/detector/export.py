@@ -22,7 +22,12 @@ from netspec.files.whole_file import write_whole
 
 VERTEX, EDGE, VERTEX_2D, EDGE_2D = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_SE2", "EDGE_SE2"
 PLANE = np.array([0, 1, 5])  # x, y and the rotation about z, in the 6-vector of a pose error
-RELATIVE = ("relative", "qx", "qy", "qz", "qw", "dx", "dy", "dz", "length_m", "agreeing", "sigma_m", "sigma_deg")
+RELATIVE = (
+    "relative",
+    *("qx", "qy", "qz", "qw", "dx", "dy", "dz", "length_m", "agreeing", "sigma_m", "sigma_deg"),
+    "length_by",
+    "covariance",
+)
 LOOPS = (
     "query_id",
     "match_id",

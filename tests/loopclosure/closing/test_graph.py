@@ -15,12 +15,8 @@ from loopclosure.closing.close import (
     turn_rmse_deg,
 )
 from loopclosure.closing.graph import Edge, State, _Graph, solve
-from loopclosure.closing.measure import Loop, cells, errors_said
-from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, Relative, View, _from_depth, relative_view
-from loopclosure.detector.export import LOOP_SIGMAS, RELATIVE, relative_pose
-from loopclosure.detector.verification import LocalFeatures
+from loopclosure.detector.export import LOOP_SIGMAS, relative_pose
 from loopclosure.errors import InputError
-from loopclosure.places.depth import depth_at
 from loopclosure.places.intrinsics import Intrinsics, from_text
 
 LAPS, PER_LAP = 3, 40
@@ -116,73 +112,6 @@ def test_steps_and_errors_of_a_path() -> None:
     assert ate_rmse_m(wide, truth) == pytest.approx(0.1 * size)
 
 
-CAMERA = Intrinsics(260, 262, 159.5, 119.5)
-POINTS = 120
-WRONG = 30
-TURN = Rotation.from_euler("yx", [8, -3], degrees=True)
-
-
-def views(step: np.ndarray, depth: bool = False) -> tuple[View, View, np.ndarray]:
-    """Two views of points at 2 to 6 m; the second camera is moved by ``step``. A quarter does not match."""
-    rng = np.random.default_rng(3)
-    points = rng.uniform([-2, -1.5, 2], [2, 1.5, 6], (POINTS, 3))
-    pixels, maps = [], []
-    for seen in (points, TURN.inv().apply(points - step)):
-        at = seen[:, :2] / seen[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
-        pixels.append((at + rng.normal(0, 0.3, at.shape)).astype(np.float32))
-        # Each point on a small patch of its own depth, as of a surface; where patches meet, depth is not used.
-        image = np.zeros((240, 320), np.float32)
-        for (x, y), z in zip(np.rint(at).astype(int), seen[:, 2], strict=True):
-            image[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] = z
-        maps.append(depth_at(image, pixels[-1]) if depth else None)
-    matches = np.stack([np.arange(POINTS)] * 2, axis=1)
-    matches[:WRONG, 1] = np.roll(matches[:WRONG, 1], 7)
-    none = np.zeros((POINTS, 128), np.uint8)
-    first, second = (View(LocalFeatures(at, none), CAMERA, z) for at, z in zip(pixels, maps, strict=True))
-    return first, second, matches
-
-
-def degrees_off(pose: np.ndarray) -> float:
-    return float(np.degrees((TURN.inv() * Rotation.from_quat(pose[3:])).magnitude()))
-
-
-def test_depth_gives_meters() -> None:
-    step = np.array([0.4, -0.1, 0.3])
-    first, second, matches = views(step, depth=True)
-    for one, other in ((first, second), (first, View(second.local, CAMERA)), (View(first.local, CAMERA), second)):
-        found = relative_view(one, other, matches)
-        assert found is not None
-        assert found.kind == METRIC
-        np.testing.assert_allclose(found.pose[:3], step, atol=0.03)
-        assert degrees_off(found.pose) < 0.5
-
-
-def test_color_gives_the_direction_without_the_length() -> None:
-    step = np.array([0.4, -0.1, 0.3])
-    found = relative_view(*views(step))
-    assert found is not None
-    assert found.kind == UP_TO_SCALE
-    assert np.linalg.norm(found.pose[:3]) == pytest.approx(1)
-    assert found.pose[:3] @ step / np.linalg.norm(step) > np.cos(np.radians(5))
-    assert degrees_off(found.pose) < 0.5
-    assert found.inliers >= 80
-
-
-def test_a_camera_that_only_turned_gives_a_rotation_only() -> None:
-    found = relative_view(*views(np.zeros(3)))
-    assert found is not None
-    assert found.kind == ROTATION_ONLY
-    assert found.pose[:3].tolist() == [0, 0, 0]
-    assert degrees_off(found.pose) < 0.2
-
-
-def test_inconsistent_points_give_no_motion() -> None:
-    first, second, matches = views(np.array([0.4, 0, 0]))
-    assert relative_view(first, second, matches[:19]) is None
-    scrambled = np.stack([matches[:, 0], np.random.default_rng(1).permutation(POINTS)], axis=1)
-    assert relative_view(first, second, scrambled) is None
-
-
 def test_the_camera_of_smaller_images_and_of_text() -> None:
     camera = from_text("517.3,516.5,318.6,255.3,0.26,-0.95,-0.005,0.003,1.16")
     assert camera.distortion == (0.26, -0.95, -0.005, 0.003, 1.16)
@@ -204,41 +133,3 @@ def test_loops_at_one_position_are_reported(ends: list[tuple[int, int]], spot: b
     edges = [Edge(first, second, poses[0], np.eye(6)) for first, second in ends]
     closed = Closed(np.arange(41), poses, poses, [], edges, [], np.ones(len(edges), bool), 0)
     assert ("the path between them goes up to 19.5 m away" in one_spot(closed)) == spot
-
-
-def test_the_standard_deviations_of_a_metric_pose_are_those_of_its_errors() -> None:
-    rng, focal = np.random.default_rng(4), 260.0
-    points = rng.uniform([-2, -1.5, 2], [2, 1.5, 6], (80, 3))
-    step, turn = np.array([0.4, -0.1, 0.3]), TURN.as_matrix()
-    seen = points @ turn.T + step
-    shifts, turns, sigmas = [], [], []
-    for _ in range(40):
-        noise = rng.normal(0, 0.5 / focal, (80, 2))
-        found = _from_depth(points[:, :2] / points[:, 2:], points[:, 2], seen[:, :2] / seen[:, 2:] + noise, focal)
-        assert found is not None
-        rotation, translation, _, sigma = found
-        shifts.append(translation - step)
-        turns.append((Rotation.from_matrix(rotation) * TURN.inv()).as_rotvec())
-        sigmas.append(sigma)
-    shift, angle = np.mean(sigmas, axis=0)
-    assert shift == pytest.approx(np.sqrt(np.mean(np.square(shifts))), rel=0.25)
-    assert angle == pytest.approx(np.sqrt(np.mean(np.square(turns))), rel=0.25)
-
-
-def test_a_measured_loop_is_a_row_of_the_table_and_judged_by_true_poses() -> None:
-    true = np.array([[0, 0, 0, 0, 0, 0, 1.0], [3, 0, 4, *TURN.as_quat()]])
-    turned = (TURN * Rotation.from_euler("y", 2, degrees=True)).as_quat()
-    metric = Relative(np.array([3, 0, 4.1, *TURN.as_quat()]), METRIC, 60, (0.01, np.deg2rad(0.3)))
-    scaled = Relative(np.array([0.6, 0, 0.8, *turned]), UP_TO_SCALE, 40)
-    turn = Relative(np.array([0, 0, 0, *TURN.as_quat()]), ROTATION_ONLY, 50)
-    rows = [dict(zip(RELATIVE, cells(each), strict=True)) for each in (metric, scaled, turn)]
-    assert [row["length_m"] for row in rows] == ["5.080354", "", ""]
-    assert [(row["dx"], row["dz"]) for row in rows] == [("0.590510", "0.807030"), ("0.600000", "0.800000"), ("", "")]
-    assert [(row["sigma_m"], row["sigma_deg"]) for row in rows] == [("0.01", "0.3"), ("", ""), ("", "")]
-    assert [row["agreeing"] for row in rows] == [60, 40, 50]
-    loops = [Loop(1, 0, each) for each in (metric, scaled, turn, None)]
-    said = errors_said(loops, true)
-    assert said.startswith("median errors of the 3 measured loops, by the true poses: rotation ")
-    assert said.endswith(" degrees, direction 0.34 degrees (of 2), translation 0.1 m (of 1)")
-    assert "rotation 2 degrees, direction" in errors_said([loops[1]], true)
-    assert errors_said(loops, np.full((2, 7), np.nan)) == ""
