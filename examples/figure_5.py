@@ -76,7 +76,7 @@ def join(folders: list[Path], out: Path, start_share: float) -> None:
 def describe(arguments: argparse.Namespace, walk: Path) -> list[str]:
     """Write the descriptors of the walk by each file of weights; return the methods that compare them.
 
-    A method has the name of the folder that table_1.py keeps the weights in, such as all_rooms.
+    A method has the name of the folder that table_1.py keeps the weights in, such as "all rooms".
     """
     net = Path("prototxt", "normalized", arguments.net, "deploy.prototxt")
     shape = f"data=1,3,{arguments.size},{arguments.size}"
@@ -87,7 +87,7 @@ def describe(arguments: argparse.Namespace, walk: Path) -> list[str]:
         extract = ["netspec", "extract", net, "--weights", weights, "--blob", "feat", "--shape", shape]
         extract += ["--mean", "128,128,128", "--scale", 1 / 128, "--images", walk / "rgb.txt", "--out", features]
         run(*extract)
-        methods.append(f"{arguments.net}, {trained_on}=features:{features}")
+        methods.append(f"net, {trained_on.replace('_', ' ')}=features:{features}")
     return methods
 
 
@@ -103,12 +103,20 @@ def learn(arguments: argparse.Namespace, walk: Path) -> list[str]:
 
 
 def rows(report: Path, angle: int) -> dict[str, dict[str, Any]]:
-    """Return R@1 and the average precision of all pairs of each method in a report, named with the angle."""
+    """Return the figures of each method in a report, named with the angle.
+
+    R@1 is the share of the frames with a loop whose best match is right; AP the average precision of all pairs.
+    """
+    summary = json.loads((report / "report.json").read_text())
+    frames = {"images": summary["queries"], f"with a loop {angle}": summary["queries_with_a_loop"]}
     found = {}
-    for method in json.loads((report / "report.json").read_text())["methods"]:
-        figures = method["figures"]
-        best, pairs = figures["best match of each query"], figures["all pairs"]
-        found[method["name"]] = {f"R@1, {angle}": best["recall at 1"], f"AP, {angle}": pairs["average precision"]}
+    for method in summary["methods"]:
+        best, pairs = (method["figures"][name] for name in ("best match of each query", "all pairs"))
+        found[method["name"]] = {
+            **frames,
+            f"R@1 {angle}": best["recall at 1"],
+            f"AP {angle}": pairs["average precision"],
+        }
     return found
 
 
@@ -138,9 +146,8 @@ def main() -> None:
     (arguments.out / "table.json").write_text(json.dumps(list(table.values()), indent=1))
     show_times(arguments.out / f"report_{ANGLES[0]}" / "times.csv")
     for cells in table.values():
-        print(
-            ", ".join(f"{name}: {cell:.3f}" if isinstance(cell, float) else f"{cell}" for name, cell in cells.items())
-        )
+        values = [round(cell, 3) if isinstance(cell, float) else cell for cell in cells.values()]
+        print(*(f"{name}: {value}" for name, value in zip(cells, values, strict=True)), sep=", ")
 
 
 if __name__ == "__main__":
