@@ -87,11 +87,7 @@ class SpecError(ValueError):
 
 
 class InputError(SpecError):
-    """An error in a user's data or options, whether in a file or not.
-
-    ``str(error)`` is one line: ``file:line:column: message``; ``file: message`` if no line is known (line 0); the
-    message alone if the error is not in a file.
-    """
+    """An error in a user's data or options. ``file`` is "" if it is in no file, ``line`` is 0 if none is known."""
 
     def __init__(self, message: str, file: str | os.PathLike[str] = "", line: int = 0, column: int = 0) -> None:
         super().__init__(message, Where(os.fspath(file), line, column) if os.fspath(file) else None)

@@ -55,13 +55,17 @@ class Fast:
         return is_fresh(layer)
 
     def learns(self, layer: Layer) -> bool:
-        """Return whether a layer has its own kernels for training."""
+        """Return whether :meth:`kernels` returns kernels for a layer with its current shapes."""
         from netspec.fast.table import learns_alone
 
         return learns_alone(layer, steady=False)
 
     def kernels(self, layer: Layer, wanted: Sequence[bool], sums: Sequence[Diff]) -> Kernels | None:
-        """Return the training kernels of a layer. Its bottoms may change before the backward pass."""
+        """Return the training kernels of a layer for its current shapes, or None.
+
+        ``wanted[i]``: whether the gradient of bottom i is computed. ``sums[j]``: the tensor to which the gradient of
+        learnable blob j is added. Bottoms may change between the calls, so backward reads them again.
+        """
         from netspec.fast.kernels import Learning
         from netspec.fast.table import learning_kernels
 

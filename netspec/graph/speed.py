@@ -9,7 +9,10 @@ if TYPE_CHECKING:
     from typing import Any, Protocol
 
     class Speed(Protocol):
-        """Makes faster runners and kernels for a net, of ``eager``, its runner with autograd (netspec/run/eager.py)."""
+        """Makes faster runners for a net, of ``eager``, its runner with autograd (netspec/run/eager.py).
+
+        netspec/fast/speed.py has more, which netspec/compat/pycaffe asks for.
+        """
 
         def prepared(self, eager: Any, passes: Collection[str]) -> Any:
             """Return a Runner without gradients. ``passes`` are the allowed ones of netspec/graph/options.py."""
@@ -26,22 +29,6 @@ if TYPE_CHECKING:
             """Return a function that reads many raw Datums together. ``decode`` returns the array (C, H, W) of one.
 
             See :class:`netspec.data.sources.DatabaseSource`.
-            """
-            ...
-
-        def is_fresh(self, layer: Any) -> bool:
-            """Return whether the top of a prepared layer has its own memory, not that of a bottom."""
-            ...
-
-        def learns(self, layer: Any) -> bool:
-            """Return whether :meth:`kernels` returns kernels for a layer with its current shapes."""
-            ...
-
-        def kernels(self, layer: Any, wanted: Sequence[bool], sums: Sequence[Any]) -> Any:
-            """Return the Kernels (netspec/run/recorded.py) of a layer for its current shapes, or None.
-
-            ``wanted[i]``: whether the gradient of bottom i is computed. ``sums[j]``: the tensor to which the gradient
-            of learnable blob j is added. Bottoms may change between the calls, so backward reads them again.
             """
             ...
 

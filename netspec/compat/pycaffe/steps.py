@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from typing_extensions import override
@@ -50,7 +51,8 @@ class LayerStep:
         self.reads = self.layer.gradient_reads
         self.reached, self.wanted = net.backward_plan.layers[i], net.backward_plan.written[i]
         self._reader = reader_of_memory(self.layer, self.node, net.plan) if self.reads else None
-        self._speed, self._device = net.options.speed, net.device
+        self._speed: Any = net.options.speed  # None, or netspec.fast.speed.Fast
+        self._device = net.device
         self.records = self._is_asked() and not (self.reads or self.layer.shares)
         self.keeps_bottom = "kept" in self.reads and self._is_asked()
         self.has_kernels = self._can_bind()
