@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from loopclosure.closing.measure import Loop, errors_said, measure
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext
 from loopclosure.methods.named import make_method
@@ -25,6 +26,7 @@ from netspec.errors import printable
 
 RECALL_AT = (1, 5, 10)
 SOFT_ZONE = "; soft zone"
+MOST_MEASURED = 200  # loops of a method whose relative pose is measured
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,7 @@ class Outcome:
     seconds  stage -> total seconds
     training_stages  the stages that run once, on training images
     answer   for a method that makes its own decisions: a summary of them and of how many are right
+    measured the errors of the poses that are measured for its loops, by the true poses; "" if there are none
     """
 
     name: str
@@ -90,6 +93,7 @@ class Outcome:
     training_stages: tuple[str, ...]
     notes: list[str]
     answer: str = ""
+    measured: str = ""
 
     @property
     def pairs(self) -> PrecisionRecall:
@@ -187,6 +191,8 @@ def judge(
         zones = [("", rule)] + ([] if soft is None else [(" in the soft zone", soft)])
         answer = "; ".join([result.answer, *(f"{judged.answered()}{zone}" for zone, judged in zones)])
         notes.append(answer)
+    measured = measured_said(data, rule.matches, progress) if result.answer else ""
+    notes += [measured] if measured else []
     return Outcome(
         name=name,
         scores=result.scores,
@@ -196,4 +202,20 @@ def judge(
         training_stages=result.training_stages,
         notes=notes,
         answer=answer,
+        measured=measured,
     )
+
+
+def measured_said(data: DataSet, matches: BestMatches, progress: Progress = silent) -> str:
+    """Measure the loops of a method in their images; return a sentence with the median errors by the true poses.
+
+    It is empty for two sequences, and without a calibrated camera or poses. Of more than MOST_MEASURED loops, as many
+    are measured, evenly spread.
+    """
+    frames = data.queries
+    queries = np.flatnonzero(matches.reference >= 0)
+    if data.references is not None or frames.camera is None or frames.poses is None or not len(queries):
+        return ""
+    some = queries[np.unique(np.linspace(0, len(queries) - 1, MOST_MEASURED).round().astype(int))]
+    loops = [Loop(query, match) for query, match in zip(some.tolist(), matches.reference[some].tolist(), strict=True)]
+    return errors_said(measure(frames, loops, frames.camera, frames.odometry, progress), frames.poses)

@@ -109,6 +109,7 @@ def measures_text(evaluation: Evaluation) -> str:
         spans.append(("soft zone", len(SOFT_MEASURES)))
         lines.append(f"soft zone, best match of each query: a match is no mistake if {data.overlap_rule}")
     answers = [f"{outcome.name}: {outcome.answer}" for outcome in evaluation.outcomes if outcome.answer]
+    answers += [f"{outcome.name}: {outcome.measured}" for outcome in evaluation.outcomes if outcome.measured]
     return "\n".join([*lines, *in_columns([heads, *rows], spans=spans), *answers])
 
 

@@ -1,5 +1,6 @@
 """Loops closed while a robot drives: a bag of a rendered robot whose wheels drift, and slip in one corner."""
 
+import re
 import time
 from pathlib import Path
 from threading import Event
@@ -10,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lmdb_build.cli import main as lmdb_build
+from loopclosure.cli import main as loopclosure
 from loopclosure.closing import online
 from loopclosure.closing.close import DEPTH_SIGMAS, ate_rmse_m, drifted, path_of, steps_between, write_closed
 from loopclosure.closing.graph import Solution, solve
@@ -46,18 +48,24 @@ def write_bag(file: Path, sequence: ImageSequence, odometry: np.ndarray) -> None
     store = get_typestore(Stores.ROS2_HUMBLE)
     make = {name.rsplit("/")[-1]: kind for name, kind in store.types.items()}
     kinds = {"/image": "sensor_msgs/msg/Image", "/camera_info": "sensor_msgs/msg/CameraInfo"}
-    kinds["/odom"] = "nav_msgs/msg/Odometry"
+    kinds |= {"/odom": "nav_msgs/msg/Odometry", "/ground_truth/pose": "geometry_msgs/msg/PoseStamped"}
     zero, none = make["Vector3"](x=0.0, y=0.0, z=0.0), np.zeros(36)
     camera = sequence.camera
     assert camera is not None
     assert sequence.stamps is not None
+    assert sequence.poses is not None
     with Writer(file, version=9) as writer:
         opened = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
 
         def write(topic: str, stamp: float, message: Any) -> None:
             writer.write(opened[topic], round(stamp * 1e9), store.serialize_cdr(message, kinds[topic]))
 
-        for image, stamp, pose in zip(sequence.paths, sequence.stamps.tolist(), odometry.tolist(), strict=True):
+        def pose_of_row(row: list[float]) -> Any:
+            point = make["Point"](x=row[0], y=row[1], z=row[2])
+            return make["Pose"](point, make["Quaternion"](x=row[3], y=row[4], z=row[5], w=row[6]))
+
+        paths = (odometry.tolist(), sequence.poses.tolist())
+        for image, stamp, pose, true in zip(sequence.paths, sequence.stamps.tolist(), *paths, strict=True):
             pixels = read_bgr(image)
             height, width = pixels.shape[:2]
             at = make["Time"](sec=int(stamp), nanosec=round(stamp % 1 * 1e9))
@@ -68,13 +76,10 @@ def write_bag(file: Path, sequence: ImageSequence, odometry: np.ndarray) -> None
             info = {"distortion_model": "plumb_bob", "d": np.zeros(5), "k": k, "r": np.eye(3).ravel()}
             info |= {"p": np.zeros(12), "binning_x": 0, "binning_y": 0, "roi": roi}
             write("/camera_info", stamp, make["CameraInfo"](header=header, **size, **info))
-            place = make["Pose"](
-                position=make["Point"](x=pose[0], y=pose[1], z=pose[2]),
-                orientation=make["Quaternion"](x=pose[3], y=pose[4], z=pose[5], w=pose[6]),
-            )
             moving = make["TwistWithCovariance"](twist=make["Twist"](linear=zero, angular=zero), covariance=none)
-            known = make["PoseWithCovariance"](pose=place, covariance=none)
+            known = make["PoseWithCovariance"](pose=pose_of_row(pose), covariance=none)
             write("/odom", stamp, make["Odometry"](header=header, child_frame_id="base", pose=known, twist=moving))
+            write("/ground_truth/pose", stamp, make["PoseStamped"](header=header, pose=pose_of_row(true)))
             row = {"encoding": "bgr8", "is_bigendian": 0, "step": 3 * width, "data": pixels.ravel()}
             write("/image", stamp, make["Image"](header=header, **size, **row))
 
@@ -84,19 +89,51 @@ def closer_of(camera: Intrinsics = CAMERA, **given: Any) -> LoopCloser:
     return LoopCloser(detector, camera, STILL, **given)
 
 
-@pytest.mark.slow
-def test_a_recorded_robot_gets_a_corrected_path(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> tuple[ImageSequence, np.ndarray, Path]:
+    """A rendered robot that walks around a house twice: its images, the odometry of its wheels, and a bag of both."""
     pytest.importorskip("rosbags")
-    from rosbags.highlevel import AnyReader
-
-    assert lmdb_build(["walk", str(tmp_path / "walk"), "--frames", "64", "--laps", "2", "--size", "160x120"]) == 0
-    sequence = read_sequence(tmp_path / "walk" / "walk_1")
+    folder = tmp_path_factory.mktemp("robot")
+    assert lmdb_build(["walk", str(folder / "walk"), "--frames", "64", "--laps", "2", "--size", "160x120"]) == 0
+    sequence = read_sequence(folder / "walk" / "walk_1")
     assert sequence.poses is not None
     odometry = slipped(drifted(sequence.poses, 3.0, 1), 20)
-    write_bag(tmp_path / "bag", sequence, odometry)
+    write_bag(folder / "bag", sequence, odometry)
+    return sequence, odometry, folder / "bag"
+
+
+@pytest.mark.slow
+def test_two_commands_correct_the_path_of_a_bag(
+    robot: tuple[ImageSequence, np.ndarray, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found, closed = tmp_path / "found", tmp_path / "closed"
+    assert loopclosure(["detect", str(robot[2]), "--describe", "small", "--out", str(found)]) == 0
+    assert "median errors of the " in capsys.readouterr().out
+    line = ["close", str(robot[2]), "--loops", str(found / "loops.csv"), "--out", str(closed)]
+    assert loopclosure(line) == 0
+    said = capsys.readouterr().out
+    print(said)
+    error = re.search(r"ATE RMSE \[m\]: (\S+) before, (\S+) after", said)
+    assert error is not None
+    assert float(error[2]) < 0.2 * float(error[1])
+    assert re.search(r"\d+ loops measured in meters, from steps of the odometry", said)
+    edges = [line.split() for line in (found / "loops.g2o").read_text().splitlines() if line.startswith("EDGE")]
+    assert len(edges) > len(robot[0]) + 10
+    ends = np.array([edge[1:3] for edge in edges], int)
+    places = relative_pose(*(robot[0].poses[ends[:, k]] for k in (0, 1))) if robot[0].poses is not None else np.zeros(0)
+    off = np.linalg.norm(np.array([edge[3:6] for edge in edges], float) - places[:, :3], axis=1)
+    assert np.median(off[len(robot[0]) - 1 :]) < 0.3, "a loop's edge is measured, not taken from the odometry"
+
+
+@pytest.mark.slow
+def test_a_recorded_robot_gets_a_corrected_path(robot: tuple[ImageSequence, np.ndarray, Path], tmp_path: Path) -> None:
+    from rosbags.highlevel import AnyReader
+
+    sequence, odometry, bag = robot
+    assert sequence.poses is not None
     said: list[str] = []
     closer, joined, spent = None, Synchronizer(warn=said.append), []
-    with AnyReader([tmp_path / "bag"]) as reader:
+    with AnyReader([bag]) as reader:
         for connection, _, raw in reader.messages():
             message: Any = reader.deserialize(raw, connection.msgtype)
             if connection.topic == "/camera_info" and closer is None:
