@@ -351,26 +351,6 @@ def test_copies_precisions_and_threads(net_of: Callable[..., Net]) -> None:
     assert_same(quickly(net, data=images().double()), slowly(net, data=images().double()))
 
 
-@pytest.mark.parametrize("outputs", [4096, 4099])
-def test_a_large_product_of_one_vector_is_right_on_any_number_of_threads(
-    net_of: Callable[..., Net], outputs: int
-) -> None:
-    net = net_of(
-        f"""layer {{ name: "x" type: "Input" top: "x" input_param {{ shape {{ dim: 1 dim: 300 }} }} }}
-        layer {{ name: "ip" type: "InnerProduct" bottom: "x" top: "ip" inner_product_param {{ num_output: {outputs}
-          weight_filler {{ type: "xavier" }} bias_filler {{ type: "gaussian" }} }} }}"""
-    )
-    weight, bias = (blob.detach().double() for blob in net.params["ip"])
-    x, threads = torch.randn(1, 300), torch.get_num_threads()
-    try:
-        for count in (1, 2, 3, 16):
-            torch.set_num_threads(count)
-            found = quickly(net, x=x)["ip"]
-            torch.testing.assert_close(found.double(), x.double() @ weight.T + bias, rtol=1e-5, atol=1e-5)
-    finally:
-        torch.set_num_threads(threads)
-
-
 def test_inference_mode_and_no_grad_can_alternate(net_of: Callable[..., Net]) -> None:
     lrn = 'layer { name: "lrn" type: "LRN" bottom: "scale" top: "lrn" }'
     net = trained(net_of(BLOCK + lrn))
