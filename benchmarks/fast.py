@@ -7,7 +7,6 @@ ratio of their CPU times is the median over the pairs of turns.
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -122,7 +121,6 @@ def _training(name: str, batch: int, limits: Limits) -> Rows:
 def forward_parts(net: Any) -> list[Part]:
     """Return the parts that a net may use when it runs without gradients."""
     from netspec.fast import prepared, table
-    from netspec.fast.layers import vision
 
     def without_layouts() -> AbstractContextManager[object]:
         entry_of = table.entry_of
@@ -131,26 +129,18 @@ def forward_parts(net: Any) -> list[Part]:
     parts = [Part(ALL, "pass", options={"passes": ()})]
     parts += [Part(each, "pass", options={"passes": [other for other in PASSES if other != each]}) for each in PASSES]
     parts.append(Part("any layout", "pass", without_layouts))
-    parts += _kernels(net, "inference")
-    if any(layer.type == "Pooling" for layer in net.layers):
-        parts.append(Part("pooling by slices", "function", lambda: patch.object(vision, "SLICED", math.inf)))
-    return parts
+    return parts + _kernels(net, "inference")
 
 
 def training_parts(net: Any) -> list[Part]:
     """Return the parts that a net may use when it trains."""
-    from netspec.exact import losses
     from netspec.fast import speed
-    from netspec.fast.layers import loss
 
-    whole = Part(ALL, "pass", lambda: patch.object(speed.Fast, "trainer", lambda *_: "it is not wanted"))
-    parts = [whole, *_kernels(net, "learning")] if net.trainer() else []
     unread = patch.object(speed.Fast, "reads_at_once", lambda *_: lambda records: None)
-    parts.append(Part("records at once", "function", lambda: unread))
-    if not net.trainer():
-        return parts
-    plain = patch.object(loss, "_prepared_softmax", lambda shape: losses.softmax)
-    parts.append(Part("prepared softmax", "function", lambda: plain))
+    parts = [Part("records at once", "function", lambda: unread)]
+    if net.trainer():
+        none = patch.object(speed.Fast, "trainer", lambda *_: "it is not wanted")
+        parts += [Part(ALL, "pass", lambda: none), *_kernels(net, "learning")]
     return parts
 
 

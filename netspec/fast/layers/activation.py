@@ -12,13 +12,11 @@ import torch.nn.functional as F
 from netspec.exact import ALL
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Folds
-from netspec.fast.kernels import RELU, Activation, Buffer, Inference, Kernel, Learning, clip, with_activation
+from netspec.fast.kernels import RELU, Activation, Buffer, Learning, clip
 from netspec.layers.activation import BNLL, ELU, Clip, PReLU, ReLU, Rounded, Sigmoid, Swish, TanH, Threshold
 from netspec.layers.contract.learned import values_of
 from netspec.layers.powers import AbsVal, Exp, Log, Power
 from netspec.run.recorded import Kernels
-
-_VECTORS = 2**12  # numbers: for fewer, one call of torch is faster than several
 
 
 def _relu_folds(layer: ReLU) -> Folds:
@@ -42,13 +40,6 @@ def _learn_relu(layer: ReLU, how: Learning) -> Kernels | None:
     return Kernels(forward, backward)
 
 
-def _prelu(layer: PReLU, how: Inference) -> Kernel | None:
-    if layer.context.options.exact == ALL:
-        return None
-    slopes = values_of(layer.blob(0)).clone().reshape(-1)
-    return with_activation(lambda x: torch.prelu(x, slopes), how.activation)
-
-
 def _learn_prelu(layer: PReLU, how: Learning) -> Kernels | None:
     shape = layer.bottom_shapes[0]
     if layer.context.options.exact == ALL or math.prod(shape) == 0:
@@ -63,11 +54,7 @@ def _learn_prelu(layer: PReLU, how: Learning) -> Kernels | None:
         return torch.prelu(x, flat)
 
     def backward(diff: torch.Tensor) -> torch.Tensor:
-        if diff.numel() > _VECTORS and diff.stride() == given.stride():  # torch's own kernel is not vectorized
-            above = given > 0
-            found, terms = torch.where(above, diff, diff * by_channel), torch.where(above, 0, given * diff)
-        else:
-            found, terms = gradients(diff, given, by_channel)
+        found, terms = gradients(diff, given, by_channel)
         if total is not None:
             total.add_(terms.sum_to_size(by_channel.shape).view(total.shape))
         return found
@@ -99,7 +86,7 @@ def _clip_folds(layer: Clip) -> Folds:
 
 ENTRIES = {
     ReLU: Entry(learning=_learn_relu, folds=_relu_folds, fresh=True, any_layout=True),
-    PReLU: Entry(_prelu, _learn_prelu, fresh=True, any_layout=True),
+    PReLU: Entry(learning=_learn_prelu, fresh=True, any_layout=True),
     Sigmoid: Entry(folds=partial(_in_place, Activation("sigmoid", torch.sigmoid_)), fresh=True, any_layout=True),
     TanH: Entry(
         learning=_learn_tanh, folds=partial(_in_place, Activation("tanh", torch.tanh_)), fresh=True, any_layout=True

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 
 from netspec.exact import SMALL_ITEM
-from netspec.exact.blas import routine
+from netspec.exact.losses import softmax
 from netspec.fast.entry import Entry
 from netspec.fast.kernels import Learning
 from netspec.layers.loss.base import normalizer
@@ -29,7 +29,7 @@ def _learn_softmax(layer: SoftmaxWithLoss, how: Learning) -> Kernels | None:
     divisor = float(normalizer(layer.normalization, layer.outer, layer.inner, None))
     exact = layer.arithmetic(torch.empty(1), small=math.prod(split[1:]) <= SMALL_ITEM).is_caffes
     label, diff = torch.empty(flat, dtype=torch.long), torch.empty(split)
-    normalize = _prepared_softmax(split) if exact else partial(F.softmax, dim=1)
+    normalize = softmax if exact else partial(F.softmax, dim=1)
     sum_up = _prepared_cross_entropy(split, FLT_MIN, divisor) if exact else lambda p, _: _mean(p, label, divisor)
     # Numpy works on p and its gradient, because its calls have less overhead than torch's.
     p, classes, found = torch.empty(0), label.numpy().reshape(-1), diff.numpy()
@@ -57,34 +57,6 @@ def _learn_softmax(layer: SoftmaxWithLoss, how: Learning) -> Kernels | None:
 
 def _mean(p: torch.Tensor, label: torch.Tensor, divisor: float) -> torch.Tensor:
     return (-p.gather(1, label).clamp_(min=FLT_MIN).log()).sum() / divisor
-
-
-def _prepared_softmax(shape: tuple[int, int, int]) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return a function like netspec.exact.losses.softmax, for float32 scores of one shape. It reuses its memory.
-
-    It must run in one thread.
-    """
-    p, largest = torch.empty(shape), np.empty((shape[0], 1, shape[2]), np.float32)
-    values, exponents, powers = p.numpy(), np.zeros(shape, np.complex64), np.empty(shape, np.complex64)
-
-    def run(scores: torch.Tensor) -> torch.Tensor:
-        given = scores.numpy()
-        np.maximum.reduce(given, 1, out=largest, keepdims=True)
-        np.subtract(given, largest, exponents.real)  # never above 0: see libm.exp
-        np.exp(exponents, powers)
-        np.divide(powers.real, _class_sums(powers.real)[:, None], values)
-        return p
-
-    return run
-
-
-def _class_sums(values: np.ndarray) -> np.ndarray:
-    """Return the sums (N, inner) over axis 1 of values (N, classes, inner), by a call of gemv for each item."""
-    sums = np.zeros((len(values), values.shape[2]), values.dtype)
-    add_up, ones = routine("gemv", values), np.ones(values.shape[1], values.dtype)
-    for item, total in zip(values, sums, strict=True):
-        add_up(1.0, item.T, ones, 1.0, total, 0, 1, 0, 1, 0, 1)
-    return sums
 
 
 def _prepared_cross_entropy(

@@ -10,7 +10,7 @@ import torch
 from netspec.exact.by_torch import normalized_batch
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Affine, Folds, blob_in_double
-from netspec.fast.kernels import Buffer, Inference, Kernel, Learning, with_activation
+from netspec.fast.kernels import Buffer, Learning
 from netspec.layers.normalization import BatchNorm, means
 from netspec.run.recorded import Kernels
 
@@ -24,12 +24,6 @@ def affine(layer: BatchNorm) -> Affine:
 
 def _folds(layer: BatchNorm) -> Folds:
     return Folds(affine=(lambda: affine(layer)) if layer.use_global_stats else None)
-
-
-def _by_stored_statistics(layer: BatchNorm, how: Inference) -> Kernel | None:
-    if not layer.use_global_stats:
-        return None
-    return with_activation(layer.by_stored_statistics(layer.arithmetic(layer.blob(0))), how.activation)
 
 
 def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
@@ -60,4 +54,4 @@ def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
     return Kernels(forward, backward)
 
 
-ENTRIES = {BatchNorm: Entry(_by_stored_statistics, _learn, _folds, fresh=True, any_layout=True)}
+ENTRIES = {BatchNorm: Entry(learning=_learn, folds=_folds, fresh=True, any_layout=True)}

@@ -4,25 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from netspec.exact.by_torch import scales_channels
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Absorbed, Affine, Folds, blob_in_double, copy_of
-from netspec.fast.kernels import Inference, Kernel, Learning, with_activation
+from netspec.fast.kernels import Learning
 from netspec.layers.scale import Bias, Scale
 from netspec.run.recorded import Kernels, recorded
-
-
-def _scale(layer: Scale, how: Inference) -> Kernel | None:
-    if not layer.by_channel:
-        return None
-    scale, bias = layer.blob(0), layer.blob(1) if len(layer.blobs) > 1 else None
-    if not layer.arithmetic(scale).is_caffes:
-        return with_activation(scales_channels(scale, bias), how.activation)
-    axes = (-1, *(1,) * (len(layer.bottom_shapes[0]) - 2))
-    factors, *shifts = (values.clone().view(axes) for values in layer.values())
-    if not shifts:
-        return with_activation(lambda data: data * factors, how.activation)
-    return with_activation(lambda data: (data * factors).add_(shifts[0]), how.activation)
 
 
 def _learn_scale(layer: Scale, how: Learning) -> Kernels | None:
@@ -60,6 +46,6 @@ def _bias_folds(layer: Bias) -> Folds:
 
 
 ENTRIES = {
-    Scale: Entry(_scale, _learn_scale, _scale_folds, fresh=True, any_layout=True),
+    Scale: Entry(learning=_learn_scale, folds=_scale_folds, fresh=True, any_layout=True),
     Bias: Entry(folds=_bias_folds),
 }

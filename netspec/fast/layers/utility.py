@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from netspec.exact import blas
 from netspec.fast.entry import Entry
 from netspec.fast.kernels import Inference, Kernel, Learning, with_activation
 from netspec.layers.utility.arithmetic import Eltwise, Softmax
 from netspec.layers.utility.parts import Concat, Slice
-from netspec.layers.utility.shape import Split
 from netspec.run.recorded import Kernels
 
 
@@ -32,27 +30,9 @@ def _learn_concat(layer: Concat, how: Learning) -> Kernels:
     return Kernels(lambda *bottoms: torch.cat(bottoms, axis), lambda diff: diff.split(sizes, axis))
 
 
-def _split(layer: Split, how: Inference) -> Kernel:
-    tops = layer.num_tops
-    return lambda x: (x,) * tops
-
-
-def _learn_split(layer: Split, how: Learning) -> Kernels:
-    """Return kernels that add gradients in Caffe's order if sums are exact, or as autograd does: the last one first."""
-    order = 1 if layer.num_tops > 2 and blas.applies(layer.context.options.exact, torch.empty(1)) else -1
-    tops = layer.num_tops
-
-    def backward(*diffs: torch.Tensor | None) -> torch.Tensor:
-        first, *others = [diff for diff in diffs[::order] if diff is not None]
-        return sum(others, first)
-
-    return Kernels(lambda x: (x,) * tops, backward)
-
-
 ENTRIES = {
     Eltwise: Entry(_eltwise, _learn_eltwise, fresh=True, any_layout=True),
     Softmax: Entry(fresh=True, any_layout=True),
     Concat: Entry(learning=_learn_concat, fresh=lambda layer: len(layer.bottom_shapes) > 1, any_layout=True),
     Slice: Entry(any_layout=True),
-    Split: Entry(_split, _learn_split),
 }

@@ -20,10 +20,8 @@ from netspec.fast.kernels import Inference, Kernel, Learning, copies, product_ke
 from netspec.fast.products import PreparedColumns, Weights, fixed_weights
 from netspec.layers.vision.convolution import Convolution, Deconvolution
 from netspec.layers.vision.pooling import AVE, STOCHASTIC, Pooling
-from netspec.layers.vision.windows import CEIL, LOWEST, Windows, max_pool
+from netspec.layers.vision.windows import CEIL, LOWEST, max_pool
 from netspec.run.recorded import Kernels, recorded
-
-SLICED, SLICED_BY_TWO = 2**12, 2**17  # numbers in a bottom: for more, slices are faster (see largest)
 
 
 def is_usual(layer: Convolution) -> bool:
@@ -154,14 +152,8 @@ def _pooling(layer: Pooling, how: Inference) -> Kernel | None:
     if layer.method == AVE:
         return with_activation(lambda maps: F.avg_pool2d(maps, *geometry, ceil, True), how.activation)
 
-    size = 0 if any(windows.pad) else math.prod(layer.bottom_shapes[0])
-    small = size <= (SLICED_BY_TWO if max(windows.kernel) <= 2 else math.inf)  # where channels lie side by side
-
     def kernel(maps: torch.Tensor) -> torch.Tensor:
-        if size > SLICED and not (small and not maps.is_contiguous()) and not layer.arithmetic(maps).is_caffes:
-            values = largest(maps, windows)
-        else:
-            values = torch.max_pool2d(maps, *geometry, 1, ceil)
+        values = torch.max_pool2d(maps, *geometry, 1, ceil)
         # As in max_pool: torch returns NaN if a window contains NaN, Caffe does not.
         return values if values.amin().item() > LOWEST else max_pool(maps, windows)[0]
 
@@ -201,26 +193,6 @@ def _learn_pooling(layer: Pooling, how: Learning) -> Kernels | None:
         return found if bottom is given else found.contiguous()
 
     return Kernels(forward, backward)
-
-
-def largest(maps: torch.Tensor, windows: Windows) -> torch.Tensor:
-    """Return the maximum of each window of contiguous maps (N, C, H, W), by slices: first of rows, then of columns.
-
-    Windows must have no padding and be ``known_to_torch``. This is up to ten times as fast as torch's kernel, which
-    reads such maps pixel by pixel. The maximum of a window with NaN is NaN; a maximum of zero may have either sign.
-    """
-    for axis, (_, kernel, stride, _), count in zip((2, 3), windows.axes(), windows.count, strict=True):
-        first, *more = (
-            maps[(*(slice(None),) * axis, slice(j, j + (count - 1) * stride + 1, stride))] for j in range(kernel)
-        )
-        if more and more[0].shape == first.shape:
-            maps = torch.maximum(first, more.pop(0))
-        else:
-            maps = first.clone()
-        for part in more:
-            best = maps.narrow(axis, 0, part.shape[axis])  # the last window may reach past the map
-            torch.maximum(best, part, out=best)
-    return maps
 
 
 CONVOLUTION = Entry(convolution, learn_convolution, convolution_folds, fresh=True, any_layout=True)
