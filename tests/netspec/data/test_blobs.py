@@ -3,6 +3,7 @@ import pytest
 
 from netspec.data import blobs
 from netspec.proto.schema import BlobProto, BlobShape
+from wire import field
 
 
 def test_values_and_gradients_can_be_written_and_read():
@@ -76,9 +77,9 @@ def test_too_few_numbers_for_the_shape_are_refused():
 
 
 def with_raw(proto: BlobProto, kind: int | None, raw: bytes) -> BlobProto:
-    """Append raw_data_type (field 10, a varint) and raw_data (field 12, bytes of fewer than 128) on the wire."""
+    """Append raw_data_type (field 10, a varint) and raw_data (field 12, bytes) on the wire."""
     number = b"" if kind is None else bytes([10 << 3, kind])
-    return BlobProto.FromString(proto.SerializeToString() + number + bytes([12 << 3 | 2, len(raw)]) + raw)
+    return BlobProto.FromString(proto.SerializeToString() + number + field(12, raw))
 
 
 @pytest.mark.parametrize(
@@ -110,7 +111,7 @@ def test_half_precision_is_read_exactly():
 def test_data_has_priority_over_fields_numbered_like_raw_data():
     data = BlobProto(shape=BlobShape(dim=[2]), data=[1, 2])
     np.testing.assert_array_equal(blobs.to_array(with_raw(data, 1, np.array([7, 8], "<f4").tobytes())), [1, 2])
-    number_12_is_a_varint = data.SerializeToString() + bytes([10 << 3 | 2, 1, 65, 12 << 3, 9])
+    number_12_is_a_varint = data.SerializeToString() + field(10, b"A") + bytes([12 << 3, 9])
     np.testing.assert_array_equal(blobs.to_array(BlobProto.FromString(number_12_is_a_varint)), [1, 2])
 
 

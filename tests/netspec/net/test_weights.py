@@ -21,6 +21,7 @@ from netspec.proto.binary import net_without_numbers
 from netspec.proto.schema import TRAIN, BlobProto, BlobShape, NetParameter, V0LayerParameter, V1LayerParameter
 from netspec.proto.text import parse_net, parse_net_text
 from paths import GOLDEN
+from wire import field
 
 CASES = sorted(path.name for path in (GOLDEN / "train").iterdir())
 
@@ -256,22 +257,6 @@ def file_of_wide_net(kind: str) -> bytes:
             layer += field(7, floats + field(7, shape))
             stored = field(100, layer)
     return stored
-
-
-def field(number: int, contents: bytes) -> bytes:
-    """Return a field of bytes in protobuf's wire format."""
-    size, key = len(contents), number << 3 | 2
-    return (
-        b"".join(
-            bytes([n])
-            if n < 128
-            else bytes([n & 127 | 128, n >> 7])
-            if n < 1 << 14
-            else bytes([n & 127 | 128, n >> 7 & 127 | 128, n >> 14])
-            for n in (key, size)
-        )
-        + contents
-    )
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from netspec.errors import SpecError
 from netspec.proto.binary import parse_binary, parse_net_binary, read_binary, read_net_binary
 from netspec.proto.schema import BlobProto, NetParameter, SolverState
 from paths import GOLDEN
+from wire import field
 
 
 def test_files_written_by_caffe_are_read() -> None:
@@ -34,18 +35,7 @@ def test_old_weights_are_upgraded(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_there_is_no_limit_of_64_megabytes(tmp_path: Path) -> None:
     path = tmp_path / "large.caffemodel"
-    floats = bytes(68 << 20)
-
-    def field(number: int, data: bytes) -> bytes:
-        length, size = b"", len(data)
-        while size > 127:
-            length += bytes([size & 127 | 128])
-            size >>= 7
-        key = number << 3 | 2
-        prefix = bytes([key]) if key < 128 else bytes([key & 127 | 128, key >> 7])
-        return prefix + length + bytes([size]) + data
-
-    path.write_bytes(field(100, field(1, b"fc") + field(7, field(5, floats))))
+    path.write_bytes(field(100, field(1, b"fc") + field(7, field(5, bytes(68 << 20)))))
     (layer,) = read_net_binary(path).layer
     assert (layer.name, len(layer.blobs[0].data)) == ("fc", 17 << 20)
 
