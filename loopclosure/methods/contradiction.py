@@ -14,10 +14,9 @@ from functools import cached_property
 import numpy as np
 from scipy.special import betaln
 
-from loopclosure.methods.geometry import Geometry
+from loopclosure.methods.geometry import SAMPLE, Geometry
 
 AGES = 100  # frames: the greatest age of a frame of the same visit
-SAMPLE = 40  # pairs of frames of one visit
 AGAINST = 0.01  # a stretch falls if the ratio of the likelihoods is less
 
 

@@ -105,10 +105,10 @@ def _against(queries: np.ndarray, matches: Matches, scores: np.ndarray, visits: 
 
 def grown(loops: np.ndarray, possible: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Return loops (Q,) with those of the ``possible`` ones that are neighbors of loops, and neighbors of these."""
-    grown = loops.copy()
+    found = np.zeros_like(loops)
     for queries in stretches(loops | possible, pairs):
-        grown[queries] = loops[queries].any()
-    return grown
+        found[queries] = loops[queries].any()
+    return found
 
 
 def stretches(loops: np.ndarray, pairs: np.ndarray) -> list[np.ndarray]:

@@ -17,7 +17,7 @@ from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.lines import Lines
 from loopclosure.progress import Progress
 
-SAMPLE = 40  # pairs from which fixed parts of the images, and the points of unlike pairs, are found
+SAMPLE = 40  # pairs of different places, and of one visit, from which it is found what these have in common
 
 Agree = Callable[[int, int], Agreement]
 
