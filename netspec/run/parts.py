@@ -32,11 +32,17 @@ class Part:
 
     def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Run the joined layer, or the members one by one if a member has hooks."""
-        if len(self.members) > 1 and any(layer._forward_hooks for layer in self.members):
+        if len(self.members) > 1 and any(map(has_hooks, self.members)):
             for layer in self.members:
                 bottoms = layer.run(*bottoms)
             return bottoms
         return self.layer.run(*bottoms)
+
+
+def has_hooks(layer: Layer) -> bool:
+    """Return whether a program watches the runs of a layer, so that the layer must run by itself."""
+    hooks = (layer._forward_hooks, layer._forward_pre_hooks, layer._backward_hooks, layer._backward_pre_hooks)
+    return any(hooks)
 
 
 def parts_of(

@@ -16,7 +16,7 @@ import torch
 
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.run.parts import Part
+from netspec.run.parts import Part, has_hooks
 from netspec.run.walk import Step
 
 _NOT_SETTINGS = ("name", "bottom", "top", "param", "blobs", "include", "exclude", "phase")  # of a LayerParameter
@@ -207,7 +207,7 @@ def _divide(count: int, batches: torch.Tensor) -> tuple[torch.Tensor, ...]:
 
 def _run(layer: Layer, parts: Sequence[Part], *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
     """Run the layer of a group. Run its parts one by one if one of them has hooks."""
-    if not any(member._forward_hooks for part in parts for member in part.members):
+    if not any(has_hooks(member) for part in parts for member in part.members):
         return layer.run(*bottoms)
     batches = zip(*(bottom.chunk(len(parts)) for bottom in bottoms), strict=True)
     tops = [part.run(*batch) for part, batch in zip(parts, batches, strict=True)]

@@ -54,19 +54,22 @@ def test_joined_layers_compute_the_same_as_separate_layers(net_of, text: str) ->
 @pytest.mark.parametrize(
     ("text", "keep", "hooked", "expected"),
     [
-        (NET, (), False, []),
-        (NET, "all", False, []),  # each wrote over the one before
-        (APART, (), False, []),
-        (APART, "s", False, ["relu"]),
-        (APART, "all", False, ["scale", "relu"]),
-        (NET, (), True, ["scale", "relu"]),
+        (NET, (), "", []),
+        (NET, "all", "", []),  # each wrote over the one before
+        (APART, (), "", []),
+        (APART, "s", "", ["relu"]),
+        (APART, "all", "", ["scale", "relu"]),
+        (NET, (), "forward", ["scale", "relu"]),
+        (NET, (), "forward_pre", ["scale", "relu"]),
+        (NET, (), "full_backward", ["scale", "relu"]),
+        (NET, (), "full_backward_pre", ["scale", "relu"]),
     ],
 )
-def test_layers_are_joined_unless_they_have_hooks(net_of, text: str, keep, hooked: bool, expected: list[str]) -> None:
+def test_layers_are_joined_unless_they_have_hooks(net_of, text: str, keep, hooked: str, expected: list[str]) -> None:
     net = net_of(text, phase=0)
     net.keep = keep
     if hooked:
-        net.layers[4].register_forward_hook(lambda *_: None)
+        getattr(net.layers[4], f"register_{hooked}_hook")(lambda *_: None)
     with calls(["scale", "relu"], net) as seen:
         net.forward_loss(x=torch.randn(4, 3, 40, 40))
     assert seen == expected

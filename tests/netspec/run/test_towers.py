@@ -112,13 +112,16 @@ def test_values_to_keep_are_those_of_each_tower(net_of, together) -> None:
         torch.testing.assert_close(net.blobs[name], value, rtol=1e-4, atol=1e-5)
 
 
-def test_hooks_see_each_tower(net_of, together) -> None:
+@pytest.mark.parametrize("kind", ["forward", "forward_pre", "full_backward", "full_backward_pre"])
+def test_hooks_see_each_tower(net_of, together, kind: str) -> None:
     net, seen = net_of(NET, phase=0, exact="none"), []
     for layer in net.layers:
         if layer.param.name in ("deep", "deep_p"):
-            layer.register_forward_hook(lambda layer, _, tops: seen.append((layer.param.name, len(tops[0]))))
+            hook = getattr(layer, f"register_{kind}_hook")
+            hook(lambda layer, values, *_: seen.append((layer.param.name, len(values[0]))))
+    net.forward_loss(**inputs())[0].backward()
+    assert sorted(seen) == [("deep", 3), ("deep_p", 3)]
     assert batches(net) == [6, 3, 3]
-    assert seen == [("deep", 3), ("deep_p", 3)]
 
 
 @pytest.mark.parametrize("kind", [torch.bfloat16, torch.float32])
