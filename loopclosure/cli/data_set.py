@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from loopclosure.errors import InputError
 from loopclosure.places import datasets
 from loopclosure.places.image_sequence import ImageSequence
+from loopclosure.places.intrinsics import from_text
 from loopclosure.places.masks import CAMERAS
 from loopclosure.places.overlap import FOV_DEG, ViewOverlap
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
@@ -195,8 +197,12 @@ def warn_of_unreadable(recording: ImageSequence) -> ImageSequence:
     return recording.readable()
 
 
-def recording_of(text: str, frames: Path) -> ImageSequence:
-    """Open a source for the detector; the frames of a bag are extracted to the folder ``frames``."""
+def recording_of(text: str, frames: Path, camera: str | None = None) -> ImageSequence:
+    """Open a source for the detector; the frames of a bag are extracted to the folder ``frames``.
+
+    ``camera``: the value of ``--camera``, which replaces the calibration of the source.
+    """
+    known = from_text(camera) if camera else None
     source = typed(text, DETECTED)
     read, said = open_sequence(source, frames, progress=bar)
     if said:
@@ -204,4 +210,4 @@ def recording_of(text: str, frames: Path) -> ImageSequence:
     recording = read.taken(source.selection())
     for remark in recording.remarks():
         warn(remark)
-    return recording
+    return recording if known is None else replace(recording, camera=known)

@@ -137,7 +137,7 @@ def _add_detect(commands: Commands) -> None:
 
 def _detect(a: argparse.Namespace) -> None:
     options = _checked_options(a)
-    recording = None if a.video else recording_of(a.source, Path(a.out) / "frames")
+    recording = None if a.video else recording_of(a.source, Path(a.out) / "frames", a.camera)
     features = read_features(a.features) if a.features else None
     describe = run.load_describe(a.describe, options) if features is None else None
     net, views = describe, run.views_of(describe, features)
@@ -180,8 +180,8 @@ def _detect(a: argparse.Namespace) -> None:
         if a.rerun:
             write_detected(Path(a.rerun), recording, results, bar)
     loops, measured = [], None
-    if recording is not None and (camera := _camera(a, recording)) is not None:
-        loops = _measured(detector, recording, camera)
+    if recording is not None and recording.camera is not None:
+        loops = _measured(detector, recording, recording.camera)
         measured = RELATIVE, {loop.query: cells(loop.relative) for loop in loops if loop.relative is not None}
     write_loops_csv(out / "loops.csv", detector.loops, detector.stamps, names, measured=measured)
     write_whole(out / "chosen.txt", "\n".join(reasons) + "\n")
@@ -230,11 +230,6 @@ def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResu
         except KeyboardInterrupt as end:
             return results, end
     return results, None
-
-
-def _camera(a: argparse.Namespace, recording: ImageSequence) -> Intrinsics | None:
-    """Return the camera that measures loops; None if it is not known."""
-    return intrinsics.from_text(a.camera) if a.camera else recording.camera
 
 
 def _measured(detector: LoopDetector, recording: ImageSequence, camera: Intrinsics) -> list[Loop]:

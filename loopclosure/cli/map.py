@@ -8,7 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from loopclosure.cli.data_set import recording_of, warn_of_unreadable
+from loopclosure.closing.close import summary
 from loopclosure.closing.locate import LOCATED, Located, Locator, located_said, place_errors_said
+from loopclosure.closing.sessions import close_map, write_closed_map
 from loopclosure.detector import run
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import Describe, LoopDetector
@@ -18,6 +20,7 @@ from loopclosure.detector.visitor import Visitor
 from loopclosure.index.index import INDEXES
 from loopclosure.methods.drive import last_session
 from loopclosure.places.image_sequence import ImageSequence
+from loopclosure.places.intrinsics import FORM
 from netspec.files.paths import inside
 from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands
@@ -29,6 +32,7 @@ def add_commands(commands: Commands) -> None:
     _add_build(known_map)
     _add_add(known_map)
     _add_query(known_map)
+    _add_close(known_map)
 
 
 def _add_map(parser: argparse.ArgumentParser) -> None:
@@ -44,12 +48,17 @@ def _add_index(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_camera(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--camera", metavar="NUMBERS", help=f"{FORM}, if a source has no calibration")
+
+
 def _add_build(commands: Commands) -> None:
     parser = commands.add_parser("build", help="build a map of one or several drives")
     parser.set_defaults(function=_build)
     _add_map(parser)
     parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as for detect")
     _add_index(parser)
+    _add_camera(parser)
     parser.add_argument(
         "--describe", default="default", metavar="NAME", help="the net, default or small (default: %(default)s)"
     )
@@ -67,6 +76,7 @@ def _add_add(commands: Commands) -> None:
     _add_map(parser)
     parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as for detect")
     _add_index(parser)
+    _add_camera(parser)
 
 
 def _add(a: argparse.Namespace) -> None:
@@ -77,7 +87,7 @@ def _add(a: argparse.Namespace) -> None:
 def _recordings(a: argparse.Namespace, first: int) -> list[ImageSequence]:
     """Open all sources of a command, which become session ``first`` of the map and those after it."""
     folders = [inside(a.map, EXTRACTED, f"{number:06d}") for number in range(first, first + len(a.source))]
-    return [recording_of(text, folder) for text, folder in zip(a.source, folders, strict=True)]
+    return [recording_of(text, folder, a.camera) for text, folder in zip(a.source, folders, strict=True)]
 
 
 def _add_all(into: Map, describe: Describe, recordings: list[ImageSequence], index: str) -> None:
@@ -107,12 +117,13 @@ def _add_query(commands: Commands) -> None:
     _add_map(parser)
     parser.add_argument("source", metavar="SOURCE", help="frames, as for detect")
     _add_index(parser)
+    _add_camera(parser)
     parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for loops.csv")
 
 
 def _query(a: argparse.Namespace) -> None:
     known, out = Map(a.map), Path(a.out)
-    recording = recording_of(a.source, out / "frames")
+    recording = recording_of(a.source, out / "frames", a.camera)
     detector, before = known.detector(run.load_describe(known.describer), a.index), len(known)
     if a.index in INDEXES:  # in memory: the frames are added to the detector, not to the map
         run.remember_all(detector, recording, progress=bar)
@@ -144,3 +155,18 @@ def _located(known: Map, recording: ImageSequence, loops: Sequence[LoopResult]) 
     if recording.poses is not None and (errors := place_errors_said(found, recording.poses)):
         said.append(errors)
     return found, said
+
+
+def _add_close(commands: Commands) -> None:
+    parser = commands.add_parser("close", help="join the sessions of a map by their loops, and correct their paths")
+    parser.set_defaults(function=_close)
+    _add_map(parser)
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the paths and closed.g2o")
+
+
+def _close(a: argparse.Namespace) -> None:
+    out = Path(a.out)
+    found = close_map(Map(a.map), bar)
+    write_closed_map(out, found)
+    print("\n".join([*found.said(), *summary(found.closed)]))
+    print(f"{out / 'closed.g2o'}, {out / 'loops.csv'}, and the path of each session: {out / '000000.txt'}")

@@ -77,19 +77,28 @@ class Closed:
         }
 
 
-def close(odometry: np.ndarray, loops: Sequence[Loop], truth: np.ndarray | None = None) -> Closed:
+def close(
+    odometry: np.ndarray,
+    loops: Sequence[Loop],
+    truth: np.ndarray | None = None,
+    starts: Sequence[int] | np.ndarray = (),
+) -> Closed:
     """Close measured loops of a sequence of frames with odometry (F, 7), NaN for frames without; truth likewise.
 
-    Loops are left out if they were not measured, or if one of their frames has no odometry.
+    Loops are left out if they were not measured, or if one of their frames has no odometry. ``starts``: the first
+    frames of the drives, if there are several; no step joins one with the drive before.
     """
     frames = np.flatnonzero(np.all(np.isfinite(odometry), axis=1))
     if len(frames) < 2:
         raise InputError(f"{len(frames)} of {len(odometry)} frames have a pose of the odometry; two are needed")
     path = odometry[frames]
+    drive = np.searchsorted(starts, frames, side="right")
     node = {int(frame): number for number, frame in enumerate(frames)}
     taken = [loop for loop in loops if loop.relative is not None and {loop.query, loop.match} <= set(node)]
     steps = [
-        Edge(number, number + 1, step, information_of_step(step)) for number, step in enumerate(steps_between(path))
+        Edge(number, number + 1, step, information_of_step(step))
+        for number, step in enumerate(steps_between(path))
+        if drive[number] == drive[number + 1]
     ]
     edges = []
     for loop in taken:
@@ -138,6 +147,12 @@ def write_closed(out: Path, closed: Closed, stamps: np.ndarray | None, names: Se
     times = closed.frames.astype(float) if stamps is None else stamps[closed.frames]
     for name, poses in (("closed", closed.poses), ("odometry", closed.odometry)):
         write_trajectory(out / f"{name}.txt", Trajectory(times, poses[:, :3], poses[:, 3:]), name)
+    write_graph(out, closed, names)
+
+
+def write_graph(out: Path, closed: Closed, names: Sequence[str]) -> None:
+    """Write closed.g2o, and loops.csv with each loop and whether it was used; ``names`` (F) of all frames."""
+    out.mkdir(parents=True, exist_ok=True)
     numbers = closed.frames.tolist()
     kept = [edge for edge, accepted in zip(closed.edges, closed.accepted, strict=True) if accepted]
     edges = [(numbers[e.first], numbers[e.second], e.pose, e.information) for e in [*closed.steps, *kept]]

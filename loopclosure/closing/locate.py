@@ -15,10 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.measure import cells, view_of
-from loopclosure.closing.online import after
 from loopclosure.closing.relative import LEAST_INLIERS, METRIC, Relative, View, relative_view
 from loopclosure.detector.decision import LoopResult
-from loopclosure.detector.export import RELATIVE
+from loopclosure.detector.export import RELATIVE, after
 from loopclosure.detector.map import Map
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError

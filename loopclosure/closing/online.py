@@ -26,24 +26,16 @@ from loopclosure.closing.length import FARTHEST, neighbors, with_length
 from loopclosure.closing.measure import Loop
 from loopclosure.closing.relative import METRIC, View, relative_view
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.export import relative_pose
+from loopclosure.detector.export import STILL, after, relative_pose
 from loopclosure.errors import InputError
 from loopclosure.places.intrinsics import Intrinsics
 from netspec import log
 
-STILL = np.array([0, 0, 0, 0, 0, 0, 1.0])  # the pose of a frame in itself
 FORWARD = np.array([0, 0, 0, -0.5, 0.5, -0.5, 0.5])  # a camera that looks along the robot's x axis; y is left, z is up
 # A stamp this much earlier than the one before it begins another drive: a recording starts again. A smaller step back
 # is an image that came late.
 ANOTHER_DRIVE_S = 1.0
 UNKNOWN = 1e6  # the variance of a position that a loop does not measure
-
-
-def after(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Return the pose (..., 7) that has the pose ``step`` (..., 7) in the frame of ``pose``."""
-    turn = Rotation.from_quat(pose[..., 3:])
-    place = pose[..., :3] + turn.apply(step[..., :3])
-    return np.concatenate([place, (turn * Rotation.from_quat(step[..., 3:])).as_quat(canonical=True)], axis=-1)
 
 
 @dataclass(frozen=True)

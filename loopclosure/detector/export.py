@@ -40,6 +40,8 @@ LOOPS = (
     "score_of",
 )
 
+STILL = np.array([0, 0, 0, 0, 0, 0, 1.0])  # the pose of a frame in itself
+
 # A pose (7,) of the query in the frame of the match and its information (6, 6), or None.
 RelativePose = Callable[[int, int], tuple[np.ndarray, np.ndarray] | None]
 
@@ -65,6 +67,13 @@ def relative_pose(pose_a: np.ndarray, pose_b: np.ndarray) -> np.ndarray:
     back, there = Rotation.from_quat(pose_a[..., 3:]).inv(), Rotation.from_quat(pose_b[..., 3:])
     step = back.apply(pose_b[..., :3] - pose_a[..., :3])
     return np.concatenate([step, (back * there).as_quat(canonical=True)], axis=-1)
+
+
+def after(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Return the pose (..., 7) that has the pose ``step`` (..., 7) in the frame of ``pose``."""
+    turn = Rotation.from_quat(pose[..., 3:])
+    place = pose[..., :3] + turn.apply(step[..., :3])
+    return np.concatenate([place, (turn * Rotation.from_quat(step[..., 3:])).as_quat(canonical=True)], axis=-1)
 
 
 def write_loops_csv(

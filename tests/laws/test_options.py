@@ -91,6 +91,7 @@ WAYS = {
         "map build new walk/walk_1,limit=2",
         "map add map walk/walk_1,limit=2",
         "map query map walk/walk_1,limit=2 --out found",
+        "map close map --out closed",
         "similarity features.npz --out s.npz",
     ],
 }
