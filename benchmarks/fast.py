@@ -34,7 +34,7 @@ FORWARD = {  # the batch size, and the size of the image if it is not the net's 
     "lenet": (64,),
     "cifar10_quick": (100,),
 }
-TRAINING = {"lenet": 64, "cifar10_quick": 100, "pnet": 64, "rnet": 64, "siamese_8": 4, "alexnet": 4, "squeezenet": 4}
+TRAINING = {"lenet": 64, "cifar10_quick": 100, "pnet": 64, "rnet": 64, "alexnet": 1, "small/siamese_8": 4}
 ALL = "all of fast"
 TURN_S, FEWEST_PAIRS, WARM_UPS = 0.06, 5, 3  # CPU seconds of a turn, in which a small net runs several times
 Run = Callable[[], object]
@@ -190,7 +190,7 @@ def _compared(run: Run, without: Run, limits: Limits) -> dict[str, float]:
         seconds = dict(pair)
         took.append(seconds[run])
         ratios.append(seconds[without] / seconds[run])
-    return {"CPU ms": 1e3 * statistics.median(took), "without / with": statistics.median(ratios)}
+    return {"CPU ms": 1e3 * statistics.median(took), "without / with": round(statistics.median(ratios), 2)}
 
 
 def _seconds(run: Run, turns: int) -> float:
