@@ -199,8 +199,12 @@ def online(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
     """Return the match of each frame (N,), -1 without one, as ``LoopDetector`` with a geometric check decides."""
     detector = LoopDetector(check=Known(pairs=cache.pairs))
     images: list[Any] = [*real.images]  # the check knows images by their paths
-    found = [detector.add_descriptor(row, image=image) for row, image in zip(rows, images, strict=True)]
-    return np.array([-1 if result.accepted is None else result.accepted for result in found])
+    for row, image in zip(rows, images, strict=True):
+        detector.add_descriptor(row, image=image)
+    match = np.full(len(rows), -1)
+    for loop in detector.loops:
+        match[loop.query_id] = loop.accepted
+    return match
 
 
 HOW = {"detect": as_detect, "map query": as_query, "online": online}

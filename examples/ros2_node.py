@@ -89,9 +89,8 @@ class LoopClosure(Node):
 
     def look(self, stamp, image, pose):
         self.closer = self.closer or self.begin(image)
-        loop = self.closer.add(image_of(image), stamp, pose)
-        if loop is not None:
-            self.tell_loop(loop, image.header.stamp)
+        for loop in self.closer.add(image_of(image), stamp, pose):
+            self.tell_loop(loop)
 
     def begin(self, image):
         camera, mount = camera_of(self.camera), self.mount
@@ -108,8 +107,8 @@ class LoopClosure(Node):
         message.header.stamp, message.header.frame_id = stamp, self.set["map"]
         return message
 
-    def tell_loop(self, loop, stamp):
-        message = self.stamped(PoseWithCovarianceStamped, stamp)
+    def tell_loop(self, loop):
+        message = self.stamped(PoseWithCovarianceStamped, Time(seconds=self.closer.stamp(loop.query)).to_msg())
         pose, covariance = self.closer.by_loop(loop)
         fill(message.pose.pose.position, message.pose.pose.orientation, pose)
         message.pose.covariance = covariance.ravel().tolist()

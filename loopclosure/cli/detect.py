@@ -16,8 +16,9 @@ from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
 from loopclosure.detector.decision import RECENT, DetectorSettings, LoopResult
-from loopclosure.detector.detector import Describe, LoopDetector
+from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import RELATIVE, write_g2o, write_loops_csv
+from loopclosure.detector.saved import Describe
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.methods.auto import PRECISION
 from loopclosure.methods.drive import Request, last_session, later_threshold, whole_drive
@@ -221,10 +222,10 @@ def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResu
     with rerun_file(a.rerun) if a.rerun else nullcontext() as made:
         try:
             for stamp, image in live_frames(a.video):
-                results.append(detector.add(image, stamp))
-                if results[-1]:
-                    match = f"shows the place of frame {results[-1].accepted}"
-                    print(f"frame {results[-1].query_id}, {stamp:.1f} s: {match}", flush=True)
+                run.put(results, detector.add(image, stamp))
+                for loop in results[-1].loops:
+                    place = f"shows the place of frame {loop.accepted}"
+                    print(f"frame {loop.query_id}, {loop.stamp:.1f} s: {place}", flush=True)
                 if made is not None:
                     made.frame(results[-1].query_id, stamp, small_jpeg(image), results[-1])
         except KeyboardInterrupt as end:

@@ -13,9 +13,10 @@ from loopclosure.closing.locate import LOCATED, Located, Locator, located_said, 
 from loopclosure.closing.sessions import close_map, write_closed_map
 from loopclosure.detector import run
 from loopclosure.detector.decision import LoopResult
-from loopclosure.detector.detector import Describe, LoopDetector
+from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.map import EXTRACTED, Map, checked_name
+from loopclosure.detector.saved import Describe
 from loopclosure.detector.visitor import Visitor
 from loopclosure.index.index import INDEXES
 from loopclosure.methods.drive import last_session

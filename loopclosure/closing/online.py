@@ -86,16 +86,16 @@ class LoopCloser:
         self.correction, self.solutions = STILL, 0
         self._new, self._stop, self._thread = Event(), Event(), None
 
-    def add(self, image: np.ndarray, stamp: float, odometry: Sequence[float] | np.ndarray) -> Loop | None:
+    def add(self, image: np.ndarray, stamp: float, odometry: Sequence[float] | np.ndarray) -> list[Loop]:
         """Add an image (H, W, 3) uint8 BGR, taken at ``stamp`` seconds where the robot had this pose (7,).
 
-        Returns the loop that it closes, measured from the two images; None if there is none, or the robot has hardly
-        moved.
+        Returns the loops that become known with it, each measured from its two images: its own, and those of the ten
+        keyframes before it that its sequence supports. There are none if the robot has hardly moved.
         """
         pose = np.asarray(odometry, np.float64).reshape(-1)
         if pose.shape != (7,) or not np.all(np.isfinite(pose)) or not np.any(pose[3:]):
             self.warn(f"the odometry at {stamp:.6f} is {pose}, not a pose; the image is left out")
-            return None
+            return []
         pose = after(pose, self.mount)
         graph, another = self._graph, False
         if graph.stamps:
@@ -106,33 +106,35 @@ class LoopCloser:
                 self.detector.begin_session()
             elif back > 0:
                 self.warn(f"an image came late, {back:.3f} s before the one that was seen last; it is left out")
-                return None
+                return []
             elif not self._moved(relative_pose(graph.odometry[-1], pose)):
-                return None
+                return []
         try:
             found = self.detector.add(image, stamp, odometry=pose)
         except InputError as fault:
             self.warn(f"the image at {stamp:.6f} is left out: {fault.message}")
-            return None
+            return []
         number = found.query_id
-        loop = None if found.accepted is None else self._measured(number, found.accepted, image, pose)
+        measured = [self._measured(each.query_id, each.accepted, image, pose) for each in found.loops]
+        loops = [loop for loop in measured if loop is not None]
         with self._lock:
             if number and not another:
                 step = relative_pose(graph.odometry[-1], pose)
                 graph.steps.append(Edge(number - 1, number, step, information_of_step(step)))
             graph.stamps.append(stamp)
             graph.odometry.append(pose)
-            if loop is not None:
-                graph.loops.append(loop)
-        if loop is not None:
+            graph.loops += loops
+        if loops:
             self._new.set()
-        return loop
+        return loops
 
     def _moved(self, step: np.ndarray) -> bool:
         turn = float(Rotation.from_quat(step[3:]).magnitude())
         return float(np.linalg.norm(step[:3])) >= self.keyframes.step_m or turn >= self.keyframes.turn_rad
 
-    def _measured(self, query: int, match: int, image: np.ndarray, pose: np.ndarray) -> Loop | None:
+    def _measured(self, query: int, match: int | None, image: np.ndarray, pose: np.ndarray) -> Loop | None:
+        """Measure a loop; ``image`` has the size of all images, ``pose`` is that of the newest keyframe."""
+        assert match is not None
         camera = self.camera.of_size(image.shape[1], image.shape[0])
         first, second = (View(self.detector.local_features(frame), camera) for frame in (match, query))
         assert self.detector.check is not None
@@ -156,6 +158,10 @@ class LoopCloser:
         with self._lock:
             stamps, poses = np.array(self._graph.stamps), self._corrected(self._odometry())
         return stamps, after(poses, _inverse(self.mount))
+
+    def stamp(self, keyframe: int) -> float:
+        """Return when the image of a keyframe was taken, in seconds."""
+        return self._graph.stamps[keyframe]
 
     def by_loop(self, loop: Loop) -> tuple[np.ndarray, np.ndarray]:
         """Return the pose (7,) of the robot in the map by one loop, and its covariance (6, 6): x y z, then rotation.

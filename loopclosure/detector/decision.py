@@ -16,7 +16,7 @@ Runs = list[tuple[int, int]]  # of one frame: (candidate, number of consecutive 
 
 @dataclass(frozen=True)
 class LoopResult:
-    """The result of adding one frame. It is true if the frame closes a loop.
+    """The result of adding one frame. It is true if the frame itself closes a loop; see also ``loops``.
 
     query_id    the frame's number, from 0
     candidates  (id, score) of the best earlier frames, best first, higher = more similar
@@ -27,6 +27,7 @@ class LoopResult:
     inliers     inliers of the accepted candidate, or the most of any candidate tried; None if none was tried
     stamp       seconds, as given
     score_of    what the score compares: "image", or the "sequence" of frames around it; they are different scales
+    late        loops of frames before it, at most ten, that the sequence up to this frame completes
     reason      what decided: the sequence of the frame or its points; empty where the verdict says all
     """
 
@@ -39,6 +40,12 @@ class LoopResult:
     stamp: float | None = None
     reason: str = ""
     score_of: str = "image"
+    late: tuple[LoopResult, ...] = ()
+
+    @property
+    def loops(self) -> tuple[LoopResult, ...]:
+        """All loops that became known with this frame: those of earlier frames, then its own."""
+        return (*self.late, *((self,) if self else ()))
 
     def __bool__(self) -> bool:
         return self.accepted is not None
@@ -95,7 +102,7 @@ def result_of(found: Any, count: int) -> LoopResult:
     """Return a loop read from a file of ``count`` frames. Raises ValueError, LookupError or TypeError."""
     candidates = [(int(number), float(score)) for number, score in found["candidates"]]
     words = {name: str(found[name]) for name in ("reason", "score_of") if name in found}
-    loop = LoopResult(**{**found, "candidates": candidates, **words})
+    loop = LoopResult(**{**found, "candidates": candidates, "late": (), **words})
     ends = (loop.query_id, loop.accepted)
     if not all(isinstance(end, int) and 0 <= end < count for end in ends) or not isinstance(loop.score, float):
         raise ValueError(f"a loop of frames {ends} among {count}")

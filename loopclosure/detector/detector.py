@@ -7,40 +7,32 @@
             ...  # this frame shows the same place as frame result.accepted
 
 An index (:mod:`loopclosure.index`) searches the earlier descriptors. The default index is exact: it multiplies all
-earlier descriptors by the new one. The cost of the search grows with the number of frames; all other costs are
-constant. See :meth:`LoopDetector.add`.
+earlier descriptors by the new one. The cost of the search grows with the number of frames, and so does that of the
+lines through all scores; all other costs are constant. See :meth:`LoopDetector.add`.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.decision import DetectorSettings, LoopResult, Runs, result_of
-from loopclosure.detector.frames import Frames, Local, LocalOnDisk, Points, points_of
-from loopclosure.detector.verification import SURE, GeometricCheck, LocalFeatures
+from loopclosure.detector.frames import Frames, Local, LocalOnDisk, Points, checked_pose, points_of
+from loopclosure.detector.images import ImageDecision
+from loopclosure.detector.lines import HALF
+from loopclosure.detector.saved import FORMAT, SAVED, Describe, fingerprint_of, reading, refuse_another, starts
+from loopclosure.detector.sequences import Sequences
+from loopclosure.detector.verification import GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.index.index import Index, open_index
 from loopclosure.stored import check_array, from_json
-from netspec.errors import SpecError
 from netspec.files.arrays import read_npz
 from netspec.files.whole_file import whole_file
-
-Describe = Callable[[np.ndarray], np.ndarray]
-UNLIKE = 40  # frames, each of which is compared with an unlike one; then every second frame is, and so on
-AMONG = 9  # frames of which the least similar one is unlike
-LEAST_STEPS = 20  # scores of consecutive frames that are needed to choose a threshold
-PART = "enough points agree, but only a part of those that match"
-ALIKE = "places look alike: of most frames with enough points, only a part of those that match agrees"
-VISIT = "the place was not left in between"
-FORMAT = 1  # of the file that save writes
-SAVED = "a file that LoopDetector.save wrote"
 
 
 class LoopDetector:
@@ -84,24 +76,28 @@ class LoopDetector:
             raise TypeError(f"LoopDetector has no setting {', '.join(sorted(unknown))}; known: {', '.join(given)}")
         self.describe = describe
         self.fingerprint: str | None = fingerprint_of(describe)  # None: unknown, from an older file
-        self.settings = DetectorSettings(**{**given, **changes})
+        chosen = DetectorSettings(**{**given, **changes})
         self.check = check
         self.loops: list[LoopResult] = []
-        metric = self.settings.metric
         if in_memory is not None and in_memory < 1:
             raise InputError(f"{in_memory} frames are to be kept in memory; expected at least 1")
-        views, rows = self.settings.views, None if in_memory is None else in_memory * self.settings.views
+        metric, views = chosen.metric, chosen.views
+        rows = None if in_memory is None else in_memory * views
         opened = open_index(index, metric, in_memory=rows) if isinstance(index, str) else index
-        self._frames = Frames(opened, views, local=Local() if in_memory is None else LocalOnDisk(in_memory))
+        self._frames = Frames(opened, views, metric, local=Local() if in_memory is None else LocalOnDisk(in_memory))
+        self._images = ImageDecision(chosen, check, self._frames)
+        self._sequences = Sequences(self._images, self._frames)
         self._sessions = [0]  # the first frame of each
-        self._steps: list[float] = []  # the score of each frame with the one before it
         self._runs: Runs = []  # of the last frame
         self._last = np.zeros((0, 0), np.float32)  # the descriptor of the last frame
-        self._unlike: list[tuple[float, int]] = []  # scores of unlike pairs of frames, and their points in common
-        self._whole, self._part = 0, 0  # frames with enough points, of which most agree, or only a part
 
     def __len__(self) -> int:
         return self._frames.count
+
+    @property
+    def settings(self) -> DetectorSettings:
+        """How loops are decided."""
+        return self._images.settings
 
     @property
     def sessions(self) -> list[int]:
@@ -151,20 +147,24 @@ class LoopDetector:
         odometry: Sequence[float] | np.ndarray | None = None,
     ) -> LoopResult:
         """Add a frame by its descriptor (D,); ``image`` is needed only for a geometric check."""
-        path = _checked_pose(pose), _checked_pose(odometry)
+        path = checked_pose(pose), checked_pose(odometry)
         row = self._row(descriptor)
         self._check_stamp(stamp)
         self._frames.settle(self._end(stamp))
-        candidates = self._candidates(row, False)
+        query, settings = len(self), self.settings
+        candidates, scores = self._frames.search_all(row, settings.top_k) if self.check else (self._similar(row), None)
         local = self._local(image)
-        result, self._runs = self._decide(len(self), candidates, stamp, local, self._runs)
+        found = self._found(query, candidates, stamp)
+        result, self._runs = self._images.decide(found, local, self._runs, self._left)
         self._keep(row, stamp, path, local)
-        if result.accepted is not None:
+        if result:
             self.loops.append(result)
-        self._compare_unlike(row, local)
-        self._whole += result.accepted is not None or result.reason == ALIKE
-        self._part += result.reason == PART
-        return result
+        self._images.learn(result, row, local)
+        late = None if scores is None else self._sequences.add(scores, self._end(stamp), self._by_visit)
+        if late is None or late.query_id in {loop.query_id for loop in self.loops[-2 * HALF :]}:
+            return result
+        self.loops.append(late)
+        return replace(result, late=(late,))
 
     def remember(
         self,
@@ -183,7 +183,7 @@ class LoopDetector:
             if self.describe is None or image is None:
                 raise InputError("a frame has neither a descriptor nor an image that can be described")
             descriptor = self.describe(image)
-        path = _checked_pose(pose), _checked_pose(odometry)
+        path = checked_pose(pose), checked_pose(odometry)
         row = self._row(descriptor)
         self._check_stamp(stamp)
         self._runs = []
@@ -195,8 +195,9 @@ class LoopDetector:
         local = None if self.check is None else self.local_features(frame)
         stamp = float(self._frames.stamps[frame])
         before = self._sessions[-1]
-        known = [(number, score) for number, score in self._candidates(row, False) if number < before]
-        return self._decide(frame, known, None if np.isnan(stamp) else stamp, local, [])[0]
+        known = [(number, score) for number, score in self._similar(row) if number < before]
+        found = self._found(frame, known, None if np.isnan(stamp) else stamp)
+        return self._images.decide(found, local, [])[0]
 
     def _keep(
         self,
@@ -207,7 +208,7 @@ class LoopDetector:
     ) -> None:
         """Store a frame; ``path`` is its pose and its odometry."""
         if len(self) > self._sessions[-1]:
-            self._steps.append(float(self._score(self._last, row)))
+            self._images.steps.append(self._frames.score(self._last, row))
         self._last = row
         self._frames.append(row, stamp, *path)
         if local is not None:
@@ -222,14 +223,15 @@ class LoopDetector:
         before: Runs,
     ) -> tuple[LoopResult, Runs]:
         """Look up frame ``query`` of another session without adding it. ``before``: the runs of the frame before it."""
-        candidates = self._candidates(self._row(descriptor), True)
-        return self._decide(query, candidates, stamp, self._local(image), before)
+        candidates = self._frames.most_similar(self._row(descriptor), self.settings.top_k, True)
+        return self._images.decide(self._found(query, candidates, stamp), self._local(image), before)
 
     def begin_session(self) -> None:
         """Start another drive. All earlier frames are candidates for its frames, however recent they are."""
         self._frames.settle(len(self))
         if len(self) > self._sessions[-1]:
             self._sessions.append(len(self))
+            self._sequences.begin_session(len(self))
         self._runs = []
 
     @property
@@ -252,7 +254,7 @@ class LoopDetector:
     def decided(self, loops: Sequence[LoopResult], threshold: float | None) -> None:
         """Set the loops, found from all frames at once, and the threshold for later frames."""
         self.loops = list(loops)
-        self.settings = replace(self.settings, threshold=None if threshold is None else float(threshold))
+        self._images.settings = replace(self.settings, threshold=None if threshold is None else float(threshold))
 
     def save(self, path: str | Path) -> None:
         """Write everything except ``describe`` to an .npz file, from which ``load`` continues."""
@@ -262,12 +264,14 @@ class LoopDetector:
             "settings": asdict(self.settings),
             "check": None if self.check is None else asdict(self.check),
             "runs": self._runs,
-            "agreed": [self._whole, self._part],
-            "unlike": self._unlike,
+            "agreed": self._images.agreed,
+            "unlike": self._images.unlike,
+            "stretch": self._sequences.stretch(),
             "loops": [asdict(loop) for loop in self.loops],
             "sessions": self._sessions,
         }
         arrays: dict[str, Any] = {"rows": self.descriptors, **self._frames.arrays(self.check is not None)}
+        arrays |= self._sequences.lines.arrays()
         with whole_file(path) as unfinished, unfinished.open("wb") as stream:
             np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 
@@ -284,7 +288,7 @@ class LoopDetector:
         Raises InputError for any other file, or if the file and ``describe`` have different fingerprints.
         """
         arrays = read_npz(path, SAVED)
-        try:
+        with reading(path):
             about = json.loads(str(arrays["about"]))
             if about["format"] != FORMAT:
                 raise InputError(f"has format {about['format']}; this version reads {FORMAT}", path)
@@ -296,18 +300,15 @@ class LoopDetector:
             detector.fingerprint = about.get("fingerprint")
             refuse_another(fingerprint_of(describe), detector.fingerprint, "or start a new file", path)
             detector._take(arrays)
-            detector._sessions = _starts(about.get("sessions", [0]), len(detector))
+            detector._sessions = starts(about.get("sessions", [0]), len(detector))
             detector._settle()
-            detector._steps = detector._all_steps()
-            detector._whole, detector._part = map(int, about.get("agreed", (0, 0)))
-            detector._unlike = [(float(score), int(points)) for score, points in about.get("unlike", [])]
+            detector._images.steps, detector._last = detector._frames.steps(detector._sessions)
+            detector._images.agreed = [int(number) for number in about.get("agreed", (0, 0))]
+            detector._images.unlike = [(float(score), int(points)) for score, points in about.get("unlike", [])]
             detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
             detector.loops = [result_of(found, len(detector)) for found in about["loops"]]
-        except SpecError as fault:
-            raise fault if fault.where else InputError(fault.message, path) from None
-        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
-            reason = " ".join(str(error).split())
-            raise InputError(f"cannot be read ({reason}); expected {SAVED}", path) from None
+            if "lines_counts" in arrays:  # older files do not have them
+                detector._sequences.take(arrays, about["stretch"])
         return detector
 
     def _take(self, arrays: dict[str, np.ndarray]) -> None:
@@ -367,20 +368,6 @@ class LoopDetector:
         if stamp is not None and frames.count > self._sessions[-1] and stamp < frames.stamps[frames.count - 1]:
             raise InputError(f"frame {frames.count} has stamp {stamp:.6f}, earlier than the one before it")
 
-    def _score(self, other: np.ndarray, row: np.ndarray) -> np.floating[Any]:
-        """Return the score of two frames (views, D), computed directly."""
-        if self.settings.metric == "cosine":
-            return (other @ row.T).max()
-        return -np.linalg.norm(other[:, None] - row, axis=-1).min()
-
-    def _threshold(self) -> float | None:
-        """Return the current threshold; None if there are too few frames to choose one."""
-        if self.settings.threshold is not None:
-            return self.settings.threshold
-        if self.check is not None:
-            return -np.inf
-        return float(np.median(self._steps)) if len(self._steps) >= LEAST_STEPS else None
-
     def _end(self, stamp: float | None) -> int:
         """Return how many frames are candidates: all of earlier sessions, and those of this one that are not recent."""
         frames, settings, begin = self._frames, self.settings, self._sessions[-1]
@@ -390,17 +377,6 @@ class LoopDetector:
             end = min(end, begin + int(np.searchsorted(frames.stamps[begin:end], latest, side="right")))
         return end
 
-    def _candidates(self, row: np.ndarray, waiting: bool) -> list[tuple[int, float]]:
-        """Return the most similar frames, best first; ``waiting``: search the frames not yet in the index too."""
-        frames, views, k = self._frames, self.settings.views, self.settings.top_k
-        best: dict[int, float] = {}  # the search can return several views of one frame
-        for view in row if frames.settled else ():
-            for number, value in zip(*(found.tolist() for found in frames.index.search(view, k * views)), strict=True):
-                best[number // views] = max(value, best.get(number // views, value))
-        if waiting:
-            best |= {frames.settled + i: float(self._score(each, row)) for i, each in enumerate(frames.waiting)}
-        return sorted(best.items(), key=lambda pair: (-pair[1], pair[0]))[:k]
-
     def _local(self, image: np.ndarray | None) -> LocalFeatures | None:
         if self.check is None:
             return None
@@ -408,132 +384,17 @@ class LoopDetector:
             raise InputError("a geometric check needs the images")
         return self.check.describe(image)
 
-    def _all_steps(self) -> list[float]:
-        rows = list(self.descriptors.reshape(len(self), self.settings.views, -1)) if len(self) else []
-        if rows:
-            self._last = rows[-1]
-        return [float(self._score(rows[i - 1], rows[i])) for i in range(len(rows)) if i not in self._sessions]
+    def _similar(self, row: np.ndarray) -> list[tuple[int, float]]:
+        return self._frames.most_similar(row, self.settings.top_k, False)
 
-    def _decide(
-        self,
-        query: int,
-        candidates: list[tuple[int, float]],
-        stamp: float | None,
-        local: LocalFeatures | None,
-        before: Runs,
-    ) -> tuple[LoopResult, Runs]:
-        """Apply threshold, consistency, then geometry; return the result and the runs for the next frame."""
-        settings = self.settings
-        runs: Runs = []
-        score = candidates[0][1] if candidates else float("-inf")
-
-        def result(
-            verdict: str,
-            accepted: int | None = None,
-            value: float = score,
-            inliers: int | None = None,
-            reason: str = "",
-        ) -> tuple[LoopResult, Runs]:
-            return LoopResult(query, candidates, accepted, verdict, value, inliers, stamp, reason), runs
-
-        if not candidates:
-            return result("no candidate")
-        threshold = self._threshold()
-        if threshold is None:
-            return result("too early")
-        likely = [(number, value) for number, value in candidates if value >= threshold]
-        if not likely:
-            return result("below threshold")
-        for number, _ in likely:
-            led = [run for other, run in before if abs(other - number) <= settings.consistency_window]
-            runs.append((number, 1 + max(led, default=0)))
-        steady = [pair for pair, (_, run) in zip(likely, runs, strict=True) if run > settings.consistency]
-        if not steady:
-            return result("not consistent")
-        if self.check is None:
-            return result("accepted", *steady[0])
-        assert local is not None
-        most, reason = 0, ""
-        for number, value in steady:
-            found = self.check.agreement(local, self._frames.local[number])
-            if inliers := self.check.sure(found, self._points):
-                if not self._left(number):
-                    most, reason = inliers, VISIT
-                    continue
-                if self._alike:
-                    return result("not verified", inliers=inliers, reason=ALIKE)
-                return result("accepted", number, value, inliers)
-            most = max(most, found.inliers)
-            if self.check.evidence(found, self._points) >= SURE:
-                reason = PART
-        return result("not verified", inliers=most, reason=reason)
+    def _found(self, query: int, candidates: list[tuple[int, float]], stamp: float | None) -> LoopResult:
+        score = candidates[0][1] if candidates else -np.inf
+        return LoopResult(query, candidates, None, "no candidate", score, stamp=stamp)
 
     @property
-    def _points(self) -> float:
-        """The mean number of points that unlike pairs have in common, of those below their own number needed 0.
+    def _by_visit(self) -> bool:
+        """Whether the visit of a frame must have ended, because no setting says how old a candidate must be."""
+        return self.settings.exclude_recent is None and not self.settings.exclude_seconds
 
-        These are the less similar half of those compared: at the start of a drive no frame is unlike.
-        """
-        unlike = sorted(self._unlike)[: (len(self._unlike) + 1) // 2]
-        return sum(points for _, points in unlike) / max(1, len(unlike))
-
-    def _compare_unlike(self, row: np.ndarray, local: LocalFeatures | None) -> None:
-        """Verify the last frame with the least similar of some earlier ones: a bridge's towers are seen all along."""
-        last = len(self) - 1
-        if self.check is None or local is None or last < LEAST_STEPS or last % (1 + len(self._unlike) // UNLIKE):
-            return
-        some = np.linspace(0, last - 1, AMONG).round().astype(int).tolist()
-        rows = [self.descriptors_of(number, number + 1).reshape(row.shape) for number in some]
-        scores = [float(self._score(other, row)) for other in rows]
-        least = some[int(np.argmin(scores))]
-        self._unlike.append((min(scores), self.check.enough(self.check.agreement(local, self._frames.local[least]))))
-
-    def _left(self, number: int) -> bool:
-        """Whether the place of a frame was left since, if no setting says how old a frame must be.
-
-        It was if two frames in a row differ from it as much as half of all frames do. On a straight road frames stay
-        alike for long; that is no loop.
-        """
-        settings, count = self.settings, len(self)
-        if settings.exclude_recent is not None or settings.exclude_seconds or number < self._sessions[-1]:
-            return True
-        rows = self.descriptors_of(self._sessions[-1], count)
-        own = rows[number - self._sessions[-1]]
-        scores = similarity_matrix(own[None], rows, settings.metric, settings.views)[0]
-        away = scores[number - self._sessions[-1] :] <= np.median(scores)
-        return bool(np.any(away[1:] & away[:-1]))
-
-    @property
-    def _alike(self) -> bool:
-        """Whether most frames with enough points agree only in part: then places cannot be told apart."""
-        return self._part > self._whole
-
-
-def fingerprint_of(describe: Describe | None) -> str:
-    """Return the ``fingerprint`` of a ``describe`` function; "" if it has none. Nets have one."""
-    return str(getattr(describe, "fingerprint", ""))
-
-
-def refuse_another(describes: str, described: str | None, instead: str, path: str | Path) -> None:
-    """Raise InputError for fingerprints that differ; ``instead`` is the alternative to using the other net."""
-    if describes and described and describes != described:
-        fault = f"its frames were described by another net ({described}, this is {describes})"
-        raise InputError(f"{fault}; use the version of the package that has it, {instead}", path)
-
-
-def _checked_pose(pose: Sequence[float] | np.ndarray | None) -> np.ndarray | None:
-    if pose is None:
-        return None
-    values = np.array(pose, np.float64).reshape(-1)
-    if len(values) != 7 or not np.all(np.isfinite(values)) or not np.any(values[3:]):
-        raise InputError(f"a pose is {values}; expected tx ty tz qx qy qz qw")
-    values[3:] /= np.linalg.norm(values[3:])
-    return values
-
-
-def _starts(found: Any, count: int) -> list[int]:
-    """Check the first frame of each session of ``count`` frames. Raises ValueError or TypeError."""
-    starts = [int(start) for start in found]
-    if starts[:1] != [0] or sorted(starts) != starts or starts[-1] > count:
-        raise ValueError(f"sessions that begin at {starts} of {count} frames")
-    return starts
+    def _left(self, frame: int) -> bool:
+        return not self._by_visit or self._sequences.lines.left(frame)

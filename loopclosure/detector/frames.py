@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from tempfile import TemporaryFile
@@ -13,7 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector.verification import LocalFeatures
+from loopclosure.errors import InputError
+from loopclosure.index.exact import ExactIndex
 from loopclosure.index.index import Index
 from loopclosure.stored import Rows, check_array
 
@@ -138,6 +141,7 @@ class Frames:
 
     index: Index
     views: int
+    metric: str = METRICS[0]
     count: int = 0
     stamps: np.ndarray = field(default_factory=lambda: np.zeros(0))
     poses: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
@@ -171,6 +175,42 @@ class Frames:
             self.index.add(np.concatenate(new))
             del self.waiting[: len(new)]
 
+    def score(self, other: np.ndarray, row: np.ndarray) -> float:
+        """Return the score of two descriptors (views, D), computed directly."""
+        if self.metric == "cosine":
+            return float((other @ row.T).max())
+        return -float(np.linalg.norm(other[:, None] - row, axis=-1).min())
+
+    def most_similar(self, row: np.ndarray, k: int, waiting: bool) -> list[tuple[int, float]]:
+        """Return the ``k`` frames most similar to a descriptor (views, D), best first, and their scores.
+
+        waiting  search the frames that are not yet in the index too
+        """
+        found = [self.index.search(view, k * self.views) for view in row if self.settled]
+        return self._best(found, row, k, waiting)
+
+    def search_all(self, row: np.ndarray, k: int) -> tuple[list[tuple[int, float]], np.ndarray | None]:
+        """Return the ``k`` most similar frames of the index, and the scores (N,) of all frames.
+
+        The scores are None if the index does not compare all descriptors; only the exact one does.
+        """
+        if not isinstance(self.index, ExactIndex):
+            return self.most_similar(row, k, False), None
+        found = [self.index.search_all(view, k * self.views) for view in row]
+        of_views = np.max([scores for *_, scores in found], axis=0).reshape(-1, self.views)
+        waiting = [self.score(each, row) for each in self.waiting]
+        scores = np.append(of_views.max(axis=1, initial=-np.inf), waiting).astype(np.float32)
+        return self._best([best for *best, _ in found], row, k, False), scores
+
+    def _best(self, found: Sequence[Sequence[np.ndarray]], row: np.ndarray, k: int, waiting: bool) -> list[Any]:
+        best: dict[int, float] = {}  # the search can return several views of one frame
+        for numbers, values in found:
+            for number, value in zip(numbers.tolist(), values.tolist(), strict=True):
+                best[number // self.views] = max(value, best.get(number // self.views, value))
+        if waiting:
+            best |= {self.settled + i: self.score(each, row) for i, each in enumerate(self.waiting)}
+        return sorted(best.items(), key=lambda pair: (-pair[1], pair[0]))[:k]
+
     def rows(self, start: int, stop: int) -> np.ndarray:
         """Return the descriptors (stop - start, views D) of some frames, as a copy."""
         if start >= stop:
@@ -179,6 +219,12 @@ class Frames:
         parts = [self.index.rows(start * views, known * views)] if start < known else []
         parts += self.waiting[max(0, start - self.settled) : max(0, stop - self.settled)]
         return np.concatenate(parts).reshape(stop - start, -1)
+
+    def steps(self, sessions: Sequence[int]) -> tuple[list[float], np.ndarray]:
+        """Return the score of each frame with the one before it in its session, and the last descriptor."""
+        rows = self.rows(0, self.count).reshape(self.count, self.views, -1) if self.count else NO_ROWS
+        scores = [self.score(rows[i - 1], rows[i]) for i in range(len(rows)) if i not in sessions]
+        return scores, rows[-1] if self.count else NO_ROWS
 
     def arrays(self, checked: bool, start: int = 0) -> dict[str, np.ndarray]:
         """Return the arrays of the frames from ``start`` on, without descriptors; ``checked``: with local features."""
@@ -226,3 +272,14 @@ def points_of(arrays: Mapping[str, Any], count: int, finite: bool = True) -> Poi
     sizes = arrays.get("sizes", np.tile(LocalFeatures.size, (count, 1)))  # older files have no sizes
     check_array({"sizes": sizes}, "sizes", "i", (count, 2))
     return Points(sizes, ends, arrays["points"], arrays["descriptors"])
+
+
+def checked_pose(pose: Sequence[float] | np.ndarray | None) -> np.ndarray | None:
+    """Check a pose, and return it with a rotation of unit length, (7,)."""
+    if pose is None:
+        return None
+    values = np.array(pose, np.float64).reshape(-1)
+    if len(values) != 7 or not np.all(np.isfinite(values)) or not np.any(values[3:]):
+        raise InputError(f"a pose is {values}; expected tx ty tz qx qy qz qw")
+    values[3:] /= np.linalg.norm(values[3:])
+    return values

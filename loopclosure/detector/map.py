@@ -23,11 +23,12 @@ import numpy as np
 
 from loopclosure.descriptors.whitening import Whitening, learn_whitening
 from loopclosure.detector.decision import LoopResult
-from loopclosure.detector.detector import Describe, LoopDetector, fingerprint_of, refuse_another
+from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.frames import Points, points_of
 from loopclosure.detector.own_files import remove_own
 from loopclosure.detector.run import NAME, remember_all, run_detector, views_of
+from loopclosure.detector.saved import Describe, fingerprint_of, refuse_another
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.index.index import INDEXES, open_index

@@ -18,8 +18,9 @@ import numpy as np
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.descriptors.whitening import Whitening
 from loopclosure.detector.decision import LoopResult
-from loopclosure.detector.detector import Describe, LoopDetector
+from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import LOOP_SIGMAS, RelativePose, relative_pose
+from loopclosure.detector.saved import Describe
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
@@ -57,15 +58,23 @@ def run_detector(
 
     Images that cannot be read are left out: the frames are then those of ``sequence.readable()``.
     """
-    results = []
+    results = list[LoopResult]()
     for row, image, frame in _described(sequence, features, detector.check is not None, progress):
         path = frame.pose, frame.odometry
         if row is not None:
-            results.append(detector.add_descriptor(row, frame.stamp, path[0], image, path[1]))
+            put(results, detector.add_descriptor(row, frame.stamp, path[0], image, path[1]))
         else:
             assert image is not None
-            results.append(detector.add(image, frame.stamp, *path))
+            put(results, detector.add(image, frame.stamp, *path))
     return results
+
+
+def put(results: list[LoopResult], result: LoopResult) -> None:
+    """Append the result of the next frame, and replace those of earlier frames whose loops it completes."""
+    for late in result.late:
+        if (number := len(results) - (result.query_id - late.query_id)) >= 0:
+            results[number] = late
+    results.append(result)
 
 
 def remember_all(

@@ -86,7 +86,9 @@ class GeometricCheck:
     confidence     of RANSAC
     min_inliers    minimum number of inliers of a loop; 0: as many as rule out chance
     least_side     an image with a shorter side below this is enlarged to it, at most four times
-    most_side      an image with a shorter side above this is reduced to it
+    most_side      an image with a shorter side above this is reduced to it; SIFT takes 39 ms of 640x480 reduced to 320
+                   (74 without), and of images of 240 reduced by as much, as many right pairs are verified at the desk
+                   and 9 % fewer in the kitchen
     focal_px       focal length in pixels of the original images; 0: not known, a fundamental matrix is used
     center_x_px, center_y_px  principal point, with focal_px
     """
@@ -97,7 +99,7 @@ class GeometricCheck:
     confidence: float = 0.985
     min_inliers: int = 0
     least_side: int = 240
-    most_side: int = 480
+    most_side: int = 320
     focal_px: float = 0.0
     center_x_px: float = 0.0
     center_y_px: float = 0.0

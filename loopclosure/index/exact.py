@@ -63,9 +63,13 @@ class ExactIndex:
 
     def search(self, row: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
         """See :class:`~loopclosure.index.index.Index`; of equal scores, the earlier one comes first."""
+        return self.search_all(row, k)[:2]
+
+    def search_all(self, row: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what ``search`` returns, and the scores (N,) of all descriptors, which are rounded."""
         k = min(k, self._count)
         if not k:
-            return np.zeros(0, np.intp), np.zeros(0, np.float32)
+            return np.zeros(0, np.intp), np.zeros(0, np.float32), np.zeros(0, np.float32)
         scores = np.empty(self._count, np.float32)
         for number, block in enumerate(self._blocks):
             part = scores[number * self._block : (number + 1) * self._block]
@@ -79,7 +83,9 @@ class ExactIndex:
         values = rows @ row if self._metric == "cosine" else -np.linalg.norm(rows - row, axis=1)
         values = values.astype(np.float32)
         order = np.lexsort((near, -values))[:k]
-        return near[order], values[order]
+        if self._metric != "cosine":
+            scores = -np.sqrt(np.maximum(row @ row - scores, 0))
+        return near[order], values[order], scores
 
     def _rounding(self, row: np.ndarray) -> float:
         """Return twice the largest error of a score, a sum of D terms."""

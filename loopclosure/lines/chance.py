@@ -1,4 +1,4 @@
-"""From which score on lines tell loops from chance."""
+"""From which score on lines tell loops from chance, and from which age on frames show different places."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 
 TAIL = 0.1  # share of the decoys that the tail is fitted to, and at least so many:
 LEAST_TAIL = 5
+SETTLED = 0.05  # the remaining share of the fall from the similarity of neighbors to that of different places
 
 
 def threshold(
@@ -30,3 +31,22 @@ def threshold(
     wrong = np.where(scores > level, odds * tail / len(decoys) * np.exp(-np.maximum(scores - level, 0) / scale), 1.0)
     good = np.flatnonzero(len(scores) * wrong <= (1 - precision) * np.arange(1, len(scores) + 1))
     return float(scores[good[-1]]) if len(good) else np.inf
+
+
+def oldest(count: int) -> int:
+    """Return the greatest age, in frames, of which a drive of ``count`` frames has enough pairs for a mean."""
+    return max(1, count - max(5, count // 20) - 1)
+
+
+def settled_age(means: np.ndarray, count: int) -> int:
+    """Return the smallest age, in frames, at which ``count`` frames of a drive differ as much as different places.
+
+    means  (A,) the mean score of frames that are 1, 2, ... A apart, NaN where not known
+
+    There, only a share ``SETTLED`` of the fall of the mean score to its median over all ages remains.
+    """
+    if not np.isfinite(means).any():
+        return 1
+    floor = np.nanmedian(means)
+    low = np.flatnonzero(means <= floor + SETTLED * (means[0] - floor))
+    return int(low[0]) + 1 if len(low) else count

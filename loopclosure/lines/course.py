@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from loopclosure.lines.trajectories import SequenceSettings
 
+WINDOW = 5  # references to each side of a line, and at least so many queries along it, where a loop has neighbors
 VELOCITIES = (0.8, 1.2, 0.1)  # least, greatest and step, as shares of the speed
 
 
@@ -26,3 +29,9 @@ class Course:
     def __str__(self) -> str:
         s, back = self.sequence, ", backwards" if self.backwards else ""
         return f"sequences of {s.length} frames, at {s.slowest:.3g} to {s.fastest:.3g} times the speed{back}"
+
+
+def on_course(moved: np.ndarray | int, way: int, course: Course) -> np.ndarray | bool:
+    """Return which matches that ``moved`` so many references are on one line, over ``way`` queries."""
+    ahead, sequence = -moved if course.backwards else moved, course.sequence
+    return (sequence.slowest * way - WINDOW <= ahead) & (ahead <= sequence.fastest * way + WINDOW)

@@ -17,11 +17,12 @@ from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.run import verdicts_said
 from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
+from loopclosure.lines.course import WINDOW
 from loopclosure.methods import reasons as said
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, earlier
 from loopclosure.methods.candidates import Candidates, Compared, candidates, far_apart
 from loopclosure.methods.contradiction import Visits, temporal
-from loopclosure.methods.decision import WINDOW, Decision, decide
+from loopclosure.methods.decision import Decision, decide
 from loopclosure.methods.decoys import elsewhere
 from loopclosure.methods.geometry import Agree, Geometry, Matches, verify
 from loopclosure.methods.lines import Lines, best_lines, pool

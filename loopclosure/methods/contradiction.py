@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import betaln
 
+from loopclosure.lines.points import too_few
 from loopclosure.methods.geometry import SAMPLE, Geometry
 
 AGES = 100  # frames: the greatest age of a frame of the same visit
-AGAINST = 0.01  # a stretch falls if the ratio of the likelihoods is less
 
 
 def temporal(scores: np.ndarray) -> np.ndarray:
@@ -74,15 +73,4 @@ class Visits:
         """Return whether the ``verified`` of the ``tried`` matches of this similarity are too few for one place."""
         if 2 * verified >= tried:
             return False
-        counts = np.array([verified, tried - verified]) / self.together
-        one, two = (_log_likelihood(counts, *seen) for seen in (self.as_similar(similarity), self.unlike))
-        return bool(one - two < np.log(AGAINST))
-
-
-def _log_likelihood(counts: np.ndarray, hits: int, tries: int) -> float:
-    """Return the log of the beta-binomial likelihood of counts (yes, no) after ``hits`` of ``tries``, but a constant.
-
-    The prior of the share is that of Jeffreys.
-    """
-    yes, no = hits + 0.5, tries - hits + 0.5
-    return float(betaln(counts[0] + yes, counts[1] + no) - betaln(yes, no))
+        return too_few((verified, tried), self.together, self.as_similar(similarity), self.unlike)

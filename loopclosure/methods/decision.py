@@ -10,14 +10,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from loopclosure.detector.verification import SURE
-from loopclosure.lines.course import Course
+from loopclosure.lines.course import WINDOW, Course, on_course
+from loopclosure.lines.points import in_part, look_alike
 from loopclosure.methods.contradiction import Visits
 from loopclosure.methods.geometry import Matches
 from loopclosure.methods.lines import LENGTHS, Lines
-
-WINDOW = 5  # references to each side of a line, and at least so many queries along it, where a loop has neighbors
-LEAST_VERIFIED = 3  # fewer verified matches of a stretch do not tell whether they agree only in part
-ALIKE = 0.25  # of the matches with enough points: if more of them agree only in part, places look alike
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ def decide(matches: Matches, lines: Lines | None, scores: np.ndarray, visits: Vi
     """
     many, nothing = matches.evidence >= SURE, np.zeros(len(matches.match), bool)
     part = many & ~matches.whole
-    alike = bool(np.count_nonzero(part) > ALIKE * np.count_nonzero(many))
+    alike = look_alike(np.count_nonzero(part), np.count_nonzero(many))
     sure = nothing if alike else many & matches.whole
     if lines is None:
         return Decision(sure, nothing, nothing, part, alike)
@@ -95,7 +92,7 @@ def _against(queries: np.ndarray, matches: Matches, scores: np.ndarray, visits: 
     """
     tried = queries[matches.tried[queries]]
     verified = tried[matches.verified[tried]]
-    if len(verified) >= LEAST_VERIFIED and 2 * np.count_nonzero(matches.whole[verified]) < len(verified):
+    if in_part(len(verified), np.count_nonzero(matches.whole[verified])):
         return True
     if visits is None or not len(tried):
         return False
@@ -127,7 +124,7 @@ def between(loops: np.ndarray, match: np.ndarray, course: Course) -> np.ndarray:
     filled = np.zeros_like(loops)
     for first, last in pairwise(np.flatnonzero(loops).tolist()):
         way, moved = last - first, match[last] - match[first]
-        if way > 1 and _on_course(moved, way, course):
+        if way > 1 and on_course(moved, way, course):
             line = match[first] + moved * np.arange(1, way) / way
             filled[first + 1 : last] = np.abs(match[first + 1 : last] - line) <= WINDOW
     return filled
@@ -141,12 +138,6 @@ def neighbors(match: np.ndarray, course: Course) -> np.ndarray:
     """
     pairs = []
     for step in range(1, max(WINDOW, course.length // 2) + 1):
-        earlier = np.flatnonzero(_on_course(match[step:] - match[:-step], step, course))
+        earlier = np.flatnonzero(on_course(match[step:] - match[:-step], step, course))
         pairs.append(np.stack([earlier, earlier + step], axis=1))
     return np.concatenate(pairs)
-
-
-def _on_course(moved: np.ndarray, way: int, course: Course) -> np.ndarray:
-    """Return which matches that ``moved`` so many references are on one line, over ``way`` queries."""
-    ahead, sequence = -moved if course.backwards else moved, course.sequence
-    return (sequence.slowest * way - WINDOW <= ahead) & (ahead <= sequence.fastest * way + WINDOW)

@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from loopclosure.lines.chance import oldest, settled_age
 from loopclosure.methods.candidates import Candidates
-
-SETTLED = 0.05  # the remaining share of the fall from the similarity of neighbors to that of different places
 
 
 def elsewhere(given: Candidates) -> tuple[np.ndarray, str]:
@@ -33,15 +32,7 @@ def elsewhere(given: Candidates) -> tuple[np.ndarray, str]:
 
 
 def floor_age(scores: np.ndarray) -> int:
-    """Return the smallest age, in frames, at which frames (N, N) of one drive differ as much as different places.
-
-    There, only a share ``SETTLED`` of the fall of the mean score to its median over all ages remains.
-    """
+    """Return the smallest age, in frames, at which frames (N, N) of one drive differ as much as different places."""
     count = len(scores)
-    ages = np.arange(1, max(2, count - max(5, count // 20)))  # the largest ages have too few pairs for a mean
-    means = np.array([np.nanmean(np.diagonal(scores, -age)) if age < count else np.nan for age in ages])
-    if not np.isfinite(means).any():
-        return 1
-    floor = np.nanmedian(means)
-    low = np.flatnonzero(means <= floor + SETTLED * (means[0] - floor))
-    return int(ages[low[0]]) if len(low) else count
+    means = [np.nanmean(np.diagonal(scores, -age)) if age < count else np.nan for age in range(1, oldest(count) + 1)]
+    return settled_age(np.array(means), count)

@@ -290,7 +290,7 @@ def test_images_do_not_wait_for_a_solution(monkeypatch: pytest.MonkeyPatch) -> N
     for number in (0, 1, 2, 0):
         closer.add(picture(number), 20.0 * len(closer.path()[0]), at(len(closer.path()[0])))
     assert begun.wait(60)
-    assert closer.add(picture(1), 80.0, at(4)) is not None
+    assert closer.add(picture(1), 80.0, at(4))
     assert (closer.solutions, len(closer.path()[0])) == (0, 5)
     go_on.set()
     closer.stop()

@@ -8,6 +8,7 @@ import pytest
 from loopclosure.descriptors.similarity import similarity_matrix, top_k
 from loopclosure.detector.detector import DetectorSettings, LoopDetector
 from loopclosure.detector.frames import FIRST_CAPACITY
+from loopclosure.detector.images import ImageDecision
 from loopclosure.detector.verification import Agreement, GeometricCheck, LocalFeatures
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
@@ -103,7 +104,7 @@ def test_a_loop_online_is_a_place_that_was_left(settings, turns, everywhere, acc
     It is none if the same points are seen everywhere, as those of the towers of a bridge.
     """
     if not everywhere:
-        monkeypatch.setattr(LoopDetector, "_compare_unlike", lambda *_: None)
+        monkeypatch.setattr(ImageDecision, "points", 0.0)
     monkeypatch.setattr(GeometricCheck, "agreement", lambda *_: Agreement(60, 50, 20))
     monkeypatch.setattr(GeometricCheck, "describe", lambda *_: LocalFeatures(np.zeros((0, 2)), np.zeros((0, 128))))
     rng = np.random.default_rng(0)
@@ -311,8 +312,8 @@ def test_in_a_new_session_no_earlier_frame_is_recent(tmp_path) -> None:
     assert len(first) == 80
     detector.save(tmp_path / "second.npz")
     again = LoopDetector.load(tmp_path / "second.npz")
-    assert again._steps == detector._steps
-    assert len(again._steps) == 78  # none from one session to the next
+    assert again._images.steps == detector._images.steps
+    assert len(again._images.steps) == 78  # none from one session to the next
 
 
 def test_a_visitor_is_checked_by_geometry_and_needs_images() -> None:

@@ -1,0 +1,98 @@
+"""Sequences while frames arrive: what they find of another season, how late, and what speaks against them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from loopclosure.detector.decision import LoopResult
+from loopclosure.detector.detector import LoopDetector
+from loopclosure.detector.images import ImageDecision
+from loopclosure.detector.run import put
+from loopclosure.detector.verification import Agreement, GeometricCheck, LocalFeatures
+
+LAP, NOTHING = 240, LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))
+
+
+class Said(GeometricCheck):
+    """A check whose images are numbers of frames; all pairs agree as ``agreed`` says."""
+
+    agreed = Agreement(0, 0, 20)
+
+    def describe(self, image: np.ndarray) -> LocalFeatures:
+        return NOTHING
+
+    def agreement(self, a: LocalFeatures, b: LocalFeatures) -> Agreement:
+        return self.agreed
+
+
+class Alike(Said):
+    """Points of two floors of a tower: enough agree, but only a part of those that match."""
+
+    agreed = Agreement(60, 22, 20)
+
+
+def seasons(backwards: bool = False) -> np.ndarray:
+    """Descriptors of a lap in summer and of one in winter: a single image tells little, neighbors are alike."""
+    rng = np.random.default_rng(0)
+    places = rng.normal(size=(LAP + 2, 32))
+    lap = places[:-2] + places[1:-1] + places[2:]
+    again = lap[::-1] if backwards else lap
+    return np.concatenate([lap, again + 3 * rng.normal(size=32) + 1.5 * rng.normal(size=lap.shape)]).astype(np.float32)
+
+
+def run(detector: LoopDetector, rows: np.ndarray) -> list[LoopResult]:
+    image = np.zeros((2, 2), np.uint8)
+    return [detector.add_descriptor(row, float(number), image=image) for number, row in enumerate(rows)]
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_lap_in_another_season_is_found_at_most_ten_frames_late(backwards: bool) -> None:
+    detector, results = LoopDetector(check=Said()), list[LoopResult]()
+    for result in run(detector, seasons(backwards)):
+        for late in result.late:
+            assert (result.query_id - late.query_id, late.score_of, late.verdict) == (10, "sequence", "accepted")
+            assert late.reason.startswith("sequence: ")
+            assert late.stamp == late.query_id
+        assert not result, "no single image is a loop by its points"
+        assert result.loops == result.late
+        put(results, result)
+    loops = {loop.query_id: loop.accepted for loop in detector.loops}
+    assert {loop.query_id: loop.accepted for loop in results if loop} == loops
+    truth = {k: 2 * LAP - 1 - k if backwards else k - LAP for k in loops}
+    assert all(abs(int(loops[k] or 0) - truth[k]) <= 2 for k in loops)
+    assert len(loops) >= LAP / 2
+
+
+def test_points_of_which_only_a_part_agrees_speak_against_a_sequence(monkeypatch) -> None:
+    monkeypatch.setattr(ImageDecision, "points", 0.0)  # unlike pairs have none in common
+    assert not run_loops(LoopDetector(check=Alike()))
+
+
+def test_a_sequence_does_not_overrule_a_threshold() -> None:
+    assert not run_loops(LoopDetector(check=Said(), threshold=-1.0))
+
+
+def test_a_road_driven_once_has_no_sequences() -> None:
+    rng = np.random.default_rng(1)
+    road = np.cumsum(0.3 * rng.normal(size=(2 * LAP, 32)), axis=0) + rng.normal(size=(2 * LAP, 32))
+    assert not run_loops(LoopDetector(check=Said()), road)
+
+
+def run_loops(detector: LoopDetector, rows: np.ndarray | None = None) -> list[Any]:
+    run(detector, seasons() if rows is None else rows)
+    return detector.loops
+
+
+@pytest.mark.slow
+def test_a_saved_detector_continues_its_sequences(tmp_path) -> None:
+    whole, first = LoopDetector(check=Said()), LoopDetector(check=Said())
+    expected, rows, at = run(whole, seasons()), seasons(), 2 * LAP - 40
+    run(first, rows[:at])
+    first.save(tmp_path / "x.npz")
+    again = LoopDetector.load(tmp_path / "x.npz")
+    again._images.check = again.check = Said()
+    image = np.zeros((2, 2), np.uint8)
+    later = [again.add_descriptor(row, float(at + k), image=image) for k, row in enumerate(rows[at:])]
+    assert [r.loops for r in later] == [r.loops for r in expected[at:]]
+    assert any(result.late for result in later)
