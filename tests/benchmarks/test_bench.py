@@ -120,7 +120,7 @@ def test_parts_of_fast_are_timed_with_and_without(
     assert main(["fast", "pnet", "tiny", "--pairs", "1", "--json", str(out)]) == 0
     rows = json.loads(out.read_text())["rows"]
     found = {(row["what"], row["net"], row["kind"], row["part"]) for row in rows}
-    assert found >= {("forward", "pnet", "kernel", "PReLU"), ("training", "tiny", "kernel", "InnerProduct")}
+    assert found >= {("forward", "pnet", "kernel", "Pooling"), ("training", "tiny", "kernel", "InnerProduct")}
     assert {part for _, net, kind, part in found if (net, kind) == ("pnet", "pass")} >= {"fold", "pack", "all of fast"}
     assert all(row["CPU ms"] > 0 and row["without / with"] > 0 for row in rows)
     assert "training tiny 2: all of fast " in capsys.readouterr().out
