@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from loopclosure.closing.graph import Edge, solve
 from loopclosure.closing.length import ODOMETRY, STEP_M, STEP_SHARE
 from loopclosure.closing.measure import Loop
-from loopclosure.closing.relative import BY_DEPTH, DEPTH, ROTATION_ONLY, STEREO, UP_TO_SCALE, Relative, across
+from loopclosure.closing.relative import DEPTH, ROTATION_ONLY, UP_TO_SCALE, Relative, across
 from loopclosure.csv_file import write_csv
 from loopclosure.detector.export import LOOP_SIGMAS, Sigmas, relative_pose, write_pose_graph
 from loopclosure.errors import InputError
@@ -125,7 +125,7 @@ def constraint(relative: Relative) -> tuple[np.ndarray, np.ndarray]:
     of a translation of FAR_M. If only the rotation is known, the information of the whole translation is 0. So any
     program that reads g2o can use these edges.
     """
-    common = np.linalg.inv((DEPTH_SIGMAS if relative.length_by in BY_DEPTH else LOOP_SIGMAS).information())
+    common = np.linalg.inv((DEPTH_SIGMAS if relative.length_by == DEPTH else LOOP_SIGMAS).information())
     pose, scale = relative.pose.copy(), np.ones(6)
     known = np.eye(6)
     if relative.kind == ROTATION_ONLY:
@@ -175,11 +175,7 @@ def summary(closed: Closed) -> list[str]:
         lines.append(spot)
     if closed.not_measured:
         lines.append(f"{closed.not_measured} more left out: fewer than 20 points agree with one relative pose")
-    for by, words in (
-        (DEPTH, "depth"),
-        (STEREO, "the two images of a stereo camera"),
-        (ODOMETRY, "steps of the odometry"),
-    ):
+    for by, words in ((DEPTH, "depth"), (ODOMETRY, "steps of the odometry")):
         if count := sum(loop.relative is not None and loop.relative.length_by == by for loop in closed.loops):
             lines.append(f"{count} loops measured in meters, from {words}")
     meanings = {

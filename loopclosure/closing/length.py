@@ -1,4 +1,4 @@
-"""Depth by a known distance between two cameras: those of a stereo camera, or one camera that the odometry moved.
+"""Depth by a known distance between two images: the odometry moved the camera from one to the other.
 
 Two color images give the translation between them up to its length. A neighbor of one of them, in the same drive, shows
 some of the same points, and the odometry knows the distance of the neighbors. So the two neighbors give the depth of
@@ -76,14 +76,6 @@ def with_length(
                 covariance[:3, :3] += np.outer(along, along)
                 return replace(found, covariance=covariance)
     return relative
-
-
-def stereo_depths(left: View, right: View, pose: np.ndarray, matching: Matching) -> np.ndarray:
-    """Return the depths (K,) in meters of the points of the left image of a stereo camera, 0 where not known.
-
-    ``pose`` (7,) is that of the right camera in the frame of the left one, in meters.
-    """
-    return _depths(left, right, pose, matching(left.local, right.local))
 
 
 def _depths(view: View, other: View, pose: np.ndarray, matches: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from loopclosure.places.intrinsics import Intrinsics
 from netspec.files.opencv import cv2
 
 METRIC, UP_TO_SCALE, ROTATION_ONLY = "metric", "up to scale", "rotation only"
-BY_DEPTH = DEPTH, STEREO = "depth", "stereo"
+DEPTH = "depth"  # how a length was measured
 LEAST_INLIERS = 20
 MAX_ERROR_PX = 2.0
 CONFIDENCE = 0.999
@@ -40,7 +40,7 @@ class View:
     """An image: its ``local`` features, its ``camera``, and the depths (K,) of its points in meters, or None.
 
     A depth is the distance along the axis of the camera; 0 where not known. ``depths_by`` says how it was measured:
-    "depth" images, "stereo" or "odometry".
+    "depth" images or the "odometry".
     """
 
     local: LocalFeatures
@@ -59,7 +59,7 @@ class Relative:
     covariance  (6, 6) of the translation, then of the rotation vector, in the frame of the query as errors in g2o; from
                 the residuals of the points, so without errors of the calibration and of the depth. What ``kind`` says
                 is not measured, the length or the translation, has zeros
-    length_by   how the length was measured: "depth", "stereo" or "odometry"; "" if it is not known
+    length_by   how the length was measured: "depth" or "odometry"; "" if it is not known
     """
 
     pose: np.ndarray

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.close import DEPTH_SIGMAS, FAR_M, constraint
-from loopclosure.closing.length import neighbors, stereo_depths, with_length
+from loopclosure.closing.length import neighbors, with_length
 from loopclosure.closing.measure import Loop, cells, errors_said
 from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, Relative, View, across, relative_view
 from loopclosure.detector.export import LOOP_SIGMAS, RELATIVE, relative_pose
@@ -196,15 +196,6 @@ def test_neighbors_are_a_step_away_by_the_odometry() -> None:
     assert dict(neighbors(odometry, 6))[1] == pytest.approx(0.305)
     assert neighbors(np.zeros((30, 7)), 6) == []
     assert neighbors(odometry, 4) == []
-
-
-def test_stereo_gives_depth() -> None:
-    (left, right, _), matching = three(np.zeros(3))
-    pose = np.array([0.4, -0.1, 0.3, *TURN.as_quat()])
-    depths = stereo_depths(left, right, pose, matching)
-    true = np.random.default_rng(8).uniform([-2, -1.5, 2], [2, 1.5, 6], (80, 3))[:, 2]
-    assert np.count_nonzero(depths) > 60
-    assert np.median(np.abs(depths / true - 1)[depths > 0]) < 0.03
 
 
 def test_a_measured_loop_is_a_row_of_the_table_and_judged_by_true_poses() -> None:
