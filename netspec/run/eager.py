@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -48,11 +49,7 @@ class Eager:
 
     def _line(self, kept: frozenset[int], joins_towers: bool) -> list[Step]:
         """Return the steps of a run that keeps the values ``kept``."""
-        parts = self.parts(kept)
-
-        def step_of(part: Part) -> list[Step]:
-            return self._step(part, kept)
-
+        parts, step_of = self.parts(kept), partial(self._step, kept=kept)
         line = steps_of_towers(self.plan, parts, self._must_run_alone(), step_of, kept) if joins_towers else None
         return line or [step for part in parts for step in step_of(part)]
 

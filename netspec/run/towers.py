@@ -19,7 +19,7 @@ from netspec.layers.contract.base import Layer
 from netspec.run.parts import Part, has_hooks
 from netspec.run.walk import Step
 
-_NOT_SETTINGS = ("name", "bottom", "top", "param", "blobs", "include", "exclude", "phase")  # of a LayerParameter
+_NOT_SETTINGS = ("name", "bottom", "top", "param", "blobs", "include", "exclude")  # of a LayerParameter
 
 
 @dataclass
@@ -81,11 +81,8 @@ def _groups(plan: Plan, parts: Sequence[Part], alone: Sequence[bool]) -> list[_G
         before = set().union(*(behind.get(v, set()) for v in bottoms))
         key = None if any(alone[part.first : part.last + 1]) else _key(part, [made.get(v) for v in bottoms])
         i = known.get(key, len(groups)) if key else len(groups)
-        if (
-            i < len(groups)
-            and not (before & {id(each) for each in groups[i].parts})
-            and _fits(groups[i], bottoms, made)
-        ):
+        is_free = i < len(groups) and not before & {id(each) for each in groups[i].parts}
+        if is_free and _fits(groups[i], bottoms, made):
             groups[i].parts.append(part)
             groups[i].bottoms.append(bottoms)
             groups[i].tops.append(tops)
@@ -116,7 +113,7 @@ def _key(part: Part, sources: Sequence[tuple[int, int, int] | None]) -> Any:
     shares = tuple(id(blob) for blob in part.blobs)
     origins = tuple((i, j) for i, _, j in filter(None, sources))
     starts = tuple(i for i, _ in origins)
-    settings = tuple((type(each), _settings(each.param)) for each in part.members)
+    settings = tuple((type(each), each.held, _settings(each.param)) for each in part.members)
     return settings, tuple(layer.bottom_shapes), shares, starts if shares else origins
 
 
@@ -197,21 +194,22 @@ class _Line:
                 del self.within[each]
 
 
-def _join(*batches: torch.Tensor) -> torch.Tensor:
-    return torch.cat(batches)
+def _join(*batches: torch.Tensor) -> Any:
+    """Return the batches as one. If they differ in shape in this pass, they stay apart: a tuple in a tuple of tops."""
+    return torch.cat(batches) if len({batch.shape for batch in batches}) == 1 else (batches,)
 
 
-def _divide(count: int, batches: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    return batches.chunk(count)
+def _divide(count: int, batches: Any) -> tuple[torch.Tensor, ...]:
+    return batches if isinstance(batches, tuple) else batches.chunk(count)
 
 
-def _run(layer: Layer, parts: Sequence[Part], *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Run the layer of a group. Run its parts one by one if one of them has hooks."""
-    if not any(has_hooks(member) for part in parts for member in part.members):
+def _run(layer: Layer, parts: Sequence[Part], *bottoms: Any) -> tuple[Any, ...]:
+    """Run the layer of a group. Run its parts one by one if one of them has hooks, or if their batches are apart."""
+    hooked = any(has_hooks(member) for part in parts for member in part.members)
+    if not hooked and not any(isinstance(bottom, tuple) for bottom in bottoms):
         return layer.run(*bottoms)
-    batches = zip(*(bottom.chunk(len(parts)) for bottom in bottoms), strict=True)
-    tops = [part.run(*batch) for part, batch in zip(parts, batches, strict=True)]
-    return tuple(map(_join, *tops))
+    batches = zip(*(_divide(len(parts), bottom) for bottom in bottoms), strict=True)
+    return tuple(zip(*(part.run(*batch) for part, batch in zip(parts, batches, strict=True)), strict=True))
 
 
 def _with_ends(steps: Sequence[Step], kept: Collection[int]) -> list[Step]:

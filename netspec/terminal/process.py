@@ -7,8 +7,7 @@ import signal
 from functools import cache
 
 # How idle OpenMP threads wait. By default, GNU's runtime lets them spin 150 times as long as set here, which takes the
-# cores from other programs. Threads that do not spin are woken for every layer, which doubles the time of small ones
-# (``tools/bench waiting``).
+# cores from other programs. Threads that do not spin are woken for every layer, which doubles the time of small ones.
 WAITING = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "2000"}
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # malloc.h: M_TRIM_THRESHOLD, M_MMAP_THRESHOLD

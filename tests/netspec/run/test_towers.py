@@ -101,6 +101,45 @@ def test_only_layers_that_are_alike_are_joined(net_of, together, changes: dict[s
     assert sorted(batches(net_of(text, phase=0, exact="none"))) == sorted(sizes)
 
 
+STILL = ('name: "bn_p" type: "BatchNorm"', 'name: "bn_p" phase: TEST type: "BatchNorm"')
+HELD = ('"deep_p" type: "Convolution" bottom: "conv_p" top: "deep_p" param { name: "x"',) * 2
+
+
+@pytest.mark.parametrize("change", [STILL, (HELD[0], HELD[1] + " lr_mult: 0")], ids=["phase", "lr_mult"])
+def test_layers_of_another_phase_or_without_a_gradient_are_not_joined(net_of, together, change) -> None:
+    """An ``lr_mult: 0`` of one tower says which of them computes the gradient, which clip_gradients counts."""
+    assert NET.count(change[0]) == 1
+    text = NET.replace(*change)
+    net, separate = (net_of(text, phase=0, exact="all", accumulate_in_place=True) for _ in range(2))
+    found = trained(net)
+    together.setattr(Eager, "_joins_towers", lambda _: False)
+    for mine, theirs in zip(found, trained(separate), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("shapes", [((4, 3, 9, 9), (2, 3, 9, 9)), ((2, 3, 9, 9), (2, 3, 7, 9))])
+def test_towers_whose_inputs_differ_in_shape_in_a_pass_run_one_by_one(net_of, together, shapes) -> None:
+    text = """
+        layer { name: "in" type: "Input" top: "a" top: "b"
+          input_param { shape { dim: 3 dim: 3 dim: 9 dim: 9 } shape { dim: 3 dim: 3 dim: 9 dim: 9 } } }
+        layer { name: "a" type: "Convolution" bottom: "a" top: "x" param { name: "w" } param { name: "v" }
+          convolution_param { num_output: 4 kernel_size: 3 weight_filler { type: "xavier" } } }
+        layer { name: "b" type: "Convolution" bottom: "b" top: "y" param { name: "w" } param { name: "v" }
+          convolution_param { num_output: 4 kernel_size: 3 weight_filler { type: "xavier" } } }
+        layer { name: "norm" type: "BatchNorm" bottom: "x" top: "x"
+          param { name: "m" lr_mult: 0 } param { name: "d" lr_mult: 0 } param { name: "n" lr_mult: 0 } }
+        layer { name: "norm_p" type: "BatchNorm" bottom: "y" top: "y"
+          param { name: "m" lr_mult: 0 } param { name: "d" lr_mult: 0 } param { name: "n" lr_mult: 0 } }
+    """
+    given = [torch.randn(shape, generator=torch.Generator().manual_seed(1)) for shape in shapes]
+    net, separate = (net_of(text, phase=0, exact="none") for _ in range(2))
+    found = net(a=given[0], b=given[1])
+    together.setattr(Eager, "_joins_towers", lambda _: False)
+    expected = separate(a=given[0], b=given[1])
+    for name in ("x", "y"):
+        torch.testing.assert_close(found[name], expected[name], rtol=1e-4, atol=1e-5)
+
+
 def test_values_to_keep_are_those_of_each_tower(net_of, together) -> None:
     net, separate = (net_of(NET, phase=0, exact="none") for _ in range(2))
     net.keep = separate.keep = "all"
