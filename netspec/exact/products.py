@@ -298,7 +298,7 @@ def _gradients(
     weight: torch.Tensor,
     bias: torch.Tensor | None,
     wanted: Sequence[bool],
-) -> tuple[torch.Tensor | None, ...]:
+) -> tuple[Any, ...]:
     """Return the gradients of maps, weight and bias that are ``wanted``, by torch's kernel; None for the others."""
     sliding, group, transposed = ctx.geometry
     return torch.ops.aten.convolution_backward(
@@ -313,7 +313,7 @@ def _gradients(
 
 def _rounded_gradients(
     ctx: Any, tops_diff: torch.Tensor, maps: torch.Tensor, bias: torch.Tensor | None
-) -> tuple[torch.Tensor | None, ...]:
+) -> tuple[Any, ...]:
     """Return the gradients of a convolution with rounded weights.
 
     If the filters have far more numbers than the maps, their gradient takes less time in Caffe's layout: the sums have
