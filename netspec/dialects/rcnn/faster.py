@@ -8,6 +8,7 @@ Fork: rbgirshick/py-faster-rcnn, lib/rpn, lib/roi_data_layer; peteanderson80/bot
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -283,7 +284,9 @@ class RoIData(_Sampling):
         for i, entry in enumerate(entries):
             if missing := {"image", "boxes", "gt_classes"} - set(entry):
                 raise self.error(f"entry {i} has no {' and no '.join(sorted(missing))}")
-        self.entries, self.waiting = list(entries), []
+        if self.entries or max(self.waiting, default=0) >= len(entries):
+            self.waiting = []  # otherwise it may be the order of a training that was resumed
+        self.entries = list(entries)
 
     def restart(self) -> None:
         self.waiting = []
@@ -292,7 +295,11 @@ class RoIData(_Sampling):
         return {"waiting": " ".join(map(str, self.waiting))}
 
     def resume(self, state: Mapping[str, Any]) -> None:
-        self.waiting = [int(i) for i in state["waiting"].split()]
+        numbers = state["waiting"].split()
+        if not all(number.isdecimal() and int(number) < (len(self.entries) or math.inf) for number in numbers):
+            given = f"numbers below {len(self.entries)}" if self.entries else "numbers"
+            raise self.error(f'found images "{state["waiting"][:40]}" to read next, expected {given}')
+        self.waiting = list(map(int, numbers))
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         given = self.context.options.given_shapes

@@ -228,6 +228,34 @@ def test_an_interrupted_pass_leaves_its_image_to_the_next(tmp_path: Path, monkey
         assert sorted(map(int, seen)) == [1, 2, 3, 4]
 
 
+def roi_data(tmp_path: Path) -> faster.RoIData:
+    text = PYTHON.format("roi_data_layer.layer", "RoIDataLayer", "'num_classes': 4")
+    (tmp_path / "net.prototxt").write_text(f'layer {{ name: "d" top: "data" top: "im_info" top: "gt_boxes" {text} }}')
+    return netspec.load_net(tmp_path / "net.prototxt", phase="TRAIN").layers[0]
+
+
+def test_a_resumed_order_of_images_stays_if_they_are_set_later(tmp_path: Path) -> None:
+    entries, layer = [{"image": "a.png", "boxes": [[0, 0, 9, 9]], "gt_classes": [1]}] * 3, roi_data(tmp_path)
+    layer.restore({"waiting": "2 0"})
+    layer.set_roidb(entries)
+    assert layer.running_state() == {"waiting": "2 0"}
+    layer.set_roidb(entries)
+    assert layer.running_state() == {"waiting": ""}
+    layer = roi_data(tmp_path)
+    layer.restore({"waiting": "2 0"})
+    layer.set_roidb(entries[:2])
+    assert layer.running_state() == {"waiting": ""}
+
+
+@pytest.mark.parametrize("waiting", ["3", "0 -1", "1 x"])
+def test_a_saved_order_of_other_images_is_refused(tmp_path: Path, waiting: str) -> None:
+    layer = roi_data(tmp_path)
+    layer.set_roidb([{"image": "a.png", "boxes": [[0, 0, 9, 9]], "gt_classes": [1]}] * 3)
+    with pytest.raises(SpecError, match=f'found images "{waiting}" to read next, expected numbers below 3'):
+        layer.restore({"waiting": waiting})
+    assert layer.running_state() == {"waiting": ""}
+
+
 @pytest.mark.slow
 def test_the_losses_of_a_small_faster_rcnn_fall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(faster, "SHORTEST", 240)  # the fork's 600 would take ten times as long
