@@ -11,6 +11,7 @@ import pytest
 
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.detector.detector import LoopDetector
+from loopclosure.detector.images import ImageDecision
 from loopclosure.detector.run import verdicts_said
 from loopclosure.detector.verification import Agreement, Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
@@ -557,7 +558,7 @@ def test_a_stored_drive_is_decided_once_and_gives_a_threshold(monkeypatch: pytes
     """Nothing is decided when a frame comes; the threshold is that of a detector that looks up frame by frame."""
     road = drive(80, 7)
     rows = np.concatenate([road, drive(60, 8), again(road, 0.3, 10)]).astype(np.float32)
-    monkeypatch.setattr(LoopDetector, "_decide", None)
+    monkeypatch.setattr(ImageDecision, "decide", None)
     detector, paths = LoopDetector(exclude_recent=20), [Path(f"{number}.png") for number in range(len(rows))]
     found = whole.whole_drive(detector, ImageSequence.of_files(paths), Features(Path("rows.npz"), rows))
     assert len(detector.loops) == np.count_nonzero(found.accepted) > 60
