@@ -34,7 +34,8 @@ class Eager:
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
         """Run all layers on the values ``given``. Return the loss and the values; those in ``kept`` are among them."""
         values: Values = dict(given)
-        key = kept, self._joins_towers()
+        # A program may ask for the gradients of values that it keeps, which joined towers do not read.
+        key = kept, kept <= set(self.plan.outputs.values()) and self._joins_towers()
         if key not in self._lines:
             self._lines = {key: self._line(*key)}
         return walk(self._lines[key], values, self.exact, self._remembering()), values

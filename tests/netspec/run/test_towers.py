@@ -151,6 +151,14 @@ def test_values_to_keep_are_those_of_each_tower(net_of, together) -> None:
         torch.testing.assert_close(net.blobs[name], value, rtol=1e-4, atol=1e-5)
 
 
+def test_values_to_keep_have_their_gradients(net_of, together) -> None:
+    net = net_of(NET, phase=0, exact="none")
+    net.keep = ["deep", "deep_p"]
+    loss, _ = net.forward_loss(**inputs())
+    gradients = torch.autograd.grad(loss, [net.blobs["deep"], net.blobs["deep_p"]])
+    assert all(float(gradient.abs().max()) > 0 for gradient in gradients)
+
+
 @pytest.mark.parametrize("kind", ["forward", "forward_pre", "full_backward", "full_backward_pre"])
 def test_hooks_see_each_tower(net_of, together, kind: str) -> None:
     net, seen = net_of(NET, phase=0, exact="none"), []
