@@ -63,7 +63,6 @@ def _of_dialects() -> dict[str, Case]:
 
 TOPS = {
     "BoxAnnotatorOHEM": 2,
-    "roi_data_layer.layer.RoIDataLayer": 3,
     "rpn.anchor_target_layer.AnchorTargetLayer": 4,
     "rpn.proposal_target_layer.ProposalTargetLayer": 5,
 }
@@ -94,7 +93,6 @@ ristretto  ConvolutionRistretto x=1,2,5,5 convolution_param { num_output: 2 kern
 ristretto  DeconvolutionRistretto x=1,2,5,5 convolution_param { num_output: 2 kernel_size: 3 }
 ristretto  FcRistretto x=2,5 inner_product_param { num_output: 2 }
 ssd        DetectionEvaluate x=1,1,2,7 z=1,1,2,8 detection_evaluate_param { num_classes: 3 }
-rcnn       roi_data_layer.layer.RoIDataLayer
 text       ContinuationIndicator continuation_indicator_param { time_step: 3 batch_size: 2 }
 text       CTCGreedyDecoder x=5,2,4
 text       CtcLoss x=5,2,4 label=2,3 ctc_loss_param { alphabet_size: 4 time_step: 5 blank_label: 0 }

@@ -71,8 +71,7 @@ REFUSED = [
     Refused("SmoothL1LossOHEM", (ONNX,), "R-FCN's loss is for training"),
     Refused("SmoothL1LossOHEM", (TORCH,), "not as R-FCN's"),
     Refused(
-        "rpn.anchor_target_layer.AnchorTargetLayer rpn.proposal_target_layer.ProposalTargetLayer "
-        "roi_data_layer.layer.RoIDataLayer",
+        "rpn.anchor_target_layer.AnchorTargetLayer rpn.proposal_target_layer.ProposalTargetLayer",
         BOTH,
         "it is for training, and chooses at random",
     ),
