@@ -83,7 +83,7 @@ def solve(
     """
     graph = _Graph(len(poses), [*odometry, *loops], held)
     state = State(poses[:, :3], Rotation.from_quat(poses[:, 3:]))
-    limits = np.full(len(loops), np.inf) if all_true else _limits(loops, flat)
+    limits = np.full(len(loops), np.inf) if all_true else limits_of(loops, flat)
 
     def worst() -> float:
         return float((graph.squares(state)[len(odometry) :] / limits).max(initial=0))
@@ -98,7 +98,7 @@ def solve(
     return Solution(solved, squares[: len(odometry)], squares[len(odometry) :], limits)
 
 
-def _limits(loops: Sequence[Edge], flat: bool) -> Array:
+def limits_of(loops: Sequence[Edge], flat: bool = False) -> Array:
     """Return the largest squared error (L,) of a true loop; it depends on how many numbers the loop measures."""
     measured = np.linalg.matrix_rank(np.array([edge.information for edge in loops]).reshape(-1, 6, 6), hermitian=True)
     return 2 * gammaincinv(np.maximum(1, measured - (3 if flat else 0)) / 2, TRUE_BELOW)
@@ -106,7 +106,7 @@ def _limits(loops: Sequence[Edge], flat: bool) -> Array:
 
 def squares_of(poses: Array, edges: Sequence[Edge]) -> Array:
     """Return the squared error (E,) of each edge for poses (N, 7)."""
-    return _Graph(len(poses), edges).squares(State(poses[:, :3], Rotation.from_quat(poses[:, 3:])))
+    return _Graph(len(poses), edges, range(len(poses))).squares(State(poses[:, :3], Rotation.from_quat(poses[:, 3:])))
 
 
 class State(NamedTuple):
@@ -163,7 +163,7 @@ class _Graph:
         self._second = np.array([edge.second for edge in edges], int)
         measured = np.array([edge.pose for edge in edges]).reshape(-1, 7)
         self._steps, self._rotations = measured[:, :3], Rotation.from_quat(measured[:, 3:])
-        self._roots = _roots(np.array([edge.information for edge in edges]).reshape(-1, 6, 6))
+        self._roots = roots_of(edges)
         self._place = _places(nodes, self._first, self._second, held)
         rows, columns = 6 * np.arange(len(edges)), 6 * self._place[np.stack([self._first, self._second])]
         self._kept = columns >= 0
@@ -225,9 +225,9 @@ def _places(nodes: int, first: NDArray[np.int_], second: NDArray[np.int_], held:
     return place
 
 
-def _roots(information: Array) -> Array:
-    """Return W with W^T W = information (E, 6, 6); a direction without information has weight 0."""
-    values, vectors = np.linalg.eigh(information)
+def roots_of(edges: Sequence[Edge]) -> Array:
+    """Return W (E, 6, 6) with W^T W = information of each edge; a direction without information has weight 0."""
+    values, vectors = np.linalg.eigh(np.array([edge.information for edge in edges]).reshape(-1, 6, 6))
     return np.sqrt(np.maximum(values, 0))[..., None] * vectors.transpose(0, 2, 1)
 
 

@@ -6,8 +6,9 @@
         closer.add(image, stamp, pose)
         closer.correction  # the frame of the odometry in the map; map -> odom in ROS
 
-A thread of its own solves the graph, so an image is never waited for. The class knows nothing of ROS;
-``examples/ros2_node.py`` is a node around it.
+A thread of its own solves the graph, so an image is never waited for. With GTSAM, it continues from the solution
+before; without, it solves the whole graph again. The class knows nothing of ROS; ``examples/ros2_node.py`` is a node
+around it.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.close import Closed, constraint, information_of_step
 from loopclosure.closing.graph import Edge, cross_matrices, solve
+from loopclosure.closing.incremental import IncrementalSolver, installed
 from loopclosure.closing.length import FARTHEST, neighbors, with_length
 from loopclosure.closing.measure import Loop
 from loopclosure.closing.relative import METRIC, View, relative_view
@@ -81,7 +83,8 @@ class LoopCloser:
         self.detector, self.camera, self.warn = detector, camera, warn
         self.mount = np.asarray(mount, np.float64)
         self.keyframes = keyframes or Keyframes()
-        self._graph, self._lock = _Graph(), Lock()
+        self._graph, self._lock, self._solving = _Graph(), Lock(), Lock()
+        self._solve = IncrementalSolver().solve if installed() else solve
         self._solved, self._accepted = np.zeros((0, 7)), np.zeros(0, bool)
         self.correction, self.solutions = STILL, 0
         self._new, self._stop, self._thread = Event(), Event(), None
@@ -210,17 +213,18 @@ class LoopCloser:
 
     def solve(self) -> None:
         """Solve the graph of all keyframes so far, and set the correction."""
-        with self._lock:
-            odometry, steps, loops = self._odometry(), list(self._graph.steps), list(self._graph.loops)
-            start = self._corrected(odometry)
-        if not len(odometry):
-            return
-        found = solve(start, steps, _edges(loops))
-        with self._lock:
-            self._solved, self._accepted = found.poses, found.accepted
-            # The robot's, not the camera's: both have the same motion, so the mount cancels out.
-            self.correction = after(found.poses[-1], _inverse(odometry[-1]))
-            self.solutions += 1
+        with self._solving:  # one after the other: an incremental solver continues from the one before
+            with self._lock:
+                odometry, steps, loops = self._odometry(), list(self._graph.steps), list(self._graph.loops)
+                start = self._corrected(odometry)
+            if not len(odometry):
+                return
+            found = self._solve(start, steps, _edges(loops))
+            with self._lock:
+                self._solved, self._accepted = found.poses, found.accepted
+                # The robot's, not the camera's: both have the same motion, so the mount cancels out.
+                self.correction = after(found.poses[-1], _inverse(odometry[-1]))
+                self.solutions += 1
 
     def _odometry(self) -> np.ndarray:
         return np.array(self._graph.odometry).reshape(-1, 7)

@@ -125,7 +125,17 @@ def test_two_commands_correct_the_path_of_a_bag(
     assert np.median(off[len(robot[0]) - 1 :]) < 0.3, "a loop's edge is measured, not taken from the odometry"
 
 
+@pytest.fixture(params=["whole graph", "incremental"])
+def solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both ways to solve the graph."""
+    if request.param == "incremental":
+        pytest.importorskip("gtsam")
+    else:
+        monkeypatch.setattr(online, "installed", lambda: False)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("solver")
 def test_a_recorded_robot_gets_a_corrected_path(robot: tuple[ImageSequence, np.ndarray, Path], tmp_path: Path) -> None:
     from rosbags.highlevel import AnyReader
 
@@ -258,6 +268,7 @@ def test_faults_of_a_sensor_are_warned_of_and_left_out() -> None:
     assert len(closer.path()[0]) == 2
 
 
+@pytest.mark.usefixtures("solver")
 def test_another_drive_is_no_step_of_the_odometry_and_is_joined_by_its_loops() -> None:
     """A recording that starts again: the robot is somewhere else by its odometry, and sees the first place again."""
     said: list[str] = []
@@ -284,8 +295,8 @@ def test_images_do_not_wait_for_a_solution(monkeypatch: pytest.MonkeyPatch) -> N
         assert go_on.wait(60)
         return solve(*given)
 
-    monkeypatch.setattr(online, "solve", slow)
     closer = closer_of()
+    monkeypatch.setattr(closer, "_solve", slow)
     closer.start()
     for number in (0, 1, 2, 0):
         closer.add(picture(number), 20.0 * len(closer.path()[0]), at(len(closer.path()[0])))
