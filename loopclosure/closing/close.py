@@ -25,6 +25,9 @@ TURN_SHARE, TURN_RAD = 0.02, 0.002
 # Of the errors of a loop that all its points have in common, by the calibration, by the depth, or by a translation that
 # was taken for a rotation: with depth; from color alone they are LOOP_SIGMAS.
 DEPTH_SIGMAS = Sigmas(0.03, 0.01)
+# Of the rays of a loop's points: an error that grows over the image by the rotation of LOOP_SIGMAS, as that of a
+# rolling shutter, has a uniform distribution. A direction from color is wrong by its ratio to the parallax.
+RAY_RAD = LOOP_SIGMAS.rotation_rad / 12**0.5
 FAR_M = 0.5  # the length that the translation of a loop is taken to have where it is not known
 
 
@@ -133,6 +136,7 @@ def constraint(relative: Relative) -> tuple[np.ndarray, np.ndarray]:
     elif relative.kind == UP_TO_SCALE:
         known = across(Rotation.from_quat(pose[3:]).inv().apply(pose[:3]))  # g2o compares in the frame of the query
         scale[:3] = FAR_M
+        common[:3, :3] += (FAR_M * RAY_RAD / relative.parallax) ** 2 * np.eye(3)
         pose[:3] = 0
     covariance = scale[:, None] * relative.covariance * scale + common
     return pose, known @ np.linalg.inv(known.T @ covariance @ known) @ known.T

@@ -60,6 +60,7 @@ class Relative:
                 the residuals of the points, so without errors of the calibration and of the depth. What ``kind`` says
                 is not measured, the length or the translation, has zeros
     length_by   how the length was measured: "depth" or "odometry"; "" if it is not known
+    parallax    "up to scale": the median angle in radians by which a rotation alone misses the points
     """
 
     pose: np.ndarray
@@ -67,6 +68,7 @@ class Relative:
     inliers: int
     covariance: np.ndarray
     length_by: str = ""
+    parallax: float = np.inf
 
     @property
     def sigmas(self) -> tuple[float, float]:
@@ -156,7 +158,8 @@ def _from_color(in_match: np.ndarray, in_query: np.ndarray, focal: float) -> Rel
     if count < LEAST_INLIERS:
         return None
     turn, turned, apart = _best_rotation(in_match[inliers], in_query[inliers])
-    if float(np.median(np.linalg.norm(apart, axis=1))) * focal < LEAST_PARALLAX_PX:
+    parallax = float(np.median(np.linalg.norm(apart, axis=1)))
+    if parallax * focal < LEAST_PARALLAX_PX:
         covariance = np.zeros((6, 6))
         # A direction has two numbers, not three: a third of the residuals is 0.
         covariance[3:, 3:] = 1.5 * _covariance(cross_matrices(turned).reshape(-1, 3), apart.ravel())
@@ -166,7 +169,8 @@ def _from_color(in_match: np.ndarray, in_query: np.ndarray, focal: float) -> Rel
         return None
     kept = ahead[:, 0] > 0
     rotation, translation, covariance = _refined(rotation, translation[:, 0], in_match[kept], in_query[kept], 1 / focal)
-    return Relative(_pose(rotation, translation, inverse=True), UP_TO_SCALE, int(count), covariance)
+    pose = _pose(rotation, translation, inverse=True)
+    return Relative(pose, UP_TO_SCALE, int(count), covariance, parallax=parallax)
 
 
 def _refined(

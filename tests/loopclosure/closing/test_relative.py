@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from loopclosure.closing.close import DEPTH_SIGMAS, FAR_M, constraint
+from loopclosure.closing.close import DEPTH_SIGMAS, FAR_M, RAY_RAD, close, constraint
 from loopclosure.closing.length import neighbors, with_length
 from loopclosure.closing.measure import Loop, cells, errors_said
 from loopclosure.closing.relative import METRIC, ROTATION_ONLY, UP_TO_SCALE, Relative, View, across, relative_view
@@ -148,12 +148,43 @@ def test_the_edge_of_a_loop_has_its_information() -> None:
     assert np.linalg.matrix_rank(information, 1e-3, hermitian=True) == 5
     side = np.append(np.cross(along, [0, 0, 1.0]) / np.linalg.norm(np.cross(along, [0, 0, 1.0])), np.zeros(3))
     spread = 1 / np.sqrt(side @ information @ side)
-    assert spread < np.hypot(LOOP_SIGMAS.translation_m, FAR_M * np.sqrt(side @ scaled.covariance @ side))
+    off = np.hypot(np.sqrt(side @ scaled.covariance @ side), RAY_RAD / scaled.parallax)
+    assert spread < np.hypot(LOOP_SIGMAS.translation_m, FAR_M * off)
     pose, information = constraint(turned)
     assert not information[:3].any()
     assert not information[:, :3].any()
     turns = np.linalg.inv(information[3:, 3:])
     np.testing.assert_allclose(turns, turned.covariance[3:, 3:] + LOOP_SIGMAS.rotation_rad**2 * np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize("parallax", [0.01, 0.1, np.inf])
+def test_a_direction_is_as_uncertain_as_its_parallax_is_small(parallax: float) -> None:
+    scaled = Relative(np.array([1.0, 0, 0, 0, 0, 0, 1]), UP_TO_SCALE, 40, np.zeros((6, 6)), parallax=parallax)
+    _, information = constraint(scaled)
+    shift = np.hypot(0.1, 0.5 * 0.05 / 12**0.5 / parallax)
+    np.testing.assert_allclose(information, np.diag([0, *[shift**-2] * 2, *[0.05**-2] * 3]), atol=1e-9)
+
+
+def test_the_parallax_is_what_a_rotation_does_not_explain() -> None:
+    near, far = (relative_view(*views(np.array([0.4, -0.1, 0.3]) * times)) for times in (1, 2))
+    assert near is not None
+    assert far is not None
+    assert 2 / 261 < near.parallax < far.parallax < 0.1
+
+
+def test_directions_that_are_noise_do_not_move_a_camera_that_turned_in_place() -> None:
+    """Rolling shutters make the same wrong direction in all loops, so their number must not count."""
+    times = np.linspace(0, 20, 300)
+    place = 0.04 * np.stack([np.sin(times), np.cos(1.3 * times), np.sin(0.7 * times)], axis=1)
+    truth = np.hstack([place, Rotation.from_euler("y", 20 * np.sin(times)[:, None], degrees=True).as_quat()])
+    loops = []
+    for query in range(150, 300):
+        pose = relative_pose(truth[query - 120], truth[query])
+        pose[:3] = 0, 1, 0
+        loops.append(Loop(query, query - 120, Relative(pose, UP_TO_SCALE, 60, np.zeros((6, 6)), parallax=0.01)))
+    errors = close(truth, loops, truth).errors()
+    assert errors is not None
+    assert errors["position, ATE RMSE [m]"][1] < 0.001  # 0.006 if parallax did not count
 
 
 def three(step: np.ndarray) -> tuple[list[View], Any]:
