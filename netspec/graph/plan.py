@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from netspec.errors import SpecError
 from netspec.proto.schema import NetParameter
@@ -115,7 +116,7 @@ def make_plan(net: NetParameter, source: SourceMap) -> Plan:
         nodes.append(Node(layer.name, layer.type, bottoms, tuple(tops), tuple(in_place), tuple(params), blocked))
     outputs = {name: current[name] for name in sorted(available)}
     final = _last_values(nodes, len(blobs))
-    return Plan(net, source, tuple(nodes), tuple(blobs), outputs, final, _last_uses(nodes))
+    return Plan(net, source, tuple(nodes), tuple(blobs), outputs, final, last_uses(nodes))
 
 
 def _last_values(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
@@ -128,10 +129,10 @@ def _last_values(nodes: Sequence[Node], count: int) -> tuple[int, ...]:
     return tuple(final)
 
 
-def _last_uses(nodes: Sequence[Node]) -> tuple[tuple[int, ...], ...]:
-    """Return, by node, the values that no later node reads."""
-    last = {v: i for i, node in enumerate(nodes) for v in (*node.tops, *node.bottoms)}
-    ends: list[list[int]] = [[] for _ in nodes]
+def last_uses(steps: Sequence[Any]) -> tuple[tuple[int, ...], ...]:
+    """Return, by node or other step with ``tops`` and ``bottoms``, the values that no later one reads."""
+    last = {v: i for i, step in enumerate(steps) for v in (*step.tops, *step.bottoms)}
+    ends: list[list[int]] = [[] for _ in steps]
     for v, i in last.items():
         ends[i].append(v)
     return tuple(map(tuple, ends))

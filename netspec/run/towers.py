@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from netspec.graph.plan import Plan
+from netspec.graph.plan import Plan, last_uses
 from netspec.layers.contract.base import Layer
 from netspec.run.parts import Part, has_hooks
 from netspec.run.walk import Step
@@ -214,8 +214,7 @@ def _run(layer: Layer, parts: Sequence[Part], *bottoms: Any) -> tuple[Any, ...]:
 
 def _with_ends(steps: Sequence[Step], kept: Collection[int]) -> list[Step]:
     """Return the steps, each with the values that no later step reads, except those that are kept."""
-    last = {v: k for k, step in enumerate(steps) for v in (*step.tops, *step.bottoms)}
     return [
-        step._replace(ends=tuple({v for v in (*step.tops, *step.bottoms) if last[v] == k and v not in kept}))
-        for k, step in enumerate(steps)
+        step._replace(ends=tuple(v for v in ends if v not in kept))
+        for step, ends in zip(steps, last_uses(steps), strict=True)
     ]
