@@ -43,19 +43,32 @@ def neighbors(odometry: np.ndarray, frame: int) -> list[tuple[int, float]]:
     return list(dict(found).items())
 
 
-def with_length(
-    relative: Relative, views: tuple[View, View], around: tuple[Neighbors, Neighbors], matching: Matching
-) -> Relative:
-    """Return the pose of a loop in meters if a neighbor of its match or its query gives depth, else itself.
+def measured(views: tuple[View, View], around: tuple[Neighbors, Neighbors], matching: Matching) -> Relative | None:
+    """Return the pose of a loop's query in the frame of its match, in meters if it can be; None if there is none.
 
     views     of the match and of the query
     around    the neighbors of each
     matching  two images -> the matches (M, 2) of their points
     """
+    matches = matching(views[0].local, views[1].local)
+    relative = relative_view(*views, matches)
+    return None if relative is None else with_length(relative, views, matches, around, matching)
+
+
+def with_length(
+    relative: Relative,
+    views: tuple[View, View],
+    matches: np.ndarray,
+    around: tuple[Neighbors, Neighbors],
+    matching: Matching,
+) -> Relative:
+    """Return the pose of a loop in meters if a neighbor of its match or its query gives depth, else itself.
+
+    ``matches`` (M, 2) are those of the points of the two views; for the others see :func:`measured`.
+    """
     if relative.kind == METRIC:
         return relative
     bare = [View(view.local, view.camera) for view in views]
-    matches = matching(bare[0].local, bare[1].local)
     for end, near in enumerate(around):
         for neighbor, step_m in near:
             other = View(neighbor.local, neighbor.camera)

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loopclosure.closing.length import neighbors, with_length
-from loopclosure.closing.relative import LEAST_INLIERS, METRIC, ROTATION_ONLY, Relative, View, relative_view
+from loopclosure.closing.length import measured, neighbors
+from loopclosure.closing.relative import LEAST_INLIERS, METRIC, ROTATION_ONLY, Relative, View
 from loopclosure.csv_file import safe_cell
 from loopclosure.detector.export import relative_pose
 from loopclosure.detector.verification import GeometricCheck
@@ -102,19 +102,16 @@ def measure(
             with suppress(InputError):
                 yield view(number), length
 
-    measured = []
+    found = []
     for loop in progress(loops, "measuring loops", len(loops)):
         try:
             match, query = view(loop.match), view(loop.query)
         except InputError:
-            measured.append(Loop(loop.query, loop.match))
+            found.append(Loop(loop.query, loop.match))
             continue
-        relative = relative_view(match, query, CHECK.matches(match.local, query.local))
-        if relative is not None:
-            near_both = around(loop.match), around(loop.query)
-            relative = with_length(relative, (match, query), near_both, CHECK.matches)
-        measured.append(Loop(loop.query, loop.match, relative))
-    return measured
+        relative = measured((match, query), (around(loop.match), around(loop.query)), CHECK.matches)
+        found.append(Loop(loop.query, loop.match, relative))
+    return found
 
 
 def cells(relative: Relative) -> list[object]:

@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation
 from loopclosure.closing.close import Closed, constraint, information_of_step
 from loopclosure.closing.graph import Edge, cross_matrices, solve
 from loopclosure.closing.incremental import IncrementalSolver, installed
-from loopclosure.closing.length import FARTHEST, neighbors, with_length
+from loopclosure.closing.length import FARTHEST, measured, neighbors
 from loopclosure.closing.measure import Loop
-from loopclosure.closing.relative import METRIC, View, relative_view
+from loopclosure.closing.relative import METRIC, View
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import STILL, after, relative_pose
 from loopclosure.errors import InputError
@@ -141,10 +141,6 @@ class LoopCloser:
         camera = self.camera.of_size(image.shape[1], image.shape[0])
         first, second = (View(self.detector.local_features(frame), camera) for frame in (match, query))
         assert self.detector.check is not None
-        matching = self.detector.check.matches
-        relative = relative_view(first, second, matching(first.local, second.local))
-        if relative is None:
-            return None
         path = [*self._graph.odometry, pose]
 
         def around(frame: int) -> Iterator[tuple[View, float]]:
@@ -153,8 +149,8 @@ class LoopCloser:
             for number, length in neighbors(near, frame - begin):
                 yield View(self.detector.local_features(begin + number), camera), length
 
-        near_both = around(match), around(query)
-        return Loop(query, match, with_length(relative, (first, second), near_both, matching))
+        relative = measured((first, second), (around(match), around(query)), self.detector.check.matches)
+        return None if relative is None else Loop(query, match, relative)
 
     def path(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the stamps (N,) of all keyframes, and the corrected poses (N, 7) of the robot in the map."""

@@ -13,9 +13,9 @@ from scipy.sparse import csgraph
 from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.close import Closed, close, write_graph
-from loopclosure.closing.length import neighbors, with_length
+from loopclosure.closing.length import measured, neighbors
 from loopclosure.closing.measure import Loop
-from loopclosure.closing.relative import View, relative_view
+from loopclosure.closing.relative import View
 from loopclosure.detector.export import STILL, after, relative_pose
 from loopclosure.detector.map import SESSION, Map, Session
 from loopclosure.detector.verification import GeometricCheck
@@ -105,7 +105,7 @@ def _measured(known: Map, starts: np.ndarray, path: np.ndarray, progress: Progre
         return None if camera is None else View(local, camera, session.depths_of(own))
 
     def around(frame: int) -> Iterator[tuple[View, float]]:
-        number = int(np.searchsorted(starts, frame, side="right")) - 1
+        number = int(_session_of([frame], starts)[0])
         begin = int(starts[number])
         for near, length in neighbors(path[begin : starts[number + 1]], frame - begin):
             beside = view(begin + near)
@@ -118,10 +118,7 @@ def _measured(known: Map, starts: np.ndarray, path: np.ndarray, progress: Progre
         match, query = view(loop.match), view(loop.query)
         relative = None
         if match is not None and query is not None:
-            relative = relative_view(match, query, check.matches(match.local, query.local))
-            if relative is not None:
-                near_both = around(loop.match), around(loop.query)
-                relative = with_length(relative, (match, query), near_both, check.matches)
+            relative = measured((match, query), (around(loop.match), around(loop.query)), check.matches)
         found.append(Loop(loop.query, loop.match, relative))
     return found
 

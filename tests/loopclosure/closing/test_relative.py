@@ -208,10 +208,11 @@ def test_a_step_of_the_odometry_gives_the_length(end: int) -> None:
     scaled = relative_view(*views, matching(match.local, query.local))
     assert scaled is not None
     assert scaled.kind == UP_TO_SCALE
+    matches = matching(views[0].local, views[1].local)
     near: list[list[tuple[View, float]]] = [[], []]
-    assert with_length(scaled, views, (near[0], near[1]), matching) is scaled
+    assert with_length(scaled, views, matches, (near[0], near[1]), matching) is scaled
     near[end] = [(views[end], 0.5), (neighbor, 0.06**0.5)]  # the first did not move
-    found = with_length(scaled, views, (near[0], near[1]), matching)
+    found = with_length(scaled, views, matches, (near[0], near[1]), matching)
     assert (found.kind, found.length_by) == (METRIC, "odometry")
     assert np.linalg.norm(found.pose[:3]) == pytest.approx(0.26**0.5, rel=0.06)
     along = Rotation.from_quat(found.pose[3:]).inv().apply(found.pose[:3])
