@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from loopclosure.lines.chance import oldest, settled_age, threshold
+from loopclosure.lines.chance import AGES, half_age, oldest, settled_age, threshold
 from loopclosure.lines.course import Course
 from loopclosure.lines.trajectories import trajectory_costs
 
@@ -22,7 +22,6 @@ HALF = 10  # frames before and after the middle of a line, which is found so man
 AROUND = 2 * HALF + 1  # frames around one, from whose scores its own stands out
 PRECISION = 0.99  # of the matches whose lines are accepted
 LEAST_PIECES = 50  # pieces of the length of a line, squared, that show what chance does
-VISIT = 100  # frames: the greatest age of a frame of the same visit
 FIRST_ROOM = 256  # frames; doubled when full
 
 
@@ -97,18 +96,15 @@ class OnlineLines:
 
     def as_similar(self, line: Line) -> int | None:
         """Return the newest frame of the visit of a line's query that is no more similar to it than its match."""
-        recent = self._scores[0][max(self._begin, line.query - VISIT) :]
+        recent = self._scores[0][max(self._begin, line.query - AGES) :]
         low = np.flatnonzero(recent <= line.similarity)
         return line.query - len(recent) + int(low[-1]) if len(low) else None
 
     @property
     def together(self) -> int:
         """How many frames in a row tell no more than one: the age at which half of the similarity has gone."""
-        total, number = self._ages[:, :VISIT][:, self._ages[1, :VISIT] > 0]
-        if not len(total):
-            return 1
-        means = total / number
-        return int(np.flatnonzero(means <= (means[0] + means.min()) / 2)[0]) + 1
+        total, number = self._ages[:, :AGES][:, self._ages[1, :AGES] > 0]
+        return half_age(total / number)
 
     def _room(self, count: int) -> None:
         self._left, self._away, self._ages = (_grown(each, count) for each in (self._left, self._away, self._ages))

@@ -6,6 +6,7 @@ import numpy as np
 
 TAIL = 0.1  # share of the decoys that the tail is fitted to, and at least so many:
 LEAST_TAIL = 5
+AGES = 100  # frames: the greatest age of a frame of the same visit
 SETTLED = 0.05  # the remaining share of the fall from the similarity of neighbors to that of different places
 
 
@@ -36,6 +37,14 @@ def threshold(
 def oldest(count: int) -> int:
     """Return the greatest age, in frames, of which a drive of ``count`` frames has enough pairs for a mean."""
     return max(1, count - max(5, count // 20) - 1)
+
+
+def half_age(means: np.ndarray) -> int:
+    """Return the age, in frames, at which half of the similarity has gone: so many in a row tell no more than one.
+
+    means  (A,) the mean score of frames of one drive that are 1, 2, ... A apart; without any, 1
+    """
+    return int(np.flatnonzero(means <= (means[0] + means.min()) / 2)[0]) + 1 if len(means) else 1
 
 
 def settled_age(means: np.ndarray, count: int) -> int:

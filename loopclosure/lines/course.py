@@ -9,6 +9,7 @@ import numpy as np
 from loopclosure.lines.trajectories import SequenceSettings
 
 WINDOW = 5  # references to each side of a line, and at least so many queries along it, where a loop has neighbors
+LENGTHS = (10, 30)  # steps of a line that are tried; a stretch of the fewer matches needs no verified one
 VELOCITIES = (0.8, 1.2, 0.1)  # least, greatest and step, as shares of the speed
 
 

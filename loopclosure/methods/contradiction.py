@@ -13,10 +13,9 @@ from functools import cached_property
 
 import numpy as np
 
+from loopclosure.lines.chance import AGES, half_age
 from loopclosure.lines.points import too_few
 from loopclosure.methods.geometry import SAMPLE, Geometry
-
-AGES = 100  # frames: the greatest age of a frame of the same visit
 
 
 def temporal(scores: np.ndarray) -> np.ndarray:
@@ -53,11 +52,8 @@ class Visits:
     @cached_property
     def together(self) -> int:
         """How many frames in a row tell no more than one: the age at which half of the similarity has gone."""
-        known = np.flatnonzero(np.isfinite(self.temporal).any(axis=0))
-        if not len(known):
-            return 1
-        means = np.nanmean(self.temporal[:, known], axis=0)
-        return int(np.flatnonzero(means <= (means[0] + means.min()) / 2)[0]) + 1
+        known = np.isfinite(self.temporal).any(axis=0)
+        return half_age(np.nanmean(self.temporal[:, known], axis=0))
 
     def as_similar(self, similarity: float) -> tuple[int, int]:
         """Return how many pairs of frames of one visit, no more similar than this, are verified, and of how many."""

@@ -10,11 +10,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from loopclosure.detector.verification import SURE
-from loopclosure.lines.course import WINDOW, Course, on_course
+from loopclosure.lines.course import LENGTHS, WINDOW, Course, on_course
 from loopclosure.lines.points import in_part, look_alike
 from loopclosure.methods.contradiction import Visits
 from loopclosure.methods.geometry import Matches
-from loopclosure.methods.lines import LENGTHS, Lines
+from loopclosure.methods.lines import Lines
 
 
 @dataclass(frozen=True)

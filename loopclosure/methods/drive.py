@@ -16,10 +16,11 @@ from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.run import remember_all
 from loopclosure.detector.verification import Between, GeometricCheck, Pairs
 from loopclosure.errors import InputError
+from loopclosure.lines.chance import AGES
 from loopclosure.methods.auto import PRECISION, Answer, Searched, answer, find_matches
 from loopclosure.methods.base import BLOCK
 from loopclosure.methods.candidates import Compared, far_apart
-from loopclosure.methods.contradiction import AGES, temporal
+from loopclosure.methods.contradiction import temporal
 from loopclosure.places.frames import gray, read_gray
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.truth import Exclusion

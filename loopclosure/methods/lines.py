@@ -14,13 +14,12 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from loopclosure.lines.chance import threshold
-from loopclosure.lines.course import VELOCITIES, Course
+from loopclosure.lines.course import LENGTHS, VELOCITIES, Course
 from loopclosure.lines.trajectories import SequenceSettings, trajectory_costs
 from loopclosure.methods.base import BLOCK
 from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.seqslam import standardize
 
-LENGTHS = (10, 30)  # steps of a line
 SPEEDS = (0.5, 2.0, 0.25, 4.0)  # references for a query, tried where neither the ratio of the lengths nor 1 finds any
 LEAST_PIECES = 25  # pieces of the length of a line, of queries times of references, that show what chance does
 MIDDLE = 4  # steps in the middle of a line
