@@ -53,13 +53,17 @@ def _add_camera(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--camera", metavar="NUMBERS", help=f"{FORM}, if a source has no calibration")
 
 
-def _add_build(commands: Commands) -> None:
-    parser = commands.add_parser("build", help="build a map of one or several drives")
-    parser.set_defaults(function=_build)
+def _add_drives(parser: argparse.ArgumentParser) -> None:
     _add_map(parser)
     parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as for detect")
     _add_index(parser)
     _add_camera(parser)
+
+
+def _add_build(commands: Commands) -> None:
+    parser = commands.add_parser("build", help="build a map of one or several drives")
+    parser.set_defaults(function=_build)
+    _add_drives(parser)
     parser.add_argument(
         "--describe", default="default", metavar="NAME", help="the net, default or small (default: %(default)s)"
     )
@@ -74,10 +78,7 @@ def _build(a: argparse.Namespace) -> None:
 def _add_add(commands: Commands) -> None:
     parser = commands.add_parser("add", help="add drives to a map and find the loops between all its drives")
     parser.set_defaults(function=_add)
-    _add_map(parser)
-    parser.add_argument("source", nargs="+", metavar="SOURCE", help="frames, as for detect")
-    _add_index(parser)
-    _add_camera(parser)
+    _add_drives(parser)
 
 
 def _add(a: argparse.Namespace) -> None:
