@@ -44,8 +44,8 @@ TITLES = {
 KINDS = {"fr1_rpy": "kitchen", "corridor_loop": "corridors", "walk": "house", "ESSEX3IN1": "streets", "SPED": "streets"}
 CORRIDORS = ("office_corridor_rc", "rc_office_corridor")
 HOUSE = 900_002
-# By the names in the tables. F is the file of the included net's descriptors, W the file of words, V that of VLAD, O
-# that of words of ORB, S that of words of the same kind of place. Words of ORB with a check of the geometry stand for
+# By the names in the tables. F is the file of the included net's descriptors, W the file of words, O that
+# of words of ORB, S that of words of the same kind of place. Words of ORB with a check of the geometry stand for
 # what DBoW2 and DBoW3 do in many SLAM systems; there is no wheel of these.
 METHODS = {
     "gray thumbnails, 32x24": "thumbnails",
@@ -53,9 +53,6 @@ METHODS = {
     "bag of ORB words, tf-idf": "bow:kind=orb,model=O",
     "FAB-MAP 2.0": "fabmap:model=W",
     "FAB-MAP 2.0, words of the same kind of place": "fabmap:model=S",
-    "VLAD of 64 SIFT words": "vlad:model=V",
-    "HOG, 256x256": "hog",
-    "like CoHOG, 256x256": "cohog",
     "the net": "features:F",
     "the small net": "describe:small",
     "verified+net": "verified+features:F",
@@ -116,7 +113,7 @@ def measure(
     work.mkdir(parents=True, exist_ok=True)
     figures = {kind: _stored_rows(kind) for kind in TABLES}
     needed = {METHODS[name][-1] for name in methods or METHODS}
-    tower = tower_images(data / "ie_tower")[::4] if needed & {*"WVO"} else []
+    tower = tower_images(data / "ie_tower")[::4] if needed & {*"WO"} else []
     for name in sets or SETS:
         held = data_set(name, data, work)
         cache = Cache(work / "kept" / f"{name}.pickle")
@@ -130,12 +127,11 @@ def measure(
             files = {
                 "F": f"{name}.npz",
                 "W": "words.npz",
-                "V": "vlad.npz",
                 "O": "orb.npz",
                 "S": f"words_{KINDS[name]}.npz",
             }
             letter = METHODS[label][-1]
-            spec = re.sub(r"\b[FWVOS]$", str(work / files.get(letter, "")), METHODS[label])
+            spec = re.sub(r"\b[FWOS]$", str(work / files.get(letter, "")), METHODS[label])
             train = same_kind(KINDS[name], data, work) if letter == "S" else tower
             outcome = judge(label, make_method(spec, context), held, train)
             for kind, value in _figures(label, outcome, name):

@@ -14,17 +14,15 @@ from loopclosure.closing.g2o import summary as graph_summary
 from loopclosure.closing.measure import measure, read_loops
 from loopclosure.errors import InputError
 from loopclosure.places import intrinsics
-from loopclosure.places.frames import read_bgr
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.pose_files import pose_form, read_poses
 from loopclosure.places.source import CLOSED, POSES, TOPICS
-from loopclosure.report.rerun_file import check_rerun, write_closed_paths
 from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands, seed
 
 # Options that cannot be used with --graph.
-OF_FRAMES = ("loops", "odometry", "drift", "odometry_form", "seed", "camera", "rerun")
+OF_FRAMES = ("loops", "odometry", "drift", "odometry_form", "seed", "camera")
 ALL = "all"  # value of --loops with --graph
 
 
@@ -63,9 +61,6 @@ def _add_close(commands: Commands) -> None:
     parser.add_argument("--seed", type=seed, metavar="N", help="seed of --drift (default: 1)")
     parser.add_argument("--camera", metavar="NUMBERS", help=f"{intrinsics.FORM}, if the source has no calibration")
     parser.add_argument(
-        "--rerun", metavar="F.rrd", help="write images, both paths and the loops for the Rerun viewer (rerun.io)"
-    )
-    parser.add_argument(
         "--out", required=True, metavar="FOLDER", help="folder for closed.g2o, closed.txt and paths.png"
     )
 
@@ -79,8 +74,6 @@ def _close(a: argparse.Namespace) -> None:
         raise WrongUsage("expected the frames and --loops, or --graph")
     if a.odometry_form and not a.odometry:
         raise WrongUsage("--odometry-form needs --odometry")
-    if a.rerun:
-        check_rerun()
     if a.seed is not None and a.drift is None:
         raise WrongUsage("--seed needs --drift")
     source = typed(a.source, CLOSED)
@@ -97,10 +90,6 @@ def _close(a: argparse.Namespace) -> None:
     from loopclosure.report.plots import draw_paths
 
     draw_paths(out / "paths.png", closed)
-    if a.rerun:
-        stamps = frames.stamps
-        images = ((i, None if stamps is None else stamps[i], read_bgr(p)) for i, p in enumerate(frames.paths))
-        write_closed_paths(Path(a.rerun), closed, images)
     print("\n".join(summary(closed)))
     print(f"{out / 'closed.g2o'}, {out / 'closed.txt'}, {out / 'paths.png'}")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +21,12 @@ from loopclosure.detector.saved import Describe
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.methods.auto import PRECISION
 from loopclosure.methods.drive import Request, last_session, later_threshold, whole_drive
-from loopclosure.methods.features import WhitenBy
 from loopclosure.places import intrinsics
 from loopclosure.places.frames import live_frames
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.source import DETECTED, FRAMES, TOPICS
-from loopclosure.report.rerun_file import check_rerun, rerun_file, small_jpeg, write_detected
 from netspec.files.whole_file import write_whole
 from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
@@ -75,9 +72,6 @@ def _add_detect(commands: Commands) -> None:
     exclusive.add_argument("--features", metavar="F.npz", help="descriptors that netspec extract --images wrote")
     parser.add_argument(
         "--with", action="append", default=[], metavar="KEY=VALUE", help="keyword argument of the --describe function"
-    )
-    parser.add_argument(
-        "--whiten", metavar="OTHER.npz", help="whiten using the descriptors in this file, from images of other places"
     )
     exclusive = parser.add_mutually_exclusive_group()
     exclusive.add_argument(
@@ -131,9 +125,6 @@ def _add_detect(commands: Commands) -> None:
         help=f"{intrinsics.FORM}: measures the relative pose of each loop, if the source has no calibration",
     )
     parser.add_argument("--save", metavar="F.npz", help="write the detector to this file, for --resume")
-    parser.add_argument(
-        "--rerun", metavar="F.rrd", help="write images, scores and loops for the Rerun viewer (rerun.io)"
-    )
 
 
 def _detect(a: argparse.Namespace) -> None:
@@ -142,10 +133,6 @@ def _detect(a: argparse.Namespace) -> None:
     features = read_features(a.features) if a.features else None
     describe = run.load_describe(a.describe, options) if features is None else None
     net, views = describe, run.views_of(describe, features)
-    if a.whiten is not None:
-        whitening = WhitenBy(a.whiten).learn()
-        describe = None if describe is None else run.whitened(describe, whitening, views)
-        features = None if features is None else features.whitened(whitening)
     detector = _detector(a, describe, views)
     # The names of the frames before --resume are not known.
     names, ended = [""] * len(detector), None
@@ -178,8 +165,6 @@ def _detect(a: argparse.Namespace) -> None:
     if recording is not None:
         recording = warn_of_unreadable(recording)
         names += recording.names
-        if a.rerun:
-            write_detected(Path(a.rerun), recording, results, bar)
     loops, measured = [], None
     if recording is not None and recording.camera is not None:
         loops = _measured(detector, recording, recording.camera)
@@ -219,17 +204,14 @@ def _detect(a: argparse.Namespace) -> None:
 def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResult], KeyboardInterrupt | None]:
     """Process the images of a camera, a stream or a file until it ends, or until Ctrl-C."""
     results: list[LoopResult] = []
-    with rerun_file(a.rerun) if a.rerun else nullcontext() as made:
-        try:
-            for stamp, image in live_frames(a.video):
-                run.put(results, detector.add(image, stamp))
-                for loop in results[-1].loops:
-                    place = f"shows the place of frame {loop.accepted}"
-                    print(f"frame {loop.query_id}, {loop.stamp:.1f} s: {place}", flush=True)
-                if made is not None:
-                    made.frame(results[-1].query_id, stamp, small_jpeg(image), results[-1])
-        except KeyboardInterrupt as end:
-            return results, end
+    try:
+        for stamp, image in live_frames(a.video):
+            run.put(results, detector.add(image, stamp))
+            for loop in results[-1].loops:
+                place = f"shows the place of frame {loop.accepted}"
+                print(f"frame {loop.query_id}, {loop.stamp:.1f} s: {place}", flush=True)
+    except KeyboardInterrupt as end:
+        return results, end
     return results, None
 
 
@@ -263,8 +245,6 @@ def _checked_options(a: argparse.Namespace) -> dict[str, str]:
         raise WrongUsage(f"--{'features' if a.features else 'least-precision'} needs a complete recording, not --video")
     if a.video and a.camera:
         raise WrongUsage("--camera measures loops in images that are read again, which those of --video are not")
-    if a.rerun:
-        check_rerun()
     if a.resume and (_changes(a) or a.verify):
         raise WrongUsage("--resume uses the settings of the saved detector; leave out all others")
     given = [f"--{name.replace('_', '-')}" for name in ONLINE if getattr(a, name) is not None]

@@ -1,4 +1,4 @@
-"""``loopclosure evaluate``, ``compare`` and ``similarity``."""
+"""``loopclosure evaluate``."""
 
 from __future__ import annotations
 
@@ -7,15 +7,11 @@ from pathlib import Path
 
 from loopclosure import evaluate
 from loopclosure.cli.data_set import HELP, add_data_set, data_set
-from loopclosure.descriptors.feature_file import read_features
-from loopclosure.descriptors.similarity import METRICS, top_k, write_similarity, write_top_k
 from loopclosure.errors import InputError
 from loopclosure.methods.base import MethodContext
 from loopclosure.methods.named import METHODS
 from loopclosure.places.frames import image_paths
 from loopclosure.places.source import FRAMES, Source, read_source
-from loopclosure.places.truth import Exclusion
-from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar
 from netspec.terminal.parser import Commands, seed
 
@@ -23,8 +19,6 @@ from netspec.terminal.parser import Commands, seed
 def add_commands(commands: Commands) -> None:
     """Add the commands of this module."""
     _add_evaluate(commands)
-    _add_compare(commands)
-    _add_similarity(commands)
 
 
 def _training(text: str) -> Source:
@@ -50,7 +44,7 @@ def _add_evaluate(commands: Commands) -> None:
         default=[],
         metavar="[LABEL=]METHOD",
         help=f"a method to evaluate (may be repeated): {', '.join(METHODS)}, with :SETTINGS, or NAME+METHOD, such as "
-        "features:PATH.npz[:cosine][:whiten=OTHER.npz], seqslam+features:PATH.npz or fabmap:model=words.npz",
+        "features:PATH.npz[:cosine], seqslam+features:PATH.npz or fabmap:model=words.npz",
     )
     parser.add_argument(
         "--train",
@@ -86,77 +80,3 @@ def _evaluate(a: argparse.Namespace) -> None:
     print(verdict(evaluation))
     print(measures_text(evaluation))
     print(f"report: {page}")
-
-
-def _add_compare(commands: Commands) -> None:
-    parser = commands.add_parser("compare", help="compare the reports of several evaluations in a table and curves")
-    parser.set_defaults(function=_compare)
-    parser.add_argument("report", nargs="+", metavar="REPORT.json", help="two or more reports that evaluate wrote")
-    parser.add_argument(
-        "--out", default="comparison.html", metavar="FILE.html", help="the page to write (default: %(default)s)"
-    )
-
-
-def _compare(a: argparse.Namespace) -> None:
-    # Imported here, since it takes seconds and only this command needs it.
-    from loopclosure.report.compare import read_reports, text, write_comparison
-
-    if len(a.report) < 2:
-        raise WrongUsage("one report was given; expected two or more")
-    reports = read_reports(a.report)
-    write_comparison(reports, a.out, a.command_line)
-    print(text(reports))
-    print(f"comparison: {a.out}")
-
-
-def _add_similarity(commands: Commands) -> None:
-    parser = commands.add_parser("similarity", help="compute the similarity of all pairs of descriptors in a file")
-    parser.set_defaults(function=_similarity)
-    parser.add_argument("features", metavar="FEATURES", help="the .npz file with the queries")
-    parser.add_argument(
-        "--references", metavar="F.npz", help="the .npz file with the references (default: the queries)"
-    )
-    parser.add_argument(
-        "--metric", default=METRICS[0], choices=METRICS, help="metric of the descriptors (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--top-k",
-        type=int,
-        metavar="K",
-        help="write the best K references of each query as CSV (default: write all as .npy)",
-    )
-    parser.add_argument(
-        "--exclude-frames",
-        type=int,
-        default=0,
-        metavar="N",
-        help="with --top-k and without --references: exclude pairs within N frames (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--exclude-seconds",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="the same, within S seconds (default: %(default)g)",
-    )
-    parser.add_argument("--out", required=True, metavar="FILE", help="the file to write")
-
-
-def _similarity(a: argparse.Namespace) -> None:
-    excluded = a.exclude_frames or a.exclude_seconds
-    if excluded and a.top_k is None:
-        raise WrongUsage("--exclude-frames and --exclude-seconds need --top-k")
-    if excluded and a.references is not None:
-        raise WrongUsage("--exclude-frames and --exclude-seconds cannot be used with --references")
-    queries = read_features(a.features)
-    references = None if a.references is None else read_features(a.references).features
-    if queries.views > 1:
-        raise InputError("describes several views of each image; this command needs one", a.features)
-    if a.top_k is None:
-        shape = write_similarity(a.out, queries.features, references, a.metric, bar)
-        print(f"{shape[0]} x {shape[1]} scores, float32: {a.out}")
-        return
-    exclusion = Exclusion(a.exclude_frames, a.exclude_seconds) if references is None else None
-    found = top_k(queries.features, references, a.top_k, a.metric, exclusion, queries.stamps)
-    write_top_k(a.out, found)
-    print(f"the best {a.top_k} of {len(found.indices)} queries ({exclusion or 'no pair excluded'}): {a.out}")

@@ -1,1 +1,1 @@
-"""Descriptors of images: their files, their similarity, whitening."""
+"""Descriptors of images: their files and their similarity."""

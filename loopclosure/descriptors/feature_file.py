@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from loopclosure.descriptors.whitening import Whitening
 from loopclosure.errors import InputError
 from netspec.files.arrays import read_npz
 
 # Arrays of the file that are not descriptors.
 NOT_FEATURES = ("names", "keys", "stamps", "seconds_per_image", "seconds_per_record", "parameters", "zooms")
-# Two machines compute descriptors of an image by the same net that differ by less than this share of their length.
-SAME_DESCRIPTOR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -63,26 +60,6 @@ class Features:
                     raise InputError(f"names {image.name} {len(numbers)} times; which one is {image}?", self.path)
             return self.features[[numbers[0] for numbers in found]]
         raise InputError(f"{missing}; its first name is {self.names[0]}", self.path)
-
-    def whitened(self, whitening: Whitening) -> Features:
-        """Return a copy with whitened descriptors; each view is whitened separately."""
-        return replace(self, features=whitening.of_views(self.features, self.views))
-
-    def also_described(self, images: Sequence[Path], rows: np.ndarray) -> list[Path]:
-        """Return those of ``images`` that this file describes, too. ``rows`` (len(images), D) are their descriptors.
-
-        Two images are the same if the last parts of their names and their descriptors are equal. The name alone is not
-        enough, because many data sets have a 0001.jpg. If the file has no names, only the descriptors are compared.
-        """
-        numbers: dict[str, list[int]] = {}
-        for number, name in enumerate(self.names):
-            numbers.setdefault(PurePosixPath(name).name, []).append(number)
-        found = []
-        for image, row in zip(images, rows, strict=True):
-            candidates = self.features[numbers.get(image.name, [])] if self.names else self.features
-            if np.any(np.linalg.norm(candidates - row, axis=1) <= SAME_DESCRIPTOR * np.linalg.norm(row)):
-                found.append(image)
-        return found
 
 
 def read_features(path: str | Path) -> Features:

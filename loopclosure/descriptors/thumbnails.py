@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from loopclosure.errors import InputError
@@ -67,63 +66,3 @@ def differences(queries: np.ndarray, references: np.ndarray) -> np.ndarray:
     """Return the mean absolute difference per pixel (Q, R) of thumbnails (Q, h, w) and (R, h, w)."""
     a, b = queries.reshape(len(queries), -1), references.reshape(len(references), -1)
     return cdist(a, b, "cityblock") / a.shape[1]
-
-
-# Gray levels of the histogram for the entropy of a region; the maximum of the entropy is their logarithm.
-ENTROPY_LEVELS = 32
-
-
-@dataclass(frozen=True)
-class Hog:
-    """Histograms of oriented gradients of a gray image, in blocks of 2 x 2 cells.
-
-    side  the image is resized to this many pixels in both directions; a multiple of ``cell``
-    cell  side of a cell in pixels
-    bins  directions over 180 degrees
-    """
-
-    side: int = 256
-    cell: int = 16
-    bins: int = 9
-
-    def __post_init__(self) -> None:
-        if self.cell < 2 or self.bins < 2 or self.side < 2 * self.cell or self.side % self.cell:
-            raise InputError(
-                f"HOG of {self.side} pixels with cells of {self.cell} and {self.bins} bins; expected at least 2 x 2 "
-                "whole cells and 2 bins"
-            )
-
-    def blocks(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return the blocks of an image (H, W) or (H, W, 3), each of unit length: (n - 1, n - 1, 4 bins), n cells."""
-        small = self._resized(image).astype(np.float32)
-        across = cv2.Sobel(small, cv2.CV_32F, 1, 0, ksize=1)
-        down = cv2.Sobel(small, cv2.CV_32F, 0, 1, ksize=1)
-        strength = np.hypot(across, down)
-        direction = np.arctan2(down, across) % np.pi / np.pi * self.bins - 0.5
-        low = np.floor(direction)
-        share = direction - low
-        cells = self.side // self.cell
-        histogram = np.zeros((cells, cells, self.bins), np.float32)
-        for bin_, weight in ((low, 1 - share), (low + 1, share)):  # each gradient is split between two bins
-            for number in range(self.bins):
-                here = np.where(bin_ % self.bins == number, strength * weight, 0)
-                histogram[..., number] += here.reshape(cells, self.cell, cells, self.cell).sum(axis=(1, 3))
-        block = np.concatenate([histogram[:-1, :-1], histogram[:-1, 1:], histogram[1:, :-1], histogram[1:, 1:]], axis=2)
-        length = np.linalg.norm(block, axis=2, keepdims=True)
-        return np.divide(block, length, out=np.zeros_like(block), where=length > 0)
-
-    def entropies(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """Return the entropy of the gray values of each block over its maximum: (n - 1, n - 1)."""
-        levels = self._resized(image) // (256 // ENTROPY_LEVELS)
-        cells = self.side // self.cell
-        count = np.stack(
-            [(levels == v).reshape(cells, self.cell, cells, self.cell).sum(axis=(1, 3)) for v in range(ENTROPY_LEVELS)],
-            axis=2,
-        )
-        count = count[:-1, :-1] + count[:-1, 1:] + count[1:, :-1] + count[1:, 1:]
-        share = count / (4.0 * self.cell**2)
-        return -(share * np.log(np.where(share > 0, share, 1))).sum(axis=2) / np.log(ENTROPY_LEVELS)
-
-    def _resized(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        resized = cv2.resize(gray(image), (self.side, self.side), interpolation=cv2.INTER_AREA)
-        return np.asarray(resized, np.uint8)

@@ -16,7 +16,6 @@ from typing import Any, cast
 import numpy as np
 
 from loopclosure.descriptors.feature_file import Features
-from loopclosure.descriptors.whitening import Whitening
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import LOOP_SIGMAS, RelativePose, relative_pose
@@ -232,11 +231,6 @@ def _file_module(path: Path) -> Any:
 def views_of(describe: Describe | None, features: Features | None) -> int:
     """Return the number of views per image: of the features, or the ``views`` attribute of ``describe`` (default 1)."""
     return getattr(describe, "views", 1) if features is None else features.views
-
-
-def whitened(describe: Describe, whitening: Whitening, views: int) -> Describe:
-    """Wrap ``describe`` so that its descriptors (views D,) are whitened, view by view."""
-    return lambda image: whitening.of_views(np.reshape(describe(image), (1, -1)), views)[0]
 
 
 def _value(text: str) -> int | float | str:

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 
 from loopclosure.errors import InputError
-from loopclosure.methods import auto, baselines, described, features, online, references, seqslam, verified
+from loopclosure.methods import auto, baselines, described, features, seqslam, verified
 from loopclosure.methods.base import Method, MethodContext
 from netspec.errors import did_you_mean
 
@@ -19,16 +19,12 @@ Factory = Callable[[str, MethodContext, Method | None], Method]
 METHODS: dict[str, Factory] = {
     "fabmap": baselines.fabmap,
     "bow": baselines.bag_of_words,
-    "vlad": references.vlad_method,
-    "hog": references.hog,
-    "cohog": references.cohog,
     "thumbnails": baselines.thumbnails,
     "seqslam": seqslam.seqslam,
     "features": features.features,
     "describe": described.described,
     "verified": verified.verified,
     "auto": auto.auto,
-    "detector": online.online,
 }
 REFINERS = ("seqslam", "verified", "auto")
 

@@ -1,1 +1,1 @@
-"""Visual words: vocabulary, bag of words, VLAD and FAB-MAP."""
+"""Visual words: vocabulary, bag of words and FAB-MAP."""

@@ -1,15 +1,13 @@
-"""Bag of words: tf-idf histograms of visual words (Sivic and Zisserman, ICCV 2003; DBoW2); and VLAD."""
+"""Bag of words: tf-idf histograms of visual words (Sivic and Zisserman, ICCV 2003; DBoW2)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from loopclosure.errors import InputError
-from loopclosure.words.vocabulary import Vocabulary
 
 METRICS = ("l1", "cosine")
 
@@ -59,21 +57,3 @@ def check_metric(metric: str) -> None:
     """Raise InputError for an unknown metric."""
     if metric not in METRICS:
         raise InputError(f'unknown metric "{metric}" of the bag of words; known: {", ".join(METRICS)}')
-
-
-def vlad(descriptors: NDArray[np.float32], vocabulary: Vocabulary) -> NDArray[np.float32]:
-    """Return the sums of differences between descriptors (n, d) and their nearest words, (words d,), of unit length.
-
-    The sum of each word is normalized too (Arandjelovic and Zisserman, CVPR 2013), so that repeated texture does not
-    dominate. Without descriptors, the result is 0.
-    """
-    centers = vocabulary.centers
-    sums = np.zeros(centers.shape, np.float32)
-    nearest = vocabulary.nearest(descriptors)
-    np.add.at(sums, nearest, descriptors - centers[nearest])
-    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    sums = np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 1e-6)
-    whole = np.linalg.norm(sums)
-    if whole > 0:
-        sums /= whole
-    return sums.reshape(-1)

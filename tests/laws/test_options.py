@@ -80,7 +80,6 @@ WAYS = {
         "evaluate tum:walk/walk_1 --method thumbnails --exclude-frames 3 --out report",
         "evaluate images:images,truth=truth.png --method thumbnails --exclude-frames 1 --out report",
         "evaluate traverses:images,references=images --method thumbnails --out report",
-        "compare report/report.json reports/other/report.json --out both",
         "detect walk/walk_1 --describe loopclosure.descriptors.thumbnails:Thumbnailer --exclude-recent 3 --out found",
         "detect walk/walk_1 --describe loopclosure.descriptors.thumbnails:Thumbnailer --threshold "
         "-1 --exclude-recent 3 --out found",
@@ -92,7 +91,6 @@ WAYS = {
         "map add map walk/walk_1,limit=2",
         "map query map walk/walk_1,limit=2 --out found",
         "map close map --out closed",
-        "similarity features.npz --out s.npz",
     ],
 }
 # Commands that this test does not start, and why.

@@ -1,10 +1,9 @@
-"""Similarity by blocks against the same by brute force."""
+"""Similarity against the same by brute force, and thumbnails."""
 
 import numpy as np
 import pytest
 
-from loopclosure.descriptors import similarity
-from loopclosure.descriptors.similarity import similarity_blocks, similarity_matrix, top_k
+from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.descriptors.thumbnails import Thumbnailer, differences, normalize_patches
 from loopclosure.errors import InputError
 from loopclosure.places.truth import Exclusion
@@ -44,65 +43,9 @@ def test_the_most_similar_two_views_decide(features, metric):
     np.testing.assert_allclose(similarity_matrix(queries, references, metric, views=2), np.max(expected, axis=0))
 
 
-def test_blocks_equal_the_matrix(features):
-    blocks = list(similarity_blocks(features, rows=16))
-    assert [start for start, _ in blocks] == [0, 16, 32]
-    np.testing.assert_allclose(np.concatenate([block for _, block in blocks]), similarity_matrix(features), atol=1e-12)
-
-
-@pytest.mark.parametrize("metric", ["euclidean", "cosine"])
-@pytest.mark.parametrize(("rows", "columns"), [(1024, 16384), (7, 5), (1, 2)])
-def test_top_k_by_blocks_equals_sorting(features, metric, rows, columns, monkeypatch):
-    monkeypatch.setattr(similarity, "BLOCK_ROWS", rows)
-    monkeypatch.setattr(similarity, "BLOCK_COLUMNS", columns)
-    stamps = np.arange(40) * 0.5
-    found = top_k(features, k=4, metric=metric, exclusion=Exclusion(frames=3, seconds=2.5), stamps=stamps)
-    scores = brute_force(features, features, metric)
-    for query in range(40):
-        allowed = [j for j in range(query) if query - j > 3 and (query - j) * 0.5 >= 2.5]
-        expected = sorted(allowed, key=lambda j: -scores[query, j])[:4]
-        assert [int(j) for j in found.indices[query] if j >= 0] == expected
-        np.testing.assert_allclose(found.scores[query, : len(expected)], scores[query, expected], rtol=1e-7)
-        assert np.all(np.isneginf(found.scores[query, len(expected) :]))
-
-
-def test_top_k_against_other_references(features):
-    found = top_k(features[30:], features[:30], k=3)
-    expected = np.argsort(-brute_force(features[30:], features[:30], "euclidean"), axis=1)[:, :3]
-    np.testing.assert_array_equal(found.indices, expected)
-
-
-@pytest.mark.parametrize("columns", [16384, 3])
-def test_equal_scores_keep_the_order_of_the_references(columns, monkeypatch):
-    monkeypatch.setattr(similarity, "BLOCK_COLUMNS", columns)
-    same = np.ones((9, 2), np.float32)
-    np.testing.assert_array_equal(top_k(same, same, k=3).indices, np.tile([0, 1, 2], (9, 1)))
-
-
-@pytest.mark.slow
-def test_memory_is_limited_to_blocks(monkeypatch):
-    """20,000 frames: the whole matrix would be 1.6 GB of float32."""
-    import tracemalloc
-
-    features = np.random.default_rng(1).normal(size=(20_000, 4)).astype(np.float32)
-    monkeypatch.setattr(similarity, "BLOCK_ROWS", 256)
-    monkeypatch.setattr(similarity, "BLOCK_COLUMNS", 2048)
-    tracemalloc.start()
-    top_k(features, k=2, exclusion=Exclusion(frames=10))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 50e6
-
-
 def test_a_zero_feature_has_cosine_similarity_zero():
     scores = similarity_matrix(np.array([[0.0, 0.0], [1.0, 0.0]]), metric="cosine")
     np.testing.assert_array_equal(scores, [[0.0, 0.0], [0.0, 1.0]])
-
-
-def test_fewer_references_than_requested():
-    assert top_k(np.eye(3), np.eye(3)[:2], k=10).indices.shape == (3, 2)
-    found = top_k(np.eye(3), k=2)
-    np.testing.assert_array_equal(found.indices[0], [-1, -1])
 
 
 @pytest.mark.parametrize(
@@ -112,9 +55,6 @@ def test_fewer_references_than_requested():
         (lambda: similarity_matrix(np.zeros((3, 2)), np.zeros((3, 4))), "queries have 2 dimensions, references 4"),
         (lambda: similarity_matrix(np.zeros((3, 2)), metric="l1"), 'unknown metric "l1"'),
         (lambda: similarity_matrix(np.array([[0.0], [np.nan]])), "frame 1"),
-        (lambda: top_k(np.eye(3), k=0), "best 0"),
-        (lambda: top_k(np.eye(3), np.eye(3), exclusion=Exclusion(frames=1)), "applies to one sequence"),
-        (lambda: top_k(np.eye(3), exclusion=Exclusion(seconds=1)), "have no time"),
         (lambda: Exclusion(frames=-1), "cannot exclude -1"),
     ],
 )

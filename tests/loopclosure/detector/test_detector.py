@@ -5,14 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopclosure.descriptors.similarity import similarity_matrix, top_k
+from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.detector import DetectorSettings, LoopDetector
 from loopclosure.detector.frames import FIRST_CAPACITY
 from loopclosure.detector.images import ImageDecision
 from loopclosure.detector.verification import Agreement, GeometricCheck, LocalFeatures
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
-from loopclosure.places.truth import Exclusion
 from netspec.errors import SpecError
 
 
@@ -38,16 +37,14 @@ def test_only_the_second_lap_closes_loops():
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "cosine"])
-def test_candidates_are_those_of_the_search_by_blocks(metric):
+def test_candidates_are_the_most_similar_earlier_frames(metric):
     descriptors = np.random.default_rng(1).normal(2.0, 1.0, (FIRST_CAPACITY + 40, 8)).astype(np.float32)
     detector = LoopDetector(metric=metric, exclude_recent=7, top_k=4)
     results = run(detector, descriptors)
-    expected = top_k(descriptors, k=4, metric=metric, exclusion=Exclusion(frames=7))
-    for result, indices, scores in zip(results, expected.indices, expected.scores, strict=True):
-        assert [number for number, _ in result.candidates] == [i for i in indices if i >= 0]
-        np.testing.assert_allclose(
-            [score for _, score in result.candidates], scores[: len(result.candidates)], atol=1e-4
-        )
+    for query, scores in enumerate(similarity_matrix(descriptors, None, metric)):
+        best = np.argsort(-scores[: max(0, query - 7)], kind="stable")[:4]
+        assert [number for number, _ in results[query].candidates] == best.tolist()
+        np.testing.assert_allclose([score for _, score in results[query].candidates], scores[best], atol=1e-4)
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "cosine"])
