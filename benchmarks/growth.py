@@ -38,6 +38,7 @@ LOSS = """
 layer {{ name: "loss" type: "Reduction" bottom: "x{i}" top: "loss" loss_weight: 1 }}"""
 TRAINED = "small/siamese_resnet27_256"
 WALK = 300  # frames; more descriptors are made by perturbing theirs
+COMPONENTS = 256  # of a descriptor
 QUERIES, AT_ONCE = 50, 4096  # frames searched for, and added at a time
 SAME_PLACE = 0.3  # distance of two descriptors of one place, as a share of that of two places
 LAP, IN_MEMORY = 40, 100  # images of a lap, and frames that the detector keeps in memory
@@ -192,7 +193,6 @@ def described_walk(frames: int) -> np.ndarray:
     """Return the small net's descriptors of a synthetic walk, minus their mean, with at most 256 components."""
     from lmdb_build.walk.sequence import Walk, write_walk
     from loopclosure.descriptors.whitening import learn_whitening
-    from loopclosure.detector.map import COMPONENTS
     from loopclosure.places.frames import read_bgr
     from netspec.inspect.features.shipped import small
 

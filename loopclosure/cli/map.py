@@ -94,13 +94,14 @@ def _recordings(a: argparse.Namespace, first: int) -> list[ImageSequence]:
 
 def _add_all(into: Map, describe: Describe, recordings: list[ImageSequence], index: str) -> None:
     for recording in recordings:
-        before, number = len(into), len(into.sessions)
+        before = len(into)
         results = into.add(recording, describe, index, bar, _decided)
         warn_of_unreadable(recording)
         loops = [result.accepted for result in results if result.accepted is not None]
         between = sum(frame < before for frame in loops)
         summary = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
-        print(f"session {number:06d}: {summary}: {into.folder / f'{number:06d}' / 'loops.csv'}")
+        folder = into.sessions[-1].folder
+        print(f"session {folder.name}: {summary}: {folder / 'loops.csv'}")
     sessions = len(into.sessions)
     print(f"{len(into)} frames in {sessions} session{'s' * (sessions != 1)}: {into.folder}")
 

@@ -18,7 +18,7 @@ from loopclosure.detector.verification import LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.index.exact import ExactIndex
 from loopclosure.index.index import Index
-from loopclosure.stored import Rows, check_array
+from loopclosure.stored import check_array
 
 FIRST_CAPACITY = 256  # frames; doubled when full
 NO_ROWS = np.zeros((0, 0), np.float32)
@@ -36,8 +36,8 @@ class Points:
 
     sizes: np.ndarray
     ends: np.ndarray
-    points: np.ndarray | Rows
-    descriptors: np.ndarray | Rows
+    points: np.ndarray
+    descriptors: np.ndarray
 
     def part(self, frame: int) -> slice:
         """Return where the points of one frame are among all points."""

@@ -19,15 +19,15 @@ Describe = Callable[[np.ndarray], np.ndarray]
 
 
 @contextmanager
-def reading(path: str | Path) -> Iterator[None]:
-    """Report whatever does not fit while a file is read as an InputError."""
+def reading(path: str | Path, expected: str = SAVED) -> Iterator[None]:
+    """Report whatever does not fit while a file is read as an InputError that contains ``expected``."""
     try:
         yield
     except SpecError as fault:
         raise fault if fault.where else InputError(fault.message, path) from None
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
+    except (LookupError, OSError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"cannot be read ({reason}); expected {SAVED}", path) from None
+        raise InputError(f"cannot be read ({reason}); expected {expected}", path) from None
 
 
 def fingerprint_of(describe: Describe | None) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from loopclosure.errors import InputError
 from netspec.files.opencv import cv2
+from netspec.files.whole_file import write_whole
 
 FORM = "FX,FY,CX,CY or FX,FY,CX,CY,K1,K2,P1,P2 or FX,FY,CX,CY,K1,K2,P1,P2,K3"
 FISHEYE = "equidistant"  # the name of the model in sensor.yaml, in CameraInfo and in calibration.txt
@@ -76,7 +77,7 @@ def write_calibration(path: Path, camera: Intrinsics) -> None:
     numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *size, *camera.distortion]
     names = " k1 k2 k3 k4 model" if camera.fisheye else " k1 k2 p1 p2 k3 k4 k5 k6"[: 3 * len(camera.distortion)]
     row = " ".join([*(f"{number:.9g}" for number in numbers), *([FISHEYE] if camera.fisheye else [])])
-    path.write_text(f"# fx fy cx cy width height{names}\n{row}\n", encoding="utf-8")
+    write_whole(path, f"# fx fy cx cy width height{names}\n{row}\n")
 
 
 def read_intrinsics(path: Path, camera: str = "") -> Intrinsics:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_pixels
 from loopclosure.places.mat_file import read_mat
-from loopclosure.stored import read_npy
 from netspec.errors import SpecError
+from netspec.files.arrays import opened, read_array
 from netspec.files.kinds import nearest_existing, unreadable
 from netspec.files.opencv import cv2
 
@@ -144,7 +144,8 @@ def _read_matrix(path: Path, keys: tuple[str, ...], what: str, last_columns: int
     if suffix == ".mat":
         return _read_mat(path, keys, what)
     if suffix == ".npy":
-        return _numeric(read_npy(path, what), path)
+        with opened(path, what) as stream:
+            return _numeric(read_array(stream, path.stat().st_size), path)
     if suffix in (".txt", ".csv", ".dat"):
         return _read_text(path, what, last_columns)
     if suffix in LOSSLESS_SUFFIXES:

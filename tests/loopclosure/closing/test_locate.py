@@ -92,7 +92,7 @@ def test_without_depth_there_is_a_rotation(walks: Path, tmp_path: Path, capsys: 
     shutil.copytree(walks / "walk_1", tmp_path / "walk_1")
     (tmp_path / "walk_1" / "depth.txt").unlink()
     build(tmp_path / "map", tmp_path)
-    assert not (tmp_path / "map" / "000000" / "depths.npy").exists()
+    assert Map(tmp_path / "map").sessions[0].depths is None
     rows, said = query(tmp_path / "map", tmp_path, tmp_path / "out", capsys)
     located = [row for row in rows if row["map_by"]]
     assert {row["map_x_m"] for row in located} == {""}
@@ -102,11 +102,10 @@ def test_without_depth_there_is_a_rotation(walks: Path, tmp_path: Path, capsys: 
     assert f"0 with position and rotation, {len(located)} with rotation only" in said
 
 
-def test_a_map_of_an_earlier_version(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It has no camera and no depth: it is opened and asked, and one line says what is missing."""
+def test_a_map_without_a_camera(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line says what is missing."""
     shutil.copytree(walks / "map", tmp_path / "map")
-    for name in ("calibration.txt", "depths.npy"):
-        (tmp_path / "map" / "000000" / name).unlink()
+    (tmp_path / "map" / "000000" / "calibration.txt").unlink()
     rows, said = query(tmp_path / "map", walks, tmp_path / "out", capsys)
     assert {row["relative"] + row["map_by"] + row["map_qw"] for row in rows} == {""}
     assert f"not located: {len(rows)}, matched in 000000, where the map has no calibration of the camera" in said
@@ -118,13 +117,6 @@ def test_a_source_without_a_camera(walks: Path, tmp_path: Path, capsys: pytest.C
     rows, said = query(walks / "map", tmp_path, tmp_path / "out", capsys)
     assert {row["map_by"] for row in rows} == {""}
     assert "not located: the source of the query has no calibration of its camera" in said
-
-
-def test_damaged_depths_are_named(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(walks / "map", tmp_path / "map")
-    np.save(tmp_path / "map" / "000000" / "depths.npy", np.zeros(3, np.float32))
-    assert main(["map", "query", str(tmp_path / "map"), str(walks / OTHERS), "--out", str(tmp_path / "out")]) == 1
-    assert '"depths"' in capsys.readouterr().err
 
 
 def test_one_image(walks: Path) -> None:
