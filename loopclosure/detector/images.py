@@ -8,14 +8,14 @@ import numpy as np
 
 from loopclosure.detector.decision import DetectorSettings, LoopResult, Runs
 from loopclosure.detector.frames import Frames
-from loopclosure.detector.verification import SURE, GeometricCheck, LocalFeatures
-from loopclosure.lines.points import Share, look_alike
+from loopclosure.detector.verification import GeometricCheck, LocalFeatures
+from loopclosure.lines.points import SURE, Share, asked, look_alike
 
 UNLIKE = 40  # frames, each of which is compared with an unlike one; then every second frame is, and so on
 AMONG = 9  # frames of which the least similar one is unlike
 LEAST_STEPS = 20  # scores of consecutive frames that are needed to choose a threshold
 PART = "enough points agree, but only a part of those that match"
-ALIKE = "places look alike: of many frames with enough points, only a part of those that match agrees"
+ALIKE = "places may look alike: until enough frames agree with their match as a whole, more points must agree"
 VISIT = "the place was not left in between"
 
 
@@ -97,7 +97,7 @@ class ImageDecision:
                 if not left(number):
                     most, reason = inliers, VISIT
                     continue
-                if look_alike(self.agreed[1], sum(self.agreed)):
+                if not self.check.sure(agreement, self.points, self.asked):
                     return result("not verified", inliers=inliers, reason=ALIKE)
                 return result("accepted", number, value, inliers)
             most = max(most, agreement.inliers)
@@ -119,6 +119,11 @@ class ImageDecision:
         scores = [frames.score(frames.rows(number, number + 1).reshape(row.shape), row) for number in some]
         least = some[int(np.argmin(scores))]
         self.unlike.append((min(scores), self.check.enough(self.check.agreement(local, frames.local[least]))))
+
+    @property
+    def asked(self) -> float:
+        """The evidence that an image needs by now."""
+        return asked(look_alike(self.agreed[1], sum(self.agreed)))
 
     @property
     def _least_alike(self) -> list[int]:

@@ -12,7 +12,7 @@ from loopclosure.detector.frames import Frames
 from loopclosure.detector.images import ImageDecision
 from loopclosure.detector.lines import HALF, Line, OnlineLines
 from loopclosure.detector.verification import Agreement, GeometricCheck
-from loopclosure.lines.course import LENGTHS, on_course
+from loopclosure.lines.course import on_course
 from loopclosure.lines.points import in_part, too_few
 
 
@@ -84,7 +84,8 @@ class Sequences:
     def _is_loop(self) -> bool:
         """Return whether the newest match is a loop: of enough on the stretch, and no points speak against it."""
         verified = [each for each in self._stretch if each.evidence >= 1]
-        if len(self._stretch) < LENGTHS[0] and not any(each.whole for each in verified):
+        sure = any(each.whole and each.evidence >= self._images.asked for each in verified)
+        if len(self._stretch) < 2 * HALF and not sure:
             return False
         if in_part(len(verified), sum(each.whole for each in verified)):
             return False

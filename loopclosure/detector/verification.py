@@ -24,6 +24,7 @@ import numpy as np
 
 from loopclosure.descriptors.similarity import squared_distances
 from loopclosure.errors import InputError
+from loopclosure.lines.points import SURE
 from netspec.files.opencv import cv2
 
 # Fewer matches prove nothing: any seven have a fundamental matrix.
@@ -31,11 +32,8 @@ LEAST_MATCHES = 8
 # The largest expected number of matrices per image pair that as many matches fit by chance. It is small because points
 # of one object are not independent, and because a detector compares thousands of pairs.
 BY_CHANCE = 1e-6
-# With this many times the inliers that rule out chance, a pair is accepted against its score. Once is not enough: the
-# windows of a facade repeat and agree more often than by chance.
-SURE = 1.5
-# And so many of its matches must be inliers. Two floors of a tower have the same doors and signs, but also points that
-# match at other positions: a poster, another number.
+# Of a pair that is accepted against its score, so many of the matches must be inliers. Two floors of a tower have the
+# same doors and signs, but also points that match at other positions: a poster, another number.
 SHARE = 0.7
 SAMPLE, SOLUTIONS = 7, 3  # matches in a sample, and the largest number of fundamental matrices they give
 PARTS = (8, 6)  # of an image, across and down
@@ -183,11 +181,11 @@ class GeometricCheck:
         """
         return found.inliers / ((self.min_inliers or found.needed) + unlike)
 
-    def sure(self, found: Agreement, unlike: float = 0.0) -> int:
-        """Return the inliers of an agreement if they outweigh a low score; 0 otherwise."""
+    def sure(self, found: Agreement, unlike: float = 0.0, asked: float = SURE) -> int:
+        """Return the inliers of an agreement if they outweigh a low score: their evidence is as ``asked``; else 0."""
         if self.min_inliers:
             return self.enough(found)
-        return found.inliers if self.evidence(found, unlike) >= SURE and found.whole else 0
+        return found.inliers if self.evidence(found, unlike) >= asked and found.whole else 0
 
     def __post_init__(self) -> None:
         if (

@@ -7,14 +7,25 @@ from scipy.special import betaln
 
 AGAINST = 0.01  # a stretch falls if the ratio of the likelihoods is less
 ALIKE = 0.25  # of the matches with enough points: if more of them agree only in part, places look alike
+# Evidence of a single image that is accepted by its points: once is not enough, the windows of a facade repeat and
+# agree more often than by chance. The more is needed where places look alike.
+SURE, SURE_AMONG_ALIKE = 1.5, 2.5
 LEAST_VERIFIED = 3  # fewer verified matches of a stretch do not tell whether they agree only in part
 
 Share = tuple[int, int]  # so many of so many
 
 
 def look_alike(part: int | np.integer, many: int | np.integer) -> bool:
-    """Return whether so many of ``many`` matches with enough points agree only in part that places look alike."""
-    return bool(part > ALIKE * many)
+    """Return whether places must be taken to look alike: of ``many`` matches with enough points, so many in part.
+
+    They are until matches say otherwise: one more that agrees in part, of two more, counts against them.
+    """
+    return bool(part + 1 > ALIKE * (many + 2))
+
+
+def asked(alike: bool) -> float:
+    """Return the evidence that a single image needs."""
+    return SURE_AMONG_ALIKE if alike else SURE
 
 
 def in_part(verified: int, whole: int | np.integer) -> bool:

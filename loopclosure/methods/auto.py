@@ -124,7 +124,7 @@ def answer(
         said.sequences(lines if matches.by_lines else None, given.far),
         said.verification(matches, geometry),
         *said.doubts(matches, decision),
-        said.total(results, given, decision.alike),
+        said.total(results, given, decision.alike and bool(decision.part.any())),
     ]
     return Answer(results, reasons)
 

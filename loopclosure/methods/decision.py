@@ -9,9 +9,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from loopclosure.detector.verification import SURE
-from loopclosure.lines.course import LENGTHS, WINDOW, Course, on_course
-from loopclosure.lines.points import in_part, look_alike
+from loopclosure.lines.course import WINDOW, Course, on_course
+from loopclosure.lines.points import SURE, asked, in_part, look_alike
 from loopclosure.methods.contradiction import Visits
 from loopclosure.methods.geometry import Matches
 from loopclosure.methods.lines import Lines
@@ -25,7 +24,7 @@ class Decision:
     by_line of these, the ones whose sequence is more alike than chance; the others are by their points
     fell    matches of sequences that their points speak against
     part    matches of which enough points agree, but only a part of those that match
-    alike   whether these are so many that places look alike, and no single image is accepted
+    alike   whether these are so many that places look alike, and a single image needs more points
     """
 
     loops: np.ndarray
@@ -44,13 +43,13 @@ def decide(matches: Matches, lines: Lines | None, scores: np.ndarray, visits: Vi
     many, nothing = matches.evidence >= SURE, np.zeros(len(matches.match), bool)
     part = many & ~matches.whole
     alike = look_alike(np.count_nonzero(part), np.count_nonzero(many))
-    sure = nothing if alike else many & matches.whole
+    sure = matches.whole & (matches.evidence >= asked(alike))
     if lines is None:
         return Decision(sure, nothing, nothing, part, alike)
     pairs = neighbors(matches.match, lines.course)
     if not matches.by_lines:
         return Decision(grown(sure, matches.verified, pairs), nothing, nothing, part, alike)
-    found = of_lines(matches, lines, pairs)
+    found = of_lines(matches, lines, sure, pairs)
     fell = fallen(found, matches, pairs, lines.course.length, scores, visits)
     by_line = found & ~fell
     by_line |= between(by_line, lines.match, lines.course) & (matches.match == lines.match)
@@ -58,11 +57,15 @@ def decide(matches: Matches, lines: Lines | None, scores: np.ndarray, visits: Vi
     return Decision(loops, by_line, fell, part, alike)
 
 
-def of_lines(matches: Matches, lines: Lines, pairs: np.ndarray) -> np.ndarray:
-    """Return the queries (Q,) with an accepted line, of enough on a stretch, and those next to them above chance."""
+def of_lines(matches: Matches, lines: Lines, sure: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Return the queries (Q,) with an accepted line, of enough on a stretch, and those next to them above chance.
+
+    A stretch has enough if these are as many as a line has steps, or one of them is ``sure`` (Q,) by its points: lines
+    of neighbors share their steps, so one line by chance is a stretch of nearly its own length.
+    """
     found = np.zeros_like(matches.line)
     for queries in stretches(matches.line, pairs):
-        found[queries] = len(queries) >= LENGTHS[0] or matches.verified[queries].any()
+        found[queries] = len(queries) >= lines.course.length or sure[queries].any()
     return grown(found, lines.above_decoys & (matches.match == lines.match), pairs)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from loopclosure.detector.decision import LoopResult
-from loopclosure.detector.verification import SURE
+from loopclosure.lines.points import SURE, SURE_AMONG_ALIKE
 from loopclosure.methods.candidates import Candidates
 from loopclosure.methods.decision import Decision
 from loopclosure.methods.geometry import Geometry, Matches
@@ -40,12 +40,11 @@ def verification(matches: Matches, geometry: Geometry | None) -> str:
 def doubts(matches: Matches, decision: Decision) -> list[str]:
     """Return what makes places hard to tell apart here."""
     said = list[str]()
-    if decision.alike:
-        nothing = "no image is accepted by its points alone" if decision.loops.any() else "nothing is accepted"
+    if decision.alike and (part := np.count_nonzero(decision.part)):
         said.append(
-            f"places look alike here: in {np.count_nonzero(decision.part)} of "
-            f"{np.count_nonzero(matches.evidence >= SURE)} matches with enough points that agree, many others do not, "
-            f"so {nothing}; --odometry tells such places apart"
+            f"places look alike here: in {part} of {np.count_nonzero(matches.evidence >= SURE)} matches with enough "
+            f"points that agree, many others do not, so an image needs {SURE_AMONG_ALIKE:g} times the points that "
+            "chance explains; --odometry tells such places apart"
         )
     if fell := np.count_nonzero(decision.fell):
         said.append(f"{fell} matches of sequences are not accepted, because their points speak against them")

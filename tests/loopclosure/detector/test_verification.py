@@ -101,11 +101,12 @@ def test_geometry_is_checked_last(tmp_path, check):
     [
         (Agreement(36, 28, 20), "not verified"),  # the windows of a facade repeat
         (Agreement(60, 32, 20), "not verified"),  # most of the points that match disagree
-        (Agreement(40, 32, 20), "accepted"),
+        (Agreement(60, 48, 20), "not verified"),  # enough, but of places that may look alike more is asked
+        (Agreement(60, 52, 20), "accepted"),
     ],
 )
 def test_an_online_loop_needs_more_points_than_rule_out_chance(check, monkeypatch, found, verdict):
-    """1.5 times as many, and 70 % of those that match, as `detect` does."""
+    """2.5 times as many until enough frames agree as a whole, and 70 % of those that match."""
     monkeypatch.setattr(GeometricCheck, "agreement", lambda *_: found)
     detector = LoopDetector(lambda image: np.ones(2), exclude_recent=0, check=check)
     detector.add(wall(0))
@@ -113,8 +114,8 @@ def test_an_online_loop_needs_more_points_than_rule_out_chance(check, monkeypatc
     assert (result.verdict, result.inliers) == (verdict, found.inliers)
 
 
-def test_online_nothing_is_accepted_where_places_look_alike(check, monkeypatch, tmp_path):
-    """More than a quarter agrees only in part: a frame that agrees as a whole is no loop either, also after loading."""
+def test_online_more_points_are_needed_where_places_look_alike(check, monkeypatch, tmp_path):
+    """More than a quarter agrees only in part: 1.8 times as many as needed are not enough, also after loading."""
     found = Agreement(60, 36, 20)
     monkeypatch.setattr(GeometricCheck, "agreement", lambda *_: found)
     detector = LoopDetector(lambda image: np.ones(2), exclude_recent=0, check=check)
@@ -127,9 +128,12 @@ def test_online_nothing_is_accepted_where_places_look_alike(check, monkeypatch, 
     detector.save(tmp_path / "d.npz")
     found = Agreement(40, 36, 20)
     for one in (detector, LoopDetector.load(tmp_path / "d.npz", detector.describe)):
-        results = [one.add(wall(number)) for number in range(8)]
-        assert results[0].reason.startswith("places look alike")
-        assert [bool(result) for result in results] == [False] * 6 + [True] * 2
+        results = [one.add(wall(number)) for number in range(14)]
+        assert results[0].reason.startswith("places may look alike")
+        accepted = [bool(result) for result in results]
+        assert accepted == sorted(accepted)
+        assert True in accepted[6:]
+        assert not any(accepted[:6])
 
 
 @pytest.mark.parametrize("camera", [{}, {"focal_px": 260.0, "center_x_px": 160.0, "center_y_px": 120.0}])
