@@ -23,7 +23,6 @@ EXTRAS = {
     "plyvel_next",
     "skimage",
     "pydot",
-    "fissix",
     "tensorboard",
 }
 SCRIPTS = Path(sys.executable).parent

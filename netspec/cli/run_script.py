@@ -9,12 +9,12 @@ from pathlib import Path
 
 from netspec.cli.arguments import add_limit, add_plugin
 from netspec.files.limits import LIMIT
-from netspec.terminal.commands import WrongUsage, refuse
+from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import VARIABLE
 from netspec.terminal.parser import NO_LOG, Commands
 
 NAME = "run"
-_WITH_VALUE = ("--plugin", "--write-py3", "--minloglevel", "--limit")
+_WITH_VALUE = ("--plugin", "--minloglevel", "--limit")
 
 
 def add_commands(commands: Commands) -> None:
@@ -39,28 +39,17 @@ def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
 def _add_run(commands: Commands) -> None:
     parser = commands.add_parser(
         NAME,
-        help="run a Python script in which `import caffe` imports netspec",
+        help="run a Python 3 script in which `import caffe` imports netspec",
         usage="netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]",
     )
     parser.set_defaults(function=_run, **NO_LOG)
     add_plugin(parser)
     add_limit(parser)
-    parser.add_argument("--shadow-caffe", action="store_true", help="use netspec even if a real Caffe is installed")
-    parser.add_argument(
-        "--python2", action="store_true", help="translate from Python 2, even if the script is valid Python 3"
-    )
-    parser.add_argument(
-        "--write-py3",
-        type=Path,
-        metavar="F.py",
-        help="translate a Python 2 script, write it to this file, and run nothing",
-    )
     parser.add_argument("-m", action="store_true", help="run a module, as python -m does")
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from netspec.compat.scripts.program import Options, run_module, run_script
-    from netspec.compat.scripts.sources import write_translation
+    from netspec.compat.scripts.program import run_module, run_script
     from netspec.terminal.process import keep_freed_memory
 
     keep_freed_memory()  # most scripts train
@@ -71,18 +60,9 @@ def _run(arguments: argparse.Namespace) -> None:
         os.environ[VARIABLE] = str(arguments.minloglevel)
     if arguments.limit is not None:
         os.environ[LIMIT] = str(arguments.limit)
-    options = Options(arguments.shadow_caffe, arguments.python2)
     name, *own = arguments.program
-    if arguments.write_py3:
-        if arguments.m or arguments.shadow_caffe or own:
-            raise WrongUsage(
-                "--write-py3 translates a script and runs nothing; leave out -m, --shadow-caffe and its arguments"
-            )
-        write_translation(name, arguments.write_py3, arguments.python2)
-        return
-    if arguments.m:
-        run_module(name, own, options)
-    run_script(name, own, options)
+    run = run_module if arguments.m else run_script
+    run(name, own)
 
 
 def _add_install_caffe(commands: Commands) -> None:
@@ -90,7 +70,6 @@ def _add_install_caffe(commands: Commands) -> None:
         "install-caffe", help="put a package `caffe` and Caffe's commands into this Python environment"
     )
     parser.set_defaults(function=_install_caffe)
-    parser.add_argument("--replace", action="store_true", help="if a real Caffe is installed, move it aside")
     parser.add_argument(
         "--build",
         type=Path,
@@ -102,9 +81,7 @@ def _add_install_caffe(commands: Commands) -> None:
 def _install_caffe(arguments: argparse.Namespace) -> None:
     from netspec.compat.scripts.environment import install_caffe, make_build_folder
 
-    if arguments.build:
-        refuse(arguments, ("replace",), "is for this Python environment; leave it out with --build")
-    written = make_build_folder(arguments.build) if arguments.build else install_caffe(arguments.replace)
+    written = make_build_folder(arguments.build) if arguments.build else install_caffe()
     for path in written:
         print(f"{path}: written")
     if arguments.build:

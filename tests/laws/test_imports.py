@@ -39,7 +39,7 @@ def test_importing_does_not_import_torch(module: str) -> None:
 BASE = {"errors", "log", "files", "terminal"}
 OURS = ("netspec", "loopclosure", "lmdb_build")
 STANDARD = {*sys.stdlib_module_names, "typing_extensions"} - {"argparse"}
-LIBRARIES = {"cv2": "OpenCV", "google": "protobuf", "sklearn": "scikit-learn", "PIL": "Pillow"}
+LIBRARIES = {"cv2": "OpenCV", "google": "protobuf", "sklearn": "scikit-learn"}
 
 
 def package_of(module: str) -> str:

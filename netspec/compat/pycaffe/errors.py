@@ -61,7 +61,7 @@ def _caffes_words(fault: SpecError) -> str | None:
     return _WORDS[fault.code].format(*fault.details, **known) if fault.code in _WORDS else None
 
 
-DISTRIBUTIONS = {"skimage": "scikit-image", "pydot": "pydot", "fissix": "fissix"}
+DISTRIBUTIONS = {"skimage": "scikit-image", "pydot": "pydot"}
 
 
 def load(module: str, extra: str, purpose: str) -> Any:

@@ -1,9 +1,8 @@
-"""Ordered dictionaries by name, with the methods that scripts in Python 2 use."""
+"""Ordered dictionaries by name."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
 from typing import Any, TypeVar
 
 from netspec.errors import did_you_mean
@@ -25,19 +24,3 @@ class Named(OrderedDict[str, T]):
 
     def __reduce__(self) -> Any:
         return Named, (self.what, list(self.items()))
-
-    def has_key(self, name: str) -> bool:
-        """Return whether the name exists."""
-        return name in self
-
-    def iterkeys(self) -> Iterator[str]:
-        """Return an iterator over the names."""
-        return iter(self.keys())
-
-    def itervalues(self) -> Iterator[T]:
-        """Return an iterator over the values."""
-        return iter(self.values())
-
-    def iteritems(self) -> Iterator[tuple[str, T]]:
-        """Return an iterator over names and values."""
-        return iter(self.items())

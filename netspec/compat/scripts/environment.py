@@ -11,22 +11,23 @@ import shutil
 import sys
 import sysconfig
 from contextlib import suppress
+from importlib.machinery import PathFinder
 from pathlib import Path
 
-from netspec.compat.scripts.finder import MARK, NAME, real_caffe
+from netspec.compat.scripts.finder import NAME
 from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
 
-_PACKAGE = f'''{MARK}: written by `netspec install-caffe`, removed by `netspec remove-caffe`.
+_MARK = "# netspec as caffe: written by `netspec install-caffe`, removed by `netspec remove-caffe`."
+_PACKAGE = f'''{_MARK}
 """Caffe's Python interface, which netspec provides."""
 
-import importlib
 import sys
 
 from netspec.compat.scripts import finder
 
 finder.install()
-sys.modules[__name__] = importlib.import_module(finder.HOME)
+sys.modules[__name__] = finder.package()
 '''
 _NETSPEC, _BUILD = "netspec.cli", "lmdb_build.cli"
 _COMMANDS: dict[str, tuple[str, list[str]]] = {
@@ -44,49 +45,36 @@ _EXAMPLES: dict[str, tuple[str, list[str]]] = {  # in the build folder only
     "examples/cifar10/convert_cifar_data": (_BUILD, ["cifar"]),
 }
 _WINDOWS = sys.platform == "win32"
-_ASIDE = ".before-netspec"  # suffix of files that are in the way, while ours are installed
 
 
-def install_caffe(replace: bool = False) -> list[Path]:
-    """Write the package and the commands; return the paths. Files that are in the way are renamed.
+def install_caffe() -> list[Path]:
+    """Write the package and the commands; return the paths.
 
-    Raises SpecError if a real Caffe or a command of one of these names exists, unless ``replace``, and OSError if the
-    environment cannot be written to.
+    Raises SpecError if another Caffe or a command of one of these names exists, and OSError if the environment cannot
+    be written to.
     """
     paths = {_package(): _PACKAGE} | {_script(name): _command(*command) for name, command in _COMMANDS.items()}
-    in_the_way = [str(path) for path in paths if path.exists() and not _is_ours(path)]
-    real = real_caffe()
-    if real and real not in in_the_way:
-        in_the_way.append(real)
-    if in_the_way and not replace:
-        there = ", ".join(in_the_way)
-        raise SpecError(f"{there}: already exists and is not netspec's; use --replace to move it aside")
+    found = PathFinder.find_spec(NAME)
+    imported = [Path(found.origin)] if found is not None and found.origin else []  # a mere folder has no origin
+    there = [str(path) for path in dict.fromkeys([*imported, *paths]) if path.exists() and not _is_ours(path)]
+    if there:
+        raise SpecError(f"{', '.join(there)}: already exists and is not netspec's; remove it first")
     for path, text in paths.items():
-        owner = path.parent if path.name == "__init__.py" else path
-        if owner.exists() and not _is_ours(path):
-            owner.rename(owner.with_name(owner.name + _ASIDE))
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, text)
-        if owner is path:
+        if path != _package():
             path.chmod(0o755)
     return list(paths)
 
 
 def remove_caffe() -> list[Path]:
-    """Remove what :func:`install_caffe` wrote, and restore the files that it renamed; return the removed paths."""
-    removed = []
-    for path in (_package(), *map(_script, _COMMANDS)):
-        owner = path.parent if path.name == "__init__.py" else path
-        if not _is_ours(path):
-            continue
-        if owner is path:
-            path.unlink()
+    """Remove what :func:`install_caffe` wrote; return the removed paths."""
+    removed = [path for path in (_package(), *map(_script, _COMMANDS)) if _is_ours(path)]
+    for path in removed:
+        if path == _package():
+            shutil.rmtree(path.parent)
         else:
-            shutil.rmtree(owner)
-        removed.append(path)
-        aside = owner.with_name(owner.name + _ASIDE)
-        if aside.exists():
-            aside.rename(owner)
+            path.unlink()
     return removed
 
 
@@ -140,7 +128,7 @@ def _command(module: str, words: list[str]) -> str:
     # On Windows the first line is a batch file that runs the other lines with Python, which skips the first (-x).
     first = f'@"{sys.executable}" -x "%~f0" %* & exit /b' if _WINDOWS else f"#!{sys.executable}"
     return f"""{first}
-{MARK}: written by `netspec install-caffe`, removed by `netspec remove-caffe`.
+{_MARK}
 import sys
 
 from netspec.terminal.main import program
@@ -154,4 +142,4 @@ def _is_ours(path: Path) -> bool:
         first = path.read_text("utf-8", errors="replace").splitlines()[:2]  # a command's first names Python
     except OSError:
         return False
-    return any(line.startswith(MARK) for line in first)
+    return any(line.startswith(_MARK) for line in first)

@@ -196,7 +196,7 @@ class Python(Layer):
 def _describe(fault: Exception) -> str:
     """Return the exception's class, text and position in one line."""
     if isinstance(fault, SyntaxError):
-        remedy = "if it is Python 2, translate it with `netspec run --python2 -m netspec train ...`"
+        remedy = "if it is Python 2, convert it with `fissix -w`, then check each / between whole numbers"
         return f"{type(fault).__name__}: {fault.msg} ({fault.filename}:{fault.lineno}); {remedy}"
     frames = traceback.extract_tb(fault.__traceback__)
     of_user = [frame for frame in frames if not frame.filename.startswith(_not_of_user())]

@@ -217,9 +217,7 @@ def test_python_2_syntax_is_reported_with_file_line_and_advice(python, tmp_path:
         python("Mine", (2,), module="of_2014")
     text = str(fault.value)
     assert "SyntaxError: " in text
-    assert text.endswith(
-        "of_2014.py:2); if it is Python 2, translate it with `netspec run --python2 -m netspec train ...`"
-    )
+    assert "of_2014.py:2); if it is Python 2, convert it with `fissix -w`" in text
 
 
 FAULTY = """

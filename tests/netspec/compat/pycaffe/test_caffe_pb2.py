@@ -10,7 +10,7 @@ from google.protobuf import descriptor_pool, text_format
 
 from netspec.compat.pycaffe.net_spec import layers, params
 from netspec.compat.pycaffe.proto import caffe_pb2
-from netspec.compat.scripts import old_names
+from netspec.compat.scripts.program import advice_on_dialects
 from netspec.dialects import known, use_dialect
 from netspec.proto import schema
 
@@ -117,6 +117,6 @@ def test_an_error_names_the_dialect_that_has_a_name(line: str, name: str) -> Non
     names = {"caffe_pb2": caffe_pb2, "L": layers, "P": params, "text_format": text_format}
     with pytest.raises(Exception, match=r"ha(s|ve) no ") as caught:
         eval(line, names)
-    said = f"{caught.value}; {old_names.remedy(caught.value)}"
+    said = f"{caught.value}; {advice_on_dialects(caught.value)}"
     assert f'dialect "ssd" has "{name}"; add --plugin ssd' in said
     assert "did you mean" not in said

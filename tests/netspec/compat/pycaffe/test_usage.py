@@ -68,10 +68,8 @@ class X(caffe.Layer):
     "net.outputs": "assert net.outputs == ['prob']",
     "net.inputs": "assert net.inputs == ['data']",
     ".top_names": "assert net.top_names['pool1'] == ['pool1']",
-    "net.params.has_key()": "assert net.params.has_key('conv1') and not net.params.has_key('conv9')",
     ".solve(..)": "solver.solve(); assert solver.iter == 3",
     "solver.iter": "assert solver.iter == 0",
-    "net.params.iteritems()": "assert [name for name, _ in net.params.iteritems()] == ['conv1', 'fc2']",
     ".set_input_arrays(..)": """
 memory = caffe.Net('memory.prototxt', caffe.TRAIN)
 memory.set_input_arrays(np.ones((4, 1, 2, 3), np.float32), np.float32([0, 1, 2, 0]))
@@ -83,7 +81,6 @@ assert memory.blobs['label'].data.tolist() == [2, 0]
     "net.blobs[..].data.copy": "a = net.blobs['data'].data.copy(); a += 1; assert not net.blobs['data'].data.any()",
     ".forward_all(**)": "assert net.forward_all(**{net.inputs[0]: images})['prob'].shape == (5, 5)",
     ".forward(**)": "assert net.forward(**{net.inputs[0]: image})['prob'].shape == (2, 5)",
-    "net.blobs.iteritems()": "assert [name for name, _ in net.blobs.iteritems()][0] == 'data'",
     "net.params[..][i].data.flat": """
 net.params['fc2'][0].data.flat = np.arange(20)
 assert net.params['fc2'][0].data[1, 0] == 4
@@ -96,7 +93,6 @@ assert net.params['fc2'][0].data[1, 0] == 4
     "caffe._caffe.BlobVec": """
 import netspec.compat.pycaffe._caffe as _caffe; assert isinstance(net.params['fc2'], _caffe.BlobVec)
 """,
-    "net.params.iterkeys()": "assert list(net.params.iterkeys()) == ['conv1', 'fc2']",
     "net.blobs[..].num": "b = net.blobs['data']; assert (b.num, b.channels, b.height, b.width) == (2, 3, 12, 12)",
     ".forward(pos)": "assert sorted(net.forward(['pool1'])) == ['pool1', 'prob']",
     "net.blobs[..].diff read": "net.forward(); net.backward(prob=ones); net.blobs['data'].diff.reshape(2, -1)",

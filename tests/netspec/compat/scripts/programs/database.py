@@ -10,12 +10,12 @@ with env.begin() as txn:
         datum.ParseFromString(value)
         data = caffe.io.datum_to_array(datum)
         labels.setdefault(datum.label, []).append(data.mean())
-for label, means in sorted(labels.iteritems()):
-    print label, len(means), '%.3f' % np.mean(means)
+for label, means in sorted(labels.items()):
+    print(label, len(means), '%.3f' % np.mean(means))
 blob = caffe_pb2.BlobProto()
 blob.ParseFromString(caffe.io.array_to_blobproto(np.ones((1, 3, 2, 2))).SerializeToString())
-print np.array(caffe.io.blobproto_to_array(blob)).shape
+print(np.array(caffe.io.blobproto_to_array(blob)).shape)
 net = caffe_pb2.NetParameter()
 layer = net.layer.add(); layer.name, layer.type = 'a', 'ReLU'
 layer.top.append('a'); layer.bottom.append('a')
-print str(net).split()
+print(str(net).split())

@@ -27,7 +27,7 @@ class Detection:
         names = dict((item.label, item.display_name) for item in self.labelmap.item)
         for row in found[0, 0]:
             if row[2] >= threshold:
-                print '%s %.5f %.5f' % (names[int(row[1])], row[2], row[3])
+                print('%s %.5f %.5f' % (names[int(row[1])], row[2], row[3]))
 
 image = np.load('image.npy')
 Detection(0, 'deploy.prototxt', 'x.caffemodel', 32, 'labelmap.prototxt').detect(image, 0.85)
