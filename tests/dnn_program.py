@@ -41,7 +41,6 @@ def _about(net: Any, sizes: list[list[list[int]]]) -> dict[str, np.ndarray]:
     names = net.getLayerNames()
     shapes = sizes[-1]
     ids, ins, outs = net.getLayersShapes(shapes)
-    costs = [[net.getFLOPS(i, shapes), *net.getMemoryConsumption(i, shapes)] for i in range(len(names) + 1)]
     layers = [net.getLayer(i) for i in range(len(names) + 1)]
     return {
         "names": np.array(names),
@@ -53,8 +52,6 @@ def _about(net: Any, sizes: list[list[list[int]]]) -> dict[str, np.ndarray]:
         "numbers": np.array([net.getLayerId(name) for name in (*names, "_input", "no such layer")]),
         "ids": np.array(ids),
         "shapes": np.array(json.dumps([_lists(ins), _lists(outs)])),
-        "costs": np.array(costs),
-        "total": np.array([net.getFLOPS(shapes), *(net.getMemoryConsumption(shapes[0]) if len(shapes) == 1 else ())]),
         "blobs": np.array(json.dumps([[list(blob.shape) for blob in layer.blobs] for layer in layers])),
         "first_weights": net.getParam(1 if layers[1].blobs else 2, 0),
     }

@@ -22,7 +22,6 @@ EXTRAS = {
     "plyvel",
     "plyvel_next",
     "skimage",
-    "pydot",
     "tensorboard",
 }
 SCRIPTS = Path(sys.executable).parent

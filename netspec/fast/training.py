@@ -99,8 +99,6 @@ class TrainingStep:
         self._blobs = blobs_of(layers)
         self._made: dict[Any, _Prepared] = {}  # by shapes, and by the blobs that learn
         self._values: Values = []
-        self.keeps = False  # whether to keep in ``passed`` the values and gradients of the last run
-        self.passed: tuple[Values, Values] | None = None
 
     def is_watched(self) -> bool:
         """Return whether this class must not run the net.
@@ -166,7 +164,6 @@ class TrainingStep:
                     if v >= 0 and diff is not None:
                         diffs[v] = diff if diffs[v] is None else diffs[v] + diff
         self._values = []
-        self.passed = (values, diffs) if self.keeps else None
         outputs = {name: values[v].clone() for name, v in self._plan.outputs.items()}
         return torch.zeros(()) if loss is None else loss, outputs
 

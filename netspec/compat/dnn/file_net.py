@@ -1,19 +1,16 @@
-"""Describes a net without running it: its layers, their shapes and costs.
+"""Describes a net without running it: its layers and their shapes.
 
 OpenCV: modules/dnn/src/net_impl.cpp (4.12)
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from netspec.compat.dnn.caffe_files import CaffeFiles
-from netspec.compat.dnn.costs import operations
 from netspec.compat.dnn.errors import BAD_ARGUMENT, NOT_FOUND, DnnError, as_dnn_error
 from netspec.compat.dnn.table import INPUT, Entry, make_table, nodes_of
 from netspec.errors import Where, did_you_mean
@@ -44,14 +41,6 @@ class FileNet:
             with as_dnn_error("readNetFromCaffe"):
                 _ = self.net
 
-    def for_arguments(
-        self, func: str, arguments: Sequence[Any], named: Mapping[str, Any]
-    ) -> tuple[CaffeNet, list[Entry]]:
-        """Return the net for the shapes in the arguments of a method, and the layer in them, or all layers."""
-        shapes = named.get("netInputShapes", named.get("netInputShape", arguments[-1] if arguments else None))
-        layer = named.get("layerId", arguments[0] if len(arguments) > 1 else None)
-        return self.shaped(shapes, func), self.table if layer is None else [self.entry(layer, func)]
-
     def shaped(self, given: Any, func: str) -> CaffeNet:
         """Return the net, built without values, for inputs of these shapes: one shape, or one for each input."""
         self.check_not_empty(func)
@@ -78,15 +67,6 @@ class FileNet:
         if entry.type == "Convolution":
             return [layer.bottom_shapes[entry.top]], [layer.top_shapes[entry.top]]
         return layer.bottom_shapes, layer.top_shapes
-
-    def operations(self, net: CaffeNet, entry: Entry) -> int:
-        """Return the number of operations of a layer in a forward pass."""
-        if entry.name == INPUT or entry.top > 0:
-            return 0
-        layer = self.layer(net, entry)
-        if layer.type == "Axpy":
-            return (2 if entry.top < 0 else 1) * sum(math.prod(shape) for shape in self.shapes(net, entry)[0])
-        return operations(layer)
 
     # The net behind it
 

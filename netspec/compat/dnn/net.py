@@ -5,7 +5,6 @@ OpenCV: modules/dnn/src/net_impl.cpp (4.12)
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
@@ -17,15 +16,16 @@ import torch
 from netspec.compat.dnn.caffe_files import CaffeFiles
 from netspec.compat.dnn.errors import BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED, UNSPECIFIED, DnnError, as_dnn_error
 from netspec.compat.dnn.file_net import FileNet
-from netspec.compat.dnn.table import INPUT, Entry, graph_of, unconnected
+from netspec.compat.dnn.table import INPUT, Entry, unconnected
 from netspec.files.opencv import cv2
-from netspec.files.whole_file import write_whole
 from netspec.layers.contract.base import Shape
 from netspec.net.net import Net as CaffeNet
 from netspec.run.walk import Step, walk
 
 Array = np.ndarray
 AS_WRITTEN = "{} cannot change a net of Caffe's files; write the layer into the prototxt"
+PICTURE = "{} is not supported; netspec draw shows the layers, shapes and connections"
+COSTS = "{} is not supported; netspec check shows multiply-adds and memory"
 
 
 class Layer:
@@ -93,23 +93,7 @@ class Net:
         """Return the names of the layers whose tops no other layer reads."""
         return tuple(self._caffe.table[number].name for number in self.getUnconnectedOutLayers())
 
-    def dump(self) -> str:
-        """Return the layers, the shapes of their tops, and their connections as a Graphviz graph."""
-        self._caffe.check_not_empty("dump")
-        assert self._caffe.files is not None
-        given = {key: value.shape for key, value in self._caffe.values.items()}
-        with as_dnn_error("dump"):
-            net = self._caffe.files.build(given, "meta")
-        return graph_of(
-            self._caffe.files.net, self._caffe.table, [self._caffe.shapes(net, entry)[1] for entry in self._caffe.table]
-        )
-
-    def dumpToFile(self, path: str) -> None:
-        """Write :meth:`dump` to a file."""
-        with as_dnn_error("dumpToFile"):
-            write_whole(path, self.dump())
-
-    # Shapes and costs
+    # Shapes
 
     def getLayersShapes(self, netInputShapes: Any) -> tuple[Array, tuple[Any, ...], tuple[Any, ...]]:
         """Return the numbers of all layers and the shapes of their bottoms and tops, for inputs of these shapes."""
@@ -123,19 +107,6 @@ class Net:
         net = self._caffe.shaped(netInputShape, "getLayerShapes")
         bottoms, tops = self._caffe.shapes(net, self._caffe.entry(layerId, "getLayerShapes"))
         return _arrays(bottoms), _arrays(tops)
-
-    def getFLOPS(self, *arguments: Any, **named: Any) -> int:
-        """Return the operations of a pass: ``getFLOPS(shapes)``, or of one layer: ``getFLOPS(number, shapes)``."""
-        net, entries = self._caffe.for_arguments("getFLOPS", arguments, named)
-        return sum(self._caffe.operations(net, entry) for entry in entries)
-
-    def getMemoryConsumption(self, *arguments: Any, **named: Any) -> tuple[int, int]:
-        """Return the bytes of weights and of tops, of all layers or of one; arguments as for :meth:`getFLOPS`."""
-        net, entries = self._caffe.for_arguments("getMemoryConsumption", arguments, named)
-        owners = [entry for entry in entries if entry.name != INPUT and entry.top <= 0]
-        weights = sum(blob.numel() for entry in owners for blob in self._caffe.layer(net, entry).blobs)
-        tops = [shape for entry in entries for shape in self._caffe.shapes(net, entry)[1]]
-        return 4 * weights, 4 * sum(map(math.prod, tops))
 
     # Its parameters
 
@@ -324,6 +295,10 @@ class Net:
         "quantize",
         "quantizing Caffe nets is not supported; export the net to ONNX (netspec export) and quantize that",
     )
+    dump = _refused("dump", PICTURE)
+    dumpToFile = _refused("dumpToFile", PICTURE)
+    getFLOPS = _refused("getFLOPS", COSTS)
+    getMemoryConsumption = _refused("getMemoryConsumption", COSTS)
     forwardAsync = _refused("forwardAsync", "forwardAsync is not supported; use forward")
     getInputDetails = _refused("getInputDetails", "the net is not quantized", UNSPECIFIED)
     getOutputDetails = _refused("getOutputDetails", "the net is not quantized", UNSPECIFIED)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from netspec.graph.plan import Plan
-from netspec.layers.contract.base import Shape
 from netspec.proto.schema import LayerParameter, NetParameter
 
 INPUT = "_input"
@@ -82,21 +81,6 @@ def unconnected(net: NetParameter, table: Sequence[Entry]) -> list[int]:
     """Return the numbers of the layers whose tops no other layer reads."""
     read = {number for number, _ in edges(net, table)}
     return [number for number in range(len(table)) if number not in read]
-
-
-def graph_of(net: NetParameter, table: Sequence[Entry], tops: Sequence[Sequence[Shape]]) -> str:
-    """Return the layers and their connections as a Graphviz graph; ``tops`` has the shapes of each layer's tops."""
-    lines = ["digraph G {"]
-    for entry, shapes in zip(table, tops, strict=True):
-        sizes = "".join(f"output: {' x '.join(map(str, shape))}\\l" for shape in shapes)
-        label = "\\n".join([entry.name, entry.type, sizes] if entry.type else [entry.name, sizes])
-        lines.append(f"\t{_quoted(entry.name)} [label={_quoted(label)} shape=box]")
-    lines += [f"\t{_quoted(table[a].name)} -> {_quoted(table[b].name)}" for a, b in edges(net, table)]
-    return "\n".join([*lines, "}\n"])
-
-
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '\\"') + '"'
 
 
 def nodes_of(plan: Plan, net: NetParameter) -> list[int]:

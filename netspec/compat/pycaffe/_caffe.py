@@ -6,15 +6,9 @@ from netspec.compat.pycaffe.mode import (
     set_device,
     set_mode_cpu,
     set_mode_gpu,
-    set_multiprocess,
     set_random_seed,
-    set_solver_count,
-    set_solver_rank,
-    solver_count,
-    solver_rank,
 )
 from netspec.compat.pycaffe.net import Net
-from netspec.compat.pycaffe.parallel import NCCL, Timer, has_nccl
 from netspec.compat.pycaffe.solver import (
     AdaDeltaSolver,
     AdaGradSolver,

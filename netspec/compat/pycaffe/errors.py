@@ -61,14 +61,10 @@ def _caffes_words(fault: SpecError) -> str | None:
     return _WORDS[fault.code].format(*fault.details, **known) if fault.code in _WORDS else None
 
 
-DISTRIBUTIONS = {"skimage": "scikit-image", "pydot": "pydot"}
-
-
-def load(module: str, extra: str, purpose: str) -> Any:
-    """Import a module of an extra. Raises ImportError with one line that says what to install."""
+def load(module: str, purpose: str) -> Any:
+    """Import a module of scikit-image. Raises ImportError with one line that says what to install."""
     try:
         return importlib.import_module(module)
     except ImportError as fault:
-        name = DISTRIBUTIONS[module.partition(".")[0]]
-        message = f"{purpose} needs {name}: pip install {name}, or pip install 'netspec-caffe[{extra}]'"
+        message = f"{purpose} needs scikit-image: pip install scikit-image, or pip install 'netspec-caffe[pycaffe]'"
         raise ImportError(message) from fault

@@ -197,8 +197,8 @@ def load_image(filename: Any, color: bool = True) -> Array:
 
     Needs the extra ``pycaffe``.
     """
-    skimage = errors.load("skimage", "pycaffe", "caffe.io.load_image")
-    reading = errors.load("skimage.io", "pycaffe", "caffe.io.load_image")
+    skimage = errors.load("skimage", "caffe.io.load_image")
+    reading = errors.load("skimage.io", "caffe.io.load_image")
     image = skimage.img_as_float(reading.imread(filename, as_gray=not color)).astype(np.float32)
     if image.ndim == 2:
         image = image[:, :, np.newaxis]
@@ -225,7 +225,7 @@ def resize_image(im: Array, new_dims: Extents, interp_order: int = 1) -> Array:
     if interp_order == 1 and unit.dtype in (np.float32, np.float64):
         resized = _bilinear(unit, height, width)
     else:
-        transform = errors.load("skimage.transform", "pycaffe", "caffe.io.resize_image")
+        transform = errors.load("skimage.transform", "caffe.io.resize_image")
         resized = transform.resize(unit, (height, width), order=interp_order, mode="constant", anti_aliasing=False)
     return (resized * (high - low) + low).astype(np.float32)
 
@@ -280,8 +280,8 @@ def __getattr__(name: str) -> Any:
 
         return zoom
     if name == "resize":
-        return errors.load("skimage.transform", "pycaffe", "caffe.io.resize").resize
+        return errors.load("skimage.transform", "caffe.io.resize").resize
     if name == "skimage":
-        errors.load("skimage.io", "pycaffe", "caffe.io.skimage")
-        return errors.load("skimage", "pycaffe", "caffe.io.skimage")
+        errors.load("skimage.io", "caffe.io.skimage")
+        return errors.load("skimage", "caffe.io.skimage")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""Settings for all nets built from now on: the device, the seed, and the rank of this process.
+"""Settings for all nets built from now on: the device, the seed, and which sums are exact.
 
 Caffe: class Caffe (include/caffe/common.hpp)
 """
@@ -26,9 +26,6 @@ class _Mode:
     seed: int | None = None
     nets: int = 0  # nets built since the seed was set
     exact: str = SMALL
-    multiprocess: bool = False
-    solver_count: int = 1
-    solver_rank: int = 0
     draws: weakref.WeakSet[Random] = field(default_factory=weakref.WeakSet)
 
 
@@ -75,12 +72,6 @@ def next_seed() -> int | None:
     return _mode.seed + _mode.nets - 1
 
 
-def solver_seed() -> int | None:
-    """Return the seed of the next solver. Parallel processes need the same one, for the same order of records."""
-    seed = next_seed()
-    return 0 if seed is None and multiprocess() else seed
-
-
 def follow_seed(random: Random) -> None:
     """Restart the random numbers of a net whenever a seed is set."""
     _mode.draws.add(random)
@@ -105,38 +96,3 @@ def build_options() -> BuildOptions:
     return BuildOptions(
         str(device()), next_seed(), allow_python=True, exact=_mode.exact, accumulate_in_place=True, speed=speed()
     )
-
-
-def set_multiprocess(value: bool) -> None:
-    """Set whether several processes train in parallel."""
-    _mode.multiprocess = bool(value)
-
-
-def multiprocess() -> bool:
-    """Return whether several processes train in parallel."""
-    return _mode.multiprocess and _mode.solver_count > 1
-
-
-def set_solver_count(count: int) -> None:
-    """Set the number of solvers that train in parallel."""
-    _mode.solver_count = int(count)
-
-
-def set_solver_rank(rank: int) -> None:
-    """Set the rank of this process among the parallel solvers; 0 is the root."""
-    _mode.solver_rank = int(rank)
-
-
-def solver_count() -> int:
-    """Return the number of solvers that train in parallel."""
-    return _mode.solver_count
-
-
-def solver_rank() -> int:
-    """Return the rank of this process among the parallel solvers."""
-    return _mode.solver_rank
-
-
-def root_solver() -> bool:
-    """Return whether this process has the root solver."""
-    return _mode.solver_rank == 0

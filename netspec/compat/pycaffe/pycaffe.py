@@ -1,7 +1,6 @@
 """The names of ``caffe.pycaffe``."""
 
 from netspec.compat.pycaffe.net import Net
-from netspec.compat.pycaffe.parallel import NCCL, Timer
 from netspec.compat.pycaffe.solver import (
     AdaDeltaSolver,
     AdaGradSolver,

@@ -19,7 +19,6 @@ from netspec.compat.pycaffe import mode
 from netspec.compat.pycaffe.debug import debug_info
 from netspec.compat.pycaffe.errors import caffes_errors
 from netspec.compat.pycaffe.net import FilePath, Net
-from netspec.compat.pycaffe.whole import WholeRun
 from netspec.graph.options import BuildOptions
 from netspec.graph.speed import speed
 from netspec.layers.utility.python import Python
@@ -27,7 +26,6 @@ from netspec.net import net as core
 from netspec.proto.source_map import Position
 from netspec.proto.text import parse_solver
 from netspec.solver import solver as core_solver
-from netspec.solver.nets import TRAIN_NET
 from netspec.solver.options import TrainingOptions
 from netspec.solver.training import Callback
 from netspec.solver.update import rule_faults
@@ -46,23 +44,10 @@ class _Training(core_solver.Solver):
         super().__init__(*arguments, **options)
         self.shown = {net: Net.of(net) for net in (self.net, *self.test_nets)}
         self.net.largest_trained = math.inf  # blobs keep all tops anyway
-        self._whole: WholeRun | None = None  # set after the first pass, if it is possible
         self.is_watched = bool(self.net.inputs) or any(
             isinstance(layer, Python) or any(top is not None for top in layer.filled_once())
             for layer in self.net.layers
         )
-
-    @property
-    @override
-    def is_root(self) -> bool:
-        return mode.root_solver()
-
-    @override
-    def build(self, filtered: Any, role: str, device: torch.device, rank: int = 0, ranks: int = 1) -> core.Net:
-        if role == TRAIN_NET and mode.multiprocess():
-            rank, ranks = mode.solver_rank(), mode.solver_count()
-            role = f"rank {rank}" if rank else role
-        return super().build(filtered, role, device, rank, ranks)
 
     @override
     def check_inputs(self) -> None:
@@ -78,17 +63,11 @@ class _Training(core_solver.Solver):
     def forward_backward(self, to_come: int) -> tuple[torch.Tensor, Outputs]:
         """Run forward and backward. The blobs are filled in the last pass of several, and if ``is_watched``."""
         runner = self.shown[self.net].runner
-        if not self.is_watched and not self.param.debug_info:
-            passed = None
-            if self._whole:
-                passed = self._whole.run()
-            elif to_come:
-                passed = self.net.forward_backward()
-            if passed:
-                return passed
+        is_seen = not to_come or self.is_watched or self.param.debug_info
+        if not is_seen and (passed := self.net.forward_backward()):
+            return passed
         loss, outputs = self.forward(self.net)
         runner.backward(len(self.net.layers) - 1, 0)
-        self._whole = WholeRun(runner) if WholeRun.suits(runner) else None
         return loss, outputs
 
     @override
@@ -150,7 +129,7 @@ class Solver:
 
     def _build(self, param: Any, node: Position) -> None:
         with caffes_errors():
-            build = BuildOptions(seed=mode.solver_seed(), allow_python=True, exact=mode.exact(), speed=speed())
+            build = BuildOptions(seed=mode.next_seed(), allow_python=True, exact=mode.exact(), speed=speed())
             # nan: the training continues, as in Caffe; a script may check the loss itself
             options = TrainingOptions(build, [mode.device()], nan="warn")
             self._training = _Training(param, node, options)
@@ -221,7 +200,7 @@ class Solver:
     def add_callback(self, on_start: Any, on_gradients_ready: Callable[[], object] | None = None) -> None:
         """Call two functions in each iteration: before its passes, and between them and the update.
 
-        An object with the methods ``on_start`` and ``on_gradients_ready`` may replace both, as :class:`NCCL` does.
+        An object with the methods ``on_start`` and ``on_gradients_ready`` may replace both.
         """
         self._training.is_watched = True
         if on_gradients_ready is None:

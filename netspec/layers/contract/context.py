@@ -62,11 +62,6 @@ class Random:
             self._begun.add(key)
         return self._generators[key]
 
-    @property
-    def has_drawn(self) -> bool:
-        """Whether random numbers were drawn in this part."""
-        return bool(self._begun)
-
     @contextmanager
     def undisturbed(self) -> Iterator[None]:
         """A block after which the same random numbers are drawn again."""

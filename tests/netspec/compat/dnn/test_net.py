@@ -179,11 +179,11 @@ def test_shapes_of_one_layer() -> None:
     assert [tuple(shape) for shape in (*bottoms, *tops)] == [(1, 3, 20, 28), (1, 6, 10, 14)]
 
 
-def test_computing_costs_does_not_change_the_net() -> None:
+def test_computing_shapes_does_not_change_the_net() -> None:
     net = read("detect")
     net.setInput(np.ones((1, 3, 32, 32)))
     before = net.forward()
-    net.getFLOPS([2, 3, 64, 64])
+    net.getLayersShapes([2, 3, 64, 64])
     np.testing.assert_array_equal(net.forward(), before)
 
 

@@ -1,20 +1,16 @@
-"""The module itself: layer types, modes, seeds, the log, several processes (Caffe: test_layer_type_list, test_nccl)."""
+"""The module itself: layer types, modes, seeds, the log (Caffe: test_layer_type_list)."""
 
 import importlib
-import os
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import forked
 import netspec.pycaffe as caffe
 from netspec.compat.pycaffe import mode
-from paths import ROOT
 from pycaffe_nets import SMALL
 
 pytestmark = pytest.mark.slow
@@ -54,23 +50,6 @@ def test_paths_can_be_bytes(write: Callable[..., str], tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="Could not open file nowhere"):
         caffe.Net(b"nowhere", caffe.TEST)
     assert caffe.get_solver(solver).iter == 0
-
-
-def test_each_group_of_processes_has_its_own_name() -> None:
-    assert isinstance(caffe.NCCL.new_uid(), bytes)
-    assert caffe.NCCL.new_uid() != caffe.NCCL.new_uid()
-
-
-def test_nccl_exists_if_torch_has_it() -> None:
-    assert caffe.has_nccl() == torch.distributed.is_nccl_available()
-
-
-def test_timer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("time.perf_counter", iter((1.0, 1.25)).__next__)
-    timer = caffe.Timer()
-    timer.start()
-    timer.stop()
-    assert timer.ms == 250
 
 
 def test_equal_seeds_give_equal_nets(net_of: Callable[..., caffe.Net], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,33 +103,6 @@ def test_the_log_has_glogs_format(write: Callable[..., str], tmp_path: Path) -> 
     later = script(f"import os; os.environ['GLOG_minloglevel'] = '3'; {code}", tmp_path)
     assert later.stderr == ""
     assert script(f"{code}; caffe.init_log(2); caffe.log('not this')", tmp_path).stderr.count("not this") == 0
-
-
-TWO = (Path(__file__).parent / "programs" / "two.py").read_text()
-
-
-@pytest.mark.slow
-def test_two_processes_train_one_net(write: Callable[..., str], tmp_path: Path) -> None:
-    write("""
-    layer { name: "data" type: "DummyData" top: "data" top: "wanted" dummy_data_param {
-      shape { dim: 4 dim: 3 } shape { dim: 4 dim: 1 } data_filler { type: "gaussian" std: 1 } } }
-    layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc"
-      inner_product_param { num_output: 1 weight_filler { type: "gaussian" std: 1 } } }
-    layer { name: "loss" type: "EuclideanLoss" bottom: "fc" bottom: "wanted" top: "loss" }
-    """)
-    write('net: "net.prototxt" base_lr: 0.1 lr_policy: "fixed"', "solver.prototxt")
-    uid = caffe.NCCL.new_uid()
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "GLOG_minloglevel": "2"}
-    running = [
-        subprocess.Popen(
-            [sys.executable, "-c", TWO, str(rank), uid],
-            cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        )
-        for rank in (0, 1)
-    ]  # fmt: skip
-    outputs = [process.communicate(timeout=300) for process in running]
-    assert [process.returncode for process in running] == [0, 0], outputs
-    assert outputs[0][0] == outputs[1][0] != ""
 
 
 @pytest.mark.slow

@@ -247,18 +247,8 @@ def test_prepared_steps_and_layer_by_layer_steps_give_equal_blobs(
             expected = shown(slow)
             for key, value in shown(whole).items():
                 np.testing.assert_array_equal(value, expected[key], err_msg=f"{k}: {key}")
-        assert whole._training._whole is not None
         for solver in (whole, slow):  # what a script writes counts
             next(iter(solver.net.params.values()))[0].data[...] *= 0.5
             solver.step(1)
             solver.net.forward(start=list(solver.net.layer_dict)[1])
         np.testing.assert_array_equal(whole.net.blobs[last].data, slow.net.blobs[last].data)
-
-
-def test_a_net_with_random_data_runs_layer_by_layer(write: Callable[..., str]) -> None:
-    write(SMALL)  # its data are drawn
-    solver = caffe.SGDSolver(write(SETTINGS, "solver.prototxt"))
-    solver._training.is_watched = False
-    solver.step(1)
-    solver.step(1)
-    assert solver._training._whole is None
