@@ -214,7 +214,6 @@ def _source(arguments: argparse.Namespace, labels: bool) -> Any:
 WRITTEN = {
     "onnx": "an ONNX model",
     "torch": "the source of a PyTorch module",
-    "pt2": "a torch.export archive",
     "safetensors": "weights",
 }
 EXPORT = """Write a net and its weights in another format.
@@ -222,7 +221,6 @@ EXPORT = """Write a net and its weights in another format.
 --to onnx         an ONNX model (opset 21), with dynamic batch, height and width if the net allows it;
                   weights of more than 2 GB go into a second file
 --to torch        the source of a PyTorch module, OUT.py, and its weights, OUT.safetensors
---to pt2          a torch.export archive
 --to safetensors  the weights alone: LAYER.INDEX, in Caffe's order
 
 Data layers become inputs. Give their shapes with --shape if the prototxt does not."""
@@ -231,7 +229,7 @@ Data layers become inputs. Give their shapes with --shape if the prototxt does n
 def _add_export(commands: Commands) -> None:
     parser = commands.add_parser(
         "export",
-        help="write a net as ONNX, PyTorch source, a torch.export archive or safetensors",
+        help="write a net as ONNX, PyTorch source or safetensors",
         description=EXPORT,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -7,7 +7,8 @@ of its own module, is called by :func:`call`::
     return (x - y).square().sum() / x.shape[0]
     return code.module(nn.Linear, 3, 4, state={"weight": w, "bias": b})(x.flatten(1))
 
-An expression is read by the printer of the PyTorch source (formats/source.py) and by :func:`evaluate` (formats/pt2.py).
+An expression is read by the printer of the PyTorch source (formats/source.py), and by :func:`evaluate`
+(formats/module.py).
 """
 
 from __future__ import annotations

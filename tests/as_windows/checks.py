@@ -139,10 +139,10 @@ def test_a_damaged_model_in_the_cache_is_made_again(tmp_path: Path, caplog: pyte
     def make(folder: Path) -> None:
         (folder / "model").write_bytes(b"m")
 
-    folder, _ = entry(tmp_path, "key", make)
+    folder = entry(tmp_path, "key", make)
     (folder / "model").write_bytes(b"n")
     with caplog.at_level(logging.WARNING):
-        assert entry(tmp_path, "key", make) == (folder, True)
+        assert entry(tmp_path, "key", make) == folder
     assert (folder / "model").read_bytes() == b"m"
     assert len(list(tmp_path.glob(".damaged-*"))) == 1
 

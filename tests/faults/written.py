@@ -11,7 +11,7 @@ from exported import onnx_model
 from netspec.errors import SpecError
 from netspec.export.formats.convert import blob_tensors
 from netspec.export.formats.deploy import fold
-from netspec.export.formats.pt2 import torch_module
+from netspec.export.formats.module import torch_module
 from netspec.export.formats.torch import torch_source
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions

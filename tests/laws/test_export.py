@@ -21,12 +21,12 @@ from laws.test_registry import TYPES, folder  # noqa: F401
 from netspec.dialects import use_dialect
 from netspec.dialects.files import known_files
 from netspec.errors import SpecError
-from netspec.export.engines.runners import MODEL, OpenVino
+from netspec.export.engines.model import openvino_runner
 from netspec.export.exporter import EXPORTERS, exported
 from netspec.export.exporter import refusal as refusal_of
 from netspec.export.expression import Expression, Value
 from netspec.export.formats.deploy import with_inputs
-from netspec.export.formats.pt2 import export_pt2, torch_module
+from netspec.export.formats.module import torch_module
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer, layer_class, layer_types
@@ -38,7 +38,7 @@ from netspec.proto.text import parse_net_text
 from paths import ROOT
 
 fresh = pytest.fixture(fresh_dialects)
-ONNX, TORCH = "ONNX", "PyTorch"  # pt2 is of PyTorch's form
+ONNX, TORCH = "ONNX", "PyTorch"
 BOTH = (ONNX, TORCH)
 KINDS = sorted({case.kind for case in CASES.values()})
 
@@ -136,7 +136,7 @@ def inputs_of(case: Case, net: Net) -> dict[str, np.ndarray]:
 
 
 def in_torch(net: Net, inputs: Arrays) -> list[Arrays]:
-    """Return the outputs of the source, and of the module that is archived as pt2."""
+    """Return the outputs of the source, and of the module that computes the same without source."""
     modules = [source_module(net), torch_module(net)]
     with torch.device("meta"):  # where tensors are that are made without regard to the device of the inputs
         return [run_module(module, net, inputs) for module in modules]
@@ -151,13 +151,14 @@ def in_engines(net: Net, inputs: Arrays, text: str) -> list[Arrays]:
     if importlib.util.find_spec("openvino") is None:
         return found
     with tempfile.TemporaryDirectory() as temporary:
-        (Path(temporary) / MODEL).write_bytes(model.SerializeToString())
-        runner = OpenVino(Path(temporary), "fp32")
+        path = Path(temporary) / "net.onnx"
+        path.write_bytes(model.SerializeToString())
+        run = openvino_runner(path, "fp32")
         if reason := next((words for words, part in OPENVINO_CANNOT.items() if part in text), ""):
             with pytest.raises(RuntimeError, match=reason):
-                runner.run(inputs)
+                run(inputs)
         else:
-            found.append(runner.run(inputs))
+            found.append(run(inputs))
     return [{name: each[name] for name in net.outputs} for each in found]
 
 
@@ -226,25 +227,6 @@ def test_every_layer_computes_the_same_in_each_format_or_is_refused(
         expected = {each for each in REFUSED if is_of(each, kind)}
         assert refusals == expected
         assert not [each for each in expected if not each.when and worked & set(each.targets)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", [kind for kind in TYPES if not any(is_of(each, kind) for each in REFUSED)])
-def test_every_layer_of_caffe_computes_the_same_as_an_archive(
-    kind: str,
-    folder: Path,  # noqa: F811
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(folder)
-    case = CASES[kind]
-    net = net_of(case, TEST)
-    inputs = inputs_of(case, net)
-    if net.outputs:
-        export_pt2(net, tmp_path / "net.pt2")
-        module = torch.export.load(tmp_path / "net.pt2").module()
-        assert_same(run_module(module, net, inputs), here(net, inputs))
-    net.close()
 
 
 def test_every_layer_of_caffe_has_a_case() -> None:

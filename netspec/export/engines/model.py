@@ -1,153 +1,224 @@
-"""A net that an engine runs: exported once, kept in the cache, and opened."""
+"""A net that onnxruntime or OpenVINO runs on the CPU: exported once, kept in the cache, and opened.
+
+The weights are in a file next to the model. Both libraries map it into memory instead of reading it.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import logging
+import os
+import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, cast
 
 import numpy as np
 
 from netspec import log
 from netspec.errors import SpecError
-from netspec.export.engines.cache import entry, key_of
+from netspec.export.engines.cache import entry
 from netspec.export.engines.choice import Choice
-from netspec.export.engines.runners import MODEL, RUNNERS, Arrays, Runner, Unable, open_runner, reason
-from netspec.files.paths import inside
-from netspec.files.whole_file import write_whole
-from netspec.graph.options import FP32
+from netspec.graph.options import BF16, FP32, ONNXRUNTIME, OPENVINO
 
-WARNINGS, DIFFERENCE = "warnings.txt", "bf16.txt"  # lines that are logged each time the model is opened
+MODEL, WARNINGS = "net.onnx", "warnings.txt"  # the warnings of the export, which are logged at each opening
+Arrays = Mapping[str, np.ndarray]
 Export = Callable[[Path], None]  # writes the ONNX model to a path, with its weights in the same folder
+Runner = Callable[[Arrays], dict[str, np.ndarray]]  # returns the outputs by name, for inputs by name
 
 
-@dataclass(frozen=True)
-class Origin:
-    """The origin of a net: its prototxt and weights, and the options that determine what is exported."""
+class Unable(Exception):
+    """An engine cannot run a net with the given options; the text is the reason."""
 
-    files: Sequence[str | Path]
-    options: Mapping[str, Any] = field(default_factory=dict)
+
+def warn_unable(choice: Choice, reason: str) -> None:
+    """Warn that torch runs the net instead of the chosen engine, with the reason, if any, and that it uses fp32."""
+    if reason:
+        log.logger.warning(f"engine {choice.engine}: {reason}; torch runs the net")
+    if choice.precision != FP32:
+        log.logger.warning(f"precision {choice.precision}: torch runs the net in {FP32}")
 
 
 class Model:
-    """A net, exported to an engine. If ``origin`` is None, the exported model is not kept in the cache.
+    """A net, exported to an engine, and kept in the cache by ``key`` (cache.py), unless that is empty.
 
     ``export`` is called if the cache does not have the model. Its warnings are kept, and logged again each time the
     model is opened. Raises Unable for a net that the engine cannot run, and SpecError for a file that cannot be read.
     """
 
-    def __init__(self, choice: Choice, origin: Origin | None, export: Export) -> None:
-        self.choice = choice
+    def __init__(self, choice: Choice, key: str, export: Export) -> None:
+        self._engine = choice.engine
         self._temporary: tempfile.TemporaryDirectory[str] | None = None  # if it is not in the cache
-        self.folder = self._make_folder(origin, export)
-        self._runner, precision = self._open(choice.precision)
-        self._difference_shown = precision == FP32
+        self.folder = self._make_folder(choice.cache, key, export)
+        for line in (self.folder / WARNINGS).read_text("utf-8").splitlines():
+            log.logger.warning(line)
+        self._reduced = choice.precision != FP32  # the difference from fp32 was not logged yet
+        try:
+            self._run = self._open(choice.precision)
+        except Unable as fault:
+            if not self._reduced:
+                raise
+            log.logger.warning(f"precision {choice.precision}: {fault}; {self._engine} runs it in {FP32}")
+            self._run, self._reduced = self._open(FP32), False
 
     def run(self, inputs: Arrays) -> dict[str, np.ndarray]:
-        """Return the outputs, float32 by name, for inputs by name.
+        """Return the outputs, float32 by name, for inputs by name. The first pass in bf16 logs its difference.
 
-        Raises Unable if the library fails. In bf16, the first pass measures the difference from fp32.
+        Raises Unable if the library fails.
         """
-        found = _run(self._runner, inputs)
-        if not self._difference_shown:
-            self._difference_shown = True
-            self._show_difference(inputs, found)
-        return found
+        with _unable():
+            found = self._run(inputs)
+            if self._reduced:
+                self._reduced = False
+                for name, exact in self._open(FP32)(inputs).items():
+                    worst = np.abs(found[name] - exact).max(initial=0) / (np.abs(exact).max(initial=0) or 1)
+                    log.logger.warning(f"precision bf16: {name} differs from fp32 by {worst:.1e} of its largest value")
+            return found
 
-    def _make_folder(self, origin: Origin | None, export: Export) -> Path:
+    def _open(self, precision: str) -> Runner:
+        with _unable():
+            return OPENERS[self._engine](self.folder / MODEL, precision)
+
+    def _make_folder(self, cache: Path | None, key: str, export: Export) -> Path:
         """Return the folder with the exported model: from the cache if it is there, otherwise a new one."""
-        runner = RUNNERS[self.choice.engine]
-        given = {"engine": self.choice.engine, **runner.identity()}
 
         def make(folder: Path) -> None:
-            with _warnings() as warnings:
-                _export(export, folder / MODEL)
             try:
-                runner.prepare(folder)
-            except Exception as fault:  # each library has its own exceptions
-                raise Unable(reason(fault)) from None
-            (folder / WARNINGS).write_text("\n".join(warnings), "utf-8", "backslashreplace")
+                with log.held_back() as records:
+                    export(folder / MODEL)
+            except SpecError as fault:
+                raise Unable(str(fault)) from None
+            lines = [record.getMessage() for record in records if record.levelno == logging.WARNING]
+            (folder / WARNINGS).write_text("\n".join(lines), "utf-8", "backslashreplace")
 
-        if self.choice.cache is not None and origin is not None:
-            key = key_of(origin.files, {**origin.options, **given})
+        if cache is not None and key:
             try:
-                folder, made = entry(self.choice.cache, key, make)
+                return entry(cache, key, make)
             except OSError as fault:
-                where = self.choice.cache
-                log.logger.warning(f"{where}: cannot be written: {fault.strerror}; the exported model will not be kept")
-            else:
-                if not made:
-                    _warn_again(folder / WARNINGS)
-                return folder
+                log.logger.warning(f"{cache}: cannot be written: {fault.strerror}; the exported model will not be kept")
         self._temporary = tempfile.TemporaryDirectory(prefix="netspec-", ignore_cleanup_errors=True)
-        folder = Path(self._temporary.name)
-        make(folder)
-        return folder
-
-    def _open(self, precision: str) -> tuple[Runner, str]:
-        try:
-            return open_runner(self.choice.engine, self.folder, precision), precision
-        except Unable as fault:
-            if precision == FP32:
-                raise
-            log.logger.warning(f"precision {precision}: {fault}; {self.choice.engine} runs it in {FP32}")
-            return open_runner(self.choice.engine, self.folder, FP32), FP32
-
-    def _show_difference(self, inputs: Arrays, found: Arrays) -> None:
-        """Log the difference of bf16 from fp32. It is measured once, on the first inputs, and kept with the model."""
-        path = self.folder / DIFFERENCE
-        if path.exists():
-            return _warn_again(path)
-        exact = _run(open_runner(self.choice.engine, self.folder, FP32), inputs)
-        lines = [
-            f"precision bf16: {name} differs from fp32 by {_difference(found[name], value):.1e} of its largest value"
-            for name, value in exact.items()
-        ]
-        for line in lines:
-            log.logger.warning(line)
-        with suppress(SpecError):  # measure it again
-            write_whole(inside(self.folder, DIFFERENCE), "\n".join(lines), "backslashreplace")
+        make(Path(self._temporary.name))
+        return Path(self._temporary.name)
 
 
-def _warn_again(path: Path) -> None:
-    """Log the lines of a file, which the cache of an older netspec does not have."""
-    with suppress(OSError):
-        for line in path.read_text("utf-8", "replace").splitlines():
-            log.logger.warning(line)
+def threads() -> int:
+    """Return the number of threads for a pass: as many as torch would use."""
+    if torch := sys.modules.get("torch"):
+        return torch.get_num_threads()
+    given = os.environ.get("OMP_NUM_THREADS", "")
+    if given.isdigit() and int(given) > 0:
+        return int(given)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _run(runner: Runner, inputs: Arrays) -> dict[str, np.ndarray]:
-    try:
-        return runner.run(inputs)
-    except Exception as fault:  # each library has its own exceptions
-        raise Unable(reason(fault)) from None
+def onnxruntime_runner(path: Path, precision: str) -> Runner:
+    """Return what runs a model by onnxruntime."""
+    if precision == BF16:
+        raise Unable(f"{ONNXRUNTIME} does not support bf16 here")
+    with _no_telemetry():
+        import onnxruntime
+    options: Any = onnxruntime.SessionOptions()
+    options.log_severity_level = 3  # errors
+    options.intra_op_num_threads = threads()
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+    wanted = {given.name for given in session.get_inputs()}
+
+    def run(inputs: Arrays) -> dict[str, np.ndarray]:
+        found: Any = session.run(names, {n: np.ascontiguousarray(x) for n, x in inputs.items() if n in wanted})
+        return dict(zip(names, found, strict=True))
+
+    return run
 
 
-def _export(export: Export, path: Path) -> None:
-    try:
-        export(path)
-    except SpecError as fault:
-        raise Unable(str(fault)) from None
+def openvino_runner(path: Path, precision: str) -> Runner:
+    """Return what runs a model by OpenVINO; it is compiled for each set of input shapes."""
+    with _no_telemetry():
+        import openvino
+    core = openvino.Core()
+    if precision == BF16:
+        with _signal_stack_kept():
+            able = core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+        if BF16.upper() not in able:
+            raise Unable("this CPU has no bf16 instructions")
+    settings = {
+        "INFERENCE_PRECISION_HINT": "bf16" if precision == BF16 else "f32",
+        "INFERENCE_NUM_THREADS": threads(),
+        "PERFORMANCE_HINT": "LATENCY",
+    }
+
+    @lru_cache(4)
+    def compiled(shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> tuple[Any, set[str], list[str]]:
+        model = core.read_model(str(path))
+        wanted = {given.any_name for given in model.inputs}
+        outputs = [name for output in model.outputs for name in output.names]
+        model.reshape({name: list(shape) for name, shape in shapes if name in wanted})
+        with _signal_stack_kept():
+            return core.compile_model(model, "CPU", settings).create_infer_request(), wanted, outputs
+
+    def run(inputs: Arrays) -> dict[str, np.ndarray]:
+        request, wanted, outputs = compiled(tuple((name, value.shape) for name, value in sorted(inputs.items())))
+        given = {name: np.ascontiguousarray(value) for name, value in inputs.items() if name in wanted}
+        found = request.infer(given, share_inputs=True)
+        return {name: np.array(found[name]) for name in outputs}
+
+    return run
 
 
-def _difference(found: np.ndarray, exact: np.ndarray) -> float:
-    if found.shape != exact.shape:
-        return float("inf")
-    return float(np.abs(found - exact).max(initial=0) / (np.abs(exact).max(initial=0) or 1))
+OPENERS: dict[str, Callable[[Path, str], Runner]] = {ONNXRUNTIME: onnxruntime_runner, OPENVINO: openvino_runner}
 
 
 @contextmanager
-def _warnings() -> Iterator[list[str]]:
-    """Yield a list that gets the warnings of the block."""
-    warnings: list[str] = []
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: warnings.append(record.getMessage()) if record.levelno == logging.WARNING else None
-    log.logger.addHandler(handler)
+def _unable() -> Iterator[None]:
+    """Raise the exceptions of the block as Unable, with their message as one short line."""
     try:
-        yield warnings
+        yield
+    except Unable:
+        raise
+    except Exception as fault:  # each library has its own
+        text = " ".join(str(fault).split()) or type(fault).__name__
+        raise Unable(text if len(text) <= 200 else f"{text[:197]}...") from None
+
+
+@contextmanager
+def _no_telemetry() -> Iterator[None]:
+    """Within the block, import a library without telemetry: no network access, and no file in the home folder.
+
+    OpenVINO uses an empty stub if its telemetry package is missing. onnxruntime reads a variable when it is imported.
+    """
+    module, variable = "openvino_telemetry", "ORT_DISABLE_TELEMETRY"
+    before, chosen = sys.modules.get(module), os.environ.get(variable)
+    sys.modules[module] = cast(ModuleType, None)
+    os.environ[variable] = chosen or "1"
+    try:
+        yield
     finally:
-        log.logger.removeHandler(handler)
+        del sys.modules[module]
+        if before is not None:
+            sys.modules[module] = before
+        if chosen is None:
+            del os.environ[variable]
+
+
+@contextmanager
+def _signal_stack_kept() -> Iterator[None]:
+    """Restore the alternate signal stack of the thread after the block, on Linux; elsewhere do nothing.
+
+    Each ``openvino.Core`` sets such a stack when it loads its CPU plugin, and frees it when it is deleted. If it is
+    still in use then, the thread gets the previous one, which may belong to a Core that was deleted earlier. That is
+    freed memory, and the next signal that Python handles would end the process.
+    """
+    if not sys.platform.startswith("linux"):
+        yield
+        return
+    library = ctypes.CDLL(None)
+    before = ctypes.create_string_buffer(64)  # more than the structure stack_t, which has 24 bytes
+    library.sigaltstack(None, before)
+    try:
+        yield
+    finally:
+        library.sigaltstack(before, None)

@@ -14,7 +14,6 @@ from netspec.export.formats.deploy import fold, with_inputs, write_caffe
 from netspec.export.formats.inputs import prune
 from netspec.export.formats.onnx import export_onnx
 from netspec.export.formats.preprocess import Preprocess
-from netspec.export.formats.pt2 import export_pt2
 from netspec.export.formats.torch import export_torch, write_tensors
 from netspec.files.kinds import unreadable
 from netspec.files.version import version
@@ -74,7 +73,7 @@ class Source:
 
 
 def export_net(source: Source, target: str, out: Path, preprocess: Preprocess | None = None) -> list[str]:
-    """Write a net as ``onnx``, ``torch``, ``pt2`` or ``safetensors``; return notes for the user, as lines.
+    """Write a net as ``onnx``, ``torch`` or ``safetensors``; return notes for the user, as lines.
 
     Raises SpecError for any error in the files, and for a layer that cannot be exported.
     """
@@ -89,8 +88,6 @@ def export_net(source: Source, target: str, out: Path, preprocess: Preprocess | 
         return export_onnx(net, out, source.metadata(), preprocess)
     if target == "torch":
         return export_torch(net, out, source.origin)
-    if target == "pt2":
-        return export_pt2(net, out)
     write_tensors(blob_tensors(net), out, source.metadata())
     return []
 

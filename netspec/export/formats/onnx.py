@@ -6,7 +6,7 @@ Caffe: the model corresponds to Net::Reshape for the sizes at run time
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,7 +16,7 @@ import torch
 from netspec.errors import SpecError
 from netspec.export.exporter import exported, layer_notes, refusal
 from netspec.export.formats.preprocess import Preprocess
-from netspec.export.formats.shapes import LayerShapes, NetShapes, settled
+from netspec.export.formats.shapes import LayerShapes, NetShapes, is_given, settled
 from netspec.files.whole_file import whole_file, write_whole
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import values_of
@@ -46,14 +46,16 @@ def export_onnx(
     metadata: Mapping[str, str] | None = None,
     preprocess: Preprocess | None = None,
     largest: int = LARGEST,
+    blobs: Collection[str] = (),
 ) -> list[str]:
     """Write a net with its current weights as an ONNX model; return notes for the user, as lines.
 
+    ``blobs`` that are neither inputs nor outputs become additional outputs.
     Weights of more than ``largest`` bytes are in a file next to it: ``path`` with ``.data`` appended.
     Raises SpecError if a layer cannot be exported or the file cannot be written.
     """
     _onnx()
-    writer, shapes = settled(net, lambda shapes: _Writer(net, shapes, preprocess))
+    writer, shapes = settled(net, lambda shapes: _Writer(net, shapes, preprocess, blobs))
     notes = [*shapes.fixed, *layer_notes(net.layers)]
     path = Path(path)
     if sum(array.nbytes for array in writer.initializers.values()) <= largest:
@@ -69,6 +71,8 @@ def export_onnx(
 
 def _write_layer(layer: Layer, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
     """Write a layer into the graph; return the values of its tops. Raises SpecError if it cannot be exported."""
+    if is_given(layer):
+        return [graph.input(i) for i in range(layer.num_tops)]
     write, op = exported(layer, "to_onnx"), exported(layer, "onnx_op")
     if write is not None:
         return write(graph, *bottoms)
@@ -95,7 +99,9 @@ class _DataFile:
 class _Writer:
     """Writes the graph of a net."""
 
-    def __init__(self, net: Net, shapes: NetShapes, preprocess: Preprocess | None) -> None:
+    def __init__(self, net: Net, shapes: NetShapes, preprocess: Preprocess | None, blobs: Collection[str]) -> None:
+        more = {blob: v for v, blob in enumerate(net.plan.blobs) if blob in blobs}
+        self.outputs = {**net.plan.outputs, **more}
         self.net, self.shapes, self.preprocess = net, shapes, preprocess
         self.nodes: list[Any] = []
         self.initializers: dict[str, np.ndarray] = {}
@@ -168,7 +174,10 @@ class _Writer:
         """Return the model. Its large weights are written to ``data_file``, if there is one."""
         onnx, net = _onnx(), self.net
         renamed = self._name_values()
-        outputs = [_value_info(name, np.float32, self.symbols(v)) for name, v in net.plan.outputs.items()]
+        taken = {given.name for given in self.inputs}
+        outputs = [
+            _value_info(name, np.float32, self.symbols(v)) for name, v in self.outputs.items() if name not in taken
+        ]
         used = {name for node in self.nodes for name in node.input}
         stored = [_tensor(name, array, data_file) for name, array in self.initializers.items() if name in used]
         graph = onnx.helper.make_graph(self.nodes, net.name or "net", self.inputs, outputs, stored)
@@ -200,7 +209,7 @@ class _Writer:
         taken = set(inputs)
         for v in reversed(range(len(plan.blobs))):
             old, blob = self.values[v], plan.blobs[v]
-            is_output = plan.outputs.get(blob) == v
+            is_output = self.outputs.get(blob) == v and blob not in inputs
             if is_output and (v in passed_on or old in new_names or old in inputs or old in self.initializers):
                 passed_on.discard(v)
                 old = self.values[v] = self.add("Identity", [old], 1, layer_of[v], {})[0]

@@ -114,6 +114,11 @@ class LayerShapes:
         return Fixed(value, axis, f'layer "{self.plan_node.name}" ({self.layer.type}): {why}')
 
 
+def is_given(layer: Layer) -> bool:
+    """Return whether the caller of an exported net gives the tops of a layer."""
+    return layer.is_input or layer.reads_data
+
+
 def settled(net: Net, write: Callable[[NetShapes], T]) -> tuple[T, NetShapes]:
     """Call ``write`` with the shapes; return its result and the shapes. After each Fixed, retry with it fixed."""
     shapes = find_shapes(net)
@@ -158,7 +163,7 @@ def input_shapes(net: Net, shapes: NetShapes) -> dict[str, tuple[int | str, ...]
     """
     found: dict[str, tuple[int | str, ...]] = {}
     for node, layer in zip(net.plan.nodes, net.layers, strict=True):
-        for v in node.tops if layer.is_input else ():
+        for v in node.tops if is_given(layer) else ():
             sizes: list[int | str] = list(shapes.built[v])
             for free in shapes.free:
                 for axis in (axis for value, axis in free.axes if value == v and not free.counted):
@@ -187,7 +192,7 @@ def _input_sizes(net: Net) -> dict[str, tuple[Axis, ...]]:
     found: dict[tuple[str, int], list[Axis]] = {}
     names: dict[tuple[str, int], str] = {}
     for node, layer in zip(net.plan.nodes, net.layers, strict=True):
-        for v, shape in zip(node.tops, layer.top_shapes, strict=True) if layer.is_input else ():
+        for v, shape in zip(node.tops, layer.top_shapes, strict=True) if is_given(layer) else ():
             kinds = {"N": 0, "H": 2, "W": 3} if len(shape) == 4 else {"N": 0} if shape else {}
             for kind, axis in kinds.items():
                 key = (kind, shape[axis])
@@ -216,7 +221,7 @@ def _propagate(net: Net, given: Mapping[Axis, int]) -> Shapes:
     shapes: list[Shape] = []
     for node, layer in zip(net.plan.nodes, net.layers, strict=True):
         bottoms = [shapes[v] for v in node.bottoms]
-        tops = layer.top_shapes if layer.is_input else [layer.possible(shape) for shape in layer.reshape(bottoms)]
+        tops = layer.top_shapes if is_given(layer) else [layer.possible(shape) for shape in layer.reshape(bottoms)]
         for v, shape in zip(node.tops, tops, strict=False):
             assert v == len(shapes), "values are numbered in the order in which they are written"
             shapes.append(tuple(given.get((v, axis), size) for axis, size in enumerate(shape)))

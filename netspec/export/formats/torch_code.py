@@ -11,7 +11,7 @@ import torch
 
 from netspec.export.exporter import exported, refusal
 from netspec.export.expression import Expression, Stored, Submodule, Value, parts
-from netspec.export.formats.shapes import LayerShapes, NetShapes
+from netspec.export.formats.shapes import LayerShapes, NetShapes, is_given
 from netspec.export.formats.source import legal, unique
 from netspec.graph.plan import origins
 from netspec.layers.contract.base import Layer
@@ -56,6 +56,8 @@ def write_definition(net: Net, shapes: NetShapes) -> Definition:
 
 def _write_layer(layer: Layer, code: TorchCode, bottoms: tuple[Value, ...]) -> Expression | Sequence[Expression]:
     """Return the expressions of a layer's tops. Raises SpecError if it cannot be exported."""
+    if is_given(layer):
+        return [code.input(i) for i in range(layer.num_tops)]
     write, plain = exported(layer, "to_torch"), exported(layer, "torch_call")
     if write is None and plain is None:
         raise refusal(layer, "PyTorch")

@@ -11,16 +11,7 @@ from netspec.export.expression import Expression
 from netspec.export.formats.onnx import OnnxGraph
 from netspec.export.formats.torch_code import TorchCode
 from netspec.layers.data.hdf5 import HDF5Output
-from netspec.layers.data.memory import DummyData, Input
-
-
-@exports(Input)
-class InputExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        return [graph.input(i) for i in range(self.layer.num_tops)]
-
-    def to_torch(self, code: TorchCode) -> Sequence[Expression]:
-        return [code.input(i) for i in range(self.layer.num_tops)]
+from netspec.layers.data.memory import DummyData
 
 
 @exports(DummyData)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,9 +17,9 @@ from netspec.data.blobs import Shape
 from netspec.data.datum import decode_pixels, planar
 from netspec.data.resize import resized
 from netspec.errors import SpecError, Where
+from netspec.export.engines.cache import key_of
 from netspec.export.engines.choice import Choice
-from netspec.export.engines.model import Model, Origin
-from netspec.export.engines.runners import Unable, warn_unable
+from netspec.export.engines.model import Model, Unable, warn_unable
 from netspec.export.formats.inputs import is_input, prune, shapes_of_input
 from netspec.files.image_list import ImageList
 from netspec.files.kinds import unreadable
@@ -104,15 +104,15 @@ class ImageNet:
         self._read, self._weights = read, weights
         self._choice = choice or Choice()
         made_of = {"blob": blob, "input": input_blob, "shape": shape, "strict": options.strict, "scaled": bool(steps)}
-        self._open(Origin([model, *weights], made_of), options.device)
+        self._open(partial(key_of, [model, *weights], made_of), options.device)
 
-    def _open(self, origin: Origin, device: str) -> None:
+    def _open(self, key: Callable[[], str], device: str) -> None:
         """Open the model of the chosen engine, or let torch run the net."""
         if self._choice.engine == TORCH or device != "cpu":
             self._use_torch("" if self._choice.engine == TORCH else f"it runs on the CPU, but this net is on {device}")
             return
         try:
-            self._model = Model(self._choice, origin, self._export)
+            self._model = Model(self._choice, key(), self._export)
         except Unable as fault:
             self._use_torch(str(fault))
 

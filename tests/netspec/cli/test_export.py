@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from safetensors import safe_open
 from safetensors.numpy import load_file
 
@@ -70,13 +69,6 @@ def test_torch(net: Net, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs = random_inputs(net)
     assert_same(run_module(exported_cli.load(), net, inputs), here(net, inputs))
     del sys.modules["exported_cli"]
-
-
-@pytest.mark.slow
-def test_pt2(net: Net, run: Run) -> None:
-    assert run("export", MODEL, "--weights", WEIGHTS, "--to", "pt2", "--out", "net.pt2").status == 0
-    inputs = random_inputs(net)
-    assert_same(run_module(torch.export.load("net.pt2").module(), net, inputs), here(net, inputs))
 
 
 def test_safetensors(net: Net, run: Run) -> None:
@@ -176,9 +168,7 @@ def test_the_onnx_library_is_an_extra(net: Net, run: Run, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("target", "out"), [("torch", "n.py"), ("pt2", "n.pt2"), ("safetensors", "n.safetensors"), ("fold", "n")]
-)
+@pytest.mark.parametrize(("target", "out"), [("torch", "n.py"), ("safetensors", "n.safetensors"), ("fold", "n")])
 def test_an_error_keeps_old_files(target: str, out: str, net: Net, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ("fold", MODEL) if target == "fold" else ("export", MODEL, "--to", target)
     words = (*words, "--weights", WEIGHTS, "--out", out)
@@ -198,7 +188,7 @@ def test_folding_needs_weights(net: Net, run: Run) -> None:
 
 
 def test_steps_for_images_are_for_onnx(net: Net, run: Run) -> None:
-    result = run("export", MODEL, "--weights", WEIGHTS, "--to", "pt2", "--out", "n.pt2", "--swap")
+    result = run("export", MODEL, "--weights", WEIGHTS, "--to", "torch", "--out", "n.py", "--swap")
     assert result.status == 2
     assert "--swap needs --to onnx" in result.err
     result = run("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "n.onnx", "--input", "data")

@@ -25,11 +25,10 @@ class Maker:
 
 def test_an_entry_is_made_once(tmp_path: Path) -> None:
     make, cache = Maker(), tmp_path / "new" / "cache"
-    folder, made = entry(cache, "key", make)
+    folder = entry(cache, "key", make)
     assert (folder / "model").read_bytes() == b"m" * 10
-    assert made
-    assert entry(cache, "key", make) == (folder, False)
-    assert entry(cache, "other", make)[0] != folder
+    assert entry(cache, "key", make) == folder
+    assert entry(cache, "other", make) != folder
     assert make.calls == 2
     assert sorted(path.name for path in cache.iterdir()) == ["key", "other"]
 
@@ -62,7 +61,7 @@ def test_an_entry_that_another_process_makes_meanwhile_is_used(tmp_path: Path) -
         entry(tmp_path, "key", Maker(20))
         Maker(10)(folder)
 
-    folder, _ = entry(tmp_path, "key", make)
+    folder = entry(tmp_path, "key", make)
     assert (folder / "model").stat().st_size == 20
     assert [path.name for path in tmp_path.iterdir()] == ["key"]
 
@@ -80,13 +79,13 @@ def test_a_damaged_entry_is_made_again(
     damage: Callable[[Path], object], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     make = Maker()
-    folder, _ = entry(tmp_path, "key", make)
+    folder = entry(tmp_path, "key", make)
     (folder / "more").write_text("what is added later is no damage")
-    assert entry(tmp_path, "key", make) == (folder, False)
+    assert entry(tmp_path, "key", make) == folder
     damage(folder)
     with caplog.at_level(logging.WARNING):
-        assert entry(tmp_path, "key", make) == (folder, True)
-        assert entry(tmp_path, "key", make) == (folder, False)
+        assert entry(tmp_path, "key", make) == folder
+        assert entry(tmp_path, "key", make) == folder
     assert (folder / "model").read_bytes() == b"m" * 10
     (aside,) = (path for path in tmp_path.iterdir() if path != folder)
     assert caplog.messages == [

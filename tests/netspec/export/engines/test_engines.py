@@ -16,7 +16,7 @@ import torch
 import netspec
 from netspec.cli import main
 from netspec.errors import SpecError
-from netspec.export.engines import choice, runners
+from netspec.export.engines import choice, model
 from netspec.inspect.features.describer import Describer
 from netspec.inspect.features.records import extract_records
 
@@ -141,9 +141,27 @@ def test_parameters_with_aliases_are_read_in_every_pass(
             torch.testing.assert_close(found, expected(data=data)["feat"].detach(), rtol=1e-5, atol=1e-5)
     (line,) = caplog.messages
     assert "a program could change the parameters" in line
-    del held
-    torch.testing.assert_close(net(data=data)["feat"], found, rtol=1e-5, atol=1e-5)
-    assert not net(data=data)["feat"].requires_grad
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("files")
+def test_nets_without_parameters_are_told_apart(engine: str, data: np.ndarray) -> None:
+    text = NET.partition('layer { name: "conv"')[0]
+    for kind in ("AbsVal", "BNLL"):
+        Path("net.prototxt").write_text(f'{text}layer {{ name: "y" type: "{kind}" bottom: "data" top: "y" }}')
+        expected = netspec.load_net("net.prototxt")(data=data)["y"]
+        found = netspec.load_net("net.prototxt", engine=engine)(data=data)["y"]
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.usefixtures("files")
+def test_an_input_that_a_layer_changes_in_place_has_its_last_value(engine: str, data: np.ndarray) -> None:
+    change = 'layer { name: "change" type: "ReLU" bottom: "data" top: "data" }'
+    Path("net.prototxt").write_text(NET.replace('layer { name: "conv"', f'{change} layer {{ name: "conv"'))
+    net = load(engine)
+    net.keep = ["data"]
+    net(data=data)
+    np.testing.assert_array_equal(net.blobs["data"].detach(), np.maximum(data, 0))
 
 
 @pytest.mark.slow
@@ -214,15 +232,13 @@ def test_torch_runs_nets_with_recurrent_state_with_a_warning(engine: str, caplog
 def test_torch_runs_the_net_if_the_library_fails(
     engine: str, data: np.ndarray, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    net = load(engine)
-    expected = net(data=data)["feat"]
-
     def fail(*_: object) -> None:
         raise RuntimeError("out\nof order")
 
-    monkeypatch.setattr(runners.RUNNERS[engine], "run", fail)
+    monkeypatch.setitem(model.OPENERS, engine, lambda *_: fail)
     with caplog.at_level(logging.WARNING):
-        torch.testing.assert_close(net(data=data)["feat"].detach(), expected, rtol=1e-5, atol=1e-5)
+        found = load(engine)(data=data)["feat"]
+    torch.testing.assert_close(found, load("torch")(data=data)["feat"], rtol=1e-5, atol=1e-5)
     assert caplog.messages == [f"engine {engine}: out of order; torch runs the net"]
 
 
@@ -267,12 +283,12 @@ def test_an_engine_that_is_not_installed_is_refused_with_its_extra(monkeypatch: 
 
 
 def test_engines_use_as_many_threads_as_torch(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert runners.threads() == torch.get_num_threads()
+    assert model.threads() == torch.get_num_threads()
     monkeypatch.setattr(sys, "modules", {})
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    assert runners.threads() == 7
+    assert model.threads() == 7
     monkeypatch.setenv("OMP_NUM_THREADS", "")
-    assert runners.threads() >= 1
+    assert model.threads() >= 1
 
 
 # Records, commands, images

@@ -1,4 +1,4 @@
-"""``--to pt2``: writes a net as a torch.export archive, which computes the same as the exported source.
+"""A net as a PyTorch module that computes the same as the exported source.
 
 It does not write and run source: the expressions of the layers are evaluated one by one.
 """
@@ -6,70 +6,23 @@ It does not write and run source: the expressions of the layers are evaluated on
 from __future__ import annotations
 
 import inspect
-import io
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
 
-from netspec.errors import SpecError, Where
-from netspec.export.exporter import layer_notes
 from netspec.export.expression import TRAINING, Submodule, evaluate
-from netspec.export.formats.shapes import NetShapes, check_shapes, input_shapes, settled
+from netspec.export.formats.shapes import check_shapes, input_shapes, settled
 from netspec.export.formats.source import legal, unique
 from netspec.export.formats.torch_code import Definition, write_definition
-from netspec.files.whole_file import whole_file
 from netspec.net.net import Net
-from netspec.proto.schema import TRAIN
-
-
-def export_pt2(net: Net, path: str | Path) -> list[str]:
-    """Write a net as a torch.export archive; return notes for its user.
-
-    The sizes are dynamic as in the exported source if torch.export supports it, otherwise only the batch, or none.
-    Raises SpecError if torch.export cannot export the net, or if the file cannot be written.
-    """
-    module, shapes = _module_and_shapes(net)
-    module.training = net.phase == TRAIN  # Dropout drops; modules such as BatchNorm2d keep what they learned
-    inputs = [v for node, layer in zip(net.plan.nodes, net.layers, strict=True) if layer.is_input for v in node.tops]
-    notes = [*shapes.fixed, *layer_notes(net.layers)]
-    every = [free.name for free in shapes.free if not free.counted]
-    for names in (*([every] if len(every) > 1 else []), *([["N"]] if "N" in every else []), []):
-        dims = {free.name: torch.export.Dim.AUTO for free in shapes.free if free.name in names}
-        axes = {axis: free.name for free in shapes.free for axis in free.axes if free.name in dims}
-        dynamic = [
-            {axis: dims[axes[v, axis]] for axis in range(len(shapes.built[v])) if (v, axis) in axes} for v in inputs
-        ]
-        example = []
-        for v in inputs:  # torch.export treats a size of 1 as a constant
-            sizes = [max(2, size) if (v, axis) in axes else size for axis, size in enumerate(shapes.built[v])]
-            example.append(torch.zeros(sizes))
-        try:
-            program = torch.export.export(module, tuple(example), dynamic_shapes=tuple(dynamic), strict=False)
-        except Exception as fault:
-            reason = str(fault).strip().splitlines()
-            if not names:
-                raise SpecError(f"torch.export failed: {reason[0] if reason else fault}", Where(str(path))) from fault
-            continue
-        with whole_file(path) as unfinished:
-            buffer = io.BytesIO()
-            torch.export.save(program, buffer)
-            unfinished.write_bytes(buffer.getvalue())
-        fixed = [free.name for free in shapes.free if not free.counted and free.name not in names]
-        return [*notes, *([f"torch.export fixes the sizes {' and '.join(fixed)}"] if fixed else [])]
-    raise AssertionError("the last choice has no dynamic size")
 
 
 def torch_module(net: Net) -> nn.Module:
     """Return a module for inference that computes the same as the exported source, with its weights."""
-    return _module_and_shapes(net)[0]
-
-
-def _module_and_shapes(net: Net) -> tuple[nn.Module, NetShapes]:
     definition, shapes = settled(net, lambda shapes: write_definition(net, shapes))
-    return _Defined(definition, input_shapes(net, shapes)).eval(), shapes
+    return _Defined(definition, input_shapes(net, shapes)).eval()
 
 
 class _Defined(nn.Module):
