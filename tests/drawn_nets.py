@@ -112,8 +112,9 @@ class Drawn:
 def drawn(seed: int) -> str:
     """Return a net that learns: data, a first layer that learns, a few more, and a loss or two."""
     net = Drawn(random.Random(seed))
-    shape = net.draw.choice(["dim: 4 dim: 4 dim: 6 dim: 6", "dim: 2 dim: 4 dim: 6 dim: 2", "dim: 4 dim: 6"])
-    maps = shape.count("dim") == 4
+    images, sizes = net.draw.choice([1, 1, 2, 4]), net.draw.choice(["4 6 6", "4 6 2", "4 1 6", "6"]).split()
+    shape = " ".join(f"dim: {size}" for size in (images, *sizes))
+    maps = len(sizes) == 3
     head = "force_backward: true\n" if net.draw.random() < 0.3 else ""
     data = f'shape {{ {shape} }} data_filler {{ type: "gaussian" }}'
     net.text.append(f'layer {{ name: "x" type: "DummyData" top: "x" dummy_data_param {{ {data} }} }}')

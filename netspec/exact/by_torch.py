@@ -9,7 +9,7 @@ import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from netspec.exact.layout import by_channel, laid_out_like
+from netspec.exact.layout import by_channel, laid_out_like, of_one_layout
 from netspec.exact.lrn import Settings
 
 MAX_OFFSET = 8  # the largest mean, in standard deviations, for which torch's CPU kernel is exact to 1e-6
@@ -84,14 +84,19 @@ def scales_channels(scale: torch.Tensor, bias: torch.Tensor | None) -> Callable[
     if not scale.numel():  # torch takes no maps without channels
         return torch.clone
     arguments = (scale, bias, torch.zeros_like(scale), torch.ones_like(scale), False, 0.0, 0.0)
-    return lambda data: torch.batch_norm(data, *arguments, torch.backends.cudnn.enabled)
+    return lambda data: torch.batch_norm(of_one_layout(data), *arguments, torch.backends.cudnn.enabled)
 
 
 def normalizes(mean: torch.Tensor, variance: torch.Tensor, eps: float) -> Callable[[torch.Tensor], torch.Tensor]:
     """Return a function that normalizes (N, C, ...) by a mean and a variance of each channel."""
     far = _far_from_zero(mean, variance, eps)
     arguments = (torch.zeros_like(mean) if far else mean, variance, False, 0.0, eps, torch.backends.cudnn.enabled)
-    return lambda data: torch.batch_norm(data - by_channel(mean, data) if far else data, None, None, *arguments)
+
+    def normalized(data: torch.Tensor) -> torch.Tensor:
+        data = of_one_layout(data)
+        return torch.batch_norm(data - by_channel(mean, data) if far else data, None, None, *arguments)
+
+    return normalized
 
 
 def normalized_batch(
@@ -105,6 +110,7 @@ def normalized_batch(
 
     Returns its result, its input, the means (C,) and the unbiased variances (C,).
     """
+    data = of_one_layout(data)
     made, mean, variance = _normalized(data, normalize, affine, eps, options)
     exact_enough = torch.finfo(data.dtype).bits < 32  # data of fewer bits lost more by their own rounding
     if not exact_enough and _far_from_zero(mean, variance, eps):

@@ -16,6 +16,7 @@ import torch
 from netspec.exact.blas import is_recorded
 
 FEWEST = 3  # with fewer channels, channels_last is not faster
+LAST = {4: torch.channels_last, 5: torch.channels_last_3d}  # by the number of axes
 
 
 def channels_side_by_side(maps: torch.Tensor) -> torch.Tensor:
@@ -49,6 +50,25 @@ def map_by_map(maps: torch.Tensor) -> torch.Tensor:
     if not torch.is_grad_enabled() or is_recorded():
         return maps.contiguous()
     return _Relaid.apply(maps, torch.contiguous_format, torch.channels_last)
+
+
+def of_one_layout(maps: torch.Tensor) -> torch.Tensor:
+    """Return maps (N, C, ...) in channels_last, with exactly its strides, if an axis other than C has length 1.
+
+    The stride of such an axis means nothing; views set it as they like. From it torch's batch normalization guesses the
+    layout of maps and of their gradient. If it guesses two layouts, it reads the gradient in the wrong order. Maps with
+    the strides of channels_last are safe with every gradient.
+    """
+    layout = LAST.get(maps.dim())
+    if layout is None or maps.device.type != "cpu" or 1 not in (len(maps), *maps.shape[2:]) or is_recorded():
+        return maps
+    strides = torch.empty(maps.shape, device="meta").to(memory_format=layout).stride()
+    return maps if maps.stride() == strides else maps.clone(memory_format=layout)
+
+
+def in_shape(maps: torch.Tensor, shape: torch.Size | tuple[int, ...]) -> torch.Tensor:
+    """Return maps in another shape. Maps that have the shape keep their strides, unlike those of ``reshape``."""
+    return maps if maps.shape == shape else maps.reshape(shape)
 
 
 def layout_of(maps: torch.Tensor) -> torch.memory_format:

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from netspec.dialects.not_learned import NotLearned
+from netspec.exact.layout import of_one_layout
 from netspec.layers import register
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import TRAIN, value
@@ -124,4 +125,4 @@ class DenseBlock(NotLearned):
         slope, bias, mean, variance = (self.blob(first + k * self.steps + step).reshape(-1) for k in range(4))
         fraction, learning = self.settings.moving_average_fraction, self.phase == TRAIN
         moving = mean.detach(), variance.detach()
-        return F.relu(F.batch_norm(maps, *moving, slope, bias, learning, fraction, EPS))
+        return F.relu(F.batch_norm(of_one_layout(maps), *moving, slope, bias, learning, fraction, EPS))

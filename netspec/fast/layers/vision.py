@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.layout import channels_side_by_side, map_by_map, of_one_channel
+from netspec.exact.layout import channels_side_by_side, in_shape, map_by_map, of_one_channel
 from netspec.exact.products import Filter, laid_out_like
 from netspec.fast import fused
 from netspec.fast.entry import Entry
@@ -78,26 +78,24 @@ def _convolutions(
     geometry = (sliding.stride, sliding.pad, sliding.dilation)
     needed = (wanted, *(total is not None for total in sums))
     bias_shape = None if bias is None else list(bias.shape)
-    # The reshapes below are those of autograd. They set the strides of a single image, on which the rounding of
-    # BatchNorm depends.
     shape, top_shape, group = layer.bottom_shapes[0], layer.top_shapes[0], layer.group
     gradients = torch.ops.aten.convolution_backward.default
     maps = laid_out = weight
 
     def forward(x: torch.Tensor) -> torch.Tensor:
         nonlocal maps, laid_out
-        maps = x.reshape(shape)
+        maps = in_shape(x, shape)
         laid_out = lay_out(maps)
-        return torch.conv2d(laid_out, weight, bias, *geometry, group).reshape(top_shape)
+        return in_shape(torch.conv2d(laid_out, weight, bias, *geometry, group), top_shape)
 
     def backward(diff: torch.Tensor) -> torch.Tensor | None:
         maps_diff, *found = gradients(
-            diff.reshape(top_shape), laid_out, weight, bias_shape, *geometry, False, [0, 0], group, needed
+            in_shape(diff, top_shape), laid_out, weight, bias_shape, *geometry, False, [0, 0], group, needed
         )
         for total, gradient in zip(sums, found, strict=True):
             if total is not None:
                 total.add_(gradient)
-        return laid_out_like(maps, maps_diff).reshape(shape) if wanted else None
+        return in_shape(laid_out_like(maps, maps_diff), shape) if wanted else None
 
     return Kernels(forward, backward)
 

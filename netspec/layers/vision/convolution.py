@@ -11,6 +11,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import SMALL_PRODUCT
+from netspec.exact.layout import in_shape
 from netspec.exact.products import Filter
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.registry import register
@@ -85,8 +86,8 @@ class Convolution(SlidingFilter):
         tops = []
         for bottom in reversed(bottoms):  # autograd starts with the last: the first bottom, as in Caffe
             images = math.prod(bottom.shape[: self.channel_axis])
-            maps = bottom.reshape(images, self.channels, *(bottom.shape[self.channel_axis + 1 :] or (1,)))
-            tops.append(self.apply_filters(maps, weight, bias, sliding).reshape(self.top_shapes[0]))
+            maps = in_shape(bottom, (images, self.channels, *(bottom.shape[self.channel_axis + 1 :] or (1,))))
+            tops.append(in_shape(self.apply_filters(maps, weight, bias, sliding), self.top_shapes[0]))
         return tuple(reversed(tops))
 
     def apply_filters(
