@@ -18,9 +18,9 @@ from loopclosure.places.bag_files import bag_paths, check_spans
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.messages import camera_of, image_of, pixels_of, pose_of, seconds
 from loopclosure.places.pixels import bits_of
-from loopclosure.places.pose_files import moved
+from loopclosure.places.pose_files import NORM_TOLERANCE
 from loopclosure.places.stamps import mended
-from loopclosure.places.trajectory import NORM_TOLERANCE
+from loopclosure.places.trajectory import moved
 from netspec.errors import SpecError
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")

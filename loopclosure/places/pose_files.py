@@ -1,61 +1,66 @@
-"""Reads files of poses in the formats of TUM, KITTI and EuRoC, and checks whether a path looks wrong.
+"""Reads tables of poses: with names of the columns, or in the forms of TUM, KITTI and EuRoC.
 
 TUM    ``timestamp tx ty tz qx qy qz qw``: seconds, meters, w last
 KITTI  twelve numbers, the upper three rows of a 4 x 4 matrix; no time: one row per image
-EuRoC  ``timestamp,px,py,pz,qw,qx,qy,qz,...``: nanoseconds, meters, w first; further columns are ignored
+EuRoC  seventeen numbers, ``timestamp,px,py,pz,qw,qx,qy,qz,...``: nanoseconds, meters, w first
 
-The first line or a comment before it may name the columns; the quaternion is then read in their order.
-
-All of them give the pose of the camera (EuRoC: the body) in the world, unless the form has ``world-to-camera``.
+If the first line, or a comment before it, names the columns, they are found by their names. Otherwise their number
+tells the form. All of them give the pose of the camera (EuRoC: the body) in the world, unless the form has
+``world-to-camera``.
 """
 
 from __future__ import annotations
 
+import math
 import os
-from dataclasses import dataclass, field
+from collections import Counter
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
-from loopclosure.places.pose_table import UNITS, form_of, numbers_of, read_lines, seconds_of
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, associate
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, associate, inverse
+from netspec.files.table import TIME, UNITS, Row, Table, is_number, read_table
 
-FORMS = ("tum", "kitti", "euroc")
-ORDERS = ("w-first", "w-last")
-DIRECTIONS = ("camera-to-world", "world-to-camera")
-# A step is a jump if its speed is this many times the 99th percentile, and it is longer than this.
-JUMP_FACTOR, JUMP_M = 10.0, 0.5
-# A car or a robot always moves in one direction of its own frame. If that is so only with another reading of the poses,
-# that reading is likely to be right. A hand-held camera moves in all directions, so it gives no hint.
-ONE_WAY, ALL_WAYS, SHORTER = 0.9, 0.7, 0.5
+EXPECTED = (
+    "names of the columns (timestamp tx ty tz qx qy qz qw), or 8 columns (TUM), 12 (KITTI: a matrix) or 17 (EuRoC)"
+)
+WORDS = {
+    "form": ("tum", "kitti", "euroc"),
+    "order": ("w-first", "w-last"),
+    "direction": ("camera-to-world", "world-to-camera"),
+    "unit": tuple(UNITS),
+}
+_LENGTHS = {8: "tum", 12: "kitti", 17: "euroc"}
+_POSITION = r"(?:.*[._])?(?:position|translation|pos|p|t)[._]?(?:\w*_)?{0}|{0}"
+_QUATERNION = r"(?:.*[._])?(?:orientation|quaternion|rotation|quat|rot|q)[._]?(?:\w*_)?{0}"
+NORM_TOLERANCE = 0.05  # of the length of a quaternion; with four decimals it is within 1e-3 of 1
+MATRIX_TOLERANCE = 0.02  # a rotation matrix in text has at least four decimals
+YEAR_1990, YEAR_2100 = 6.3e8, 4.1e9  # in seconds since 1970
 
 
 @dataclass(frozen=True)
 class PoseForm:
-    """How to read a file of poses; an empty field means the default.
-
-    form       "tum", "kitti" or "euroc"; default: found from the rows
-    order      "w-first" or "w-last" of the quaternion; default: as the header says, or w first for EuRoC, last for TUM
-    direction  "camera-to-world" (default) or "world-to-camera"
-    """
+    """How to read a file of poses; an empty field means the default. ``WORDS`` has the words of each field."""
 
     form: str = ""
     order: str = ""
     direction: str = ""
+    unit: str = ""
 
 
 @dataclass(frozen=True)
 class PoseFile:
     """N poses, camera-to-world: ``poses`` (N, 7) tx ty tz qx qy qz qw, and ``stamps`` (N,) in s, None for KITTI.
 
-    A row that has no usable pose is NaN. ``doubts`` are sentences about what looks wrong.
+    A row that has no usable pose is NaN. ``doubts`` says how many there are; ``form`` is the one that was found.
     """
 
     poses: np.ndarray
     stamps: np.ndarray | None
-    form: PoseForm
-    doubts: tuple[str, ...] = field(default=())
+    form: str
+    doubts: tuple[str, ...] = ()
 
     def of_images(
         self,
@@ -72,147 +77,124 @@ class PoseFile:
         if self.stamps is None or stamps is None:
             if len(self.poses) != images:
                 missing = "the poses have no time" if self.stamps is None else "the images have no time"
-                raise InputError(
-                    f"has {len(self.poses)} poses, but there are {images} images; {missing}, so pose i must be "
-                    "that of image i",
-                    path,
-                )
+                fault = f"has {len(self.poses)} poses, but there are {images} images; {missing}"
+                raise InputError(f"{fault}, so pose i must be that of image i", path)
             return self.poses
         known = np.isfinite(self.poses).all(axis=1)
-        poses = self.poses[known]
         nearest = associate(stamps, self.stamps[known], max_difference)
-        for unit in UNITS:  # times since the start of a drive do not tell their unit
-            found = associate(stamps, self.stamps[known] * unit, max_difference)
-            if nearest.max() < 0 and np.mean(found >= 0) > 0.5:
-                nearest = found
         if nearest.max() < 0:
             raise InputError(
                 f"none of {images} images has a pose within {max_difference:g} s: images from {stamps[0]:.3f} to "
-                f"{stamps[-1]:.3f} s, poses from {self.stamps[0]:.3f} to {self.stamps[-1]:.3f} s",
+                f"{stamps[-1]:.3f} s, poses from {self.stamps[0]:.3f} to {self.stamps[-1]:.3f} s; if their unit is "
+                "another one, name it: timestamp [ns] in the first line, or pose-form=ns",
                 path,
             )
-        return np.where(nearest[:, None] < 0, np.nan, poses[nearest])
+        return np.where(nearest[:, None] < 0, np.nan, self.poses[known][nearest])
 
 
 def pose_form(text: str) -> PoseForm:
     """Parse words such as ``tum,w-first,world-to-camera``. Raises InputError for unknown words."""
     chosen = {}
     for word in filter(None, text.split(",")):
-        for name, known in (("form", FORMS), ("order", ORDERS), ("direction", DIRECTIONS)):
-            if word in known:
-                chosen[name] = word
-                break
-        else:
-            known_words = ", ".join((*FORMS, *ORDERS, *DIRECTIONS))
-            raise InputError(f'"{word}" is not a form of poses; known: {known_words}')
+        field = next((field for field, words in WORDS.items() if word in words), "")
+        if not field:
+            known = ", ".join(word for words in WORDS.values() for word in words)
+            raise InputError(f'"{word}" is not a form of poses; known: {known}')
+        chosen[field] = word
     return PoseForm(**chosen)
 
 
 def read_poses(path: str | os.PathLike[str], form: PoseForm = PoseForm()) -> PoseFile:
     """Read a file of poses, sorted by time if it has stamps.
 
-    Rows without a usable pose are NaN; ``doubts`` counts them. Raises InputError (file:line:column) if no row is
-    usable, or if the form cannot be told from the rows.
+    Raises InputError (file:line) if no row is usable, or if the columns are not those of poses.
     """
-    lines = read_lines(path)
-    kind = form.form or form_of(lines, form.order, path)
-    order = form.order or lines.order or ("w-first" if kind == "euroc" else "w-last")
-    table, faults = numbers_of(lines, kind, order, path)
-    if kind == "kitti":
-        stamps, matrices, usable = None, table.reshape(-1, 3, 4), np.isfinite(table).all(axis=1)
-        poses = np.full((len(table), 7), np.nan)
-        turns = Rotation.from_matrix(matrices[usable, :, :3]).as_quat(canonical=True)
-        poses[usable] = np.hstack([matrices[usable, :, 3], turns])
+    table = read_table(path, EXPECTED)
+    columns, found = _columns(table, form)
+    values, faults = np.full((len(table.rows), len(columns)), np.nan), []
+    for row, into in zip(table.rows, values, strict=True):
+        try:
+            into[:] = _numbers(row, columns, table)
+        except InputError as fault:
+            faults.append(fault)
+            if found != "kitti" and len(row.cells) > columns[0] and is_number(row.cells[columns[0]]):
+                into[0] = float(row.cells[columns[0]])  # a frame without a pose
+    if len(faults) == len(table.rows):
+        raise faults[0] if faults else InputError("holds no pose", path)
+    first = faults[0].where.line if faults and faults[0].where else 0
+    count = f"rows without a usable pose: {len(faults)} of {len(values)}"
+    doubts = (f"{count}; line {first}: {faults[0].message}",) if first else ()
+    if found == "kitti":
+        stamps, known, poses = None, np.isfinite(values[:, 0]), np.full((len(values), 7), np.nan)
+        matrices = values[known].reshape(-1, 3, 4)
+        turns = Rotation.from_matrix(matrices[:, :, :3]).as_quat(canonical=True)
+        poses[known] = np.hstack([matrices[:, :, 3], turns])
     else:
-        table = table[np.isfinite(table[:, 0])]
-        table = table[np.argsort(table[:, 0], kind="stable")]
-        stamps, quaternions = _seconds(table[:, 0], kind), table[:, 4:]
-        if order == "w-first":
-            quaternions = np.roll(quaternions, -1, axis=1)
-        poses = np.hstack([table[:, 1:4], quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)])
-    if form.direction == "world-to-camera":
-        poses = inverse(poses)
-    read = PoseForm(kind, "" if kind == "kitti" else order, form.direction or DIRECTIONS[0])
-    known = np.isfinite(poses).all(axis=1)
-    found = doubts(poses[known], None if stamps is None else stamps[known], read)
-    return PoseFile(poses, stamps, read, (*([str(faults)] if faults else []), *found))
+        unit = form.unit or table.unit(columns[0]) or ("ns" if found == "euroc" else "")
+        values = values[np.isfinite(values[:, 0])]
+        values = values[np.argsort(values[:, 0], kind="stable")]
+        stamps, poses = values[:, 0] * UNITS[unit] if unit else seconds_of(values[:, 0]), values[:, 1:]
+        poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    return PoseFile(inverse(poses) if form.direction == "world-to-camera" else poses, stamps, found, doubts)
 
 
-def _seconds(times: np.ndarray, kind: str) -> np.ndarray:
-    """Return times in seconds. EuRoC's are nanoseconds, also if they are counted from the start of the drive."""
-    seconds = seconds_of(times)
-    relative = kind == "euroc" and seconds is times and np.all(times % 1 == 0) and times[-1] > 1e6
-    return times * 1e-9 if relative else seconds
+def seconds_of(stamps: np.ndarray) -> np.ndarray:
+    """Return stamps (N,) in seconds. A date may be in s, ms, us or ns since 1970; its size tells which."""
+    usual = float(np.median(stamps)) if len(stamps) else 0.0
+    return next((stamps * unit for unit in UNITS.values() if YEAR_1990 < usual * unit < YEAR_2100), stamps)
 
 
-def inverse(poses: np.ndarray) -> np.ndarray:
-    """Return the inverse (N, 7) of each pose (7,); NaN stays NaN."""
-    known, back = np.isfinite(poses).all(axis=1), np.full(poses.shape, np.nan)
-    turns = Rotation.from_quat(poses[known, 3:]).inv()
-    back[known] = np.hstack([-turns.apply(poses[known, :3]), turns.as_quat(canonical=True)])
-    return back
+def matrix_fault(matrix: np.ndarray) -> str:
+    """Return why the first three columns (3, 3) of a pose are not a rotation; empty if they are."""
+    difference = float(np.abs(matrix.T @ matrix - np.eye(3)).max()) if np.abs(matrix).max() < 2 else np.inf
+    if not difference <= MATRIX_TOLERANCE:
+        return f"its first three columns are not a rotation: M^T M differs from the identity by {difference:.3g}"
+    reflected = np.linalg.det(matrix) < 0
+    return "its first three columns are a reflection (determinant -1), not a rotation" if reflected else ""
 
 
-def moved(poses: np.ndarray, mount: np.ndarray) -> np.ndarray:
-    """Return the poses (N, 7) of a sensor from the poses of its body; ``mount`` (4, 4): its pose in the body.
-
-    NaN stays NaN.
-    """
-    known, there = np.isfinite(poses).all(axis=1), np.full(poses.shape, np.nan)
-    turns = Rotation.from_quat(poses[known, 3:])
-    positions = poses[known, :3] + turns.apply(mount[:3, 3])
-    there[known] = np.hstack([positions, (turns * Rotation.from_matrix(mount[:3, :3])).as_quat(canonical=True)])
-    return there
-
-
-def doubts(poses: np.ndarray, stamps: np.ndarray | None, form: PoseForm = PoseForm()) -> list[str]:
-    """Return sentences about poses (N, 7) that look wrong: jumps, inverted poses, order of the quaternion."""
-    found = []
-    steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
-    if len(steps) < 10:
-        return found
-    times = np.ones(len(steps)) if stamps is None else np.maximum(np.diff(stamps), 1e-6)
-    speeds = steps / times
-    usual = float(np.percentile(speeds, 99 if len(steps) > 200 else 90))
-    jumps = np.flatnonzero((speeds > JUMP_FACTOR * usual) & (steps > JUMP_M))
-    if len(jumps):
-        at = int(jumps[np.argmax(steps[jumps])])
-        often = f"{len(jumps)} {'time' if len(jumps) == 1 else 'times'}"
-        found.append(
-            f"the path jumps {often}: by {steps[at]:.3g} m from pose {at + 1} to {at + 2}, "
-            f"where steps are mostly below {float(np.percentile(steps, 90)):.2g} m"
-        )
-    direction = DIRECTIONS[form.direction != DIRECTIONS[1]]
-    back = inverse(poses)
-    shorter = np.linalg.norm(np.diff(back[:, :3], axis=0), axis=1).sum() < SHORTER * steps.sum()
-    if shorter and _one_way(back) > ONE_WAY:
-        found.append(
-            f"read as {direction}, the path is less than half as long, and the camera always moves one way: if that is "
-            f"right, say so with pose-form={direction}"
-        )
-    if form.form != "kitti" and _one_way(poses) < ALL_WAYS:
-        order = ORDERS[form.order != ORDERS[1]]
-        if _one_way(np.hstack([poses[:, :3], _other_order(poses[:, 3:], form.order)])) > ONE_WAY:
-            found.append(
-                "the camera would move now forward, now sideways or back as it turns; with the quaternion read "
-                f"{order} it always moves one way: if that is right, say so with pose-form={order}"
-            )
-    return found
+def _columns(table: Table, form: PoseForm) -> tuple[list[int], str]:
+    """Return the columns of time, tx ty tz and qx qy qz qw, or those of a matrix; and the form."""
+    patterns = [TIME, *(_POSITION.format(axis) for axis in "xyz"), *(_QUATERNION.format(axis) for axis in "xyzw")]
+    named = [table.column(pattern) for pattern in patterns]
+    if table.column(r"(?:.*[._])?n(?:ano)?secs?") is not None and form.form != "kitti":
+        raise InputError("has its time in two columns, seconds and nanoseconds; join them", table.path, 1, 1)
+    counts = Counter(len(row.cells) for row in table.rows).most_common(1) or [(0, 0)]
+    if None not in named and form.form != "kitti" and not form.order:
+        of_euroc = counts[0][0] == 17 or table.column("p_rs_r_x") is not None
+        return [column for column in named if column is not None], form.form or ("euroc" if of_euroc else "tum")
+    if table.named and not form.form:
+        found = ", ".join(table.names)
+        raise InputError(f"has the columns {found}; expected {EXPECTED}", table.path, 1, 1)
+    found = form.form or _LENGTHS.get(counts[0][0], "")
+    if not found and table.rows:
+        raise InputError(f"has {counts[0][0]} columns; expected {EXPECTED}", table.path, table.rows[0].line, 1)
+    if found == "kitti":
+        return list(range(12)), found
+    w_first = form.order == "w-first" or (found == "euroc" and not form.order)
+    return [0, 1, 2, 3, *((5, 6, 7, 4) if w_first else (4, 5, 6, 7))], found
 
 
-def _other_order(quaternions: np.ndarray, order: str) -> np.ndarray:
-    """Convert quaternions xyzw that were read in ``order`` to the other order."""
-    return np.roll(quaternions, 1, axis=1) if order == "w-first" else np.roll(quaternions, -1, axis=1)
+def _numbers(row: Row, columns: list[int], table: Table) -> list[float]:
+    """Return the numbers of a row. Raises InputError if they are not a pose."""
+    where = table.path, row.line, 1
+    if max(columns) >= len(row.cells):
+        raise InputError(f"has {len(row.cells)} columns, a pose has {max(columns) + 1}", *where)
+    values = [number(row.cells[column], *where) for column in columns]
+    if len(values) == 12:
+        if fault := matrix_fault(np.array(values).reshape(3, 4)[:, :3]):
+            raise InputError(fault, *where)
+    elif not abs((length := float(np.linalg.norm(values[4:]))) - 1) <= NORM_TOLERANCE:
+        raise InputError(f"its quaternion has length {length:.4g}, a rotation has length 1", *where)
+    return values
 
 
-def _one_way(poses: np.ndarray) -> float:
-    """Return how constant the direction of motion is in the camera's frame: 0 all directions, 1 always the same."""
-    every = max(1, len(poses) // 200)  # longer steps: the direction of a short one is noise
-    poses = poses[::every]
-    steps = np.diff(poses[:, :3], axis=0)
-    lengths = np.linalg.norm(steps, axis=1)
-    long = lengths > 0.2 * np.median(lengths)
-    if not lengths[long].any():
-        return 0.0
-    own = Rotation.from_quat(poses[:-1, 3:][long]).inv().apply(steps[long] / lengths[long, None])
-    return float(np.linalg.norm(own.mean(axis=0)))
+def number(text: str, path: str | os.PathLike[str], line: int, column: int) -> float:
+    """Return a cell as a number. Raises InputError if it is none, or if it is too large to compute distances with."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(16 * value * value):
+        raise InputError(f'expected a number, found "{text}"', path, line, column)
+    return value

@@ -5,7 +5,6 @@ All of them become an :class:`~loopclosure.places.image_sequence.ImageSequence`,
 
 from __future__ import annotations
 
-import csv
 import os
 import re
 from collections.abc import Callable
@@ -18,13 +17,13 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import VIDEO_SUFFIXES, video_length
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import kitti_projection, read_intrinsics, yaml_numbers
-from loopclosure.places.pose_files import PoseForm, moved, read_poses
-from loopclosure.places.pose_table import matrix_fault, seconds_of
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, content_lines, number
+from loopclosure.places.pose_files import PoseForm, matrix_fault, number, read_poses, seconds_of
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, moved
 from netspec.errors import SpecError
 from netspec.files.image_list import list_images
 from netspec.files.kinds import nearest_existing, unreadable
 from netspec.files.paths import relative
+from netspec.files.table import read_table
 
 GROUNDTRUTH, ODOMETRY = "groundtruth.txt", "odometry.txt"
 QUERIES = ("query", "queries", "Query", "Queries")
@@ -189,16 +188,12 @@ def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
         expected = "expected an EuRoC sequence, a folder with mav0/cam0/data.csv"
         raise InputError(f"no such file; {expected}{nearest_existing(listing)}", listing)
     stamps, images = [], []
-    for line_number, line in content_lines(listing, 'a list of images, "timestamp [ns],filename" per line'):
-        row = next(csv.reader([line]))
-        if not images and len(row) >= 2 and not any(character.isdigit() for character in line):
-            continue  # the names of the columns
-        if len(row) < 2 or not re.fullmatch(r"\s*[0-9]{1,19}\s*", row[0]):
-            found = line.strip()[:60]
+    for row in read_table(listing, 'a list of images, "timestamp [ns],filename" per line').rows:
+        if len(row.cells) < 2 or not re.fullmatch("[0-9]{1,19}", row.cells[0]):
             expected = "a time in nanoseconds and the name of an image, with a comma between them"
-            raise InputError(f'expected {expected}, found "{found}"', listing, line_number, 1)
-        stamps.append(int(row[0]) * 1e-9)
-        images.append(_existing(listing.parent / "data" / row[1].strip(), listing, line_number))
+            raise InputError(f'expected {expected}, found "{",".join(row.cells):.60}"', listing, row.line, 1)
+        stamps.append(int(row.cells[0]) * 1e-9)
+        images.append(_existing(listing.parent / "data" / row.cells[1], listing, row.line))
     if not images:
         raise InputError("lists no images", listing)
     order = np.argsort(stamps, kind="stable")
@@ -245,8 +240,8 @@ def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
     images = list_images(folder / cameras[0]).paths
     times = None
     if (folder / "times.txt").is_file():
-        rows = content_lines(folder / "times.txt", "one time in seconds per image")
-        times = np.array([_time(line, folder / "times.txt", line_number) for line_number, line in rows])
+        rows = read_table(folder / "times.txt", "one time in seconds per image").rows
+        times = np.array([number(row.cells[0], folder / "times.txt", row.line, 1) for row in rows])
         if len(times) != len(images):
             raise InputError(f"has {len(times)} times, but there are {len(images)} images", folder / "times.txt")
     sequence = ImageSequence(images, _names(images, folder), times, folder)
@@ -283,11 +278,6 @@ _READERS: dict[str, Callable[[Path, float, bool], ImageSequence]] = {
     "images": _images,
     "video": _video,
 }
-
-
-def _time(line: str, path: Path, line_number: int) -> float:
-    text = line.split()[0]
-    return number(text, "the time in seconds", path, line_number, line.index(text) + 1)
 
 
 def _names(images: tuple[Path, ...], folder: Path) -> tuple[str, ...]:

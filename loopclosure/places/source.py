@@ -16,7 +16,7 @@ from loopclosure.places.bags import BY_NAME, NO_POSES, Topics, open_bag
 from loopclosure.places.frames import VIDEO_SUFFIXES, Selection, video_frames, video_length, write_picture
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import write_calibration
-from loopclosure.places.pose_files import DIRECTIONS, FORMS, ORDERS, pose_form
+from loopclosure.places.pose_files import WORDS, pose_form
 from loopclosure.places.sequences import GROUNDTRUTH, ODOMETRY, PoseChoice, layout_of, read_sequence
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Trajectory, write_rgb_list, write_trajectory
 from loopclosure.progress import Progress, silent
@@ -128,7 +128,7 @@ LAYOUT_LINES = "\n".join(f"  {kind + ':':11} {what}" for kind, what in LAYOUTS.i
 POSES_HELP = "camera poses in the format of TUM, KITTI or EuRoC, instead of the sequence's own"
 POSE_FORM_HELP = (
     f"format of the poses, if not detected from the file: one or more of "
-    f"{', '.join((*FORMS, *ORDERS, *DIRECTIONS))}, separated by commas"
+    f"{', '.join(word for words in WORDS.values() for word in words)}, separated by commas"
 )
 
 

@@ -1,29 +1,25 @@
-"""Camera poses in time, and the files of the TUM RGB-D benchmark that hold them.
+"""Camera poses in time, and writing them in the form of the TUM RGB-D benchmark.
 
-A sequence is a folder with ``rgb.txt`` (``timestamp filename``) and ``groundtruth.txt`` (``timestamp tx ty tz qx qy qz
-qw``). A pose is camera-to-world: the position of the optical center in meters and a unit quaternion with w last; the
-camera looks along its +z, x to the right, y down. Stamps are in seconds.
+A pose is camera-to-world: the position of the optical center in meters and a unit quaternion with w last; the camera
+looks along its +z, x to the right, y down. Stamps are in seconds.
 """
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from loopclosure.errors import InputError
-from netspec.files.kinds import unreadable
 from netspec.files.whole_file import write_whole
 
 # TUM's associate.py allows 0.02 s; with 30 Hz images and 100 Hz motion capture, 0.03 s does no harm.
 MAX_DIFFERENCE_S = 0.03
-# With four decimals the norm is within 1e-3 of 1. If it differs much more, the numbers are not a quaternion.
-NORM_TOLERANCE = 0.05
+GAP_S = 0.5  # no pose is taken between two that are further apart
 
 
 @dataclass(frozen=True)
@@ -60,26 +56,21 @@ class Trajectory:
 Posed = Poses | Trajectory
 
 
-def write_rgb_list(
-    path: str | os.PathLike[str], frames: Iterable[tuple[float, str]], what: str = "color images"
-) -> None:
-    """Write ``rgb.txt`` or ``depth.txt`` with TUM's three comment lines.
-
-    frames  the stamp in seconds, written with microseconds, and the file of each, relative to the list
-    """
-    lines = [f"# {what}", f"# file: '{Path(path).parent.name}'", "# timestamp filename"]
-    lines += [f"{stamp:.6f} {file}" for stamp, file in frames]
-    write_whole(Path(path), "\n".join(lines) + "\n", "backslashreplace")
+def inverse(poses: np.ndarray) -> np.ndarray:
+    """Return the inverse (N, 7) of each pose (7,), tx ty tz qx qy qz qw; NaN stays NaN."""
+    known, back = np.isfinite(poses).all(axis=1), np.full(poses.shape, np.nan)
+    turns = Rotation.from_quat(poses[known, 3:]).inv()
+    back[known] = np.hstack([-turns.apply(poses[known, :3]), turns.as_quat(canonical=True)])
+    return back
 
 
-def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory, what: str = "ground truth") -> None:
-    """Write poses in TUM's form with its three comment lines; meters and quaternions with six decimals."""
-    lines = [f"# {what} trajectory", f"# file: '{Path(path).parent.name}'", "# timestamp tx ty tz qx qy qz qw"]
-    for stamp, position, quaternion in zip(
-        trajectory.stamps, trajectory.positions, trajectory.quaternions, strict=True
-    ):
-        lines.append(f"{stamp:.6f} " + " ".join(f"{value:.6f}" for value in (*position, *quaternion)))
-    write_whole(Path(path), "\n".join(lines) + "\n", "backslashreplace")
+def moved(poses: np.ndarray, mount: np.ndarray) -> np.ndarray:
+    """Return the poses (N, 7) of a sensor from those of its body; ``mount`` (4, 4): its pose in the body."""
+    known, there = np.isfinite(poses).all(axis=1), np.full(poses.shape, np.nan)
+    turns = Rotation.from_quat(poses[known, 3:])
+    positions = poses[known, :3] + turns.apply(mount[:3, 3])
+    there[known] = np.hstack([positions, (turns * Rotation.from_matrix(mount[:3, :3])).as_quat(canonical=True)])
+    return there
 
 
 def associate(
@@ -96,35 +87,24 @@ def associate(
     return np.where(np.abs(stamps[nearest] - frame_stamps) <= max_difference, nearest, -1)
 
 
-def content_lines(
-    path: str | os.PathLike[str], expected: str, comments: list[str] | None = None
-) -> Iterator[tuple[int, str]]:
-    """Yield the lines that are not empty and not a comment, with their numbers from 1.
+def write_rgb_list(
+    path: str | os.PathLike[str], frames: Iterable[tuple[float, str]], what: str = "color images"
+) -> None:
+    """Write ``rgb.txt`` or ``depth.txt`` with TUM's three comment lines.
 
-    Comments are added to ``comments``.
+    frames  the stamp in seconds, written with microseconds, and the file of each, relative to the list
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(unreadable(path, error, expected), path) from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"is not a text file; expected {expected}", path) from error
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            yield number, line
-        elif line.strip() and comments is not None:
-            comments.append(line)
+    rows = (f"{stamp:.6f} {file}" for stamp, file in frames)
+    _write(path, what, "timestamp filename", rows)
 
 
-def number(text: str, name: str, path: str | os.PathLike[str], line: int, column: int) -> float:
-    """Return a field of a file as a number; ``name`` is for the message.
+def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory, what: str = "ground truth") -> None:
+    """Write poses in TUM's form with its three comment lines; meters and quaternions with six decimals."""
+    table = np.column_stack([trajectory.stamps, trajectory.positions, trajectory.quaternions])
+    rows = (" ".join(f"{value:.6f}" for value in row) for row in table)
+    _write(path, f"{what} trajectory", "timestamp tx ty tz qx qy qz qw", rows)
 
-    Raises InputError (file:line:column) if it is not a number, or if it is too large to compute distances with.
-    """
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(16 * value * value):
-        raise InputError(f'expected a number for {name}, found "{text}"', path, line, column)
-    return value
+
+def _write(path: str | os.PathLike[str], what: str, columns: str, rows: Iterable[str]) -> None:
+    lines = [f"# {what}", f"# file: '{Path(path).parent.name}'", f"# {columns}", *rows]
+    write_whole(Path(path), "\n".join(lines) + "\n", "backslashreplace")

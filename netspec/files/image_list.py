@@ -11,14 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from netspec.errors import SpecError, Where
-from netspec.files.kinds import unreadable
+from netspec.files.table import TIME, UNITS, Table, is_number, read_table
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 SUBFOLDERS = ("rgb", "images", "Images")
 _EXPECTED = "a folder of images, or a text file that lists them"
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _LINE = re.compile(rf"(?:(?P<stamp>{_NUMBER})(?:\s+|\s*,\s*))?(?P<name>.+?)(?:\s+[+-]?\d+)?")
-_HEADER = re.compile(r"(?:time|stamp)[a-z_]*(?:\s*\[\w+\])?[\s,]+[a-z_ ]+", re.IGNORECASE)  # timestamp filename
+# The names of a column of images, the likelier ones first.
+_NAMES = (r".*(?:file|path).*", r"(?:image|img|rgb|name).*")
 _COMMENT = re.compile(r"\s+#")
 
 
@@ -74,17 +75,13 @@ def _in_time(images: ImageList) -> ImageList:
 def _read_list(path: Path) -> ImageList:
     if path.suffix.lower() in IMAGE_ENDINGS:
         raise SpecError(f"is a single image; expected {_EXPECTED}", Where(str(path)))
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as fault:
-        raise SpecError(unreadable(path, fault, _EXPECTED), Where(str(path))) from None
-    except UnicodeDecodeError:
-        raise SpecError(f"is not UTF-8 text; expected {_EXPECTED}", Where(str(path))) from None
+    table = read_table(path, _EXPECTED)
+    column = next((found for name in _NAMES if (found := table.column(name)) is not None), None)
+    if table.named and column is not None:
+        return _by_columns(table, column)
     names, stamps = [], []
-    for number, line in enumerate(lines, 1):
+    for number, line in table.lines:
         text = line.strip()
-        if not text or text.startswith("#"):
-            continue
         readings = list(_readings(text))
         for name, stamp in readings:
             if os.path.isfile(path.parent / name):  # unlike Path.is_file, it accepts names that no file can have
@@ -95,14 +92,33 @@ def _read_list(path: Path) -> ImageList:
                 stamps.append(stamp)
                 break
         else:
-            if not names and _HEADER.fullmatch(text):
-                continue
             name = readings[-1][0]
             raise SpecError(f'no such image "{name}" in {path.parent}', Where(str(path), number, line.index(name) + 1))
     if not names:
         raise SpecError("lists no images", Where(str(path)))
     known = np.array(stamps, np.float64) if None not in stamps else None
     return ImageList(tuple(path.parent / name for name in names), tuple(names), known)
+
+
+def _by_columns(table: Table, column: int) -> ImageList:
+    """Return the images of a list whose first line names the columns."""
+    time = table.column(TIME)
+    unit = 1.0 if time is None else UNITS[table.unit(time) or "s"]
+    names, stamps = [], []
+    for row in table.rows:
+        where = Where(str(table.path), row.line, 1)
+        if len(row.cells) != len(table.names):
+            raise SpecError(f"has {len(row.cells)} columns, the first line names {len(table.names)}", where)
+        if not os.path.isfile(table.path.parent / row.cells[column]):
+            raise SpecError(f'no such image "{row.cells[column]}" in {table.path.parent}', where)
+        if time is not None and not (is_number(row.cells[time]) and np.isfinite(float(row.cells[time]))):
+            raise SpecError(f'the time stamp "{row.cells[time]}" is not a number', where)
+        names.append(row.cells[column])
+        stamps.append(0.0 if time is None else unit * float(row.cells[time]))
+    if not names:
+        raise SpecError("lists no images", Where(str(table.path)))
+    known = None if time is None else np.array(stamps)
+    return ImageList(tuple(table.path.parent / name for name in names), tuple(names), known)
 
 
 def _readings(text: str) -> Iterator[tuple[str, float | None]]:

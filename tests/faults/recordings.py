@@ -8,8 +8,9 @@ import numpy as np
 
 from loopclosure.places.bags import open_bag
 from loopclosure.places.masks import read_matches
-from loopclosure.places.pose_files import moved, read_poses
+from loopclosure.places.pose_files import read_poses
 from loopclosure.places.sequences import read_sequence
+from loopclosure.places.trajectory import moved
 from places_bags import Bag
 from places_layouts import MOUNT, euroc_rows, kitti_rows, path, tum_rows, write_pictures
 

@@ -54,11 +54,13 @@ FOUND: dict[str, tuple[dict[str, str], str, list[str], list[float] | None]] = {
     "stamp and label": ({"l.txt": "7.5 a.png 1\n8.5 b c.png 0", "a.png": "", "b c.png": ""}, "l.txt",
         ["a.png", "b c.png"], [7.5, 8.5]),
     "stamps with commas, below the names of the columns": (
-        {"l.txt": "timestamp,filename\n1.5,a.png\n2.5, b,c.png\n3,4.png\n", "a.png": "", "b,c.png": "", "4.png": ""},
+        {"l.txt": 'timestamp,filename\n1.5,a.png\n2.5, "b,c.png"\n3,4.png\n', "a.png": "", "b,c.png": "", "4.png": ""},
         "l.txt", ["a.png", "b,c.png", "4.png"], [1.5, 2.5, 3]),
-    "an image that has the name of a column": (
-        {"rgb.txt": "time file\na.png\n", "a.png": "", "time file": ""},
-        "rgb.txt", ["time file", "a.png"], None),
+    "columns in another order, with a unit": (
+        {"l.csv": "exposure;path_rgb_0;ts_rgb_0 (ns)\n9;rgb/a.png;1500000000\n", "rgb/a.png": ""},
+        "l.csv", ["rgb/a.png"], [1.5]),
+    "columns of names and times, with quotes": (
+        {"l.csv": 'image,timestamp\n"a.png",1.5\n', "a.png": ""}, "l.csv", ["a.png"], [1.5]),
     "comments": (
         {"l.txt": "# chosen\n  # and\n#a.png\na.png # twice\n1 a.png 0  # again\n", "a.png": "", "#a.png": ""}, "l.txt",
         ["a.png", "a.png"], None),
@@ -90,7 +92,7 @@ REFUSED: dict[str, tuple[dict[str, str], str, str]] = {
         {"here/rgb.txt": "1 rgb/1.png\n"}, "here", 'here/rgb.txt:1:3: no such image "rgb/1.png" in here'),
     "nothing": ({}, "gone", "gone: cannot be read: No such file or directory; expected a folder of images, or a text"),
     "a single image": ({"a.PNG": ""}, "a.PNG", "a.PNG: is a single image; expected a folder of images, or a text"),
-    "something else": ({"a.avi": "\udcff\udcfe"}, "a.avi", "a.avi: is not UTF-8 text; expected a folder of images, or"),
+    "something else": ({"a.avi": "\udcff\udcfe"}, "a.avi", "a.avi: is not a text file; expected a folder of images"),
 }  # fmt: skip
 
 
