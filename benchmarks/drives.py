@@ -134,10 +134,10 @@ def _posed(paths: Sequence[Path], poses: np.ndarray) -> DataSet:
     """Make one drive of images with poses (N, 7), NaN where not known: these images are left out."""
     known = np.flatnonzero(np.all(np.isfinite(poses), axis=1))
     posed = Poses(poses[known, :3], poses[known, 3:])
-    hard, soft = (same_place_matrix(posed, posed, MAX_DISTANCE_M, angle) for angle in (MAX_ANGLE_DEG, SOFT_DEG))
+    hard = same_place_matrix(posed, posed, MAX_DISTANCE_M, MAX_ANGLE_DEG)
     truth = sequence_truth(hard, Exclusion(GAP), "same place: less than 2 m and 15 degrees apart")
     images = ImageSequence.of_files([paths[i] for i in known.tolist()])
-    return DataSet("", images, None, truth, GAP, overlap=soft, overlap_rule=f"less than {SOFT_DEG:g} degrees apart")
+    return DataSet("", images, None, truth, GAP)
 
 
 def _of_route(name: str, route: list[Path], other: list[Path], work: Path) -> Iterator[Drive]:
@@ -239,16 +239,13 @@ def _traverses(queries: list[Path], there: np.ndarray, references: list[Path], h
     step = np.median(np.diff(here))
     truth = traverse_truth(differences <= max(NEAR, step / 2), "same place: frames of the same number")
     both = ImageSequence.of_files(queries), ImageSequence.of_files(references)
-    return DataSet("", *both, truth, overlap=differences <= OVERLAP, overlap_rule=f"{OVERLAP} frames apart")
+    return DataSet("", *both, truth)
 
 
 def _one_drive(images: list[Path], where: np.ndarray) -> DataSet:
     differences = np.abs(np.subtract.outer(where, where))
     truth = sequence_truth(differences <= NEAR, Exclusion(GAP), "same place: frames of the same number")
-    rule = f"{OVERLAP} frames apart"
-    return DataSet(
-        "", ImageSequence.of_files(images), None, truth, GAP, overlap=differences <= OVERLAP, overlap_rule=rule
-    )
+    return DataSet("", ImageSequence.of_files(images), None, truth, GAP)
 
 
 def in_season(images: list[Path], folder: Path, season: int) -> list[Path]:

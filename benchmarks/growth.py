@@ -190,9 +190,8 @@ def keyframes(size: int) -> Found:
 
 
 def described_walk(frames: int) -> np.ndarray:
-    """Return the small net's descriptors of a synthetic walk, minus their mean, with at most 256 components."""
+    """Return the small net's descriptors of a synthetic walk, minus their mean."""
     from lmdb_build.walk.sequence import Walk, write_walk
-    from loopclosure.descriptors.whitening import learn_whitening
     from loopclosure.places.frames import read_bgr
     from netspec.inspect.features.shipped import small
 
@@ -200,7 +199,7 @@ def described_walk(frames: int) -> np.ndarray:
     with TemporaryDirectory(prefix="growth-") as folder:
         walk = Walk(frames=frames, width=160, height=120, laps=1)
         rows = np.array([describe(read_bgr(image)) for image in write_walk(Path(folder) / "walk", walk)])
-    return learn_whitening(rows, COMPONENTS, power=0).project(rows)
+    return rows - rows.mean(axis=0)
 
 
 def perturbed(base: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:

@@ -1,7 +1,4 @@
-"""Evaluates ``auto`` on drives with known loops: precision and recall of the matches that it accepts.
-
-A match of views that overlap does not count as a mistake.
-"""
+"""Evaluates ``auto`` on drives with known loops: precision and recall of the matches that it accepts."""
 
 from __future__ import annotations
 
@@ -103,15 +100,14 @@ def measure(drive: Drive, cache: Cache) -> Result:
     queries = cache.descriptors(data.queries.paths)
     references = None if data.references is None else cache.descriptors(data.references.paths)
     scores = similarity_matrix(queries, references)
-    truth = data.soft_truth or data.truth
     auto = Auto(Scored(scores), exclude_frames=data.exclude_frames, pairs=cache.pairs)
     found = auto.score(Images(data.queries, data.references), silent)
     accepted = int(np.count_nonzero(np.isfinite(found.scores)))
-    judged = Judgment.of(found.scores, truth).best
+    judged = Judgment.of(found.scores, data.truth).best
     return Result(
         family=drive.family,
         kind=drive.kind,
-        loops=int(np.count_nonzero(truth.queries_with_a_loop)),
+        loops=int(np.count_nonzero(data.truth.queries_with_a_loop)),
         accepted=accepted,
         precision=float(judged.precision[-1]) if len(judged.precision) else float(accepted == 0),
         recall=float(judged.recall[-1]) if len(judged.recall) else 0.0,

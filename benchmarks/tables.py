@@ -156,9 +156,9 @@ def _figures(label: str, outcome: Outcome, name: str) -> Iterator[tuple[str, flo
         found = outcome.recall_at[1] if name in PAIRS else outcome.pairs.average_precision
         yield "accuracy", round(float(found), 3)
     if name not in PAIRS and label in TABLES["recall"]:
-        zones = [judged.best for judged in (outcome.rule, outcome.soft) if judged is not None]
+        angles = [judged.best for judged in (outcome.rule, outcome.wide) if judged is not None]
         if label == AUTO:
-            texts = [f"{z.recall[-1]:.3f} at {z.precision[-1]:.3f}" if len(z.recall) else "none" for z in zones]
+            texts = [f"{z.recall[-1]:.3f} at {z.precision[-1]:.3f}" if len(z.recall) else "none" for z in angles]
         else:
-            texts = [f"{z.recall_at_full_precision:.3f}" for z in zones]
+            texts = [f"{z.recall_at_full_precision:.3f}" for z in angles]
         yield "recall", texts[0] + "".join(f" ({text})" for text in texts[1:])

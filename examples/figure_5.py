@@ -7,13 +7,12 @@ The sequences show one place, in the layout of TUM RGB-D, with poses in one fram
 which table_1.py keeps for tests, becomes a part of one walk. --start 0 shows whole sequences: for weights that were
 trained without this place. FAB-MAP's vocabulary and tree are learned from images of another place; with several, each
 is a method of its own. A match is right less than 2 m and 15 degrees away, as in the paper, and also less than 45.
-The reports in OUT/report_15 and OUT/report_45 have the matrix of true loops, the matrix of each method, and precision
-against recall; OUT/table.json and the last lines have R@1, average precision, and the times of the methods.
+OUT/report has the matrix of true loops, the matrix of each method, and precision against recall; OUT/table.json and the
+last lines have R@1, average precision, and the times of the methods.
 Run it in a clone, or in a folder with a copy of the clone's folder prototxt.
 """
 
 import argparse
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,8 @@ from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import Trajectory, write_rgb_list, write_trajectory
 
 PAUSE_S = 60  # between two sequences of the walk
-ANGLES = (15, 45)  # degrees, below which two views less than 2 m apart are of one place
+# The two angles of a report, and what follows the names of its measures.
+ANGLES = {15: "", 45: "; 45 degrees"}
 
 
 def parse() -> argparse.Namespace:
@@ -102,30 +102,30 @@ def learn(arguments: argparse.Namespace, walk: Path) -> list[str]:
     return methods
 
 
-def rows(report: Path, angle: int) -> dict[str, dict[str, Any]]:
-    """Return the figures of each method in a report, named with the angle.
+def rows(summary: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the figures of each method in a report.json, by both angles.
 
     R@1 is the share of the frames with a loop whose best match is right; AP the average precision of all pairs.
     """
-    summary = json.loads((report / "report.json").read_text())
-    frames = {"images": summary["queries"], f"with a loop {angle}": summary["queries_with_a_loop"]}
-    found = {}
+    loops = {15: summary["queries_with_a_loop"], 45: summary["wide_angle"]["queries_with_a_loop"]}
+    found = []
     for method in summary["methods"]:
-        best, pairs = (method["figures"][name] for name in ("best match of each query", "all pairs"))
-        found[method["name"]] = {
-            **frames,
-            f"R@1 {angle}": best["recall at 1"],
-            f"AP {angle}": pairs["average precision"],
-        }
+        row = {"method": method["name"], "images": summary["queries"]}
+        for angle, suffix in ANGLES.items():
+            best, pairs = (method["figures"][f"{name}{suffix}"] for name in ("best match of each query", "all pairs"))
+            row[f"with a loop {angle}"] = loops[angle]
+            row |= {f"R@1 {angle}": best["recall at 1"], f"AP {angle}": pairs["average precision"]}
+        found.append(row)
     return found
 
 
-def show_times(path: Path) -> None:
+def show_times(summary: dict[str, Any]) -> None:
     """Print the times of ``loopclosure evaluate`` for an image and for all images, and the paper's."""
-    with path.open() as file:
-        for row in csv.DictReader(file):
-            each = f", {row['milliseconds a frame']:.6} ms an image" if row["milliseconds a frame"] else ""
-            print(f"{row['method']}, {row['stage']}: {float(row['seconds']):.3g} s for {row['frames']} images{each}")
+    for method in summary["methods"]:
+        for stage, seconds in method["seconds"].items():
+            each = method["milliseconds_a_frame"].get(stage)
+            text = "" if each is None else f", {each:.4g} ms an image"
+            print(f"{method['name']}, {stage}: {seconds:.3g} s for {summary['queries']} images{text}")
     print("The paper: 0.23 s an image; the matrix of 1,000 images 2.8 s, by FAB-MAP 2.0 22 minutes")
 
 
@@ -135,17 +135,14 @@ def main() -> None:
     walk = arguments.out / "walk"
     join(arguments.sequence, walk, arguments.start)
     methods = [*describe(arguments, walk), *learn(arguments, walk), "thumbnails"]
-    table: dict[str, dict[str, Any]] = {}
-    for angle in ANGLES:
-        report = arguments.out / f"report_{angle}"
-        evaluate = ["loopclosure", "evaluate", walk, "--out", report, "--max-angle", angle]
-        evaluate += ["--exclude-seconds", arguments.exclude_seconds]
-        run(*evaluate, *(word for method in methods for word in ("--method", method)))
-        for name, figures in rows(report, angle).items():
-            table.setdefault(name, {"method": name}).update(figures)
-    (arguments.out / "table.json").write_text(json.dumps(list(table.values()), indent=1))
-    show_times(arguments.out / f"report_{ANGLES[0]}" / "times.csv")
-    for cells in table.values():
+    report = arguments.out / "report"
+    evaluate = ["loopclosure", "evaluate", walk, "--out", report, "--exclude-seconds", arguments.exclude_seconds]
+    run(*evaluate, *(word for method in methods for word in ("--method", method)))
+    summary = json.loads((report / "report.json").read_text())
+    table = rows(summary)
+    (arguments.out / "table.json").write_text(json.dumps(table, indent=1))
+    show_times(summary)
+    for cells in table:
         values = [round(cell, 3) if isinstance(cell, float) else cell for cell in cells.values()]
         print(*(f"{name}: {value}" for name, value in zip(cells, values, strict=True)), sep=", ")
 

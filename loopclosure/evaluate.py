@@ -1,8 +1,7 @@
 """Evaluates methods on a data set: their scores, precision and recall, and times.
 
-Measures are computed by two conventions, over all pairs and over the best match of each query, and in two zones. In the
-rule zone, the truth of the data set decides what is a mistake. In the soft zone, which needs poses, a match of
-overlapping views is not a mistake either (:mod:`loopclosure.places.overlap`). The loops to find are the same in both.
+Measures are computed by two conventions, over all pairs and over the best match of each query. With poses they are
+computed by two angles: by that of the rule, and by 45 degrees, up to which views of one place share what they see.
 """
 
 from __future__ import annotations
@@ -19,19 +18,20 @@ from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext
 from loopclosure.methods.named import make_method
 from loopclosure.places.datasets import DataSet
+from loopclosure.places.same_place import WIDE_ANGLE_DEG
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import ALL_PAIRS, BestMatches, JudgedScores, PrecisionRecall
 from loopclosure.progress import Progress, silent
 from netspec.errors import printable
 
 RECALL_AT = (1, 5, 10)
-SOFT_ZONE = "; soft zone"
+WIDE = f"; {WIDE_ANGLE_DEG:g} degrees"  # follows the convention of measures by the wide angle
 MOST_MEASURED = 200  # loops of a method whose relative pose is measured
 
 
 @dataclass(frozen=True)
 class Judgment:
-    """The measures of a matrix of scores in one zone.
+    """The measures of a matrix of scores by one truth.
 
     pairs      the curve over all pairs
     best       the curve of the best match of each query
@@ -58,17 +58,17 @@ class Judgment:
             return "nothing accepted, recall 0"
         return f"precision {self.best.precision[-1]:.3f}, recall {self.best.recall[-1]:.3f}"
 
-    def measures(self, zone: str = "") -> dict[str, dict[str, float]]:
-        """Return convention + ``zone`` -> name of the measure -> value in 0..1."""
+    def measures(self, angle: str = "") -> dict[str, dict[str, float]]:
+        """Return convention + ``angle`` -> name of the measure -> value in 0..1."""
         table = {
-            curve.convention + zone: {
+            curve.convention + angle: {
                 "average precision": curve.average_precision,
                 "recall at 100 % precision": curve.recall_at_full_precision,
                 "best F1": curve.best_f1,
             }
             for curve in (self.pairs, self.best)
         }
-        table[self.best.convention + zone].update({f"recall at {k}": value for k, value in self.recall_at.items()})
+        table[self.best.convention + angle].update({f"recall at {k}": value for k, value in self.recall_at.items()})
         return table
 
 
@@ -77,8 +77,8 @@ class Outcome:
     """The result of one method on one data set.
 
     scores   (Q, R) of the method, higher = more similar
-    rule     the measures in the rule zone
-    soft     the measures in the soft zone; None if it is not known
+    rule     the measures by the truth of the data set
+    wide     the measures by the wide angle; None without poses
     seconds  stage -> total seconds
     training_stages  the stages that run once, on training images
     answer   for a method that makes its own decisions: a summary of them and of how many are right
@@ -88,7 +88,7 @@ class Outcome:
     name: str
     scores: np.ndarray
     rule: Judgment
-    soft: Judgment | None
+    wide: Judgment | None
     seconds: dict[str, float]
     training_stages: tuple[str, ...]
     notes: list[str]
@@ -97,22 +97,22 @@ class Outcome:
 
     @property
     def pairs(self) -> PrecisionRecall:
-        """The curve over all pairs, in the rule zone."""
+        """The curve over all pairs, by the rule."""
         return self.rule.pairs
 
     @property
     def best(self) -> PrecisionRecall:
-        """The curve of the best match of each query, in the rule zone."""
+        """The curve of the best match of each query, by the rule."""
         return self.rule.best
 
     @property
     def matches(self) -> BestMatches:
-        """The best match of each query, in the rule zone."""
+        """The best match of each query, judged by the rule."""
         return self.rule.matches
 
     @property
     def recall_at(self) -> dict[int, float]:
-        """The recall at k in the rule zone, see :class:`Judgment`."""
+        """The recall at k by the rule, see :class:`Judgment`."""
         return self.rule.recall_at
 
     @property
@@ -130,8 +130,8 @@ class Outcome:
 
     @cached_property
     def measures(self) -> dict[str, dict[str, float]]:
-        """The measures in both zones: convention and zone -> name of the measure -> value in 0..1."""
-        return {**self.rule.measures(), **({} if self.soft is None else self.soft.measures(SOFT_ZONE))}
+        """The measures by both angles: convention and angle -> name of the measure -> value in 0..1."""
+        return {**self.rule.measures(), **({} if self.wide is None else self.wide.measures(WIDE))}
 
 
 @dataclass(frozen=True)
@@ -179,17 +179,16 @@ def judge(
     """Run one method and judge its scores."""
     result = method.score(Images(data.queries, data.references, list(train_images)), progress)
     rule = Judgment.of(result.scores, data.truth)
-    soft_truth = data.soft_truth
     unscored = int(np.count_nonzero(np.isnan(result.scores) & data.truth.judged))
     notes = list(result.notes)
     if unscored:
         judged = int(np.count_nonzero(data.truth.judged))
         notes.append(f"no score for {unscored} of {judged} judged pairs, which counts as no loop")
-    soft = None if soft_truth is None else Judgment.of(result.scores, soft_truth)
+    wide = None if data.wide is None else Judgment.of(result.scores, data.wide)
     answer = ""
     if result.answer:
-        zones = [("", rule)] + ([] if soft is None else [(" in the soft zone", soft)])
-        answer = "; ".join([result.answer, *(f"{judged.answered()}{zone}" for zone, judged in zones)])
+        angles = [("", rule)] + ([] if wide is None else [(f" by {WIDE_ANGLE_DEG:g} degrees", wide)])
+        answer = "; ".join([result.answer, *(f"{judged.answered()}{angle}" for angle, judged in angles)])
         notes.append(answer)
     measured = measured_said(data, rule.matches, progress) if result.answer else ""
     notes += [measured] if measured else []
@@ -197,7 +196,7 @@ def judge(
         name=name,
         scores=result.scores,
         rule=rule,
-        soft=soft,
+        wide=wide,
         seconds=result.seconds,
         training_stages=result.training_stages,
         notes=notes,

@@ -11,7 +11,6 @@ from loopclosure.places import datasets
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import from_text
 from loopclosure.places.masks import CAMERAS
-from loopclosure.places.overlap import FOV_DEG, ViewOverlap
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.sequences import GROUNDTRUTH, benchmark_parts, layout_of
 from loopclosure.places.source import (
@@ -48,12 +47,8 @@ KEYs: start, stop (a frame number N or a percentage P%), stride, limit: which fr
 truth=FILE (.mat .npy .txt or image); poses=FILE ({POSES_HELP}),
 pose-form ({POSE_FORM_HELP});
 references=PATH: another sequence to search; topic, pose-topic: the topics to read from a bag with several."""
-RULE = ("max_distance", "max_angle", "soft_distance", "soft_angle", "fov", "overlap", "exclude_seconds")
-TRAVERSES = ("tolerance", "soft_tolerance")
-
-
+RULE = ("max_distance", "max_angle", "exclude_seconds")
 EXCLUDED = f"fabmap {datasets.FABMAP_EXCLUSION.frames}, images {datasets.FOLDER_EXCLUSION.frames}"
-OVERLAP = "ignore a wrong match if at least this share of each view is visible in the other"
 
 
 def add_data_set(parser: argparse.ArgumentParser) -> None:
@@ -66,12 +61,6 @@ def add_data_set(parser: argparse.ArgumentParser) -> None:
         help="traverses: largest difference between frame numbers of the same place (default: 0)",
     )
     parser.add_argument(
-        "--soft-tolerance",
-        type=int,
-        metavar="FRAMES",
-        help="traverses: ignore wrong matches up to this difference",
-    )
-    parser.add_argument(
         "--max-distance",
         type=above_zero,
         metavar="M",
@@ -80,14 +69,6 @@ def add_data_set(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--max-angle", type=above_zero, metavar="DEG", help=f"maximum angle between them (default: {MAX_ANGLE_DEG:g})"
     )
-    parser.add_argument(
-        "--soft-distance", type=above_zero, metavar="M", help="ignore wrong matches up to this distance"
-    )
-    parser.add_argument("--soft-angle", type=above_zero, metavar="DEG", help="ignore wrong matches up to this angle")
-    parser.add_argument(
-        "--fov", type=float, metavar="DEG", help=f"horizontal field of view (default: the camera's, or {FOV_DEG:g})"
-    )
-    parser.add_argument("--overlap", type=float, metavar="SHARE", help=f"{OVERLAP} (default: {ViewOverlap().least:g})")
     parser.add_argument(
         "--exclude-frames",
         type=int,
@@ -133,7 +114,7 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
     if not posed:
         refuse(a, RULE, f"is for sequences with poses, not for {kind}")
     if kind != "traverses":
-        refuse(a, TRAVERSES, "is for traverses")
+        refuse(a, ("tolerance",), "is for traverses")
     if kind in ("traverses", "nordland", "pairs"):
         refuse(a, ("exclude_frames",), f"is for one sequence, not for {kind}")
     chosen = source.selection()
@@ -153,9 +134,9 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
             sequence(source, out / "frames", posed=True),
             chosen,
             exclusion,
-            limits=datasets.PoseLimits(a.max_distance, a.max_angle, a.soft_distance, a.soft_angle),
+            max_distance_m=a.max_distance or MAX_DISTANCE_M,
+            max_angle_deg=a.max_angle or MAX_ANGLE_DEG,
             references=sequence(others, out / "references", posed=True) if others else None,
-            view_overlap=ViewOverlap(a.fov, ViewOverlap().least if a.overlap is None else a.overlap),
         )
     if kind == "fabmap":
         camera = source.get("camera", str) or "both"
@@ -172,7 +153,7 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
     if kind == "traverses":
         if references is None:
             raise WrongUsage(f"traverses:{source} needs ,references=FOLDER (the other drive)")
-        return datasets.load_traverses(source.path, references, a.tolerance or 0, a.soft_tolerance, chosen, truth)
+        return datasets.load_traverses(source.path, references, a.tolerance or 0, chosen, truth)
     if kind == "nordland":
         queries, found, truth_file = benchmark_parts(source.path)
         return datasets.load_traverses(queries, found, selection=chosen, truth_file=truth_file)

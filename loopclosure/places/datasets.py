@@ -21,8 +21,7 @@ from loopclosure.places.masks import (
     read_place_pairs,
     read_truth_matrix,
 )
-from loopclosure.places.overlap import ViewOverlap, overlap_matrix, views
-from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
+from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, WIDE_ANGLE_DEG, same_place_matrix
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import write_whole
@@ -43,8 +42,7 @@ class DataSet:
     references      R frames, or None for one sequence that visits its own places again
     truth           (Q, R)
     exclude_frames  smallest number of frames that covers all excluded pairs (SeqSLAM needs frames, not seconds)
-    overlap         (Q, R) bool: views that overlap by their poses and depth; None without poses
-    overlap_rule    the rule for overlapping views, as text
+    wide            the truth (Q, R) by poses with an angle of 45 degrees; None without poses, or if truth has more
     notes           remarks for readers of the results: what was left out, what looks wrong
     """
 
@@ -53,8 +51,7 @@ class DataSet:
     references: ImageSequence | None
     truth: Truth
     exclude_frames: int = 0
-    overlap: np.ndarray | None = None
-    overlap_rule: str = ""
+    wide: Truth | None = None
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -68,107 +65,49 @@ class DataSet:
         poses = self.queries.poses
         return None if poses is None or np.isnan(poses[:, 0]).any() else poses[:, :3]
 
-    @property
-    def soft_truth(self) -> Truth | None:
-        """The truth in which a match of overlapping views is not a mistake; None if the overlap is not known."""
-        if self.overlap is None:
-            return None
-        description = f"{self.truth.description}; no mistake where views overlap: {self.overlap_rule}"
-        return replace(self.truth, soft=self.truth.soft | self.overlap, description=description)
-
-
-@dataclass(frozen=True)
-class PoseLimits:
-    """How far from each other, in meters and degrees, two poses of one place may be.
-
-    A distance or angle that is None is the paper's. The ``soft`` ones are wider limits: a match within them is not a
-    mistake. If both are None there is no soft truth; if one is, it is as wide as the hard one.
-    """
-
-    distance_m: float | None = None
-    angle_deg: float | None = None
-    soft_distance_m: float | None = None
-    soft_angle_deg: float | None = None
-
-    @property
-    def hard(self) -> tuple[float, float]:
-        """The limits, in meters and degrees."""
-        return _or_default(self.distance_m, MAX_DISTANCE_M), _or_default(self.angle_deg, MAX_ANGLE_DEG)
-
-    @property
-    def soft(self) -> tuple[float, float] | None:
-        """The limits of soft truth, None if there is none. Raises InputError if they are narrower than hard ones."""
-        if self.soft_distance_m is None and self.soft_angle_deg is None:
-            return None
-        wide_m, wide_deg = (
-            _or_default(self.soft_distance_m, self.hard[0]),
-            _or_default(self.soft_angle_deg, self.hard[1]),
-        )
-        if wide_m < self.hard[0] or wide_deg < self.hard[1]:
-            raise InputError(f"soft truth ({wide_m:g} m, {wide_deg:g} degrees) is narrower than hard truth ({self})")
-        return wide_m, wide_deg
-
-    def __str__(self) -> str:
-        return "same place: nearer than {:g} m and turned less than {:g} degrees".format(*self.hard)
-
 
 def load_sequence(
     sequence: ImageSequence,
     selection: Selection = ALL_FRAMES,
     exclusion: Exclusion | None = None,
     *,
-    limits: PoseLimits = PoseLimits(),
+    max_distance_m: float = MAX_DISTANCE_M,
+    max_angle_deg: float = MAX_ANGLE_DEG,
     references: ImageSequence | None = None,
-    view_overlap: ViewOverlap | None = None,
 ) -> DataSet:
     """Make a data set of a sequence with poses; truth by the paper's rule.
 
     ``selection`` counts all frames; then frames without a pose are left out. The default ``exclusion`` is pairs of
     frames within 10 s, or within 10 frames if there are no stamps.
 
-    limits        how near frames of one place are
-    references    another sequence, with poses in the same frame of reference: each query against all its frames;
-                  ``selection`` applies to the queries only, and no pair is excluded
-    view_overlap  the rule for overlapping views, for the soft zone
+    max_distance_m, max_angle_deg  see :func:`~loopclosure.places.same_place.same_place`
+    references  another sequence, with poses in the same frame of reference: each query against all its frames;
+                ``selection`` applies to the queries only, and no pair is excluded
     """
-    wide = limits.soft
-    rule = f"{limits}" if wide is None else f"{limits} (soft: {wide[0]:g} m, {wide[1]:g} degrees)"
     taken = sequence.taken(selection)
     queries = taken.with_poses().with_files()
     others = queries if references is None else references.with_poses().with_files()
-    poses, stamps = queries.known_poses(), queries.stamps
-    hard = same_place_matrix(poses, others.known_poses(), *limits.hard)
-    soft = None if wide is None else same_place_matrix(poses, others.known_poses(), *wide)
-    overlap_rule = (view_overlap or ViewOverlap()).of_camera(sequence.camera)
-    height, width = read_bgr(queries.paths[0]).shape[:2]
-    seen = views(poses, queries.depths or ())
-    others_seen = seen if references is None else views(others.known_poses(), others.depths or ())
-    overlap = overlap_matrix(seen, others_seen, overlap_rule, height / width)
-    measured = bool(seen.measured.any() or others_seen.measured.any())
+    stamps = queries.stamps
     if references is None:
         exclusion = exclusion or (FOLDER_EXCLUSION if stamps is None else TUM_EXCLUSION)
-        truth = sequence_truth(hard, exclusion, rule, soft=soft, stamps=stamps)
         frames = exclusion.frames if stamps is None else _excluded_frames(exclusion, stamps)
         name, notes = f"{queries.name}{_selection_text(selection)}", _pose_notes(taken)
     else:
-        truth, frames = traverse_truth(hard, rule, soft=soft), 0
+        frames = 0
         name = f"{queries.name}{_selection_text(selection)} in {others.name}"
         notes = [*_pose_notes(taken), *(f"{others.name}: {note}" for note in _pose_notes(references))]
-    data = DataSet(
-        name=name,
-        queries=queries,
-        references=None if references is None else others,
-        truth=truth,
-        exclude_frames=frames,
-        overlap=overlap,
-        overlap_rule=overlap_rule.describe(measured),
-        notes=notes,
-    )
-    return _checked(data, hard)
 
+    def by_angle(angle_deg: float) -> Truth:
+        hard = same_place_matrix(queries.known_poses(), others.known_poses(), max_distance_m, angle_deg)
+        rule = f"same place: nearer than {max_distance_m:g} m and turned less than {angle_deg:g} degrees"
+        if references is None:
+            return sequence_truth(hard, exclusion or FOLDER_EXCLUSION, rule, stamps=stamps)
+        return traverse_truth(hard, rule)
 
-def _or_default(value: float | None, default: float) -> float:
-    return default if value is None else value
+    truth = by_angle(max_angle_deg)
+    wide = by_angle(WIDE_ANGLE_DEG) if max_angle_deg < WIDE_ANGLE_DEG else None
+    data = DataSet(name, queries, None if references is None else others, truth, frames, wide, notes)
+    return _checked(data, truth.hard)
 
 
 def _pose_notes(sequence: ImageSequence) -> list[str]:
@@ -261,22 +200,21 @@ def load_traverses(
     queries: str | Path,
     references: str | Path,
     tolerance: int = 0,
-    soft_tolerance: int | None = None,
     selection: Selection = ALL_FRAMES,
     truth_file: str | Path | None = None,
 ) -> DataSet:
     """Load two traverses of one route.
 
     Without ``truth_file``, frames with the same number show the same place, as in Nordland. Frames i and j are the same
-    place if |i - j| <= ``tolerance``; ``soft_tolerance`` is the same for soft truth. Both count all frames, and
-    ``selection`` then takes the same frames of both traverses. With ``truth_file`` (a mask or lists, see
-    :func:`loopclosure.places.masks.read_matches`), ``selection`` applies to the queries only.
+    place if |i - j| <= ``tolerance``, which counts all frames; ``selection`` then takes the same frames of both
+    traverses. With ``truth_file`` (a mask or lists, see :func:`loopclosure.places.masks.read_matches`), ``selection``
+    applies to the queries only.
     """
     query_images = ImageSequence.of_files(image_paths(queries))
     reference_images = ImageSequence.of_files(image_paths(references))
     name = f"{_folder_name(queries)} in {_folder_name(references)}{_selection_text(selection)}"
     if truth_file is not None:
-        if tolerance or soft_tolerance is not None:
+        if tolerance:
             raise InputError("a tolerance cannot be used with a file of matching frames", truth_file)
         hard, soft = read_matches(truth_file, len(query_images), len(reference_images))
         taken = selection.numbers(len(query_images))
@@ -287,13 +225,12 @@ def load_traverses(
             f"{len(query_images)} queries in {queries}, {len(reference_images)} references in {references}; "
             "expected equal numbers, since frame i of one is frame i of the other"
         )
-    if tolerance < 0 or (soft_tolerance is not None and soft_tolerance < tolerance):
-        raise InputError(f"tolerance {tolerance}, soft tolerance {soft_tolerance}; expected 0 <= tolerance <= soft")
+    if tolerance < 0:
+        raise InputError(f"tolerance is {tolerance}; expected 0 or more")
     taken = selection.numbers(len(query_images))
     differences = np.abs(np.subtract.outer(taken, taken))
     rule = f"same place: at most {tolerance} frames apart" if tolerance else "same place: the frame of the same number"
-    soft = None if soft_tolerance is None else differences <= soft_tolerance
-    truth = traverse_truth(differences <= tolerance, rule, soft=soft)
+    truth = traverse_truth(differences <= tolerance, rule)
     return DataSet(name, query_images.at(taken), reference_images.at(taken), truth)
 
 

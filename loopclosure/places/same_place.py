@@ -18,6 +18,8 @@ from loopclosure.places.trajectory import Posed, Poses
 
 MAX_DISTANCE_M = 2.0
 MAX_ANGLE_DEG = 15.0
+# Views of one place that are turned further than the rule allows; results are given by this angle too.
+WIDE_ANGLE_DEG = 45.0
 
 
 def distances_m(pose_a: Posed, pose_b: Posed) -> NDArray[np.float64]:

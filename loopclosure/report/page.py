@@ -1,4 +1,4 @@
-"""Writes the report of an evaluation: a self-contained HTML page, and the same data as PNG, CSV and JSON files.
+"""Writes the report of an evaluation: a self-contained HTML page, its pictures as PNG files, and the same data as JSON.
 
 Every file states the convention of its results and the exclusion. The template ``report.html.jinja`` escapes all
 values, so names of methods, folders and notes may have any characters.
@@ -17,10 +17,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome
 from loopclosure.places.frames import read_bgr
-from loopclosure.places.same_place import angles_deg, distances_m
+from loopclosure.places.same_place import WIDE_ANGLE_DEG, angles_deg, distances_m
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from loopclosure.report import plots
-from loopclosure.report.files import EXPLANATION, SOFT_MEASURES, share, write_files
+from loopclosure.report.files import EXPLANATION, WIDE_MEASURES, share, write_json
 from netspec.files.figures import png
 from netspec.files.opencv import cv2
 from netspec.files.whole_file import write_whole
@@ -49,10 +49,8 @@ class Kind:
 def write_report(evaluation: Evaluation, folder: str | Path, title: str = "", command: str = "") -> Path:
     """Write report.html and its parts into ``folder``, which is created if needed; return the path of the page.
 
-    The parts are ``figures.csv``, ``times.csv``, ``report.json``, ``precision_recall.png``, ``matrices.png``,
-    ``matches.png`` and, for one sequence with positions, ``map.png``; for each method ``curve_*.csv`` (one row for each
-    value of recall, with its precision) and ``matches_*.csv``. ``command``, if given, is printed at the end of the page
-    to repeat the evaluation.
+    The parts are ``report.json``, ``precision_recall.png``, ``matrices.png``, ``matches.png`` and, for one sequence
+    with positions, ``map.png``. ``command``, if given, is printed at the end of the page to repeat the evaluation.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -69,7 +67,7 @@ def write_report(evaluation: Evaluation, folder: str | Path, title: str = "", co
     page = folder / "report.html"
     text = _page(evaluation, encoded, title or f"Loop closure on {evaluation.data.name}", command)
     write_whole(page, text, "backslashreplace")
-    write_files(evaluation, folder, command)
+    write_json(evaluation, folder / "report.json", command)
     return page
 
 
@@ -87,8 +85,6 @@ def _page(evaluation: Evaluation, pictures: dict[str, bytes], title: str, comman
         f"{loops} of {len(data.queries)} queries have a loop",
         "training": evaluation.train,
     }
-    if data.soft_truth is not None:
-        facts["soft zone"] = f"in addition to the rule: a match is not a mistake if {data.overlap_rule}"
     return rendered(
         "report.html.jinja",
         title=title,
@@ -96,7 +92,7 @@ def _page(evaluation: Evaluation, pictures: dict[str, bytes], title: str, comman
         command=command,
         data=data,
         truth=truth.description,
-        soft=data.soft_truth is not None,
+        wide=None if data.wide is None else f"{WIDE_ANGLE_DEG:g} degrees",
         frames=frames,
         facts=facts,
         images=evaluation.image_count,
@@ -132,8 +128,8 @@ def _measures_rows(evaluation: Evaluation) -> list[tuple[str, list[tuple[float, 
     """Return the name and the measures of each method; each measure with whether it is the best of all methods."""
     rows = [[v for name in (ALL_PAIRS, BEST_MATCH) for v in o.shown[name].values()] for o in evaluation.outcomes]
     for row, outcome in zip(rows, evaluation.outcomes, strict=True):
-        if outcome.soft is not None:
-            row += [outcome.soft.measures()[BEST_MATCH][name] for name in SOFT_MEASURES]
+        if outcome.wide is not None:
+            row += [outcome.wide.measures()[BEST_MATCH][name] for name in WIDE_MEASURES]
     best = [max((row[i] for row in rows if not math.isnan(row[i])), default=None) for i in range(len(rows[0]))]
     return [
         (outcome.name, [(value, len(rows) > 1 and value == top) for value, top in zip(row, best, strict=True)])
@@ -161,7 +157,6 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[Kind]:
     true_scores = np.nan_to_num(outcome.scores[loops, true], nan=-np.inf)
     right = right[np.argsort(-matches.score[right], kind="stable")]
     wrong = wrong[np.argsort(-matches.score[wrong], kind="stable")]
-    excused = plots.overlapping(outcome, wrong)
     lowest = np.argsort(true_scores, kind="stable")
 
     alone = evaluation.data.references is None
@@ -171,14 +166,11 @@ def _kinds_of_pairs(evaluation: Evaluation, outcome: Outcome) -> list[Kind]:
         shown = spread(queries.tolist(), PAIRS_SHOWN, least_gap)
         return [_pair(evaluation, outcome, queries[i], references[i]) for i in shown]
 
-    both = "" if outcome.soft is None else " in both zones"
-    kinds = [
+    return [
         Kind("found", "right, highest score", pairs(right, matches.reference[right])),
-        Kind("false", f"wrong{both}, highest score", pairs(wrong[~excused], matches.reference[wrong[~excused]])),
-        Kind("excused", "wrong by the rule, views overlap", pairs(wrong[excused], matches.reference[wrong[excused]])),
+        Kind("false", "wrong, highest score", pairs(wrong, matches.reference[wrong])),
         Kind("missed", "true, lowest score", pairs(loops[lowest], true[lowest])),
     ]
-    return kinds if outcome.soft is not None else [kind for kind in kinds if kind.name != "excused"]
 
 
 def spread(frames: Sequence[int], count: int, least_gap: float) -> list[int]:
@@ -215,14 +207,13 @@ def side_by_side(*images: np.ndarray) -> bytes:
 
 
 def _distance_text(evaluation: Evaluation, query: int, reference: int) -> str:
-    """Return the distance and angle between two views and whether they overlap; empty if the poses are not known."""
+    """Return the distance and angle between two views; empty if the poses are not known."""
     data = evaluation.data
-    if data.overlap is None or data.references is not None or not data.queries.known.all():
+    if data.wide is None or data.references is not None or not data.queries.known.all():
         return ""
     poses = data.queries.known_poses()
     a, b = poses[query], poses[reference]
-    seen = "views overlap" if data.overlap[query, reference] else "views do not overlap"
-    return f"; {float(distances_m(a, b)):.2g} m and {float(angles_deg(a, b)):.0f} degrees apart, {seen}"
+    return f"; {float(distances_m(a, b)):.2g} m and {float(angles_deg(a, b)):.0f} degrees apart"
 
 
 def rendered(template: str, **values: object) -> str:
@@ -231,12 +222,7 @@ def rendered(template: str, **values: object) -> str:
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
     )
     environment.filters |= {"share": share, "significant": _significant, "base64": _in_base64}
-    colors = {
-        "found": plots.FOUND,
-        "false": plots.FALSE,
-        "missed": plots.MISSED,
-        "overlapping": plots.OVERLAPPING,
-    }
+    colors = {"found": plots.FOUND, "false": plots.FALSE, "missed": plots.MISSED}
     return environment.get_template(template).render(**values, colors=colors)
 
 

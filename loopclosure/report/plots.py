@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
 from loopclosure.closing.close import Closed, aligned
-from loopclosure.evaluate import SOFT_ZONE, Evaluation, Outcome
+from loopclosure.evaluate import WIDE, Evaluation, Outcome
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from netspec.errors import printable
@@ -30,7 +30,7 @@ from netspec.files import figures
 from netspec.files.figures import COLORS
 from netspec.files.whole_file import whole_file
 
-FOUND, FALSE, MISSED, OVERLAPPING = "#1a9641", "#d7191c", "#9e9e9e", "#f4a582"
+FOUND, FALSE, MISSED, NEARLY = "#1a9641", "#d7191c", "#9e9e9e", "#f4a582"
 LINES = ("-", "--", ":", "-.")  # the second use of a color is dashed, and so on
 TITLE_WIDTH = 38  # characters that fit above a panel
 LABEL_WIDTH = 60  # characters that fit in a line of a legend
@@ -55,11 +55,8 @@ def matrices(evaluation: Evaluation) -> Figure:
     panels = 1 + len(evaluation.outcomes)
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(panels, 1.0 if truth.hard.shape[0] == truth.hard.shape[1] else 0.9)
-        soft = (evaluation.data.soft_truth or truth).soft
-        shown = np.where(truth.hard, 2.0, np.where(soft, 1.0, 0.0))
-        _draw_matrix(
-            axes[0], np.where(truth.judged, shown, np.nan), ListedColormap(["white", OVERLAPPING, "black"]), 0, 2
-        )
+        shown = np.where(truth.hard, 2.0, np.where(truth.soft, 1.0, 0.0))
+        _draw_matrix(axes[0], np.where(truth.judged, shown, np.nan), ListedColormap(["white", NEARLY, "black"]), 0, 2)
         axes[0].set_title("ground truth")
         for axis, outcome in zip(axes[1:], evaluation.outcomes, strict=True):
             scores = np.where(truth.judged & np.isfinite(outcome.scores), outcome.scores, np.nan)
@@ -76,14 +73,14 @@ def matrices(evaluation: Evaluation) -> Figure:
 
 
 def curves(evaluation: Evaluation) -> Figure:
-    """Draw the precision-recall curves of all methods, one panel for each convention and zone.
+    """Draw the precision-recall curves of all methods, one panel for each convention.
 
-    For the soft zone, only the best match of each query is drawn: over all pairs, it differs little from the rule zone.
+    With poses, a third panel has the best match of each query by the wide angle.
     """
     panels = {
         ALL_PAIRS: [outcome.pairs for outcome in evaluation.outcomes],
         BEST_MATCH: [outcome.best for outcome in evaluation.outcomes],
-        BEST_MATCH + SOFT_ZONE: [outcome.soft.best for outcome in evaluation.outcomes if outcome.soft is not None],
+        BEST_MATCH + WIDE: [outcome.wide.best for outcome in evaluation.outcomes if outcome.wide is not None],
     }
     panels = {title: found for title, found in panels.items() if found}
     with matplotlib.rc_context(STYLE):
@@ -120,7 +117,7 @@ def matches(evaluation: Evaluation) -> Figure:
             _draw_matches(axis, outcome, evaluation.data.truth)
             _name_panel(axis, outcome)
         _label_left(axes, "query")
-        _loop_legend(figure, evaluation)
+        _loop_legend(figure)
         _state_truth(figure, evaluation, BEST_MATCH)
         return figure
 
@@ -139,7 +136,7 @@ def maps(evaluation: Evaluation) -> Figure:
         for axis, outcome in zip(axes, evaluation.outcomes, strict=True):
             _draw_map(axis, outcome, evaluation.data.truth, positions)
             _name_panel(axis, outcome)
-        _loop_legend(figure, evaluation)
+        _loop_legend(figure)
         _state_truth(figure, evaluation, BEST_MATCH)
         return figure
 
@@ -156,13 +153,6 @@ def decisions(outcome: Outcome, truth: Truth) -> tuple[np.ndarray, np.ndarray, n
     false = accepted & ~outcome.matches.right & ~outcome.matches.ignored
     missed = truth.queries_with_a_loop & ~found
     return np.flatnonzero(found), np.flatnonzero(false), np.flatnonzero(missed)
-
-
-def overlapping(outcome: Outcome, queries: np.ndarray) -> np.ndarray:
-    """Return for each of these queries with wrong matches by the rule whether the match is right in the soft zone."""
-    if outcome.soft is None:
-        return np.zeros(len(queries), bool)
-    return outcome.soft.matches.right[queries] | outcome.soft.matches.ignored[queries]
 
 
 def best_true_references(outcome: Outcome, truth: Truth, queries: np.ndarray) -> np.ndarray:
@@ -254,13 +244,13 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
 
 
 def _drawn(outcome: Outcome, truth: Truth) -> list[tuple[np.ndarray, np.ndarray, str]]:
-    """Return queries, references and a color for each group: missed, found, false only by the rule, false."""
+    """Return queries, references and a color for each group: missed, found, false."""
     found, false, missed = decisions(outcome, truth)
-    excused, reference = overlapping(outcome, false), outcome.matches.reference
-    colored = [(found, FOUND), (false[excused], OVERLAPPING), (false[~excused], FALSE)]
+    reference = outcome.matches.reference
     return [
         (missed, best_true_references(outcome, truth, missed), MISSED),
-        *((queries, reference[queries], color) for queries, color in colored),
+        (found, reference[found], FOUND),
+        (false, reference[false], FALSE),
     ]
 
 
@@ -274,10 +264,8 @@ def _draw_matches(axis: Axes, outcome: Outcome, truth: Truth) -> None:
     axis.set_xlabel("reference")
 
 
-def _loop_legend(figure: Figure, evaluation: Evaluation) -> None:
+def _loop_legend(figure: Figure) -> None:
     colors = [(FOUND, "found"), (FALSE, "false"), (MISSED, "missed")]
-    if evaluation.data.soft_truth is not None:
-        colors.insert(1, (OVERLAPPING, "false by the rule, views overlap"))
     lines = [Line2D([], [], color=color, linewidth=2, label=label) for color, label in colors]
     figure.legend(handles=lines, loc="outside upper center", ncols=len(colors))
 

@@ -20,8 +20,8 @@ from paths import ROOT
 
 @pytest.mark.slow
 def test_evaluate(two_laps, two_laps_features, tmp_path, capsys):
-    line = f"evaluate tum:{two_laps} --method thumbnails --method net=features:{two_laps_features} --soft-distance 3"
-    line += f" --soft-angle 30 --out {tmp_path / 'r'}"
+    line = f"evaluate tum:{two_laps} --method thumbnails --method net=features:{two_laps_features}"
+    line += f" --out {tmp_path / 'r'}"
     assert main([*line.split(), "--title", "Round trip"]) == 0
     printed = capsys.readouterr().out
     assert "thumbnails" in printed
@@ -35,16 +35,15 @@ def test_evaluate(two_laps, two_laps_features, tmp_path, capsys):
 @pytest.mark.slow
 def test_evaluate_the_whole_system_on_another_recording(two_laps, two_laps_features, tmp_path, capsys):
     features = f"features:{two_laps_features}"
-    line = f"evaluate {two_laps},start=20,references={two_laps} --fov 50 --overlap 0.4 --out {tmp_path}"
+    line = f"evaluate {two_laps},start=20,references={two_laps} --out {tmp_path}"
     line += f" --method verified:k=2,min_inliers=8+{features} --method verified+seqslam+{features}"
     assert main(line.split()) == 0
-    assert "soft zone" in capsys.readouterr().out
+    assert "best match; 45 degrees" in capsys.readouterr().out
     summary = json.loads((tmp_path / "report.json").read_text())
     assert (summary["queries"], summary["references"]) == (20, 40)
-    assert "at least 40 % of each view" in summary["soft_zone"]
-    assert "horizontal field of view 50 degrees" in summary["soft_zone"]
+    assert "turned less than 45 degrees" in summary["wide_angle"]["truth"]
     for method in summary["methods"]:
-        assert {"best match of each query", "best match of each query; soft zone"} < set(method["figures"])
+        assert {"best match of each query", "best match of each query; 45 degrees"} < set(method["figures"])
         assert set(method["curves"]) == set(method["figures"])
 
 
@@ -253,7 +252,10 @@ def test_a_folder_with_poses_but_no_times_of_its_images_says_what_is_missing(tmp
     [
         ('a sequence has no setting "camera"', "evaluate LAPS,camera=left --method thumbnails --out OUT"),
         ("needs ,truth=MASK", "evaluate images:LAPS --method thumbnails --out OUT"),
-        ("--fov is for sequences with poses, not for ", "evaluate pairs:LAPS --fov 60 --method thumbnails --out OUT"),
+        (
+            "--max-angle is for sequences with poses, not for ",
+            "evaluate pairs:LAPS --max-angle 60 --method thumbnails --out OUT",
+        ),
         ("--exclude-frames cannot", "evaluate LAPS,references=LAPS --exclude-seconds 3 --method thumbnails --out OUT"),
         ("expected KEY=VALUE", "detect LAPS --threshold 1 --with width --out OUT"),
         ("--with is for --describe", "detect LAPS --threshold 1 --features FEATURES --with width=8 --out OUT"),
@@ -300,8 +302,6 @@ def test_wrong_usage_is_status_2(line, capsys):
         ("argument --seed: found 99999999999, expected a number from 0 to", "close x --seed 99999999999"),
         ("argument --max-distance: found nan, expected a number above 0", "evaluate --max-distance nan"),
         ("argument --max-angle: found nan, expected a number above 0", "evaluate --max-angle nan"),
-        ("argument --soft-distance: found -1, expected a number above 0", "evaluate --soft-distance -1"),
-        ("argument --soft-angle: found 0, expected a number above 0", "evaluate --soft-angle 0"),
     ],
 )
 def test_invalid_numbers_are_wrong_usage(words, said, capsys):

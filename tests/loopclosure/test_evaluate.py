@@ -8,7 +8,7 @@ import pytest
 
 from given_scores import GivenScores
 from loopclosure.errors import InputError
-from loopclosure.evaluate import SOFT_ZONE, evaluate, named_method
+from loopclosure.evaluate import WIDE, evaluate, named_method
 from loopclosure.methods.auto import Auto
 from loopclosure.methods.base import MethodContext
 from loopclosure.methods.features import FeatureMethod
@@ -104,25 +104,18 @@ def test_methods_can_refine_a_refining_method():
     assert isinstance(make_method("seqslam+verified+thumbnails"), SeqSlam)
 
 
-def test_the_soft_zone_excuses_overlapping_views(two_laps):
+def test_results_by_a_wider_angle(two_laps):
+    """Neighboring places are 18 degrees apart, and 1.6 m: other places by 15 degrees, the same by 45."""
     data = load_sequence(read_sequence(two_laps, "tum"))
-    assert data.overlap is not None
     neighbors = np.roll(data.truth.hard, 1, axis=1)
-    overlapping = replace(data, overlap=neighbors | data.truth.hard, overlap_rule="they are neighbors")
-    scores = np.where(neighbors, 2.0, np.where(data.truth.hard, 1.0, 0.0))
-    scores[39] = np.where(np.arange(40) == 3, 3.0, 0.0)  # the surest match is wrong in both zones
-    outcome, blameless = evaluate(
-        overlapping, [("x", GivenScores(scores)), ("y", GivenScores(scores * (scores < 3)))]
-    ).outcomes
+    (outcome,) = evaluate(data, [("x", GivenScores(neighbors.astype(float)))]).outcomes
     assert outcome.measures[BEST_MATCH]["recall at 100 % precision"] == 0
-    assert outcome.measures[BEST_MATCH + SOFT_ZONE]["recall at 100 % precision"] == 0
-    assert blameless.measures[BEST_MATCH]["recall at 100 % precision"] == 0
-    assert blameless.measures[BEST_MATCH + SOFT_ZONE]["recall at 100 % precision"] == pytest.approx(0.95)
-    assert outcome.soft is not None
-    assert "no mistake where views overlap: they are neighbors" in outcome.soft.best.truth_description
-    alone = evaluate(replace(data, overlap=None), [("x", GivenScores(scores))]).outcomes[0]
-    assert alone.soft is None
-    assert BEST_MATCH + SOFT_ZONE not in alone.measures
+    assert outcome.measures[BEST_MATCH + WIDE]["recall at 100 % precision"] > 0.9
+    assert outcome.wide is not None
+    assert "turned less than 45 degrees" in outcome.wide.best.truth_description
+    (alone,) = evaluate(replace(data, wide=None), [("x", GivenScores(neighbors.astype(float)))]).outcomes
+    assert alone.wide is None
+    assert BEST_MATCH + WIDE not in alone.measures
 
 
 def test_a_method_that_accepts_nothing_scores_0(two_laps):
@@ -145,6 +138,5 @@ def test_every_registered_name_exists(name):
         "describe": ":a.py:function",
         "verified": "+thumbnails",
         "auto": "+thumbnails",
-        "detector": ":a.npz:threshold=-1",
     }
     assert make_method(name + needed.get(name, "")).name

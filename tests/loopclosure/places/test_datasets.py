@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from loopclosure.errors import InputError
 from loopclosure.places.datasets import (
     FabmapFiles,
-    PoseLimits,
     load_fabmap,
     load_folder,
     load_place_pairs,
@@ -60,14 +59,14 @@ def test_tum_truth_is_the_papers_rule(tum_folder):
     assert data.notes[1].startswith("71 of 180 pairs")
 
 
-def test_tum_soft_truth_and_selection(tum_folder):
-    data = load_sequence(read_sequence(tum_folder, "tum"), Selection(stride=2), limits=PoseLimits(soft_angle_deg=25))
+def test_tum_by_a_wider_angle_and_selection(tum_folder):
+    data = load_sequence(read_sequence(tum_folder, "tum"), Selection(stride=2))
     assert len(data.queries.paths) == 36
-    only_soft = {(int(i), int(j)) for i, j in np.argwhere(data.truth.soft & ~data.truth.hard & data.truth.judged)}
-    assert only_soft == {(i, j) for i in range(36) for j in range(36) if i - j in (17, 19, 35)}
+    assert data.wide is not None
+    only_wide = {(int(i), int(j)) for i, j in np.argwhere(data.wide.hard & ~data.truth.hard & data.truth.judged)}
+    assert only_wide == {(i, j) for i in range(36) for j in range(i) if (i - j) % 18 in (1, 2, 16, 17) and i - j > 10}
     assert "every 2nd" in data.name
-    with pytest.raises(InputError, match="narrower than hard truth"):
-        load_sequence(read_sequence(tum_folder, "tum"), limits=PoseLimits(soft_angle_deg=5))
+    assert load_sequence(read_sequence(tum_folder, "tum"), max_angle_deg=60).wide is None
 
 
 def test_tum_without_a_revisit_is_refused(tum_folder):
@@ -198,15 +197,14 @@ def test_exclusion_that_takes_every_loop_is_refused(tmp_path):
 def test_traverses(tmp_path):
     night = write_images(tmp_path / "night", [f"{i}.png" for i in range(10)])
     day = write_images(tmp_path / "day", [f"{i}.png" for i in range(10)])
-    data = load_traverses(night, day, tolerance=2, soft_tolerance=4, selection=Selection(stride=2))
+    data = load_traverses(night, day, tolerance=2, selection=Selection(stride=2))
     assert data.truth.hard.shape == (5, 5)
     np.testing.assert_array_equal(data.truth.hard, np.abs(np.subtract.outer(np.arange(5), np.arange(5))) <= 1)
-    np.testing.assert_array_equal(data.truth.soft, np.abs(np.subtract.outer(np.arange(5), np.arange(5))) <= 2)
     (day / "9.png").unlink()
     with pytest.raises(InputError, match=r"10 queries .* 9 references"):
         load_traverses(night, day)
-    with pytest.raises(InputError, match="0 <= tolerance <= soft"):
-        load_traverses(night, night, tolerance=2, soft_tolerance=1)
+    with pytest.raises(InputError, match="tolerance is -1"):
+        load_traverses(night, night, tolerance=-1)
 
 
 def test_place_pairs(tmp_path):
