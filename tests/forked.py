@@ -18,7 +18,6 @@ PRELOADED = [
     "scipy.optimize",
     "scipy.stats",
     "matplotlib.pyplot",
-    "sklearn.cluster",
     "torch.distributed.run",
     "netspec",
     "netspec.cli",

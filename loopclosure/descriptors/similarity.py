@@ -51,8 +51,7 @@ def squared_distances(a: np.ndarray, b: np.ndarray, squares_a: np.ndarray | floa
     squares_a  (N, 1) squared lengths of the rows of ``a``; 0 omits them; the order within each row is the same
     squares_b  (M,) squared lengths of the rows of ``b``
 
-    Rounding may make a result slightly negative. scikit-learn's euclidean_distances and pairwise_distances_argmin are
-    several times slower, because they compute float32 in float64.
+    Rounding may make a result slightly negative.
     """
     products = a @ b.T
     products *= -2

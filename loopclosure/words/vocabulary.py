@@ -7,11 +7,13 @@ is still a place.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
 
 from loopclosure.descriptors.similarity import squared_distances
 from loopclosure.errors import InputError
@@ -20,6 +22,7 @@ from netspec.files.opencv import cv2
 
 # Rows processed at a time when all distances to the centers are needed: 4096 x 5000 words need 80 MB.
 BLOCK_ROWS = 4096
+ITERATIONS = 10  # of k-means: with 20, the squared distances to the words are 0.1 % smaller
 KINDS = {"sift": 128, "orb": 256}
 
 
@@ -106,17 +109,16 @@ def nearest_centers(descriptors: np.ndarray, centers: np.ndarray) -> np.ndarray:
 
 
 def kmeans(descriptors: np.ndarray, words: int, seed: int = 0) -> np.ndarray:
-    """Return ``words`` centers (words, d) float32 of the descriptors (n, d) by mini-batch k-means."""
-    from sklearn.cluster import MiniBatchKMeans
-
+    """Return ``words`` centers (words, d) float32 of the descriptors (n, d) by k-means."""
     if len(descriptors) < words:
         raise InputError(
             f"{len(descriptors)} descriptors cannot make {words} words; take more training images or fewer words"
         )
-    clusters = MiniBatchKMeans(
-        words, batch_size=max(4096, 2 * words), max_iter=20, n_init="auto", random_state=seed, compute_labels=False
-    )
-    return np.asarray(clusters.fit(descriptors).cluster_centers_, np.float32)
+    first = descriptors[np.random.default_rng(seed).choice(len(descriptors), words, replace=False)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of equal first centers all but one stay empty
+        centers, _ = kmeans2(descriptors, first, iter=ITERATIONS, minit="matrix")
+    return np.asarray(centers, np.float32)
 
 
 def founders(descriptors: np.ndarray, radius: float) -> np.ndarray:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from netspec.cli import caffe, caffe_tools, data, export, look, nets, run_script, shell
+from netspec.cli import caffe, caffe_tools, data, export, nets, run_script, shell
 from netspec.terminal.commands import run
 from netspec.terminal.parser import Commands, Parser, program
 
 # The headings in ``netspec --help``, and the modules with the commands below each.
 _GROUPS = {
     "Caffe's programs": [caffe, caffe_tools],
-    "inspect nets": [nets, look],
+    "inspect nets": [nets],
     "inspect data and trainings": [data],
     "features and other formats": [export],
     "programs written for pycaffe": [run_script],

@@ -24,12 +24,6 @@ class StoredLayer:
     blobs: tuple[np.ndarray, ...]
     legacy: bool = False
 
-    @property
-    def has_filters(self) -> bool:
-        """Whether the first blob has filters: four axes, except for an old InnerProduct (1, 1, M, N)."""
-        shape = self.blobs[0].shape
-        return len(shape) == 4 and not (self.legacy and shape[:2] == (1, 1))
-
 
 def stored_layers(path: str | Path) -> list[StoredLayer]:
     """Return the layers with weights, in the net's order (HDF5: in alphabetical order). Raises SpecError."""

@@ -25,7 +25,6 @@ from netspec.data.database import Writer, open_reader
 from netspec.data.images import read_image
 from netspec.errors import SpecError
 from netspec.export.formats.preprocess import read_mean_option
-from netspec.inspect.features import embedding
 from netspec.inspect.features.images import read_pixels as read_for_features
 from netspec.load import load_net, load_solver
 from netspec.net.weights import load_weights
@@ -51,12 +50,11 @@ def test_an_npy_with_a_false_size_is_refused(tmp_path: Path) -> None:
         read_mean_option(str(tmp_path / "x.npy"))
 
 
-@pytest.mark.parametrize("read", [read_features, embedding.read_features], ids=["loopclosure", "netspec"])
-def test_an_npz_with_a_false_size_is_refused(read: Any, tmp_path: Path) -> None:
+def test_an_npz_with_a_false_size_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
         archive.writestr("features.npy", false_header())
     with pytest.raises(InputError, match=r"shape \(1048576, 1048576\), float32, in"):
-        read(tmp_path / "x.npz")
+        read_features(tmp_path / "x.npz")
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +66,9 @@ def large_npz(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("read", [read_features, embedding.read_features], ids=["loopclosure", "netspec"])
-def test_an_npz_that_decompresses_to_too_much_is_refused(read: Any, large_npz: Path) -> None:
+def test_an_npz_that_decompresses_to_too_much_is_refused(large_npz: Path) -> None:
     with pytest.raises(InputError, match=r"would take 280 MiB of memory, in a file of \d+ bytes"):
-        read(large_npz)
+        read_features(large_npz)
 
 
 @pytest.mark.parametrize("kind", ["<U4", ">U4"], ids=["little_endian", "big_endian"])

@@ -48,12 +48,6 @@ WAYS = {
         "plot train.log --out p.html",
         "data stat pairs/test_lmdb",
         "data show pairs/test_lmdb --out s.png",
-        "look filters init.caffemodel --out f.png",
-        "look maps train_val.prototxt --weights init.caffemodel --blob feat --image images/0.png --out m.png",
-        "look saliency train_val.prototxt --weights init.caffemodel --blob feat --image images/0.png --out s.png",
-        "look saliency train_val.prototxt --weights init.caffemodel --blob feat --image "
-        "images/0.png --to images/1.png --out s.png",
-        "look embedding features.npz --out e.png",
         "bug-report train_val.prototxt",
         "extract_features init.caffemodel train_val.prototxt feat features_lmdb 1 lmdb",
         "device_query",

@@ -34,8 +34,6 @@ from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
 
 if TYPE_CHECKING:
-    import torch
-
     from netspec.inspect.features.records import Progress
     from netspec.net.net import Net
 
@@ -160,14 +158,10 @@ class ImageNet:
                 self._use_torch(str(fault))
         import torch
 
-        with torch.no_grad():
-            return self.differentiable(torch.from_numpy(data)).cpu().numpy()
-
-    def differentiable(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the blob with a gradient, computed by torch for any engine."""
         assert self._net is not None, "torch runs this net"
-        self._net(**{self.input: data})
-        return self._net.blobs[self.blob]
+        with torch.no_grad():
+            self._net(**{self.input: torch.from_numpy(data)})
+        return self._net.blobs[self.blob].cpu().numpy()
 
 
 def extract_images(describe: ImageNet, images: ImageList, progress: Progress = iter) -> dict[str, np.ndarray]:
