@@ -30,7 +30,7 @@ from loopclosure.closing.online import Keyframes, LoopCloser
 from loopclosure.closing.synchronizer import Synchronizer
 from loopclosure.detector.run import load_describe
 from loopclosure.errors import InputError
-from loopclosure.places.messages import camera_of, image_of, pose_of, seconds
+from loopclosure.places.messages import camera_of, image_of, is_rectified, pose_of, seconds
 
 DEFAULTS = {"describe": "default", "map": "map", "step": 0.1, "turn": 0.1, "recent": 10.0, "gap": 0.5, "kept": 1000}
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # who subscribes later gets the last message
@@ -93,7 +93,8 @@ class LoopClosure(Node):
             self.tell_loop(loop)
 
     def begin(self, image):
-        camera, mount = camera_of(self.camera), self.mount
+        rectified = is_rectified(self.resolve_topic_name("image"))
+        camera, mount = camera_of(self.camera, rectified), self.mount
         if camera is None:
             raise InputError("camera_info has no calibration yet of a pinhole or fisheye camera")
         if not any(mount[3:]):

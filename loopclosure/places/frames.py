@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.bag_files import is_bag
-from loopclosure.places.bags import bag_frames
+from loopclosure.places.bags import bag_frames, is_bag
 from loopclosure.places.pixels import bits_of, eight_bits
 from netspec.files.environment import environment
 from netspec.files.image_list import list_images

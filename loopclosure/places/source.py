@@ -11,8 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.bag_files import is_bag
-from loopclosure.places.bags import BY_NAME, NO_POSES, Topics, open_bag
+from loopclosure.places.bags import BY_NAME, NO_POSES, Topics, is_bag, open_bag, right
 from loopclosure.places.frames import VIDEO_SUFFIXES, Selection, video_frames, video_length, write_picture
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import write_calibration
@@ -228,16 +227,22 @@ def _bag(source: Path, folder: Path, topics: Topics, progress: Progress) -> tupl
         files = [file for _, file in _write_images(folder, progress(images(), source.name, bag.count))]
         if not files:
             raise InputError(f"has no image in {bag.topics.images}", source)
-        stamps = bag.mended(np.array(times), bag.topics.images).tolist()
         about = [f" of {bag.topics.images}"]
         camera = bag.camera()
         if camera is not None:
             write_calibration(folder / "calibration.txt", camera)
-        for path, name in ((bag.poses(), GROUNDTRUTH), (bag.odometry(), ODOMETRY)):
-            if path is not None and len(path.stamps):
-                trajectory = Trajectory(path.stamps, path.poses[:, :3], path.poses[:, 3:])
-                write_trajectory(folder / name, trajectory, name.removesuffix(".txt"))
-                about.append(path.about)
+        tracks = {name: path for name, path in ((GROUNDTRUTH, bag.poses()), (ODOMETRY, bag.odometry())) if path}
+        # Stamps of all topics, or times of receipt of all: two clocks may differ.
+        recorded = [np.array(times), *(path.times for path in tracks.values())]
+        column = 0 if all(right(each[:, 0]) for each in recorded) else 1
+        if column:
+            bag.doubts.append("a topic has stamps that are 0, equal or go back; times of receipt are used instead")
+        stamps = recorded[0][:, column].tolist()
+        for name, path in tracks.items():
+            at = path.times[:, column]
+            trajectory = Trajectory(at, path.poses[:, :3], path.poses[:, 3:])
+            write_trajectory(folder / name, trajectory, name.removesuffix(".txt"))
+            about.append(path.about)
     return list(zip(stamps, files, strict=True)), Extracted(folder, ", ".join(about), bag.doubts, bag.pose_fault)
 
 

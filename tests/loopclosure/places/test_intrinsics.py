@@ -70,7 +70,18 @@ def test_tum_vi_has_a_fisheye(tmp_path: Path) -> None:
 )
 def test_models_of_a_camera_info(model: str, count: int, fisheye: bool) -> None:
     k = np.array([300.0, 0, 160, 0, 301, 120, 0, 0, 1])
-    message = SimpleNamespace(distortion_model=model, k=k, d=np.full(count, 0.01), width=320, height=240)
+    roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0)
+    message = SimpleNamespace(
+        p=[0] * 12,
+        roi=roi,
+        binning_x=0,
+        binning_y=0,
+        distortion_model=model,
+        k=k,
+        d=np.full(count, 0.01),
+        width=320,
+        height=240,
+    )
     camera = camera_of(message)
     assert camera is not None
     assert (camera.fisheye, len(camera.distortion), camera.size) == (fisheye, count, (320, 240))
