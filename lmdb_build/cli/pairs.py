@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from dataclasses import replace
 from pathlib import Path
 
 from lmdb_build.pairs.build import Plan, build_lists
 from lmdb_build.pairs.by_list import (
-    CAMERAS,
     MaskSource,
     TraverseSource,
     folders_source,
@@ -23,8 +21,8 @@ from lmdb_build.pairs.list_file import common_folder, join_lists, root_of, write
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
+from loopclosure.places.masks import CAMERAS
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.sequences import benchmark_parts
 from loopclosure.places.source import (
     LAYOUT_LINES,
     LAYOUTS,
@@ -35,6 +33,7 @@ from loopclosure.places.source import (
     is_recording,
     open_sequence,
     read_source,
+    resolved,
 )
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S
 from netspec.files.paths import relative
@@ -43,12 +42,6 @@ from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands, above_zero, seed
 
 SEQUENCES = ("", *LAYOUTS)
-NEEDED = {
-    "images": ("truth",),
-    "traverses": ("references", "truth"),
-    "folders": ("references",),
-    "index": ("group", "track", "time"),
-}
 HELP = f"""A SOURCE is [KIND:]PATH[,KEY=VALUE]...
 
 One or more sequences with poses (KIND may be omitted; it is then detected from the files):
@@ -245,16 +238,9 @@ def _pairs(arguments: argparse.Namespace) -> None:
 
 def _source_text(text: str) -> Source:
     try:
-        found = read_source(text, PAIRED)
+        return resolved(read_source(text, PAIRED))
     except InputError as fault:
         raise argparse.ArgumentTypeError(str(fault)) from None
-    kind = found.kind or ("images" if "truth" in found.settings else "")
-    if kind == "images" and "poses" in found.settings:
-        kind = ""
-    for name in NEEDED.get(kind, ()):
-        if name not in found.settings:
-            raise argparse.ArgumentTypeError(f"{text} needs ,{name}=...")
-    return replace(found, kind=kind)
 
 
 def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
@@ -277,15 +263,14 @@ def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
     if sequences:
         return _pose_source(arguments, sequences, root), root
     min_gap = None if arguments.min_gap is None else int(arguments.min_gap)
-    get = {name: first.get(name, str) for name in PAIRED[kind]}
-    if kind in ("images", "traverses"):
-        truth = Path(str(get["truth"]))
-        if kind == "traverses":
-            return TraverseSource(truth, path, Path(str(get["references"])), root), root
-        return MaskSource(truth, path, root, min_gap, _camera(first)), root
-    if kind == "nordland":
-        queries, references, truth = benchmark_parts(path)
-        return TraverseSource(truth, queries, references, root), root
+    truth, references = first.get("truth", Path), first.get("references", Path)
+    get = {name: first.get(name, str) for name in PAIRED.get(kind, ())}
+    if kind == "traverses":
+        if truth is None or references is None:
+            raise WrongUsage(f"traverses:{first} needs ,truth=FILE (which images show the same place)")
+        return TraverseSource(truth, path, references, root), root
+    if kind == "images" and truth is not None:
+        return MaskSource(truth, path, root, min_gap, first.get("camera", str) or "all"), root
     if kind == "folders":
         return folders_source(path, Path(str(get["references"])), root, min_gap or 0), root
     if kind == "table":
@@ -295,13 +280,6 @@ def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
         group, track, time = (str(get[name]) for name in ("group", "track", "time"))
         return index_source(path, root, group, track, time, 1.0 if max_gap is None else max_gap), root
     return singles_source(path, root), root
-
-
-def _camera(source: Source) -> str:
-    camera = source.get("camera", str) or "all"
-    if camera not in CAMERAS:
-        raise WrongUsage(f'{source}: camera is "{camera}", expected {", ".join(CAMERAS)}')
-    return camera
 
 
 def _sequences(arguments: argparse.Namespace) -> list[ImageSequence]:

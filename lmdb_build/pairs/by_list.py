@@ -15,8 +15,6 @@ from loopclosure.places import masks
 from loopclosure.places.frames import image_paths
 from loopclosure.places.masks import read_matches, read_truth_matrix
 
-CAMERAS = tuple(camera for camera in masks.CAMERAS if camera != "joined")  # a pair is two files
-
 
 class MaskSource(PairSource):
     """One run of images and a mask of loops, as of the FAB-MAP sets."""
@@ -34,7 +32,7 @@ class MaskSource(PairSource):
         hard, soft = (masks.mask_of_places(camera, matrix, len(paths), mask) for matrix in (hard, soft))
         self._judged = masks.comparable(camera, places)
         self._hard, self._soft = (hard | hard.T) & self._judged, soft | soft.T
-        self.names = [relative(paths[image], root) for image in places[:, 0]]
+        self.names = [relative(paths[image], root) for image in places]
         count = len(self.names)
         self.tracks = self.groups = np.zeros(count, np.intp)
         self.group_names = [images.name]

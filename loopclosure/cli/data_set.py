@@ -12,7 +12,7 @@ from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import from_text
 from loopclosure.places.masks import CAMERAS
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.sequences import GROUNDTRUTH, benchmark_parts, layout_of
+from loopclosure.places.sequences import GROUNDTRUTH, layout_of
 from loopclosure.places.source import (
     DETECTED,
     EVALUATED,
@@ -26,6 +26,7 @@ from loopclosure.places.source import (
     is_recording,
     open_sequence,
     read_source,
+    resolved,
 )
 from loopclosure.places.truth import Exclusion
 from netspec.terminal.commands import WrongUsage, refuse
@@ -107,17 +108,20 @@ def sequence(source: Source, frames: Path, posed: bool = False) -> ImageSequence
 
 def data_set(a: argparse.Namespace) -> datasets.DataSet:
     """Load the data set that the arguments describe."""
-    source = typed(a.source, EVALUATED)
-    truth, references = source.get("truth", str), source.get("references", str)
-    kind = source.kind or ("images" if truth else "")
-    posed = not kind or kind in LAYOUTS or (kind == "images" and "poses" in source.settings)
+    given = typed(a.source, EVALUATED)
+    try:
+        source = resolved(given)
+    except InputError as fault:
+        raise fault if fault.where else WrongUsage(str(fault)) from None
+    kind, chosen, truth = source.kind, source.selection(), source.get("truth", str)
+    references = source.get("references", Path)
+    posed = not kind or kind in LAYOUTS
     if not posed:
-        refuse(a, RULE, f"is for sequences with poses, not for {kind}")
-    if kind != "traverses":
+        refuse(a, RULE, f"is for sequences with poses, not for {given.kind or kind}")
+    if given.kind != "traverses":
         refuse(a, ("tolerance",), "is for traverses")
-    if kind in ("traverses", "nordland", "pairs"):
-        refuse(a, ("exclude_frames",), f"is for one sequence, not for {kind}")
-    chosen = source.selection()
+    if kind in ("traverses", "pairs"):
+        refuse(a, ("exclude_frames",), f"is for one sequence, not for {given.kind}")
     excluded = a.exclude_frames is not None or a.exclude_seconds is not None
     exclusion = Exclusion(a.exclude_frames or 0, a.exclude_seconds or 0.0) if excluded else None
     if references is not None and excluded:
@@ -129,7 +133,7 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
         if references and "poses" in source.settings:
             raise WrongUsage("poses=FILE is for one sequence; with references, each sequence must have its own poses")
         out, topics = Path(a.out), {name: text for name, text in source.settings.items() if name in TOPICS}
-        others = Source(source.kind, Path(references), topics) if references else None
+        others = Source(source.kind, references, topics) if references else None
         return datasets.load_sequence(
             sequence(source, out / "frames", posed=True),
             chosen,
@@ -138,25 +142,14 @@ def data_set(a: argparse.Namespace) -> datasets.DataSet:
             max_angle_deg=a.max_angle or MAX_ANGLE_DEG,
             references=sequence(others, out / "references", posed=True) if others else None,
         )
-    if kind == "fabmap":
-        camera = source.get("camera", str) or "both"
-        if camera not in CAMERAS:
-            raise InputError(f'{source}: camera is "{camera}", expected {", ".join(CAMERAS)}')
-        exclusion = exclusion or datasets.FABMAP_EXCLUSION
-        files = datasets.FabmapFiles(truth, source.get("coordinates", str))
-        return datasets.load_fabmap(source.path, files, camera, chosen, exclusion, Path(a.out) / "joined")
-    if kind == "images":
-        if truth is None:
-            raise WrongUsage(f"images:{source} needs ,truth=MASK (which frames show the same place) or ,poses=FILE")
-        exclusion = exclusion or datasets.FOLDER_EXCLUSION
-        return datasets.load_folder(source.path, truth, references, chosen, exclusion)
-    if kind == "traverses":
-        if references is None:
-            raise WrongUsage(f"traverses:{source} needs ,references=FOLDER (the other drive)")
+    if references is not None:
         return datasets.load_traverses(source.path, references, a.tolerance or 0, chosen, truth)
-    if kind == "nordland":
-        queries, found, truth_file = benchmark_parts(source.path)
-        return datasets.load_traverses(queries, found, selection=chosen, truth_file=truth_file)
+    if kind == "fabmap":
+        camera, files = source.get("camera", str) or "both", datasets.FabmapFiles(truth, source.get("coordinates", str))
+        return datasets.load_fabmap(source.path, files, camera, chosen, exclusion or datasets.FABMAP_EXCLUSION)
+    if kind == "images":
+        assert truth is not None
+        return datasets.load_folder(source.path, truth, chosen, exclusion or datasets.FOLDER_EXCLUSION)
     return datasets.load_place_pairs(source.path, chosen)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths, read_bgr
+from loopclosure.places.frames import ALL_FRAMES, Selection, image_paths
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.masks import (
     comparable,
@@ -23,8 +22,6 @@ from loopclosure.places.masks import (
 )
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, WIDE_ANGLE_DEG, same_place_matrix
 from loopclosure.places.truth import Exclusion, Truth, sequence_truth, traverse_truth
-from netspec.files.opencv import cv2
-from netspec.files.whole_file import write_whole
 
 # Ten seconds are usual for TUM's 30 Hz sequences; the other sets have no stamps.
 TUM_EXCLUSION = Exclusion(seconds=10.0)
@@ -130,15 +127,14 @@ def load_fabmap(
     camera: str = "both",
     selection: Selection = ALL_FRAMES,
     exclusion: Exclusion = FABMAP_EXCLUSION,
-    joined_folder: str | Path | None = None,
 ) -> DataSet:
     """Load a set in the format of FAB-MAP's New College and City Centre: numbered images of two cameras.
 
     Image 0001 is the left one of the first place, 0002 the right one, and so on. The mask (``*GroundTruth.mat``) and
     the coordinates (``*Coordinates.mat`` or ``.txt``) are searched for in the folder unless ``files`` names them.
 
-    camera     which images are used: see loopclosure.places.masks; "joined" images are written to ``joined_folder``
-    selection  counts images of one camera, or joined images, or with "both" single images
+    camera     which images are used: see loopclosure.places.masks
+    selection  counts images of one camera, or with "both" of both
     """
     folder = Path(folder)
     images = image_paths(folder)
@@ -152,18 +148,11 @@ def load_fabmap(
     judged = comparable(camera, places)
     if camera == "both":
         notes.append("pairs of a left and a right image are not judged: the two cameras look to opposite sides")
-    if camera == "joined":
-        if joined_folder is None:
-            raise InputError("joined images are written to files; give a folder for them")
-        paths = join_images([(images[a], images[b]) for a, b in places], Path(joined_folder))
-    else:
-        paths = [images[place[0]] for place in places]
-    queries = replace(
-        ImageSequence.of_files(paths), poses=_fabmap_poses(folder, files.coordinates, len(images), places)
-    )
+    sequence = ImageSequence.of_files([images[place] for place in places])
+    queries = replace(sequence, poses=_fabmap_poses(folder, files.coordinates, len(images), places))
     rule = f"same place: as {truth_path.name} says"
     truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=judged)
-    views = {"both": "left and right images", "joined": "left and right joined"}.get(camera, f"{camera} images")
+    views = "left and right images" if camera == "both" else f"{camera} images"
     name = f"{folder.resolve().name}, {views}{_selection_text(selection)}"
     data = DataSet(name, queries, None, truth, exclusion.frames, notes=notes)
     return _checked(data, hard & judged)
@@ -172,16 +161,10 @@ def load_fabmap(
 def load_folder(
     images: str | Path,
     truth_file: str | Path,
-    references: str | Path | None = None,
     selection: Selection = ALL_FRAMES,
     exclusion: Exclusion = FOLDER_EXCLUSION,
 ) -> DataSet:
-    """Load images and their mask: (N, N) of one sequence, or (Q, R) with ``references``, another folder.
-
-    With references, ``selection`` applies to the queries only, and no pair is excluded.
-    """
-    if references is not None:
-        return load_traverses(images, references, selection=selection, truth_file=truth_file)
+    """Load the images of one sequence and their mask (N, N)."""
     queries = ImageSequence.of_files(image_paths(images))
     hard, soft = read_truth_matrix(truth_file)
     name = f"{_folder_name(images)}{_selection_text(selection)}"
@@ -247,22 +230,6 @@ def load_place_pairs(folder: str | Path, selection: Selection = ALL_FRAMES) -> D
     return DataSet(name, queries, references, truth)
 
 
-def join_images(pairs: Sequence[tuple[Path, Path]], folder: Path) -> list[Path]:
-    """Write left and right images side by side as PNG files into ``folder``; existing files are kept."""
-    folder.mkdir(parents=True, exist_ok=True)
-    joined = []
-    for left, right in pairs:
-        path = folder / f"{left.stem}_{right.stem}.png"
-        if not os.path.isfile(path):
-            images = read_bgr(left), read_bgr(right)
-            if images[0].shape[0] != images[1].shape[0]:
-                raise InputError(f"is {images[1].shape[0]} pixels high, {left.name} {images[0].shape[0]}", right)
-            _, picture = cv2.imencode(".png", np.hstack(images))
-            write_whole(path, picture.tobytes())
-        joined.append(path)
-    return joined
-
-
 def _fold(path: Path, hard: np.ndarray, soft: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Move a square mask below the diagonal (frame i against earlier frames); return it with notes about it."""
     if hard.shape[0] != hard.shape[1]:
@@ -285,7 +252,7 @@ def _fabmap_poses(
     if len(coordinates) not in (images, images / 2):
         raise InputError(f"has {len(coordinates)} rows, but there are {images} images", path)
     poses = np.full((len(places), 7), np.nan)
-    poses[:, : coordinates.shape[1]] = coordinates[places[:, 0] * len(coordinates) // images]
+    poses[:, : coordinates.shape[1]] = coordinates[places * len(coordinates) // images]
     return poses
 
 

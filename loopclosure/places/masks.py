@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 from pathlib import Path
@@ -10,14 +9,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.io import loadmat
+from scipy.sparse import issparse
 
 from loopclosure.errors import InputError
 from loopclosure.places.frames import read_pixels
-from loopclosure.places.mat_file import read_mat
-from netspec.errors import SpecError
 from netspec.files.arrays import opened, read_array
-from netspec.files.kinds import nearest_existing, unreadable
+from netspec.files.kinds import nearest_existing
 from netspec.files.opencv import cv2
+from netspec.files.table import is_number, read_table
 
 # Names of the matrix: "truth" in the FAB-MAP sets, "GT" in files derived from them.
 TRUTH_KEYS = ("truth", "gt", "groundtruth", "ground_truth")
@@ -112,28 +112,18 @@ def read_place_pairs(path: str | Path) -> list[tuple[str, Path, Path]]:
 
     The images are relative to the table's folder. Raises InputError (file:line) for a missing image.
     """
-    path = Path(path)
+    table = read_table(path, TABLE_OF_PLACES)
+    found = [table.column(name) for name in ("place_id", "query", "ref")]
+    columns = [column for column in found if column is not None]
+    if len(columns) < 3 or not table.rows:
+        raise InputError(f"is not a table of places; expected {TABLE_OF_PLACES}", path, 1, 1)
     rows = []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream)
-            missing = {"place_id", "query", "ref"} - set(reader.fieldnames or ())
-            if missing:
-                raise InputError(f"has no column {', '.join(sorted(missing))}; expected place_id,query,ref", path, 1, 1)
-            for row in reader:
-                images = []
-                for column in ("query", "ref"):
-                    image = path.parent / (row[column] or "")
-                    if not os.path.isfile(image):
-                        raise InputError(f'no such {column} image "{row[column]}"', path, reader.line_num, 1)
-                    images.append(image)
-                rows.append((row["place_id"], images[0], images[1]))
-    except OSError as error:
-        raise InputError(unreadable(path, error, TABLE_OF_PLACES), path) from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"is not a table; expected {TABLE_OF_PLACES}", path) from error
-    if not rows:
-        raise InputError("has no row", path)
+    for row in table.rows:
+        place, *images = (row.cells[column] if column < len(row.cells) else "" for column in columns)
+        for image in images:
+            if not os.path.isfile(table.path.parent / image):
+                raise InputError(f'no such image "{image}"', path, row.line, 1)
+        rows.append((place, table.path.parent / images[0], table.path.parent / images[1]))
     return rows
 
 
@@ -149,26 +139,26 @@ def _read_matrix(path: Path, keys: tuple[str, ...], what: str, last_columns: int
     if suffix in (".txt", ".csv", ".dat"):
         return _read_text(path, what, last_columns)
     if suffix in LOSSLESS_SUFFIXES:
-        try:
-            return read_pixels(path, cv2.IMREAD_GRAYSCALE)
-        except SpecError as fault:
-            raise InputError(f"{fault.message}; expected {what}", path) from None
-    raise InputError(
-        f'"{suffix}" is not a known suffix for {what}; known: .mat .npy .txt .csv {" ".join(LOSSLESS_SUFFIXES)}'
-        + (" (a JPEG has lost the exact values)" if suffix in (".jpg", ".jpeg") else ""),
-        path,
-    )
+        return read_pixels(path, cv2.IMREAD_GRAYSCALE)
+    known = f".mat .npy .txt .csv {' '.join(LOSSLESS_SUFFIXES)} (a JPEG has lost the exact values)"
+    raise InputError(f'"{suffix}" is not a known suffix for {what}; known: {known}', path)
 
 
 def _read_mat(path: Path, keys: tuple[str, ...], what: str) -> np.ndarray:
-    matrices = read_mat(path)
+    try:
+        found = loadmat(path)
+    except NotImplementedError:
+        raise InputError("is a MATLAB 7.3 file; save it again in MATLAB with -v7", path) from None
+    except Exception as fault:  # for a damaged file, loadmat can raise anything
+        raise InputError(f"cannot be read as .mat ({' '.join(str(fault).split())}); expected {what}", path) from None
+    matrices = {name: each.toarray() if issparse(each) else each for name, each in found.items() if name[0] != "_"}
     named = [name for key in keys for name in matrices if name.lower() == key]
     if not named and len(matrices) == 1:
         named = list(matrices)
     if not named:
-        found = ", ".join(f"{n} {m.shape[0]}x{m.shape[1]}" for n, m in matrices.items()) or "no matrix"
-        raise InputError(f'has no variable "{keys[0]}" ({what}); found {found}', path)
-    return _numeric(matrices[named[0]], path)
+        there = ", ".join(matrices) or "none"
+        raise InputError(f'has no variable "{keys[0]}" ({what}); it has {there}', path)
+    return _numeric(np.asarray(matrices[named[0]]), path)
 
 
 def _numeric(values: np.ndarray, path: Path) -> np.ndarray:
@@ -179,26 +169,14 @@ def _numeric(values: np.ndarray, path: Path) -> np.ndarray:
 
 def _read_text(path: Path, what: str, last_columns: int | None) -> np.ndarray:
     """Read rows of numbers; only the ``last_columns`` from the right, if given: the others may be names."""
-    rows: list[list[float]] = []
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read as text; expected {what}", path) from error
-    for number, line in enumerate(lines, start=1):
-        fields = line.partition("#")[0].replace(",", " ").split()
-        if not fields:
-            continue
-        taken = fields if last_columns is None else fields[-last_columns:]
-        try:
-            row = [float(field) for field in taken]
-        except ValueError:
-            raise InputError(f'expected numbers, found "{line.strip()[:60]}"', path, number, 1) from None
-        if rows and len(row) != len(rows[0]):
-            raise InputError(f"has {len(row)} numbers, the rows above have {len(rows[0])}", path, number, 1)
-        rows.append(row)
-    if not rows:
-        raise InputError(f"is empty; expected {what}", path)
-    return np.array(rows)
+    table = read_table(path, what)
+    cells = [row.cells if last_columns is None else row.cells[-last_columns:] for row in table.rows]
+    for row, found in zip(table.rows, cells, strict=True):
+        if not all(map(is_number, found)) or len(found) != len(cells[0]):
+            raise InputError(f"expected {len(cells[0])} numbers, as in the first row", path, row.line, 1)
+    if not cells:
+        raise InputError(f"has no row of numbers; expected {what}", path)
+    return np.array(cells, np.float64)
 
 
 # Which images of a folder are used. Except with "all", images of a left and a right camera alternate (Cummins and
@@ -207,23 +185,21 @@ def _read_text(path: Path, what: str, last_columns: int | None) -> np.ndarray:
 #   left    only the left images
 #   right   only the right images
 #   both    all images; a left one is never compared with a right one, because the cameras look to opposite sides
-#   joined  left and right joined as one image; two show the same place if any of their views does
-CAMERAS = ("all", "left", "right", "both", "joined")
+CAMERAS = ("all", "left", "right", "both")
 
 
 def images_of_places(camera: str, images: int) -> NDArray[np.intp]:
-    """Return the image numbers of each place: (places, 1), or for "joined" (places, 2), left and right.
+    """Return the numbers of the images of a ``camera``, one for each place.
 
     Raises InputError for an unknown camera, or if the number of ``images`` is odd.
     """
     if camera not in CAMERAS:
         raise InputError(f'unknown camera "{camera}"; known: {", ".join(CAMERAS)}')
-    if camera in ("all", "both"):
-        return np.arange(images)[:, None]
-    if images % 2:
-        raise InputError(f"{images} images cannot be pairs of a left and a right one")
-    left = np.arange(0, images, 2)
-    return {"left": left[:, None], "right": left[:, None] + 1, "joined": np.stack([left, left + 1], axis=1)}[camera]
+    if camera in ("left", "right"):
+        if images % 2:
+            raise InputError(f"{images} images cannot be pairs of a left and a right one")
+        return np.arange(camera == "right", images, 2)
+    return np.arange(images)
 
 
 def mask_of_places(camera: str, mask: NDArray, images: int, file: Path) -> NDArray:
@@ -233,11 +209,8 @@ def mask_of_places(camera: str, mask: NDArray, images: int, file: Path) -> NDArr
     """
     places = images_of_places(camera, images)
     if mask.shape == (images, images):
-        views = [
-            mask[np.ix_(places[:, i], places[:, j])] for i in range(places.shape[1]) for j in range(places.shape[1])
-        ]
-        return np.any(views, axis=0)
-    if camera in ("left", "right", "joined") and mask.shape == (len(places), len(places)):
+        return mask[np.ix_(places, places)]
+    if mask.shape == (len(places), len(places)):
         return mask
     halved = "; does the folder have only one camera's images?" if len(mask) == 2 * images else ""
     raise InputError(f"is {mask.shape[0]} x {mask.shape[1]}, but there are {images} images{halved}", file)
@@ -245,5 +218,5 @@ def mask_of_places(camera: str, mask: NDArray, images: int, file: Path) -> NDArr
 
 def comparable(camera: str, places: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Return which pairs of places from :func:`images_of_places` can be judged: (places, places)."""
-    side = places[:, 0] % 2 if camera == "both" else np.zeros(len(places))
+    side = places % 2 if camera == "both" else np.zeros(len(places))
     return side[:, None] == side

@@ -15,8 +15,9 @@ from loopclosure.places.bags import BY_NAME, NO_POSES, Topics, is_bag, open_bag,
 from loopclosure.places.frames import VIDEO_SUFFIXES, Selection, video_frames, video_length, write_picture
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import write_calibration
+from loopclosure.places.masks import CAMERAS
 from loopclosure.places.pose_files import WORDS, pose_form
-from loopclosure.places.sequences import GROUNDTRUTH, ODOMETRY, PoseChoice, layout_of, read_sequence
+from loopclosure.places.sequences import GROUNDTRUTH, ODOMETRY, PoseChoice, benchmark_parts, layout_of, read_sequence
 from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Trajectory, write_rgb_list, write_trajectory
 from loopclosure.progress import Progress, silent
 from netspec.errors import did_you_mean
@@ -113,6 +114,34 @@ def read_source(text: str, kinds: Kinds) -> Source:
     return Source(kind, Path(path), settings)
 
 
+def resolved(source: Source) -> Source:
+    """Return a source with its kind, "" for sequences with poses, and with the files that a kind implies.
+
+    A VPR benchmark (``nordland``) is two traverses. Raises InputError if a setting is missing.
+    """
+    path, settings = source.path, dict(source.settings)
+    kind = source.kind or ("images" if "truth" in settings else "")
+    if kind in LAYOUTS or (kind == "images" and "poses" in settings):
+        kind = "" if kind == "images" else kind
+    elif kind == "nordland":
+        kind, (path, references, truth) = "traverses", benchmark_parts(path)
+        settings |= {"references": str(references), "truth": str(truth)}
+    for name in NEEDED.get(kind, ()):
+        if name not in settings:
+            raise InputError(f"{kind}:{source} needs ,{name}=...")
+    camera = settings.get("camera", CAMERAS[0])
+    if camera not in CAMERAS:
+        raise InputError(f'{source}: camera is "{camera}", expected {", ".join(CAMERAS)}')
+    return Source(kind, path, settings)
+
+
+# The settings that a kind of source cannot do without.
+NEEDED = {
+    "images": ("truth",),
+    "traverses": ("references",),
+    "folders": ("references",),
+    "index": ("group", "track", "time"),
+}
 MADE_FROM = "source.txt"  # the file and topics, then a line for each doubt about them
 MADE_BY = 2  # the version of what extract writes
 # The sequences with poses, as the help texts describe them.

@@ -119,7 +119,7 @@ def test_an_invalid_line_of_groundtruth_is_reported(
     (tmp_path / "s/groundtruth.txt").write_text("# head\n1.0 0 0 0 0 0 0 one\n")
     assert main(["pairs", str(tmp_path / "s"), "--out", str(tmp_path)]) == 1
     place = tmp_path / "s/groundtruth.txt"
-    assert capsys.readouterr().err.startswith(f'{place}:2:17: expected a number for qw, found "one"')
+    assert capsys.readouterr().err.startswith(f'{place}:2:1: expected a number, found "one"')
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_pairs_of_a_benchmark_are_a_query_and_a_reference(tmp_path: Path) -> Non
 
 def test_traverses_need_a_mask_and_poses_are_for_sequences(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["pairs", "traverses:a,references=b", "--out", "o"]) == 2
-    assert "traverses:a,references=b needs ,truth=..." in capsys.readouterr().err
+    assert "traverses:a,references=b needs ,truth=" in capsys.readouterr().err
     assert main(["pairs", "nordland:a,poses=p.txt", "--out", "o"]) == 2
     assert 'nordland has no setting "poses"' in capsys.readouterr().err
     assert main(["pairs", "images:a,truth=b.npy", "--out", "o", "--max-angle", "9"]) == 2

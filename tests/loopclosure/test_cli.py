@@ -251,7 +251,7 @@ def test_a_folder_with_poses_but_no_times_of_its_images_says_what_is_missing(tmp
     ("sentence", "line"),
     [
         ('a sequence has no setting "camera"', "evaluate LAPS,camera=left --method thumbnails --out OUT"),
-        ("needs ,truth=MASK", "evaluate images:LAPS --method thumbnails --out OUT"),
+        ("needs ,truth=", "evaluate images:LAPS --method thumbnails --out OUT"),
         (
             "--max-angle is for sequences with poses, not for ",
             "evaluate pairs:LAPS --max-angle 60 --method thumbnails --out OUT",

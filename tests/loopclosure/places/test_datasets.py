@@ -96,20 +96,15 @@ def fabmap_folder(tmp_path):
         ("right", ["0002", "0004", "0006", "0008", "0010", "0012"], {(4, 0)}),
         ("both", [f"{i:04}" for i in range(1, 13)], {(8, 0), (9, 1), (10, 2)}),
         ("all", [f"{i:04}" for i in range(1, 13)], {(8, 0), (8, 1), (9, 0), (9, 1), (10, 2)}),
-        ("joined", ["0001_0002", "0003_0004", "0005_0006", "0007_0008", "0009_0010", "0011_0012"], {(4, 0), (5, 1)}),
     ],
 )
-def test_fabmap_cameras(fabmap_folder, tmp_path, camera, frames, loops):
-    data = load_fabmap(fabmap_folder, camera=camera, exclusion=Exclusion(frames=1), joined_folder=tmp_path / "joined")
+def test_fabmap_cameras(fabmap_folder, camera, frames, loops):
+    data = load_fabmap(fabmap_folder, camera=camera, exclusion=Exclusion(frames=1))
     assert [path.stem for path in data.queries.paths] == frames
     assert {(int(i), int(j)) for i, j in np.argwhere(data.truth.hard & data.truth.judged)} == loops
     assert data.positions is not None
     assert data.positions.shape == (len(frames), 3)
     np.testing.assert_allclose(data.positions[-1], [5.0, 15.5, np.nan])  # the set says no height
-    if camera == "joined":
-        joined = cv2.imread(str(data.queries.paths[0]))
-        assert joined is not None
-        assert joined.shape == (6, 16, 3)
     if camera == "both":
         assert not data.truth.judged[9, 0]
         assert "left and a right image" in data.notes[0]
@@ -139,8 +134,6 @@ def test_fabmap_mask_of_places_for_images_of_both_cameras(fabmap_folder):
 def test_fabmap_faults(fabmap_folder, tmp_path):
     with pytest.raises(InputError, match="unknown camera"):
         load_fabmap(fabmap_folder, camera="front")
-    with pytest.raises(InputError, match="give a folder"):
-        load_fabmap(fabmap_folder, camera="joined")
     np.save(tmp_path / "big.npy", np.eye(24, k=-20, dtype=np.uint8))
     with pytest.raises(InputError, match="24 x 24, but there are 12 images; does the folder have only one camera's"):
         load_fabmap(fabmap_folder, FabmapFiles(tmp_path / "big.npy"))
@@ -179,12 +172,12 @@ def test_folder_with_references(tmp_path):
     queries = write_images(tmp_path / "night", ["a.png", "b.png"])
     references = write_images(tmp_path / "day", ["a.png", "b.png", "c.png"])
     np.save(tmp_path / "truth.npy", np.array([[1, 0, 0], [0, 0, 1]], bool))
-    data = load_folder(queries, tmp_path / "truth.npy", references)
+    data = load_traverses(queries, references, truth_file=tmp_path / "truth.npy")
     assert data.references is not None
     assert data.truth.judged.all()
     np.save(tmp_path / "turned.npy", np.ones((3, 2), bool))
     with pytest.raises(InputError, match="2 queries and 3 references; transpose it"):
-        load_folder(queries, tmp_path / "turned.npy", references)
+        load_traverses(queries, references, truth_file=tmp_path / "turned.npy")
 
 
 def test_exclusion_that_takes_every_loop_is_refused(tmp_path):
@@ -215,7 +208,7 @@ def test_place_pairs(tmp_path):
     data = load_place_pairs(tmp_path)
     np.testing.assert_array_equal(data.truth.hard, [[1, 0, 1], [0, 1, 0], [1, 0, 1]])
     (tmp_path / "ref" / "2.png").unlink()
-    with pytest.raises(InputError, match=r"pairs.csv:3:1: no such ref image"):
+    with pytest.raises(InputError, match=r"pairs.csv:3:1: no such image"):
         load_place_pairs(tmp_path)
 
 

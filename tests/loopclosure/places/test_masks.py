@@ -1,6 +1,5 @@
 """Masks and coordinates in every format, and errors for broken ones."""
 
-import resource
 from pathlib import Path
 
 import cv2
@@ -10,7 +9,6 @@ import scipy.io
 import scipy.sparse
 
 from loopclosure.errors import InputError
-from loopclosure.places import mat_file
 from loopclosure.places.masks import (
     CAMERAS,
     comparable,
@@ -54,32 +52,34 @@ def test_sparse_and_bool_masks(tmp_path):
     np.testing.assert_array_equal(read_truth_matrix(tmp_path / "bool.npy")[0], MASK == 1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "content", "sentence"),
+    ("name", "content", "line"),
     [
-        ("x.txt", "0 0\n1\n", r"x.txt:2:1: has 1 numbers, the rows above have 2"),
-        ("x.txt", "0 one\n", r"x.txt:1:1: expected numbers"),
-        ("x.txt", "# nothing\n", "is empty"),
-        ("x.txt", "0 7\n0 0\n", "largest entry is 7"),
-        ("x.txt", "0 -1\n1 0\n", "negative or non-finite"),
-        ("x.txt", "0 0\n0 0\n", "largest entry is 0"),
-        ("x.jpg", "", "a JPEG has lost the exact values"),
-        ("x.npy", "no array", "cannot be read .*magic string"),
-        ("x.mat", "no matlab", "cannot be read as .mat"),
-        ("x.png", "no image", "is not a readable image"),
+        pytest.param("x.txt", "0 0\n1\n", 2, id="short row"),
+        pytest.param("x.txt", "0 0\n0 one\n", 2, id="no number"),
+        pytest.param("x.txt", "# nothing\n", 0, id="empty"),
+        pytest.param("x.txt", "0 7\n0 0\n", 0, id="seven"),
+        pytest.param("x.txt", "0 -1\n1 0\n", 0, id="negative"),
+        pytest.param("x.txt", "0 0\n0 0\n", 0, id="no loop"),
+        pytest.param("x.jpg", "", 0, id="jpeg"),
+        pytest.param("x.npy", "no array", 0, id="npy"),
+        pytest.param("x.mat", "no matlab", 0, id="mat"),
+        pytest.param("x.mat", "", 0, id="empty mat"),
+        pytest.param("x.png", "no image", 0, id="png"),
     ],
 )
-def test_invalid_masks_are_refused(tmp_path, name, content, sentence):
+def test_invalid_masks_are_refused(tmp_path: Path, name: str, content: str, line: int) -> None:
     (tmp_path / name).write_text(content)
-    with pytest.raises(InputError, match=sentence):
+    with pytest.raises(InputError) as caught:
         read_truth_matrix(tmp_path / name)
+    assert caught.value.where is not None
+    assert (caught.value.where.file, caught.value.where.line) == (str(tmp_path / name), line)
 
 
 @pytest.mark.slow
 def test_mat_without_the_variable_lists_what_it_has(tmp_path):
     scipy.io.savemat(tmp_path / "x.mat", {"alpha": np.eye(2), "beta": np.eye(3)})
-    with pytest.raises(InputError, match=r'no variable "truth".*alpha 2x2, beta 3x3'):
+    with pytest.raises(InputError, match=r'no variable "truth".*alpha, beta'):
         read_truth_matrix(tmp_path / "x.mat")
     with pytest.raises(InputError, match="no such file"):
         read_truth_matrix(tmp_path / "absent.mat")
@@ -98,22 +98,14 @@ def test_coordinates(tmp_path):
         read_coordinates(tmp_path / "d.npy")
 
 
-def test_place_pairs_need_their_columns(tmp_path):
-    (tmp_path / "pairs.csv").write_text("place,query,ref\n")
-    with pytest.raises(InputError, match=r"pairs.csv:1:1: has no column place_id"):
-        read_place_pairs(tmp_path / "pairs.csv")
-    (tmp_path / "pairs.csv").write_text("place_id,query,ref\n")
-    with pytest.raises(InputError, match="has no row"):
+@pytest.mark.parametrize("text", ["place,query,ref\n", "place_id,query,ref\n"])
+def test_place_pairs_need_their_columns_and_a_row(text: str, tmp_path: Path) -> None:
+    (tmp_path / "pairs.csv").write_text(text)
+    with pytest.raises(InputError, match=r"pairs.csv:1:1: is not a table of places"):
         read_place_pairs(tmp_path / "pairs.csv")
 
 
-PLACES = {
-    "all": [[0], [1], [2], [3]],
-    "left": [[0], [2]],
-    "right": [[1], [3]],
-    "both": [[0], [1], [2], [3]],
-    "joined": [[0, 1], [2, 3]],
-}
+PLACES = {"all": [0, 1, 2, 3], "left": [0, 2], "right": [1, 3], "both": [0, 1, 2, 3]}
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -124,27 +116,24 @@ def test_the_images_of_each_place(camera: str) -> None:
 def test_only_pairs_of_images_need_an_even_number() -> None:
     for camera in ("all", "both"):
         assert len(images_of_places(camera, 5)) == 5
-    for camera in ("left", "right", "joined"):
+    for camera in ("left", "right"):
         with pytest.raises(InputError, match="5 images cannot be pairs of a left and a right one"):
             images_of_places(camera, 5)
-    with pytest.raises(InputError, match='unknown camera "front"; known: all, left, right, both, joined'):
+    with pytest.raises(InputError, match='unknown camera "front"'):
         images_of_places("front", 4)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_a_mask_of_images_becomes_one_of_places(camera: str) -> None:
     mask = np.zeros((4, 4), bool)
-    mask[3, 0] = True  # the second place's right image shows what the first one's left image does
-    found = mask_of_places(camera, mask, 4, Path("mask.png"))
+    mask[3, 0] = mask[2, 0] = True
     places = images_of_places(camera, 4)
-    expected = [[any(mask[a, b] for a in first for b in second) for second in places] for first in places]
-    assert found.tolist() == expected
-    assert found.any() == (camera not in ("left", "right"))
+    assert mask_of_places(camera, mask, 4, Path("mask.png")).tolist() == mask[np.ix_(places, places)].tolist()
 
 
 def test_a_mask_of_places_fits_where_places_are_pairs_of_images() -> None:
     mask = np.array([[False, False], [True, False]])
-    for camera in ("left", "right", "joined"):
+    for camera in ("left", "right"):
         assert mask_of_places(camera, mask, 4, Path("mask.png")) is mask
     for camera in ("all", "both"):
         with pytest.raises(InputError, match=r"mask\.png: is 2 x 2, but there are 4 images$"):
@@ -156,16 +145,5 @@ def test_a_mask_of_places_fits_where_places_are_pairs_of_images() -> None:
 def test_for_both_cameras_only_images_of_the_same_camera_are_compared() -> None:
     both = comparable("both", images_of_places("both", 4))
     assert both.tolist() == [[(i + j) % 2 == 0 for j in range(4)] for i in range(4)]
-    for camera in ("all", "left", "right", "joined"):
+    for camera in ("all", "left", "right"):
         assert comparable(camera, images_of_places(camera, 4)).all()
-
-
-def test_on_macos_the_memory_of_the_matlab_reader_is_not_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    """macOS has no /proc, and refuses a limit of the address space below what a process has reserved."""
-
-    def refuse(*_: object) -> None:
-        raise ValueError("current limit exceeds maximum limit")
-
-    monkeypatch.setattr(resource, "setrlimit", refuse)
-    monkeypatch.setattr(Path, "exists", lambda self: False)
-    mat_file._limit_memory("file.mat")
