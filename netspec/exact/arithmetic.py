@@ -19,7 +19,6 @@ from netspec.exact import libm, losses, lrn, sums
 from netspec.exact.blas import applies, is_recorded
 from netspec.exact.by_torch import (
     Floor,
-    NormalizedBatches,
     Standardization,
     normalized_batch,
     normalizes,
@@ -147,16 +146,6 @@ class AsTorch:
         how = torch.batch_norm, (factors, bias), eps, torch.backends.cudnn.enabled
         top, _, mean, variance = normalized_batch(data, *how)
         return top, mean, variance, 1.0
-
-    def normalized_batches(
-        self, data: torch.Tensor, count: int, eps: float, factors: torch.Tensor | None, bias: torch.Tensor | None
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, float]:
-        """Do the same for ``count`` batches that are joined along axis 0, each by its own statistics (count, C)."""
-        if torch.finfo(data.dtype).bits < 32:
-            return *NormalizedBatches.apply(data, factors, bias, count, eps), 1.0
-        found = [self.normalized_batch(batch, eps, factors, bias) for batch in data.chunk(count)]
-        tops, means, variances, unbiased = zip(*found, strict=True)
-        return torch.cat(tops), torch.stack(means), torch.stack(variances), unbiased[0]
 
     def normalizes(self, mean: torch.Tensor, variance: torch.Tensor, eps: float) -> Function:
         """Return a function that normalizes (N, C, ...) by a mean and a variance of each channel."""

@@ -6,10 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from netspec.exact.layout import by_channel, laid_out_like, of_one_layout
+from netspec.exact.layout import by_channel, of_one_layout
 from netspec.exact.lrn import Settings
 
 MAX_OFFSET = 8  # the largest mean, in standard deviations, for which torch's CPU kernel is exact to 1e-6
@@ -119,48 +118,6 @@ def normalized_batch(
         made, _, variance = _normalized(data, normalize, affine, eps, options)
     # Torch's unbiased variance of one value is 0 / 0, Caffe's 0.
     return made, data, mean, torch.zeros_like(variance) if data.numel() == len(mean) else variance
-
-
-class NormalizedBatches(torch.autograd.Function):
-    """Normalize several batches that are joined along axis 0, (N, C, ...), each by its own statistics.
-
-    Returns the result, the means (batches, C) and the unbiased variances (batches, C), which get no gradient.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any, data: torch.Tensor, factors: torch.Tensor | None, bias: torch.Tensor | None, count: int, eps: float
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        top = torch.empty_like(data)
-        shape = count, data.shape[1]
-        means, variances, saved_means, saved_deviations = data.new_zeros(4, *shape, dtype=torch.float32).unbind()
-        ctx.count, ctx.eps, ctx.has_bias = count, eps, bias is not None
-        ctx.save_for_backward(data, factors, saved_means, saved_deviations)
-        for k, (batch, into) in enumerate(zip(data.chunk(count), top.chunk(count), strict=True)):
-            torch.ops.aten.native_batch_norm.out(
-                *(batch, factors, bias, means[k], variances[k], True, 1.0, eps),
-                out=into,
-                save_mean=saved_means[k],
-                save_invstd=saved_deviations[k],
-            )
-        if data.numel() == means.numel():  # torch's unbiased variance of one value is 0 / 0, Caffe's 0
-            variances.zero_()
-        ctx.mark_non_differentiable(means, variances)
-        return top, means, variances
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *diffs: torch.Tensor) -> tuple[Any, ...]:
-        data, factors, means, deviations = ctx.saved_tensors
-        found, sums = torch.empty_like(data), [None, None]
-        wanted = [True, factors is not None, ctx.has_bias]
-        batches = zip(*(x.chunk(ctx.count) for x in (laid_out_like(data, diffs[0]), data, found)), strict=True)
-        for k, (diff, batch, into) in enumerate(batches):
-            how = factors, None, None, means[k], deviations[k], True, ctx.eps, wanted
-            of_batch, *others = torch.ops.aten.native_batch_norm_backward(diff, batch, *how)
-            into.copy_(of_batch)
-            sums = others if k == 0 else [a if a is None else a + b for a, b in zip(sums, others, strict=True)]
-        return found, *(x if asked else None for x, asked in zip(sums, wanted[1:], strict=True)), None, None
 
 
 def _normalized(

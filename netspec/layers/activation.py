@@ -53,8 +53,6 @@ class ReLU(Activation):
     Caffe: src/caffe/layers/relu_layer.cpp
     """
 
-    by_item = True
-
     def setup(self) -> None:
         self.slope: float = self.param.relu_param.negative_slope
 

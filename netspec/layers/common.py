@@ -54,10 +54,6 @@ class InnerProduct(Layer):
         return self.arithmetic(data).inner_product(vectors, weight, bias, transposed)
 
     @property
-    def by_item(self) -> bool:
-        return self.axis > 0
-
-    @property
     def small(self) -> bool:
         return math.prod(self.blob_shapes[0]) <= SMALL_PRODUCT
 

@@ -26,8 +26,6 @@ class LRN(Layer):
     Caffe: src/caffe/layers/lrn_layer.cpp
     """
 
-    by_item = True
-
     def setup(self) -> None:
         param = self.param.lrn_param
         if param.local_size % 2 == 0 or param.local_size > MOST:

@@ -36,7 +36,6 @@ class BatchNorm(Layer):
     ignores_propagate_down = frozenset({0})
     joined: tuple[Layer, ...] = ()  # a Scale and a ReLU after it that it also computes, in training
     rectifies = False  # whether they include a ReLU
-    batches = 1  # that are joined along axis 0, and normalized one after the other
     first_weight = 0.0  # what blobs[2] begins with
 
     def setup(self) -> None:
@@ -71,14 +70,8 @@ class BatchNorm(Layer):
         arithmetic = self.arithmetic(data)
         if self.use_global_stats:
             return self.by_stored_statistics(arithmetic)(data)
-        if self.batches == 1:
-            top, mean, variance, unbiased = arithmetic.normalized_batch(data, self.eps, *self.factors())
-            self.add(mean, variance, unbiased)
-        else:
-            how = self.batches, self.eps, *self.factors()
-            top, by_batch, variances, unbiased = arithmetic.normalized_batches(data, *how)
-            for mean, variance in zip(by_batch, variances, strict=True):
-                self.add(mean, variance, unbiased)
+        top, mean, variance, unbiased = arithmetic.normalized_batch(data, self.eps, *self.factors())
+        self.add(mean, variance, unbiased)
         return top.relu_() if self.rectifies else top
 
     @property
@@ -103,12 +96,6 @@ class BatchNorm(Layer):
             return None
         made = copy.copy(self)
         made.joined, made.rectifies = (*self.joined, after), kind == "relu"
-        return made
-
-    @override
-    def of_batches(self, count: int) -> Layer | None:
-        made = copy.copy(self)
-        made.batches = count
         return made
 
     def factors(self) -> tuple[torch.Tensor | None, torch.Tensor | None]:

@@ -86,10 +86,6 @@ class Scale(_Affine):
     def joins_as(self) -> str:
         return "scale" if self.by_channel else ""
 
-    @property
-    def by_item(self) -> bool:
-        return self.by_channel
-
 
 @register("Bias", "bias_param")
 class Bias(_Affine):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -12,7 +11,6 @@ from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.run.overwritten import Memory, overwritten
 from netspec.run.parts import Part, parts_of
-from netspec.run.towers import steps_of_towers
 from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
 
 
@@ -29,33 +27,21 @@ class Eager:
         self.plan, self.layers, self.loss_weights, self.exact = plan, list(layers), loss_weights, exact
         self.losses = losses_of(loss_weights)
         self.overwritten = [overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
-        self._lines: dict[tuple[frozenset[int], bool], list[Step]] = {}  # of the last run
+        self._lines: dict[frozenset[int], list[Step]] = {}  # of the last run
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result:
         """Run all layers on the values ``given``. Return the loss and the values; those in ``kept`` are among them."""
         values: Values = dict(given)
-        # A program may ask for the gradients of values that it keeps, which joined towers do not read.
-        key = kept, kept <= set(self.plan.outputs.values()) and self._joins_towers()
-        if key not in self._lines:
-            self._lines = {key: self._line(*key)}
-        return walk(self._lines[key], values, self.exact, self._remembering()), values
+        if kept not in self._lines:
+            self._lines = {kept: [step for part in self.parts(kept) for step in self._step(part, kept)]}
+        return walk(self._lines[kept], values, self.exact, self._remembering()), values
 
     def one_by_one(self) -> list[Step]:
         """Return one step for each layer, except the inputs. No step drops a value."""
         return [step._replace(ends=()) for i in range(len(self.layers)) for step in self._alone(i)]
 
-    def _joins_towers(self) -> bool:
-        """Return whether towers run together: in a training on a CPU under autocast, which rounds anyway."""
-        return torch.is_grad_enabled() and torch.is_autocast_enabled("cpu") and not any(self.overwritten)
-
-    def _line(self, kept: frozenset[int], joins_towers: bool) -> list[Step]:
-        """Return the steps of a run that keeps the values ``kept``."""
-        parts, step_of = self.parts(kept), partial(self._step, kept=kept)
-        line = steps_of_towers(self.plan, parts, self._must_run_alone(), step_of, kept) if joins_towers else None
-        return line or [step for part in parts for step in step_of(part)]
-
     def _step(self, part: Part, kept: frozenset[int]) -> list[Step]:
-        """Return the step that runs a part."""
+        """Return the step that runs a part and keeps the values ``kept``."""
         nodes = self.plan.nodes
         if len(part.members) == 1:
             return self._alone(part.first, kept)

@@ -12,7 +12,6 @@ constructor, before it logs the layer's bottoms and tops, and reads the first re
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -87,7 +86,6 @@ class Layer(torch.nn.Module):
     ignores_unit_axes: ClassVar[bool] = False  # files may store its blobs with other axes of size 1
     changes_itself: bool = False  # a pass changes its state, so it can be neither prepared nor copied
     passes_on: bool = False  # every top is the bottom, unchanged, at the present settings
-    by_item: bool = False  # computes each item of a batch (N, ...) alone and alike, at any N
     # what the layer before it may compute too: "relu" (max(x, 0)), "scale" (factors and biases of channels)
     joins_as: str = ""
     # what its gradient reads from memory: of "bottom", "sign" (of it), "top" and "kept" (the bottom of the forward
@@ -98,8 +96,6 @@ class Layer(torch.nn.Module):
         "passes_on",
         "joins_as",
         "joined_with",
-        "by_item",
-        "of_batches",
         "gradient_reads",
         "caffes_gradient",
         "caffes_gradients",
@@ -198,13 +194,6 @@ class Layer(torch.nn.Module):
     def joined_with(self, after: Layer) -> Layer | None:
         """Return a layer that does the work of this one and of ``after`` in a training, with the blobs of both."""
         return None
-
-    def of_batches(self, count: int) -> Layer | None:
-        """Return a layer with the blobs of this one for ``count`` batches of equal size, joined along axis 0.
-
-        It computes what this layer computes of one batch after the other. None if there is none.
-        """
-        return copy.copy(self) if self.by_item else None
 
     def caffes_gradient(self, bottom: torch.Tensor, top: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
         """Return the bottom's gradient with Caffe's steps, from the data in memory at the backward pass.

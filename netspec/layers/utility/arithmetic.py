@@ -27,7 +27,6 @@ class Eltwise(Layer):
     """
 
     PROD, SUM, MAX = 0, 1, 2  # caffe.proto: enum EltwiseParameter.EltwiseOp
-    by_item = True
     bottoms = (2, None)
 
     def setup(self) -> None:

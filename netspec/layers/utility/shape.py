@@ -99,7 +99,6 @@ class Split(Layer):
     tops = (1, None)
     shares = frozenset({"data"})
     passes_on = True
-    by_item = True
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         return [bottom_shapes[0]] * self.num_tops

@@ -100,10 +100,6 @@ class Convolution(SlidingFilter):
         return self.arithmetic(maps).convolution(maps, weight, bias, sliding, self.group)
 
     @property
-    def by_item(self) -> bool:
-        return self.channel_axis == 1
-
-    @property
     def small(self) -> bool:
         return self.spatial_axes == 2 and self.group == 1 and self.work <= SMALL_PRODUCT
 

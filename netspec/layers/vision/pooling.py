@@ -106,10 +106,6 @@ class Pooling(_PoolingBase):
             raise self.error(message, "pooling_param")
         return [(*shape[:2], *self.windows.count)] * self.num_tops
 
-    @property
-    def by_item(self) -> bool:
-        return self.method != STOCHASTIC  # which draws numbers
-
     def forward(self, data: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
         values, indices = self.pool(data, self.windows, self.method)
         return values if indices is None or self.num_tops == 1 else (values, indices.to(values.dtype))

@@ -13,7 +13,7 @@ from netspec.exact.pointwise import tanh_gradient
 from netspec.exact.products import Filter
 from paths import ROOT
 
-OF_BOTH = {"floored", "normalized_batches"}  # nothing of their own that rounds: one way to compute them
+OF_BOTH = {"floored"}  # nothing of its own that rounds: one way to compute it
 FILTER = Filter((3, 2), (2, 1), (1, 1), (1, 2))
 LRN = Settings(3, 0.5, 0.75, 2.0)
 
