@@ -14,7 +14,7 @@ import threading
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import islice
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -24,7 +24,7 @@ from types import ModuleType, TracebackType
 import lmdb
 
 from netspec import log
-from netspec.data.lmdb_file import LmdbFile, Record
+from netspec.data.lmdb_pages import check_is_whole
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import head_of, nearest_existing, pointer_fault
 from netspec.files.limits import amount
@@ -114,51 +114,79 @@ def _kind(source: str) -> str:
 
 
 class _LmdbReader(Reader):
-    """An LMDB, read without locks, so that it works on read-only media and in forked workers."""
+    """An LMDB, read without locks, so that it works on read-only media.
+
+    It is open only while it is read, because the library opens a file only once in a process, and a program may want to
+    look at the records too.
+    """
 
     def __init__(self, source: str) -> None:
-        path = os.path.join(source, "data.mdb")
-        if not os.path.getsize(path):
+        self._source, self._path = source, os.path.join(source, "data.mdb")
+        if not os.path.getsize(self._path):
             raise ValueError("has an empty data.mdb, so it was never written")
-        if fault := pointer_fault(head_of(path)):
+        if fault := pointer_fault(head_of(self._path)):
             raise ValueError(f"has a data.mdb that {fault}")
-        self._source = source
-        self._file = LmdbFile(path)
-        self._coming = self._file.records()
-        self._records: list[Record] = []
-        self._lock = threading.Lock()
+        check_is_whole(self._path)
+        self._stamp = _stamp(self._path)
+        self._keys: list[bytes] = []
+        with self._reading() as transaction:
+            self._size: int = transaction.stat()["entries"]
 
     def __len__(self) -> int:
-        return len(self._file)
+        return self._size
 
     def key(self, i: int) -> bytes:
-        return self._record(i).key
+        if i >= len(self._keys):
+            with self._reading() as transaction:
+                self._list_keys(i, transaction)
+        return self._keys[i]
 
     def records(self, numbers: Sequence[int]) -> list[bytes]:
-        found = [self._record(i) for i in numbers]
-        try:
-            return [value for run in _runs(numbers) for value in self._file.values(found[run])]
-        except (ValueError, OSError) as fault:
-            raise self._fault(fault) from None
+        with self._reading() as transaction:
+            self._list_keys(max(numbers), transaction)
+            return [transaction.get(self._keys[i]) for i in numbers]
 
     @property
     def is_current(self) -> bool:
-        return self._file.is_current
+        return _stamp(self._path) == self._stamp
 
-    def _record(self, i: int) -> Record:
-        """Return a record, after listing only the records before it: listing a large database can take minutes."""
-        if i >= len(self._records):
-            with self._lock:
-                try:
-                    self._records += islice(self._coming, max(0, i + _SCAN - len(self._records)))
-                except (ValueError, OSError) as fault:
-                    raise self._fault(fault) from None
-        if i >= len(self._records):
-            raise self._fault(ValueError("is damaged: it has fewer records than its header says"))
-        return self._records[i]
+    @contextmanager
+    def _reading(self) -> Iterator[lmdb.Transaction]:
+        """Open the database. Raise SpecError if it is damaged or was changed: a cut file must not be mapped."""
+        with _lmdb_lock:
+            if not self.is_current:
+                raise SpecError(f'database "{self._source}" was changed by another program while it was being read')
+            try:
+                with lmdb.open(self._source, readonly=True, lock=False, readahead=False) as env, env.begin() as opened:
+                    yield opened
+            except lmdb.Error as fault:
+                raise SpecError(f'database "{self._source}" cannot be read as an LMDB ({fault})') from None
 
-    def _fault(self, fault: ValueError | OSError) -> SpecError:
-        return SpecError(f'database "{self._source}" {fault}')
+    def _list_keys(self, last: int, transaction: lmdb.Transaction) -> None:
+        """List the keys up to a record and some more: listing those of a large database can take minutes."""
+        if last >= len(self._keys):
+            cursor = transaction.cursor()
+            if self._keys:
+                cursor.set_key(self._keys[-1])
+                cursor.next()
+            self._keys += islice(cursor.iternext(values=False), last + _SCAN - len(self._keys))
+
+
+# While it is held, the library has a file open. A process is forked only in between.
+_lmdb_lock = threading.Lock()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=_lmdb_lock.acquire, after_in_parent=_lmdb_lock.release, after_in_child=_lmdb_lock.release
+    )
+
+
+def _stamp(path: str) -> tuple[int, ...] | None:
+    """Return what changes with a file, None if it is gone."""
+    try:
+        state = os.stat(path)
+    except OSError:
+        return None
+    return state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns
 
 
 class _LevelDbReader(Reader):

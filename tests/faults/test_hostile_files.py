@@ -2,7 +2,6 @@
 
 import io
 import os
-import shutil
 import subprocess
 import sys
 import zipfile
@@ -371,9 +370,3 @@ def test_a_database_that_was_written_to_is_opened_again(backend: str, tmp_path: 
     after = open_reader(path, backend)
     assert [after.record(i) for i in range(len(after))] == [b"old", b"new"]
     assert len(before) == 1
-
-
-def test_a_database_that_is_replaced_is_still_read(database: Path) -> None:
-    reader = open_reader(str(database))
-    shutil.rmtree(database)
-    assert reader.record(299)[:1] == bytes([299 % 256])
