@@ -24,13 +24,14 @@ from netspec.graph.filter import with_train_state
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Position
 from netspec.solver import update
-from netspec.solver.extra import read_extra
+from netspec.solver.checks import bad_parameter
+from netspec.solver.extra import Remembered, read_extra, running_state
 from netspec.solver.lr_policy import learning_rate, next_step
 from netspec.solver.options import TrainingOptions
 from netspec.solver.precision import FP16
-from netspec.solver.resuming import Snapshots
-from netspec.solver.testing import Display, Tests
-from netspec.solver.training import Blobs, Training
+from netspec.solver.resuming import restore, sole_writer, write_snapshot
+from netspec.solver.testing import Blobs, Display, log_scores, test
+from netspec.solver.training import Training
 
 
 def make_solver(
@@ -61,14 +62,14 @@ def make_solver(
 
 
 class Solver(Training):
-    """A training: the loop and its updates. Tests, snapshots and display are separate parts that share a Training."""
+    """A training: the loop, its updates, tests and snapshots. Only the solver changes its fields."""
 
     _overflowed = False
+    _before_test: tuple[Remembered, ...] = ()  # the running states of the test nets before the current test
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
-        self._tests, self._display = Tests(self), Display(self)
-        self._snapshots = Snapshots(self, self._tests)
+        self._display = Display(self.net)
         log.info("solver.cpp:57", "Solver scaffolding done.")
 
     @property
@@ -79,9 +80,9 @@ class Solver(Training):
     def solve(self) -> None:
         """Train up to max_iter, then log the loss and test again if the settings require it.
 
-        Raises SpecError if another process trains with the same snapshot_prefix (see Snapshots.sole_writer).
+        Raises SpecError if another process trains with the same snapshot_prefix (see sole_writer).
         """
-        with self._snapshots.sole_writer():
+        with sole_writer(self):
             self._solve()
 
     def _solve(self) -> None:
@@ -114,7 +115,7 @@ class Solver(Training):
         self.losses.clear()
         self.losses.extend(self.losses_before)
         self.losses_before = ()
-        self._display.begin()
+        self._display.begin(self.iteration, self.options.clock)
         with waiting_interrupts() as interrupt:
             for to_come in reversed(range(iterations)):
                 self._iterate(to_come)
@@ -137,7 +138,7 @@ class Solver(Training):
         if not math.isfinite(loss):
             self.report_nan(f"the loss is {loss}")
         if self.is_due(self.param.display):
-            self._display.show(outputs)
+            self._display.show(self.iteration, self.param.display, self.loss, outputs)
         for callback in self.callbacks:
             callback.on_gradients_ready()
         self.apply_update()
@@ -210,15 +211,56 @@ class Solver(Training):
 
     def test_all(self) -> None:
         """Run every test net for its test_iter batches with the current weights."""
-        self._tests.run(self.snapshot)
+        if not self.is_root:
+            return
+        self.scores = [{} for _ in self.test_nets]
+        self._before_test = tuple(map(running_state, self.test_nets))
+        for i in range(len(self.test_nets)):
+            if not self.stopped:
+                self._test(i)
+        self._before_test = ()
+
+    def _test(self, i: int) -> None:
+        log.info("solver.cpp:347", f"Iteration {self.iteration}, Testing net (#{i})")
+        net, batches, param = self.test_nets[i], self.param.test_iter[i], self.param
+        net.share_weights_with(self.net)
+        net.random.begin(f"test at iteration {self.iteration}")
+        with self.debugged(net) if param.debug_info else nullcontext():
+            tally = test(net, batches, lambda: self.forward(net), self._stops_test, param)
+        if tally is None:
+            log.info("solver.cpp:396", "Test interrupted.")
+            return
+        if param.test_compute_loss and batches:
+            log.info("solver.cpp:401", f"Test loss: {log.number(tally.loss)}")
+        self.scores[i] = tally.scores
+        log_scores("solver.cpp:414", "Test", tally.scores, net.output_loss_weights)
+        for callback in self.callbacks:
+            callback.on_test(i)
+
+    def _stops_test(self) -> bool:
+        """Take a snapshot if that is requested; return whether to stop. Several processes agree after an iteration."""
+        while self.options.processes.count == 1 and (request := self.options.action()):
+            if request == "snapshot":
+                self.snapshot()
+            self.stopped |= request == "stop"
+        return self.stopped
 
     def snapshot(self) -> tuple[str, str]:
-        """Write the weights and the state; return their paths. Raises SpecError (see Snapshots.take)."""
-        return self._snapshots.take()
+        """Write the weights and the state; return their paths. Raises SpecError (see write_snapshot)."""
+        if self.options.nan == "stop" and bad_parameter(self.net):
+            self.report_nan("the weights cannot be saved")
+        model, state = write_snapshot(self, self._before_test or tuple(map(running_state, self.test_nets)))
+        self.last_snapshot = state
+        if self.is_root:
+            for callback in self.callbacks:
+                callback.on_snapshot(model)
+        return model, state
 
     def restore(self, path: str | Path) -> None:
-        """Resume from a .solverstate or .solverstate.h5. Raises SpecError (see Snapshots.restore)."""
-        self._snapshots.restore(path)
+        """Resume from a .solverstate or .solverstate.h5. Raises SpecError (see netspec/solver/resuming.py)."""
+        progress = restore(self, path)
+        self.iteration, self.current_step = progress.iteration, progress.current_step
+        self.losses_before = progress.losses
 
 
 @contextmanager

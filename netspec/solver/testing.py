@@ -6,7 +6,6 @@ Caffe: Solver::TestAll, Solver::Test, Solver::Step (src/caffe/solver.cpp), test(
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -15,9 +14,9 @@ import torch
 from netspec import log
 from netspec.log import number
 from netspec.net.net import Net
-from netspec.solver.extra import Remembered, running_state
-from netspec.solver.training import Blobs, Outputs, Training
 
+Blobs = dict[str, torch.Tensor]  # the outputs of a run, by name
+Outputs = dict[str, list[float]]  # the elements of each output
 Scorer = Callable[[Sequence[torch.Tensor]], list[float]]
 
 
@@ -88,50 +87,20 @@ def score_lines(scores: Outputs, weights: Mapping[str, float]) -> Iterator[str]:
             yield f"{name} = {number(value)}{ending}"
 
 
-class Tests:
-    """The tests of a training. ``states_before`` is the state of the test nets before the current test."""
+@torch.no_grad()
+def test(
+    net: Net, batches: int, forward: Callable[[], tuple[torch.Tensor, Blobs]], stops: Callable[[], bool], param: Any
+) -> Tally | None:
+    """Run ``forward`` for each batch and return the sums; None if ``stops`` says so before one of them.
 
-    def __init__(self, training: Training) -> None:
-        self._training = training
-        self.states_before: tuple[Remembered, ...] = ()
-
-    def run(self, snapshot: Callable[[], object]) -> None:
-        """Run every test net for its test_iter batches with the current weights; ``snapshot`` is taken on request."""
-        training = self._training
-        if not training.is_root:
-            return
-        training.scores = [{} for _ in training.test_nets]
-        self.states_before = tuple(running_state(net) for net in training.test_nets)
-        for i in range(len(training.test_nets)):
-            if not training.stopped:
-                self._run(i, snapshot)
-        self.states_before = ()
-
-    @torch.no_grad()
-    def _run(self, i: int, snapshot: Callable[[], object]) -> None:
-        training = self._training
-        log.info("solver.cpp:347", f"Iteration {training.iteration}, Testing net (#{i})")
-        net, batches, param = training.test_nets[i], training.param.test_iter[i], training.param
-        net.share_weights_with(training.net)
-        net.random.begin(f"test at iteration {training.iteration}")
-        tally = Tally(scorers(net, param))
-        is_alone = training.options.processes.count == 1  # several processes agree after an iteration
-        for _ in range(batches):
-            while is_alone and (request := training.options.action()):
-                if request == "snapshot":
-                    snapshot()
-                training.stopped |= request == "stop"
-            if training.stopped:
-                log.info("solver.cpp:396", "Test interrupted.")
-                return
-            with training.debugged(net) if param.debug_info else nullcontext():
-                tally.add(*training.forward(net))
-        if param.test_compute_loss and batches:
-            log.info("solver.cpp:401", f"Test loss: {number(tally.loss)}")
-        training.scores[i] = tally.scores
-        log_scores("solver.cpp:414", "Test", tally.scores, net.output_loss_weights)
-        for callback in training.callbacks:
-            callback.on_test(i)
+    ``param`` is the solver's message, which some scores depend on.
+    """
+    tally = Tally(scorers(net, param))
+    for _ in range(batches):
+        if stops():
+            return None
+        tally.add(*forward())
+    return tally
 
 
 def log_scores(site: str, phase: str, scores: Outputs, weights: dict[str, float]) -> None:
@@ -141,30 +110,29 @@ def log_scores(site: str, phase: str, scores: Outputs, weights: dict[str, float]
 
 
 class Display:
-    """Logs the speed, the loss, the outputs, and the time that the training waited for data."""
+    """Logs the speed, the loss, the outputs, and the time that a net waited for data."""
 
-    def __init__(self, training: Training) -> None:
-        self._training = training
-        self._reads = any(layer.reads_data for layer in training.net.layers)
+    def __init__(self, net: Net) -> None:
+        self._net = net
+        self._reads = any(layer.reads_data for layer in net.layers)
 
-    def begin(self) -> None:
+    def begin(self, iteration: int, clock: Callable[[], float]) -> None:
         """Start the clock."""
-        self._time, self._iteration = self._training.options.clock(), self._training.iteration
-        self._waited = self._seconds_waited()
+        self._clock = clock
+        self._time, self._iteration, self._waited = clock(), iteration, self._seconds_waited()
 
-    def show(self, outputs: Blobs) -> None:
+    def show(self, iteration: int, interval: int, loss: float, outputs: Blobs) -> None:
         """Log the progress since the last call."""
-        training = self._training
-        now, waited = training.options.clock(), self._seconds_waited()
+        now, waited = self._clock(), self._seconds_waited()
         seconds = now - self._time
-        speed = (training.iteration - self._iteration) / (seconds or 1)
-        pace = f"{number(speed)} iter/s, {number(seconds)}s/{training.param.display} iters"
-        log.info("solver.cpp:239", f"Iteration {training.iteration} ({pace}), loss = {number(training.loss)}")
-        log_scores("solver.cpp:258", "Train", as_scores(outputs), training.net.output_loss_weights)
+        speed = (iteration - self._iteration) / (seconds or 1)
+        pace = f"{number(speed)} iter/s, {number(seconds)}s/{interval} iters"
+        log.info("solver.cpp:239", f"Iteration {iteration} ({pace}), loss = {number(loss)}")
+        log_scores("solver.cpp:258", "Train", as_scores(outputs), self._net.output_loss_weights)
         if self._reads:
             share = 100 * (waited - self._waited) / (seconds or 1)
             log.info("blocking_queue.cpp:49", f"Waiting for data: {share:.1f} % of the time")
-        self._time, self._iteration, self._waited = now, training.iteration, waited
+        self._time, self._iteration, self._waited = now, iteration, waited
 
     def _seconds_waited(self) -> float:
-        return sum(layer.waited for layer in self._training.net.layers)
+        return sum(layer.waited for layer in self._net.layers)

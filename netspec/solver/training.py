@@ -40,9 +40,7 @@ from netspec.solver.options import TrainingOptions, choose_device
 from netspec.solver.precision import BF16, FP16, FP32, LossScale, computing, has_bfloat16
 from netspec.solver.processes import own_device
 from netspec.solver.replicas import Replicas
-
-Blobs = dict[str, torch.Tensor]  # the outputs of a run, by name
-Outputs = dict[str, list[float]]  # the elements of each output
+from netspec.solver.testing import Blobs, Outputs
 
 _CREATING = {
     "net": ("solver.cpp:102", "Creating training net from {}"),
@@ -112,7 +110,7 @@ class Training:
         with log.held_back() as lines:  # report missing files before Caffe's log, which is long
             filtered = [described.filtered() for described in nets.solver_nets(param, self.node)]
             for part in filtered if self.is_root else filtered[:1]:
-                check_sources(part.net, part.source, self.options.build)
+                check_sources(part.net, part.source)
         self.devices = self._chosen_devices()
         self.device = self.devices[0]
         log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))
