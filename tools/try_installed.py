@@ -65,10 +65,9 @@ def main(golden: Path) -> None:
     run("netspec", "check", "--data", "sgd_step/solver.prototxt")
     log = run("netspec", "train", "--solver", "sgd_step/solver.prototxt", stderr=subprocess.STDOUT)
     Path("train.log").write_text(log, "utf-8")
-    out = run("netspec", "plot", "train.log", "--out", "training.html")
+    out = run("netspec", "plot", "train.log", "--out", "training.png")
     assert "state done, iterations 60" in out, out
     run("netspec", "data", "show", "pairs/test_lmdb", "--out", "sheet.png")
-    run("netspec", "bug-report", "sgd_step/solver.prototxt", "--out", "report.md")
     run("lmdb-build", "walk", "walk", "--frames", "12", "--size", "48x36")
     run("loopclosure", "evaluate", "--help")
     from netspec.dialects.files import known_files

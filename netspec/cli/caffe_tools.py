@@ -7,9 +7,8 @@ import logging
 from pathlib import Path
 
 from netspec import log
-from netspec.cli.arguments import add_limit, add_plugin, add_shapes, device, options, positive
+from netspec.cli.arguments import add_limit, add_plugin, device, options, positive
 from netspec.files.whole_file import write_whole
-from netspec.terminal.commands import WrongUsage
 from netspec.terminal.parser import Commands
 
 
@@ -91,28 +90,16 @@ def _add_files(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_upgrade_net_proto_text(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "upgrade_net_proto_text", help="write a net's prototxt, or the net inside a .caffemodel, in the current format"
-    )
+    parser = commands.add_parser("upgrade_net_proto_text", help="write a net's prototxt in the current format")
     parser.set_defaults(function=_upgrade_net_proto_text)
     add_plugin(parser)
     _add_files(parser)
-    add_shapes(parser, "for a .caffemodel: shape of an input of the deploy prototxt that is written")
 
 
 def _upgrade_net_proto_text(arguments: argparse.Namespace) -> None:
-    from netspec.proto.binary import is_net_binary
     from netspec.proto.text import read_net, write_text
 
-    if is_net_binary(arguments.input):
-        from netspec.inspect.recovered import recover_net
-
-        net, _ = recover_net(arguments.input, dict(arguments.shape))
-    elif arguments.shape:
-        raise WrongUsage("--shape is for a .caffemodel; a prototxt has its own shapes")
-    else:
-        net = read_net(arguments.input)
-    write_whole(arguments.output, write_text(net))
+    write_whole(arguments.output, write_text(read_net(arguments.input)))
     log.info("upgrade_net_proto_text.cpp:49", f"Wrote upgraded NetParameter text proto to {arguments.output}")
 
 

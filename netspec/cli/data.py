@@ -1,101 +1,57 @@
-"""``netspec data`` and ``plot``."""
+"""``netspec data show`` and ``plot``."""
 
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from netspec.cli.arguments import positive
 from netspec.errors import printable
-from netspec.terminal.commands import DONE, FAULT, WrongUsage, refuse
+from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar
 from netspec.terminal.parser import QUIET, Commands
 
-if TYPE_CHECKING:
-    from netspec.inspect.check.survey import Survey
-    from netspec.inspect.records import Records
-
-SHOW, STAT = "show", "stat"
 SHOWN_FAULTS = 4  # which come first
 
 
 def add_commands(commands: Commands) -> None:
     """Add the commands of this module."""
-    _add_data(commands)
+    _add_show(commands.add_group("data", help="look at the records of a database"))
     _add_plot(commands)
 
 
-def _add_data(commands: Commands) -> None:
-    parser = commands.add_parser("data", help="show the records of a database, or print its statistics")
-    parser.set_defaults(function=_data, **QUIET)
-    parser.add_argument(
-        "what", choices=[SHOW, STAT], help="show: draw records, labels, statistics; stat: print statistics"
-    )
+def _add_show(commands: Commands) -> None:
+    parser = commands.add_parser("show", help="draw records with their labels, and statistics of all of them")
+    parser.set_defaults(function=_show, **QUIET)
     parser.add_argument("source", metavar="DB", help="an LMDB, a LevelDB, an HDF5 file, or a list of HDF5 files")
+    parser.add_argument("--out", required=True, metavar="F.png|svg", help="the image to write")
     parser.add_argument("--records", type=positive, metavar="N", help="read N evenly spaced records (default: all)")
-    parser.add_argument("--out", metavar="F.png|svg", help="show: the image to write")
     parser.add_argument(
-        "--count", type=positive, default=40, metavar="N", help="show: number of records to draw (default: %(default)s)"
+        "--count", type=positive, default=40, metavar="N", help="number of records to draw (default: %(default)s)"
     )
     parser.add_argument(
-        "--start",
-        type=int,
-        metavar="K",
-        help="show: index of the first record to draw (default: draw evenly spaced records)",
+        "--start", type=int, metavar="K", help="index of the first record to draw (default: evenly spaced ones)"
     )
     parser.add_argument(
         "--images",
         type=positive,
         metavar="N",
-        help="show: number of images in a record, side by side (default: 2 if there are 2 or 6 channels)",
+        help="number of images in a record, side by side (default: 2 if there are 2 or 6 channels)",
     )
-    parser.add_argument("--json", action="store_true", help="stat: print JSON")
 
 
-def _data(arguments: argparse.Namespace) -> int:
+def _show(arguments: argparse.Namespace) -> None:
     from netspec.inspect.check.survey import survey
+    from netspec.inspect.draw.sheet import sheet
+    from netspec.inspect.draw.style import ending_of, write_figure
     from netspec.inspect.records import open_records, spread
 
-    if arguments.what == SHOW:
-        refuse(arguments, ("json",), "is for `data stat`")
-        if not arguments.out:
-            raise WrongUsage("`data show` needs --out F.png")
-    else:
-        refuse(arguments, ("out", "count", "start", "images"), "is for `data show`")
+    ending_of(arguments.out)
     records = open_records(arguments.source)
     if arguments.start is not None and not 0 <= arguments.start < len(records):
         raise WrongUsage(f"found --start {arguments.start}, expected 0 to {len(records) - 1}")
     found = survey(records, spread(len(records), arguments.records), partial(bar, stage="look", unit="record"))
-    if arguments.what == STAT:
-        return _print_survey(arguments, found)
-    _show(arguments, records, found)
-    return DONE
-
-
-def _print_survey(arguments: argparse.Namespace, found: Survey) -> int:
-    from netspec.inspect.check.survey import as_json, as_lines
-
-    if arguments.json:
-        print(json.dumps(as_json(found)))
-    else:
-        print("\n".join(printable(line) for line in as_lines(found, arguments.source)))
-    for fault in found.faults:
-        print(printable(f'{arguments.source}: record "{fault.key}" {fault.text}'), file=sys.stderr)
-    if found.num_faults > len(found.faults):
-        print(f"and {found.num_faults - len(found.faults):,} more", file=sys.stderr)
-    return FAULT if found.num_faults else DONE
-
-
-def _show(arguments: argparse.Namespace, records: Records, found: Survey) -> None:
-    from netspec.inspect.draw.sheet import sheet
-    from netspec.inspect.draw.style import ending_of, write_figure
-    from netspec.inspect.records import spread
-
-    ending_of(arguments.out, ("png", "svg"))
     if arguments.start is None:
         numbers = [fault.number for fault in found.faults[: min(SHOWN_FAULTS, arguments.count)]]
         others = [k for k in range(len(records)) if k not in numbers]
@@ -110,7 +66,7 @@ def _add_plot(commands: Commands) -> None:
     parser = commands.add_parser("plot", help="draw the curves of trainings from their logs, netspec's or Caffe's")
     parser.set_defaults(function=_plot, **QUIET)
     parser.add_argument("logs", nargs="+", metavar="LOG", help="log of a training (its stderr)")
-    parser.add_argument("--out", required=True, metavar="F.png|svg|html", help="image or HTML page to write")
+    parser.add_argument("--out", required=True, metavar="F.png|svg", help="the image to write")
     parser.add_argument(
         "--names",
         metavar="NAMES,...",
@@ -121,22 +77,17 @@ def _add_plot(commands: Commands) -> None:
 
 
 def _plot(arguments: argparse.Namespace) -> None:
-    from netspec.files.whole_file import write_whole
     from netspec.inspect.draw.style import ending_of, write_figure
     from netspec.inspect.draw.training import Look, training_figure
-    from netspec.inspect.draw.training_page import training_page
     from netspec.inspect.logs.training_log import read_log, summary
 
     names = [printable(name) for name in (arguments.names.split(",") if arguments.names else _names(arguments.logs))]
     if len(names) != len(arguments.logs):
         raise WrongUsage(f"found {len(names)} --names and {len(arguments.logs)} logs, expected equal numbers")
-    ending = ending_of(arguments.out)
+    ending_of(arguments.out)
     logs = [read_log(path, name) for path, name in zip(arguments.logs, names, strict=True)]
     figure = training_figure(logs, Look(arguments.smooth, arguments.log_scale))
-    if ending == "html":
-        write_whole(arguments.out, training_page(logs, figure, ", ".join(names)))
-    else:
-        write_figure(figure, arguments.out)
+    write_figure(figure, arguments.out)
     for log in logs:
         print(f"{log.name}: " + ", ".join(f"{name} {value}" for name, value in summary(log).items()))
     print(arguments.out)

@@ -1,4 +1,4 @@
-"""``netspec check``, ``lint``, ``draw``, ``diff``, ``fmt`` and ``layers``."""
+"""``netspec check``, ``lint``, ``draw``, ``diff`` and ``layers``."""
 
 from __future__ import annotations
 
@@ -20,12 +20,10 @@ from netspec.cli.arguments import (
     add_verbose,
     options,
 )
-from netspec.errors import SpecError, printable
+from netspec.errors import printable
 from netspec.files.limits import no_collection
-from netspec.files.whole_file import write_whole
-from netspec.proto.binary import is_net_binary
 from netspec.proto.schema import PHASES, TEST, TRAIN
-from netspec.terminal.commands import DONE, FAULT, SOMETHING, UNREADABLE, WrongUsage, refuse
+from netspec.terminal.commands import DONE, SOMETHING, UNREADABLE, WrongUsage, refuse
 from netspec.terminal.parser import QUIET, Commands
 
 
@@ -35,7 +33,6 @@ def add_commands(commands: Commands) -> None:
     _add_lint(commands)
     _add_draw(commands)
     _add_diff(commands)
-    _add_fmt(commands)
     _add_layers(commands)
 
 
@@ -47,7 +44,7 @@ def _add_check(commands: Commands) -> None:
     add_verbose(parser)
     add_plugin(parser)
     add_limit(parser)
-    parser.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt, or a .caffemodel")
+    parser.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt")
     add_phase(parser)
     add_state(parser)
     add_shapes(parser, "shape of a data layer's top, instead of opening its data")
@@ -90,8 +87,6 @@ def _check(arguments: argparse.Namespace) -> int:
     )
     if len(checked) > 1:
         refuse(arguments, ("phase",), "is for a net; for a solver, the nets of both phases are checked")
-    elif is_net_binary(arguments.file):
-        refuse(arguments, ("phase", "level", "stage", "weights", "strict"), f"is for a prototxt, not {arguments.file}")
     elif checked[0].net is not None and not arguments.weights:
         refuse(arguments, ("strict",), "needs --weights")
     advice = {str(found): found for part in checked for found in part.advice}
@@ -160,14 +155,13 @@ def _lint(arguments: argparse.Namespace) -> int:
 
 
 FORMATS = (".svg", ".png", ".html")
-STDIN = "-"
 
 
 def _add_draw(commands: Commands) -> None:
     parser = commands.add_parser("draw", help="draw a net: layers, shapes, shared parameters, multiply-adds")
     parser.set_defaults(function=_draw, **QUIET)
     add_plugin(parser)
-    parser.add_argument("file", metavar="FILE", help="a net, a .caffemodel, or a solver (its training net is drawn)")
+    parser.add_argument("file", metavar="FILE", help="a net, or a solver (its training net is drawn)")
     parser.add_argument("--out", type=Path, required=True, metavar="F.svg|F.png|F.html", help="the file to write")
     parser.add_argument(
         "--phase", type=str.upper, choices=["TEST", "TRAIN"], help="only this phase (default: both in one)"
@@ -226,55 +220,13 @@ def _add_diff(commands: Commands) -> None:
 
 
 def _diff(arguments: argparse.Namespace) -> int:
-    from netspec.inspect.check.compare import compare_files
+    from netspec.inspect.check.diff import compare_files
 
     status = DONE
     for each in compare_files(arguments.first, arguments.second, arguments.tolerance):
         print(each)
         status = SOMETHING
     return status
-
-
-def _add_fmt(commands: Commands) -> None:
-    parser = commands.add_parser("fmt", help="format prototxt files; comments are kept")
-    parser.set_defaults(function=_fmt, **QUIET)
-    parser.add_argument("files", nargs="+", metavar="FILE", help="a net's or a solver's prototxt; - is standard input")
-    parser.add_argument("--check", action="store_true", help="write nothing; list the files that would change")
-
-
-def _fmt(arguments: argparse.Namespace) -> int:
-    from netspec.inspect.check.format import format_text
-    from netspec.proto.text import text_of
-
-    status = DONE
-    for path in arguments.files:
-        try:
-            text = sys.stdin.read() if path == STDIN else text_of(path)
-            formatted = format_text(text, path)
-        except SpecError as fault:  # still format the other files
-            print(fault, file=sys.stderr)
-            status = UNREADABLE if arguments.check else max(status, FAULT)
-            continue
-        if arguments.check:
-            status = max(status, _differs(path, text, formatted))
-        elif path == STDIN:
-            print(formatted, end="")
-        elif formatted == text:
-            print(f"{path}: already formatted")
-        else:
-            write_whole(path, formatted, "surrogateescape")
-            print(f"{path}: formatted")
-    return status
-
-
-def _differs(path: str, text: str, formatted: str) -> int:
-    """Print where a file would change; return the status."""
-    if text == formatted:
-        return DONE
-    lines = zip(text.split("\n"), formatted.split("\n"), strict=False)
-    first = next((k for k, (a, b) in enumerate(lines, 1) if a != b), 1)
-    print(f"{path}:{first}:1: netspec fmt would change this line, the first of them")
-    return SOMETHING
 
 
 def _add_layers(commands: Commands) -> None:

@@ -1,4 +1,4 @@
-"""``netspec completion`` and ``bug-report``."""
+"""``netspec completion``."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from netspec.errors import SpecError
-from netspec.files.whole_file import write_whole
-from netspec.terminal.parser import NO_LOG, QUIET, Commands
+from netspec.terminal.parser import NO_LOG, Commands
 
 WORDS = (None, str, Path)  # the types of values that may be names of files
 
@@ -16,7 +15,6 @@ WORDS = (None, str, Path)  # the types of values that may be names of files
 def add_commands(commands: Commands) -> None:
     """Add the commands of this module."""
     _add_completion(commands)
-    _add_bug_report(commands)
 
 
 COMPLETION = """Print a script that lets a shell complete netspec's commands.
@@ -58,30 +56,3 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
         if isinstance(action, argparse._SubParsersAction):
             for command in action.choices.values():
                 yield from _actions(command)
-
-
-def _add_bug_report(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "bug-report",
-        help="collect versions and the shapes in files for a bug report, without weights or images",
-    )
-    parser.set_defaults(function=_bug_report, **QUIET)
-    parser.add_argument(
-        "files",
-        nargs="*",
-        default=[],
-        metavar="FILE",
-        help="files that the bug is about: prototxt, weights, database, log",
-    )
-    parser.add_argument("--out", metavar="F.md", help="write the report here (default: print it)")
-
-
-def _bug_report(arguments: argparse.Namespace) -> None:
-    from netspec.inspect.check.bug_report import bug_report
-
-    text = bug_report(arguments.files)
-    if not arguments.out:
-        print(text, end="")
-        return
-    write_whole(arguments.out, text)
-    print(f"{arguments.out}: read it before you send it; it contains prototxt files and logs in full")

@@ -1,7 +1,7 @@
 """Environment variables that a library reads when it is loaded.
 
 Used for OpenCV's limit on pixels (netspec/files/opencv.py) and the kernels of SciPy's OpenBLAS (netspec/exact/blas.py).
-threadpoolctl and torch's report (netspec/inspect/check/bug_report.py) set variables themselves.
+threadpoolctl sets variables itself.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from pathlib import Path
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import kind_of, pointer_fault, unreadable
 from netspec.files.limits import read_bytes
+from netspec.proto.binary import is_net_binary
 from netspec.proto.forks import forks
 from netspec.proto.reader import read_text
 from netspec.proto.schema import NetParameter, SolverParameter
@@ -75,6 +76,8 @@ def text_of(path: str | Path) -> str:
         data = read_bytes(path)
     except OSError as fault:
         raise SpecError(unreadable(path, fault), Where(str(path))) from None
-    if fault := pointer_fault(data) or (kind_of(data) and f"expected a prototxt, found {kind_of(data)}"):
+    binary = b"\0" in data and is_net_binary(path)
+    kind = kind_of(data) or ("a .caffemodel; give the prototxt of its net" if binary else "")
+    if fault := pointer_fault(data) or (kind and f"expected a prototxt, found {kind}"):
         raise SpecError(fault, Where(str(path)))
     return data.removeprefix(b"\xef\xbb\xbf").decode(errors="surrogateescape")

@@ -173,7 +173,7 @@ CASES = {
         detect_inputs,
         lambda: check_npz("out/d.npz"),
     ),
-    "plot": Case(netspec.cli.main, ["plot", "train.log", "--out", "out/x.html"], log_inputs, check_report),
+    "plot": Case(netspec.cli.main, ["plot", "train.log", "--out", "out/x.svg"], log_inputs, check_report),
     "data": Case(
         netspec.cli.main,
         ["data", "show", "pairs/test_lmdb", "--count", "4", "--out", "out/x.png"],

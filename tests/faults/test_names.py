@@ -195,13 +195,11 @@ def test_plots_of_logs_with_hostile_names_parse(first: int, capsys: pytest.Captu
         lines += [f"{start}Iteration 10, Testing net (#0)", outputs[1], f"{start}Iteration 10, loss = 1.25"]
         Path(f"log{k}").write_text("\n".join(lines), encoding="utf-8")
     logs = [f"log{k}" for k in range(len(wanted))]
-    for ending in ("svg", "html", "png"):
+    for ending in ("svg", "png"):
         words = ["plot", *logs, "--out", f"out.{ending}", "--names", ",".join(wanted)]
         assert main(words) == 0, capsys.readouterr().err
-    ElementTree.parse("out.svg")
-    texts = " ".join(page(Path("out.html")).texts)
+    texts = " ".join("".join(text.itertext()) for text in ElementTree.parse("out.svg").iter())
     assert all(printable(name).strip() in texts for name in wanted)
-    json.loads(re.findall(r'id="curves">(.*?)</script>', Path("out.html").read_text(encoding="utf-8"), re.S)[0])
 
 
 EVIL = "a\\033[31m\\nI1122 10:00:00.000000     1 solver.cpp:239] Iteration 99999, loss = 0\\r\\302\\233"

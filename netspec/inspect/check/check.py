@@ -22,11 +22,10 @@ from netspec.graph.options import BuildOptions
 from netspec.inspect.check import net_rules, solver_rules  # noqa: F401, they register their rules
 from netspec.inspect.check.findings import NET, PLAN, SETTINGS, SOLVER, TEXT, Finding, findings, not_ignored
 from netspec.inspect.check.forks import gathered, others, python_layers, unknown_types
-from netspec.inspect.recovered import recover_net
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights
-from netspec.proto.binary import is_net_binary, split_paths
+from netspec.proto.binary import split_paths
 from netspec.proto.schema import TEST, NetParameter, PhaseValue, SolverParameter
 from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.text import parse_net, parse_solver
@@ -56,15 +55,11 @@ def check_file(
 ) -> list[Checked]:
     """Check a net for a phase, level and stages; or a solver and all its nets (level and stages: the training net's).
 
-    For a .caffemodel, the net inside it is checked (:func:`netspec.inspect.recovered.recover_net`).
-
     ``weights`` are paths separated by commas, for the start of a training; they replace those of the solver. A file
     that cannot be read gives one result without a net. On a device other than "meta" a net gets memory, as
     :func:`netspec.inspect.check.plan.plan_text` needs it.
     """
     given = [weights] if weights else []
-    if Path(path).suffix == ".caffemodel" or is_net_binary(path):  # also if damaged; its reader reports the damage
-        return [_check_weights(path, options)]
     unknown: list[SpecError] = []
     try:
         net, source = parse_net(path, report=unknown.append)
@@ -94,18 +89,6 @@ def _reach(faults: Sequence[SpecError]) -> tuple[int, int]:
     """Read a file as a net and as a solver; return the result that got further."""
     where = faults[-1].where
     return (where.line, where.column) if where else (0, 0)
-
-
-def _check_weights(path: str | Path, options: BuildOptions) -> Checked:
-    """Check the net inside a .caffemodel, as a deploy net, and its weights."""
-    try:
-        net, source = recover_net(path, options.given_shapes)
-    except SpecError as fault:
-        return Checked(str(path), None, [fault])
-    types = list(unknown_types(net, source))
-    if types:
-        return Checked(str(path), None, gathered(types))
-    return _check_net(with_state(net, TEST), source, str(path), [str(path)], replace(options, given_shapes={}))
 
 
 def _check_net(

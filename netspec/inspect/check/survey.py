@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +15,6 @@ from netspec.inspect.records import Record, Records
 Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm: wraps an iterable
 _MOST_FAULTS = 100  # errors to keep with their keys; all are counted
 MOST_LABELS = 8  # labels to list one by one
-_SORTED = 100  # with this many records, sorted labels are no coincidence
 
 
 @dataclass
@@ -74,7 +71,7 @@ class Survey:
     """The result of :func:`survey`.
 
     ``records`` of ``total`` records were read. ``forms`` counts records by storage and shape, ``labels`` by label.
-    ``faults`` are records that a data layer would refuse. ``notes`` mention anything else that is unusual.
+    ``faults`` are records that a data layer would refuse.
     """
 
     total: int
@@ -86,13 +83,12 @@ class Survey:
     channels: Channels = field(default_factory=Channels)
     faults: list[Fault] = field(default_factory=list)
     num_faults: int = 0
-    notes: list[str] = field(default_factory=list)
 
 
 def survey(records: Records, numbers: Sequence[int], progress: Progress = iter) -> Survey:
     """Examine the records with these numbers."""
     found = Survey(len(records))
-    watch = _Watch(found)
+    first = None
     for number in progress(numbers):
         record = records[number]
         found.records += 1
@@ -101,94 +97,31 @@ def survey(records: Records, numbers: Sequence[int], progress: Progress = iter) 
             found.unlabeled += 1
         else:
             found.labels[record.label] += 1
-        fault = record.fault or watch.fault(record)
+        if record.values is not None:
+            first = first or record
+            found.forms[f"{record.kind}, {shape_text(record.values.shape)}"] += 1
+        else:
+            found.forms[record.kind] += 1
+        fault = record.fault if record.values is None or first is None else _fault(record, first)
         if fault:
             found.num_faults += 1
             if len(found.faults) < _MOST_FAULTS:
                 found.faults.append(Fault(number, record.key, fault))
-        watch.see(record, sound=not fault)
-    found.notes = list(watch.notes())
+        elif record.values is not None:
+            found.channels.add(record.values)
     return found
 
 
-class _Watch:
-    """The state for comparing later records with earlier ones."""
-
-    def __init__(self, found: Survey) -> None:
-        self._found = found
-        self._first: Record | None = None
-        self._hashes: list[int] = []
-        self._labels: list[float] = []
-        self._flat = 0
-
-    def fault(self, record: Record) -> str:
-        """Return the error in a readable record; "" if there is none."""
-        values = record.values
-        assert values is not None
-        if self._first is None:
-            self._first = record
-        assert self._first.values is not None
-        if values.shape != self._first.values.shape:
-            first = f'the first record, "{self._first.key}", {shape_text(self._first.values.shape)}'
-            return f"is {shape_text(values.shape)}, {first}"
-        if values.dtype != np.uint8 and not np.isfinite(values).all():
-            return "contains a NaN or an infinity"
-        return ""
-
-    def see(self, record: Record, sound: bool) -> None:
-        """Count a record. If it is ``sound``, also add its values to the statistics."""
-        values = record.values
-        if values is None:
-            self._found.forms[record.kind] += 1
-            return
-        self._found.forms[f"{record.kind}, {shape_text(values.shape)}"] += 1
-        self._flat += bool(values.size > 1 and (values == values.flat[0]).all())
-        if sound:
-            self._found.channels.add(values)
-        digest = hashlib.blake2b(values.tobytes(), digest_size=8).digest()
-        self._hashes.append(int.from_bytes(digest, "little"))
-        self._labels.append(np.nan if record.label is None else record.label)
-
-    def notes(self) -> Iterable[str]:
-        """Yield notes about anything unusual."""
-        labels = np.array(self._labels)
-        _, place, counts = np.unique(np.array(self._hashes, np.uint64), return_inverse=True, return_counts=True)
-        if (twice := int((counts - 1).sum())) > 0:
-            yield f"records with the same values as another record: {twice:,}"
-        least, most = (np.full(len(counts), end) for end in (np.inf, -np.inf))
-        known = ~np.isnan(labels)
-        np.minimum.at(least, place[known], labels[known])
-        np.maximum.at(most, place[known], labels[known])
-        if differing := int((most > least).sum()):
-            yield f"images that occur with different labels: {differing:,}"
-        if self._flat:
-            yield f"records in which all values are equal: {self._flat:,}"
-        if 0 < self._found.unlabeled < self._found.records:
-            yield f"records without a label, which Caffe reads as 0: {self._found.unlabeled:,}"
-        if len(labels) >= _SORTED and len(self._found.labels) > 1 and (np.diff(labels) >= 0).all():
-            yield "the records are sorted by label, so batches have few classes; shuffle when converting"
-
-
-def as_json(found: Survey) -> dict[str, Any]:
-    """Return the survey as a dictionary for JSON."""
-    channels = found.channels
-    return {
-        "records": found.total,
-        "looked_at": found.records,
-        "bytes": found.size,
-        "forms": dict(found.forms),
-        "labels": {f"{label:g}": count for label, count in sorted(found.labels.items())},
-        "unlabeled": found.unlabeled,
-        "channels": [
-            {"mean": float(mean), "deviation": float(deviation), "least": float(least), "most": float(most)}
-            for mean, deviation, least, most in zip(
-                channels.mean, channels.deviation, channels.least, channels.most, strict=True
-            )
-        ],
-        "num_faults": found.num_faults,
-        "faults": [{"key": fault.key, "fault": fault.text} for fault in found.faults],
-        "notes": found.notes,
-    }
+def _fault(record: Record, first: Record) -> str:
+    """Return the error in a readable record; "" if there is none."""
+    assert record.values is not None
+    assert first.values is not None
+    if record.values.shape != first.values.shape:
+        expected = f'the first record, "{first.key}", {shape_text(first.values.shape)}'
+        return f"is {shape_text(record.values.shape)}, {expected}"
+    if record.values.dtype != np.uint8 and not np.isfinite(record.values).all():
+        return "contains a NaN or an infinity"
+    return ""
 
 
 def as_lines(found: Survey, name: str) -> list[str]:
@@ -203,7 +136,7 @@ def as_lines(found: Survey, name: str) -> list[str]:
         lines.append(f"channel {k}: mean {mean:.4g}, {spread}")
     if len(channels.mean) > 12:
         lines.append(f"and {len(channels.mean) - 12} more channels")
-    return lines + [f"note: {note}" for note in found.notes]
+    return lines
 
 
 def labels_line(found: Survey) -> str:

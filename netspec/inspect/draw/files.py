@@ -6,18 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from netspec import log
-from netspec.errors import SpecError
 from netspec.files.whole_file import write_whole
 from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.diagram import Diagram, diagram_of
 from netspec.inspect.draw.dot import dot_of
 from netspec.inspect.draw.graphviz import render
 from netspec.inspect.draw.page import net_page
-from netspec.inspect.recovered import recover_net
-from netspec.proto.binary import is_net_binary
+from netspec.inspect.net_or_solver import parse_net_or_solver
 from netspec.proto.schema import NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap
-from netspec.proto.text import parse_net, parse_solver
 from netspec.solver.nets import solver_nets
 
 SLOW_TO_DRAW = 5000  # boxes; drawing them takes about half a minute
@@ -28,10 +25,10 @@ def write_picture(
 ) -> Diagram:
     """Draw the net of a file, or the training net of a solver, as SVG, PNG or HTML by the ending of ``out``.
 
-    For a .caffemodel, draws the net inside it. Returns the diagram. Its faults are the errors in parts that could
+    Returns the diagram. Its faults are the errors in parts that could
     not be built and have no shapes. Raises SpecError for a file that cannot be read, or if Graphviz is missing.
     """
-    diagram = diagram_of(*_net_of(path, options), phases, options)
+    diagram = diagram_of(*_net_of(path), phases, options)
     if len(diagram.boxes) > SLOW_TO_DRAW:
         log.warning(
             "draw_net.py:1",
@@ -45,17 +42,9 @@ def write_picture(
     return diagram
 
 
-def _net_of(path: str | Path, options: BuildOptions) -> tuple[NetParameter, SourceMap]:
-    if is_net_binary(path):
-        return recover_net(path, options.given_shapes)
-    try:
-        return parse_net(path)
-    except SpecError:
-        try:
-            solver, node = parse_solver(path)
-        except SpecError:
-            solver = None
-        if solver is None:
-            raise
-    described = solver_nets(solver, node)
+def _net_of(path: str | Path) -> tuple[NetParameter, SourceMap]:
+    read = parse_net_or_solver(path)
+    if isinstance(read[0], NetParameter):
+        return read
+    described = solver_nets(*read)
     return described[0].net, described[0].source

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from netspec.files.whole_file import why_unwritable, write_whole
 
 FAULT = "#c62828"
 DPI = 144
-ENDINGS = ("png", "svg", "html")
+ENDINGS = ("png", "svg")
 
 STYLE: dict[Any, Any] = {
     **figures.STYLE,
@@ -33,11 +32,11 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def ending_of(path: str | Path, endings: Sequence[str] = ENDINGS) -> str:
+def ending_of(path: str | Path) -> str:
     """Return the format of a file name. Raises SpecError for another format, and for a folder that is not writable."""
     ending = Path(path).suffix.lower().lstrip(".")
-    if ending not in endings:
-        raise SpecError(f"expected a name that ends in {', '.join(f'.{each}' for each in endings)}", Where(str(path)))
+    if ending not in ENDINGS:
+        raise SpecError(f"expected a name that ends in {', '.join(f'.{each}' for each in ENDINGS)}", Where(str(path)))
     if reason := why_unwritable(path):
         raise SpecError(f"cannot be written: {reason}", Where(str(path)))
     return ending

@@ -43,8 +43,8 @@ class Look:
 def training_figure(logs: Sequence[TrainingLog], look: Look | None = None) -> Figure:
     """Draw trainings in different colors: a panel for losses, one for each other output, and one for the rate.
 
-    The training loss is drawn light, and its smoothed curve dark. Tests are dashed, with markers. The parts have ids,
-    such as ``run0-raw``, so that a page can hide them.
+    The training loss is drawn light, and its smoothed curve dark. Tests are dashed, with markers. The parts have ids
+    in the SVG, such as ``run0-raw``.
     """
     look = replace(look or Look(), marker_distance=max((log.iteration for log in logs), default=0) / MOST_MARKERS)
     others = other_outputs(logs)

@@ -223,11 +223,6 @@ class Layer(torch.nn.Module):
         """Return the path that a LayerParameter names for its records, "" where it names none."""
         return ""
 
-    @staticmethod
-    def channels_read(param: Any) -> int:
-        """Return how many channels of its bottoms the filters in a LayerParameter need; 0 without filters."""
-        return 0
-
     def restart(self) -> None:
         """Return to the first record."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch.nn import functional as F
@@ -32,14 +31,6 @@ class Convolution(SlidingFilter):
     bottoms = (1, None)
     tops = (1, None)
     same_tops = True
-
-    @staticmethod
-    def channels_read(param: Any) -> int:
-        if not param.blobs:
-            return 0
-        filters = param.blobs[0]
-        channels = filters.shape.dim[1] if len(filters.shape.dim) > 1 else filters.channels
-        return channels * param.convolution_param.group
 
     def setup(self) -> None:
         self.read_geometry()

@@ -10,8 +10,7 @@ from case_files import read_cases
 from netspec.cli import main
 from netspec.data.blobs import from_array
 from netspec.errors import SpecError
-from netspec.inspect.check.compare import compare_files
-from netspec.inspect.check.format import format_text
+from netspec.inspect.check.diff import compare_files
 from netspec.proto.schema import BlobProto, NetParameter
 from netspec.proto.text import parse_net, write_text
 from paths import last_parts, nets_as_found
@@ -57,7 +56,7 @@ def test_an_absent_field_differs_if_its_default_means_something_else() -> None:
     norm = 'layer { name: "n" type: "BatchNorm" bottom: "a" top: "a" batch_norm_param { %s } }\n'
     assert diff(NET + norm % "", NET + norm % "eps: 1e-5") == []
     assert diff(NET + norm % "", NET + norm % "use_global_stats: false") == [
-        'B:7:77: layer "n" (BatchNorm): use_global_stats is false, was absent (A:7:58)'
+        'B:7:77: layer "n" (BatchNorm): batch_norm_param.use_global_stats is false, was absent (A:7:58)'
     ]
     concat = 'layer { name: "c" type: "Concat" bottom: "a" bottom: "b" top: "c" concat_param { %s } }\n'
     assert diff(NET + concat % "axis: 2", NET + concat % "concat_dim: 2") == []
@@ -74,16 +73,16 @@ def test_loss_weight_is_compared_with_its_default_of_one() -> None:
 
 def test_solvers_are_compared_with_their_nets() -> None:
     Path("net").write_text(NET)
-    Path("same").write_text(format_text(NET, "net"))
+    Path("same").write_text(NET.replace(" {", "  {"))
     Path("other").write_text(NET.replace("num_output: 2", "num_output: 3", 1))
     assert diff(SOLVER, SOLVER + 'type: "SGD" momentum: 0') == []
     assert diff(SOLVER, SOLVER.replace('"net"', '"same"')) == []
     assert diff(SOLVER, SOLVER.replace("0.1", "0.2").replace('"net"', '"other"')) == [
         "B:2:1: base_lr is 0.2, was 0.1 (A:2:1)",
-        'other:3:80: layer "a" (Convolution): train net: num_output is 3, was 2 (net:3:80)',
+        'other:3:80: layer "a" (Convolution): train net: convolution_param.num_output is 3, was 2 (net:3:80)',
     ]
-    (line,) = diff(SOLVER, SOLVER.replace('"net"', '"gone"'))
-    assert line.startswith('B:1:1: net differs; not compared: B:1:1: net "gone" is not a file')
+    with pytest.raises(SpecError, match=r'^B:1:1: net "gone" is not a file'):
+        diff(SOLVER, SOLVER.replace('"net"', '"gone"'))
     assert diff(SOLVER + "solver_type: ADAM", SOLVER + 'type: "Adam"') == []
 
 
@@ -101,10 +100,9 @@ def test_weights_are_compared_blob_by_blob() -> None:
     write_weights("a.caffemodel", one=[values, values[0]], two=[values], three=[values])
     write_weights("b.caffemodel", one=[moved, values[0]], two=[values.reshape(1, 1, 2, 3)], four=[values])
     assert [str(each) for each in compare_files("a.caffemodel", "b.caffemodel")] == [
-        'a.caffemodel: layer "three" is only here, not in the second file',
-        'b.caffemodel: layer "one", blob 0: 3 of 6 values differ, by 0.25 on average and 0.25 at most; '
-        "the largest was 5",
-        'b.caffemodel: layer "four" is only here, not in the first file',
+        'a.caffemodel: layer "three": is only here, not in the second file',
+        'b.caffemodel: layer "four": is only here, not in the first file',
+        'b.caffemodel: layer "one": blob 0: 3 of 6 values differ, by 0.25 at most',
     ]
     assert len(list(compare_files("a.caffemodel", "b.caffemodel", tolerance=0.25))) == 2
 

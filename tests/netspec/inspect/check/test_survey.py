@@ -1,6 +1,5 @@
-"""``netspec data``: statistics of databases, faulty and unusual records, and pictures of records."""
+"""``netspec data show``: statistics of databases, faulty records, and pictures of records."""
 
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -55,7 +54,7 @@ def test_statistics_are_those_of_numpy(tmp_path: Path, backend: str) -> None:
     assert found.channels.histogram is not None
     assert found.channels.histogram[1, 7] == (together[:, 1] == 7).sum()
     assert found.labels == {0: 5, 1: 4}
-    assert (found.total, found.faults, found.notes) == (9, [], [])
+    assert (found.total, found.faults) == (9, [])
     assert found.forms == {"raw bytes, 3 x 6 x 8": 9}
 
 
@@ -77,20 +76,6 @@ def test_records_that_a_data_layer_refuses_are_errors(tmp_path: Path) -> None:
         (4, "contains a NaN or an infinity"),
     ]
     np.testing.assert_allclose(found.channels.mean, np.stack([image(0), image(2)]).mean(axis=(0, 2, 3)))
-
-
-def test_unusual_records_are_noted(tmp_path: Path) -> None:
-    images: list[Any] = [(image(k), k // 50) for k in range(100)]
-    images += [(image(0), 2), (image(0), 2), (np.zeros((3, 6, 8), np.uint8), 3)]
-    notes = look(write(tmp_path / "db", images)).notes
-    assert notes[:3] == [
-        "records with the same values as another record: 2",
-        "images that occur with different labels: 1",
-        "records in which all values are equal: 1",
-    ]
-    assert "sorted by label" in notes[3]
-    some = [array_to_datum(image(k), None if k else 1).SerializeToString() for k in range(3)]
-    assert look(write(tmp_path / "some", some)).notes == ["records without a label, which Caffe reads as 0: 2"]
 
 
 def test_records_of_a_list_of_hdf5_files_are_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,19 +129,6 @@ def test_records_are_split_into_images_and_converted_to_pictures() -> None:
     assert as_picture(np.arange(5.0).reshape(5, 1, 1)).shape == (2, 3)
 
 
-def test_data_stat_prints_statistics_and_has_status_1_for_errors(run: Run, tmp_path: Path) -> None:
-    result = run("data", "stat", "pairs/train_lmdb")
-    assert (result.status, result.err) == (0, "")
-    assert "640 records" in result.out
-    assert "labels: 0 (320), 1 (320)" in result.out
-    found = json.loads(run("data", "stat", "pairs/train_lmdb", "--records", 10, "--json").out)
-    assert (found["records"], found["looked_at"], len(found["channels"])) == (640, 10, 2)
-    path = write(tmp_path / "bad", [image(0), b"\xff"])
-    result = run("data", "stat", path)
-    assert (result.status, result.err) == (1, f'{path}: record "00000001" is not a Datum (1 bytes)\n')
-    assert run("data", "stat", "nowhere").fault.startswith('nowhere: database "nowhere" does not exist')
-
-
 @pytest.mark.slow
 def test_data_show_draws_pairs_and_lists_errors_first(run: Run, tmp_path: Path) -> None:
     assert run("data", "show", "pairs/train_lmdb", "--out", "x.png", "--count", 6).status == 0
@@ -189,8 +161,8 @@ def test_the_count_of_errors_is_red_and_no_good_record_is_left_out_for_a_bad_one
 
 @pytest.mark.parametrize(
     "words",
-    [("show", "db"), ("stat", "db", "--out", "x.png"), ("draw", "db")],
-    ids=["show_without_out", "stat_with_out", "unknown"],
+    [("show", "db"), ("draw", "db")],
+    ids=["show_without_out", "unknown"],
 )
 def test_invalid_arguments_of_data_have_status_2(run: Run, words: tuple[str, ...]) -> None:
     assert run("data", *words).status == 2

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-import netspec
 from netspec.cli import main
 from netspec.errors import SpecError, Where
 from netspec.graph.options import BuildOptions
@@ -186,16 +185,6 @@ def test_a_solver_is_drawn_by_its_training_net(tmp_path: Path, monkeypatch: pyte
     Path("solver.prototxt").write_text('net: "net.prototxt" base_lr: 1 lr_policy: "fixed"')
     assert main(["draw", "solver.prototxt", "--out", "net.svg"]) == 0
     assert "trained" in Path("net.svg").read_text()
-
-
-def test_the_net_in_a_caffemodel_is_drawn(tmp_path: Path) -> None:
-    net = tmp_path / "net.prototxt"
-    net.write_text('name: "kept"\n' + INPUT + conv("conv", "data"))
-    netspec.save_weights(netspec.load_net(net), tmp_path / "net.caffemodel")
-    assert main(["draw", str(tmp_path / "net.caffemodel"), "--out", str(tmp_path / "net.svg")]) == 0
-    picture = (tmp_path / "net.svg").read_text()
-    assert "kept" in picture
-    assert "conv" in picture
 
 
 def test_names_are_escaped_in_markup() -> None:

@@ -63,8 +63,8 @@ def test_a_training_from_damaged_weights_fails_before_its_first_iteration(
     Path("w.caffemodel").write_text("nothing")
     stderr, file, _ = endings("--weights", "w.caffemodel")
     assert (stderr, file) == ("failed", "failed")
-    result = run("plot", "stderr.log", "--out", "x.html")
-    assert result.out == "stderr.log: state failed, iterations 0\nx.html\n"
+    result = run("plot", "stderr.log", "--out", "x.svg")
+    assert result.out == "stderr.log: state failed, iterations 0\nx.svg\n"
 
 
 @pytest.mark.parametrize(
