@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.cli.data_set import sequence, typed
-from loopclosure.closing.close import Closed, close, drifted, summary, write_closed
-from loopclosure.closing.g2o import read_pose_graph, solve_pose_graph, write_solution
-from loopclosure.closing.g2o import summary as graph_summary
+from loopclosure.closing.close import close, drifted, summary, write_closed
 from loopclosure.closing.measure import measure, read_loops
 from loopclosure.errors import InputError
 from loopclosure.places import intrinsics
@@ -20,10 +18,6 @@ from loopclosure.places.source import CLOSED, POSES, TOPICS
 from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands, seed
-
-# Options that cannot be used with --graph.
-OF_FRAMES = ("loops", "odometry", "drift", "odometry_form", "seed", "camera")
-ALL = "all"  # value of --loops with --graph
 
 
 def add_commands(commands: Commands) -> None:
@@ -36,17 +30,11 @@ def _add_close(commands: Commands) -> None:
     parser.set_defaults(function=_close)
     parser.add_argument(
         "source",
-        nargs="?",
         metavar="SOURCE",
         help="the frames: a TUM, EuRoC or KITTI sequence, a folder or list of images, a video or bag; "
         f"{', '.join((*POSES, *TOPICS))} may follow, as in drive.mp4,poses=slam.txt",
     )
-    parser.add_argument("--graph", type=Path, metavar="IN.g2o", help="solve this pose graph instead of reading frames")
-    parser.add_argument(
-        "--loops",
-        metavar="CSV",
-        help="the loops.csv that detect wrote; with --graph only the word all, to accept every loop",
-    )
+    parser.add_argument("--loops", required=True, metavar="CSV", help="the loops.csv that detect wrote")
     exclusive = parser.add_mutually_exclusive_group()
     exclusive.add_argument(
         "--odometry",
@@ -67,11 +55,6 @@ def _add_close(commands: Commands) -> None:
 
 def _close(a: argparse.Namespace) -> None:
     out = Path(a.out)
-    if a.graph:
-        _close_graph(a, out)
-        return
-    if not a.source or not a.loops:
-        raise WrongUsage("expected the frames and --loops, or --graph")
     if a.odometry_form and not a.odometry:
         raise WrongUsage("--odometry-form needs --odometry")
     if a.seed is not None and a.drift is None:
@@ -92,23 +75,6 @@ def _close(a: argparse.Namespace) -> None:
     draw_paths(out / "paths.png", closed)
     print("\n".join(summary(closed)))
     print(f"{out / 'closed.g2o'}, {out / 'closed.txt'}, {out / 'paths.png'}")
-
-
-def _close_graph(a: argparse.Namespace, out: Path) -> None:
-    for option in ("source", *OF_FRAMES):
-        if getattr(a, option) not in (None, ALL if option == "loops" else None):
-            name = "the frames" if option == "source" else f"--{option.replace('_', '-')}"
-            hint = f"; --loops {ALL} accepts every loop" if option == "loops" else ""
-            raise WrongUsage(f"{name} cannot be used with --graph, which has its own poses and loops{hint}")
-    graph = read_pose_graph(a.graph)
-    solution = solve_pose_graph(graph, a.loops == ALL)
-    write_solution(out, graph, solution)
-    from loopclosure.report.plots import draw_paths
-
-    ends = graph.poses, solution.poses, graph.steps, graph.loops
-    draw_paths(out / "paths.png", Closed(graph.ids, *ends, [], solution.accepted, 0), ("before", "after"))
-    print("\n".join(graph_summary(graph, solution)))
-    print(f"{out / 'closed.g2o'}, {out / 'loops.csv'}, {out / 'paths.png'}")
 
 
 def _odometry(a: argparse.Namespace, frames: ImageSequence) -> np.ndarray:

@@ -187,8 +187,9 @@ def _detect(a: argparse.Namespace) -> None:
     driven = np.isfinite(odometry).any()
     if driven or np.isfinite(poses).any():
         of_loop = {(loop.query, loop.match): constraint(loop.relative) for loop in loops if loop.relative is not None}
-        relative = run.from_poses(detector) if not driven and measured is None else lambda *ends: of_loop.get(ends)
-        left_out = write_g2o(out / "loops.g2o", odometry if driven else poses, detector.loops, relative)
+        left_out = write_g2o(
+            out / "loops.g2o", odometry if driven else poses, detector.loops, lambda *ends: of_loop.get(ends)
+        )
         note = f"; loops without a measured relative pose, left out: {left_out}" if left_out else ""
         print(f"pose graph of the {'odometry' if driven else 'known poses'}{note}: {out / 'loops.g2o'}")
     if np.isfinite(poses).any():

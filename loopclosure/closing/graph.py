@@ -15,7 +15,7 @@ never more than c. To allow a start far from the solution, c is at least the lar
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -32,6 +32,7 @@ from scipy.special import gammaincinv  # scipy.stats, which has chi2, takes a qu
 Array = NDArray[np.float64]
 
 TRUE_BELOW = 0.99  # probability that the squared error of a true loop is below its limit (chi-squared)
+LEAST_KNOWN = 1e-7  # of the largest information: below it a direction is not measured, and the rest is rounding
 WIDEST, NARROWER = 1000.0, 10.0  # c at first, as a multiple of that limit, and its divisor from stage to stage
 EARLY_STEPS, LAST_STEPS = 2, 50
 EARLY_GAIN, LAST_GAIN = 1e-2, 1e-7  # a stage ends when a step reduces the loss by less than this share
@@ -67,28 +68,19 @@ class Solution:
         return self.squares <= self.limits
 
 
-def solve(
-    poses: Array,
-    odometry: Sequence[Edge],
-    loops: Sequence[Edge],
-    held: Collection[int] = (),
-    flat: bool = False,
-    all_true: bool = False,
-) -> Solution:
-    """Find the poses (N, 7) that agree best with all edges.
+def solve(poses: Array, odometry: Sequence[Edge], loops: Sequence[Edge]) -> Solution:
+    """Find the poses (N, 7) that agree best with all edges; some of the loops may be false.
 
-    The search starts from ``poses``. Some of the loops may be false, unless ``all_true`` is set. The ``held`` nodes do
-    not move; in a connected part of the graph without held nodes, the first node does not move. In a ``flat`` graph,
-    an edge measures three numbers, not six.
+    The search starts from ``poses``. In each connected part of the graph, the first node does not move.
     """
-    graph = _Graph(len(poses), [*odometry, *loops], held)
+    graph = _Graph(len(poses), [*odometry, *loops])
     state = State(poses[:, :3], Rotation.from_quat(poses[:, 3:]))
-    limits = np.full(len(loops), np.inf) if all_true else limits_of(loops, flat)
+    limits = limits_of(loops)
 
     def worst() -> float:
         return float((graph.squares(state)[len(odometry) :] / limits).max(initial=0))
 
-    factor = max(WIDEST, worst()) if loops and not all_true else 1.0
+    factor = max(WIDEST, worst()) if loops else 1.0
     while factor > 1:
         state = _descend(graph, state, _Loss(len(odometry), factor * limits), EARLY_STEPS, EARLY_GAIN)
         factor = min(factor / NARROWER, worst())  # directly to the last stage if no loop is false
@@ -98,15 +90,16 @@ def solve(
     return Solution(solved, squares[: len(odometry)], squares[len(odometry) :], limits)
 
 
-def limits_of(loops: Sequence[Edge], flat: bool = False) -> Array:
+def limits_of(loops: Sequence[Edge]) -> Array:
     """Return the largest squared error (L,) of a true loop; it depends on how many numbers the loop measures."""
-    measured = np.linalg.matrix_rank(np.array([edge.information for edge in loops]).reshape(-1, 6, 6), hermitian=True)
-    return 2 * gammaincinv(np.maximum(1, measured - (3 if flat else 0)) / 2, TRUE_BELOW)
+    values = np.linalg.eigvalsh(np.array([edge.information for edge in loops]).reshape(-1, 6, 6))
+    measured = (values > LEAST_KNOWN * values[:, -1:]).sum(axis=1)
+    return 2 * gammaincinv(np.maximum(1, measured) / 2, TRUE_BELOW)
 
 
 def squares_of(poses: Array, edges: Sequence[Edge]) -> Array:
     """Return the squared error (E,) of each edge for poses (N, 7)."""
-    return _Graph(len(poses), edges, range(len(poses))).squares(State(poses[:, :3], Rotation.from_quat(poses[:, 3:])))
+    return _Graph(len(poses), edges, solved=False).squares(State(poses[:, :3], Rotation.from_quat(poses[:, 3:])))
 
 
 class State(NamedTuple):
@@ -158,13 +151,13 @@ def _descend(graph: _Graph, state: State, loss: _Loss, most_steps: int, least_ga
 class _Graph:
     """The errors of all edges and their derivatives. The unknowns are a translation and a rotation per free node."""
 
-    def __init__(self, nodes: int, edges: Sequence[Edge], held: Collection[int] = ()) -> None:
+    def __init__(self, nodes: int, edges: Sequence[Edge], solved: bool = True) -> None:
         self._first = np.array([edge.first for edge in edges], int)
         self._second = np.array([edge.second for edge in edges], int)
         measured = np.array([edge.pose for edge in edges]).reshape(-1, 7)
         self._steps, self._rotations = measured[:, :3], Rotation.from_quat(measured[:, 3:])
         self._roots = roots_of(edges)
-        self._place = _places(nodes, self._first, self._second, held)
+        self._place = _places(nodes, self._first, self._second) if solved else np.full(nodes, -1)
         rows, columns = 6 * np.arange(len(edges)), 6 * self._place[np.stack([self._first, self._second])]
         self._kept = columns >= 0
         six = np.arange(6)
@@ -210,14 +203,12 @@ class _Graph:
         return step, self._rotations.inv() * back * there
 
 
-def _places(nodes: int, first: NDArray[np.int_], second: NDArray[np.int_], held: Collection[int]) -> NDArray[np.int_]:
+def _places(nodes: int, first: NDArray[np.int_], second: NDArray[np.int_]) -> NDArray[np.int_]:
     """Return the place (N,) of each node among the unknowns, -1 for those that stay."""
     ends = sparse.coo_matrix((np.ones(len(first)), (first, second)), (nodes, nodes))
     _, part = csgraph.connected_components(ends, directed=False)
     stays = np.zeros(nodes, bool)
-    stays[list(held)] = True
-    parts, starts = np.unique(part, return_index=True)
-    stays[starts[~np.isin(parts, part[stays])]] = True
+    stays[np.unique(part, return_index=True)[1]] = True
     place = np.full(nodes, -1)
     place[~stays] = np.arange(np.count_nonzero(~stays))
     free = (place[first] >= 0) & (place[second] >= 0)

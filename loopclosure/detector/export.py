@@ -20,8 +20,7 @@ from loopclosure.detector.decision import LoopResult
 from loopclosure.errors import InputError
 from netspec.files.whole_file import write_whole
 
-VERTEX, EDGE, VERTEX_2D, EDGE_2D = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_SE2", "EDGE_SE2"
-PLANE = np.array([0, 1, 5])  # x, y and the rotation about z, in the 6-vector of a pose error
+VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 RELATIVE = (
     "relative",
     *("qx", "qy", "qz", "qw", "dx", "dy", "dz", "length_m", "agreeing", "sigma_m", "sigma_deg"),
@@ -140,31 +139,16 @@ def write_g2o(path: str | Path, poses: np.ndarray, loops: Sequence[LoopResult], 
 
 
 def write_pose_graph(
-    path: str | Path,
-    vertices: Mapping[int, np.ndarray],
-    edges: Iterable[tuple[int, int, np.ndarray, np.ndarray]],
-    fixed: Iterable[int] = (),
-    flat: bool = False,
+    path: str | Path, vertices: Mapping[int, np.ndarray], edges: Iterable[tuple[int, int, np.ndarray, np.ndarray]]
 ) -> None:
-    """Write vertices, number -> pose (7,), and edges: i, j, pose (7,) of j in the frame of i, information (6, 6).
-
-    An optimizer does not move ``fixed`` vertices. ``flat``: write a 2D graph; the poses lie in the plane z = 0.
-    """
-    vertex, edge = (VERTEX_2D, EDGE_2D) if flat else (VERTEX, EDGE)
-    upper = np.triu_indices(3 if flat else 6)
-    as_written = _flat_pose if flat else np.asarray
-    lines = [f"{vertex} {i} {_numbers(as_written(pose))}" for i, pose in vertices.items()]
-    lines += [f"FIX {i}" for i in fixed]
+    """Write vertices, number -> pose (7,), and edges: i, j, pose (7,) of j in the frame of i, information (6, 6)."""
+    upper = np.triu_indices(6)
+    lines = [f"{VERTEX} {i} {_numbers(pose)}" for i, pose in vertices.items()]
     for i, j, pose, information in edges:
-        entries = (information[np.ix_(PLANE, PLANE)] if flat else information)[upper]
-        lines.append(f"{edge} {i} {j} {_numbers(as_written(pose))} {_numbers(entries)}")
+        lines.append(f"{EDGE} {i} {j} {_numbers(pose)} {_numbers(information[upper])}")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, "\n".join(lines) + "\n")
-
-
-def _flat_pose(pose: np.ndarray) -> np.ndarray:
-    return np.array([*pose[:2], Rotation.from_quat(pose[3:]).as_rotvec()[2]])
 
 
 def _numbers(values: np.ndarray) -> str:

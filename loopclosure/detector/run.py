@@ -18,7 +18,6 @@ import numpy as np
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.export import LOOP_SIGMAS, RelativePose, relative_pose
 from loopclosure.detector.saved import Describe
 from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
@@ -110,17 +109,6 @@ def verdicts_said(results: Sequence[LoopResult]) -> str:
     words = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts))
     scores = [result.score for result in results if result.candidates]
     return f"frames: {words}" + (f"; best score {max(scores) + 0.0:.4g}" if scores else "")
-
-
-def from_poses(detector: LoopDetector) -> RelativePose:
-    """Return a function that computes relative poses from absolute poses (motion capture)."""
-    poses = detector.poses
-
-    def relative(query: int, match: int) -> tuple[np.ndarray, np.ndarray] | None:
-        both = poses[[match, query]]
-        return (relative_pose(*both), LOOP_SIGMAS.information()) if np.all(np.isfinite(both)) else None
-
-    return relative
 
 
 def judged_by_poses(detector: LoopDetector) -> str:

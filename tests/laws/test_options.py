@@ -73,7 +73,7 @@ WAYS = {
         "detect walk/walk_1 --features walk.npz --threshold -1 --exclude-recent 1 --out found",
         "detect --video walk.avi --describe loopclosure.descriptors.thumbnails:Thumbnailer --out found",
         "close walk/walk_1 --loops loops.csv --drift 2 --out closed",
-        "close --graph loops.g2o --out closed",
+        "close images --loops loops.csv --odometry odometry.txt --out closed",
         "map build new walk/walk_1,limit=2",
         "map add map walk/walk_1,limit=2",
         "map query map walk/walk_1,limit=2 --out found",
