@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -44,23 +43,23 @@ TITLES = {
 KINDS = {"fr1_rpy": "kitchen", "corridor_loop": "corridors", "walk": "house", "ESSEX3IN1": "streets", "SPED": "streets"}
 CORRIDORS = ("office_corridor_rc", "rc_office_corridor")
 HOUSE = 900_002
-# By the names in the tables. F is the file of the included net's descriptors, W the file of words, O that
-# of words of ORB, S that of words of the same kind of place. Words of ORB with a check of the geometry stand for
-# what DBoW2 and DBoW3 do in many SLAM systems; there is no wheel of these.
+# By the names in the tables: the method, and what its words are learned from. Words of ORB with a check of the geometry
+# stand for what DBoW2 and DBoW3 do in many SLAM systems; there is no wheel of these.
+TOWER, OF_ORB, SAME_KIND = "words", "orb", "same kind"
 METHODS = {
-    "gray thumbnails, 32x24": "thumbnails",
-    "bag of SIFT words, tf-idf": "bow:model=W",
-    "bag of ORB words, tf-idf": "bow:kind=orb,model=O",
-    "FAB-MAP 2.0": "fabmap:model=W",
-    "FAB-MAP 2.0, words of the same kind of place": "fabmap:model=S",
-    "the net": "features:F",
-    "the small net": "describe:small",
-    "verified+net": "verified+features:F",
-    "SeqSLAM on the net": "seqslam+features:F",
-    "verified, SeqSLAM on the net": "verified+seqslam+features:F",
-    "auto, on the net": "auto+features:F",
-    "verified+FAB-MAP": "verified+fabmap:model=W",
-    "verified+bag of ORB words": "verified+bow:kind=orb,model=O",
+    "gray thumbnails, 32x24": ("thumbnails", ""),
+    "bag of SIFT words, tf-idf": ("bow", TOWER),
+    "bag of ORB words, tf-idf": ("bow", OF_ORB),
+    "FAB-MAP 2.0": ("fabmap", TOWER),
+    "FAB-MAP 2.0, words of the same kind of place": ("fabmap", SAME_KIND),
+    "the net": ("features", ""),
+    "the small net": ("describe:small", ""),
+    "verified+net": ("verified+features", ""),
+    "SeqSLAM on the net": ("seqslam+features", ""),
+    "verified, SeqSLAM on the net": ("verified+seqslam+features", ""),
+    "auto, on the net": ("auto+features", ""),
+    "verified+FAB-MAP": ("verified+fabmap", TOWER),
+    "verified+bag of ORB words": ("verified+bow", OF_ORB),
 }
 TABLES = {
     "accuracy": [name for name in METHODS if not name.startswith(("verified", "auto"))],
@@ -112,28 +111,28 @@ def measure(
     """Measure methods on data sets and update the figures; ``words`` are the arguments of the command."""
     work.mkdir(parents=True, exist_ok=True)
     figures = {kind: _stored_rows(kind) for kind in TABLES}
-    needed = {METHODS[name][-1] for name in methods or METHODS}
-    tower = tower_images(data / "ie_tower")[::4] if needed & {*"WO"} else []
+    needed = [METHODS[name] for name in methods or METHODS]
+    tower = tower_images(data / "ie_tower")[::4] if any(words in (TOWER, OF_ORB) for _, words in needed) else []
     for name in sets or SETS:
         held = data_set(name, data, work)
         cache = Cache(work / "kept" / f"{name}.pickle")
         images = [*held.queries.paths, *(() if held.references is None else held.references.paths)]
-        if "F" in needed:
+        if any("features" in method for method, _ in needed):
             np.savez(work / f"{name}.npz", features=cache.descriptors(images), names=[str(image) for image in images])
         context = MethodContext(held.exclude_frames, pairs=cache.pairs)
         for label in methods or METHODS:
             if name in PAIRS and (label not in TABLES["accuracy"] or "SeqSLAM" in label):
                 continue
-            files = {
-                "F": f"{name}.npz",
-                "W": "words.npz",
-                "O": "orb.npz",
-                "S": f"words_{KINDS[name]}.npz",
-            }
-            letter = METHODS[label][-1]
-            spec = re.sub(r"\b[FWOS]$", str(work / files.get(letter, "")), METHODS[label])
-            train = same_kind(KINDS[name], data, work) if letter == "S" else tower
-            outcome = judge(label, make_method(spec, context), held, train)
+            method, learned = METHODS[label]
+            inner, settings = method.rpartition("+")[2], {}
+            if inner == "features":
+                settings["features.file"] = str(work / f"{name}.npz")
+            elif learned:
+                stem = f"words_{KINDS[name]}" if learned == SAME_KIND else learned
+                settings[f"{inner}.model"] = str(work / f"{stem}.npz")
+                settings |= {f"{inner}.kind": "orb"} if learned == OF_ORB else {}
+            train = same_kind(KINDS[name], data, work) if learned == SAME_KIND else tower
+            outcome = judge(label, make_method(method, context, settings), held, train)
             for kind, value in _figures(label, outcome, name):
                 say(f"{name}, {label}, {kind}: {value}")
                 figures[kind][label][TITLES[name]] = value

@@ -74,32 +74,33 @@ def join(folders: list[Path], out: Path, start_share: float) -> None:
 
 
 def describe(arguments: argparse.Namespace, walk: Path) -> list[str]:
-    """Write the descriptors of the walk by each file of weights; return the methods that compare them.
+    """Write the descriptors of the walk by each file of weights; return the options of methods that compare them.
 
     A method has the name of the folder that table_1.py keeps the weights in, such as "all rooms".
     """
     net = Path("prototxt", "normalized", arguments.net, "deploy.prototxt")
     shape = f"data=1,3,{arguments.size},{arguments.size}"
-    methods = []
+    options = []
     for weights in arguments.weights:
         trained_on = Path(weights).resolve().parents[2].name
         features = arguments.out / f"{trained_on}.npz"
         extract = ["netspec", "extract", net, "--weights", weights, "--blob", "feat", "--shape", shape]
         extract += ["--mean", "128,128,128", "--scale", 1 / 128, "--images", walk / "rgb.txt", "--out", features]
         run(*extract)
-        methods.append(f"net, {trained_on.replace('_', ' ')}=features:{features}")
-    return methods
+        options += ["--method", f"net, {trained_on.replace('_', ' ')}=features:{features}"]
+    return options
 
 
 def learn(arguments: argparse.Namespace, walk: Path) -> list[str]:
-    """Learn each vocabulary; return the methods that use them, named by the folders of their images."""
-    methods = []
+    """Learn each vocabulary; return the options of the methods that use them, named by the folders of their images."""
+    options = []
     for images in arguments.vocabulary:
         name = Path(images.partition(",")[0]).stem
-        method = f"FAB-MAP 2.0, words of {name}=fabmap:model={arguments.out / name}.words.npz"
-        run("loopclosure", "evaluate", walk, "--train", images, "--method", method, "--out", arguments.out / name)
-        methods.append(method)
-    return methods
+        label = f"FAB-MAP 2.0, words of {name}"
+        option = ["--method", f"{label}=fabmap", "--set", f"{label}.model={arguments.out / name}.words.npz"]
+        run("loopclosure", "evaluate", walk, "--train", images, *option, "--out", arguments.out / name)
+        options += option
+    return options
 
 
 def rows(summary: dict[str, Any]) -> list[dict[str, Any]]:
@@ -134,10 +135,10 @@ def main() -> None:
     arguments = parse()
     walk = arguments.out / "walk"
     join(arguments.sequence, walk, arguments.start)
-    methods = [*describe(arguments, walk), *learn(arguments, walk), "thumbnails"]
+    methods = [*describe(arguments, walk), *learn(arguments, walk), "--method", "thumbnails"]
     report = arguments.out / "report"
     evaluate = ["loopclosure", "evaluate", walk, "--out", report, "--exclude-seconds", arguments.exclude_seconds]
-    run(*evaluate, *(word for method in methods for word in ("--method", method)))
+    run(*evaluate, *methods)
     summary = json.loads((report / "report.json").read_text())
     table = rows(summary)
     (arguments.out / "table.json").write_text(json.dumps(table, indent=1))

@@ -15,14 +15,12 @@ import numpy as np
 
 from loopclosure.closing.measure import Loop, errors_said, measure
 from loopclosure.errors import InputError
-from loopclosure.methods.base import Images, Method, MethodContext
-from loopclosure.methods.named import make_method
+from loopclosure.methods.base import Images, Method
 from loopclosure.places.datasets import DataSet
 from loopclosure.places.same_place import WIDE_ANGLE_DEG
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import ALL_PAIRS, BestMatches, JudgedScores, PrecisionRecall
 from loopclosure.progress import Progress, silent
-from netspec.errors import printable
 
 RECALL_AT = (1, 5, 10)
 WIDE = f"; {WIDE_ANGLE_DEG:g} degrees"  # follows the convention of measures by the wide angle
@@ -146,15 +144,6 @@ class Evaluation:
     def image_count(self) -> int:
         """Return the number of images a method has to describe."""
         return len(self.data.queries) + len(self.data.references or ())
-
-
-def named_method(text: str, context: MethodContext) -> tuple[str, Method]:
-    """Build a method from ``LABEL=METHOD`` or ``METHOD``; return the name to show, and the method."""
-    label, equals, spec = text.partition("=")
-    if not equals or ":" in label:  # this = belongs to a setting after the method's colon
-        method = make_method(text, context)
-        return method.name, method
-    return printable(label.strip()), make_method(spec, context)
 
 
 def evaluate(

@@ -9,7 +9,7 @@ from loopclosure import evaluate
 from loopclosure.cli.data_set import HELP, add_data_set, data_set
 from loopclosure.errors import InputError
 from loopclosure.methods.base import MethodContext
-from loopclosure.methods.named import METHODS
+from loopclosure.methods.named import METHODS, named_methods
 from loopclosure.places.frames import image_paths
 from loopclosure.places.source import FRAMES, Source, read_source
 from netspec.terminal.output import bar
@@ -28,6 +28,13 @@ def _training(text: str) -> Source:
         raise argparse.ArgumentTypeError(str(fault)) from None
 
 
+def _setting(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals or "." not in name:
+        raise argparse.ArgumentTypeError(f"found {text}, expected NAME.SETTING=VALUE")
+    return name, value
+
+
 def _add_evaluate(commands: Commands) -> None:
     parser = commands.add_parser(
         "evaluate",
@@ -43,8 +50,16 @@ def _add_evaluate(commands: Commands) -> None:
         required=True,
         default=[],
         metavar="[LABEL=]METHOD",
-        help=f"a method to evaluate (may be repeated): {', '.join(METHODS)}, with :SETTINGS, or NAME+METHOD, such as "
-        "features:PATH.npz[:cosine], seqslam+features:PATH.npz or fabmap:model=words.npz",
+        help=f"a method to evaluate (may be repeated): {', '.join(METHODS)}, or one that refines another, such as "
+        "features:PATH.npz, describe:small, seqslam+features:PATH.npz",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        type=_setting,
+        default=[],
+        metavar="NAME.SETTING=VALUE",
+        help="a setting of a method, by its name or label (may be repeated), such as fabmap.model=words.npz",
     )
     parser.add_argument(
         "--train",
@@ -69,7 +84,7 @@ def _evaluate(a: argparse.Namespace) -> None:
 
     data = data_set(a)
     context = MethodContext(data.exclude_frames, a.seed)
-    methods = [evaluate.named_method(text, context) for text in a.method]
+    methods = named_methods(a.method, context, dict(a.set))
     train: list[Path] = []
     for source in a.train:
         images = image_paths(source.path)

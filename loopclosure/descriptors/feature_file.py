@@ -37,7 +37,9 @@ class Features:
         """Return the descriptors (len(images), D) of these images, found by name.
 
         Names match if their last parts are equal, with as many parts as needed to distinguish all images: ``rgb/1.png``
-        in the file matches ``/data/fr1/rgb/1.png``. A file without names must have exactly these images, in order.
+        in the file matches ``/data/fr1/rgb/1.png``. A descriptor is that of one image only: with equal names in two
+        folders, the names in the file must have the folders too. A file without names must have exactly these images,
+        in order.
         """
         if not self.names:
             if len(self.features) != len(images):
@@ -55,9 +57,14 @@ class Features:
             if absent:
                 missing = f"has no descriptor of {absent[0]} ({len(absent)} of {len(images)} images are not in it)"
                 continue
+            image_of: dict[int, Path] = {}
             for image, numbers in zip(images, found, strict=True):
                 if len(numbers) > 1:
                     raise InputError(f"names {image.name} {len(numbers)} times; which one is {image}?", self.path)
+                first = image_of.setdefault(numbers[0], image)
+                if first.absolute() != image.absolute():
+                    name = self.names[numbers[0]]
+                    raise InputError(f"has one descriptor of {name}; is it that of {first} or of {image}?", self.path)
             return self.features[[numbers[0] for numbers in found]]
         raise InputError(f"{missing}; its first name is {self.names[0]}", self.path)
 

@@ -7,6 +7,7 @@ reject sequences of which too few matches are verified. docs/methods.md has the 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -219,11 +220,11 @@ class Auto:
         return MethodResult(scores, seconds, notes, found.training_stages, verdicts_said(decided.results))
 
 
-def auto(argument: str, context: MethodContext, inner: Method | None) -> Auto:
-    """Build ``auto[:setting=value,...]+METHOD``."""
+def auto(settings: Mapping[str, str], context: MethodContext, inner: Method | None) -> Auto:
+    """Build ``auto+METHOD``."""
     if inner is None:
         raise InputError("auto needs a method whose scores it judges; write auto+METHOD, as in auto+features:F.npz")
     plain = Auto(inner, exclude_frames=context.exclude_frames, pairs=context.pairs)
-    method, check = configure("auto", argument, plain, plain.check)
+    method, check = configure("auto", settings, plain, plain.check)
     method.check = check
     return method

@@ -1,12 +1,12 @@
 """The baselines as methods: ``fabmap``, ``bow`` and ``thumbnails`` on the command line.
 
-The argument is a comma-separated list of ``setting=value``; the settings are the fields of the classes below and of
-the classes of these fields. ``fabmap:model=words.npz,scored=posterior`` writes its vocabulary to a file and reads it
-the next time.
+Their settings are the fields of the classes below and of the classes of these fields. With ``fabmap.model=words.npz``
+the vocabulary is written to a file, and read from it the next time.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -27,16 +27,24 @@ from loopclosure.words.word_model import TRAINING_STAGES, Training, WordModel, t
 
 @dataclass(frozen=True)
 class WordModelSource:
-    """The source of the word model: the file ``model``, or training, which then writes that file."""
+    """The source of the word model: the file ``model``, or training, which then writes that file.
+
+    given   names of the settings of ``training`` that a file must have been made with; the others are the file's own
+    """
 
     training: Training = field(default_factory=Training)
     model: str = ""
+    given: tuple[str, ...] = ()
 
     def learn(self, images: Images, progress: Progress, seconds: dict[str, float]) -> tuple[WordModel, list[str]]:
         """Return the model and notes about it; refuse a model that was trained on a test image."""
         path = Path(self.model)
         if self.model and path.exists():
             model = WordModel.load(path)
+            asked, made = self.training.settings, model.training.settings
+            for name in self.given:
+                if asked[name] != made[name]:
+                    raise InputError(f"was made with {name} {made[name]}, not {asked[name]}; give another file", path)
             source = f"read from {path}"
         else:
             refuse_overlap(images.train, images.tested)
@@ -80,22 +88,16 @@ class _WordMethod:
 
 @dataclass
 class FabMapMethod(_WordMethod):
-    """FAB-MAP; ``scored`` is "log_odds" (evidence against a new place) or "posterior"."""
+    """FAB-MAP 2.0; the score is the posterior probability of the place."""
 
     settings: FabMapSettings = field(default_factory=FabMapSettings)
-    scored: str = "log_odds"
     name: str = "fabmap"
     stage: ClassVar[str] = "likelihoods"
-
-    def __post_init__(self) -> None:
-        if self.scored not in ("log_odds", "posterior"):
-            raise InputError(f'FAB-MAP\'s score is "log_odds" or "posterior", not "{self.scored}"')
 
     def _compared(self, model: WordModel, queries: np.ndarray, references: np.ndarray | None) -> tuple[np.ndarray, str]:
         fabmap = FabMapModel(model.tree, model.training_words, self.settings)
         found = score_sequence(fabmap, queries) if references is None else score_sets(fabmap, queries, references)
-        said = f"FAB-MAP {self.settings.version}, score: {self.scored}; {self.settings}"
-        return found.log_odds if self.scored == "log_odds" else found.posterior, said
+        return found.posterior, f"FAB-MAP 2.0, score: posterior; {self.settings}"
 
 
 @dataclass
@@ -133,28 +135,29 @@ class ThumbnailMethod:
         return MethodResult(scores, seconds, [f"mean absolute difference of gray thumbnails; {self.thumbnailer}"])
 
 
-def configure_words(argument: str, method: Any, training: Training, *parts: Any) -> list[Any]:
-    """Return a method with a word model as its ``source``, and other parts, with the settings in ``argument``."""
+def _configured(settings: Mapping[str, str], method: Any, seed: int, *parts: Any) -> list[Any]:
+    """Return a method with a word model as its ``source``, and other parts, with their settings."""
     method, source, training, extractor, *others = configure(
-        method.name, argument, method, WordModelSource(), training, Extractor(), *parts
+        method.name, settings, method, WordModelSource(), Training(seed=seed), Extractor(), *parts
     )
-    source = replace(source, training=replace(training, extractor=extractor))
-    return [replace(method, source=source), *others]
+    training = replace(training, extractor=extractor)
+    given = tuple(name for name in settings if name in training.settings)
+    return [replace(method, source=replace(source, training=training, given=given)), *others]
 
 
-def fabmap(argument: str, context: MethodContext, inner: Method | None) -> FabMapMethod:
-    """Build ``fabmap[:setting=value,...]``."""
-    plain = FabMapSettings(recent=context.exclude_frames, seed=context.seed)
-    method, settings = configure_words(argument, FabMapMethod(), Training(seed=context.seed), plain)
-    return replace(method, settings=settings)
+def fabmap(settings: Mapping[str, str], context: MethodContext, inner: Method | None) -> FabMapMethod:
+    """Build ``fabmap``."""
+    plain = FabMapSettings(recent=context.exclude_frames)
+    method, model = _configured(settings, FabMapMethod(), context.seed, plain)
+    return replace(method, settings=model)
 
 
-def bag_of_words(argument: str, context: MethodContext, inner: Method | None) -> BagOfWordsMethod:
-    """Build ``bow[:setting=value,...]``."""
-    return configure_words(argument, BagOfWordsMethod(), Training(seed=context.seed))[0]
+def bag_of_words(settings: Mapping[str, str], context: MethodContext, inner: Method | None) -> BagOfWordsMethod:
+    """Build ``bow``."""
+    return _configured(settings, BagOfWordsMethod(), context.seed)[0]
 
 
-def thumbnails(argument: str, context: MethodContext, inner: Method | None) -> ThumbnailMethod:
-    """Build ``thumbnails[:setting=value,...]``."""
-    method, thumbnailer = configure("thumbnails", argument, ThumbnailMethod(), Thumbnailer())
+def thumbnails(settings: Mapping[str, str], context: MethodContext, inner: Method | None) -> ThumbnailMethod:
+    """Build ``thumbnails``."""
+    method, thumbnailer = configure("thumbnails", settings, ThumbnailMethod(), Thumbnailer())
     return replace(method, thumbnailer=thumbnailer)

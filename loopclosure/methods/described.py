@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopclosure.descriptors.similarity import METRICS
+from loopclosure.descriptors.similarity import METRICS, check_metric
 from loopclosure.detector.run import load_describe, views_of
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, compared
+from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_bgr
 from loopclosure.progress import Progress, timed
 
@@ -42,11 +44,11 @@ class DescribedMethod:
         return replace(result, training_stages=("loading",))
 
 
-def described(argument: str, context: MethodContext, inner: Method | None) -> DescribedMethod:
-    """Build ``describe:NAME|MODULE:FUNCTION|FILE.py:FUNCTION[:euclidean|cosine]``."""
-    function, _, metric = argument.rpartition(":")
-    if metric not in METRICS:
-        function, metric = argument, METRICS[0]
-    if ":" not in function and not re.fullmatch(r"[\w-]+", function):
-        raise InputError(f'"describe:{argument}": expected describe:NAME, describe:FILE.py:FUNCTION or MODULE:FUNCTION')
-    return DescribedMethod(function, metric)
+def described(settings: Mapping[str, str], context: MethodContext, inner: Method | None) -> DescribedMethod:
+    """Build ``describe:NAME|MODULE:FUNCTION|FILE.py:FUNCTION``; ``metric``: euclidean or cosine."""
+    (method,) = configure("describe", settings, DescribedMethod(""))
+    function = method.function
+    if not re.fullmatch(r"[\w-]+|.+:\w+", function):
+        raise InputError(f'"describe:{function}": expected describe:NAME, describe:FILE.py:FUNCTION or MODULE:FUNCTION')
+    check_metric(method.metric)
+    return method

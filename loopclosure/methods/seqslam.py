@@ -7,7 +7,7 @@ thumbnails, and on those of learned features ("seqslam+features:...").
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -162,8 +162,8 @@ class SeqSlam:
         return scores
 
 
-def seqslam(argument: str, context: MethodContext, inner: Method | None) -> SeqSlam:
-    """Build ``seqslam[:setting=value,...]`` on SeqSLAM's thumbnails, or ``seqslam[:...]+METHOD`` on another method's.
+def seqslam(settings: Mapping[str, str], context: MethodContext, inner: Method | None) -> SeqSlam:
+    """Build ``seqslam`` on SeqSLAM's thumbnails, or ``seqslam+METHOD`` on another method's.
 
     Local contrast is SeqSLAM's own for its differences of thumbnails. For another method's scores the default is to
     standardize rows and columns, of two traverses, instead: better in another season on every sequence that it was
@@ -172,13 +172,8 @@ def seqslam(argument: str, context: MethodContext, inner: Method | None) -> SeqS
     own = Thumbnailer(width=64, height=32, normalize="patch", patch=8)
     if inner is not None:
         refined = SeqSlam(inner, standardize="traverses", exclude_frames=context.exclude_frames)
-        method, settings = configure("seqslam", argument, refined, SequenceSettings(contrast=0))
-        return replace(method, settings=settings, name=f"seqslam+{inner.name}")
-    method, settings, thumbnailer = configure(
-        "seqslam",
-        argument,
-        SeqSlam(ThumbnailMethod(own), exclude_frames=context.exclude_frames),
-        SequenceSettings(),
-        own,
-    )
-    return replace(method, settings=settings, inner=ThumbnailMethod(thumbnailer))
+        method, sequences = configure("seqslam", settings, refined, SequenceSettings(contrast=0))
+        return replace(method, settings=sequences, name=f"seqslam+{inner.name}")
+    plain = SeqSlam(ThumbnailMethod(own), exclude_frames=context.exclude_frames)
+    method, sequences, thumbnailer = configure("seqslam", settings, plain, SequenceSettings(), own)
+    return replace(method, settings=sequences, inner=ThumbnailMethod(thumbnailer))

@@ -1,7 +1,8 @@
-"""The argument of a method on the command line: ``setting=value,setting=value``."""
+"""The settings of a method on the command line."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
@@ -12,18 +13,16 @@ YES_NO = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no"
 FIXED = ("name", "seed")
 
 
-def configure(method: str, argument: str, *parts: Any) -> list[Any]:
-    """Return the dataclasses ``parts`` with the settings in ``argument``.
+def configure(method: str, settings: Mapping[str, str], *parts: Any) -> list[Any]:
+    """Return the dataclasses ``parts`` with the settings, each parsed to the type of its field's default.
 
-    A setting goes to the first part that has a field of that name, and is parsed to the type of the field's default.
-    Raises InputError for an unknown setting, or a value of another type.
+    No two parts have a setting of one name. Raises InputError for an unknown setting, or a value of another type.
     """
+    known = {f.name: i for i, part in enumerate(parts) for f in fields(part) if _settable(part, f.name)}
     changes: list[dict[str, Any]] = [{} for _ in parts]
-    known = {f.name: i for i, part in reversed(list(enumerate(parts))) for f in fields(part) if _settable(part, f.name)}
-    for item in filter(None, (text.strip() for text in argument.split(","))):
-        key, equals, value = (text.strip() for text in item.partition("="))
-        if not equals or key not in known:
-            raise InputError(f'{method} has no setting "{item}"; write setting=value with {", ".join(sorted(known))}')
+    for key, value in settings.items():
+        if key not in known:
+            raise InputError(f'{method} has no setting "{key}"; known: {", ".join(sorted(known))}')
         changes[known[key]][key] = _read(method, key, value, getattr(parts[known[key]], key))
     return [replace(part, **changed) for part, changed in zip(parts, changes, strict=True)]
 

@@ -10,7 +10,7 @@ verified if it lies between two verified pairs on one of its trajectories.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -125,11 +125,11 @@ def on_trajectories(accepted: np.ndarray, offsets: np.ndarray, part: Iterable[in
     return supported
 
 
-def verified(argument: str, context: MethodContext, inner: Method | None) -> Verified:
-    """Build ``verified[:setting=value,...]+METHOD``."""
+def verified(settings: Mapping[str, str], context: MethodContext, inner: Method | None) -> Verified:
+    """Build ``verified+METHOD``."""
     if inner is None:
         raise InputError("verified needs another method; write verified+METHOD")
     plain = Verified(inner, exclude_frames=context.exclude_frames, pairs=context.pairs)
-    method, check = configure("verified", argument, plain, plain.check)
+    method, check = configure("verified", settings, plain, plain.check)
     method.check = check
     return method

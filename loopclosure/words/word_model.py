@@ -11,6 +11,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,24 +20,51 @@ from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, silent, timed
 from loopclosure.stored import check_array, from_json
 from loopclosure.words.chow_liu import LOWER_BOUND, WordTree, learn_tree
-from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans, sequential_clusters
+from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans
 from netspec.errors import SpecError
 from netspec.files.arrays import read_npz
 from netspec.files.whole_file import whole_file
 
-FORMAT = 1
 # The stages of ``train``, which run once for any number of tested images.
 TRAINING_STAGES = ("training features", "vocabulary", "training words", "tree")
 
 
 @dataclass(frozen=True)
+class Training:
+    """Settings for learning a word model.
+
+    words            number of words
+    max_descriptors  number of descriptors that are clustered, with the same limit for each image
+    lower_bound      see :func:`learn_tree`
+    seed             seed of all random numbers
+    """
+
+    extractor: Extractor = field(default_factory=Extractor)
+    words: int = 2000
+    max_descriptors: int = 200_000
+    lower_bound: float = LOWER_BOUND
+    seed: int = 0
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All of them by name, those of the extractor too."""
+        return {**{name: value for name, value in vars(self).items() if name != "extractor"}, **vars(self.extractor)}
+
+
+@dataclass(frozen=True)
 class WordModel:
-    """The vocabulary, the counts ``training_words`` (n, v) of the training images, their paths, and the word tree."""
+    """What was learned from n training images: v words, and what predicts them.
+
+    training_words   (n, v) how often each image shows each word
+    training_images  the n paths
+    training         the settings
+    """
 
     vocabulary: Vocabulary
     training_words: np.ndarray
     training_images: list[Path]
     tree: WordTree
+    training: Training
 
     def count_words(
         self, images: list[Path], progress: Progress = silent, seconds: dict[str, float] | None = None
@@ -53,7 +81,7 @@ class WordModel:
 
     def save(self, path: Path) -> None:
         """Write the model to ``path``, a .npz file."""
-        settings = {"format": FORMAT, "extractor": asdict(self.vocabulary.extractor), "made": self.vocabulary.made}
+        settings = {**asdict(self.training), "made": self.vocabulary.made}
         with whole_file(path) as unfinished, unfinished.open("wb") as file:
             np.savez_compressed(
                 file,
@@ -74,8 +102,9 @@ class WordModel:
         file = read_npz(path, expected)
         try:
             settings = json.loads(str(file["settings"]))
-            if settings["format"] != FORMAT:
-                raise InputError(f"a word model of format {settings['format']}; format {FORMAT} is known", path)
+            made = settings.pop("made")
+            extractor = from_json(Extractor, settings.pop("extractor"))
+            training = Training(extractor, **settings)
             count, dimensions = file["centres"].shape
             images = [Path(image) for image in file["training_images"].tolist()]
             check_array(file, "centres", "f", (count, dimensions))
@@ -87,31 +116,12 @@ class WordModel:
             if len(parents) and (parents.min() < 0 or parents.max() >= count):
                 raise ValueError("the parent of a word is not a word")
             tree = WordTree(*(file[name] for name in ("parent", "marginal", "given_present", "given_absent")))
-            vocabulary = Vocabulary(file["centres"], from_json(Extractor, settings["extractor"]), settings["made"])
-            return cls(vocabulary, file["training_words"], images, tree)
+            vocabulary = Vocabulary(file["centres"], extractor, made)
+            return cls(vocabulary, file["training_words"], images, tree, training)
         except SpecError:
             raise
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
             raise InputError(f"not {expected} ({' '.join(str(error).split())})", path) from None
-
-
-@dataclass(frozen=True)
-class Training:
-    """Settings for learning a word model.
-
-    words            number of words, by k-means; 0: sequential clustering with ``radius`` instead
-    radius           see :func:`sequential_clusters`
-    max_descriptors  number of descriptors that are clustered, with the same limit for each image
-    lower_bound      see :func:`learn_tree`
-    seed             seed of all random numbers
-    """
-
-    extractor: Extractor = field(default_factory=Extractor)
-    words: int = 2000
-    radius: float = 0.6
-    max_descriptors: int = 200_000
-    lower_bound: float = LOWER_BOUND
-    seed: int = 0
 
 
 def train(
@@ -137,16 +147,12 @@ def train(
             found.append(training.extractor(read_gray(path)))
     with timed(seconds, "vocabulary"):
         sample = np.concatenate([d if len(d) <= share else rng.choice(d, share, replace=False) for d in found])
-        if training.words:
-            centers = kmeans(sample, training.words, training.seed)
-            how = f"k-means, {len(centers)} words"
-        else:
-            centers = sequential_clusters(sample, training.radius, training.seed)
-            how = f"sequential clustering, radius {training.radius:g}, {len(centers)} words"
-    made = f"{how} of {len(sample)} descriptors of {len(paths)} training images, seed {training.seed}"
+        centers = kmeans(sample, training.words, training.seed)
+    of = f"{len(sample)} descriptors of {len(paths)} training images, seed {training.seed}"
+    made = f"k-means, {len(centers)} words of {of}"
     vocabulary = Vocabulary(centers, training.extractor, made)
     with timed(seconds, "training words"):
         words = np.stack([vocabulary.count_descriptors(descriptors) for descriptors in found])
     with timed(seconds, "tree"):
         tree = learn_tree(words, training.lower_bound)
-    return WordModel(vocabulary, words, paths, tree)
+    return WordModel(vocabulary, words, paths, tree, training)

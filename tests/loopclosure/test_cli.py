@@ -36,7 +36,8 @@ def test_evaluate(two_laps, two_laps_features, tmp_path, capsys):
 def test_evaluate_the_whole_system_on_another_recording(two_laps, two_laps_features, tmp_path, capsys):
     features = f"features:{two_laps_features}"
     line = f"evaluate {two_laps},start=20,references={two_laps} --out {tmp_path}"
-    line += f" --method verified:k=2,min_inliers=8+{features} --method verified+seqslam+{features}"
+    line += f" --method verified+{features} --method verified+seqslam+{features}"
+    line += " --set verified.k=2 --set verified.min_inliers=8"
     assert main(line.split()) == 0
     assert "best match; 45 degrees" in capsys.readouterr().out
     summary = json.loads((tmp_path / "report.json").read_text())
@@ -50,7 +51,7 @@ def test_evaluate_the_whole_system_on_another_recording(two_laps, two_laps_featu
 @pytest.mark.slow
 def test_evaluate_trains_on_other_images(two_laps, tmp_path, capsys):
     line = f"evaluate {two_laps},start=20 --exclude-seconds 0 --max-angle 19 --train {two_laps},stop=50%,stride=2"
-    assert main([*line.split(), "--method", "bow:words=20", "--out", str(tmp_path)]) == 0
+    assert main([*line.split(), "--method", "bow", "--set", "bow.words=20", "--out", str(tmp_path)]) == 0
     summary = json.loads((tmp_path / "report.json").read_text())
     assert summary["training"] == "10 images of two_laps"
     assert "vocabulary" not in summary["methods"][0]["milliseconds_a_frame"]

@@ -8,11 +8,11 @@ import pytest
 
 from given_scores import GivenScores
 from loopclosure.errors import InputError
-from loopclosure.evaluate import WIDE, evaluate, named_method
+from loopclosure.evaluate import WIDE, evaluate
 from loopclosure.methods.auto import Auto
 from loopclosure.methods.base import MethodContext
 from loopclosure.methods.features import FeatureMethod
-from loopclosure.methods.named import METHODS, make_method
+from loopclosure.methods.named import METHODS, make_method, named_methods
 from loopclosure.methods.seqslam import SeqSlam
 from loopclosure.methods.verified import Verified
 from loopclosure.places.datasets import load_sequence
@@ -22,7 +22,7 @@ from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 
 def test_perfect_features_find_every_loop(two_laps, two_laps_features):
     data = load_sequence(read_sequence(two_laps, "tum"))
-    found = evaluate(data, [named_method(f"net=features:{two_laps_features}", MethodContext())])
+    found = evaluate(data, named_methods([f"net=features:{two_laps_features}"]))
     (outcome,) = found.outcomes
     assert outcome.name == "net"
     assert outcome.pairs.average_precision == pytest.approx(1.0)
@@ -67,18 +67,19 @@ def test_two_methods_of_one_name_are_refused(two_laps):
 @pytest.mark.parametrize(
     ("text", "name"),
     [
-        ("features:a/siamese_8.npz:cosine", "siamese_8 (cosine)"),
+        ("features:a/siamese_8.npz", "siamese_8 (euclidean)"),
+        ("features:a=b/c+d.npz", "c+d (euclidean)"),
         ("Siamese (8)=features:a.npz", "Siamese (8)"),
         ("a + b=thumbnails", "a + b"),
-        ("thumbnails:width=16", "thumbnails"),
+        ("thumbnails", "thumbnails"),
     ],
 )
 def test_labels(text, name):
-    assert named_method(text, MethodContext())[0] == name
+    assert named_methods([text])[0][0] == name
 
 
 def test_methods_can_refine_another():
-    method = make_method("seqslam+features:a.npz:cosine", MethodContext(exclude_frames=7))
+    method = make_method("seqslam+features:a.npz", MethodContext(exclude_frames=7), {"features.metric": "cosine"})
     assert isinstance(method, SeqSlam)
     assert method.name == "seqslam+a (cosine)"
     assert method.inner == FeatureMethod(Path("a.npz"), Path("a.npz"), "cosine")
@@ -86,22 +87,36 @@ def test_methods_can_refine_another():
 
 
 def test_a_path_in_a_method_may_have_a_plus():
-    for path in ("a+b/o.txt", "a+hog/o.txt"):
-        method = make_method(f"auto:odometry={path}+seqslam+thumbnails")
+    for path in ("a+b/o.npz", "a+bow/o.npz"):
+        method = make_method(f"auto+seqslam+features:{path}")
         assert isinstance(method, Auto)
-        assert (method.odometry, method.name) == (path, "auto+seqslam+thumbnails")
+        assert method.name == "auto+seqslam+o (euclidean)"
     with pytest.raises(InputError, match='unknown method "foo" in "foo:1"'):
         make_method("auto+foo:1")
 
 
 def test_methods_can_refine_a_refining_method():
-    outer = make_method("verified:k=7,min_inliers=9,ratio=0.7+seqslam:length=6+features:a.npz", MethodContext(3))
+    settings = {"verified.k": "7", "verified.min_inliers": "9", "verified.ratio": "0.7", "seqslam.length": "6"}
+    outer = make_method("verified+seqslam+features:a.npz", MethodContext(3), settings)
     assert isinstance(outer, Verified)
     assert (outer.k, outer.check.min_inliers, outer.check.ratio, outer.exclude_frames) == (7, 9, 0.7, 3)
     assert isinstance(outer.inner, SeqSlam)
     assert outer.inner.settings.length == 6
     assert outer.name == "verified+seqslam+a (euclidean)"
     assert isinstance(make_method("seqslam+verified+thumbnails"), SeqSlam)
+
+
+def test_settings_of_a_method_and_of_a_label():
+    settings = {"seqslam.length": "6", "long, v1.0.length": "20", "thumbnails.width": "16"}
+    methods = named_methods(["seqslam+thumbnails", "long, v1.0=seqslam+thumbnails"], settings=settings)
+    assert [(name, method.settings.length, method.inner.thumbnailer.width) for name, method in methods] == [
+        ("seqslam+thumbnails", 6, 16),
+        ("long, v1.0", 20, 16),
+    ]
+    with pytest.raises(InputError, match='settings of "bow", which is none of the methods'):
+        named_methods(["thumbnails"], settings={"bow.words": "9"})
+    with pytest.raises(InputError, match=r"expected NAME\.setting=value"):
+        named_methods(["thumbnails"], settings={"width": "9"})
 
 
 def test_results_by_a_wider_angle(two_laps):

@@ -46,6 +46,14 @@ def test_equal_file_names_in_two_folders_are_distinguished_by_the_folder(tmp_pat
         features.rows_of([Path("elsewhere/1.jpg")])
 
 
+def test_a_descriptor_is_that_of_one_image(tmp_path):
+    summer = save(tmp_path / "summer.npz", ["1.jpg", "2.jpg", "3.jpg", "4.jpg"])
+    queries, references = [Path("summer/1.jpg"), Path("summer/2.jpg")], [Path("winter/1.jpg"), Path("winter/2.jpg")]
+    with pytest.raises(InputError, match=r"one descriptor of 1.jpg; is it that of summer/1.jpg or of winter/1.jpg"):
+        make_method(f"features:{summer}").score(Images.of_files(queries, references), silent)
+    assert make_method(f"features:{summer}").score(Images.of_files(queries, queries), silent).scores.shape == (2, 2)
+
+
 def test_images_without_a_descriptor_are_named(tmp_path):
     features = read_features(save(tmp_path / "f.npz", ["1.png", "2.png", "3.png", "4.png"]))
     with pytest.raises(InputError, match=r"no descriptor of 7.png \(1 of 2 images are not in it\)"):
@@ -108,10 +116,11 @@ def test_the_method_includes_the_time_of_the_net(tmp_path):
 
 def test_specification_of_files_and_metric(tmp_path):
     assert make_method("features:a/b.npz") == FeatureMethod(Path("a/b.npz"), Path("a/b.npz"), "euclidean")
-    assert make_method("features:q.npz,r.npz:cosine") == FeatureMethod(Path("q.npz"), Path("r.npz"), "cosine")
-    for spec in ("features:", "features:a.npz,b.npz,c.npz", "features:a.npz:manhattan"):
+    two = make_method("features:q.npz,r.npz", settings={"features.metric": "cosine"})
+    assert two == FeatureMethod(Path("q.npz"), Path("r.npz"), "cosine")
+    for spec, metric in (("features:", "cosine"), ("features:a.npz,b.npz,c.npz", "cosine"), ("features:a.npz", "city")):
         with pytest.raises(InputError):
-            make_method(spec)
+            make_method(spec, settings={"features.metric": metric})
 
 
 def test_queries_and_references_of_two_files(tmp_path):

@@ -503,7 +503,7 @@ class Fixed:
 def test_as_a_method(tmp_path, monkeypatch):
     road = drive(150, 11)
     scores = alike(again(road, 1.0, 12), road)
-    method: Any = make_method("auto:precision=0.9+thumbnails", MethodContext())
+    method: Any = make_method("auto+thumbnails", MethodContext(), {"auto.precision": "0.9"})
     assert method.name == "auto+thumbnails"
     assert method.precision == 0.9
     method.inner = Fixed(scores)
@@ -517,12 +517,12 @@ def test_as_a_method(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("spec", "message"),
-    [("auto", r"write auto\+METHOD"), ("auto:length=3+thumbnails", 'auto has no setting "length=3"')],
+    ("spec", "settings", "message"),
+    [("auto", {}, r"write auto\+METHOD"), ("auto+thumbnails", {"auto.length": "3"}, 'auto has no setting "length"')],
 )
-def test_invalid_settings_are_refused(spec, message):
+def test_invalid_settings_are_refused(spec, settings, message):
     with pytest.raises(InputError, match=message):
-        make_method(spec)
+        make_method(spec, settings=settings)
 
 
 def test_a_precision_that_makes_no_sense():

@@ -17,7 +17,6 @@ from paths import shared
 pytestmark = pytest.mark.slow
 
 PLACES = 8
-WORDS = "words=200,lower_bound=0"
 
 
 def scene(seed: int) -> np.ndarray:
@@ -41,23 +40,30 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
     return {"train": train, "first": first, "again": again}
 
 
-@pytest.mark.parametrize("spec", [f"fabmap:{WORDS}", f"fabmap:{WORDS},scored=posterior", f"bow:{WORDS}", "thumbnails"])
-def test_two_traverses(spec: str, images: dict[str, list[Path]]) -> None:
-    result = make_method(spec).score(Images.of_files(images["again"], images["first"], images["train"]), silent)
+def of(name: str) -> dict[str, str]:
+    """The settings for few images of a method with words."""
+    return {} if name == "thumbnails" else {f"{name}.words": "200", f"{name}.lower_bound": "0"}
+
+
+@pytest.mark.parametrize("name", ["fabmap", "bow", "thumbnails"])
+def test_two_traverses(name: str, images: dict[str, list[Path]]) -> None:
+    result = make_method(name, settings=of(name)).score(
+        Images.of_files(images["again"], images["first"], images["train"]), silent
+    )
     assert result.scores.shape == (PLACES, PLACES)
     np.testing.assert_array_equal(np.argmax(result.scores, axis=1), np.arange(PLACES))
     assert result.notes
     assert all(value >= 0 for value in result.seconds.values())
 
 
-@pytest.mark.parametrize("spec", [f"fabmap:{WORDS}", f"bow:{WORDS}", "thumbnails"])
-def test_one_sequence(spec: str, images: dict[str, list[Path]]) -> None:
+@pytest.mark.parametrize("name", ["fabmap", "bow", "thumbnails"])
+def test_one_sequence(name: str, images: dict[str, list[Path]]) -> None:
     walk = images["first"] + images["again"]
-    result = make_method(spec, MethodContext(exclude_frames=2)).score(
+    result = make_method(name, MethodContext(exclude_frames=2), of(name)).score(
         Images.of_files(walk, None, images["train"]), silent
     )
     assert result.scores.shape == (2 * PLACES, 2 * PLACES)
-    assert np.isfinite(result.scores[np.tril_indices(2 * PLACES, -1)]).all()
+    assert np.isfinite(result.scores[np.tril_indices(2 * PLACES, -3)]).all()
     earlier = np.where(np.tri(2 * PLACES, 2 * PLACES, -3, dtype=bool), result.scores, -np.inf)
     np.testing.assert_array_equal(np.argmax(earlier[PLACES:], axis=1), np.arange(PLACES))
 
@@ -69,7 +75,7 @@ def test_every_stage_has_progress_and_time(images: dict[str, list[Path]]) -> Non
         shown[stage] = total
         return items
 
-    result = make_method(f"fabmap:{WORDS}").score(
+    result = make_method("fabmap", settings=of("fabmap")).score(
         Images.of_files(images["again"], images["first"], images["train"]), progress
     )
     assert shown == {"training features": 10, "features": 16}
@@ -80,16 +86,21 @@ def test_every_stage_has_progress_and_time(images: dict[str, list[Path]]) -> Non
 
 def test_a_vocabulary_is_saved_and_reused(tmp_path: Path, images: dict[str, list[Path]]) -> None:
     path = tmp_path / "words.npz"
-    first = make_method(f"fabmap:model={path},{WORDS}").score(
+    first = make_method("fabmap", settings={**of("fabmap"), "fabmap.model": str(path)}).score(
         Images.of_files(images["again"], images["first"], images["train"]), silent
     )
     assert len(WordModel.load(path).vocabulary) == 200
-    second = make_method(f"fabmap:model={path}").score(Images.of_files(images["again"], images["first"]), silent)
+    images_of_two = Images.of_files(images["again"], images["first"])
+    second = make_method("fabmap", settings={"fabmap.model": str(path)}).score(images_of_two, silent)
     np.testing.assert_array_equal(first.scores, second.scores)
     assert "vocabulary" not in second.seconds
     assert f"read from {path}" in second.notes[0]
     with pytest.raises(InputError, match=r"words.npz: 10 of 10 test images are training images too"):
-        make_method(f"bow:model={path}").score(Images.of_files(images["train"]), silent)
+        make_method("bow", settings={"bow.model": str(path)}).score(Images.of_files(images["train"]), silent)
+    for setting, value, sentence in (("words", "50", "words 200, not 50"), ("kind", "orb", "kind sift, not orb")):
+        other = make_method("bow", settings={"bow.model": str(path), f"bow.{setting}": value})
+        with pytest.raises(InputError, match=f"words.npz: was made with {sentence}"):
+            other.score(images_of_two, silent)
 
 
 @pytest.mark.parametrize("spec", ["fabmap", "bow"])
@@ -102,46 +113,46 @@ def test_training_images_are_required_and_not_tested(spec: str, images: dict[str
 
 def test_settings_are_passed_to_their_part() -> None:
     fabmap = make_method(
-        "fabmap:words=77, kind=orb,version=1,samples=9,motion=yes,scored=posterior",
+        "fabmap",
         MethodContext(exclude_frames=6, seed=4),
+        {"fabmap.words": "77", "fabmap.kind": "orb", "fabmap.hit": "0.5"},
     )
     assert isinstance(fabmap, FabMapMethod)
     assert (fabmap.source.training.words, fabmap.source.training.extractor.kind) == (77, "orb")
-    assert (fabmap.settings.version, fabmap.settings.samples, fabmap.settings.motion) == (1, 9, True)
-    assert (fabmap.settings.recent, fabmap.settings.seed, fabmap.source.training.seed) == (6, 4, 4)
-    assert fabmap.scored == "posterior"
-    bow = make_method("bow:metric=cosine,radius=0.5,root=no")
+    assert (fabmap.settings.hit, fabmap.settings.recent, fabmap.source.training.seed) == (0.5, 6, 4)
+    bow = make_method("bow", settings={"bow.metric": "cosine", "bow.lower_bound": "0.5", "bow.root": "no"})
     assert isinstance(bow, BagOfWordsMethod)
-    assert (bow.metric, bow.source.training.radius, bow.source.training.extractor.root) == ("cosine", 0.5, False)
-    small = make_method("thumbnails:width=16,normalize=none")
+    assert (bow.metric, bow.source.training.lower_bound, bow.source.training.extractor.root) == ("cosine", 0.5, False)
+    small = make_method("thumbnails", settings={"thumbnails.width": "16", "thumbnails.normalize": "none"})
     assert isinstance(small, ThumbnailMethod)
     assert (small.thumbnailer.width, small.thumbnailer.normalize) == (16, "none")
 
 
 @pytest.mark.parametrize(
-    ("message", "spec"),
+    ("message", "spec", "settings"),
     [
-        ("unknown kind of features", "bow:kind=surf"),
-        (r"write verified\+METHOD", "verified"),
-        ("k = 0; expected 1 or more", "verified:k=0+thumbnails"),
-        ("expected at least 8", "verified:min_inliers=3+thumbnails"),
-        ("needs focal_px, center_x_px and center_y_px", "verified:focal_px=300+thumbnails"),
-        ('order of verified is "size"; expected score or inliers', "verified:order=size+thumbnails"),
-        ('verified has no setting "depth=3"', "verified:depth=3+thumbnails"),
-        ('fabmap has no setting "wrods=5"; write setting=value with .*words', "fabmap:wrods=5"),
-        ('fabmap has no setting "words"', "fabmap:words"),
-        ('fabmap: words is a whole number, not "many"', "fabmap:words=many"),
-        ('fabmap: hit is a number, not "high"', "fabmap:hit=high"),
-        ('fabmap: motion is yes or no, not "2"', "fabmap:motion=2"),
-        ('"log_odds" or "posterior", not "odds"', "fabmap:scored=odds"),
-        ("fabmap has no setting", "fabmap:name=x"),
-        ('unknown metric "chi2"', "bow:metric=chi2"),
-        (r"bow\+thumbnails: bow works on images", "bow+thumbnails"),
+        ("unknown kind of features", "bow", "kind=surf"),
+        (r"write verified\+METHOD", "verified", ""),
+        ("k = 0; expected 1 or more", "verified+thumbnails", "k=0"),
+        ("expected at least 8", "verified+thumbnails", "min_inliers=3"),
+        ("needs focal_px, center_x_px and center_y_px", "verified+thumbnails", "focal_px=300"),
+        ('order of verified is "size"; expected score or inliers', "verified+thumbnails", "order=size"),
+        ('verified has no setting "depth"', "verified+thumbnails", "depth=3"),
+        ('fabmap has no setting "wrods"; known: .*words', "fabmap", "wrods=5"),
+        ('fabmap: words is a whole number, not "many"', "fabmap", "words=many"),
+        ('fabmap: hit is a number, not "high"', "fabmap", "hit=high"),
+        ('bow: root is yes or no, not "2"', "bow", "root=2"),
+        ("fabmap has no setting", "fabmap", "name=x"),
+        ('unknown metric "chi2"', "bow", "metric=chi2"),
+        (r"bow\+thumbnails: bow works on images", "bow+thumbnails", ""),
+        ("settings are given apart", "bow:words=9", ""),
+        ("settings are given apart", "verified:k=2+thumbnails", ""),
     ],
 )
-def test_invalid_methods_and_settings_are_refused(spec: str, message: str) -> None:
+def test_invalid_methods_and_settings_are_refused(spec: str, settings: str, message: str) -> None:
+    name, (key, _, value) = spec.partition("+")[0], settings.partition("=")
     with pytest.raises(InputError, match=message):
-        make_method(spec.strip())
+        make_method(spec, settings={f"{name}.{key}": value} if settings else {})
 
 
 @pytest.mark.slow
@@ -149,11 +160,11 @@ def test_corridor_loop_with_its_two_images_without_features() -> None:
     corridor = shared("data", "corridor_loop", "samples")
     train = sorted(shared("data", "tum_fr1", "rgbd_dataset_freiburg1_rpy", "rgb").glob("*.jpg"))[::12]
     walk = [corridor / f"{k}.jpg" for k in range(1, 85)]
-    result = make_method("fabmap:words=300,max_features=150", MethodContext(exclude_frames=10)).score(
-        Images.of_files(walk, None, train), silent
-    )
+    result = make_method(
+        "fabmap", MethodContext(exclude_frames=10), {"fabmap.words": "300", "fabmap.max_features": "150"}
+    ).score(Images.of_files(walk, None, train), silent)
     assert "2 of 84 images have no features: places without words" in result.notes
-    assert np.isfinite(result.scores[np.tril_indices(84, -1)]).all()
+    assert np.isfinite(result.scores[np.tril_indices(84, -11)]).all()
     mask = cv2.imread(str(corridor.parent / "samples_GT.bmp"), cv2.IMREAD_GRAYSCALE)
     assert mask is not None
     truth = mask > 0

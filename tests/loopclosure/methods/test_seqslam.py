@@ -226,11 +226,15 @@ def test_a_sequence_shorter_than_the_exclusion_has_no_scores() -> None:
 
 
 def test_the_command_line_builds_it() -> None:
-    method = make_method("seqslam:length=6,directions=both,width=32,patch=4", MethodContext(exclude_frames=7))
+    method = make_method(
+        "seqslam",
+        MethodContext(exclude_frames=7),
+        {"seqslam.length": "6", "seqslam.directions": "both", "seqslam.width": "32", "seqslam.patch": "4"},
+    )
     assert isinstance(method, SeqSlam)
     assert (method.settings.length, method.settings.directions, method.exclude_frames) == (6, "both", 7)
     assert method.name == "seqslam"
-    on_words = make_method("seqslam:length=4+bow:words=50")
+    on_words = make_method("seqslam+bow", settings={"seqslam.length": "4", "bow.words": "50"})
     assert isinstance(on_words, SeqSlam)
     assert on_words.name == "seqslam+bow"
     assert (on_words.settings.contrast, on_words.settings.length, on_words.standardize) == (0, 4, "traverses")
@@ -293,7 +297,7 @@ def test_invalid_settings_are_refused(settings: dict, message: str) -> None:
 
 def test_an_unknown_way_to_standardize() -> None:
     with pytest.raises(InputError, match='standardize of SeqSLAM is "rows"; expected no, yes, traverses'):
-        make_method("seqslam:standardize=rows+thumbnails")
+        make_method("seqslam+thumbnails", settings={"seqslam.standardize": "rows"})
 
 
 def test_an_unknown_score() -> None:

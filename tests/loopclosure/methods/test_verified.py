@@ -109,10 +109,11 @@ def test_few_inliers_do_not_override_a_score(walls, inliers, best):
 def test_results_of_another_method_are_reused(walls, monkeypatch):
     context = MethodContext()
     images = Images.of_files(walls[WALLS:], walls[:WALLS])
-    scores = make_method("verified:k=6+thumbnails", context).score(images, silent).scores
+    scores = make_method("verified+thumbnails", context, {"verified.k": "6"}).score(images, silent).scores
     monkeypatch.setattr(GeometricCheck, "describe", None)
     monkeypatch.setattr(GeometricCheck, "agreement", None)
-    again = make_method("verified:k=6,min_inliers=25+thumbnails", context).score(images, silent).scores
+    stricter = {"verified.k": "6", "verified.min_inliers": "25"}
+    again = make_method("verified+thumbnails", context, stricter).score(images, silent).scores
     np.testing.assert_array_equal(scores, again)
 
 
@@ -149,7 +150,7 @@ def test_excluded_frames_are_not_candidates(walls):
 
 @pytest.mark.slow
 def test_a_known_camera(walls):
-    camera = "focal_px=260,center_x_px=160,center_y_px=120"
-    method = make_method(f"verified:{camera},k=12,min_inliers=25+thumbnails", MethodContext())
+    settings = {"focal_px": "260", "center_x_px": "160", "center_y_px": "120", "k": "12", "min_inliers": "25"}
+    method = make_method("verified+thumbnails", settings={f"verified.{key}": v for key, v in settings.items()})
     found = first(method.score(Images.of_files(walls), silent).scores, np.zeros(1))
     assert found == [(i, i - WALLS) for i in range(WALLS, 2 * WALLS)]

@@ -11,8 +11,8 @@ import pytest
 
 from given_scores import GivenScores
 from loopclosure.detector.decision import LoopResult
-from loopclosure.evaluate import Judgment, Outcome, evaluate, named_method
-from loopclosure.methods.base import MethodContext
+from loopclosure.evaluate import Judgment, Outcome, evaluate
+from loopclosure.methods.named import named_methods
 from loopclosure.places.datasets import load_sequence, load_traverses
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.sequences import read_sequence
@@ -48,7 +48,7 @@ class Tags(HTMLParser):
 def evaluation(two_laps, two_laps_features):
     rng = np.random.default_rng(0)
     methods = [
-        named_method(f"A net & more=features:{two_laps_features}", MethodContext()),
+        *named_methods([f"A net & more=features:{two_laps_features}"]),
         ("<noise>", GivenScores(rng.normal(size=(40, 40)), *COSTS)),
         ("silent", GivenScores(np.full((40, 40), np.nan), *COSTS)),
     ]

@@ -1,24 +1,15 @@
 """FAB-MAP against a compiled openFABMAP (the worked examples)."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.special import logsumexp
 
 from loopclosure.errors import InputError
 from loopclosure.words.chow_liu import WordTree, learn_tree
-from loopclosure.words.fabmap import (
-    FabMapModel,
-    FabMapSettings,
-    mean_field_table,
-    place_table,
-    score_sequence,
-    score_sets,
-)
+from loopclosure.words.fabmap import FabMapModel, FabMapSettings, place_table, score_sequence, score_sets
 
 
 def rows(text: str) -> np.ndarray:
@@ -32,8 +23,6 @@ TRAIN_B = rows(
 )
 PLACES_B = rows("101001 010110 111000 000100")
 EXAMPLES = {"A": (TRAIN_A, PLACES_A), "B": (TRAIN_B, PLACES_B)}
-
-MEAN_FIELD = FabMapSettings(version=1, new_place="mean_field")
 
 
 def synthetic_walk(images: int = 60, words: int = 80, seed: int = 0) -> tuple[WordTree, np.ndarray, np.ndarray]:
@@ -61,60 +50,29 @@ def test_table_of_example_b() -> None:
     )
 
 
-@pytest.mark.parametrize("naive", [False, True])
 @pytest.mark.parametrize("false_alarm", [0.0, 0.005])
-def test_tables_are_probabilities(naive: bool, false_alarm: float) -> None:
-    settings = FabMapSettings(naive=naive, false_alarm=false_alarm)
-    tree = learn_tree(TRAIN_B)
-    np.testing.assert_allclose(place_table(tree, settings).sum(axis=2), 1.0, atol=1e-12)
-    np.testing.assert_allclose(mean_field_table(tree, settings).sum(axis=1), 1.0, atol=1e-12)
+def test_tables_are_probabilities(false_alarm: float) -> None:
+    table = place_table(learn_tree(TRAIN_B), FabMapSettings(false_alarm=false_alarm))
+    np.testing.assert_allclose(table.sum(axis=2), 1.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("case", json.loads(Path(__file__).with_name("openfabmap.json").read_text()))
 def test_worked_examples(case: dict[str, Any]) -> None:
-    """The numbers in the file are openFABMAP's; version 2 leaves out of its likelihoods what all places share."""
+    """The numbers in the file are openFABMAP's."""
     (training, places), query = EXAMPLES[case["example"]], rows(case["query"])
     model = FabMapModel(learn_tree(training), training, FabMapSettings(**case["settings"]))
     scores = score_sets(model, query, places)
-    found = {"loglik": model.likelihoods(query, places)[0], "loglik_new": model.new_place(query)[0]}
-    found["posterior"] = [scores.new[0], *scores.posterior[0]]
-    if model.settings.version == 2 and "loglik" in case:
-        found["log_odds"], case["log_odds"] = scores.log_odds[0], np.subtract(case["loglik"], case["loglik_new"])
-        del found["loglik"], found["loglik_new"]
-    for name in found.keys() & case.keys():
-        np.testing.assert_allclose(found[name], case[name], atol=1e-8, err_msg=name)
+    if "loglik" in case:  # its FAB-MAP 2.0 leaves out what the likelihoods of all places share
+        loglik, loglik_new = model.likelihoods(query, places)[0], model.new_place(query)[0]
+        np.testing.assert_allclose(loglik - loglik_new, np.subtract(case["loglik"], case["loglik_new"]), atol=1e-8)
+    np.testing.assert_allclose([scores.new[0], *scores.posterior[0]], case["posterior"], atol=1e-8)
 
 
-def test_motion_model_of_example_a() -> None:
-    model = FabMapModel(learn_tree(TRAIN_A), None, replace(MEAN_FIELD, motion=True))
-    expected = [
-        [1.0],
-        [0.735863694, 0.264136306],
-        [0.274942451, 0.111831447, 0.613226101],
-        [0.179924886, 0.563385570, 0.034151477, 0.222538067],
-        [0.261208680, 0.037565051, 0.539892087, 0.067428700, 0.093905482],
-    ]
-    scores = score_sequence(model, rows("11001 00110 10010 11001 00110"))
-    for i, posterior in enumerate(expected):
-        np.testing.assert_allclose([scores.new[i], *scores.posterior[i, :i]], posterior, atol=1e-8)
-
-
-@pytest.mark.parametrize("motion", [False, True])
-def test_two_traverses_are_located_on_a_finished_map(motion: bool) -> None:
+def test_two_traverses_are_located_on_a_finished_map() -> None:
     tree, training, walk = synthetic_walk()
-    scores = score_sets(FabMapModel(tree, training, FabMapSettings(motion=motion)), walk[30:], walk[:30])
+    scores = score_sets(FabMapModel(tree, training), walk[30:], walk[:30])
     np.testing.assert_allclose(scores.new + scores.posterior.sum(axis=1), 1.0, atol=1e-12)
-    assert np.mean(np.argmax(scores.log_odds, axis=1) == np.arange(30)) > 0.9
-
-
-def test_sampling_approximates_the_mean_and_depends_on_the_seed() -> None:
-    tree, training, walk = synthetic_walk()
-    model = {seed: FabMapModel(tree, training, FabMapSettings(version=1, seed=seed)) for seed in (0, 1)}
-    drawn = [model[seed].new_place(walk) for seed in (0, 0, 1)]
-    exact = logsumexp(model[0].likelihoods(walk, training), axis=1) - np.log(len(training))
-    np.testing.assert_array_equal(drawn[0], drawn[1])
-    assert not np.array_equal(drawn[0], drawn[2])
-    np.testing.assert_allclose(drawn[0], exact, atol=0.5)  # 3000 draws of 50 images
+    assert np.mean(np.argmax(scores.posterior, axis=1) == np.arange(30)) > 0.9
 
 
 def test_a_place_seen_again_unchanged_wins_among_places_with_as_many_words() -> None:
@@ -132,7 +90,7 @@ def test_frequent_words_weigh_less_than_rare_ones() -> None:
     training = rng.random((100, 30)) < 0.2
     training[:, 10] = True
     training[:, 11] = np.arange(100) < 2
-    model = FabMapModel(learn_tree(training), training, FabMapSettings(naive=True))
+    model = FabMapModel(learn_tree(training), training)
     place = rng.random(30) < 0.2
     place[[10, 11]] = False
 
@@ -149,34 +107,24 @@ def test_images_without_words_are_places() -> None:
     tree, training, _ = synthetic_walk()
     walk = np.zeros((4, len(tree)), bool)
     walk[[1, 3]] = training[0]
-    odds = score_sequence(FabMapModel(tree, training), walk).log_odds
-    assert odds[2, 0] > odds[2, 1]  # nothing looks more like nothing than like something
-    assert odds[3, 1] == np.nanmax(odds[3])
+    found = score_sequence(FabMapModel(tree, training), walk).posterior
+    assert found[2, 0] > found[2, 1]  # nothing looks more like nothing than like something
+    assert found[3, 1] == np.nanmax(found[3])
 
 
 def test_the_second_lap_finds_the_first() -> None:
     tree, training, walk = synthetic_walk()
-    scores = score_sequence(FabMapModel(tree, training), walk)
-    earlier = np.nan_to_num(np.tril(scores.posterior, -1))
-    np.testing.assert_allclose(earlier.sum(axis=1) + scores.new, 1.0, atol=1e-12)
-    assert np.mean(np.argmax(earlier[30:], axis=1) == np.arange(30)) > 0.8
-
-
-def test_recent_images_have_log_odds_but_no_posterior() -> None:
-    tree, training, walk = synthetic_walk()
     scores = score_sequence(FabMapModel(tree, training, FabMapSettings(recent=4)), walk)
     np.testing.assert_array_equal(np.isfinite(scores.posterior), np.tri(60, 60, -5, dtype=bool))
-    np.testing.assert_array_equal(np.isfinite(scores.log_odds), np.tri(60, 60, -1, dtype=bool))
+    earlier = np.nan_to_num(scores.posterior)
+    np.testing.assert_allclose(earlier.sum(axis=1) + scores.new, 1.0, atol=1e-12)
+    assert np.mean(np.argmax(earlier[30:], axis=1) == np.arange(30)) > 0.8
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"version": 3}, "versions 1 and 2, not 3"),
-        ({"version": 2, "new_place": "mean_field"}, "mean_field needs version 1"),
-        ({"new_place": "sample"}, 'not "sample"'),
         ({"hit": 0.2, "false_alarm": 0.3}, "false_alarm < hit"),
-        ({"samples": -1}, "samples is -1"),
         ({"recent": -1}, "recent is -1"),
     ],
 )
@@ -186,8 +134,8 @@ def test_invalid_settings_are_refused(settings: dict, message: str) -> None:
 
 
 def test_a_sampled_new_place_needs_training_images() -> None:
-    with pytest.raises(InputError, match="needs the words of training images"):
-        FabMapModel(learn_tree(TRAIN_A), None)
+    with pytest.raises(InputError, match="sampled from the words of training images"):
+        FabMapModel(learn_tree(TRAIN_A), TRAIN_A[:0])
 
 
 def test_words_of_another_vocabulary_are_refused() -> None:

@@ -7,7 +7,7 @@ from scipy.spatial.distance import cdist
 
 from loopclosure.errors import InputError
 from loopclosure.words.bag_of_words import METRICS, BagOfWords
-from loopclosure.words.vocabulary import Extractor, Vocabulary, founders, kmeans, nearest_centers, sequential_clusters
+from loopclosure.words.vocabulary import Extractor, Vocabulary, kmeans, nearest_centers
 
 
 def texture(seed: int) -> np.ndarray:
@@ -64,8 +64,6 @@ def test_the_number_of_features_is_limited_and_color_becomes_gray() -> None:
         (lambda: Extractor(kind="surf"), '"surf"; known: sift, orb'),
         (lambda: Extractor(max_features=0), "is 0"),
         (lambda: kmeans(unit_vectors(7), 8), "7 descriptors cannot make 8 words"),
-        (lambda: sequential_clusters(np.zeros((0, 128), np.float32), 0.6), "no descriptors to cluster"),
-        (lambda: sequential_clusters(unit_vectors(4), 0.0), "must be positive"),
         (lambda: BagOfWords(np.ones(3), "chi2"), '"chi2" of the bag of words; known: l1, cosine'),
     ],
 )
@@ -97,50 +95,6 @@ def test_kmeans_finds_clusters_and_follows_the_seed() -> None:
     spread = np.linalg.norm(points - centers[nearest_centers(points, centers)], axis=1)
     assert spread.mean() < 0.2
     np.testing.assert_array_equal(centers, kmeans(points, 10, seed=1))
-
-
-def founders_one_by_one(descriptors: np.ndarray, radius: float) -> list[int]:
-    chosen: list[int] = []
-    for i, descriptor in enumerate(descriptors):
-        if all(np.linalg.norm(descriptor - descriptors[j]) > radius for j in chosen):
-            chosen.append(i)
-    return chosen
-
-
-@pytest.mark.slow
-def test_cluster_seeds_equal_those_of_a_plain_loop() -> None:
-    descriptors = unit_vectors(600)
-    np.testing.assert_array_equal(founders(descriptors, 0.6), founders_one_by_one(descriptors, 0.6))
-
-
-def test_cluster_seeds_are_distant_and_cover_all_descriptors() -> None:
-    descriptors, radius = unit_vectors(10_000, seed=3), 0.7
-    centers = descriptors[founders(descriptors, radius)]
-    apart = cdist(centers, centers)
-    np.fill_diagonal(apart, np.inf)
-    assert apart.min() > radius
-    assert cdist(descriptors, centers).min(axis=1).max() <= radius + 1e-6
-
-
-def test_sequential_words_are_the_means_of_their_clusters() -> None:
-    descriptors = unit_vectors(3000, seed=5)
-    words = sequential_clusters(descriptors, 0.8, seed=None)
-    nearest = np.argmin(cdist(descriptors, descriptors[founders(descriptors, 0.8)]), axis=1)
-    means = np.stack([descriptors[nearest == k].mean(axis=0) for k in range(nearest.max() + 1)])
-    np.testing.assert_allclose(words, means, atol=1e-6)
-
-
-def test_sequential_clustering_follows_the_seed() -> None:
-    descriptors = unit_vectors(500)
-    np.testing.assert_array_equal(sequential_clusters(descriptors, 0.7, 2), sequential_clusters(descriptors, 0.7, 2))
-    shuffled = sequential_clusters(descriptors, 0.7, 3)
-    assert shuffled.shape != (0, 8)
-    assert not np.array_equal(shuffled, sequential_clusters(descriptors, 0.7, 2))
-
-
-def test_one_cluster_where_all_are_near() -> None:
-    descriptors = unit_vectors(1).repeat(40, axis=0)
-    np.testing.assert_allclose(sequential_clusters(descriptors, 0.1), descriptors[:1], atol=1e-6)
 
 
 TRAINING = np.array([[1, 2, 0, 0], [1, 0, 3, 0], [4, 1, 0, 0], [1, 0, 0, 0]])
