@@ -42,7 +42,7 @@ def obstacle(plan: Plan, parts: Sequence[Part], largest: float = LARGEST) -> str
             return "it runs on a GPU"
         if layer.is_input:
             return f'"{node.name}" is an input'
-        if node.bottoms and node.tops and (layer.counted_axis is not None or not layer.fixed_shapes):
+        if node.bottoms and node.tops and layer.counted_axis is not None:
             return f'"{node.name}" determines the shapes of its tops in each pass'
         if any(blob.dtype != torch.float32 for blob in layer.blobs):
             return f'"{node.name}" does not compute in float32'

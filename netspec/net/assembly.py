@@ -25,6 +25,7 @@ from netspec.graph.plan import AUTOMATIC, Backward, Node, Param, Plan, plan_back
 from netspec.layers import class_of, unknown_type
 from netspec.layers.contract.base import Layer, Shape, shape_string
 from netspec.layers.contract.context import Context, Random, device_of
+from netspec.layers.contract.data_layer import DataLayer
 from netspec.layers.contract.fillers import READS
 from netspec.net.frozen import compute_caffes_gradients, needs_backward
 from netspec.proto.forks import forks
@@ -295,8 +296,9 @@ class MemoryNeed:
         self._alive += made
         self.tops = max(self.tops, self._alive)
         self.parameters += parameters
-        self.ahead += layer.ahead
-        self._largest = max(self._largest, (made + parameters + layer.ahead, -i))
+        ahead = layer.ahead if isinstance(layer, DataLayer) else 0
+        self.ahead += ahead
+        self._largest = max(self._largest, (made + parameters + ahead, -i))
         for v in self._ends[i]:
             home = self._home.pop(v, None)
             if home is not None:

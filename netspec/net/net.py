@@ -6,7 +6,7 @@ Caffe: src/caffe/net.cpp
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,6 +23,7 @@ from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer, State
 from netspec.layers.contract.context import device_of
+from netspec.layers.contract.data_layer import DataLayer
 from netspec.net.assembly import Assembly
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST
@@ -88,7 +89,7 @@ class Net(torch.nn.Module):
         self.name: str = plan.net.name
         self.phase = plan.net.state.phase
         self.layers: Any = torch.nn.ModuleList(assembly.layers.values())
-        self.positions = Positions(self.layers)
+        self.positions = Positions(self.data_layers)
         self.shapes = ByName("blob", assembly.shapes)
         self.loss_weights, self.learnable = assembly.loss_weights, assembly.learnable
         self.need, self.random = assembly.need, assembly.random
@@ -114,8 +115,13 @@ class Net(torch.nn.Module):
     def replace_layer(self, i: int, layer: Layer) -> None:
         """Replace layer ``i`` by a layer with the same blobs and shapes."""
         self.layers[i] = layer
-        self.positions = Positions(self.layers)
+        self.positions = Positions(self.data_layers)
         self._set_runners()
+
+    @property
+    def data_layers(self) -> list[DataLayer]:
+        """The layers whose tops are records."""
+        return [layer for layer in self.layers if isinstance(layer, DataLayer)]
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the runners."""
@@ -126,7 +132,7 @@ class Net(torch.nn.Module):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._passes = _Passes()
-        self.positions = Positions(self.layers)
+        self.positions = Positions(self.data_layers)
         self._set_runners()
 
     @override
@@ -292,7 +298,7 @@ class Net(torch.nn.Module):
         Raises SpecError for other shapes, and for a net without such a layer.
         Caffe: Net_SetInputArrays (python/caffe/_caffe.cpp)
         """
-        taker = next((layer for layer in self.layers if layer.takes_arrays), None)
+        taker = next((layer for layer in self.data_layers if layer.takes_arrays), None)
         if taker is None:
             message = "set_input_arrays needs a MemoryData layer, and this net has none; call net(blob=array)"
             raise SpecError(message, Where(self.plan.source.file))
@@ -333,8 +339,8 @@ class Positions:
     Further Ctrl-C may interrupt any line here. What was not restored then is restored at the start of the next block.
     """
 
-    def __init__(self, layers: Iterable[Layer]) -> None:
-        self._layers = [layer for layer in layers if layer.reads_data]
+    def __init__(self, layers: Sequence[Layer]) -> None:
+        self._layers = layers
         self._before: list[tuple[Layer, State]] = []  # from the start of the pass; [] once it is done
 
     def __enter__(self) -> None:

@@ -234,7 +234,7 @@ def _from_message(net: Net, message: Any, path: str, file: BinaryIO | None, repo
             report(_wrong_count(path, source.name, len(source.blobs), len(target.blobs)))
             continue
         for j, blob in enumerate(source.blobs):
-            if not (blobs.fits(blob, target.blob_shapes[j]) or _fits_loosely(target, j, blobs.shape_of(blob))):
+            if not (blobs.fits(blob, target.blob_shapes[j]) or target.takes_stored(j, blobs.shape_of(blob))):
                 report(_wrong_shape(path, source.name, j, blobs.shape_of(blob), target.blob_shapes[j]))
                 continue
             try:
@@ -292,7 +292,7 @@ def _from_arrays(net: Net, layers: Iterable[tuple[str, Any]], path: str, report:
                     continue
                 report(_wrong_count(path, name, len(arrays), len(target.blobs)))
                 break
-            if array.shape != target.blob_shapes[j] and not _fits_loosely(target, j, array.shape):
+            if not target.takes_stored(j, array.shape):
                 report(_wrong_shape(path, name, j, array.shape, target.blob_shapes[j]))
                 continue
             copies.append((target, j, array[()].astype(np.float32)))
@@ -340,12 +340,6 @@ def _ignore(name: str) -> None:
 def _wrong_count(path: str, name: str, found: int, expected: int) -> SpecError:
     message = f"incompatible number of blobs for layer '{name}': {found} in the file, {expected} in the net. "
     return SpecError(message + _RENAME, Where(str(path)))
-
-
-def _fits_loosely(layer: Layer, j: int, shape: tuple[int, ...]) -> bool:
-    """Return whether a file's blob differs only in axes of size 1, in which forks differ for this layer type."""
-    same = [n for n in shape if n != 1] == [n for n in layer.blob_shapes[j] if n != 1]
-    return same and layer.ignores_unit_axes
 
 
 def _wrong_shape(path: str, name: str, j: int, found: tuple[int, ...], expected: tuple[int, ...]) -> SpecError:

@@ -24,7 +24,7 @@ def fitted(
         if known and not layer.changes_itself:
             layer = copy.copy(layer)
             layer.fit([shapes[v] for v in node.bottoms])
-            if layer.counted_axis is None and layer.fixed_shapes:
+            if layer.counted_axis is None:
                 shapes.update(zip(node.tops, layer.top_shapes, strict=False))
             found.append(layer)
         else:

@@ -82,6 +82,7 @@ def settings_of(param: Any, nets: Mapping[str, Net], run_settings: Mapping[str, 
         for layer in net.layers:
             for field, value in _fields(layer.param, _IGNORED_IN_LAYERS):
                 found[name][f'layer "{layer.param.name}" {field}'] = value
+        for layer in net.data_layers:
             if records := layer.num_records:
                 found[name][f'layer "{layer.param.name}" number of records'] = records
     return found

@@ -24,7 +24,7 @@ def scorers(net: Net, solver: Any = None) -> dict[str, Scorer]:
     """Return, by output, the function that computes its score from all batches, for layers that define one."""
     makers = {v: layer for node, layer in zip(net.plan.nodes, net.layers, strict=True) for v in node.tops}
     found = [(name, makers[v]) for name, v in net.plan.outputs.items()]
-    return {name: partial(layer.score, solver=solver) for name, layer in found if layer.scores_tests}
+    return {name: partial(own.score, solver=solver) for name, layer in found if (own := layer.scorer())}
 
 
 class Tally:
@@ -114,7 +114,7 @@ class Display:
 
     def __init__(self, net: Net) -> None:
         self._net = net
-        self._reads = any(layer.reads_data for layer in net.layers)
+        self._reads = bool(net.data_layers)
 
     def begin(self, iteration: int, clock: Callable[[], float]) -> None:
         """Start the clock."""
@@ -135,4 +135,4 @@ class Display:
         self._time, self._iteration, self._waited = now, iteration, waited
 
     def _seconds_waited(self) -> float:
-        return sum(layer.waited for layer in self._net.layers)
+        return sum(layer.waited for layer in self._net.data_layers)

@@ -219,7 +219,7 @@ class Training:
     def _warn_of_settings(self) -> None:
         """Warn of fields without effect, and of settings that make the training slow or dependent on the machine."""
         tested = [layer for net in self.test_nets for layer in net.layers]
-        read = forks().rates.fields.union(*(layer.solver_reads for layer in tested))
+        read = forks().rates.fields.union(*(own.reads for layer in tested if (own := layer.scorer())))
         for line in fields_without_effect(self.param, self.node, read):
             log.warning("solver.cpp:45", line)
         if said := dependence(self.net, torch.get_num_threads()):

@@ -22,6 +22,7 @@ from netspec.compat.pycaffe.named import Named
 from netspec.compat.pycaffe.proto import caffe_pb2
 from netspec.errors import did_you_mean, several
 from netspec.graph.filter import with_state
+from netspec.layers.data.memory import MemoryData
 from netspec.layers.utility import pycaffe_shim
 from netspec.layers.utility.live_blobs import Blob, BlobVec
 from netspec.net import net as core
@@ -307,7 +308,7 @@ class Net:
     def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
         """Give the net's first layer, a MemoryData, images (n, C, H, W) and labels (n,), both float32."""
         layer = self.runner.net.layers[0]
-        if not layer.takes_arrays:
+        if not isinstance(layer, MemoryData):
             kind = f'it is "{self._layer_names[0]}" ({layer.type})'
             raise RuntimeError(f"set_input_arrays may only be called if the first layer is a MemoryDataLayer; {kind}")
         self.runner.net.positions.go_back()

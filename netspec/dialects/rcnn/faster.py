@@ -22,7 +22,8 @@ from netspec.dialects.rcnn.proposals import all_anchors, base_anchors
 from netspec.dialects.rcnn.smooth import four
 from netspec.errors import SpecError
 from netspec.files.opencv import cv2
-from netspec.layers.contract.base import Layer, Shape, State
+from netspec.layers.contract.base import ALL_AXES, Layer, Shape, State
+from netspec.layers.contract.data_layer import DataLayer
 
 RATIOS, SCALES = (0.5, 1, 2), (8, 16, 32)
 # The minibatch of anchors: its size, its maximum share of objects, and the overlaps of an object and of background.
@@ -250,7 +251,7 @@ class ProposalTarget(_Sampling):
         return self.tops_of(proposals, [regions, labels, *flat, traits][: self.num_tops])
 
 
-class RoIData(_Sampling):
+class RoIData(_Sampling, DataLayer):
     """Read images and their true boxes, one image per pass, in random order.
 
     The short side is scaled to 600 pixels, but the long one to at most 1000. ``net.layers[0].set_roidb(entries)`` sets
@@ -264,8 +265,7 @@ class RoIData(_Sampling):
     """
 
     bottoms, tops = (0, 0), (3, None)
-    fixed_shapes = False  # images have different sizes
-    reads_data = True
+    counted_axis = ALL_AXES  # images have different sizes
 
     def setup(self) -> None:
         if self.num_tops != 3:

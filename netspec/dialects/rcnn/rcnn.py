@@ -21,7 +21,7 @@ from netspec.dialects.rcnn.proposals import all_anchors, base_anchors, moved, su
 from netspec.dialects.rcnn.regions import RegionPooling, whole
 from netspec.dialects.rcnn.smooth import NORMALIZED, SmoothL1Loss
 from netspec.layers import Layer, register
-from netspec.layers.contract.base import Shape
+from netspec.layers.contract.base import ALL_AXES, Shape
 from netspec.proto.schema import TRAIN, value
 
 DECLARATIONS = """
@@ -180,7 +180,7 @@ class Proposal(Layer):
     Fork: PVANet's and Intel's caffe, src/caffe/layers/proposal_layer.cpp
     """
 
-    fixed_shapes = False  # there may be fewer
+    counted_axis = ALL_AXES  # there may be fewer
     bottoms = (3, 3)
     tops = (1, 2)
     label_bottoms = frozenset({0, 1, 2})

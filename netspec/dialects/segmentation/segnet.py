@@ -113,7 +113,6 @@ class BN(NotLearned):
     Fork: hszhao/PSPNet, happynear/caffe-windows and alexgkendall/caffe-segnet, src/caffe/layers/bn_layer.cpp
     """
 
-    ignores_unit_axes = True  # TSN's and happynear's files have (1, C)
     tops = (1, 3)
 
     def setup(self) -> None:
@@ -143,6 +142,10 @@ class BN(NotLearned):
             self.add_blob(size)
             self.add_blob(size, value=float(param.frozen or self.inverse))
             self.not_learned = frozenset(range(4) if param.frozen else (2, 3))
+
+    def takes_stored(self, index: int, shape: Shape) -> bool:
+        """Compare shapes without axes of size 1: TSN's and happynear's files have (1, C)."""
+        return [n for n in shape if n != 1] == [n for n in self.blob_shapes[index] if n != 1]
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         shown = [(1, self.channels, 1, 1)] * (self.num_tops - 1)

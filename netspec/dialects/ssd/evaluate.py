@@ -17,7 +17,7 @@ from netspec import log
 from netspec.dialects.boxes import Array, as_array, highest, overlaps
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
-from netspec.layers.contract.base import Layer, Shape, State
+from netspec.layers.contract.base import Layer, Scorer, Shape, State
 from netspec.proto.schema import value
 
 IMAGE, LABEL, CONFIDENCE = 0, 1, 2  # columns of a detection; its box follows
@@ -44,8 +44,6 @@ class DetectionEvaluate(Layer):
     counted_axis = 2
     not_exported = "it compares with true boxes"
     changes_itself = True  # index of the next image
-    scores_tests = True
-    solver_reads = frozenset({"eval_type", "ap_version", "show_per_class_result"})
 
     def setup(self) -> None:
         param = value(self.param, "detection_evaluate_param")
@@ -130,6 +128,9 @@ class DetectionEvaluate(Layer):
         scale = np.tile(self._sizes[self._image % len(self._sizes)], 2)
         pixel = np.array([0, 0, 1, 1], np.float32)  # a box of pixels includes its last row and column
         return overlaps(found.clip(0, 1)[:, None] * scale + pixel, true[None] * scale + pixel)
+
+    def scorer(self) -> Scorer:
+        return Scorer(self.score, frozenset({"eval_type", "ap_version", "show_per_class_result"}))
 
     def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
         """Return the mean average precision over all batches, in the version of the solver's ``ap_version``."""

@@ -19,6 +19,7 @@ from netspec.export.exporter import layer_notes
 from netspec.export.formats.onnx import export_onnx
 from netspec.export.formats.shapes import is_given
 from netspec.graph.options import TORCH
+from netspec.layers.contract.data_layer import DataLayer
 from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias, values_of
 from netspec.net.net import Net
 from netspec.proto.schema import PHASE_NAMES, TEST
@@ -70,7 +71,7 @@ class Engine:
         losses = [(node.tops, own) for node, own in zip(net.plan.nodes, net.eager.losses, strict=True)]
         self._nameless = any(j >= len(tops) for tops, own in losses for j, _ in own)  # a loss without a top
         self._losses = [] if self._nameless else [(tops[j], weight) for tops, own in losses for j, weight in own]
-        self._readers = [step for step in net.eager.one_by_one() if self._layers[step.node].reads_data]
+        self._readers = [step for step in net.eager.one_by_one() if isinstance(self._layers[step.node], DataLayer)]
         ends = [node for node, layer in zip(net.plan.nodes, net.layers, strict=True) if is_given(layer)]
         self._ends = {v: net.plan.blobs[v] for node in ends for v in node.tops}  # what the exported net is given
         self._built = {blob: net.shapes[blob] for blob in self._ends.values()}

@@ -20,6 +20,7 @@ from netspec.graph.filter import filter_net
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import origins
 from netspec.graph.speed import speed
+from netspec.layers.contract.data_layer import DataLayer
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import NetParameter, ParamSpec, copy_without
@@ -46,7 +47,7 @@ def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool
             missing.update(layer.top)
             continue
         missing.difference_update(layer.top)
-        if not built[layer.name].reads_data:
+        if not isinstance(built[layer.name], DataLayer):
             result.layer.add().CopyFrom(layer)
             positions.append(source.layers[i])
             continue

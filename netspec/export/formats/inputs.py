@@ -67,9 +67,10 @@ def prune(
 def wrong_given_shapes(shapes: Mapping[str, Shape], nets: Sequence[NetParameter], path: str | Path) -> list[SpecError]:
     """Return an error for each given shape of a blob that is not a top of a data layer (or Python layer)."""
     from netspec.layers import class_of  # imports torch, which a stored model of another engine does not need
+    from netspec.layers.utility.python import Python  # its code need not run if the shapes are given
 
     layers = [layer for net in nets for layer in net.layer]
-    makers = [layer for layer in layers if not layer.bottom or ((cls := class_of(layer)) and cls.takes_shapes)]
+    makers = [layer for layer in layers if not layer.bottom or issubclass(class_of(layer) or object, Python)]
     blobs = list(dict.fromkeys(top for layer in makers for top in layer.top))
     known = ", ".join(blobs) or "none"
     return [

@@ -13,7 +13,8 @@ from typing import TypeVar
 from netspec.data.blobs import Shape
 from netspec.errors import SpecError, Where
 from netspec.graph.plan import Node
-from netspec.layers.contract.base import Layer
+from netspec.layers.contract.base import ALL_AXES, Layer
+from netspec.layers.contract.data_layer import DataLayer
 from netspec.net.net import Net
 
 Sizes = tuple[int | None, ...]  # a shape; None where the size is known only when the exported net runs
@@ -116,7 +117,7 @@ class LayerShapes:
 
 def is_given(layer: Layer) -> bool:
     """Return whether the caller of an exported net gives the tops of a layer."""
-    return layer.is_input or layer.reads_data
+    return layer.is_input or isinstance(layer, DataLayer)
 
 
 def settled(net: Net, write: Callable[[NetShapes], T]) -> tuple[T, NetShapes]:
@@ -145,7 +146,7 @@ def find_shapes(net: Net) -> NetShapes:
             culprit = fault.where and fault.where.layer
             fixed.append(_line(name, size, f"{fault.where} accepts no other size" if culprit else str(fault)))
     for node, layer in zip(net.plan.nodes, net.layers, strict=True):
-        if layer.counted_axis is not None:
+        if layer.counted_axis not in (None, ALL_AXES):
             axes = tuple((v, layer.counted_axis) for v in node.tops)
             size = built[axes[0][0]][axes[0][1]]
             tried, fault = _try(net, axes, size)

@@ -73,7 +73,7 @@ def _test_sizes(solver: Any, node: Position, nets: Sequence[Net]) -> Findings:
     This rule needs the data (``--data``). It allows a tenth more or less.
     """
     for k, net in enumerate(nets[1:]):
-        for layer in net.layers:
+        for layer in net.data_layers:
             if records := layer.num_records:
                 batch, iterations = layer.top_shapes[0][0], solver.test_iter[k]
                 read = iterations * batch

@@ -47,7 +47,7 @@ def extract_records(
     Runs ``iterations`` batches; by default, as many as needed to read every record once (repeated ones are dropped).
     Raises SpecError if the net reads no records or lacks a blob.
     """
-    readers = [layer for layer in net.layers if layer.num_records]
+    readers = [layer for layer in net.data_layers if layer.num_records]
     if not readers:
         raise SpecError("no layer of this net reads records; use image files instead", Where(net.plan.source.file))
     check_blobs(blobs, net.shapes, net.plan.source.file)

@@ -13,11 +13,10 @@ constructor, before it logs the layer's bottoms and tops, and reads the first re
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
 import torch
 from typing_extensions import override
 
@@ -38,6 +37,20 @@ MOST = 2**31 - 1  # the most numbers in a blob in Caffe (Blob::Reshape)
 def shape_string(shape: Sequence[int]) -> str:
     """Return a shape as Caffe prints it, ``64 20 24 24 (737280)`` (Caffe: Blob::shape_string)."""
     return "".join(f"{d} " for d in shape) + f"({math.prod(shape)})"
+
+
+ALL_AXES = -1  # counted_axis of a layer whose tops may have any shapes
+
+
+class Scorer(NamedTuple):
+    """A layer's own score of a test.
+
+    ``score`` takes the layer's tops of all batches, and the SolverParameter or None; ``reads`` are a fork's fields of
+    the solver that it reads.
+    """
+
+    score: Callable[[Sequence[torch.Tensor], Any], list[float]]
+    reads: frozenset[str] = frozenset()
 
 
 State = dict[str, int | str | tuple[torch.Tensor, ...]]  # what a layer keeps between passes
@@ -69,21 +82,10 @@ class Layer(torch.nn.Module):
     reads: ClassVar[frozenset[str]] = frozenset()  # the fields of LayerParameter that it reads; set by ``register``
     ignores: frozenset[str] = frozenset()  # those of ``reads`` that have no effect, e.g. "data_param.scale"
     shares: frozenset[str] = frozenset()  # "data", "diff": what its tops share with its bottom in Caffe's memory
-    counted_axis: ClassVar[int | None] = None  # the axis of the tops with a size that is known only after forward
+    # the axis of the tops with a size that is known only after forward, which may be ALL_AXES
+    counted_axis: ClassVar[int | None] = None
     ignores_frozen: ClassVar[bool] = False  # computes the gradients of all blobs, also of those with lr_mult: 0
-    held: frozenset[int] = frozenset()  # blobs whose gradient another layer computes, but not this one
-    # whether its tops have the shapes that ``reshape`` returned, except in ``counted_axis``
-    fixed_shapes: ClassVar[bool] = True
-    reads_data: ClassVar[bool] = False  # its tops are records: inputs of an exported net
-    takes_shapes: ClassVar[bool] = False  # ``--shape`` may set the shapes of its tops, although it has bottoms
-    takes_arrays: ClassVar[bool] = False  # its records are arrays of a program: ``set_input_arrays``
-    scores_tests: ClassVar[bool] = False  # it has its own score of a test: ``score``
-    solver_reads: ClassVar[frozenset[str]] = frozenset()  # a fork's fields of the solver that ``score`` reads
     ignores_propagate_down: frozenset[int] = frozenset()  # the bottoms that get a gradient even where it is false
-    ahead: int = 0  # bytes of the batches that it reads ahead
-    waited: float = 0.0  # the seconds that forward passes have waited for records
-    num_records: int = 0  # 0: it reads none, or the data is not open
-    ignores_unit_axes: ClassVar[bool] = False  # files may store its blobs with other axes of size 1
     changes_itself: bool = False  # a pass changes its state, so it can be neither prepared nor copied
     passes_on: bool = False  # every top is the bottom, unchanged, at the present settings
     # what the layer before it may compute too: "relu" (max(x, 0)), "scale" (factors and biases of channels)
@@ -117,6 +119,7 @@ class Layer(torch.nn.Module):
         self.num_tops: int = max(len(param.top), self.tops[0] if self.is_loss else 0)
         self.blobs = _NO_BLOBS
         self.blob_shapes: list[Shape] = []
+        self.held: frozenset[int] = frozenset()  # blobs whose gradient another layer computes, but not this one
         self._fillings: list[tuple[Any, float]] = []  # of the blobs: a FillerParameter or None, and a value
         self.construct()
         self.context.created(self.num_tops)
@@ -218,11 +221,6 @@ class Layer(torch.nn.Module):
         fitting = top.view(diff.shape)
         return self.caffes_gradients([fitting if bottom is top else bottom for bottom in bottoms], fitting, diff)
 
-    @classmethod
-    def source_of(cls, param: Any) -> str:
-        """Return the path that a LayerParameter names for its records, "" where it names none."""
-        return ""
-
     def restart(self) -> None:
         """Return to the first record."""
 
@@ -247,20 +245,17 @@ class Layer(torch.nn.Module):
         """Return an error if a solver cannot run the layer, because a program must first give it data."""
         return None
 
-    def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
-        """Take images (n, C, H, W) and labels (n,) as records. Raises SpecError for other shapes."""
-        raise NotImplementedError
-
     def filled_once(self) -> Sequence[torch.Tensor | None]:
         """Return for each top its values, filled when it was built, or None; an empty sequence if none is constant."""
         return ()
 
-    def score(self, tops: Sequence[torch.Tensor], solver: Any = None) -> list[float]:
-        """Return the scores of a test from the tops of all its batches; without it, they are the means of the tops.
+    def scorer(self) -> Scorer | None:
+        """Return how a test is scored from the tops of all its batches; None: by their means."""
+        return None
 
-        ``solver`` is the SolverParameter, None where there is no solver.
-        """
-        raise NotImplementedError
+    def takes_stored(self, index: int, shape: Shape) -> bool:
+        """Return whether a blob of this shape in a file can be its learnable blob ``index``."""
+        return shape == self.blob_shapes[index]
 
     # Running
 
@@ -283,7 +278,8 @@ class Layer(torch.nn.Module):
     def check_shapes(self, tops: Sequence[torch.Tensor]) -> None:
         """Raise SpecError if the tops of a pass have other shapes than ``reshape`` returned."""
         found = [tuple(top.shape) if isinstance(top, torch.Tensor) else None for top in tops]
-        if self.fixed_shapes and list(map(self._counted, found)) != list(map(self._counted, self.top_shapes)):
+        expected = found if self.counted_axis == ALL_AXES else self.top_shapes
+        if list(map(self._counted, found)) != list(map(self._counted, expected)):
             one, other = (" and ".join(map(str, shapes)) or "no top" for shapes in (found, self.top_shapes))
             raise self.error(f"forward returned a top of shape {one}, but reshape returned {other}", "type")
 

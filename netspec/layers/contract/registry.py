@@ -9,6 +9,7 @@ from typing import TypeVar
 from netspec.errors import did_you_mean
 from netspec.graph.options import BuildOptions
 from netspec.layers.contract.base import Layer
+from netspec.layers.contract.data_layer import DataLayer
 from netspec.proto.forks import forks
 from netspec.proto.schema import LayerParameter
 
@@ -60,7 +61,7 @@ def class_of(param: LayerParameter, options: BuildOptions | None = None) -> type
 def source_of(param: LayerParameter) -> str:
     """Return the path that a layer names for its records, "" where it names none, or is unknown."""
     cls = class_of(param)
-    return cls.source_of(param) if cls else ""
+    return cls.source_of(param) if cls and issubclass(cls, DataLayer) else ""
 
 
 def layer_types() -> list[str]:

@@ -23,7 +23,8 @@ from netspec.data.prefetch import Feed
 from netspec.data.sources import Cursor, DatabaseSource, Draws, ImageListSource, Source, Together, batches, draw_skip
 from netspec.data.transformer import Transformer, contradictions
 from netspec.errors import SpecError, UnknownShape, Where
-from netspec.layers.contract.base import Layer, Shape, State
+from netspec.layers.contract.base import Shape, State
+from netspec.layers.contract.data_layer import DataLayer
 from netspec.layers.contract.registry import register
 from netspec.proto.schema import PHASE_NAMES, value
 
@@ -35,16 +36,13 @@ Batch = tuple[tuple[torch.Tensor, ...], int]
 T = TypeVar("T")
 
 
-class ReadingLayer(Layer):
+class ReadingLayer(DataLayer):
     """Base of the layers that read records from files, some batches ahead of the net.
 
     Files are opened in the constructor. Threads start at the first forward pass. If data must not be opened, or the
     shape of the first top is given, the shapes of the tops are the given ones, or those that the prototxt determines.
     """
 
-    bottoms = (0, 0)
-    tops = (2, 2)
-    reads_data = True
     in_order = False  # whether batches can be made only one after the other
     group: ClassVar[str]  # the field with the layer's own settings
 

@@ -13,6 +13,7 @@ from netspec import log
 from netspec.errors import SpecError
 from netspec.layers.contract import fillers
 from netspec.layers.contract.base import Layer, Shape, State
+from netspec.layers.contract.data_layer import DataLayer
 from netspec.layers.contract.registry import register
 from netspec.proto.schema import FillerParameter
 
@@ -118,7 +119,7 @@ class DummyData(Layer):
 
 
 @register("MemoryData", "memory_data_param", "transform_param")
-class MemoryData(Layer):
+class MemoryData(DataLayer):
     """Return arrays that the program gives with ``set_input_arrays``, batch after batch, over and over.
 
     top[0]  images (batch_size, channels, height, width)
@@ -126,9 +127,6 @@ class MemoryData(Layer):
     Caffe: src/caffe/layers/memory_data_layer.cpp (Reset), python/caffe/_caffe.cpp (Net_SetInputArrays)
     """
 
-    bottoms = (0, 0)
-    tops = (2, 2)
-    reads_data = True
     takes_arrays = True
 
     def setup(self) -> None:

@@ -20,7 +20,7 @@ from typing_extensions import override
 
 from netspec import log
 from netspec.errors import SpecError, did_you_mean
-from netspec.layers.contract.base import Layer, Shape, State
+from netspec.layers.contract.base import ALL_AXES, Layer, Shape, State
 from netspec.layers.contract.registry import register
 from netspec.layers.utility.live_blobs import Blob
 from netspec.layers.utility.pycaffe_shim import can_import, importable
@@ -66,8 +66,7 @@ class Python(Layer):
     not_allowed = "a Python layer runs code named in the prototxt; pass --allow-python-layers if you trust it"
     bottoms = (0, None)
     tops = (0, None)
-    takes_shapes = True  # if its code must not run
-    fixed_shapes = False  # as in Caffe, the code may reshape its tops in forward
+    counted_axis = ALL_AXES  # as in Caffe, the code may reshape its tops in forward
 
     def setup(self) -> None:
         given = self.context.options.given_shapes
