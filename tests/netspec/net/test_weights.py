@@ -13,7 +13,7 @@ import netspec
 from netspec.errors import SpecError
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
-from netspec.inspect.stored_weights import stored_layers
+from netspec.inspect.stored_weights import stored_weights
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, net_to_proto, save_weights
@@ -278,8 +278,8 @@ def test_blobs_in_every_encoding_are_read(kind: str, transposed: bool, tmp_path:
     assert blob._version > version
     assert (blobs_of(net)["ip"][0].ravel() == np.arange(1200)).all()
     assert (blobs_of(net)["ip"][1] == np.arange(40)).all()
-    [stored] = stored_layers(tmp_path / "w.caffemodel")
-    assert [blob.ravel().tolist() for blob in stored.blobs] == [list(range(1200)), list(range(40))]
+    stored = stored_weights(tmp_path / "w.caffemodel")["ip"]
+    assert [blob.ravel().tolist() for blob in stored] == [list(range(1200)), list(range(40))]
 
 
 def test_truncated_files_and_blobs_are_refused_and_change_nothing(tmp_path: Path) -> None:
