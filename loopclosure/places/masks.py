@@ -135,7 +135,7 @@ def _read_matrix(path: Path, keys: tuple[str, ...], what: str, last_columns: int
         return _read_mat(path, keys, what)
     if suffix == ".npy":
         with opened(path, what) as stream:
-            return _numeric(read_array(stream, path.stat().st_size), path)
+            return _numeric(read_array(stream), path)
     if suffix in (".txt", ".csv", ".dat"):
         return _read_text(path, what, last_columns)
     if suffix in LOSSLESS_SUFFIXES:

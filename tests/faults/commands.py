@@ -105,18 +105,6 @@ def check_npz(path: str, *without: str) -> object:
         return [archive[name].tobytes() for name in sorted(archive.files) if name not in without]
 
 
-def features_inputs() -> None:
-    np.savez("features.npz", features=np.random.default_rng(0).random((2500, 16)).astype(np.float32))
-
-
-def check_npy() -> object:
-    if not Path("out/s.npy").exists():
-        return None
-    matrix = np.load("out/s.npy")
-    assert np.all(np.any(matrix != 0, axis=1)), "rows of zeros"
-    return matrix.tobytes()
-
-
 def walk_inputs() -> None:
     images(30)
     np.save("truth.npy", np.eye(30, k=-15) + np.eye(30, k=-16))
@@ -157,9 +145,6 @@ CASES = {
         ["extract", "--model", "net.prototxt", "--blob", "ip", "--images", "images", "--out", "out/f.npz"],
         extract_inputs,
         lambda: check_npz("out/f.npz", "seconds_per_image"),
-    ),
-    "similarity": Case(
-        loopclosure.cli.main, ["similarity", "features.npz", "--out", "out/s.npy"], features_inputs, check_npy
     ),
     "evaluate": Case(
         loopclosure.cli.main,

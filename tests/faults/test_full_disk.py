@@ -104,7 +104,7 @@ def test_upgrade_fold_and_export_on_a_full_disk_report_one_line_and_keep_old_fil
     assert contents() == before
 
 
-@pytest.mark.parametrize("name", ["extract", "similarity", "detect"])
+@pytest.mark.parametrize("name", ["extract", "detect"])
 def test_a_missing_output_folder_is_reported(name: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     case = CASES[name]
     case.prepare()

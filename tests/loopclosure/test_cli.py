@@ -57,15 +57,6 @@ def test_evaluate_trains_on_other_images(two_laps, tmp_path, capsys):
     assert "vocabulary" not in summary["methods"][0]["milliseconds_a_frame"]
 
 
-@pytest.mark.slow
-def test_tools_evaluate_loops_writes_a_report(two_laps, two_laps_features, tmp_path):
-    line = [sys.executable, ROOT / "tools" / "evaluate_loops.py", two_laps, "--out", tmp_path]
-    line += ["--method", f"features:{two_laps_features}"]
-    done = subprocess.run(line, capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "report.html").is_file()
-
-
 def test_detect_writes_loops_and_a_pose_graph(two_laps, tmp_path, capsys):
     line = f"detect {two_laps} --metric cosine --threshold 0.9 --exclude-recent 10 --consistency 2 --out {tmp_path}"
     assert main([*line.split(), "--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]) == 0

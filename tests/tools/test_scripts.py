@@ -43,7 +43,7 @@ def run(project: Path, python: Path, script: str, *words: str) -> subprocess.Com
 
 
 def test_the_scripts_are_found() -> None:
-    assert {"train.py", "convert_pairs_lmdb", "convert_imageset", "compute_image_mean", "compare.py"} < set(SCRIPTS)
+    assert {"train.py", "convert_pairs_lmdb", "compare.py"} < set(SCRIPTS)
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
@@ -67,15 +67,16 @@ def test_without_one_a_message_names_the_command_to_run(script: str, project: Pa
 def test_a_virtual_environment_without_the_packages_is_tried_only_once(project: Path, bare_python: Path) -> None:
     (project / ".venv").symlink_to(bare_python.parents[1])
     for python in (bare_python, project / ".venv" / "bin" / "python"):
-        done = run(project, python, "convert_imageset", "--help")
+        done = run(project, python, "convert_pairs_lmdb", "--help")
         assert done.returncode == 1
         assert len(done.stderr.splitlines()) == 1
 
 
 def test_arguments_and_the_exit_status_are_passed_on(project: Path, bare_python: Path) -> None:
     (project / ".venv").symlink_to(sys.prefix)
-    words = ("-gray", f"{GOLDEN}/images/png/", f"{GOLDEN}/images/list.txt", "a db")
-    assert run(project, bare_python, "convert_imageset", *words).returncode == 0
+    (project.parent / "pairs.txt").write_text("0.png 1.png 1\n")
+    words = ("-gray", "-resize_width=8", "-resize_height=8", f"{GOLDEN}/images/png/", "pairs.txt", "a db")
+    assert run(project, bare_python, "convert_pairs_lmdb", *words).returncode == 0
     assert (project.parent / "a db" / "data.mdb").is_file()
-    assert run(project, bare_python, "convert_imageset", *words).returncode == 1
-    assert run(project, bare_python, "convert_imageset", "-grey", *words).returncode == 2
+    assert run(project, bare_python, "convert_pairs_lmdb", *words).returncode == 1
+    assert run(project, bare_python, "convert_pairs_lmdb", "-grey", *words).returncode == 2

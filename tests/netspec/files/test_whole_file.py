@@ -1,7 +1,6 @@
 """Files that appear whole, locks, and whether a file could be written."""
 
 import errno
-import logging
 import os
 import signal
 import subprocess
@@ -65,24 +64,6 @@ def test_the_file_and_its_folder_are_on_disk_before_the_block_ends(
     assert synced == [(False, [unfinished.name]), (True, ["file"])]
 
 
-def test_a_folder_that_cannot_be_synced_gives_one_warning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def refuse(path: Path) -> None:
-        raise PermissionError(errno.EACCES, "Access is denied")
-
-    monkeypatch.setattr(package, "_sync", refuse)
-    monkeypatch.setattr(logging.getLogger(package.__name__), "propagate", True)
-    monkeypatch.setattr(logging.getLogger(package.__name__.partition(".")[0]), "propagate", True)
-    package._warn_not_synced.cache_clear()
-    for text in ("new", "newer"):
-        with package.whole_file(tmp_path / "file") as unfinished:
-            unfinished.write_text(text)
-    assert (tmp_path / "file").read_text() == "newer"
-    (record,) = caplog.records
-    assert record.getMessage().startswith("folders cannot be synced to disk here (Permission denied)")
-
-
 def test_where_files_have_no_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")  # as on some network file systems
@@ -95,12 +76,6 @@ def test_where_files_have_no_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with package.only_one(tmp_path / "lock", ""):
         pass
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
-
-
-def test_why_unwritable_without_statvfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(os, "statvfs")  # as on Windows
-    monkeypatch.setattr(os, "access", lambda path, mode: False)
-    assert package.why_unwritable(tmp_path / "file") == os.strerror(errno.EACCES)
 
 
 def test_a_link_stays_a_link(tmp_path: Path) -> None:
