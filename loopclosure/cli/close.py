@@ -13,10 +13,9 @@ from loopclosure.closing.measure import measure, read_loops
 from loopclosure.errors import InputError
 from loopclosure.places import intrinsics
 from loopclosure.places.image_sequence import ImageSequence
-from loopclosure.places.pose_files import pose_form, read_poses
 from loopclosure.places.source import CLOSED, POSES, TOPICS
 from netspec.terminal.commands import WrongUsage
-from netspec.terminal.output import bar, warn
+from netspec.terminal.output import bar
 from netspec.terminal.parser import Commands, seed
 
 
@@ -60,14 +59,14 @@ def _close(a: argparse.Namespace) -> None:
     if a.seed is not None and a.drift is None:
         raise WrongUsage("--seed needs --drift")
     source = typed(a.source, CLOSED)
-    frames = sequence(source, out / "frames")
+    frames = sequence(source, out / "frames", odometry=a.odometry, form=a.odometry_form)
     camera = intrinsics.from_text(a.camera) if a.camera else frames.camera
     if camera is None:
         raise InputError(f"has no camera calibration; give --camera {intrinsics.FORM}", frames.source)
     odometry = _odometry(a, frames)[source.selection().numbers(len(frames))]
     frames = frames.taken(source.selection())
     loops = measure(frames, read_loops(Path(a.loops), frames), camera, odometry, bar)
-    closed = close(odometry, loops, frames.poses)
+    closed = close(odometry, loops, frames.poses, stamps=frames.stamps)
     write_closed(out, closed, frames.stamps, frames.names)
     # Imported here, since it takes seconds and only this command needs it.
     from loopclosure.report.plots import draw_paths
@@ -79,11 +78,6 @@ def _close(a: argparse.Namespace) -> None:
 
 def _odometry(a: argparse.Namespace, frames: ImageSequence) -> np.ndarray:
     """Return the path (F, 7) to correct, NaN for frames without a pose. Raises InputError if there is none."""
-    if a.odometry:
-        read = read_poses(a.odometry, pose_form(a.odometry_form or ""))
-        for doubt in read.doubts:
-            warn(f"{a.odometry}: {doubt}".replace("pose-form=", "--odometry-form "))
-        return read.of_images(len(frames), frames.stamps, a.odometry)
     if a.drift is None:
         if frames.odometry is None:
             raise InputError("has no odometry; give --odometry FILE, or --drift PERCENT to simulate it", frames.source)

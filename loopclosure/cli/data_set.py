@@ -11,8 +11,9 @@ from loopclosure.places import datasets
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import from_text
 from loopclosure.places.masks import CAMERAS
+from loopclosure.places.pose_files import pose_form
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.sequences import GROUNDTRUTH, layout_of
+from loopclosure.places.sequences import GROUNDTRUTH, PoseChoice, layout_of, with_odometry
 from loopclosure.places.source import (
     DETECTED,
     EVALUATED,
@@ -93,14 +94,19 @@ def typed(text: str, kinds: Kinds) -> Source:
         raise WrongUsage(str(fault)) from None
 
 
-def sequence(source: Source, frames: Path, posed: bool = False) -> ImageSequence:
+def sequence(
+    source: Source, frames: Path, posed: bool = False, odometry: Path | None = None, form: str | None = None
+) -> ImageSequence:
     """Read a sequence, with a warning for all that looks wrong; see :func:`~loopclosure.places.source.open_sequence`.
 
     The frames of a bag or video are extracted to the folder ``frames``. ``posed``: the command needs poses.
+    ``odometry`` is a file that replaces the odometry of the sequence, in this ``form``.
     """
     read, said = open_sequence(source, frames, posed=posed, videos=True, progress=bar)
     if said:
         print(said)
+    if odometry is not None:
+        read = with_odometry(read, PoseChoice(odometry, pose_form(form or "")))
     for doubt in read.doubts if posed else read.remarks():
         warn(doubt)
     return read
@@ -171,16 +177,19 @@ def warn_of_unreadable(recording: ImageSequence) -> ImageSequence:
     return recording.readable()
 
 
-def recording_of(text: str, frames: Path, camera: str | None = None) -> ImageSequence:
+def recording_of(text: str, frames: Path, camera: str | None = None, odometry: Path | None = None) -> ImageSequence:
     """Open a source for the detector; the frames of a bag are extracted to the folder ``frames``.
 
-    ``camera``: the value of ``--camera``, which replaces the calibration of the source.
+    ``camera`` is the value of ``--camera``, which replaces the calibration of the source, and ``odometry`` that of
+    ``--odometry``, which replaces its odometry.
     """
     known = from_text(camera) if camera else None
     source = typed(text, DETECTED)
     read, said = open_sequence(source, frames, progress=bar)
     if said:
         print(said)
+    if odometry is not None:
+        read = with_odometry(read, PoseChoice(odometry))
     recording = read.taken(source.selection())
     for remark in recording.remarks():
         warn(remark)

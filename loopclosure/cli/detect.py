@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.cli.data_set import recording_of, typed, warn_of_unreadable
+from loopclosure.cli.data_set import recording_of, warn_of_unreadable
 from loopclosure.closing.close import constraint
 from loopclosure.closing.measure import Loop, cells, errors_said, measure
 from loopclosure.descriptors.feature_file import read_features
@@ -25,8 +25,8 @@ from loopclosure.places import intrinsics
 from loopclosure.places.frames import live_frames
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import Intrinsics
-from loopclosure.places.pose_files import read_poses
-from loopclosure.places.source import DETECTED, FRAMES, TOPICS
+from loopclosure.places.source import FRAMES, TOPICS
+from loopclosure.places.trajectory import pieces
 from netspec.files.whole_file import write_whole
 from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import bar, warn
@@ -116,8 +116,9 @@ def _add_detect(commands: Commands) -> None:
     parser.add_argument("--verify", action="store_true", help="verify candidates with SIFT matches and RANSAC")
     parser.add_argument(
         "--odometry",
+        type=Path,
         metavar="FILE",
-        help="poses (TUM, KITTI, EuRoC); frames far apart by these poses are never a loop",
+        help="poses by the odometry: frames far apart by it are no loop, and its steps give the lengths of loops",
     )
     parser.add_argument(
         "--camera",
@@ -129,7 +130,7 @@ def _add_detect(commands: Commands) -> None:
 
 def _detect(a: argparse.Namespace) -> None:
     options = _checked_options(a)
-    recording = None if a.video else recording_of(a.source, Path(a.out) / "frames", a.camera)
+    recording = None if a.video else recording_of(a.source, Path(a.out) / "frames", a.camera, a.odometry)
     features = read_features(a.features) if a.features else None
     describe = run.load_describe(a.describe, options) if features is None else None
     net, views = describe, run.views_of(describe, features)
@@ -151,8 +152,9 @@ def _detect(a: argparse.Namespace) -> None:
             detector.decided([result for result in results if result], None)
     elif a.threshold is None and not a.resume:
         precision = PRECISION if a.least_precision is None else a.least_precision
-        odometry = _odometry(a.odometry, a.source, recording) if a.odometry else None
-        request = Request(precision, a.exclude_recent, odometry=odometry)
+        path = recording.odometry  # after a jump, its poses are in another frame
+        whole = path is not None and not pieces(path, recording.stamps).any()
+        request = Request(precision, a.exclude_recent, odometry=path if whole else None)
         found = whole_drive(detector, recording, features, request, bar)
         results = found.results
         reasons = [*found.reasons, run.verdicts_said(results)]
@@ -187,9 +189,9 @@ def _detect(a: argparse.Namespace) -> None:
     driven = np.isfinite(odometry).any()
     if driven or np.isfinite(poses).any():
         of_loop = {(loop.query, loop.match): constraint(loop.relative) for loop in loops if loop.relative is not None}
-        left_out = write_g2o(
-            out / "loops.g2o", odometry if driven else poses, detector.loops, lambda *ends: of_loop.get(ends)
-        )
+        path = odometry if driven else poses
+        drives = pieces(path, detector.stamps, detector.sessions)
+        left_out = write_g2o(out / "loops.g2o", path, detector.loops, lambda *ends: of_loop.get(ends), drives)
         note = f"; loops without a measured relative pose, left out: {left_out}" if left_out else ""
         print(f"pose graph of the {'odometry' if driven else 'known poses'}{note}: {out / 'loops.g2o'}")
     if np.isfinite(poses).any():
@@ -225,19 +227,6 @@ def _measured(detector: LoopDetector, recording: ImageSequence, camera: Intrinsi
     return [Loop(loop.query + first, loop.match + first, loop.relative) for loop in measured]
 
 
-def _odometry(path: str, source: str, recording: ImageSequence) -> np.ndarray:
-    """Return the odometry (frames, 7) of the selected frames."""
-    read = read_poses(path)
-    for doubt in read.doubts:
-        warn(f"{path}: {doubt}")
-    numbers = np.arange(len(recording)) if recording.numbers is None else recording.numbers
-    untimed = read.stamps is None or recording.stamps is None
-    chosen = set(FRAMES) & set(typed(source, DETECTED).settings)
-    if untimed and chosen and numbers[-1] < len(read.poses):
-        return read.poses[numbers]
-    return read.of_images(len(recording), recording.stamps, path)
-
-
 def _checked_options(a: argparse.Namespace) -> dict[str, str]:
     """Return the keywords of --with. Raises WrongUsage for options that do not go together."""
     if bool(a.source) == bool(a.video):
@@ -252,8 +241,8 @@ def _checked_options(a: argparse.Namespace) -> dict[str, str]:
     given += ["--verify"] if a.verify else []
     if given and a.threshold is None and not a.video:
         raise WrongUsage(f"{given[0]} needs --threshold")
-    if a.odometry and (a.threshold is not None or a.resume or a.video):
-        raise WrongUsage("--odometry cannot be used with --threshold, --resume or --video, which decide frame by frame")
+    if a.odometry and a.video:
+        raise WrongUsage("--odometry is for a recording, not for --video")
     if a.features and getattr(a, "with"):
         raise WrongUsage("--with is for --describe, not for --features")
     options = {}

@@ -11,17 +11,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.graph import Edge, solve
-from loopclosure.closing.length import ODOMETRY, STEP_M, STEP_SHARE
+from loopclosure.closing.length import ODOMETRY
 from loopclosure.closing.measure import Loop
 from loopclosure.closing.relative import DEPTH, ROTATION_ONLY, UP_TO_SCALE, Relative, across
 from loopclosure.csv_file import write_csv
-from loopclosure.detector.export import LOOP_SIGMAS, Sigmas, relative_pose, write_pose_graph
+from loopclosure.detector.export import LOOP_SIGMAS, Sigmas, information_of_step, relative_pose, write_pose_graph
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import MAX_DISTANCE_M
-from loopclosure.places.trajectory import Trajectory, write_trajectory
+from loopclosure.places.trajectory import Trajectory, pieces, write_trajectory
 
-# The standard deviation of the rotation of a step of odometry: a share of its angle, plus a constant.
-TURN_SHARE, TURN_RAD = 0.02, 0.002
 # Of the errors of a loop that all its points have in common, by the calibration, by the depth, or by a translation that
 # was taken for a rotation: with depth; from color alone they are LOOP_SIGMAS.
 DEPTH_SIGMAS = Sigmas(0.03, 0.01)
@@ -44,6 +42,8 @@ class Closed:
     accepted   (L,) bool: the loop agrees with the rest of the graph
     not_measured  number of loops left out because no relative pose could be computed from their images
     truth      (N, 7), NaN where not known, or None
+    no_path    number of loops left out because one of their frames has no odometry
+    gaps       number of steps that are no edges, because the odometry jumps or another drive begins
     """
 
     frames: np.ndarray
@@ -55,6 +55,8 @@ class Closed:
     accepted: np.ndarray
     not_measured: int
     truth: np.ndarray | None = None
+    no_path: int = 0
+    gaps: int = 0
 
     def count(self, kind: str) -> int:
         """Return the number of loops of this ``Relative.kind``."""
@@ -85,19 +87,22 @@ def close(
     loops: Sequence[Loop],
     truth: np.ndarray | None = None,
     starts: Sequence[int] | np.ndarray = (),
+    stamps: np.ndarray | None = None,
 ) -> Closed:
     """Close measured loops of a sequence of frames with odometry (F, 7), NaN for frames without; truth likewise.
 
     Loops are left out if they were not measured, or if one of their frames has no odometry. ``starts``: the first
-    frames of the drives, if there are several; no step joins one with the drive before.
+    frames of the drives, if there are several; no step joins one with the drive before, and none is a jump of the
+    odometry, which ``stamps`` (F,) in seconds help to find.
     """
     frames = np.flatnonzero(np.all(np.isfinite(odometry), axis=1))
     if len(frames) < 2:
         raise InputError(f"{len(frames)} of {len(odometry)} frames have a pose of the odometry; two are needed")
     path = odometry[frames]
-    drive = np.searchsorted(starts, frames, side="right")
+    drive = pieces(odometry, stamps, starts)[frames]
     node = {int(frame): number for number, frame in enumerate(frames)}
-    taken = [loop for loop in loops if loop.relative is not None and {loop.query, loop.match} <= set(node)]
+    measured = [loop for loop in loops if loop.relative is not None]
+    taken = [loop for loop in measured if {loop.query, loop.match} <= node.keys()]
     steps = [
         Edge(number, number + 1, step, information_of_step(step))
         for number, step in enumerate(steps_between(path))
@@ -108,16 +113,10 @@ def close(
         assert loop.relative is not None
         edges.append(Edge(node[loop.match], node[loop.query], *constraint(loop.relative)))
     solution = solve(path, steps, edges)
-    left_out = len(loops) - len(taken)
     known = None if truth is None else truth[frames]
-    return Closed(frames, path, solution.poses, steps, edges, taken, solution.accepted, left_out, known)
-
-
-def information_of_step(step: np.ndarray) -> np.ndarray:
-    """Return the information (6, 6) of a step (7,) of the odometry."""
-    length, turn = float(np.linalg.norm(step[:3])), float(Rotation.from_quat(step[3:]).magnitude())
-    sigmas = [STEP_SHARE * length + STEP_M] * 3 + [TURN_SHARE * turn + TURN_RAD] * 3
-    return np.diag(np.array(sigmas) ** -2.0)
+    left_out = len(loops) - len(measured), len(measured) - len(taken)
+    found = frames, path, solution.poses, steps, edges, taken, solution.accepted, left_out[0], known
+    return Closed(*found, no_path=left_out[1], gaps=len(frames) - 1 - len(steps))
 
 
 def constraint(relative: Relative) -> tuple[np.ndarray, np.ndarray]:
@@ -179,6 +178,10 @@ def summary(closed: Closed) -> list[str]:
         lines.append(spot)
     if closed.not_measured:
         lines.append(f"{closed.not_measured} more left out: fewer than 20 points agree with one relative pose")
+    if closed.no_path:
+        lines.append(f"{closed.no_path} more left out: one of their frames has no odometry")
+    if closed.gaps:
+        lines.append(f"the odometry has {closed.gaps} gaps, where it jumps or another drive begins; loops bridge them")
     for by, words in ((DEPTH, "depth"), (ODOMETRY, "steps of the odometry")):
         if count := sum(loop.relative is not None and loop.relative.length_by == by for loop in closed.loops):
             lines.append(f"{count} loops measured in meters, from {words}")

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.relative import METRIC, UP_TO_SCALE, Relative, View, relative_view
+from loopclosure.detector.export import STEP_M, STEP_SHARE
 from loopclosure.detector.verification import LocalFeatures
 
 ODOMETRY = "odometry"
@@ -22,19 +23,20 @@ STEPS_M = 0.3, 0.1  # distances to a neighbor by the odometry, in the order in w
 FARTHEST = 20  # frames to a neighbor
 LEAST_PARALLAX_PX = 3.0  # of a point whose depth is used
 OFF_PX = 2.0  # of a point from where the other camera sees it
-# The standard deviation of the length of a step of odometry: a share of it, and a constant.
-STEP_SHARE, STEP_M = 0.02, 0.002
 Matching = Callable[[LocalFeatures, LocalFeatures], np.ndarray]
 Neighbors = Iterable[tuple[View, float]]  # of an image: another image, and its distance by the odometry in meters
 
 
-def neighbors(odometry: np.ndarray, frame: int) -> list[tuple[int, float]]:
-    """Return the neighbors of a frame, and their distances in meters, by odometry (N, 7), NaN where not known."""
+def neighbors(odometry: np.ndarray, frame: int, drives: np.ndarray) -> list[tuple[int, float]]:
+    """Return the neighbors of a frame, and their distances in meters, by odometry (N, 7), NaN where not known.
+
+    ``drives`` (N,) has the piece of the path of each frame; a neighbor is of the same piece.
+    """
     found = []
     for least in STEPS_M:
         for way in (-1, 1):
             for number in range(frame + way, frame + way * (FARTHEST + 1), way):
-                if not 0 <= number < len(odometry):
+                if not 0 <= number < len(odometry) or drives[number] != drives[frame]:
                     break
                 length = float(np.linalg.norm(odometry[number, :3] - odometry[frame, :3]))
                 if length >= least:

@@ -22,6 +22,7 @@ from loopclosure.places.depth import read_depths
 from loopclosure.places.frames import read_bgr
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import Intrinsics
+from loopclosure.places.trajectory import pieces
 from loopclosure.progress import Progress, silent
 from netspec.files.kinds import nearest_existing
 
@@ -85,7 +86,8 @@ def measure(
     be read is not measured.
     """
     ends = {end for loop in loops for end in (loop.query, loop.match)}
-    near = {} if odometry is None else {end: neighbors(odometry, end) for end in ends}
+    drives = None if odometry is None else pieces(odometry, sequence.stamps)
+    near = {} if odometry is None or drives is None else {end: neighbors(odometry, end, drives) for end in ends}
     wanted = ends.union(number for each in near.values() for number, _ in each)
     # A video is read once, in order.
     of_video = {} if sequence.paths else {i: view_of(CHECK, camera, image) for i, image, _ in sequence.frames(wanted)}

@@ -6,9 +6,9 @@
         closer.add(image, stamp, pose)
         closer.correction  # the frame of the odometry in the map; map -> odom in ROS
 
-A thread of its own solves the graph, so an image is never waited for. With GTSAM, it continues from the solution
-before; without, it solves the whole graph again. The class knows nothing of ROS; ``examples/ros2_node.py`` is a node
-around it.
+A thread of its own solves the graph; an image waits at most for a step of GTSAM. With GTSAM, it continues from the
+solution before; without, it solves the whole graph again. The class knows nothing of ROS; ``examples/ros2_node.py`` is
+a node around it.
 """
 
 from __future__ import annotations
@@ -21,22 +21,24 @@ from threading import Event, Lock, Thread
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loopclosure.closing.close import Closed, constraint, information_of_step
+from loopclosure.closing.close import Closed, constraint
 from loopclosure.closing.graph import Edge, cross_matrices, solve
 from loopclosure.closing.incremental import IncrementalSolver, installed
 from loopclosure.closing.length import FARTHEST, measured, neighbors
 from loopclosure.closing.measure import Loop
 from loopclosure.closing.relative import METRIC, View
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.export import STILL, after, relative_pose
+from loopclosure.detector.export import STILL, after, information_of_step, relative_pose
 from loopclosure.errors import InputError
 from loopclosure.places.intrinsics import Intrinsics
+from loopclosure.places.trajectory import jumps
 from netspec import log
 
 FORWARD = np.array([0, 0, 0, -0.5, 0.5, -0.5, 0.5])  # a camera that looks along the robot's x axis; y is left, z is up
 # A stamp this much earlier than the one before it begins another drive: a recording starts again. A smaller step back
 # is an image that came late.
 ANOTHER_DRIVE_S = 1.0
+COMPARED = 100  # keyframes that a step is compared with
 UNKNOWN = 1e6  # the variance of a position that a loop does not measure
 
 
@@ -50,10 +52,11 @@ class Keyframes:
 
 @dataclass
 class _Graph:
-    """The keyframes so far: their stamps, poses by the odometry, and edges. Poses are of the camera."""
+    """The keyframes so far: their stamps, poses by the odometry, drives, and edges. Poses are of the camera."""
 
     stamps: list[float] = field(default_factory=list)
     odometry: list[np.ndarray] = field(default_factory=list)
+    drives: list[int] = field(default_factory=list)
     steps: list[Edge] = field(default_factory=list)
     loops: list[Loop] = field(default_factory=list)
 
@@ -104,21 +107,26 @@ class LoopCloser:
         if graph.stamps:
             back = graph.stamps[-1] - stamp
             another = back > ANOTHER_DRIVE_S
-            if another:
-                self.warn(f"the time goes back by {back:.1f} s, to {stamp:.6f}: another drive begins")
-                self.detector.begin_session()
-            elif back > 0:
+            if not another and back > 0:
                 self.warn(f"an image came late, {back:.3f} s before the one that was seen last; it is left out")
                 return []
-            elif not self._moved(relative_pose(graph.odometry[-1], pose)):
+            step = relative_pose(graph.odometry[-1], pose)
+            if another:
+                self.warn(f"the time goes back by {back:.1f} s, to {stamp:.6f}: another drive begins")
+            elif not self._moved(step):
                 return []
+            elif another := self._jumps(stamp, pose):
+                far = np.linalg.norm(step[:3])
+                self.warn(f"the odometry jumps by {far:.3g} m at {stamp:.6f}: another drive begins")
+            if another:
+                self.detector.begin_session()
         try:
             found = self.detector.add(image, stamp, odometry=pose)
         except InputError as fault:
             self.warn(f"the image at {stamp:.6f} is left out: {fault.message}")
             return []
-        number = found.query_id
-        measured = [self._measured(each.query_id, each.accepted, image, pose) for each in found.loops]
+        number, drive = found.query_id, (graph.drives[-1] if graph.drives else 0) + another
+        measured = [self._measured(each.query_id, each.accepted, image, (pose, drive)) for each in found.loops]
         loops = [loop for loop in measured if loop is not None]
         with self._lock:
             if number and not another:
@@ -126,6 +134,7 @@ class LoopCloser:
                 graph.steps.append(Edge(number - 1, number, step, information_of_step(step)))
             graph.stamps.append(stamp)
             graph.odometry.append(pose)
+            graph.drives.append(drive)
             graph.loops += loops
         if loops:
             self._new.set()
@@ -135,18 +144,27 @@ class LoopCloser:
         turn = float(Rotation.from_quat(step[3:]).magnitude())
         return float(np.linalg.norm(step[:3])) >= self.keyframes.step_m or turn >= self.keyframes.turn_rad
 
-    def _measured(self, query: int, match: int | None, image: np.ndarray, pose: np.ndarray) -> Loop | None:
-        """Measure a loop; ``image`` has the size of all images, ``pose`` is that of the newest keyframe."""
+    def _jumps(self, stamp: float, pose: np.ndarray) -> bool:
+        """Return whether the odometry was reset before the next keyframe."""
+        graph = self._graph
+        begin = max(graph.drives.index(graph.drives[-1]), len(graph.drives) - COMPARED)
+        path = np.array([*graph.odometry[begin:], pose])
+        return bool(jumps(path, np.array([*graph.stamps[begin:], stamp]))[-1])
+
+    def _measured(
+        self, query: int, match: int | None, image: np.ndarray, newest: tuple[np.ndarray, int]
+    ) -> Loop | None:
+        """Measure a loop; ``image`` has the size of all images, ``newest`` is the pose and drive of its keyframe."""
         assert match is not None
         camera = self.camera.of_size(image.shape[1], image.shape[0])
         first, second = (View(self.detector.local_features(frame), camera) for frame in (match, query))
         assert self.detector.check is not None
-        path = [*self._graph.odometry, pose]
+        path, drives = [*self._graph.odometry, newest[0]], [*self._graph.drives, newest[1]]
 
         def around(frame: int) -> Iterator[tuple[View, float]]:
             begin = max(0, frame - FARTHEST)
-            near = np.array(path[begin : frame + FARTHEST + 1])
-            for number, length in neighbors(near, frame - begin):
+            near = slice(begin, frame + FARTHEST + 1)
+            for number, length in neighbors(np.array(path[near]), frame - begin, np.array(drives[near])):
                 yield View(self.detector.local_features(begin + number), camera), length
 
         relative = measured((first, second), (around(match), around(query)), self.detector.check.matches)

@@ -21,7 +21,7 @@ from loopclosure.detector.map import SESSION, Map, Session
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.trajectory import Trajectory, write_trajectory
+from loopclosure.places.trajectory import Trajectory, pieces, write_trajectory
 from loopclosure.progress import Progress, silent
 from netspec.files.kinds import unreadable
 
@@ -96,7 +96,7 @@ def write_closed_map(out: Path, found: ClosedMap) -> None:
 
 def _measured(known: Map, starts: np.ndarray, path: np.ndarray, progress: Progress) -> list[Loop]:
     """Return the loops of all sessions with their relative poses, None where they cannot be measured."""
-    check = GeometricCheck()
+    check, drives = GeometricCheck(), pieces(path, starts=starts)
 
     def view(frame: int) -> View | None:
         session, own = known.session_of(frame)
@@ -107,7 +107,8 @@ def _measured(known: Map, starts: np.ndarray, path: np.ndarray, progress: Progre
     def around(frame: int) -> Iterator[tuple[View, float]]:
         number = int(_session_of([frame], starts)[0])
         begin = int(starts[number])
-        for near, length in neighbors(path[begin : starts[number + 1]], frame - begin):
+        own = slice(begin, int(starts[number + 1]))
+        for near, length in neighbors(path[own], frame - begin, drives[own]):
             beside = view(begin + near)
             if beside is not None:
                 yield beside, length

@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.online import ANOTHER_DRIVE_S
-from loopclosure.detector.export import relative_pose
+from loopclosure.places.trajectory import GAP_S, at
 from netspec import log
 
 KEPT_POSES, KEPT_IMAGES = 1000, 30
-
-
-def between(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
-    """Return the pose (7,) at a share, 0 to 1, of the way from one pose to another, at a constant speed."""
-    turn = Rotation.from_rotvec(share * Rotation.from_quat(relative_pose(first, second)[3:]).as_rotvec())
-    place = (1 - share) * first[:3] + share * second[:3]
-    return np.concatenate([place, (Rotation.from_quat(first[3:]) * turn).as_quat(canonical=True)])
 
 
 class Synchronizer:
@@ -31,7 +22,7 @@ class Synchronizer:
     warn   gets a sentence for each image that has no pose
     """
 
-    def __init__(self, gap_s: float = 0.5, warn: Callable[[str], None] = log.logger.warning) -> None:
+    def __init__(self, gap_s: float = GAP_S, warn: Callable[[str], None] = log.logger.warning) -> None:
         self.gap_s, self.warn = gap_s, warn
         self._stamps: list[float] = []
         self._poses: list[np.ndarray] = []
@@ -40,10 +31,12 @@ class Synchronizer:
     def odometry(self, stamp: float, pose: np.ndarray) -> None:
         """Add the pose (7,) of the robot at ``stamp`` seconds. A pose that comes late is left out.
 
-        If the time goes back, as where a recording starts again, the poses before are forgotten.
+        If the time goes back, as where a recording starts again, the poses and the images before are forgotten.
         """
         if self._stamps and stamp < self._stamps[-1] - ANOTHER_DRIVE_S:
             self._stamps, self._poses = [], []
+            near = [pair for pair in self._images if abs(pair[0] - stamp) < ANOTHER_DRIVE_S]
+            self._images = deque(near, KEPT_IMAGES)
         if not self._stamps or stamp > self._stamps[-1]:
             self._stamps.append(stamp)
             self._poses.append(np.asarray(pose, np.float64))
@@ -63,17 +56,9 @@ class Synchronizer:
             return None
         self._images = deque((pair for pair in self._images if pair[0] > self._stamps[-1]), KEPT_IMAGES)
         stamp, image = ready[-1]
-        pose = self._at(stamp)
-        if pose is None:
+        known = np.array(self._stamps[-KEPT_POSES:]), np.array(self._poses[-KEPT_POSES:])
+        pose = at(*known, np.array([stamp]), self.gap_s)[0]
+        if np.isnan(pose).any():
             self.warn(f"the image at {stamp:.6f} has no odometry within {self.gap_s:g} s; it is left out")
             return None
         return stamp, image, pose
-
-    def _at(self, stamp: float) -> np.ndarray | None:
-        after = bisect_left(self._stamps, stamp)
-        if self._stamps[after] == stamp:
-            return self._poses[after]
-        if not after or self._stamps[after] - self._stamps[after - 1] > self.gap_s:
-            return None
-        begin, end = self._stamps[after - 1 : after + 1]
-        return between(self._poses[after - 1], self._poses[after], (stamp - begin) / (end - begin))

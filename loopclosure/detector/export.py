@@ -57,7 +57,9 @@ class Sigmas:
         return np.diag([self.translation_m**-2] * 3 + [self.rotation_rad**-2] * 3)
 
 
-ODOMETRY_SIGMAS = Sigmas(0.05, 0.02)
+# The uncertainty of a step of the odometry: a share of its length or angle, and a constant in meters or radians.
+STEP_SHARE, STEP_M = 0.02, 0.002
+TURN_SHARE, TURN_RAD = 0.02, 0.002
 LOOP_SIGMAS = Sigmas(0.1, 0.05)
 
 
@@ -108,23 +110,36 @@ def write_loops_csv(
     write_csv(path, (*LOOPS, *columns), rows, "surrogateescape")
 
 
-def write_g2o(path: str | Path, poses: np.ndarray, loops: Sequence[LoopResult], relative: RelativePose) -> int:
+def information_of_step(step: np.ndarray) -> np.ndarray:
+    """Return the information (6, 6) of a step (7,) of the odometry."""
+    length, turn = float(np.linalg.norm(step[:3])), float(Rotation.from_quat(step[3:]).magnitude())
+    return Sigmas(STEP_SHARE * length + STEP_M, TURN_SHARE * turn + TURN_RAD).information()
+
+
+def write_g2o(
+    path: str | Path,
+    poses: np.ndarray,
+    loops: Sequence[LoopResult],
+    relative: RelativePose,
+    drives: np.ndarray | None = None,
+) -> int:
     """Write a pose graph; return how many loops were left out because their relative pose is not known.
 
     poses     (N, 7) poses of the frames, tx ty tz qx qy qz qw, as the robot estimates them; NaN if not known. They are
-              the vertices, and consecutive poses give the odometry edges.
+              the vertices, and consecutive poses of one drive give the odometry edges.
     relative  (query_id, match_id) -> pose (7,) of the query in the frame of the match and its information (6, 6), or
               None. It must be measured
               (by the images, depth, or motion capture), and never come from the robot's poses, because the loop is
               to correct their drift. Loops without it are left out.
+    drives    (N,) the piece of the path that each frame belongs to; None: all are of one
     """
     poses = np.asarray(poses, np.float64)
     known: list[int] = np.flatnonzero(np.all(np.isfinite(poses), axis=1)).tolist()
     if not known:
         raise InputError("no frame has a pose; a pose graph needs the poses of the frames")
-    edges = [
-        (a, b, relative_pose(poses[a], poses[b]), ODOMETRY_SIGMAS.information()) for a, b in itertools.pairwise(known)
-    ]
+    steps = [(a, b) for a, b in itertools.pairwise(known) if drives is None or drives[a] == drives[b]]
+    moves = [relative_pose(poses[a], poses[b]) for a, b in steps]
+    edges = [(a, b, move, information_of_step(move)) for (a, b), move in zip(steps, moves, strict=True)]
     left_out = 0
     with_pose = set(known)
     for loop in loops:

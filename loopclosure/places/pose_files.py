@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, associate, inverse
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, associate, at, inverse
 from netspec.files.table import TIME, UNITS, Row, Table, is_number, read_table
 
 EXPECTED = (
@@ -68,11 +68,13 @@ class PoseFile:
         stamps: np.ndarray | None,
         path: str | os.PathLike[str],
         max_difference: float = MAX_DIFFERENCE_S,
+        measured: bool = False,
     ) -> np.ndarray:
         """Return the poses (images, 7) of images with these stamps, NaN where none is within ``max_difference`` [s].
 
-        If the poses or the images have no stamps, pose i belongs to image i. Raises InputError if their numbers differ
-        then, or if no image has a pose.
+        ``measured``: the path of the robot by its odometry, in which a pose lies between two others. If the poses or
+        the images have no stamps, pose i belongs to image i. Raises InputError if their numbers differ then, or if no
+        image has a pose.
         """
         if self.stamps is None or stamps is None:
             if len(self.poses) != images:
@@ -81,15 +83,19 @@ class PoseFile:
                 raise InputError(f"{fault}, so pose i must be that of image i", path)
             return self.poses
         known = np.isfinite(self.poses).all(axis=1)
-        nearest = associate(stamps, self.stamps[known], max_difference)
-        if nearest.max() < 0:
+        if measured:
+            found = at(self.stamps[known], self.poses[known], stamps)
+        else:
+            nearest = associate(stamps, self.stamps[known], max_difference)
+            found = np.where(nearest[:, None] < 0, np.nan, self.poses[known][nearest])
+        if np.isnan(found).all():
             raise InputError(
-                f"none of {images} images has a pose within {max_difference:g} s: images from {stamps[0]:.3f} to "
+                f"none of {images} images has a pose: images from {stamps[0]:.3f} to "
                 f"{stamps[-1]:.3f} s, poses from {self.stamps[0]:.3f} to {self.stamps[-1]:.3f} s; if their unit is "
                 "another one, name it: timestamp [ns] in the first line, or pose-form=ns",
                 path,
             )
-        return np.where(nearest[:, None] < 0, np.nan, self.poses[known][nearest])
+        return found
 
 
 def pose_form(text: str) -> PoseForm:

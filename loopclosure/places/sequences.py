@@ -53,9 +53,51 @@ def read_sequence(
     sequence = _READERS[layout or layout_of(source)](source, max_difference, poses is None)
     if poses is None:
         return sequence
-    read = read_poses(poses.path, poses.form)
-    found = read.of_images(len(sequence), sequence.stamps, poses.path, max_difference)
-    return replace(sequence, poses=found, doubts=(*sequence.doubts, *_named(read.doubts, poses.path)))
+    found, doubts = _chosen(sequence, poses, max_difference)
+    return replace(sequence, poses=found, doubts=(*sequence.doubts, *doubts))
+
+
+def with_odometry(sequence: ImageSequence, odometry: PoseChoice) -> ImageSequence:
+    """Return a sequence with the path of the robot in a file. Raises InputError if it cannot be read."""
+    found, doubts = _chosen(sequence, odometry, measured=True)
+    return replace(sequence, odometry=found, doubts=(*sequence.doubts, *doubts))
+
+
+def _chosen(
+    sequence: ImageSequence, choice: PoseChoice, max_difference: float = MAX_DIFFERENCE_S, measured: bool = False
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the poses (N, 7) of the camera in a file that the user named, wherever it lies, and doubts about them."""
+    read = read_poses(choice.path, choice.form)
+    found = read.of_images(len(sequence), sequence.stamps, choice.path, max_difference, measured)
+    if read.form == layout_of(sequence.source):
+        found = moved(found, _camera_in_body(sequence.source))
+    return found, _named(read.doubts, choice.path)
+
+
+def _camera_in_body(source: Path) -> np.ndarray:
+    """Return the pose (4, 4) of the camera of an EuRoC or KITTI sequence in the frame of its poses.
+
+    Raises InputError if its calibration cannot be read.
+    """
+    mount, calibration = np.eye(4), source / "calib.txt"
+    sensor = _cam0(source) / "sensor.yaml"
+    if sensor.is_file():
+        mount = np.array(yaml_numbers(_calibration(sensor), "data", 16, sensor)).reshape(4, 4)
+        if fault := matrix_fault(mount[:3, :3]):
+            raise InputError(f"the camera's pose in the body, T_BS: {fault}", sensor)
+    elif calibration.is_file():
+        matrix = kitti_projection(_calibration(calibration), _projection(source), calibration)
+        mount[:3, 3] = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    return mount
+
+
+def _cam0(source: Path) -> Path:
+    return (source / "mav0" if (source / "mav0").is_dir() else source) / "cam0"
+
+
+def _projection(source: Path) -> str:
+    """Return the name of the projection of the camera of a KITTI sequence that is used, P0 to P3."""
+    return f"P{next(name for name in KITTI_CAMERAS if (source / name).is_dir())[-1]}"
 
 
 def layout_of(source: Path, otherwise: str = "images") -> str:
@@ -112,7 +154,10 @@ def _with_tum_files(
     if own_poses:
         sequence = _with_poses(sequence, folder / GROUNDTRUTH, "tum", max_difference)
     if (folder / ODOMETRY).is_file():
-        sequence = _with_odometry(sequence, folder / ODOMETRY, max_difference)
+        try:
+            sequence = with_odometry(sequence, PoseChoice(folder / ODOMETRY, PoseForm("tum")))
+        except InputError as fault:
+            sequence = replace(sequence, doubts=(*sequence.doubts, f"{fault}; the odometry is not used"))
     if (folder / "depth.txt").is_file():
         try:
             sequence = replace(sequence, depths=_nearest_depths(folder / "depth.txt", stamps, max_difference))
@@ -123,31 +168,13 @@ def _with_tum_files(
     return sequence
 
 
-def _with_poses(
-    sequence: ImageSequence, path: Path, form: str, max_difference: float, mount: np.ndarray | None = None
-) -> ImageSequence:
-    """Add the poses in a file of a sequence; ``mount`` (4, 4): the camera in the frame whose poses the file has.
-
-    If the file cannot be read, the sequence has no poses, and its ``pose_fault`` says why.
-    """
+def _with_poses(sequence: ImageSequence, path: Path, form: str, max_difference: float) -> ImageSequence:
+    """Add the poses in a file of a sequence. If it cannot be read, there are none, and ``pose_fault`` says why."""
     try:
-        read = read_poses(path, PoseForm(form))
-        found = read.of_images(len(sequence), sequence.stamps, path, max_difference)
+        found, doubts = _chosen(sequence, PoseChoice(path, PoseForm(form)), max_difference)
     except InputError as fault:
         return replace(sequence, pose_fault=fault)
-    if mount is not None:
-        found = moved(found, mount)
-    return replace(sequence, poses=found, doubts=(*sequence.doubts, *_named(read.doubts, path)))
-
-
-def _with_odometry(sequence: ImageSequence, path: Path, max_difference: float) -> ImageSequence:
-    """Add the odometry in a file of a sequence; a sentence about the file if it cannot be used."""
-    try:
-        read = read_poses(path, PoseForm("tum"))
-        found = read.of_images(len(sequence), sequence.stamps, path, max_difference)
-    except InputError as fault:
-        return replace(sequence, doubts=(*sequence.doubts, f"{fault}; the odometry is not used"))
-    return replace(sequence, odometry=found, doubts=(*sequence.doubts, *_named(read.doubts, path)))
+    return replace(sequence, poses=found, doubts=(*sequence.doubts, *doubts))
 
 
 def _with_camera(sequence: ImageSequence, path: Path, projection: str = "") -> ImageSequence:
@@ -182,8 +209,8 @@ def _images(source: Path, max_difference: float, own_poses: bool) -> ImageSequen
 
 def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequence:
     """Read EuRoC MAV and TUM-VI (Burri et al., IJRR 2016): the left camera; its poses are computed from the body's."""
-    base = folder / "mav0" if (folder / "mav0").is_dir() else folder
-    listing = base / "cam0" / "data.csv"
+    listing = _cam0(folder) / "data.csv"
+    base = listing.parent.parent
     if not listing.is_file():
         expected = "expected an EuRoC sequence, a folder with mav0/cam0/data.csv"
         raise InputError(f"no such file; {expected}{nearest_existing(listing)}", listing)
@@ -204,21 +231,7 @@ def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
         sequence = _with_camera(sequence, sensor)
     paths = [base / name / "data.csv" for name in EUROC_POSES]
     path = next((path for path in paths if path.is_file()), None)
-    if not own_poses or path is None:
-        return sequence
-    try:
-        mount = _mount(sensor) if sensor.is_file() else np.eye(4)
-    except InputError as fault:
-        return replace(sequence, pose_fault=fault)
-    return _with_poses(sequence, path, "euroc", max_difference, mount)
-
-
-def _mount(sensor: Path) -> np.ndarray:
-    """Return the pose of the camera in the body (4, 4) from a ``sensor.yaml``. Raises InputError if it is not one."""
-    mount = np.array(yaml_numbers(_calibration(sensor), "data", 16, sensor)).reshape(4, 4)
-    if fault := matrix_fault(mount[:3, :3]):
-        raise InputError(f"the camera's pose in the body, T_BS: {fault}", sensor)
-    return mount
+    return _with_poses(sequence, path, "euroc", max_difference) if own_poses and path else sequence
 
 
 def _calibration(path: Path) -> str:
@@ -245,21 +258,11 @@ def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
         if len(times) != len(images):
             raise InputError(f"has {len(times)} times, but there are {len(images)} images", folder / "times.txt")
     sequence = ImageSequence(images, _names(images, folder), times, folder)
-    calibration, projection = folder / "calib.txt", f"P{cameras[0][-1]}"
-    if calibration.is_file():
-        sequence = _with_camera(sequence, calibration, projection)
+    if (folder / "calib.txt").is_file():
+        sequence = _with_camera(sequence, folder / "calib.txt", _projection(folder))
     paths = (folder / "poses.txt", folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt")
     path = next((path for path in paths if path.is_file()), None)
-    if not own_poses or path is None:
-        return sequence
-    mount = np.eye(4)
-    try:
-        if calibration.is_file():
-            matrix = kitti_projection(_calibration(calibration), projection, calibration)
-            mount[:3, 3] = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
-    except InputError as fault:
-        return replace(sequence, pose_fault=fault)
-    return _with_poses(sequence, path, "kitti", max_difference, mount)
+    return _with_poses(sequence, path, "kitti", max_difference) if own_poses and path else sequence
 
 
 def _video(source: Path, max_difference: float, own_poses: bool) -> ImageSequence:

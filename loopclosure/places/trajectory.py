@@ -7,7 +7,7 @@ looks along its +z, x to the right, y down. Stamps are in seconds.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,9 @@ from netspec.files.whole_file import write_whole
 # TUM's associate.py allows 0.02 s; with 30 Hz images and 100 Hz motion capture, 0.03 s does no harm.
 MAX_DIFFERENCE_S = 0.03
 GAP_S = 0.5  # no pose is taken between two that are further apart
+# A step is a jump if it is longer than this, and so many times as fast as nine of ten others. Moves below LEAST_M are
+# noise of a robot that stands.
+JUMP_M, JUMP_FACTOR, LEAST_M = 0.5, 10.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,51 @@ def moved(poses: np.ndarray, mount: np.ndarray) -> np.ndarray:
     positions = poses[known, :3] + turns.apply(mount[:3, 3])
     there[known] = np.hstack([positions, (turns * Rotation.from_matrix(mount[:3, :3])).as_quat(canonical=True)])
     return there
+
+
+def jumps(poses: np.ndarray, stamps: np.ndarray | None = None) -> np.ndarray:
+    """Return which steps (N - 1,) between poses (N, 7) are jumps: of an odometry that was reset, or to another drive.
+
+    Without ``stamps`` (N,), all steps take the same time. A stamp that goes back begins another drive.
+    """
+    lengths = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+    timed = stamps is not None and bool(np.isfinite(stamps).all())
+    times = np.diff(stamps) if timed and stamps is not None else np.ones(len(lengths))
+    speeds = lengths / np.maximum(times, 1e-3)
+    moving = speeds[lengths > LEAST_M]
+    usual = np.percentile(moving, 90 if len(moving) >= 10 else 50, method="lower") if len(moving) else 0.0
+    return (times < 0) | ((lengths > JUMP_M) & (speeds > JUMP_FACTOR * usual))
+
+
+def pieces(poses: np.ndarray, stamps: np.ndarray | None = None, starts: Sequence[int] | np.ndarray = ()) -> np.ndarray:
+    """Return the number (N,) of the piece of a path (N, 7) that each frame belongs to; a jump separates two pieces.
+
+    Poses may be NaN. ``starts`` are the first frames of drives, if there are several.
+    """
+    known = np.flatnonzero(np.isfinite(poses).all(axis=1))
+    begins = np.zeros(len(poses), int)
+    begins[known[1:]] = jumps(poses[known], None if stamps is None else stamps[known])
+    begins[[start for start in starts if 0 < start < len(poses)]] = 1
+    return np.cumsum(begins)
+
+
+def at(stamps: np.ndarray, poses: np.ndarray, times: np.ndarray, gap_s: float = GAP_S) -> np.ndarray:
+    """Return the poses (M, 7) at ``times`` (M,) of a path with ascending ``stamps`` (N,) and poses (N, 7).
+
+    Between two poses, the motion has a constant speed. A time is NaN if it is before the first pose or after the last
+    one, or between two that are more than ``gap_s`` seconds or a jump apart.
+    """
+    after = np.searchsorted(stamps, times).clip(0, len(stamps) - 1)
+    before = np.where(stamps[after] == times, after, (after - 1).clip(0))
+    gap = np.append(0, np.cumsum(jumps(poses, stamps)))
+    inside = (stamps[before] <= times) & (times <= stamps[after]) & (stamps[after] - stamps[before] <= gap_s)
+    inside &= gap[before] == gap[after]
+    first, second = poses[before], poses[after]
+    share = ((times - stamps[before]) / np.where(after > before, stamps[after] - stamps[before], 1))[:, None]
+    begin = Rotation.from_quat(first[:, 3:])
+    turn = Rotation.from_rotvec(share * (begin.inv() * Rotation.from_quat(second[:, 3:])).as_rotvec())
+    found = np.hstack([(1 - share) * first[:, :3] + share * second[:, :3], (begin * turn).as_quat(canonical=True)])
+    return np.where(inside[:, None], found, np.nan)
 
 
 def associate(

@@ -12,7 +12,9 @@ import pytest
 
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.cli import main
+from loopclosure.closing.close import close as close_path
 from loopclosure.closing.measure import Loop, measure, read_loops
+from loopclosure.closing.relative import METRIC, Relative
 from loopclosure.detector.export import relative_pose
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
@@ -208,6 +210,17 @@ def test_missing_loops_are_reported_with_a_limit(tmp_path: Path, monkeypatch: py
     assert str(fault.value) == f"{expected}; relative paths start from {tmp_path}"
     with pytest.raises(InputError, match=f'; "{tmp_path}" has no "gone"$'):
         read_loops(tmp_path / "gone" / "loops.csv", ImageSequence.of_files([Path("a.png")]))
+
+
+def test_what_is_left_out_has_its_own_reason() -> None:
+    path = np.tile([0, 0, 0, 0, 0, 0, 1.0], (30, 1))
+    path[:, 0] = np.arange(30)
+    path[20:, 0] += 500  # a reset
+    path[1:10:2] = np.nan
+    one = Relative(np.array([0, 0, 0, 0, 0, 0, 1.0]), METRIC, 200, 1e-4 * np.eye(6), "depth")
+    closed = close_path(path, [Loop(8, 0, one), Loop(5, 0, one), Loop(6, 3, one), Loop(6, 0)])
+    assert (len(closed.loops), closed.no_path, closed.not_measured, closed.gaps) == (1, 2, 1, 1)
+    assert (19, 20) not in {(closed.frames[step.first], closed.frames[step.second]) for step in closed.steps}
 
 
 def test_a_loop_of_an_image_that_cannot_be_read_is_not_measured(walk: Path, tmp_path: Path) -> None:

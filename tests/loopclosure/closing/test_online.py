@@ -18,7 +18,7 @@ from loopclosure.closing.graph import Solution, solve
 from loopclosure.closing.measure import CHECK, Loop
 from loopclosure.closing.online import STILL, UNKNOWN, Keyframes, LoopCloser, after
 from loopclosure.closing.relative import METRIC, ROTATION_ONLY, Relative
-from loopclosure.closing.synchronizer import Synchronizer, between
+from loopclosure.closing.synchronizer import Synchronizer
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import LOOP_SIGMAS, relative_pose
@@ -227,8 +227,14 @@ def test_when_the_time_goes_back_the_poses_before_are_forgotten() -> None:
     assert not said
 
 
-def test_half_of_a_turn_beyond_180_degrees() -> None:
-    np.testing.assert_allclose(np.abs(between(at(0, 170), at(1, -170), 0.5)), np.abs(at(0.5, 180)), atol=1e-9)
+def test_an_image_of_the_last_drive_gets_no_pose_of_the_next() -> None:
+    joined = Synchronizer()
+    for stamp in np.arange(0, 10, 0.1):
+        joined.odometry(stamp, at(stamp))
+    joined.image(10.05, "of the first drive")
+    for stamp in np.arange(0, 10.3, 0.1):
+        joined.odometry(stamp, at(100 + stamp))
+        assert joined.newest() is None
 
 
 def picture(seed: int) -> np.ndarray:
@@ -285,6 +291,16 @@ def test_another_drive_is_no_step_of_the_odometry_and_is_joined_by_its_loops() -
     assert closed.accepted.all()
     turns = relative_pose(closed.poses[:3], closed.poses[3:])
     np.testing.assert_allclose(turns[:, 3:], np.tile(STILL[3:], (3, 1)), atol=0.02)
+
+
+def test_a_jump_of_the_odometry_begins_another_drive() -> None:
+    said: list[str] = []
+    closer = closer_of(warn=said.append)
+    for number, x in enumerate([49.5, 49.75, 50.0, 0.0, 0.25]):
+        closer.add(picture(number), 100 + 0.1 * number, at(x))
+    assert len(said) == 1
+    assert [(step.first, step.second) for step in closer.closed().steps] == [(0, 1), (1, 2), (3, 4)]
+    assert closer.detector.sessions == [0, 3]
 
 
 def test_images_do_not_wait_for_a_solution(monkeypatch: pytest.MonkeyPatch) -> None:

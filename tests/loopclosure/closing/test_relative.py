@@ -224,10 +224,11 @@ def test_neighbors_are_a_step_away_by_the_odometry() -> None:
     odometry = np.zeros((30, 7))
     odometry[:, 0] = 0.061 * np.arange(30)
     odometry[4] = np.nan
-    assert [number for number, _ in neighbors(odometry, 6)] == [1, 11, 3, 8]
-    assert dict(neighbors(odometry, 6))[1] == pytest.approx(0.305)
-    assert neighbors(np.zeros((30, 7)), 6) == []
-    assert neighbors(odometry, 4) == []
+    assert [number for number, _ in neighbors(odometry, 6, np.zeros(30))] == [1, 11, 3, 8]
+    assert [number for number, _ in neighbors(odometry, 6, np.arange(30) // 6)] == [11, 8]
+    assert dict(neighbors(odometry, 6, np.zeros(30)))[1] == pytest.approx(0.305)
+    assert neighbors(np.zeros((30, 7)), 6, np.zeros(30)) == []
+    assert neighbors(odometry, 4, np.zeros(30)) == []
 
 
 def test_a_measured_loop_is_a_row_of_the_table_and_judged_by_true_poses() -> None:

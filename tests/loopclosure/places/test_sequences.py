@@ -12,7 +12,7 @@ from loopclosure.errors import InputError
 from loopclosure.places.datasets import load_sequence, load_traverses
 from loopclosure.places.frames import Selection
 from loopclosure.places.masks import read_matches
-from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_sequence
+from loopclosure.places.sequences import PoseChoice, benchmark_parts, layout_of, read_sequence, with_odometry
 from loopclosure.places.source import extract
 from loopclosure.places.truth import Exclusion
 from places_layouts import (
@@ -182,6 +182,18 @@ def test_a_file_of_poses_replaces_the_sequences_poses(tmp_path: Path) -> None:
     sequence = read_sequence(folder, poses=PoseChoice(poses))
     assert (len(sequence), len(sequence.with_poses())) == (48, 30)
     assert sequence.with_poses().names[29] == "image_0/000029.png"
+
+
+@pytest.mark.parametrize(
+    ("write", "name"), [(write_euroc, "mav0/state_groundtruth_estimate0/data.csv"), (write_kitti, "../../poses/07.txt")]
+)
+def test_poses_are_the_cameras_wherever_they_lie(write: Callable[[Path], Path], name: str, tmp_path: Path) -> None:
+    folder = write(tmp_path)
+    sequence = read_sequence(folder)
+    moved_away = PoseChoice((folder / name).resolve().rename(tmp_path / "poses"))
+    for found in (read_sequence(folder, poses=moved_away).poses, with_odometry(sequence, moved_away).odometry):
+        assert found is not None
+        np.testing.assert_array_equal(found, sequence.poses)
 
 
 def test_a_video_is_extracted_once(tmp_path: Path) -> None:

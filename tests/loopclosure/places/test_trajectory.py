@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
 from loopclosure.places.pose_files import read_poses
@@ -11,6 +12,8 @@ from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import (
     Trajectory,
     associate,
+    at,
+    pieces,
     write_rgb_list,
     write_trajectory,
 )
@@ -77,6 +80,44 @@ def test_associate_chooses_the_nearest_pose_within_the_limit() -> None:
     frames = np.array([0.5, 0.98, 1.02, 1.51, 2.49, 3.0, 3.03, 3.2])
     assert associate(frames, stamps, 0.05).tolist() == [-1, 0, 0, -1, -1, 2, 2, -1]
     assert associate(frames, stamps, 1.0).tolist() == [0, 0, 0, 1, 1, 2, 2, 2]
+
+
+def path_at(*x: float) -> np.ndarray:
+    poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(x), 1))
+    poses[:, 0] = x
+    return poses
+
+
+def test_between_two_poses_the_speed_is_constant() -> None:
+    poses = path_at(0, 1)
+    poses[:, 3:] = Rotation.from_rotvec(np.radians([[0, 0, 170], [0, 0, -170]])).as_quat()
+    found = at(np.array([10.0, 10.4]), poses, np.array([9.9, 10.0, 10.1, 10.2, 10.4, 10.5]))
+    np.testing.assert_allclose(found[:, 0], [np.nan, 0, 0.25, 0.5, 1, np.nan])
+    turns = Rotation.from_quat(found[1:5, 3:]).as_euler("xyz", degrees=True)[:, 2]
+    np.testing.assert_allclose(turns % 360, [170, 175, 180, 190])
+
+
+def test_no_pose_lies_in_a_gap_or_a_jump() -> None:
+    stamps = np.array([0, 0.1, 0.2, 2, 2.1, 2.2, 2.3])
+    found = at(stamps, path_at(0, 0.1, 0.2, 2, 2.1, 40, 40.1), np.array([0.15, 1.0, 2.05, 2.15, 2.25]))
+    np.testing.assert_allclose(found[:, 0], [0.15, np.nan, 2.05, np.nan, 40.05])
+
+
+@pytest.mark.parametrize(
+    ("x", "stamps", "expected"),
+    [
+        pytest.param([49.5, 49.75, 50, 0, 0.25], [0, 0.1, 0.2, 0.3, 0.4], [3], id="reset"),
+        pytest.param([0, 0, 0, 0, 1, 2, 3, 3, 3], None, [], id="stands and goes"),
+        pytest.param([0, 0.1, 0.2, 0.3, 0.4], [0, 0.1, 0.2, -50, -49.9], [3], id="time goes back"),
+        pytest.param([0, 1, 2, 30, 31], [0, 1, 2, 30, 31], [], id="a pause of the camera"),
+        pytest.param([0, 1, np.nan, np.nan, 4, 5, 60], None, [6], id="without odometry"),
+        pytest.param([0, 1e-4, 0, 1e-4, 0, 0.4, 0.8], None, [], id="noise"),
+    ],
+)
+def test_a_jump_separates_two_pieces(x: list[float], stamps: list[float] | None, expected: list[int]) -> None:
+    found = pieces(path_at(*x), None if stamps is None else np.array(stamps))
+    assert np.flatnonzero(np.diff(found, prepend=0)).tolist() == expected
+    assert pieces(path_at(*x), starts=[0, 2])[2] == pieces(path_at(*x), starts=[0, 2])[1] + 1
 
 
 def test_frames_without_a_pose_are_counted_and_omitted(tmp_path: Path) -> None:
