@@ -39,10 +39,7 @@ def parser() -> Parser:
     _add_forward(commands)
     _add_train(commands)
     _add_whole(commands)
-    _add_fast(commands)
     _add_growth(commands)
-    _add_feeding(commands)
-    _add_settings(commands)
     _add_revisits(commands)
     _add_tables(commands)
     _add_pages(commands)
@@ -106,25 +103,6 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--work", type=Path, required=True, metavar="FOLDER", help="folder for images, descriptors and results"
     )
-
-
-def _add_settings(commands: Commands) -> None:
-    parser = commands.add_parser("settings", help="evaluate loopclosure's method auto on drives with known loops")
-    parser.set_defaults(function=_settings)
-    _add_data(parser)
-    parser.add_argument("families", nargs="*", metavar="FAMILY", help="families of drives to evaluate (default: all)")
-    parser.add_argument(
-        "--halves", action="store_true", help="also print the results for each half of the roads and rooms"
-    )
-
-
-def _settings(arguments: argparse.Namespace) -> None:
-    from benchmarks.settings import halves, run, summary
-
-    results = run(arguments.data, arguments.work, arguments.families, partial(print, flush=True))
-    if arguments.halves:
-        print(halves(results))
-    print(summary(results))
 
 
 def _add_revisits(commands: Commands) -> None:
@@ -217,25 +195,8 @@ def _train(arguments: argparse.Namespace) -> None:
     _compare(arguments, training_case, training=True, device=arguments.device)
 
 
-def _add_feeding(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "feeding", help="measure how long trainings wait for data from databases and image files"
-    )
-    parser.set_defaults(function=_feeding)
-    _add_nets(parser)
-    parser.add_argument("--batch", type=int, default=4, help="batch size (default: 4)")
-    parser.add_argument("--threads", type=int, default=2, help="threads of the training (default: 2)")
-    _add_json(parser)
-
-
-def _feeding(arguments: argparse.Namespace) -> None:
-    from benchmarks.feeding import measure
-
-    _keep(arguments, measure(arguments.nets, arguments.batch, arguments.threads, partial(print, flush=True)))
-
-
 def _add_growth(commands: Commands) -> None:
-    parser = commands.add_parser("growth", help="measure how time and memory grow with layers, pairs or frames")
+    parser = commands.add_parser("growth", help="measure how time and memory grow with layers or frames")
     parser.set_defaults(function=_growth)
     parser.add_argument("kind", choices=KINDS, help="what to increase")
     parser.add_argument(
@@ -278,32 +239,6 @@ def _whole(arguments: argparse.Namespace) -> None:
         return measure(arguments.names or WHOLE, How(arguments.threads, arguments.rounds, separate_python))
 
     _report(arguments, rows)
-
-
-def _add_fast(commands: Commands) -> None:
-    parser = commands.add_parser("fast", help="time nets with and without each part of netspec/fast, in one thread")
-    parser.set_defaults(function=_fast)
-    parser.add_argument(
-        "nets", nargs="*", metavar="NET", help="nets of the catalog, or prototxts (default: nets that people run)"
-    )
-    parser.add_argument("--pairs", type=int, default=21, help="most pairs of turns for each part (default: 21)")
-    parser.add_argument(
-        "--seconds", type=float, default=8, help="time limit for each part; 5 pairs are run (default: 8)"
-    )
-    _add_json(parser)
-
-
-def _fast(arguments: argparse.Namespace) -> None:
-    import torch
-
-    from benchmarks import fast
-
-    torch.set_num_threads(1)
-    rows: list[dict[str, Any]] = []
-    for row in fast.measure(arguments.nets, fast.Limits(arguments.pairs, arguments.seconds)):
-        print("{what} {net} {batch}: {part} {CPU ms:.3g} ms, {without / with:.3f}".format(**row), flush=True)
-        rows.append(row)
-        _keep(arguments, rows)
 
 
 def _compare(

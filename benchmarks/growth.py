@@ -1,4 +1,4 @@
-"""Measures how cost grows with layers, the batch, pairs in a database, or frames of a sequence.
+"""Measures how cost grows with layers or frames of a sequence.
 
 Each size is measured in a separate process, ``python -m benchmarks.growth KIND SIZE``, to get its peak memory. Times
 are CPU times of one thread, which other load hardly changes.
@@ -6,7 +6,6 @@ are CPU times of one thread, which other load hardly changes.
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import subprocess
@@ -36,12 +35,10 @@ layer {{ name: "relu{i}" type: "ReLU" bottom: "x{k}" top: "x{k}" }}"""
 DATA = 'layer { name: "data" type: "Input" top: "x0" input_param { shape { dim: 1 dim: 4 dim: 8 dim: 8 } } }'
 LOSS = """
 layer {{ name: "loss" type: "Reduction" bottom: "x{i}" top: "loss" loss_weight: 1 }}"""
-TRAINED = "small/siamese_resnet27_256"
 WALK = 300  # frames; more descriptors are made by perturbing theirs
 COMPONENTS = 256  # of a descriptor
 QUERIES, AT_ONCE = 50, 4096  # frames searched for, and added at a time
 SAME_PLACE = 0.3  # distance of two descriptors of one place, as a share of that of two places
-LAP, IN_MEMORY = 40, 100  # images of a lap, and frames that the detector keeps in memory
 
 
 def residual_net(layers: int) -> str:
@@ -82,52 +79,6 @@ def layers(size: int) -> Found:
     }
 
 
-def batch(size: int) -> Found:
-    """Train the paper's small ResNet with ``size`` pairs per iteration."""
-    import torch
-
-    import netspec
-    from benchmarks.case import training_case
-
-    torch.set_num_threads(1)
-    with training_case(TRAINED, size) as case:
-        _forget_peak()
-        solver = netspec.load_solver(case.solver, case.caffemodel, device="cpu")
-        solver.step(1)
-        spent = _least(lambda: solver.step(1), 3)
-        solver.close()
-    return {"iteration, s": spent, "iteration, ms per pair": 1e3 * spent / size}
-
-
-def pairs(size: int) -> Found:
-    """Write and read an LMDB of ``size`` pairs of images of 16x16."""
-    from netspec.data.database import Writer, open_reader
-    from netspec.data.datum import array_to_datum
-
-    datum = array_to_datum(np.random.default_rng(0).integers(0, 256, (6, 16, 16), np.uint8), 1).SerializeToString()
-    with TemporaryDirectory(prefix="growth-") as folder:
-        path = str(Path(folder) / "pairs")
-        start = time.process_time()
-        with Writer(path) as writer:
-            for k in range(size):
-                writer.put(b"%08d" % k, datum)
-        written = time.process_time() - start
-        stored = sum(file.stat().st_size for file in Path(path).iterdir())
-        start = time.process_time()
-        reader = open_reader(path)
-        opened = time.process_time() - start
-        start = time.process_time()
-        for k in range(size):
-            reader.record(k)
-        read = time.process_time() - start
-    return {
-        "opening, ms": 1e3 * opened,
-        "writing, us per pair": 1e6 * written / size,
-        "reading, us per pair": 1e6 * read / size,
-        "file, bytes per pair": stored / size,
-    }
-
-
 def frames(size: int) -> Found:
     """Search ``size`` descriptors of the default net as a detector does, exactly and by FAISS."""
     from loopclosure.detector.detector import LoopDetector
@@ -155,38 +106,6 @@ def frames(size: int) -> Found:
         found["FAISS, share of best matches found"] = float(np.mean([a[0] == b[0] for a, b in pairs]))
         found["FAISS, share of best five found"] = float(np.mean([len({*a} & {*b}) / len(a) for a, b in pairs]))
     return found
-
-
-def keyframes(size: int) -> Found:
-    """Add images of 640x480 to a detector that has ``size`` frames: net, points, search and check."""
-    from lmdb_build.walk.sequence import Walk, write_walk
-    from loopclosure.detector.detector import LoopDetector
-    from loopclosure.detector.frames import Points
-    from loopclosure.detector.verification import GeometricCheck
-    from loopclosure.places.frames import read_bgr
-    from netspec.inspect.features.shipped import default
-
-    describe, check, random = default(), GeometricCheck(), np.random.default_rng(0)
-    with TemporaryDirectory(prefix="growth-") as folder:
-        walk = Walk(frames=2 * LAP, width=640, height=480, laps=2)
-        first, again = np.split(np.array([read_bgr(file) for file in write_walk(Path(folder) / "walk", walk)]), 2)
-    rows, local = np.array([describe(image) for image in first]), [check.describe(image) for image in first]
-    detector = LoopDetector(describe, check=check, in_memory=IN_MEMORY, exclude_recent=0)
-    for begin in range(0, size, LAP):  # each block of frames is that lap, with other descriptors
-        count = min(LAP, size - begin)
-        ends = np.cumsum([len(each.points) for each in local[:count]])
-        parts = (np.concatenate([getattr(each, name) for each in local[:count]]) for name in ("points", "descriptors"))
-        no_poses = {"stamps": np.full(count, np.nan), "poses": np.full((count, 7), np.nan)}
-        points = Points(np.tile([640, 480], (count, 1)), ends, *parts)
-        detector.take_session([perturbed(rows, count, random)], no_poses, points)
-    detector.begin_session()
-    detector.add(again[0])  # warm-up
-    spent = []
-    for image in again[1:]:
-        start = time.process_time()
-        detector.add(image)
-        spent.append(time.process_time() - start)
-    return {"add, ms": 1e3 * float(np.median(spent)), "add, slowest, ms": 1e3 * max(spent)}
 
 
 def described_walk(frames: int) -> np.ndarray:
@@ -224,10 +143,7 @@ class Kind:
 
 KINDS: Mapping[str, Kind] = {
     "layers": Kind("layers", (125, 250, 500, 1000, 2000), layers),
-    "batch": Kind("pairs per iteration", (1, 2, 4, 8, 16, 32, 64), batch),
-    "pairs": Kind("pairs in an LMDB", (1000, 10_000, 100_000, 1_000_000), pairs),
     "frames": Kind("frames", (1000, 10_000, 100_000, 1_000_000), frames),
-    "keyframes": Kind("frames in the detector", (100, 1000, 10_000), keyframes),
 }
 
 
@@ -296,13 +212,6 @@ def _peak() -> float:
         return float("nan")
     (line,) = (line for line in status.splitlines() if line.startswith("VmHWM:"))
     return int(line.split()[1]) / 1e3
-
-
-def _forget_peak() -> None:
-    """Return freed memory to the system and reset the peak memory, if the system supports it."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).malloc_trim(0)
-        Path("/proc/self/clear_refs").write_text("5")
 
 
 def _number(value: float) -> str:

@@ -1,8 +1,7 @@
 """Measures what loopclosure finds on real drives that come back, and on drives that do not: ``tools/bench revisits``.
 
 Each drive is decided as ``detect`` decides it, frame by frame as ``LoopDetector`` does, and in thirds: each third of a
-drive is asked of the other two, as ``map query`` does. Nothing is warped, relit or rendered here; for drives that are,
-see :mod:`benchmarks.drives`.
+drive is asked of the other two, as ``map query`` does. Nothing is warped, relit or rendered.
 """
 
 from __future__ import annotations
@@ -17,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks import results
-from benchmarks.drives import GAP, NEAR, OVERLAP, SOFT_DEG
+from benchmarks.cache import Cache
 from benchmarks.pages import RESULTS
-from benchmarks.settings import Cache
 from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.verification import Agreement, Between, GeometricCheck, LocalFeatures, Pairs
@@ -33,6 +31,9 @@ from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_pl
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import Poses
 
+GAP = 30  # frames nearer than this in one drive are not a loop
+NEAR, OVERLAP = 1, 4  # frames of one route: the same place, and views that overlap
+SOFT_DEG = 45.0  # views of one place (2 m) with a smaller angle are not a mistake
 FIRST = ("kitchen", "fr1_rpy", "nordland_1", "tower, floors 3 to 12")  # drives with these names were chosen on
 FIRST_ONLINE = (*FIRST, "road: ")  # the online detector's last rules were added after two of the roads had wrong loops
 OVERLAPS = 0.25, 0.05  # of the footprint of a drone's image that another sees: the same place, and no mistake

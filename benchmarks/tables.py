@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks import results
-from benchmarks.drives import walked
+from benchmarks.cache import Cache
 from benchmarks.pages import RESULTS
-from benchmarks.settings import Cache
-from lmdb_build.walk.sequence import Walk
+from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.evaluate import Outcome, judge
 from loopclosure.methods.base import MethodContext
 from loopclosure.methods.named import make_method
@@ -66,6 +65,15 @@ TABLES = {
     "recall": [name for name in METHODS if any(word in name for word in ("ORB", "FAB-MAP", "net"))],
 }
 AUTO = "auto, on the net"
+
+
+def walked(work: Path, walk: Walk) -> Path:
+    """Return the folder of a synthetic walk in ``work``."""
+    folder = work / f"walk_{walk.seed}_{walk.width}"
+    if not (folder / "rgb.txt").exists():
+        for _ in write_walk(folder, walk):
+            pass
+    return folder
 
 
 def data_set(name: str, data: Path, work: Path) -> DataSet:

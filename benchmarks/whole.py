@@ -16,7 +16,6 @@ import numpy as np
 from benchmarks.case import DECAY, MOMENTUM, RATE, Case, calm, randomize, training_case
 from benchmarks.compare import python_of, rows_of_times
 from benchmarks.detectors import HEADS, SOURCES, mtcnn, ssd300
-from benchmarks.feeding import FILE_SIZE, smooth_noise
 from benchmarks.report import Row
 from benchmarks.rounds import Command, Contestant, Pass, Worker
 from benchmarks.zoo import deploy
@@ -118,8 +117,9 @@ def _pictures(folder: Path, count: int) -> list[str]:
 
     random = np.random.default_rng(0)
     files = [str(folder / f"{k}.jpg") for k in range(count)]
-    for path in files:
-        cv2.imwrite(path, smooth_noise(random, 3, *FILE_SIZE))
+    for path in files:  # smooth noise: as many bytes as a photograph of 640x480
+        coarse = random.integers(0, 256, (60, 80, 3), np.uint8)
+        cv2.imwrite(path, cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC))
     return files
 
 

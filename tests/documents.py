@@ -22,7 +22,6 @@ PROGRAMS = {
     "tools/docs": "",
     "tools/quickstart": "",
     "tools/run_tests": "",
-    "benchmarks/gpu_steps": "",
     "python3": "",
     "pip": "",
 }

