@@ -62,7 +62,7 @@ def read_image(path: str, color: bool = True, size: tuple[int, int] | None = Non
 
 
 def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Where]]:
-    """Yield the lines of a list file with their positions, except blank lines.
+    """Yield the lines of a list file with their positions, except blank lines and lines that begin with ``#``.
 
     ``where`` is the position in the prototxt. Raises SpecError if the file cannot be read.
     """
@@ -75,7 +75,7 @@ def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Whe
     if any("\0" in line for line in lines):
         raise SpecError(f'list file "{path}" is not text: it contains a NUL character', where or Where(path))
     for number, line in enumerate(lines, 1):
-        if line.strip():
+        if line.strip() and not line.lstrip().startswith("#"):
             yield line.strip(), Where(path, number, 1)
 
 

@@ -61,10 +61,11 @@ def use_dialect(name: str | Path) -> None:
     """Add the fields and layers of a dialect to every net of the process. ``name`` is its name, or that of its file.
 
     Does nothing if it was added before. Raises SpecError if there is no such dialect, if its file has an error, or if
-    Caffe or another added dialect already has one of its fields or layer types.
+    Caffe already has one of its fields or layer types.
     """
     from netspec.dialects.layers import load  # imported here, since it needs torch
 
-    if dialect := known.to_add(read_dialect(find_file(name))):
+    dialect = read_dialect(find_file(name))
+    if dialect.name not in known.added() or dialect != known.dialect(dialect.name):
         load(dialect)
         known.add(dialect)

@@ -9,10 +9,10 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 from netspec import log
 from netspec.dialects.registry import Dialect
@@ -23,8 +23,7 @@ OF_FILES = "netspec_dialect_"  # begins the names of modules that are given by t
 GROUP = "netspec.dialects"  # entry points of other packages: the name of a dialect and its module
 
 
-@dataclass(frozen=True)
-class DialectFile:
+class DialectFile(NamedTuple):
     """A file that has not been read. ``module`` is the name of its module."""
 
     name: str
@@ -39,15 +38,14 @@ def known_files() -> dict[str, DialectFile]:
 
     found = {}
     for point in entry_points(group=GROUP):
-        module = point.value.partition(":")[0].strip()
         try:
-            spec = find_spec(module)
+            spec = find_spec(point.module)
         except Exception:  # an error in another package's import must not hide the user's own error
             spec = None
-        if spec is None or spec.origin is None:
-            log.logger.warning(f'dialect "{point.name}": there is no module {module}; the dialect is ignored')
+        if spec and spec.origin:
+            found[point.name] = DialectFile(point.name, Path(spec.origin), point.module)
         else:
-            found[point.name] = DialectFile(point.name, Path(spec.origin), module)
+            log.logger.warning(f'dialect "{point.name}": there is no module {point.module}; the dialect is ignored')
     for path in sorted(Path(__file__).parent.glob("*/*.py"), key=lambda path: path.stem):
         if "\nDECLARATIONS = " in path.read_text("utf-8"):
             found[path.stem] = DialectFile(path.stem, path, f"{__package__}.{path.parent.name}.{path.stem}")
@@ -56,23 +54,20 @@ def known_files() -> dict[str, DialectFile]:
 
 def find_file(name: str | Path) -> DialectFile:
     """Return the file of a dialect, given by its name or by a path that ends in .py. Raises SpecError."""
-    path = Path(name)
+    path, files = Path(name), known_files()
     if path.suffix == ".py":
         name = re.sub(r"\W", "_", path.stem)
         return DialectFile(name, path, f"{OF_FILES}{name}")
-    files = known_files()
     if str(name) not in files:
-        known = f"; expected one of: {', '.join(files)}, or the path of a .py file"
-        close = did_you_mean(str(name), list(files)) or known
-        raise SpecError(f'unknown dialect "{name}"{close}')
+        expected = f"; expected one of: {', '.join(files)}, or the path of a .py file"
+        raise SpecError(f'unknown dialect "{name}"{did_you_mean(str(name), list(files)) or expected}')
     return files[str(name)]
 
 
 def read_dialect(file: DialectFile) -> Dialect:
     """Return what a file declares. Raises SpecError if it cannot be read or declares nothing."""
     try:
-        text = file.path.read_text("utf-8")
-        tree = ast.parse(text)
+        tree = ast.parse(file.path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError) as fault:
         raise SpecError(unreadable(file.path, fault), Where(str(file.path))) from None
     except SyntaxError as fault:
@@ -86,11 +81,10 @@ def read_dialect(file: DialectFile) -> Dialect:
                 raise SpecError("DECLARATIONS must be one plain string: it is read without running the file", where)
             # Prepend blank lines, so that errors have the line numbers of the file.
             source = "\n" * (node.value.lineno - 1) + node.value.value
-    types = list(_registered_types(tree))
+    types = tuple(_registered_types(tree))
     if not source and not types:
         raise SpecError("declares no dialect: neither DECLARATIONS nor a layer with @register", Where(str(file.path)))
-    advice = f'add --plugin {file.name}, in Python netspec.use_dialect("{file.name}")'
-    return Dialect(file.name, source, tuple(types), advice, str(file.path), file.module)
+    return Dialect(file.name, source, types, str(file.path), file.module)
 
 
 def _registered_types(tree: ast.Module) -> Iterator[str]:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import cache
 
 from netspec import log
 from netspec.dialects.files import OF_FILES, known_files, read_dialect
-from netspec.dialects.registry import Dialect, check, check_beside, declare
+from netspec.dialects.registry import Dialect, declare
 from netspec.errors import SpecError
 from netspec.proto.forks import Additions
 
-_OWN = f"{__package__}."
 _added: dict[str, Dialect] = {}  # for every net of the process
 
 
@@ -35,23 +33,8 @@ def add(given: Dialect) -> None:
     _added[given.name] = given
 
 
-def to_add(given: Dialect) -> Dialect | None:
-    """Return a dialect that is to be added for every net, None if it was already. Raises SpecError if it cannot be."""
-    if given == _added.get(given.name):
-        return None
-    check(given)
-    if given.module.startswith(OF_FILES):
-        for each in _found().values():
-            declare(each)  # so that they keep their numbers
-        declare(given)
-    check_beside(given, list(_added.values()))
-    return given
-
-
 def dialect_of_module(module: str) -> str:
     """Return the name of the dialect with a module; "" if it belongs to none."""
-    if module.startswith(_OWN):
-        return module.rpartition(".")[2]
     if module.startswith(OF_FILES):
         return module.removeprefix(OF_FILES)
     return next((name for name, file in known_files().items() if file.module == module), "")
@@ -64,7 +47,7 @@ def _found() -> dict[str, Dialect]:
     for file in known_files().values():
         try:
             each = read_dialect(file)
-            check(each)
+            declare(each)
         except SpecError as fault:
             log.logger.warning(f'dialect "{file.name}" is ignored: {fault}')
         else:
@@ -75,15 +58,13 @@ def _found() -> dict[str, Dialect]:
 @cache
 def _additions(added: tuple[Dialect, ...]) -> Additions:
     found = Additions()
-    for each in sorted({**_found(), **{one.name: one for one in added}}.values(), key=lambda one: one.name):
-        _enter(found.fields, each, each.fields())
-        _enter(found.values, each, [(*key, value) for key, values in each.values().items() for value in values])
-        _enter(found.types, each, each.layer_types)
-        _enter(found.messages, each, each.messages())
-        found.advice[each.name] = each.advice
+    for name, each in sorted({**_found(), **{one.name: one for one in added}}.items()):
+        values = [(*key, value) for key, names in each.values().items() for value in names]
+        for table, keys in (
+            (found.fields, each.fields()),
+            (found.values, values),
+            (found.types, each.layer_types),
+            (found.messages, each.messages()),
+        ):
+            table.update({key: (*table.get(key, ()), name) for key in keys})  # type: ignore[arg-type]
     return found
-
-
-def _enter(table: dict, each: Dialect, keys: Iterable) -> None:
-    for key in keys:
-        table[key] = (*table.get(key, ()), each.name)

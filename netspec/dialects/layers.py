@@ -7,23 +7,23 @@ import importlib.util
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from google.protobuf.message import Message
 
 from netspec.dialects.files import OF_FILES
-from netspec.dialects.known import added, dialect, dialect_of_module, known
+from netspec.dialects.known import dialect, dialect_of_module, known
 from netspec.dialects.registry import Dialect, declare
-from netspec.dialects.signatures import has_several
+from netspec.dialects.signatures import chosen, has_several
 from netspec.errors import SpecError, Where
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.registry import calling_module, registered
 from netspec.proto.schema import PACKAGE, LayerParameter, NetParameter
 
 Condition = Callable[[LayerParameter], bool]
-_classes: dict[str, dict[str, type[Layer]]] = {}  # type -> dialect -> class, of types that Caffe lacks
+CLASSES: dict[str, dict[str, type[Layer]]] = {}  # type -> dialect -> class, of types that Caffe lacks
 _replacing: dict[str, dict[str, tuple[type[Layer], Condition]]] = {}  # type -> dialect -> class, condition
 _lock = threading.RLock()
 L = TypeVar("L", bound=type[Layer])
@@ -47,63 +47,42 @@ def replace(type_name: str, *reads: str, where: Condition = lambda param: True) 
     return add
 
 
-def adopt(cls: type[Layer], owner: str) -> None:
-    """Keep a class that the module of a dialect registers."""
-    _classes.setdefault(cls.type, {})[owner] = cls
+def class_of(layer: LayerParameter, shown: Sequence[Collection[str]], runs_python: bool = False) -> type[Layer] | None:
+    """Return the class of a layer in a net that shows these dialects; None if it is Caffe's, or not clear.
 
-
-def class_of(param: LayerParameter, dialects: Collection[str], runs_python: bool) -> type[Layer] | None:
-    """Return the class of a layer that Caffe lacks, or with which one of the dialects replaces Caffe's; or None.
-
-    If a dialect implements the module and class of a Python layer, such as ``"rpn.proposal_layer.ProposalLayer"``, its
-    class is used, unless Python code is allowed to run and the module exists.
+    ``shown``: the strongest first, and all that the net uses last. If a dialect implements the module and class of a
+    Python layer, such as ``"rpn.proposal_layer.ProposalLayer"``, its class is used, unless Python code is allowed to
+    run and the module exists. Raises SpecError if the net shows several dialects that replace or define the layer.
     """
-    used = sorted({*dialects, *added()})
-    for name in used:
+    for name in shown[-1]:
         load(dialect(name))
-        cls, condition = _replacing.get(param.type, {}).get(name, (None, bool))
-        if cls and condition(param):
-            return cls
-    if param.type == "Python":
+    replacing = {name: cls for name, (cls, where) in _replacing.get(layer.type, {}).items() if where(layer)}
+    if found := chosen(layer.type, [(name,) for name in sorted(replacing) if name in shown[-1]], shown):
+        return replacing[found[0]]
+    kind = layer.type
+    if kind == "Python":
         python: Any = registered("Python")
-        if runs_python and python.is_there(param):
+        if runs_python and python.is_there(layer):
             return None
-        return _class_of_type(f"{param.python_param.module}.{param.python_param.layer}", used)
-    return None if registered(param.type) else _class_of_type(param.type, used)
-
-
-def _class_of_type(layer_type: str, used: Collection[str]) -> type[Layer] | None:
-    """Return the class that a dialect defines for a type: one that is used, or else the only one; a user's own first.
-
-    None if there is no such dialect, or if it is not clear which one is meant.
-    """
-    name = owner_of(layer_type, used)
-    if not name:
+        kind = f"{layer.python_param.module}.{layer.python_param.layer}"
+    elif registered(kind):
         return None
-    load(dialect(name))
-    return _classes.get(layer_type, {}).get(name)
-
-
-def owner_of(layer_type: str, used: Collection[str] = ()) -> str:
-    """Return the dialect that defines a layer type, "" if none does, or if it is not clear which one is meant."""
-    having = known().types.get(layer_type, ())
-    meant = [name for name in having if name in used] or list(having)
-    own = [name for name in meant if name in added()] if len(meant) > 1 else meant
-    return own[0] if len(own) == 1 else ""
+    if not (found := chosen(kind, [(name,) for name in known().types.get(kind, ())], shown)):
+        return None
+    load(dialect(found[0]))
+    return CLASSES.get(kind, {}).get(found[0])
 
 
 def dialects_of(net: NetParameter) -> set[str]:
-    """Return the dialects that a net uses: those of its fields and layer types, and those added for every net.
+    """Return the dialects of a net's fields, and of its layer types that only one of them has.
 
-    A layer type of several forks does not determine the dialect (netspec/dialects/signatures.py).
+    Layers whose type several forks have show none: the fields of one may be declared by another.
     """
-    found = set(added())
+    found: set[str] = set()
     for layer in net.layer:
-        if registered(layer.type) is None:
-            if has_several(layer.type) or not known().types.get(layer.type):
-                continue
-            found.update(filter(None, [owner_of(layer.type, found)]))
-        found |= _dialects_in(layer)
+        having = () if registered(layer.type) else known().types.get(layer.type, ())
+        if not has_several(layer.type):
+            found.update(having if len(having) == 1 else (), _dialects_in(layer))
     return found
 
 
@@ -115,8 +94,7 @@ def _dialects_in(message: Message) -> set[str]:
         if field.is_extension:
             found.add(field.file.package.removeprefix(f"{PACKAGE}."))
         if field.message_type is not None:
-            values = [value] if isinstance(value, Message) else value
-            found.update(*(_dialects_in(each) for each in values))
+            found.update(*map(_dialects_in, [value] if isinstance(value, Message) else value))
     return found
 
 
@@ -139,9 +117,7 @@ def _run(dialect: Dialect) -> None:
         if not dialect.module.startswith(OF_FILES):
             importlib.import_module(dialect.module)
             return
-        spec = importlib.util.spec_from_file_location(dialect.module, path)
-        assert spec is not None
-        assert spec.loader is not None
+        spec: Any = importlib.util.spec_from_file_location(dialect.module, path)
         module = importlib.util.module_from_spec(spec)
         sys.modules[dialect.module] = module
         spec.loader.exec_module(module)

@@ -1,18 +1,9 @@
 """The dialects of Caffe's forks: their messages and fields, as extensions of Caffe's messages.
 
 A dialect declares its additions in the language of caffe.proto: new messages as in the fork's own file, and new
-fields of Caffe's messages in ``extend``::
-
-    message NormalizeParameter {
-      optional bool across_spatial = 1 [default = true];
-    }
-    extend LayerParameter {
-      optional NormalizeParameter norm_param = 206;
-    }
-
-The text reader and writer then treat ``norm_param { ... }`` as a field of LayerParameter, and a layer reads it
-with ``schema.value(self.param, "norm_param")``. Values for an enum of Caffe's are declared as a field that has the name
-of Caffe's, of an enum that has the new ones only::
+fields of Caffe's messages in ``extend``. The text reader and writer then treat ``norm_param { ... }`` as a field of
+LayerParameter, and a layer reads it with ``schema.value(self.param, "norm_param")``. Values for an enum of Caffe's are
+declared as a field that has the name of Caffe's, of an enum that has the new ones only::
 
     enum PoolMethod { AVE_EXC_PAD = 3; }
     extend PoolingParameter {
@@ -23,14 +14,13 @@ of Caffe's, of an enum that has the new ones only::
 
 Each dialect has a package of its own in the schema's pool, so forks may use the same names, and the classes of Caffe's
 messages stay the same objects. Which dialect a field in a text belongs to is decided by the reader, for each text.
-Numbers must be above those that Caffe itself uses in the message. A fork that uses one of these, as in
-``interp_param = 143``, needs another number here; text files do not contain the numbers.
+Files of text have no numbers: a number that Caffe or another dialect uses is replaced by a free one.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -56,133 +46,82 @@ from netspec.proto.schema import (
 
 @dataclass(frozen=True)
 class Dialect:
-    """What a fork adds. ``advice`` tells a user how to enable it, e.g. ``"add --plugin ssd"``.
-
-    ``file`` is the source file, for errors, and ``module`` the module of its layers.
-    """
+    """What a fork adds. ``file`` is the source file, for errors, and ``module`` the module of its layers."""
 
     name: str
     source: str = ""
     layer_types: tuple[str, ...] = ()
-    advice: str = ""
     file: str = ""
     module: str = ""
 
     @cached_property
     def declarations(self) -> FileDescriptorProto:
-        """The additions as a descriptor, in a package of their own, so that forks may use the same names."""
+        """The additions as a descriptor, in a package of their own, so that forks may use the same names.
+
+        Raises SpecError if they cannot be read, if Caffe lacks a message that they extend, or has one of the fields.
+        """
         file = read_declarations(self.source, self.file or f"{self.name}.proto", f"{PACKAGE}.{self.name}")
-        if "caffe.proto" not in file.dependency:
-            file.dependency.append("caffe.proto")
+        enums = {enum.name for enum in file.enum_type}
+        for field in file.extension:
+            field.extendee = f"{PACKAGE}.{field.extendee.removeprefix(f'{PACKAGE}.')}"
+            try:
+                message: Any = pool.FindMessageTypeByName(field.extendee)
+            except KeyError:
+                raise SpecError(f'Caffe has no message "{field.extendee}" to extend', Where(file.name)) from None
+            theirs = message.fields_by_name.get(field.name)
+            if theirs and not (theirs.enum_type and field.type_name in enums):
+                raise SpecError(f'{field.extendee} already has a field "{field.name}"', Where(file.name))
         return file
 
     def fields(self) -> set[tuple[str, str]]:
         """The fields that it adds: full name of Caffe's message and name of the field."""
-        return {(full_name, field) for (full_name, _), field in self.numbers().items()} - set(self.values())
+        return {(field.extendee, field.name) for field in self.declarations.extension} - set(self.values())
 
     def values(self) -> dict[tuple[str, str], Sequence[str]]:
         """The values that it adds to Caffe's enums, by full name of the message and name of the field."""
-        file = self.declarations
-        enums = {enum.name: [value.name for value in enum.value] for enum in file.enum_type}
-        added = {(full_name_of(f.extendee), f.name): enums[f.type_name] for f in file.extension if f.type_name in enums}
-        return {key: names for key, names in added.items() if is_enum_of_caffe(*key)}
+        enums = {enum.name: [value.name for value in enum.value] for enum in self.declarations.enum_type}
+        added = self.declarations.extension
+        return {
+            (field.extendee, field.name): enums[field.type_name]
+            for field in added
+            if field.name in fields_of(pool.FindMessageTypeByName(field.extendee))
+        }
 
     def messages(self) -> set[str]:
         """The names of its own messages and enums."""
         return {each.name for each in (*self.declarations.message_type, *self.declarations.enum_type)}
 
-    def numbers(self) -> dict[tuple[str, int], str]:
-        """The names of the fields that it adds, by full name of Caffe's message and number of the field."""
-        added = self.declarations.extension
-        return {(full_name_of(f.extendee), f.number): f.name for f in added}
-
-
-def full_name_of(extendee: str) -> str:
-    """Return the full name of a message of Caffe's, as ``extend`` names it."""
-    return f"{PACKAGE}.{extendee.removeprefix(f'{PACKAGE}.')}"
-
-
-def is_enum_of_caffe(message: str, field: str) -> bool:
-    """Return whether a message of Caffe's (full name) has a field of an enum of this name."""
-    try:
-        found = pool.FindMessageTypeByName(message).fields_by_name.get(field)
-    except KeyError:
-        return False
-    return found is not None and found.enum_type is not None
-
-
-def check(dialect: Dialect) -> None:
-    """Raise SpecError if Caffe lacks a message that the dialect extends, or already has one of its fields or numbers.
-
-    Raises SpecError also if the declarations cannot be read.
-    """
-    where = Where(dialect.declarations.name)
-    for full_name, _ in dialect.numbers():
-        try:
-            pool.FindMessageTypeByName(full_name)
-        except KeyError:
-            raise SpecError(f'Caffe has no message "{full_name}" to extend', where) from None
-    for full_name, field in dialect.fields():
-        if field in fields_of(pool.FindMessageTypeByName(full_name)):
-            raise SpecError(f'{full_name} already has a field "{field}"', where)
-    for (full_name, number), field in dialect.numbers().items():
-        message: Any = pool.FindMessageTypeByName(full_name)
-        if not any(first <= number < last for first, last in message.extension_ranges):
-            theirs = message.fields_by_number.get(number)
-            owner = f'that of Caffe\'s "{theirs.name}"' if theirs else "kept for Caffe's own"
-            advice = "files of text have no numbers, and the weights of a .caffemodel are read all the same"
-            another = f'give "{field}" another, say {_free_number(full_name, dialect.numbers())}'
-            raise SpecError(f"number {number} of {full_name} is {owner}; {another}: {advice}", where)
-
-
-def check_beside(dialect: Dialect, others: Sequence[Dialect]) -> None:
-    """Raise SpecError if one of the other dialects has a field, added values, a number or a layer type of this one."""
-    where = Where(dialect.declarations.name)
-    numbers = dialect.numbers()
-    for other in others:
-        for full_name, field in sorted(dialect.fields() & other.fields()):
-            raise SpecError(f'{full_name} already has a field "{field}"', where)
-        for full_name, field in sorted(dialect.values().keys() & other.values().keys()):
-            raise SpecError(f'another added dialect adds values to "{field}" of {full_name}', where)
-        for key in sorted(numbers.keys() & other.numbers().keys()):
-            message = f'number {key[1]} of {key[0]} is used by "{other.numbers()[key]}" of dialect "{other.name}"'
-            raise SpecError(f'{message}; give "{numbers[key]}" another number', where)
-        for layer_type in sorted({*dialect.layer_types} & {*other.layer_types}):
-            raise SpecError(f'layer type "{layer_type}" already exists, from {other.module}', where)
-
 
 _lock = threading.RLock()
-_declared: dict[str, Dialect] = {}  # by package, those that are in the pool
+_declared: dict[str, tuple[Dialect, FileDescriptorProto]] = {}  # those in the pool, by name, with their declarations
 _taken: set[tuple[str, int]] = set()  # their numbers, by full name of the message
 
 
-def declare(dialect: Dialect) -> None:
-    """Add the messages and fields of a dialect to the schema's pool, once. No text is read in another way by that.
+def declare(dialect: Dialect) -> FileDescriptorProto:
+    """Add the messages and fields of a dialect to the schema's pool, once, and return them as they are there.
 
-    A number that another dialect uses is replaced by a free one. Raises SpecError if the declarations do not fit.
+    The new fields of a message are declared inside one of their own. No text is read in another way by that. Raises
+    SpecError if the declarations do not fit.
     """
     file = dialect.declarations
     with _lock:
-        if file.package in _declared:
-            if _declared[file.package] != dialect:
-                theirs = _declared[file.package].declarations.name
-                raise SpecError(f'another dialect "{dialect.name}" was added, from {theirs}', Where(file.name))
-            return
-        scoped = FileDescriptorProto()
+        if dialect.name in _declared:
+            known, scoped = _declared[dialect.name]
+            if known != dialect:
+                message = f'another dialect "{dialect.name}" was added, from {known.declarations.name}'
+                raise SpecError(message, Where(file.name))
+            return scoped
+        scoped, scopes, taken = FileDescriptorProto(), dict[str, Any](), set(_taken)
         scoped.CopyFrom(file)
         del scoped.extension[:]
-        taken = set(_taken)
-        scopes: dict[str, Any] = {}  # the new fields of each message are in a scope of their own, so names may repeat
         for declared in file.extension:
             message = declared.extendee.rpartition(".")[2]
             if message not in scopes:
                 scopes[message] = scoped.message_type.add(name=SCOPE + message)
             own = scopes[message].extension.add()
             own.CopyFrom(declared)
-            full_name = full_name_of(declared.extendee)
-            if (full_name, own.number) in taken:
-                own.number = _free_number(full_name, {*dialect.numbers(), *taken})
-            taken.add((full_name, own.number))
+            own.number = _free_number(own.extendee, own.number, taken)
+            taken.add((own.extendee, own.number))
         try:
             add_file(scoped)
         except TypeError as fault:
@@ -190,15 +129,17 @@ def declare(dialect: Dialect) -> None:
         for message, scope in scopes.items():
             for declared in scope.extension:
                 add_field(declared, pool.FindExtensionByName(extension_name(file.package, message, declared.name)))
-        _declared[file.package] = dialect
+        _declared[dialect.name] = dialect, scoped
         _taken.update(taken)
+        return scoped
 
 
-def _free_number(message: str, taken: Iterable[tuple[str, int]]) -> int:
-    """Return a number, from 2000, for another field of a message."""
+def _free_number(message: str, wanted: int, taken: set[tuple[str, int]]) -> int:
+    """Return a number for another field of a message: the wanted one, or the first free one from 2000."""
     ranges = pool.FindMessageTypeByName(message).extension_ranges
-    used = {number for name, number in taken if name == message}
-    return next(n for first, last in ranges for n in range(max(first, 2000), last) if n not in used)
+    free = (n for first, last in ranges for n in range(max(first, 2000), last) if (message, n) not in taken)
+    fits = any(first <= wanted < last for first, last in ranges) and (message, wanted) not in taken
+    return wanted if fits else next(free)
 
 
 def field(dialect: Dialect, message: str, name: str) -> Field:

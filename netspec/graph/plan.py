@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from netspec.errors import SpecError
+from netspec.proto.forks import Meaning
 from netspec.proto.schema import NetParameter
 from netspec.proto.source_map import SourceMap
 
@@ -50,8 +51,7 @@ class Plan:
     ``blobs[v]`` is the name of value ``v``; ``outputs`` maps names, in Caffe's order, to values;
     ``final[v]`` is the value that finally replaces ``v`` in Caffe's memory, from the last in-place layer.
     ``ends[i]`` are the values that are no longer needed once node ``i`` has run.
-    ``dialects`` are the forks of Caffe that the net uses, and ``warnings`` say what they changed
-    (``Forks.applied_to``).
+    ``meaning`` is what the forks of Caffe say that the net means (``Forks.meaning``).
     """
 
     net: NetParameter
@@ -61,11 +61,10 @@ class Plan:
     outputs: dict[str, int]
     final: tuple[int, ...]
     ends: tuple[tuple[int, ...], ...]
-    dialects: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    meaning: Meaning
 
 
-def make_plan(net: NetParameter, source: SourceMap) -> Plan:
+def make_plan(net: NetParameter, source: SourceMap, meaning: Meaning | None = None) -> Plan:
     """Return the Plan of a filtered net with its splits."""
     blobs: list[str] = []
     current: dict[str, int] = {}
@@ -116,7 +115,8 @@ def make_plan(net: NetParameter, source: SourceMap) -> Plan:
         nodes.append(Node(layer.name, layer.type, bottoms, tuple(tops), tuple(in_place), tuple(params), blocked))
     outputs = {name: current[name] for name in sorted(available)}
     final = _last_values(nodes, len(blobs))
-    return Plan(net, source, tuple(nodes), tuple(blobs), outputs, final, last_uses(nodes))
+    meaning = meaning or Meaning(net)
+    return Plan(net, source, tuple(nodes), tuple(blobs), outputs, final, last_uses(nodes), meaning)
 
 
 def _last_values(nodes: Sequence[Node], count: int) -> tuple[int, ...]:

@@ -22,13 +22,13 @@ from netspec.errors import Code, Report, SpecError, Where
 from netspec.files.limits import LIMIT, amount, is_out_of_memory, memory, read_amount
 from netspec.graph.options import BuildOptions
 from netspec.graph.plan import AUTOMATIC, Backward, Node, Param, Plan, plan_backward, unblocked
-from netspec.layers import class_of, unknown_type
+from netspec.layers import unknown_type
 from netspec.layers.contract.base import Layer, Shape, shape_string
 from netspec.layers.contract.context import Context, Random, device_of
 from netspec.layers.contract.data_layer import DataLayer
 from netspec.layers.contract.fillers import READS
+from netspec.layers.contract.registry import registered
 from netspec.net.frozen import compute_caffes_gradients, needs_backward
-from netspec.proto.forks import forks
 from netspec.proto.schema import TEST
 
 BYTES = 4  # of a number: float32
@@ -64,7 +64,7 @@ class Assembly:
     """
 
     def __init__(self, plan: Plan, options: BuildOptions) -> None:
-        self.options = replace(options, dialects=plan.dialects)
+        self.options = replace(options, dialects=plan.meaning.dialects)
         self.plan = plan
         self._report = plan.source.report
         self.layers: dict[int, Layer] = {}
@@ -95,14 +95,15 @@ class Assembly:
         node, param = self.plan.nodes[i], self.plan.net.layer[i]
         this = _LayerInNet(self.plan, i)
         log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
-        cls = class_of(param, self.options)
+        cls = self.plan.meaning.classes.get(i) or registered(node.type)
         if cls is None:
             self._report(SpecError(unknown_type(node.type), this.at("type"), Code.UNKNOWN_TYPE, (node.type,)))
             return None
         if any(v not in self._values for v in node.bottoms):
             return None  # an error upstream was reported
         phase = self.plan.net.state.phase
-        context = Context(phase, self.options, self.random, this.at, self._report, this.created, allocates=False)
+        fork = self.plan.meaning.forks.get(i, "")
+        context = Context(phase, self.options, self.random, this.at, self._report, this.created, False, fork)
         try:
             layer = cls(param, [self._values[v] for v in node.bottoms], context)
         except SpecError as fault:
@@ -202,7 +203,7 @@ class Assembly:
         for name in self.plan.outputs:
             log.info("net.cpp:244", f"This network produces output {name}")
         log.info("net.cpp:257", "Network initialization done.")
-        for line in (*self.plan.warnings, *doubtful_layers(self.plan, layers), *unused_fields(self.plan, layers)):
+        for line in (*self.plan.meaning.warnings, *unused_fields(self.plan, layers)):
             log.warning("net.cpp:257", line)
         return backward
 
@@ -361,12 +362,6 @@ def unused_fields(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
         if field.is_extension or field.name == "debug_info":
             advice = "; set it in the solver" if field.name == "debug_info" else ""
             yield f"{plan.source.net.find(field.name)}: {field.name} has no effect in a net{advice}"
-
-
-def doubtful_layers(plan: Plan, layers: Iterable[Layer]) -> Iterator[str]:
-    """Yield a warning for each layer type that several forks define, if the net does not show which fork is meant."""
-    for doubt, i in forks().doubts(layers).items():
-        yield f"{plan.source.at(i, layer=plan.nodes[i].name, type=plan.nodes[i].type)}: {doubt}"
 
 
 def _unused(layer: Layer) -> Iterator[tuple[_FieldPath, str]]:

@@ -59,9 +59,8 @@ def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOpti
     for layer in split.layer:
         if not layer.HasField("phase"):
             layer.phase = split.state.phase
-    plan = make_plan(split, source)
-    plan = forks().applied_to(plan, options.dialects)
-    built = Net(plan, options)
+    meaning = forks().meaning(split, source, options)
+    built = Net(make_plan(meaning.net, source, meaning), options)
     written = NetParameter(layer=[layer for layer in split.layer if layer.blobs])
     if written.layer:  # weights in the prototxt itself
         copy_weights(built, written, source.file)

@@ -14,9 +14,10 @@ from netspec import log
 from netspec.errors import Code, SpecError
 from netspec.exact import SMALL
 from netspec.graph.options import BuildOptions
-from netspec.layers import Context, Layer, Random, class_of, unknown_type
+from netspec.layers import Context, Layer, Random, unknown_type
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.context import device_of, nowhere
+from netspec.layers.contract.registry import registered
 from netspec.net.net import Array
 from netspec.proto.forks import forks
 from netspec.proto.reader import read_text
@@ -77,19 +78,22 @@ def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int |
     """
     param = LayerParameter()
     position = read_text(text, FILE, param)
-    net, source = upgrade_net(NetParameter(layer=[param]), SourceMap(FILE, Position(position.where), (position,)))
+    source = SourceMap(FILE, Position(position.where), (position,), dialects=position.dialects)
+    net, source = upgrade_net(NetParameter(layer=[param]), source)
     (param,) = net.layer
     at = partial(source.at, 0, layer=param.name, type=param.type)
-    options = replace(context.options, dialects=tuple(sorted(forks().dialects_of(net))))
-    cls = class_of(param, options)
+    param.bottom.extend(f"bottom{i}" for i in range(len(param.bottom), len(shapes)))
+    param.top.extend(f"top{i}" for i in range(len(param.top), tops or 0))
+    meaning = forks().meaning(net, source, context.options)
+    cls = meaning.classes.get(0) or registered(param.type)
     if cls is None:
         raise SpecError(unknown_type(param.type), at("type"), Code.UNKNOWN_TYPE, (param.type,))
-    param.bottom.extend(f"bottom{i}" for i in range(len(param.bottom), len(shapes)))
     if tops is None:
         fewest = len(shapes) if cls.same_tops else cls.tops[0]
         tops = fewest or int(cls.tops[1] is None)
-    param.top.extend(f"top{i}" for i in range(len(param.top), tops))
-    layer = cls(param, shapes, replace(context, options=options, **({"at": at} if context.at is nowhere else {})))
-    for doubt in forks().doubts([layer]):
-        log.logger.warning(f"{at()}: {doubt}")
-    return layer
+        param.top.extend(f"top{i}" for i in range(len(param.top), tops))
+    for warning in meaning.warnings:
+        log.logger.warning(warning)
+    options = replace(context.options, dialects=meaning.dialects)
+    context = replace(context, options=options, fork=meaning.forks.get(0, ""))
+    return cls(param, shapes, replace(context, at=at) if context.at is nowhere else context)

@@ -1,18 +1,19 @@
 """The interface to Caffe's forks: their fields, layer types and layers.
 
-A *dialect* is what one fork adds. Reading a text changes nothing in the process: a net has the dialects that its text
-names, and those whose fields and layer types it uses. :class:`Forks` is the implementation for Caffe alone.
+A *dialect* is what one fork adds. The reader asks for the fields that a text uses, and :meth:`Forks.meaning` says,
+between parsing and planning, what the layers of a net are. :class:`Forks` is the implementation for Caffe alone.
 ``netspec/__init__.py`` registers the one with forks (netspec/dialects), which is imported at its first use. This file
 imports nothing, so every other file can import it.
 """
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Callable, Collection
     from pathlib import Path
     from typing import Any
 
     from netspec.proto.schema import Field, LayerParameter, NetParameter, SolverParameter
+    from netspec.proto.source_map import SourceMap
 
     Names = tuple[str, ...]
 
@@ -21,8 +22,7 @@ class Additions:
     """What the known dialects add, and which of them have it. Messages have full names: ``caffe.LayerParameter``.
 
     ``fields`` is by message and field, ``values`` by message, field and added value of its enum, ``types`` by layer
-    type, ``messages`` by the name of a message or an enum without its package. ``advice`` says, by dialect, how to use
-    it.
+    type, ``messages`` by the name of a message or an enum without its package.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,6 @@ class Additions:
         self.values: dict[tuple[str, str, str], Names] = {}
         self.types: dict[str, Names] = {}
         self.messages: dict[str, Names] = {}
-        self.advice: dict[str, str] = {}
 
     def with_field(self, field: str) -> "Names":
         """Return the dialects that have a field of any message."""
@@ -40,12 +39,10 @@ class Additions:
         """Return advice for using ``name``, which these dialects have; "" if there are none."""
         if not dialects:
             return ""
-        several = len(dialects) > 1
-        listed = " and ".join(f'"{dialect}"' for dialect in dialects)
-        advice = f"; {self.advice[dialects[0]]}" if self.advice[dialects[0]] else ""
-        if several:
-            advice += f'{", or" if advice else ";"} write "# dialect: {dialects[0]}" into the prototxt'
-        return f'dialect{"s" if several else ""} {listed} {"have" if several else "has"} "{name}"{advice}'
+        first, *others = (f'"{dialect}"' for dialect in dialects)
+        have = f"dialects {' and '.join([first, *others])} have" if others else f"dialect {first} has"
+        use = f"add --plugin {dialects[0]}, in Python netspec.use_dialect({first})"
+        return f'{have} "{name}"; {use}, or write a line "# dialect: {dialects[0]}" into the prototxt'
 
 
 class Rates:
@@ -66,11 +63,25 @@ class Rates:
         return caffes(param.base_lr)
 
 
+class Meaning:
+    """What a net means by the forks that it uses, ``dialects``; here nothing. ``net`` is the net that is built.
+
+    By index of the layer: ``classes`` that Caffe lacks or that replace Caffe's, and ``forks`` of types that several
+    have.
+    """
+
+    def __init__(self, net: "NetParameter", dialects: "Names" = ()) -> None:
+        self.net = net
+        self.dialects = dialects
+        self.classes: dict[int, Any] = {}
+        self.forks: dict[int, str] = {}
+        self.warnings: list[str] = []
+
+
 class Forks:
     """The implementation without forks: a prototxt with fields or layers that Caffe lacks is refused."""
 
-    new_layer = ""  # advice for adding an unknown layer type, for errors
-    new_field = ""  # advice for adding an unknown field
+    new = ""  # how to add a layer type or a field that is unknown, for errors
     everywhere: "Names" = ()  # the dialects that a user requested for every net of the process
     rates = Rates()
 
@@ -92,6 +103,18 @@ class Forks:
         """Return the field with which a dialect extends a message, or the values of the enum of its field."""
         raise NotImplementedError
 
+    def meaning(self, net: "NetParameter", source: "SourceMap", options: "Any") -> Meaning:
+        """Return what a filtered net means, with BuildOptions. A layer of two forks is reported to ``source``."""
+        return Meaning(net)
+
+    def class_of(self, param: "LayerParameter") -> "Any":
+        """Return the class of a layer by itself that Caffe lacks, or that replaces Caffe's; None without one."""
+        return None
+
+    def adopt(self, cls: "Any", module: str) -> bool:
+        """Keep a class of layers that a module registers; return whether it is the module of a dialect."""
+        return False
+
     def schema_file(self, dialects: "Collection[str]" = ()) -> "Any":
         """Return the descriptor of caffe.proto with what ``everywhere`` and dialects add; None if there are none."""
         return None
@@ -99,37 +122,6 @@ class Forks:
     def sources(self) -> "list[tuple[str, str, str]]":
         """Return the names, files and declarations of ``everywhere``."""
         return []
-
-    # The layers
-
-    def adopt(self, cls: "Any", module: str) -> bool:
-        """Keep a class of layers that a module registers; return whether it is the module of a dialect."""
-        return False
-
-    def class_of(self, param: "LayerParameter", dialects: "Collection[str]", runs_python: bool) -> "Any":
-        """Return the class of a layer of these dialects that Caffe lacks, or that replaces Caffe's; None without one.
-
-        ``runs_python``: Python layers may run their own code.
-        """
-        return None
-
-    def dialects_of(self, net: "NetParameter") -> "set[str]":
-        """Return the dialects whose fields and layer types a net uses, and those of ``everywhere``."""
-        return set()
-
-    def applied_to(self, plan: "Any", dialects: "Collection[str]") -> "Any":
-        """Return a new Plan with its dialects: the given ones, those that its text names, and those that it uses.
-
-        Its layers have the fields that these dialects mean, and its ``warnings`` say what they changed.
-        """
-        return plan
-
-    def doubts(self, layers: "Any") -> "Mapping[str, int]":
-        """Return warnings about layers whose type exists in several forks, if the net does not show which is meant.
-
-        Each comes with the index of the first of its layers.
-        """
-        return {}
 
 
 _known: "list[Forks]" = []
@@ -147,6 +139,6 @@ def use_dialect(name: "str | Path") -> None:
     """Add the fields and layers of a dialect to every net of the process. It is given by its name or by its file.
 
     Does nothing if it was added before. Raises SpecError if there is no such dialect, its file has an error, or Caffe
-    or another added dialect already has one of its fields or layer types.
+    already has one of its fields or layer types.
     """
     forks().use(name)

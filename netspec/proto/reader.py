@@ -49,32 +49,26 @@ _CLOSING = {"{": "}", "<": ">", "[": "]"}
 Children = dict[str, list[Position]]
 
 
-def read_text(
-    text: str,
-    file: str,
-    message: Message,
-    report: Callable[[SpecError], None] | None = None,
-    dialects: Sequence[str] = (),
-) -> Position:
+def read_text(text: str, file: str, message: Message, report: Callable[[SpecError], None] | None = None) -> Position:
     """Read a text into an empty ``message``; return the positions of its parts.
 
     ``report``, if given, gets a ForkFault for each unknown field, which is then left out with its contents. A field of
-    several forks is that of the one in ``dialects``, or of the only one whose message has the fields inside.
+    several forks is that of the one that a comment names or that the text uses, or else of the only one whose message
+    has the fields inside.
 
     Raises SpecError for unknown fields, values of the wrong type or out of range, singular fields given twice, missing
     required fields, and text that is not protobuf's text format.
     """
-    return _Reader(text, file, report, dialects).read(message)
+    return _Reader(text, file, report).read(message)
 
 
 class _Reader:
     """A recursive descent parser; ``self.token`` is the next token."""
 
-    def __init__(
-        self, text: str, file: str, report: Callable[[SpecError], None] | None, dialects: Sequence[str]
-    ) -> None:
+    def __init__(self, text: str, file: str, report: Callable[[SpecError], None] | None) -> None:
         self._report = report
-        self._dialects = [*dialects, *forks().everywhere]  # those that are used
+        self._named = forks().named_in(text, file)
+        self._dialects = [*self._named, *forks().everywhere]  # those that are used
         self.lexer = Lexer(text, file)
         self._tokens = iter(self.lexer)
         self._open: list[tuple[Message, Token]] = []  # the messages being read, each with the token that named it
@@ -86,7 +80,7 @@ class _Reader:
         while self.token.kind != END:
             self._field(message, children)
         self._check_required(message)
-        return Position(Where(self.lexer.file), _frozen(children))
+        return Position(Where(self.lexer.file), _frozen(children), self._named)
 
     # ---- Grammar ----
 
@@ -140,7 +134,8 @@ class _Reader:
 
     def _of_fork(self, message: str, name: str, dialects: Sequence[str]) -> Field | None:
         """Return the field of a message that one of these dialects adds, or None if it is not clear which one."""
-        meant = [dialect for dialect in dialects if dialect in self._dialects] or dialects
+        named = [dialect for dialect in dialects if dialect in self._named]
+        meant = named or [dialect for dialect in dialects if dialect in self._dialects] or dialects
         found = {dialect: forks().field(dialect, message, name) for dialect in meant}
         if len(found) > 1:
             inside, types = self._names_inside(), {d: f.descriptor.message_type for d, f in found.items()}
@@ -417,7 +412,7 @@ class _Reader:
         error = self._error(fault + (elsewhere or hint), token)
         if elsewhere or self.lexer.suspicion(token.start):
             return error
-        new = forks().new_field
+        new = forks().new
         own = f"{'' if hint else ';'} {new}" if new else ""
         if hint[-1:] not in ("", "?") or all(outer.DESCRIPTOR.full_name not in _LAYERS for outer, _ in self._open):
             own = ""

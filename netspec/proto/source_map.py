@@ -12,10 +12,14 @@ _NONE: dict[str, tuple[Position, ...]] = {}  # shared by all positions without f
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """The position of a message in its file, and the positions of the values of its fields, by field name, in order."""
+    """The position of a message in its file, and the positions of the values of its fields, by field name, in order.
+
+    ``dialects`` of the outermost message are those that comments name.
+    """
 
     where: Where
     fields: Mapping[str, tuple[Position, ...]] = field(default_factory=lambda: _NONE)
+    dialects: tuple[str, ...] = ()
 
     def find(self, *path: str | int) -> Where:
         """Return the position of ``path``, e.g. ``("convolution_param", "pad", 1)``, or of its nearest known ancestor.
@@ -53,7 +57,8 @@ class SourceMap:
     @staticmethod
     def of(net: Position) -> SourceMap:
         """Return the map of a net that was just read; its layers are in ``layer``, or in ``layers`` (old format)."""
-        return SourceMap(net.where.file, net, (*net.fields.get("layer", ()), *net.fields.get("layers", ())))
+        layers = (*net.fields.get("layer", ()), *net.fields.get("layers", ()))
+        return SourceMap(net.where.file, net, layers, dialects=net.dialects)
 
     @staticmethod
     def unknown(file: str, count: int) -> SourceMap:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import kind_of, pointer_fault, unreadable
 from netspec.files.limits import read_bytes
 from netspec.proto.binary import is_net_binary
-from netspec.proto.forks import forks
 from netspec.proto.reader import read_text
 from netspec.proto.schema import NetParameter, SolverParameter
 from netspec.proto.source_map import Position, SourceMap
@@ -44,8 +42,7 @@ def parse_net(path: str | Path, upgrade: bool = True, report: Report = None) -> 
 def parse_net_text(text: str, file: str, upgrade: bool = True, report: Report = None) -> tuple[NetParameter, SourceMap]:
     """Return the net in a text, and the positions of its parts; ``file`` is its name in errors."""
     net = NetParameter()
-    named = forks().named_in(text, file)
-    source = replace(SourceMap.of(read_text(text, file, net, report, named)), dialects=named)
+    source = SourceMap.of(read_text(text, file, net, report))
     return upgrades.upgrade_net(net, source) if upgrade else (net, source)
 
 
@@ -63,7 +60,7 @@ def parse_solver_text(
 ) -> tuple[SolverParameter, Position]:
     """Return the solver in a text, and the positions of its parts; ``file`` is its name in errors."""
     solver = SolverParameter()
-    node = read_text(text, file, solver, report, forks().named_in(text, file))
+    node = read_text(text, file, solver, report)
     if upgrade:
         solver, node = upgrades.upgrade_solver(solver, node)
         solver = upgrades.upgrade_snapshot_prefix(solver, file)

@@ -113,7 +113,7 @@ class _Reader:
         value = getattr(self._param, name) if index is None else getattr(self._param, name)[index]
         if not isinstance(value, str):
             nodes = self._node.fields.get(name, ())
-            known = SourceMap.of(nodes[index or 0]) if nodes else None
+            known = SourceMap.of(replace(nodes[index or 0], dialects=self._node.dialects)) if nodes else None
             return name, value, known or SourceMap.unknown(self._node.where.file, len(value.layer))
         if value not in self._files:
             try:

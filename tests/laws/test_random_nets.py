@@ -90,7 +90,8 @@ def _faults(seed: int) -> Iterator[str]:
             yield f"seed {seed}: {way}: {type(fault).__name__}: {fault}\n{text}"
             continue
         reported = _differs(first, second)
-        if reported:
+        drawn_otherwise = "Dropout" in text and way != "prepared"  # numbers are drawn in the order of memory
+        if reported and not drawn_otherwise:
             yield f"seed {seed}: {way} differs from autograd: {reported}\n{text}"
 
 

@@ -12,31 +12,11 @@ from typing import Any
 import numpy as np
 
 from netspec.compat.pycaffe.net_spec import Function, Top, layers
+from netspec.graph.coordinates import PASS_THROUGH_LAYERS, inverted, of_windows
 
 Mapping = tuple[Any, Any, Any]
 
 IDENTITY: Mapping = (None, 1, 0)
-PASS_THROUGH_LAYERS = (
-    "AbsVal",
-    "BatchNorm",
-    "Bias",
-    "BNLL",
-    "Dropout",
-    "Eltwise",
-    "ELU",
-    "Exp",
-    "Log",
-    "LRN",
-    "MVN",
-    "Power",
-    "PReLU",
-    "ReLU",
-    "Scale",
-    "Sigmoid",
-    "Split",
-    "TanH",
-    "Threshold",
-)
 _TWO_DIMENSIONAL = frozenset(f"{what}_{axis}" for what in ("kernel", "stride", "pad") for axis in "hw")
 
 
@@ -74,11 +54,11 @@ def coord_map(fn: Function) -> Mapping:
         axis, offset = crop_params(fn)
         return axis - 1, 1, -offset  # the axis of a mapping is the last one that it does not change
     if fn.type_name in ("Convolution", "Pooling", "Im2col"):
-        axis, stride, extent, pad = conv_params(fn)
-        return axis, 1 / stride, (pad - (extent - 1) / 2) / stride
+        axis, *windows = conv_params(fn)
+        return axis, *of_windows(*windows)
     if fn.type_name == "Deconvolution":
-        axis, stride, extent, pad = conv_params(fn)
-        return axis, stride, (extent - 1) / 2 - pad
+        axis, *windows = conv_params(fn)
+        return axis, *inverted(*of_windows(*windows))
     raise UndefinedMapException(f"a layer of type {fn.type_name} has no coordinate mapping")
 
 
@@ -97,7 +77,7 @@ def compose(base_map: Mapping, next_map: Mapping) -> Mapping:
 def inverse(coord_map: Mapping) -> Mapping:
     """Return the mapping from top to bottom."""
     axis, scale, shift = coord_map
-    return axis, 1 / scale, -shift / scale
+    return axis, *inverted(scale, shift)
 
 
 def coord_map_from_to(top_from: Top, top_to: Top) -> Mapping:

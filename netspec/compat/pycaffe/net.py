@@ -98,7 +98,7 @@ class Net:
 
     def _set_net(self, net: core.Net) -> None:
         mode.follow_seed(net.random)
-        caffe_pb2._of_net = net.plan.dialects
+        caffe_pb2._of_net = net.options.dialects
         self.runner = runner = BlobRunner(net)
         names = [node.name for node in net.plan.nodes]
         self._layer_names = names

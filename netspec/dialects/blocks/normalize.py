@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import given_fields, value
@@ -61,7 +60,7 @@ class Normalize(Layer):
         fields, shape = given_fields(self.param), self.bottom_shapes[0]
         if len(shape) < 2:
             raise self.error(f"found a bottom of shape {shape}, expected at least 2 axes (N, C, ...)", "bottom")
-        self.fork = fork_of(self)
+        self.fork = self.context.fork or SSD
         self.across, self.eps, self.squares = self.fork == TSN, 0.0, True
         if self.fork == HAPPYNEAR:
             self._set_up_as_happynears(value(self.param, "normalize_param") if "normalize_param" in fields else None)

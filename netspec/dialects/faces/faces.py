@@ -12,7 +12,6 @@ import torch
 from typing_extensions import override
 
 from netspec.dialects.faces.margins import Margin, MarginProduct
-from netspec.dialects.signatures import fork_of
 from netspec.layers import register
 from netspec.layers.contract.base import Shape
 from netspec.layers.loss.base import Classified, Loss
@@ -100,7 +99,7 @@ class CenterLoss(Loss, Classified):
         axis = self.canonical_axis(p.axis, shape, "center_loss_param", "axis")
         self.length = torch.Size(shape[axis:]).numel()
         self.add_blob((p.num_output, self.length), p.center_filler)
-        self.n_times = fork_of(self) == "happynear"
+        self.n_times = self.context.fork == "happynear"
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         vectors, labels = (torch.Size(shape) for shape in bottom_shapes)

@@ -17,7 +17,6 @@ from typing_extensions import override
 from netspec.dialects.faces.margins import MarginProduct
 from netspec.dialects.layers import replace
 from netspec.dialects.not_learned import NotLearned
-from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer, common, register
 from netspec.layers.contract.base import Shape, State
 from netspec.layers.loss.base import VALID, Classified, Loss, ignore_label, normalization_mode, normalizer
@@ -263,7 +262,7 @@ class FocalLoss(Loss, Classified):
                 message = f"{name} must be {expected}, found {getattr(p, name):g}"
                 raise self.error(message, "focal_loss_param", name)
         self.base, self.factor = p.alpha, 1.0
-        if fork_of(self) != "happynear":
+        if self.context.fork == "rcnn":
             self.base, self.factor = 1.0, p.alpha if p.HasField("alpha") else 0.25
         self.ignored = ignore_label(self.param.loss_param)
         self.normalization = normalization_mode(self.param.loss_param, VALID)

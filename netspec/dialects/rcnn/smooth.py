@@ -11,7 +11,6 @@ import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.dialects.registry import added_value
-from netspec.dialects.signatures import fork_of
 from netspec.errors import Code
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
@@ -79,7 +78,7 @@ class SmoothL1Loss(Loss):
 
     def found_fork(self) -> str:
         """The dialect that defines this layer."""
-        return fork_of(self)
+        return self.context.fork
 
     @property
     @override

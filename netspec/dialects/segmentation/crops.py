@@ -1,169 +1,117 @@
-"""Crop without crop_param, which aligns its bottoms in some forks, while Caffe crops from the corner.
+"""Crop without crop_param: HED's branch aligns its bottoms, while Caffe crops from the corner.
 
-Pixel i of the top of a convolution with kernel k, stride s and pad p is at s i + (k - 1) / 2 - p in its bottom; for a
-deconvolution, it is the inverse. HED's branch, and nets that follow it (OSVOS, early fcn-8s), crop so that the
-pixels of both bottoms are aligned.
+Nets that follow HED (OSVOS, early fcn-8s) crop so that the pixels of both bottoms are aligned.
 Fork: s9xie/hed, src/caffe/layers/crop_layer.cpp. The rule became BVLC's python/caffe/coord_map.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Collection
 from fractions import Fraction
 from typing import Any
 
-from netspec.graph.plan import Plan
+from netspec.graph.coordinates import PASS_THROUGH_LAYERS, inverted, of_windows
 from netspec.proto.schema import LayerParameter, NetParameter
+from netspec.proto.source_map import SourceMap
 
-Line = tuple[Fraction, Fraction]  # (scale, shift): pixel i is at scale i + shift
+Line = tuple[Fraction, Fraction]  # (scale, shift): pixel i of an ancestor is at scale i + shift in the Crop's bottom
+Value = tuple[int, str]  # the index of the layer that makes it, and its name
 SAME = (Fraction(1), Fraction(0))
-ELEMENTWISE = (
-    "AbsVal",
-    "BatchNorm",
-    "Bias",
-    "BN",
-    "BNLL",
-    "Clip",
-    "Dropout",
-    "Eltwise",
-    "ELU",
-    "Exp",
-    "Log",
-    "LRN",
-    "MVN",
-    "Power",
-    "PReLU",
-    "ReLU",
-    "ReLU6",
-    "Scale",
-    "Sigmoid",
-    "Split",
-    "Swish",
-    "TanH",
-    "Threshold",
-)
+CONVOLUTIONS = ("Convolution", "DepthwiseConvolution", "ConvolutionDepthwise", "Deconvolution")
 HED = "hed"
 CORNER = (
-    "without crop_param it cuts from the corner, as in Caffe; HED's branch aligns its bottoms, by {by}: for that "
-    'write "# dialect: hed" into the prototxt or pass --plugin hed'
-)
-ALIGNED = (
-    "without crop_param it aligns its bottoms as HED's branch does, by {by}, since a convolution before it pads with "
-    "more than its kernel; Caffe cuts from the corner: for that write crop_param {{ axis: 2 offset: 0 }}"
-)
-EDGES = (
-    "; SigmoidCrossEntropyLoss is computed as in Caffe; for that of HED or RCF, which weights edges, name the dialect"
+    "without crop_param it cuts from the corner, as in Caffe; HED's branch aligns its bottoms, by {by}, and weights "
+    'the edges of SigmoidCrossEntropyLoss: for these write "# dialect: hed" into the prototxt, or pass --plugin hed'
 )
 
 
-def with_aligned_crops(plan: Plan) -> Plan:
-    """Return a plan whose Crops without crop_param have offsets where HED's branch is meant, with warnings."""
-    if not any(layer.type == "Crop" for layer in plan.net.layer):
-        return plan
-    net = NetParameter()
-    net.CopyFrom(plan.net)
-    aligned = replace(plan, net=net)
-    return replace(aligned, warnings=tuple(_align(aligned)))
+def with_aligned_crops(
+    net: NetParameter, source: SourceMap, dialects: Collection[str]
+) -> tuple[NetParameter, list[str]]:
+    """Return a net whose Crops without crop_param are aligned if it is HED's, and a warning if others would be."""
+    if not any(layer.type == "Crop" and not layer.HasField("crop_param") for layer in net.layer):
+        return net, []
+    aligned = NetParameter()
+    aligned.CopyFrom(net)
+    crops = _align(aligned)
+    if HED in dialects or not crops:
+        return aligned, []
+    where = source.at(crops[0], layer=net.layer[crops[0]].name, type="Crop")
+    by = " and ".join(map(str, aligned.layer[crops[0]].crop_param.offset))
+    others = f" (also in {len(crops) - 1} more of these layers)" if len(crops) > 1 else ""
+    return net, [f"{where}: {CORNER.format(by=by)}{others}"]
 
 
-def _align(plan: Plan) -> Iterator[str]:
-    """Set the offsets of each Crop without crop_param as in HED's branch, if the net is made for it; yield warnings.
+def _align(net: NetParameter) -> list[int]:
+    """Set the offsets in rows and columns at which Crops without crop_param are aligned; return the indices of these.
 
-    It is if the dialect is named, or if a convolution before the Crop has more padding than its kernel, because only
-    such a Crop removes the surplus.
+    Those are left out whose bottoms are not connected, have different scales or no whole number of pixels between them.
     """
-    makers = {value: i for i, node in enumerate(plan.nodes) for value in node.tops}
-    found: dict[str, list[int]] = {}
-    by: dict[int, str] = {}
-    for i, layer in enumerate(plan.net.layer):
-        if layer.type != "Crop" or layer.HasField("crop_param") or len(layer.bottom) != 2:
-            continue
-        offsets, padded = _offsets(plan, makers, i) or ([], False)
-        if any(offsets) and (padded or HED in plan.dialects):
-            layer.crop_param.axis = 2
-            layer.crop_param.offset.extend(offsets)
-        if any(offsets) and HED not in plan.dialects:
-            found.setdefault(ALIGNED if padded else CORNER, []).append(i)
-            by.setdefault(i, " and ".join(map(str, offsets)))
-    for message, crops in found.items():
-        where = plan.source.at(crops[0], layer=plan.nodes[crops[0]].name, type="Crop")
-        others = f" (also in {len(crops) - 1} more of these layers)" if len(crops) > 1 else ""
-        edges = any(layer.type == "SigmoidCrossEntropyLoss" for layer in plan.net.layer) and "rcf" not in plan.dialects
-        yield f"{where}: {message.format(by=by[crops[0]])}{others}{EDGES if edges else ''}"
+    newest: dict[str, Value] = {}
+    below: dict[Value, Value | None] = {}  # the first bottom of the layer that makes a value
+    found = []
+    for i, layer in enumerate(net.layer):
+        bottoms = [newest.get(name) for name in layer.bottom]
+        if layer.type == "Crop" and not layer.HasField("crop_param") and len(bottoms) == 2:
+            first, second = (_lines(net, below, bottom) for bottom in bottoms)
+            common = next((value for value in second if value in first), None)
+            offsets = [_between(*lines) for lines in zip(first[common], second[common], strict=True)] if common else []
+            if any(offsets) and None not in offsets:
+                layer.crop_param.axis = 2
+                layer.crop_param.offset.extend(offset for offset in offsets if offset is not None)
+                found.append(i)
+        for name in layer.top:
+            below[i, name] = bottoms[0] if bottoms else None
+            newest[name] = (i, name)
+    return found
 
 
-def _offsets(plan: Plan, makers: dict[int, int], crop: int) -> tuple[list[int], bool] | None:
-    """Return the offsets of a Crop's rows and columns, and whether a convolution pads beyond its kernel.
-
-    None if the bottoms are not connected, have different scales, or if the offset is not a whole number of pixels.
-    """
-    first, second = (_ancestors(plan, makers, value) for value in plan.nodes[crop].bottoms)
-    common = next((value for value in second if value in first), None)
-    if common is None:
-        return None
-    offsets, padded = [], False
-    for axis in (0, 1):
-        lines = []
-        for way in (first, second):
-            line: Line | None = SAME
-            for value, maker in way.items():
-                if value == common or line is None:
-                    break
-                line, beyond = _line_below(plan.net.layer[maker], axis, line)
-                padded = padded or beyond
-            lines.append(line)
-        if lines[0] is None or lines[1] is None or lines[0][0] != lines[1][0]:
-            return None
-        offset = (lines[1][1] - lines[0][1]) / lines[0][0]
-        if offset < 0 or offset.denominator != 1:
-            return None
-        offsets.append(int(offset))
-    return offsets, padded
+def _between(first: Line, second: Line) -> int | None:
+    """Return how far the second bottom of a Crop lies inside the first, if it does, by whole pixels."""
+    offset = first[1] - second[1]
+    return int(offset) if first[0] == second[0] and offset >= 0 and offset.denominator == 1 else None
 
 
-def _ancestors(plan: Plan, makers: dict[int, int], value: int) -> dict[int, int]:
-    """Return the ancestors of a value, by first bottoms, and the layers that compute them; -1 for an input."""
-    way: dict[int, int] = {}
-    while value >= 0:
-        maker = makers.get(value, -1)
-        way[value] = maker
-        bottoms = plan.nodes[maker].bottoms if maker >= 0 else ()
-        value = bottoms[0] if bottoms else -1
-    return way
+def _lines(net: NetParameter, below: dict[Value, Value | None], value: Value | None) -> dict[Value, tuple[Line, Line]]:
+    """Return the ancestors of a value by first bottoms, with their lines along rows and columns."""
+    lines: list[Line] = [SAME, SAME]
+    found: dict[Value, tuple[Line, Line]] = {}
+    while value:
+        found[value] = (lines[0], lines[1])
+        layer, value = net.layer[value[0]], below[value]
+        for axis, (scale, shift) in enumerate(lines):
+            step = _step(layer, axis)
+            if step is None:
+                return found
+            lines[axis] = scale * step[0], scale * step[1] + shift
+    return found
 
 
-def _line_below(layer: LayerParameter, axis: int, line: Line) -> tuple[Line | None, bool]:
-    """Return the (scale, shift) of a layer's bottom from that of its top, and whether it pads beyond its kernel."""
-    scale, shift = line
-    if layer.type in ELEMENTWISE:
-        return line, False
+def _step(layer: LayerParameter, axis: int) -> Line | None:
+    """Return the line from a layer's bottom to its top, None if it has none."""
+    if layer.type in PASS_THROUGH_LAYERS:
+        return SAME
     if layer.type == "Crop":
         param, rows = layer.crop_param, 2 + axis - layer.crop_param.axis
         offsets = list(param.offset) or [0]
-        offset = 0 if rows < 0 or param.axis < 0 else offsets[rows if len(offsets) > rows else 0]
-        return (scale, shift + offset), False
-    if layer.type in ("Convolution", "DepthwiseConvolution", "ConvolutionDepthwise", "Deconvolution"):
+        return Fraction(1), Fraction(0 if rows < 0 or param.axis < 0 else -offsets[rows if len(offsets) > rows else 0])
+    if layer.type in CONVOLUTIONS:
         param: Any = layer.convolution_param
         kernel, stride, pad, dilation = (_of(param, name, axis) for name in ("kernel", "stride", "pad", "dilation"))
-        kernel = (kernel - 1) * dilation + 1
-    elif layer.type == "Pooling" and not layer.pooling_param.global_pooling:
-        kernel, stride, pad = (_of(layer.pooling_param, name, axis) for name in ("kernel", "stride", "pad"))
-    else:
-        return None, False
-    middle = Fraction(kernel - 1, 2) - pad
-    if layer.type == "Deconvolution":
-        return (scale / stride, (shift - middle) / stride), False
-    return (scale * stride, shift * stride + middle), pad >= kernel
+        step = of_windows(stride, (kernel - 1) * dilation + 1, pad)
+        return inverted(*step) if layer.type == "Deconvolution" else step
+    if layer.type == "Pooling" and not layer.pooling_param.global_pooling:
+        return of_windows(*(_of(layer.pooling_param, name, axis) for name in ("stride", "kernel", "pad")))
+    return None
 
 
-def _of(param: Any, name: str, axis: int) -> int:
+def _of(param: Any, name: str, axis: int) -> Fraction:
     """Return a size of a convolution or pooling along rows (0) or columns (1)."""
     single = "kernel_size" if name == "kernel" else name
     own = f"{name}_{'hw'[axis]}"
     if own in param.DESCRIPTOR.fields_by_name and param.HasField(own):
-        return getattr(param, own)
-    values = getattr(param, single)
+        return Fraction(getattr(param, own))
+    values, least = getattr(param, single), 0 if name == "pad" else 1
     if isinstance(values, int):
-        return max(values, 0 if name == "pad" else 1)
-    return values[min(axis, len(values) - 1)] if values else 0 if name == "pad" else 1
+        return Fraction(max(values, least))
+    return Fraction(values[min(axis, len(values) - 1)] if values else least)

@@ -9,7 +9,6 @@ import torch
 import torch.nn.functional as F
 
 from netspec.dialects.not_learned import NotLearned
-from netspec.dialects.signatures import fork_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.normalization import as_before
@@ -126,7 +125,7 @@ class BN(NotLearned):
             raise self.error(
                 f"{other} is PSPNet's and {min(segnets)} is SegNet's; use one kind only", "bn_param", other
             )
-        fork = fork_of(self)
+        fork = self.context.fork
         segnet = fork == "segmentation" and not fields - segnets
         self.channels = shape[1]
         size = (1, self.channels, 1, 1)

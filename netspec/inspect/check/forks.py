@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 from netspec.errors import Code, ForkFault, SpecError
+from netspec.graph.options import BuildOptions
 from netspec.layers import class_of, layer_class, unknown_type
 from netspec.proto.forks import forks
 from netspec.proto.schema import NetParameter
@@ -15,9 +16,9 @@ MOST_LINES = 8  # number of lines to list in an error
 
 def unknown_types(net: NetParameter, source: SourceMap) -> Iterator[ForkFault]:
     """Yield a fault for each layer of a type that is not known."""
-    dialects = {*source.dialects, *forks().dialects_of(net)}
+    meaning = forks().meaning(net, source.reporting_to(lambda fault: None), BuildOptions())
     for i, layer in enumerate(net.layer):
-        if layer_class(layer.type, dialects) is None:
+        if i not in meaning.classes and layer_class(layer.type) is None:
             where = source.at(i, "type", layer=layer.name, type=layer.type)
             message = unknown_type(layer.type)
             yield ForkFault(message, where, "layer", layer.type, forks().additions().types.get(layer.type, ()))

@@ -93,6 +93,8 @@ class Context:
     created: Callable[[int], None] = lambda tops: None
     # whether the constructor allocates the blobs; a net does it when it knows that the memory is enough
     allocates: bool = True
+    # the fork of Caffe that the layer belongs to, if several have its type (Forks.meaning)
+    fork: str = ""
 
     @property
     def device(self) -> torch.device:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import TypeVar
 
 from netspec.errors import did_you_mean
-from netspec.graph.options import BuildOptions
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.data_layer import DataLayer
 from netspec.proto.forks import forks
@@ -47,15 +46,14 @@ def registered(type_name: str) -> type[Layer] | None:
     return _LAYERS.get(type_name)
 
 
-def layer_class(type_name: str, dialects: Collection[str] = ()) -> type[Layer] | None:
+def layer_class(type_name: str) -> type[Layer] | None:
     """Return the class of a layer type: Caffe's, or that of the only fork or dialect that can be meant; or None."""
-    return registered(type_name) or forks().class_of(LayerParameter(type=type_name), dialects, False)
+    return registered(type_name) or forks().class_of(LayerParameter(type=type_name))
 
 
-def class_of(param: LayerParameter, options: BuildOptions | None = None) -> type[Layer] | None:
-    """Return the class of a layer, or None: that of ``options.dialects`` for it, or else that of its type."""
-    dialects, runs_python = (options.dialects, options.allow_python) if options else ((), False)
-    return forks().class_of(param, dialects, runs_python) or registered(param.type)
+def class_of(param: LayerParameter) -> type[Layer] | None:
+    """Return the class of a layer by itself, or None: that of the fork that it shows, or else that of its type."""
+    return forks().class_of(param) or registered(param.type)
 
 
 def source_of(param: LayerParameter) -> str:
@@ -72,9 +70,8 @@ def layer_types() -> list[str]:
 
 def unknown_type(type_name: str) -> str:
     """Return the message for an unknown type, with a similar type or the fork that defines it."""
-    additions, new_layer = forks().additions(), forks().new_layer
+    additions, new = forks().additions(), forks().new
     advice = additions.advise(type_name, additions.types.get(type_name, ()))
     close = did_you_mean(type_name, sorted({*layer_types(), *additions.types}), near=True) or ";"
-    new = f", {new_layer}" if new_layer else ""
-    hint = f"; {advice}" if advice else f"{close} `netspec layers` lists the known ones{new}"
+    hint = f"; {advice}" if advice else f"{close} `netspec layers` lists the known ones{', ' * bool(new)}{new}"
     return f'unknown layer type "{type_name}"{hint}'

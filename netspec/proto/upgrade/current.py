@@ -327,7 +327,7 @@ def upgrade_solver(solver: SolverParameter, position: Position) -> tuple[SolverP
             "upgrade_proto.cpp:1093",
             "Note that future Caffe releases will only support 'type' field (string) for a solver's type.",
         )
-    return draft.message, draft.position()
+    return draft.message, replace(draft.position(), dialects=position.dialects)
 
 
 def upgrade_snapshot_prefix(solver: SolverParameter, path: str | Path) -> SolverParameter:

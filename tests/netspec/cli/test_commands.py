@@ -258,7 +258,7 @@ def test_typos_are_reported_with_suggestions(run: Run, edited: Edit) -> None:
 
     assert fault("num_output: 6", "num_outputs: 6") == (
         'net.prototxt:35:23: layer "conv1" (Convolution): ConvolutionParameter has no field "num_outputs"; '
-        'did you mean "num_output"? docs/layer.md shows how to add a fork\'s with --plugin FILE.py'
+        'did you mean "num_output"? docs/layer.md shows how to add one with --plugin FILE.py'
     )
     assert fault('type: "ReLU"', 'type: "Relu"') == (
         'net.prototxt:71:3: layer "relu1" (Relu): unknown layer type "Relu"; did you mean "ReLU"? '

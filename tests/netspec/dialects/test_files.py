@@ -143,16 +143,34 @@ def test_errors_of_a_plugin_are_reported_in_one_line(
     assert known.added() == ()
 
 
-def test_two_dialects_with_the_same_type_number_or_name_are_refused(fork: Path, tmp_path: Path) -> None:
+TRIPLING = """
+from netspec.layers import Layer, register
+
+@register("Times")
+class Times(Layer):
+    def reshape(self, bottom_shapes):
+        return bottom_shapes
+
+    def forward(self, data):
+        return 3 * data
+"""
+
+
+def test_a_layer_of_two_added_dialects_is_that_of_the_one_that_the_file_names(fork: Path, tmp_path: Path) -> None:
     use_dialect(fork)
-    other = tmp_path / "tripling.py"
-    other.write_text('from netspec.layers import Layer, register\n@register("Times")\nclass A(Layer): pass\n')
-    with pytest.raises(SpecError, match='layer type "Times" already exists, from netspec_dialect_doubling'):
-        use_dialect(other)
-    third = tmp_path / "same_number.py"
-    third.write_text('DECLARATIONS = "extend LayerParameter { optional int32 even_more = 1000; }"\n')
-    with pytest.raises(SpecError, match=r'number 1000 of caffe\.LayerParameter is used by "times_param'):
-        use_dialect(third)
+    (tmp_path / "tripling.py").write_text(TRIPLING)
+    use_dialect(tmp_path / "tripling.py")
+    net = tmp_path / "net.prototxt"
+    net.write_text(NET.replace("times_param { factor: 5 }", ""))
+    with pytest.raises(SpecError, match='dialects "doubling" and "tripling" have "Times"') as caught:
+        netspec.load_net(net)
+    assert 'write a line "# dialect: doubling"' in caught.value.message
+    net.write_text("# dialect: tripling\n" + net.read_text())
+    assert netspec.load_net(net)(x=np.ones((2, 3)))["y"].tolist() == [[3] * 3] * 2
+
+
+def test_two_files_of_one_name_are_refused(fork: Path, tmp_path: Path) -> None:
+    use_dialect(fork)
     namesake = tmp_path / "elsewhere" / "doubling.py"
     namesake.parent.mkdir()
     namesake.write_text('DECLARATIONS = "extend LayerParameter { optional int32 more = 1001; }"\n')
@@ -211,7 +229,7 @@ def test_a_layer_type_of_two_dialects_is_refused_with_the_options_to_give(
     assert main(["check", str(net)]) == 1
     said = capsys.readouterr().err
     assert 'unknown layer type "ImageLabelmapData"; dialects "hed" and "rcf" have "ImageLabelmapData"; add --' in said
-    assert 'or write "# dialect: hed" into the prototxt' in said
+    assert 'or write a line "# dialect: hed" into the prototxt' in said
     for name in ("rcf", "hed"):
         net.write_text(f'# dialect: {name}\nlayer {{ name: "l" type: "ImageLabelmapData" top: "x" top: "y" }}')
         assert main(["check", str(net)]) == 1

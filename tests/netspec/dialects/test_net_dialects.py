@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
+import netspec
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
-from netspec.graph.plan import make_plan
+from netspec.graph.options import BuildOptions
 from netspec.layers.vision.convolution import Convolution
 from netspec.net.net import Net
 from netspec.net.weights import load_weights
@@ -50,6 +51,7 @@ def test_a_layer_type_of_one_dialect_activates_it_and_one_of_several_does_not(ne
 NORMALIZE = 'layer { name: "n" type: "Normalize" bottom: "data" top: "n" }'
 INTERP = 'layer { name: "v" type: "Interp" bottom: "n" top: "v" interp_param { zoom_factor: 2 } }'
 BN = 'layer { name: "n" type: "BN" bottom: "data" top: "n" }'
+SIGMOID = 'layer { name: "n" type: "SigmoidCrossEntropyLoss" bottom: "data" bottom: "data" top: "n" }'
 SMOOTH = 'layer { name: "n" type: "SmoothL1Loss" bottom: "data" bottom: "data" top: "n" %s }'
 FOCAL = """layer { name: "l" type: "DummyData" top: "l" dummy_data_param { shape { dim: [1, 7, 7] } } }
 layer { name: "n" type: "FocalLoss" bottom: "conv" bottom: "l" top: "n" focal_loss_param { %s } }"""
@@ -87,6 +89,49 @@ def test_a_layer_of_several_forks_gets_a_warning_unless_the_file_shows_the_fork(
     assert all(others in line and "# dialect: " in line and "--plugin" in line for line in said)
 
 
+OF_TWO_FORKS = {
+    "a_layer_with_both": (
+        TWO_TOPS.replace('top: "l"', 'top: "l" norm_param { }'),
+        "Normalize",
+        ("ssd", "happynear"),
+    ),
+    "a_net_with_both": (
+        'layer { name: "p" type: "Flip" bottom: "data" top: "p" }'
+        'layer { name: "v" type: "Interp" bottom: "p" top: "v" interp_param { zoom_factor: 2 } }' + BN,
+        "BN",
+        ("blocks", "happynear"),
+    ),
+    "both_named": ("# dialect: ssd\n# dialect: tsn\n" + NORMALIZE, "Normalize", ("ssd", "tsn")),
+    "both_named_for_caffes": (
+        "# dialect: hed\n# dialect: rcf\n" + SIGMOID,
+        "SigmoidCrossEntropyLoss",
+        ("hed", "rcf"),
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "kind", "names"), OF_TWO_FORKS.values(), ids=OF_TWO_FORKS)
+def test_a_layer_of_two_forks_at_once_is_refused_with_the_line_that_chooses(
+    net_of: Callable[..., Net], text: str, kind: str, names: tuple[str, str]
+) -> None:
+    with pytest.raises(SpecError) as caught:
+        net_of(PLAIN + text)
+    assert caught.value.where is not None
+    assert caught.value.where.type == kind
+    assert all(f'"{name}"' in caught.value.message for name in names)
+    assert f"# dialect: {names[0]}" in caught.value.message
+    if "# dialect" not in text:
+        net_of(f"# dialect: {names[0]}\n" + PLAIN + text.replace('top: "l"', ""))
+
+
+def test_dialects_that_solvers_name_are_those_of_the_nets_inside(tmp_path: Path) -> None:
+    text = (
+        f'# dialect: tsn\nbase_lr: 1 lr_policy: "fixed" snapshot_prefix: "x" train_net_param {{ {PLAIN} {NORMALIZE} }}'
+    )
+    (tmp_path / "solver.prototxt").write_text(text)
+    assert netspec.load_solver(tmp_path / "solver.prototxt").net.options.dialects == ("tsn",)
+
+
 def test_a_comment_with_an_unknown_dialect_is_refused(net_of: Callable[..., Net]) -> None:
     with pytest.raises(SpecError, match=r':2:1: unknown dialect "hd"; did you mean "hed"'):
         net_of("\n# dialect: hd\n" + PLAIN)
@@ -106,10 +151,11 @@ def conv(pad: int) -> str:
         (conv(1), 0, ""),
         (conv(2), 0, "cuts from the corner, as in Caffe; HED's branch aligns its bottoms, by 1 and 1"),
         ("# dialect: hed\n" + conv(2), 1, ""),
-        (conv(35), 34, "aligns its bottoms as HED's branch does, by 34 and 34"),
+        (conv(35), 0, "cuts from the corner, as in Caffe; HED's branch aligns its bottoms, by 34 and 34"),
+        ("# dialect: hed\n" + conv(35), 34, ""),
         (conv(35).replace('"crop" }', '"crop" crop_param { offset: 0 } }'), 0, ""),
     ],
-    ids=["pad_1", "pad_2", "pad_2_hed", "pad_35", "pad_35_with_offset"],
+    ids=["pad_1", "pad_2", "pad_2_hed", "pad_35", "pad_35_hed", "pad_35_with_offset"],
 )
 def test_crop_without_offsets_aligns_its_bottoms_in_hed_only(
     net_of: Callable[..., Net], caplog: pytest.LogCaptureFixture, text: str, offset: int, said: str
@@ -122,11 +168,11 @@ def test_crop_without_offsets_aligns_its_bottoms_in_hed_only(
     assert all(said in line for line in lines)
 
 
-def test_a_plan_is_not_changed_by_its_forks() -> None:
-    plan = make_plan(*parse_net_text(conv(35), "f"))
-    first, second = forks().applied_to(plan, ()), forks().applied_to(plan, ())
-    assert [layer.HasField("crop_param") for layer in (plan.net.layer[-1], first.net.layer[-1])] == [False, True]
-    assert first.warnings == second.warnings != ()
+def test_a_net_is_not_changed_by_its_forks() -> None:
+    net, source = parse_net_text("# dialect: hed\n" + conv(2), "f")
+    first, second = (forks().meaning(net, source, BuildOptions()) for _ in range(2))
+    assert [layer.HasField("crop_param") for layer in (net.layer[-1], first.net.layer[-1])] == [False, True]
+    assert first.net == second.net
 
 
 def test_crop_offsets_of_hed_equal_those_of_coord_map(net_of: Callable[..., Net]) -> None:

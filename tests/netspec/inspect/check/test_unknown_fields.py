@@ -15,7 +15,7 @@ NORM = """layer { name: "n" type: "Normalize" bottom: "a" top: "n"
 """
 SHUFFLE = 'layer { name: "s" type: "ShuffleChannel" bottom: "a" top: "s" shuffle_channel_param { group: 2 } }\n'
 STRANGE = 'layer { name: "s" type: "Strange" bottom: "a" top: "s" strange_param { group: 2 } }\n'
-OWN = " docs/layer.md shows how to add a fork's with --plugin FILE.py"
+OWN = " docs/layer.md shows how to add one with --plugin FILE.py"
 POOL = (
     'layer { name: "k" type: "Pooling" bottom: "a" top: "k" pooling_param { kernal: -3, pool: MAX kernel_size: 2 } }\n'
 )
