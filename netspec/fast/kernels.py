@@ -72,8 +72,6 @@ class Learning:
 
     - ``wanted[i]``: whether the gradient of bottom i is needed.
     - ``sums[j]``: the tensor to which the gradient of learnable blob j is added; None if it is not learned.
-    - ``steady``: bottoms do not change between the forward and the backward kernel. If they may, the backward kernel
-      must read them again, as Caffe's does.
 
     The forward and the backward kernel run alternately, without autograd, and BLAS uses one thread. The backward kernel
     gets None for a top without a gradient, but never for all tops. A tensor that a kernel returns is valid until the
@@ -82,7 +80,6 @@ class Learning:
 
     wanted: tuple[bool, ...]
     sums: tuple[Diff, ...] = ()
-    steady: bool = True
 
 
 def with_activation(kernel: Kernel, activation: Activation | None) -> Kernel:

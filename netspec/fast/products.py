@@ -126,9 +126,8 @@ class PreparedVectors:
 class PreparedColumns:
     """:class:`netspec.exact.products.ColumnProducts` of maps (N, C, H, W) of one shape.
 
-    If the columns of a batch fit into :data:`netspec.exact.products.COLUMNS`, they are kept for the backward pass. If
-    maps may change before it (not ``steady``), they are computed again. ``nbytes`` is about the memory that is kept
-    between runs.
+    If the columns of a batch fit into :data:`netspec.exact.products.COLUMNS`, they are kept for the backward pass.
+    ``nbytes`` is about the memory that is kept between runs.
     """
 
     def __init__(
@@ -138,13 +137,11 @@ class PreparedColumns:
         group: int,
         learned: Weights,
         wanted: bool = False,
-        steady: bool = True,
     ) -> None:
         weight, bias, weight_sums, bias_sums = learned
         count, channels, *size = shape
         self._size, self._sliding, self._group = tuple(size), sliding, group
         fits = sliding.fits(self._size)
-        self._steady = steady
         self._top = torch.empty((count, len(weight), *fits), dtype=weight.dtype)
         self._bias = None if bias is None else bias.view(-1, 1, 1)
         self._at_once = min(count, sliding.images_at_once(channels, self._size))
@@ -190,7 +187,7 @@ class PreparedColumns:
             for each in diffs:
                 self._gemv(1.0, each.T, self._ones, 1.0, self._bias_sums, 0, 1, 0, 1, 1, 1)
         found: list[torch.Tensor] = []
-        whole = self._steady and len(self._columns) == 1
+        whole = len(self._columns) == 1
         for k, lay_out in enumerate(self._columns):
             start = k * self._at_once
             some = [_by_group(each, self._group) for each in diffs[start : start + self._at_once]]

@@ -5,7 +5,7 @@ Its methods import what they need. So a command whose net is run by another engi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from netspec.fast.training import TrainingStep
     from netspec.layers.contract.base import Layer
     from netspec.run.eager import Eager
-    from netspec.run.recorded import Diff, Kernels
 
 
 @dataclass(frozen=True)
@@ -31,13 +30,13 @@ class Fast:
 
         return Prepared(eager.plan, eager.layers, eager.loss_weights, eager.exact, passes)
 
-    def trainer(self, eager: Eager, largest: float | None) -> TrainingStep | str:
+    def trainer(self, eager: Eager) -> TrainingStep | str:
         """Return the prepared training step of a net, or the reason why it has none."""
-        from netspec.fast.training import LARGEST, TrainingStep, obstacle
+        from netspec.fast.training import TrainingStep, obstacle
         from netspec.run.walk import weighted_sum
 
         parts = eager.parts()
-        if why := obstacle(eager.plan, parts, LARGEST if largest is None else largest):
+        if why := obstacle(eager.plan, parts):
             return why
         weighted = partial(weighted_sum, exact=eager.exact)
         return TrainingStep(eager.plan, parts, eager.loss_weights, eager.overwritten, weighted)
@@ -53,20 +52,3 @@ class Fast:
         from netspec.fast.table import is_fresh
 
         return is_fresh(layer)
-
-    def learns(self, layer: Layer) -> bool:
-        """Return whether :meth:`kernels` returns kernels for a layer with its current shapes."""
-        from netspec.fast.table import learns_alone
-
-        return learns_alone(layer, steady=False)
-
-    def kernels(self, layer: Layer, wanted: Sequence[bool], sums: Sequence[Diff]) -> Kernels | None:
-        """Return the training kernels of a layer for its current shapes, or None.
-
-        ``wanted[i]``: whether the gradient of bottom i is computed. ``sums[j]``: the tensor to which the gradient of
-        learnable blob j is added. Bottoms may change between the calls, so backward reads them again.
-        """
-        from netspec.fast.kernels import Learning
-        from netspec.fast.table import learning_kernels
-
-        return learning_kernels(layer, Learning(tuple(wanted), tuple(sums), steady=False))

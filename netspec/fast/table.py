@@ -49,7 +49,7 @@ def learning_kernels(layer: Layer, how: Learning) -> Kernels | None:
     return entry_of(layer).learning(layer, how)
 
 
-def learns_alone(layer: Layer, steady: bool = True) -> bool:
+def learns_alone(layer: Layer) -> bool:
     """Return whether a layer has its own kernels for training at its present shapes."""
-    how = Learning((True,) * len(layer.bottom_shapes), (None,) * len(layer.blobs), steady)
+    how = Learning((True,) * len(layer.bottom_shapes), (None,) * len(layer.blobs))
     return learning_kernels(layer, how) is not None

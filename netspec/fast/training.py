@@ -31,12 +31,12 @@ LARGEST = 2**22  # numbers in all tops: in larger nets the time of autograd is n
 Values = list[Any]  # by value number, a tensor or None
 
 
-def obstacle(plan: Plan, parts: Sequence[Part], largest: float = LARGEST) -> str:
+def obstacle(plan: Plan, parts: Sequence[Part]) -> str:
     """Return the reason why prepared kernels cannot train a net of these parts; "" if they can."""
     layers = [layer for part in parts for layer in part.members]
     count = sum(math.prod(shape) for part in parts for shape in part.layer.top_shapes)
-    if count > largest:
-        return f"its tops have {count:,} numbers, more than {largest:,}"
+    if count > LARGEST:
+        return f"its tops have {count:,} numbers, more than {LARGEST:,}"
     for node, layer in zip(plan.nodes, layers, strict=True):
         if layer.context.device.type != "cpu":
             return "it runs on a GPU"

@@ -18,11 +18,8 @@ if TYPE_CHECKING:
             """Return a Runner without gradients. ``passes`` are the allowed ones of netspec/graph/options.py."""
             ...
 
-        def trainer(self, eager: Any, largest: float | None) -> Any:
-            """Return a Trainer (netspec/run/walk.py), or the reason, a string, why there is none.
-
-            ``largest`` is the largest number of elements in all tops of a net trained this way; None: a default.
-            """
+        def trainer(self, eager: Any) -> Any:
+            """Return a Trainer (netspec/run/walk.py), or the reason, a string, why there is none."""
             ...
 
         def reads_at_once(self, decode: Callable[[Any], Any]) -> Callable[[Sequence[bytes]], Any]:

@@ -109,7 +109,6 @@ class Net(torch.nn.Module):
         speed = options.speed if options.passes and self.phase == TEST else None
         self.prepared: Any = speed and speed.prepared(self.eager, options.passes)
         self._trainer: Trainer | str | None = None  # made at the first pass that trains
-        self.largest_trained: float | None = None  # the most numbers in all tops for which a trainer is made
         self.runners: list[Runner] = [runner for runner in (self.prepared, self.eager) if runner]
 
     def replace_layer(self, i: int, layer: Layer) -> None:
@@ -213,15 +212,11 @@ class Net(torch.nn.Module):
             self._trainer = self.new_trainer()
         return None if isinstance(self._trainer, str) else self._trainer
 
-    def forget_trainer(self) -> None:
-        """Discard the trainer. The next :meth:`forward_backward` makes a new one, with new memory."""
-        self._trainer = None
-
     def new_trainer(self) -> Trainer | str:
         """Return a trainer that is faster than autograd, or the reason why there is none."""
         if self.options.speed is None:
             return "without netspec/fast"
-        return self.options.speed.trainer(self.eager, self.largest_trained)
+        return self.options.speed.trainer(self.eager)
 
     def input_tensors(self, inputs: Mapping[str, Array]) -> dict[int, torch.Tensor]:
         """Return the inputs as tensors, by value number. Raises SpecError for a missing or an unknown one."""

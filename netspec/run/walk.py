@@ -40,13 +40,7 @@ class Runner(Protocol):
 
 
 class Trainer(Protocol):
-    """Runs a net forward and backward.
-
-    If ``keeps`` is set, ``passed`` contains the values of the last pass and their gradients, by value number.
-    """
-
-    keeps: bool
-    passed: tuple[list[Any], list[Any]] | None
+    """Runs a net forward and backward."""
 
     def is_watched(self) -> bool:
         """Return whether a layer or blob has hooks, which only autograd calls."""

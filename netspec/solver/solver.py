@@ -96,7 +96,7 @@ class Solver(Training):
             return
         if self.is_due(self.param.display):
             with torch.no_grad():
-                self.losses.append(self.forward(self.net)[0].item())
+                self.losses.append(self.run(self.net)[0].item())
             log.info("solver.cpp:327", f"Iteration {self.iteration}, loss = {log.number(self.loss)}")
         if self.is_due(self.param.test_interval):
             self.test_all()
@@ -117,13 +117,13 @@ class Solver(Training):
         self.losses_before = ()
         self._display.begin(self.iteration, self.options.clock)
         with waiting_interrupts() as interrupt:
-            for to_come in reversed(range(iterations)):
-                self._iterate(to_come)
+            for _ in range(iterations):
+                self._iterate()
                 if self.stopped:
                     return
                 interrupt()
 
-    def _iterate(self, to_come: int) -> None:
+    def _iterate(self) -> None:
         """Run one iteration, including the tests before it and the snapshot after it."""
         if self.is_due(self.param.test_interval) and (self.iteration > 0 or self.param.test_initialization):
             self.test_all()
@@ -133,7 +133,7 @@ class Solver(Training):
             net.random.begin(f"iteration {self.iteration}")
         for callback in self.callbacks:
             callback.on_start()
-        loss, outputs = self._accumulate(to_come)
+        loss, outputs = self._accumulate()
         self.losses.append(loss)
         if not math.isfinite(loss):
             self.report_nan(f"the loss is {loss}")
@@ -150,7 +150,7 @@ class Solver(Training):
         if request == "stop":
             self.stopped = True
 
-    def _accumulate(self, to_come: int) -> tuple[float, Blobs]:
+    def _accumulate(self) -> tuple[float, Blobs]:
         """Sum the gradients of iter_size runs; return the mean of their losses, and the outputs of the last."""
         self.clear_gradients()
         self.replicas.clear()
@@ -159,7 +159,7 @@ class Solver(Training):
         for _ in range(self.param.iter_size):
             wanted = self.param.debug_info and self.is_due(self.param.display)
             with self.debugged(self.net) if wanted else nullcontext():
-                loss, outputs = self.forward_backward(to_come)
+                loss, outputs = self.run(self.net, learns=True)
             self.replicas.backward(self.options.precision, self.scale)
             total += np.float32(loss.item())
         self._reduce()
@@ -226,7 +226,7 @@ class Solver(Training):
         net.share_weights_with(self.net)
         net.random.begin(f"test at iteration {self.iteration}")
         with self.debugged(net) if param.debug_info else nullcontext():
-            tally = test(net, batches, lambda: self.forward(net), self._stops_test, param)
+            tally = test(net, batches, lambda: self.run(net), self._stops_test, param)
         if tally is None:
             log.info("solver.cpp:396", "Test interrupted.")
             return

@@ -229,19 +229,14 @@ class Training:
         if self.options.precision == BF16 and self.device.type == "cpu" and has_bfloat16() is False:
             log.logger.warning("precision bf16: this CPU has no instructions for it, so it is slower than fp32")
 
-    def forward(self, net: Net) -> tuple[torch.Tensor, Blobs]:
-        """Run a net forward; return its loss and outputs."""
-        return net.forward_loss()
-
-    def forward_backward(self, to_come: int) -> tuple[torch.Tensor, Blobs]:
-        """Run the training net forward and backward; return its loss and outputs.
-
-        ``to_come`` is the number of iterations of this call of ``step`` after the current one.
-        """
-        if self.options.precision == FP32 and (done := self.net.forward_backward()):
+    def run(self, net: Net, learns: bool = False) -> tuple[torch.Tensor, Blobs]:
+        """Run a net forward, and backward if it ``learns``; return its loss and outputs."""
+        if not learns:
+            return net.forward_loss()
+        if self.options.precision == FP32 and (done := net.forward_backward()):
             return done
         with computing(self.options.precision, self.device):
-            loss, outputs = self.net.forward_loss()
+            loss, outputs = net.forward_loss()
         if loss.requires_grad:
             self.scale.of(loss).backward()
         return loss, outputs

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from netspec.compat.pycaffe.blob_runner import BlobRunner
+from netspec.compat.pycaffe.runner import BlobRunner
 from netspec.solver.debug import log_all_params, log_bottom_diff, log_param_diffs, log_params, log_top
 
 

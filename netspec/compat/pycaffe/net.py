@@ -16,10 +16,10 @@ import numpy as np
 from netspec import log
 from netspec.compat.alias import AliasFinder
 from netspec.compat.pycaffe import mode
-from netspec.compat.pycaffe.blob_runner import BlobRunner
 from netspec.compat.pycaffe.errors import caffes_errors
 from netspec.compat.pycaffe.named import Named
 from netspec.compat.pycaffe.proto import caffe_pb2
+from netspec.compat.pycaffe.runner import BlobRunner
 from netspec.errors import did_you_mean, several
 from netspec.graph.filter import with_state
 from netspec.layers.data.memory import MemoryData

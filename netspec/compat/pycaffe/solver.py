@@ -5,7 +5,6 @@ Caffe: python/caffe/_caffe.cpp, src/caffe/solver.cpp
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -21,7 +20,6 @@ from netspec.compat.pycaffe.errors import caffes_errors
 from netspec.compat.pycaffe.net import FilePath, Net
 from netspec.graph.options import BuildOptions
 from netspec.graph.speed import speed
-from netspec.layers.utility.python import Python
 from netspec.net import net as core
 from netspec.proto.source_map import Position
 from netspec.proto.text import parse_solver
@@ -34,46 +32,22 @@ Outputs = dict[str, torch.Tensor]
 
 
 class _Training(core_solver.Solver):
-    """A training that fills the memory of the nets' blobs whenever a script could read it.
-
-    ``is_watched``: blobs are filled in every iteration, because callbacks or Python layers may read them, or because a
-    pass reads what a script wrote to them.
-    """
+    """A training whose nets run through the memory of their blobs."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.shown = {net: Net.of(net) for net in (self.net, *self.test_nets)}
-        self.net.largest_trained = math.inf  # blobs keep all tops anyway
-        self.is_watched = bool(self.net.inputs) or any(
-            isinstance(layer, Python) or any(top is not None for top in layer.filled_once())
-            for layer in self.net.layers
-        )
 
     @override
     def check_inputs(self) -> None:
         """Do nothing: the inputs of a net are the contents of its input blobs."""
 
     @override
-    def clear_gradients(self) -> None:
-        """Set the gradients to 0 in place, so that views of them stay valid."""
-        self.shown[self.net].runner.upload()
-        super().clear_gradients()
-
-    @override
-    def forward_backward(self, to_come: int) -> tuple[torch.Tensor, Outputs]:
-        """Run forward and backward. The blobs are filled in the last pass of several, and if ``is_watched``."""
-        runner = self.shown[self.net].runner
-        is_seen = not to_come or self.is_watched or self.param.debug_info
-        if not is_seen and (passed := self.net.forward_backward()):
-            return passed
-        loss, outputs = self.forward(self.net)
-        runner.backward(len(self.net.layers) - 1, 0)
-        return loss, outputs
-
-    @override
-    def forward(self, net: core.Net) -> tuple[torch.Tensor, Outputs]:
-        shown = self.shown[net]
-        loss = shown.runner.forward(0, len(net.layers) - 1)
+    def run(self, net: core.Net, learns: bool = False) -> tuple[torch.Tensor, Outputs]:
+        shown, last = self.shown[net], len(net.layers) - 1
+        loss = shown.runner.forward(0, last)
+        if learns:
+            shown.runner.backward(last, 0)
         blobs = {name: shown.blobs[name] for name in shown.outputs}
         return loss, {name: blob.data_memory.tensor(blob.shape) for name, blob in blobs.items()}
 
@@ -81,32 +55,22 @@ class _Training(core_solver.Solver):
     def debugged(self, net: core.Net) -> AbstractContextManager[None]:
         return debug_info(self.shown[net].runner)
 
-    @override
-    def apply_update(self) -> None:
-        """Update the weights. Scripts may have written to the values and gradients."""
-        self.shown[self.net].runner.upload()
-        super().apply_update()
-
-    @override
-    def snapshot(self) -> tuple[str, str]:
-        """Write a snapshot. Scripts may have written to the values."""
-        self.shown[self.net].runner.upload()
-        return super().snapshot()
-
 
 class _Functions(Callback):
-    """Two functions of a script."""
+    """Two functions of a script. What they write to learnable blobs counts."""
 
-    def __init__(self, on_start: Callable[[], object], on_gradients_ready: Callable[[], object]) -> None:
-        self._on_start, self._on_gradients_ready = on_start, on_gradients_ready
+    def __init__(self, net: Net, on_start: Callable[[], object], on_gradients_ready: Callable[[], object]) -> None:
+        self._net, self._on_start, self._on_gradients_ready = net, on_start, on_gradients_ready
 
     @override
     def on_start(self) -> None:
         self._on_start()
+        self._net.runner.upload()
 
     @override
     def on_gradients_ready(self) -> None:
         self._on_gradients_ready()
+        self._net.runner.upload()
 
 
 class Solver:
@@ -165,11 +129,13 @@ class Solver:
         if resume_file:
             log.info("solver.cpp:296", f"Restoring previous solver status from {os.fsdecode(resume_file)}")
             self.restore(resume_file)
+        self.net.runner.upload()
         with caffes_errors():
             self._training.solve()
 
     def step(self, iterations: int) -> None:
         """Run a number of iterations."""
+        self.net.runner.upload()
         with caffes_errors():
             self._training.step(int(iterations))
 
@@ -180,6 +146,7 @@ class Solver:
 
     def snapshot(self) -> None:
         """Write the weights and the state to files named by snapshot_prefix."""
+        self.net.runner.upload()
         self._training.snapshot()
 
     def share_weights(self, net: Net) -> None:
@@ -188,6 +155,7 @@ class Solver:
 
     def apply_update(self) -> None:
         """Update the weights with the current gradients. Count an iteration if it is not counted yet."""
+        self.net.runner.upload()
         self._training.apply_update()
         self._training.iteration -= self._counted
         self._counted = False
@@ -202,12 +170,9 @@ class Solver:
 
         An object with the methods ``on_start`` and ``on_gradients_ready`` may replace both.
         """
-        self._training.is_watched = True
         if on_gradients_ready is None:
-            functions = _Functions(on_start.on_start, on_start.on_gradients_ready)
-        else:
-            functions = _Functions(on_start, on_gradients_ready)
-        self._training.callbacks.append(functions)
+            on_start, on_gradients_ready = on_start.on_start, on_start.on_gradients_ready
+        self._training.callbacks.append(_Functions(self.net, on_start, on_gradients_ready))
 
 
 class SGDSolver(Solver, type_name="SGD"):

@@ -16,7 +16,7 @@ def _learn_scale(layer: Scale, how: Learning) -> Kernels | None:
         return None
     # Then the layer itself adds to its gradients in Caffe's order, so they are not added a second time.
     adds_itself = layer.arithmetic(layer.blob(0)).is_caffes and layer.context.options.accumulate_in_place
-    return recorded(layer.run, how.wanted, list(layer.blobs)) if adds_itself and how.steady else None
+    return recorded(layer.run, how.wanted, list(layer.blobs)) if adds_itself else None
 
 
 def _scale_folds(layer: Scale) -> Folds:

@@ -55,7 +55,7 @@ def learn_convolution(layer: Convolution, how: Learning) -> Kernels | None:
     (weight, bias), sums = weight_and_bias(layer, how)
     weights = Weights(weight, bias, *sums)
     if layer.arithmetic(weight).is_caffes:
-        product = PreparedColumns(shape, sliding, layer.group, weights, how.wanted[0], how.steady)
+        product = PreparedColumns(shape, sliding, layer.group, weights, how.wanted[0])
         return Kernels(product.forward, product.backward)
     if sliding.reads_padding_alone:
         return None

@@ -17,6 +17,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from netspec.exact.layout import layout_of
+
 Shape = tuple[int, ...]
 
 
@@ -61,22 +63,16 @@ class Memory:
     def tensor(self, shape: Shape) -> torch.Tensor:
         """Return the first numbers on the device. The caller must not write to the tensor."""
         count = math.prod(shape)
-        holder = self.holder(count)
-        if holder.shape == shape:
-            return holder
-        return (holder if holder.numel() == count else holder.view(-1)[:count]).view(shape)
-
-    def holder(self, count: int) -> torch.Tensor:
-        """Return the tensor that holds the first ``count`` numbers. They have not moved while it is the same tensor."""
         if self._fresh is not None and self._fresh.numel() == count:
-            self._fresh = self._fresh.contiguous()
-            return self._fresh
-        flat = self._settled(count)
+            if self._fresh.shape != shape:
+                self._fresh = self._fresh.contiguous()
+            return self._fresh.view(shape)
+        flat = self._settled(count)[:count]
         if self.device.type == "cpu":
-            return flat
+            return flat.view(shape)
         if self._uploaded is None or self._uploaded.numel() != count:
-            self._uploaded = flat[:count].to(self.device)
-        return self._uploaded
+            self._uploaded = flat.to(self.device)
+        return self._uploaded.view(shape)
 
     def put(self, tensor: torch.Tensor) -> None:
         """Store the result of a layer. The caller must not change the tensor afterwards."""
@@ -88,7 +84,7 @@ class Memory:
             self._fresh = None
             write(self._flat, tensor)
         else:
-            self._fresh = tensor
+            self._fresh = tensor.contiguous(memory_format=layout_of(tensor))
             if self._seen() is None:
                 self._flat = None
 

@@ -9,6 +9,7 @@ import torch
 
 from golden_cases import assert_same_layers, assert_training, lay_out_examples, parameters, set_parameters, train
 from netspec.load import load_solver
+from netspec.net.net import Net
 from netspec.solver.solver import Solver
 from paths import GOLDEN
 
@@ -67,12 +68,12 @@ def test_training_starts_like_caffe_on_every_cpu(run: str, folder: Path, monkeyp
 
 def _watched(solver: Solver, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, float]]:
     """Return a list that gets the outputs of each training pass of a solver."""
-    forward_backward, outputs = solver.forward_backward, []
+    run, outputs = solver.run, []
 
-    def keep(to_come: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        loss, blobs = forward_backward(to_come)
-        outputs.append({name: blob.item() for name, blob in blobs.items()})
+    def keep(net: Net, learns: bool = False) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        loss, blobs = run(net, learns)
+        outputs.extend([{name: blob.item() for name, blob in blobs.items()}] if learns else [])
         return loss, blobs
 
-    monkeypatch.setattr(solver, "forward_backward", keep)
+    monkeypatch.setattr(solver, "run", keep)
     return outputs
