@@ -23,24 +23,42 @@ from netspec.net.net import Net as CaffeNet
 from netspec.run.walk import Step, walk
 
 Array = np.ndarray
+BIASED = ("Convolution", "Deconvolution", "InnerProduct", "Scale")
 AS_WRITTEN = "{} cannot change a net of Caffe's files; write the layer into the prototxt"
 PICTURE = "{} is not supported; netspec draw shows the layers, shapes and connections"
 COSTS = "{} is not supported; netspec check shows multiply-adds and memory"
 
 
 class Layer:
-    """One layer: ``name``, ``type``, ``blobs`` (copies of its learnable blobs) and ``preferableTarget``."""
+    """One layer: ``name``, ``type``, ``preferableTarget``, and ``blobs``, copies of its learnable blobs.
 
-    def __init__(self, name: str, type: str, blobs: Sequence[Array], tops: Sequence[str]) -> None:
-        self.name, self.type, self.blobs = name, type, tuple(blobs)
-        self.preferableTarget = 0
-        self._tops = list(tops)
+    Assigning to ``blobs`` sets them, as :meth:`Net.setParam` does. A bias may be left out; it becomes 0.
+    """
+
+    __slots__ = ("_entry", "_net")
+
+    def __init__(self, net: Net, entry: Entry) -> None:
+        self._net, self._entry = net, entry
+
+    name = property(lambda self: self._entry.name)
+    type = property(lambda self: self._entry.type)
+    preferableTarget = property(lambda self: 0)
+
+    @property
+    def blobs(self) -> tuple[Array, ...]:
+        """Copies of the learnable blobs."""
+        return tuple(self._net._parameter(self._entry, j) for j in range(len(self._net._blobs(self._entry))))
+
+    @blobs.setter
+    def blobs(self, arrays: Sequence[Array]) -> None:
+        self._net._set_blobs(self._entry, arrays)
 
     def outputNameToIndex(self, outputName: str) -> int:
         """Return the index of an input, for the input layer (-1 if it has no such input); 0 for other layers."""
         if self.name != INPUT:
             return 0
-        return self._tops.index(outputName) if outputName in self._tops else -1
+        inputs = list(self._net._caffe.shown.values())
+        return inputs.index(outputName) if outputName in inputs else -1
 
 
 def _refused(func: str, message: str, code: int = NOT_IMPLEMENTED) -> Callable[..., NoReturn]:
@@ -112,11 +130,7 @@ class Net:
 
     def getLayer(self, layerId: int | str) -> Layer:
         """Return a layer, by number or name."""
-        entry = self._caffe.entry(layerId, "getLayer")
-        if entry.name == INPUT:
-            return Layer(INPUT, "", (), list(self._caffe.shown.values()))
-        count = len(self._caffe.layer(self._caffe.net, entry).blobs)
-        return Layer(entry.name, entry.type, [self._parameter(entry, j) for j in range(count)], ())
+        return Layer(self, self._caffe.entry(layerId, "getLayer"))
 
     def getParam(self, layer: int | str, numParam: int = 0) -> Array:
         """Return a copy of a learnable blob of a layer."""
@@ -126,14 +140,35 @@ class Net:
 
     def setParam(self, layer: int | str, numParam: int, blob: Array | Sequence[float]) -> None:
         """Write a learnable blob of a layer; the array must have the same number of elements."""
-        target = self._blob(self._caffe.entry(layer, "setParam"), numParam, "setParam")
-        values = np.asarray(blob, np.float32)
-        if values.size != target.numel():
-            message = f"found an array of shape {values.shape}, expected {tuple(target.shape)}"
-            raise DnnError(message, code=BAD_ARGUMENT, func="setParam")
+        entry = self._caffe.entry(layer, "setParam")
+        self._blob(entry, numParam, "setParam")
+        self._write({numParam: blob}, entry, "setParam")
+
+    def _set_blobs(self, entry: Entry, arrays: Sequence[Array]) -> None:
+        """Write all learnable blobs of a layer; a bias that is left out becomes 0, as without one in OpenCV."""
+        blobs, values = self._blobs(entry), dict(enumerate(arrays))
+        if len(values) == 1 and len(blobs) == 2 and entry.type in BIASED:
+            values[1] = np.zeros(blobs[1].shape)
+        if len(values) != len(blobs):
+            message = f'found {len(values)} arrays for the blobs of layer "{entry.name}", expected {len(blobs)}'
+            raise DnnError(message, code=BAD_ARGUMENT, func="Layer.blobs")
+        self._write(values, entry, "Layer.blobs")
+
+    def _write(self, arrays: Mapping[int, Array | Sequence[float]], entry: Entry, func: str) -> None:
+        """Write learnable blobs of a layer, after a look at the sizes of all."""
+        blobs = self._blobs(entry)
+        made = {j: np.asarray(array, np.float32) for j, array in arrays.items()}
+        for j, values in made.items():
+            if values.size != blobs[j].numel():
+                message = f"found an array of shape {values.shape}, expected {tuple(blobs[j].shape)}"
+                raise DnnError(message, code=BAD_ARGUMENT, func=func)
         with torch.no_grad():
-            target.copy_(torch.tensor(values).reshape(target.shape))
+            for j, values in made.items():
+                blobs[j].copy_(torch.tensor(values).reshape(blobs[j].shape))
         self._runnable = True
+
+    def _blobs(self, entry: Entry) -> Sequence[torch.Tensor]:
+        return () if entry.name == INPUT else list(self._caffe.layer(self._caffe.net, entry).blobs)
 
     def _parameter(self, entry: Entry, index: int) -> Array:
         """Return a copy of a learnable blob; vectors are columns, but the bias of an InnerProduct is a row."""
@@ -141,7 +176,7 @@ class Net:
         return array.reshape(1, -1) if entry.type == "InnerProduct" and index == 1 else array
 
     def _blob(self, entry: Entry, index: int, func: str) -> torch.Tensor:
-        blobs = () if entry.name == INPUT else self._caffe.layer(self._caffe.net, entry).blobs
+        blobs = self._blobs(entry)
         if not 0 <= index < len(blobs):
             message = f'layer "{entry.name}" has {len(blobs)} learnable blobs, found index {index}'
             raise DnnError(message, code=BAD_ARGUMENT, func=func)

@@ -16,6 +16,12 @@ class Named(OrderedDict[str, T]):
     def __init__(self, what: str = "name", items: Any = ()) -> None:
         self.what = what
         super().__init__(items)
+        self._is_whole = True
+
+    def __setitem__(self, name: str, value: T) -> None:
+        if getattr(self, "_is_whole", False):
+            raise TypeError(f'the {self.what} "{name}" cannot be replaced; write to it: .data[...] = array')
+        super().__setitem__(name, value)
 
     def __missing__(self, name: str) -> T:
         known = ", ".join(self) or "none"

@@ -42,8 +42,10 @@ class Layer(pycaffe_shim.Layer):
     """The type and the learnable blobs of a layer. For a Python layer, the user's own object is shown instead."""
 
     def __init__(self, type_name: str, blobs: BlobVec) -> None:
-        self.type = type_name
-        self.blobs = blobs
+        self._type, self._blobs = type_name, blobs
+
+    type = property(lambda self: self._type)
+    blobs = property(lambda self: self._blobs)
 
 
 def _hook_adder(which: str) -> Callable[[Net, Callable[[int], object]], None]:

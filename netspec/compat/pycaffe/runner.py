@@ -445,7 +445,7 @@ class PythonStep(LayerStep):
     def set_up(self) -> None:
         if self.layer.code:
             self.layer.bottom[:], self.layer.top[:] = self.bottoms, self.tops
-            self.layer.code.blobs[:] = self.params
+            self.layer.code.blobs = self.params
         super().set_up()
 
     @override
@@ -546,12 +546,13 @@ class BorrowedMemory(Memory):
 
 def parameters(layer: Layer) -> BlobVec:
     """Return a layer's learnable blobs, as views of its parameters and of their gradients."""
-    made = BlobVec()
-    for j, shape in enumerate(layer.blob_shapes):
+
+    def view(j: int, shape: Shape) -> Blob:
         count = layer.blobs[j].numel()
-        data = BorrowedMemory(lambda j=j: layer.blobs[j], count)
-        made.append(Blob(shape, data, BorrowedMemory(lambda j=j: gradient_of(layer.blobs[j]), count)))
-    return made
+        data = BorrowedMemory(lambda: layer.blobs[j], count)
+        return Blob(shape, data, BorrowedMemory(lambda: gradient_of(layer.blobs[j]), count))
+
+    return BlobVec(view(j, shape) for j, shape in enumerate(layer.blob_shapes))
 
 
 def gradient_of(parameter: torch.Tensor) -> torch.Tensor:

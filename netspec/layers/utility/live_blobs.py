@@ -12,10 +12,12 @@ from __future__ import annotations
 import math
 import operator
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from netspec.exact.layout import layout_of
 
@@ -197,9 +199,23 @@ class Blob:
 MOST_AXES = 32  # caffe: kMaxBlobAxes
 
 
-class BlobVec(list[Blob]):
-    """A layer's learnable blobs."""
+class BlobVec(Sequence[Blob]):
+    """A layer's learnable blobs. A blob cannot be replaced, only written to: ``blobs[0].data[...] = array``."""
+
+    def __init__(self, blobs: Iterable[Blob] = ()) -> None:
+        self._blobs = list(blobs)
+
+    @override
+    def __getitem__(self, index: Any) -> Any:
+        return self._blobs[index]
+
+    @override
+    def __len__(self) -> int:
+        return len(self._blobs)
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        raise TypeError("Invalid assignment: a layer's blob cannot be replaced; write blobs[i].data[...] = array")
 
     def add_blob(self, *shape: int) -> None:
         """Append a blob of zeros."""
-        self.append(Blob(shape))
+        self._blobs.append(Blob(shape))

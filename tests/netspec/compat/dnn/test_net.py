@@ -206,3 +206,33 @@ def test_other_names_are_those_of_cv2_dnn() -> None:
 def test_a_path_object_and_a_text_path_are_the_same() -> None:
     assert dnn.readNetFromCaffe(str(HERE / "classify.prototxt")).getLayerNames() == read("classify").getLayerNames()
     assert isinstance(HERE, Path)
+
+
+def test_assigned_blobs_are_the_layers() -> None:
+    """As the colorization programs of OpenCV's samples set the centers of colors."""
+    net = read("classify")
+    net.setInput(DATA)
+    before, layer = net.forward("conv2"), net.getLayer("conv2")
+    filters, bias = layer.blobs
+    layer.blobs = [filters * 2, bias * 2]
+    np.testing.assert_array_equal(net.getLayer("conv2").blobs[1], bias * 2)
+    np.testing.assert_allclose(net.forward("conv2"), 2 * before, rtol=0, atol=1e-5)
+    layer.blobs = [filters]  # without a bias, as in OpenCV
+    expected = before - bias.reshape(1, -1, 1, 1)
+    np.testing.assert_allclose(net.forward("conv2"), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("arrays", [[], [np.zeros(3)], [np.zeros(3)] * 3], ids=["none", "size", "three"])
+def test_blobs_of_other_sizes_or_numbers_are_refused(arrays: list[np.ndarray]) -> None:
+    net = read("classify")
+    before = net.getParam("conv2")
+    with pytest.raises(dnn.DnnError) as fault:
+        net.getLayer("conv2").blobs = arrays
+    assert fault.value.code == cv2.Error.StsBadArg
+    np.testing.assert_array_equal(net.getParam("conv2"), before)
+
+
+@pytest.mark.parametrize("name", ["name", "type", "preferableTarget", "other"])
+def test_other_attributes_of_a_layer_are_read_only(name: str) -> None:
+    with pytest.raises(AttributeError):
+        setattr(read("classify").getLayer("conv2"), name, "x")

@@ -303,3 +303,63 @@ def test_deep_dream_increases_its_objective(net_of: Callable[..., caffe.Net]) ->
         gradient = source.diff[0]
         source.data[:] += 0.5 / np.abs(gradient).mean() * gradient * 0.1
     assert norms == sorted(norms)
+
+
+FROM_X = """
+force_backward: true
+layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 4 dim: 3 dim: 2 dim: 2 } } }
+layer { name: "twice" type: "Power" bottom: "x" top: "y" power_param { scale: 2 } }
+"""
+END = 'layer { name: "r" type: "Reduction" bottom: "z" top: "r" loss_weight: 1 reduction_param { operation: SUMSQ } }'
+BIAS = 'type: "Bias" bias_param { axis: 0 num_axes: -1 filler { value: 0.5 } }'
+LEARNING = {
+    "BatchNorm": 'type: "BatchNorm"',
+    "Scale": 'type: "Scale" scale_param { bias_term: true filler { value: 2 } }',
+    "Bias": BIAS,
+    "PReLU": 'type: "PReLU"',
+    "Convolution": 'type: "Convolution" convolution_param { num_output: 3 kernel_size: 1 weight_filler { value: 1 } }',
+    "InnerProduct": 'type: "InnerProduct" inner_product_param { num_output: 2 weight_filler { value: 1 } }',
+}
+
+
+@pytest.mark.parametrize(
+    ("layer", "top"), [*((layer, "z") for layer in LEARNING), *((layer, "y") for layer in list(LEARNING)[:4])]
+)
+def test_a_backward_pass_after_an_update_reads_the_new_weights(write: Callable[..., str], layer: str, top: str) -> None:
+    """Also if a script has looked at the gradients, and if the layer has overwritten what it has read."""
+    it = f'layer {{ name: "it" {LEARNING[layer]} bottom: "y" top: "{top}" }}'
+    write(FROM_X + it + END.replace('"z"', f'"{top}"'))
+    solver = caffe.get_solver(write('net: "net.prototxt" base_lr: 0.125 lr_policy: "fixed"', "solver.prototxt"))
+    net, other = solver.net, caffe.Net("net.prototxt", caffe.TRAIN)
+    net.forward(x=image(4, 3, 2, 2))
+    net.backward()
+    looked = [blob.diff for blob in net.params["it"]]
+    solver.apply_update()
+    weights = [blob.data.copy() for blob in net.params["it"]]
+    other.forward(x=image(4, 3, 2, 2))
+    for blob, values in zip(other.params["it"], weights, strict=True):
+        blob.data[...] = values
+    for each in (net, other):
+        each.blobs[top].diff[...] = 1
+        each.clear_param_diffs()
+        each.backward(start="it")
+    for mine, others, values in zip(net.params["it"], other.params["it"], weights, strict=True):
+        np.testing.assert_array_equal(mine.diff, others.diff)
+        np.testing.assert_array_equal(mine.data, values)
+    np.testing.assert_array_equal(net.blobs["x"].diff, other.blobs["x"].diff)
+    assert len(looked) == len(weights)
+
+
+def test_the_gradient_of_a_bias_as_large_as_its_bottom_is_cleared(net_of: Callable[..., caffe.Net]) -> None:
+    fc = 'layer { name: "fc" type: "InnerProduct" bottom: "b" top: "z" inner_product_param { num_output: 2 } }'
+    net = net_of(f'{FROM_X} layer {{ name: "b" {BIAS} bottom: "y" top: "b" }} {fc} {END}', caffe.TRAIN)
+    net.params["fc"][0].data[...] = 1
+    seen = []
+    for _ in range(3):
+        net.clear_param_diffs()
+        net.forward(x=image(4, 3, 2, 2))
+        net.backward()
+        seen.append(net.params["b"][0].diff.copy())
+    assert seen[0].any()
+    for diff in seen[1:]:
+        np.testing.assert_array_equal(diff, seen[0])

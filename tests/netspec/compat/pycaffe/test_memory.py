@@ -219,6 +219,31 @@ def test_net_surgery(net_of: Callable[..., caffe.Net], write: Callable[..., str]
     assert np.array_equal(again.params["fc-conv"][0].data, conv.params["fc-conv"][0].data)
 
 
+@pytest.mark.parametrize(
+    ("assignment", "kind"),
+    [
+        ("net.params['conv1'][0] = array", TypeError),
+        ("net.layers[1].blobs[0] = array", TypeError),
+        ("net.params['conv1'] = [array]", TypeError),
+        ("net.blobs['data'] = array", TypeError),
+        ("net.blobs['data'].data = array", AttributeError),
+        ("net.params['conv1'][0].diff = array", AttributeError),
+        ("net.blobs['data'].shape = array.shape", AttributeError),
+        ("net.layers[1].blobs = [array]", AttributeError),
+        ("net.layers[1].type = 'ReLU'", AttributeError),
+        ("net.params['conv1'].append(array)", AttributeError),
+    ],
+)
+def test_assignments_without_effect_are_refused(
+    net_of: Callable[..., caffe.Net], assignment: str, kind: type[Exception]
+) -> None:
+    net = net_of(PYRAMID)
+    before = net.params["conv1"][0].data.copy()
+    with pytest.raises(kind):
+        exec(assignment, {"net": net, "array": np.zeros_like(before)})
+    np.testing.assert_array_equal(net.params["conv1"][0].data, before)
+
+
 def test_shared_parameters_share_memory(net_of: Callable[..., caffe.Net]) -> None:
     layer = (
         'layer {{ name: "{0}" type: "InnerProduct" bottom: "data" top: "{0}" param {{ name: "w" }} '
