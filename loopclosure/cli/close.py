@@ -9,13 +9,13 @@ import numpy as np
 
 from loopclosure.cli.data_set import sequence, typed
 from loopclosure.closing.close import close, drifted, summary, write_closed
-from loopclosure.closing.measure import measure, read_loops
+from loopclosure.closing.measure import depth_scale_said, measure, read_loops
 from loopclosure.errors import InputError
 from loopclosure.places import intrinsics
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.source import CLOSED, POSES, TOPICS
 from netspec.terminal.commands import WrongUsage
-from netspec.terminal.output import bar
+from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands, seed
 
 
@@ -66,6 +66,8 @@ def _close(a: argparse.Namespace) -> None:
     odometry = _odometry(a, frames)[source.selection().numbers(len(frames))]
     frames = frames.taken(source.selection())
     loops = measure(frames, read_loops(Path(a.loops), frames), camera, odometry, bar)
+    if a.drift is None and (said := depth_scale_said(frames, camera)):
+        warn(said)
     closed = close(odometry, loops, frames.poses, stamps=frames.stamps)
     write_closed(out, closed, frames.stamps, frames.names)
     # Imported here, since it takes seconds and only this command needs it.

@@ -10,7 +10,7 @@ import numpy as np
 
 from loopclosure.cli.data_set import recording_of, warn_of_unreadable
 from loopclosure.closing.close import constraint
-from loopclosure.closing.measure import Loop, cells, errors_said, measure
+from loopclosure.closing.measure import Loop, cells, depth_scale_said, errors_said, measure
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
@@ -170,6 +170,8 @@ def _detect(a: argparse.Namespace) -> None:
     loops, measured = [], None
     if recording is not None and recording.camera is not None:
         loops = _measured(detector, recording, recording.camera)
+        if said := depth_scale_said(recording, recording.camera):
+            warn(said)
         measured = RELATIVE, {loop.query: cells(loop.relative) for loop in loops if loop.relative is not None}
     write_loops_csv(out / "loops.csv", detector.loops, detector.stamps, names, measured=measured)
     write_whole(out / "chosen.txt", "\n".join(reasons) + "\n")

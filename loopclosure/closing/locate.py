@@ -21,6 +21,7 @@ from loopclosure.detector.export import RELATIVE, after
 from loopclosure.detector.map import Map
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
+from loopclosure.places.frames import DEPTH_PER_M
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.progress import Progress, silent
@@ -58,18 +59,20 @@ class Locator:
     def __init__(self, known: Map, camera: Intrinsics) -> None:
         self.map, self.camera, self.check = known, camera, GeometricCheck()
 
-    def locate(self, image: np.ndarray, match: int, depth: Path | None = None) -> Located | None:
+    def locate(
+        self, image: np.ndarray, match: int, depth: Path | None = None, depth_per_m: float = DEPTH_PER_M
+    ) -> Located | None:
         """Return where the camera was for an image (H, W, 3) uint8 BGR that shows the place of frame ``match``.
 
-        ``depth`` is the file of its depth (TUM's form), if there is one. None if fewer than 20 points agree or if the
-        session of the match has no camera. Raises InputError if there is no such frame.
+        ``depth`` is the file of its depth, ``depth_per_m`` for a meter, if there is one. None if fewer than 20 points
+        agree or if the session of the match has no camera. Raises InputError if there is no such frame.
         """
         session, frame = self.map.session_of(match)
         if session.camera is None:
             return None
         local = session.points.of(frame)
         seen = View(local, session.camera.of_size(*local.size), session.depths_of(frame))
-        query = view_of(self.check, self.camera, image, depth)
+        query = view_of(self.check, self.camera, image, depth, depth_per_m)
         relative = relative_view(seen, query, self.check.matches(seen.local, query.local))
         if relative is None:
             return None
@@ -91,7 +94,7 @@ class Locator:
         for frame, image, _ in progress(recording.frames(matches), "locating", len(matches)):
             depth = None if recording.depths is None else recording.depths[frame]
             try:
-                located = self.locate(image, matches[frame], depth)
+                located = self.locate(image, matches[frame], depth, recording.depth_per_m)
             except InputError:  # its depth cannot be read
                 located = self.locate(image, matches[frame])
             if located is not None:

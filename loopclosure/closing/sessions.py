@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.close import Closed, close, write_graph
 from loopclosure.closing.length import measured, neighbors
-from loopclosure.closing.measure import Loop
+from loopclosure.closing.measure import Loop, loop_rows, whole_number
 from loopclosure.closing.relative import View
 from loopclosure.detector.export import STILL, after, relative_pose
 from loopclosure.detector.map import SESSION, Map, Session
@@ -23,7 +22,6 @@ from loopclosure.errors import InputError
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
 from loopclosure.places.trajectory import Trajectory, pieces, write_trajectory
 from loopclosure.progress import Progress, silent
-from netspec.files.kinds import unreadable
 
 MOST_TRIED = 200  # loops of two sessions that are tried as the one that places them
 
@@ -127,15 +125,13 @@ def _measured(known: Map, starts: np.ndarray, path: np.ndarray, progress: Progre
 def _loops_of(session: Session, starts: np.ndarray, number: int) -> list[Loop]:
     """Read the loops of a session; frames are numbered as in the map. Raises InputError for another file."""
     path = session.folder / "loops.csv"
-    try:
-        with path.open(newline="", encoding="utf-8", errors="surrogateescape") as stream:
-            loops = [Loop(int(row["query_id"]), int(row["match_id"])) for row in csv.DictReader(stream)]
-    except OSError as error:
-        raise InputError(unreadable(path, error, SESSION), path) from error
-    except (KeyError, ValueError, TypeError, csv.Error):
-        raise InputError(f"has no loops; expected {SESSION}", path) from None
-    if not all(starts[number] <= loop.query < starts[number + 1] and 0 <= loop.match < loop.query for loop in loops):
-        raise InputError(f"has frames that are not of this map; expected {SESSION}", path)
+    loops = []
+    for line, row in loop_rows(path, SESSION):
+        ends = (whole_number(row[f"{end}_id"], int(starts[number + 1]), path, line) for end in ("query", "match"))
+        query, match = ends
+        if not match < query or query < starts[number]:
+            raise InputError(f"joins frames {query} and {match}, which this session does not", path, line, 1)
+        loops.append(Loop(query, match))
     return loops
 
 

@@ -15,7 +15,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -197,7 +197,7 @@ class Map:
         folder = self.folder / next(name for name in names if not os.path.lexists(self.folder / name))
         arrays = detector.arrays_since(len(self))
         if recording.depths is not None:
-            arrays["depths"] = _depths(recording.depths, points_of(arrays, len(recording)))
+            arrays["depths"] = _depths(recording, points_of(arrays, len(recording)))
         arrays["rows"] = detector.descriptors_of(len(self), len(detector))
         # File names are not always UTF-8.
         arrays["names"] = np.frombuffer(json.dumps(list(recording.names)).encode(), np.uint8)
@@ -266,12 +266,12 @@ def checked_name(describer: str) -> str:
     return describer
 
 
-def _depths(files: Sequence[Path | None], points: Points) -> np.ndarray:
+def _depths(recording: ImageSequence, points: Points) -> np.ndarray:
     """Return the depths (P,) of all points of a session, 0 where not known or where the file cannot be read."""
     found = np.zeros(points.points.shape[0], np.float32)
-    for frame, file in enumerate(files):
+    for frame, file in enumerate(recording.depths or ()):
         local = points.of(frame)
         with suppress(InputError):
             if file is not None:
-                found[points.part(frame)] = read_depths(file, local.points, local.size)
+                found[points.part(frame)] = read_depths(file, local.points, local.size, recording.depth_per_m)
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from tempfile import TemporaryFile
 
 import numpy as np
@@ -21,10 +22,10 @@ class ExactIndex:
         self._metric, self._in_memory = metric, in_memory
         self._block = BLOCK if in_memory is None else min(BLOCK, max(LEAST_BLOCK, in_memory // 4))
         self._count = 0
-        self._blocks: list[np.ndarray] = []  # (block, D) each; the last one may have room
+        self._blocks: list[np.ndarray] = []  # (block, D) each, those in memory; the last one may have room
+        self._stored = np.zeros((0, 0), np.float32)  # the blocks before them, in one mapping of the file
         self._squares = np.zeros(0, np.float32)  # the squared length of each descriptor, with room for more
         self._longest = 0.0  # the largest of them
-        self._on_disk = 0  # blocks; they are the first ones
         self._file = None if in_memory is None else TemporaryFile(prefix="loopclosure-")  # noqa: SIM115
 
     def __len__(self) -> int:
@@ -47,19 +48,20 @@ class ExactIndex:
     def _make_room(self, width: int) -> None:
         """Append a block, and write the oldest one in memory to the file if there are too many."""
         if self._file is not None and self._in_memory is not None:
-            while self._blocks[self._on_disk :] and self._count - self._block * self._on_disk >= max(
-                self._in_memory, self._block
-            ):
-                block = self._blocks[self._on_disk]
-                begin = self._on_disk * block.nbytes
-                self._file.seek(begin)
-                self._file.write(block.tobytes())
+            while self._blocks and self._count - len(self._stored) >= max(self._in_memory, self._block):
+                self._file.write(self._blocks.pop(0).tobytes())
                 self._file.flush()
-                self._blocks[self._on_disk] = np.memmap(self._file, np.float32, "r", begin, block.shape)
-                self._on_disk += 1
+                size = len(self._stored) + self._block, width
+                self._stored = np.memmap(self._file, np.float32, "r", 0, size)  # the mapping before is closed
         self._blocks.append(np.empty((self._block, width), np.float32))
         if self._count == len(self._squares):
             self._squares = np.append(self._squares, np.empty(max(self._block, self._count), np.float32))
+
+    def _parts(self) -> Iterator[np.ndarray]:
+        """Yield all blocks, those on disk first."""
+        for begin in range(0, len(self._stored), self._block):
+            yield self._stored[begin : begin + self._block]
+        yield from self._blocks
 
     def search(self, row: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
         """See :class:`~loopclosure.index.index.Index`; of equal scores, the earlier one comes first."""
@@ -71,7 +73,7 @@ class ExactIndex:
         if not k:
             return np.zeros(0, np.intp), np.zeros(0, np.float32), np.zeros(0, np.float32)
         scores = np.empty(self._count, np.float32)
-        for number, block in enumerate(self._blocks):
+        for number, block in enumerate(self._parts()):
             part = scores[number * self._block : (number + 1) * self._block]
             np.matmul(block[: len(part)], row, out=part)
         if self._metric != "cosine":  # minus the squared distance, without the square of ``row``, has the same order
@@ -79,7 +81,7 @@ class ExactIndex:
             scores -= self._squares[: self._count]
         # The product is fast but rounds: the descriptors that may be the best k are compared directly.
         near = np.flatnonzero(scores >= np.partition(scores, self._count - k)[self._count - k] - self._rounding(row))
-        rows = np.array([self._blocks[number // self._block][number % self._block] for number in near], np.float64)
+        rows = np.concatenate([self.rows(number, number + 1) for number in near.tolist()]).astype(np.float64)
         values = rows @ row if self._metric == "cosine" else -np.linalg.norm(rows - row, axis=1)
         values = values.astype(np.float32)
         order = np.lexsort((near, -values))[:k]
@@ -94,6 +96,10 @@ class ExactIndex:
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         """See :class:`~loopclosure.index.index.Index`."""
-        first, last = start // self._block, -(-stop // self._block)
-        parts = [block[: self._count - k * self._block] for k, block in enumerate(self._blocks[first:last], first)]
-        return np.concatenate(parts)[start - first * self._block : stop - first * self._block]
+        split = len(self._stored)
+        parts = [self._stored[start:stop]] if start < split else []
+        for number, block in enumerate(self._blocks):
+            begin = split + number * self._block
+            if begin < stop and start < begin + self._block:
+                parts.append(block[max(0, start - begin) : min(stop, self._count) - begin])
+        return np.concatenate(parts)

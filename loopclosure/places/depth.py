@@ -6,19 +6,20 @@ from pathlib import Path
 
 import numpy as np
 
-from loopclosure.places.frames import read_depth
+from loopclosure.places.frames import DEPTH_PER_M, read_depth
 from netspec.files.opencv import cv2
 
 # Neighboring pixels are on the same surface if their depths differ by less than this factor.
 ONE_SURFACE = 1.05
 
 
-def read_depths(path: Path, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def read_depths(path: Path, points: np.ndarray, size: tuple[int, int], per_m: float = DEPTH_PER_M) -> np.ndarray:
     """Read the depth (N,) in meters at pixels (N, 2) of an image of ``size`` (width, height), 0 where not known.
 
-    The depth image may have another size. Raises InputError if it cannot be read.
+    The depth image may have another size; its values are ``per_m`` for a meter. Raises InputError if it cannot be read.
     """
-    return depth_at(cv2.resize(read_depth(path).astype(np.float32), size, interpolation=cv2.INTER_NEAREST), points)
+    depth = read_depth(path, per_m).astype(np.float32)
+    return depth_at(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), points)
 
 
 def depth_at(depth: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -18,11 +18,12 @@ from loopclosure.errors import InputError
 from loopclosure.places.bags import bag_frames, is_bag
 from loopclosure.places.pixels import bits_of, eight_bits
 from netspec.files.environment import environment
-from netspec.files.image_list import list_images
+from netspec.files.image_list import IMAGE_ENDINGS, list_images
 from netspec.files.kinds import is_cut_png, nearest_existing, unreadable
 from netspec.files.opencv import cv2
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
+FIRST_BYTES = 4096  # of a file tell whether it is text
 
 DEPTH_PER_M = 5000  # of depth images, as TUM RGB-D has them
 BESIDE = 16  # at most so many images of a folder show how many bits its camera uses
@@ -116,15 +117,15 @@ def read_pixels(path: str | Path, mode: int) -> np.ndarray:
     return image
 
 
-def read_depth(path: str | Path) -> np.ndarray:
-    """Read a depth image of TUM RGB-D (16 bits, 5000 per meter) as meters (H, W), 0 where not known.
+def read_depth(path: str | Path, per_m: float = DEPTH_PER_M) -> np.ndarray:
+    """Read a depth image of 16 bits, with ``per_m`` for a meter, as meters (H, W), 0 where not known.
 
     Raises InputError if it is not one.
     """
     image = read_pixels(path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype != np.uint16:
-        raise InputError("is not a depth image; expected one channel of 16 bits, 5000 per meter, as of TUM RGB-D", path)
-    return image / DEPTH_PER_M
+        raise InputError("is not a depth image; expected one channel of 16 bits, as of TUM RGB-D", path)
+    return image / per_m
 
 
 def write_picture(path: Path, image: np.ndarray, *settings: int) -> None:
@@ -137,6 +138,15 @@ def write_picture(path: Path, image: np.ndarray, *settings: int) -> None:
         raise InputError(f"cannot be written: {error.strerror}", path) from None
 
 
+def is_video(path: Path) -> bool:
+    """Return whether a path is a video: by its name, or a file that is no text, no image and no bag."""
+    if path.suffix.lower() in VIDEO_SUFFIXES or not path.is_file():
+        return path.suffix.lower() in VIDEO_SUFFIXES
+    with path.open("rb") as stream:
+        first = stream.read(FIRST_BYTES)
+    return b"\0" in first and path.suffix.lower() not in IMAGE_ENDINGS and not is_bag(path)
+
+
 def _capture(path: str | Path) -> cv2.VideoCapture:
     try:
         str(path).encode()
@@ -147,17 +157,23 @@ def _capture(path: str | Path) -> cv2.VideoCapture:
 
 
 def video_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
-    """Yield (seconds from the start, image (H, W, 3) uint8 BGR) for each frame of a video file."""
+    """Yield (seconds from the start, image (H, W, 3) uint8 BGR) for each frame of a video file.
+
+    The times are those of the file; its frame rate gives them if it has none.
+    """
     capture = _opened(path)
     rate = capture.get(cv2.CAP_PROP_FPS)
-    number = 0
+    number, last = 0, -1.0
     try:
         while True:
             there, image = capture.read()
             if not there:
                 break
-            yield number / rate if rate > 0 else float(number), image
-            number += 1
+            seconds = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            if not seconds > last:
+                seconds = last + 1 / rate if rate > 0 else last + 1
+            yield seconds, image
+            number, last = number + 1, seconds
     finally:
         capture.release()
     if not number:

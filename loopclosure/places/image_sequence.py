@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import Selection, read_bgr, video_frames
+from loopclosure.places.frames import DEPTH_PER_M, Selection, read_bgr, video_frames
 from loopclosure.places.intrinsics import Intrinsics
 from loopclosure.places.trajectory import Poses
 from netspec.files.image_list import ImageList
@@ -30,7 +30,8 @@ class ImageSequence(ImageList):
     poses       (N, 7) the camera's true poses in the world, tx ty tz qx qy qz qw, NaN where not known; None without any
     odometry    (N, 7) the camera's path as the robot measured it, which drifts, NaN where not known; None without it
     camera      None if not known
-    depths      N files of depth in TUM's form (16 bits, 5000 per meter), None for an image without one; or None
+    depths      N files of depth (16 bits), None for an image without one; or None
+    depth_per_m the value of a meter in them
     doubts      sentences about poses that look wrong, and about files that could not be used
     pose_fault  why the sequence's own poses could not be read
     unreadable  indices of the images that ``frames`` could not read
@@ -42,7 +43,7 @@ class ImageSequence(ImageList):
     odometry: np.ndarray | None = None
     camera: Intrinsics | None = None
     depths: tuple[Path | None, ...] | None = None
-    doubts: tuple[str, ...] = ()
+    depth_per_m: float = DEPTH_PER_M
     pose_fault: InputError | None = None
     unreadable: list[int] = field(default_factory=list)
 
@@ -141,7 +142,8 @@ class ImageSequence(ImageList):
             try:
                 image = read_bgr(self.paths[i])
             except InputError:
-                self.unreadable.append(i)
+                if i not in self.unreadable:
+                    self.unreadable.append(i)
                 if len(self.unreadable) == len(self):
                     raise
                 continue
@@ -156,7 +158,8 @@ class ImageSequence(ImageList):
         for number, (seconds, image) in enumerate(video_frames(self.source)):
             count += 1
             if number == wanted[0][0]:
-                yield wanted.pop(0)[1], image, seconds
+                index = wanted.pop(0)[1]
+                yield index, image, seconds if self.stamps is None else float(self.stamps[index])
                 if not wanted:
                     return
         message = f"ends after {count} frames, though frame {wanted[0][0]} is wanted and it says that it has it"

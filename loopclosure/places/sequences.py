@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from loopclosure.errors import InputError
-from loopclosure.places.frames import VIDEO_SUFFIXES, video_length
+from loopclosure.places.frames import is_video, video_length
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import kitti_projection, read_intrinsics, yaml_numbers
 from loopclosure.places.pose_files import PoseForm, matrix_fault, number, read_poses, seconds_of
@@ -23,7 +23,7 @@ from netspec.errors import SpecError
 from netspec.files.image_list import list_images
 from netspec.files.kinds import nearest_existing, unreadable
 from netspec.files.paths import relative
-from netspec.files.table import read_table
+from netspec.files.table import TIME, UNITS, read_table
 
 GROUNDTRUTH, ODOMETRY = "groundtruth.txt", "odometry.txt"
 QUERIES = ("query", "queries", "Query", "Queries")
@@ -41,16 +41,22 @@ class PoseChoice:
 
 
 def read_sequence(
-    source: str | Path, layout: str = "", max_difference: float = MAX_DIFFERENCE_S, poses: PoseChoice | None = None
+    source: str | Path,
+    layout: str = "",
+    max_difference: float = MAX_DIFFERENCE_S,
+    poses: PoseChoice | None = None,
+    times: Path | None = None,
 ) -> ImageSequence:
     """Read a sequence with a layout "tum", "euroc", "kitti", "images" or "video"; "": found from the files.
 
     A frame gets the pose nearest in time, within ``max_difference`` seconds, or none. If the sequence's own poses or
     calibration cannot be read, it has none, and says why. Raises InputError for images or lists that are missing or
-    damaged, and for ``poses`` that cannot be read.
+    damaged, and for ``poses`` that cannot be read. ``times``: a file with the time of each frame in seconds.
     """
     source = Path(source)
     sequence = _READERS[layout or layout_of(source)](source, max_difference, poses is None)
+    if times is not None:
+        sequence = replace(sequence, stamps=_times(times, len(sequence)))
     if poses is None:
         return sequence
     found, doubts = _chosen(sequence, poses, max_difference)
@@ -102,7 +108,7 @@ def _projection(source: Path) -> str:
 
 def layout_of(source: Path, otherwise: str = "images") -> str:
     """Return the layout of a source by its name and its folders; ``otherwise`` if they do not determine it."""
-    if source.suffix.lower() in VIDEO_SUFFIXES:
+    if is_video(source):
         return "video"
     if (source / "mav0").is_dir() or (source / "cam0" / "data.csv").is_file():
         return "euroc"
@@ -199,7 +205,7 @@ def _nearest_depths(listing: Path, stamps: np.ndarray, max_difference: float) ->
 def _images(source: Path, max_difference: float, own_poses: bool) -> ImageSequence:
     listed = list_images(source)
     stamps = None if listed.stamps is None else seconds_of(listed.stamps)
-    sequence = ImageSequence(listed.paths, (), stamps, source)
+    sequence = ImageSequence(listed.paths, (), stamps, source, doubts=listed.doubts)
     sequence = replace(sequence, names=tuple(relative(path, sequence.folder) for path in listed.paths))
     if stamps is None or not source.is_dir():
         return sequence
@@ -253,10 +259,7 @@ def _kitti(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
     images = list_images(folder / cameras[0]).paths
     times = None
     if (folder / "times.txt").is_file():
-        rows = read_table(folder / "times.txt", "one time in seconds per image").rows
-        times = np.array([number(row.cells[0], folder / "times.txt", row.line, 1) for row in rows])
-        if len(times) != len(images):
-            raise InputError(f"has {len(times)} times, but there are {len(images)} images", folder / "times.txt")
+        times = _times(folder / "times.txt", len(images))
     sequence = ImageSequence(images, _names(images, folder), times, folder)
     if (folder / "calib.txt").is_file():
         sequence = _with_camera(sequence, folder / "calib.txt", _projection(folder))
@@ -281,6 +284,21 @@ _READERS: dict[str, Callable[[Path, float, bool], ImageSequence]] = {
     "images": _images,
     "video": _video,
 }
+
+
+def _times(path: Path, frames: int) -> np.ndarray:
+    """Read the times (N,) of frames: the column of that name, or the only one."""
+    table = read_table(path, "the time of each frame")
+    column = table.column(TIME)
+    if column is None and any(len(row.cells) != 1 for row in table.rows):
+        raise InputError("has several columns and none named timestamp; name them in the first line", path, 1, 1)
+    column = column or 0
+    if len(table.rows) != frames:
+        raise InputError(f"has {len(table.rows)} times, but there are {frames} images", path)
+    cells = [(row, row.cells[column] if column < len(row.cells) else "") for row in table.rows]
+    times = np.array([number(cell, path, row.line, 1) for row, cell in cells])
+    unit = table.unit(column) if table.names else ""
+    return times * UNITS[unit] if unit else seconds_of(times)
 
 
 def _names(images: tuple[Path, ...], folder: Path) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from loopclosure.errors import InputError
 from loopclosure.places.bags import BY_NAME, NO_POSES, Topics, is_bag, open_bag, right
-from loopclosure.places.frames import VIDEO_SUFFIXES, Selection, video_frames, video_length, write_picture
+from loopclosure.places.frames import Selection, is_video, video_frames, video_length, write_picture
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import write_calibration
 from loopclosure.places.masks import CAMERAS
@@ -27,21 +27,22 @@ from netspec.files.whole_file import whole_folder
 
 FRAMES = ("start", "stop", "stride", "limit")
 POSES = ("poses", "pose-form")
+READ = ("times", "depth-scale")  # how a sequence is read
 TOPICS = ("topic", "pose-topic", "odometry-topic")
 Kinds = Mapping[str, Sequence[str]]  # the settings of each kind of source; "" if no kind is named
 Listed = list[tuple[float, str]]  # the stamp in seconds and the file of each frame
 T = TypeVar("T")
-SEQUENCE = (*FRAMES, *POSES, "references")
+SEQUENCE = (*FRAMES, *POSES, *READ, "references")
 # The settings of each kind of source: for an evaluation (loopclosure evaluate) and for pairs of images
 # (lmdb-build pairs). None: the command does not accept this kind.
 _KINDS: dict[str, tuple[Sequence[str] | None, Sequence[str] | None]] = {
-    "": ((*SEQUENCE, *TOPICS, "truth"), (*POSES, *TOPICS, "truth", "camera")),
-    "tum": (SEQUENCE, (*POSES, *TOPICS)),
-    "euroc": (SEQUENCE, (*POSES, *TOPICS)),
-    "kitti": (SEQUENCE, (*POSES, *TOPICS)),
-    "bag": ((*SEQUENCE, *TOPICS), (*POSES, *TOPICS)),
-    "video": (SEQUENCE, (*POSES, *TOPICS)),
-    "images": ((*SEQUENCE, "truth"), (*POSES, "truth", "camera")),
+    "": ((*SEQUENCE, *TOPICS, "truth"), (*POSES, *READ, *TOPICS, "truth", "camera")),
+    "tum": (SEQUENCE, (*POSES, *READ, *TOPICS)),
+    "euroc": (SEQUENCE, (*POSES, *READ, *TOPICS)),
+    "kitti": (SEQUENCE, (*POSES, *READ, *TOPICS)),
+    "bag": ((*SEQUENCE, *TOPICS), (*POSES, *READ, *TOPICS)),
+    "video": (SEQUENCE, (*POSES, *READ, *TOPICS)),
+    "images": ((*SEQUENCE, "truth"), (*POSES, *READ, "truth", "camera")),
     "traverses": ((*FRAMES, "references", "truth"), ("references", "truth")),
     "nordland": (FRAMES, ()),
     "fabmap": ((*FRAMES, "truth", "camera", "coordinates"), None),
@@ -54,8 +55,8 @@ _KINDS: dict[str, tuple[Sequence[str] | None, Sequence[str] | None]] = {
 EVALUATED = {kind: settings for kind, (settings, _) in _KINDS.items() if settings is not None}
 PAIRED = {kind: settings for kind, (_, settings) in _KINDS.items() if settings is not None}
 # The settings for detect and map, and for close. These commands take one sequence and detect its kind from the files.
-DETECTED: Kinds = {"": (*FRAMES, *TOPICS)}
-CLOSED: Kinds = {"": (*FRAMES, *POSES, *TOPICS)}
+DETECTED: Kinds = {"": (*FRAMES, *READ, *TOPICS)}
+CLOSED: Kinds = {"": (*FRAMES, *POSES, *READ, *TOPICS)}
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,7 @@ POSE_FORM_HELP = (
 
 def is_recording(source: Path) -> bool:
     """Return whether a source is a bag or a video."""
-    return is_bag(source) or source.suffix.lower() in VIDEO_SUFFIXES
+    return is_bag(source) or is_video(source)
 
 
 def open_sequence(
@@ -183,17 +184,21 @@ def open_sequence(
     """
     path, layout, poses = source.path, source.kind, source.pose_choice()
     topics = Topics(*(source.get(name, str) or "" for name in TOPICS))
-    video = layout == "video" or (not layout and path.suffix.lower() in VIDEO_SUFFIXES)
+    video = layout == "video" or (not layout and is_video(path))
+    times, scale = source.get("times", Path), source.get("depth-scale", float)
+    if scale is not None and not 0 < scale < np.inf:
+        raise InputError(f"{source}: depth-scale is {scale:g}; expected the value of a meter, as 5000 or 1000")
     if layout == "bag" or (not layout and is_bag(path)) or (video and videos):
         extracted = extract(path, frames, topics, progress)
-        sequence = read_sequence(extracted.folder, "images", max_difference, poses)
+        sequence = read_sequence(extracted.folder, "images", max_difference, poses, times)
         doubts = tuple(f"{path}: {doubt}" for doubt in extracted.doubts)
         fault = InputError(extracted.pose_fault, path) if extracted.pose_fault and poses is None else None
         return replace(sequence, doubts=(*doubts, *sequence.doubts), pose_fault=fault), extracted.said
     if topics != BY_NAME:
         raise InputError(f"is no bag; {', '.join(TOPICS)} are for bags", path)
     layout = layout or layout_of(path, "tum" if posed and poses is None else "images")
-    return read_sequence(path, layout, max_difference, poses), ""
+    sequence = read_sequence(path, layout, max_difference, poses, times)
+    return sequence if scale is None else replace(sequence, depth_per_m=scale), ""
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,13 @@ import numpy as np
 from netspec.errors import SpecError, Where
 from netspec.files.table import TIME, UNITS, Table, is_number, read_table
 
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
-SUBFOLDERS = ("rgb", "images", "Images")
+IMAGE_ENDINGS = (
+    *(".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"),
+    *(".jpe", ".jfif", ".jp2", ".pnm", ".avif"),
+)
+OTHER_PHOTOS = (".heic", ".heif", ".gif", ".dng", ".raw", ".cr2", ".nef", ".arw")  # that OpenCV does not read
+SUBFOLDERS = ("rgb", "images", "Images", "data")
+_DEPTH = re.compile(r"(?<![a-z])depth(?![a-z])", re.IGNORECASE)  # in the name of a depth image beside a color image
 _EXPECTED = "a folder of images, or a text file that lists them"
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _LINE = re.compile(rf"(?:(?P<stamp>{_NUMBER})(?:\s+|\s*,\s*))?(?P<name>.+?)(?:\s+[+-]?\d+)?")
@@ -27,12 +33,14 @@ _COMMENT = re.compile(r"\s+#")
 class ImageList:
     """Image files in order: ``paths``, ``names``, and ``stamps`` (N,) in seconds if all images have one.
 
-    ``ImageSequence`` in ``loopclosure.places`` adds poses, a camera and videos.
+    ``ImageSequence`` in ``loopclosure.places`` adds poses, a camera and videos. ``doubts`` are sentences about what was
+    not read, and about what looks wrong.
     """
 
     paths: tuple[Path, ...]
     names: tuple[str, ...]
     stamps: np.ndarray | None = None
+    doubts: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -45,10 +53,19 @@ def list_images(source: str | Path) -> ImageList:
         return _read_list(source)
     if (source / "rgb.txt").is_file():
         return _in_time(_read_list(source / "rgb.txt"))
+    left_out: list[str] = []
     for folder in (source, *(source / name for name in SUBFOLDERS)):
-        if images := _images_in(folder):
-            return ImageList(tuple(images), tuple(path.relative_to(source).as_posix() for path in images))
-    raise SpecError(f"contains no images; expected files that end in {', '.join(IMAGE_ENDINGS)}", Where(str(source)))
+        images, more = _images_in(folder)
+        left_out += more
+        if images:
+            names = tuple(path.relative_to(source).as_posix() for path in images)
+            return ImageList(tuple(images), names, doubts=tuple(left_out))
+    below = [path for name in ("*", "*/*") for path in sorted(source.glob(name))]
+    inner = [path for path in below if _images_in(path)[0]]
+    there = f"; {', '.join(path.as_posix() for path in inner[:3])} has some: name one folder" if inner else ""
+    said = "".join(f"; {sentence}" for sentence in left_out)
+    expected = f"expected files that end in {', '.join(IMAGE_ENDINGS)}"
+    raise SpecError(f"contains no images; {expected}{there}{said}", Where(str(source)))
 
 
 def natural_order(name: str) -> tuple[list[str | int], str]:
@@ -56,13 +73,16 @@ def natural_order(name: str) -> tuple[list[str | int], str]:
     return [int(part) if k % 2 else part.lower() for k, part in enumerate(re.split(r"(\d+)", name))], name
 
 
-def _images_in(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    found = [
-        path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS and not path.name.startswith(".")
-    ]
-    return sorted((path for path in found if path.is_file()), key=lambda path: natural_order(path.name))
+def _images_in(folder: Path) -> tuple[list[Path], list[str]]:
+    """Return the images of a folder in order, and sentences that count the photos which are not read."""
+    files = [path for path in folder.iterdir() if not path.name.startswith(".")] if folder.is_dir() else []
+    found = [path for path in files if path.suffix.lower() in IMAGE_ENDINGS and path.is_file()]
+    color = [path for path in found if not _DEPTH.search(path.name)]
+    counts = Counter(path.suffix for path in files if path.suffix.lower() in OTHER_PHOTOS)
+    left_out = [f"{count} files {suffix} are not read; convert them" for suffix, count in sorted(counts.items())]
+    if color and len(color) < len(found):
+        left_out.append(f"{len(found) - len(color)} depth images are not frames")
+    return sorted(color or found, key=lambda path: natural_order(path.name)), left_out
 
 
 def _in_time(images: ImageList) -> ImageList:

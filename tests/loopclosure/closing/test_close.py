@@ -13,7 +13,7 @@ import pytest
 from lmdb_build.walk.sequence import Walk, write_walk
 from loopclosure.cli import main
 from loopclosure.closing.close import close as close_path
-from loopclosure.closing.measure import Loop, measure, read_loops
+from loopclosure.closing.measure import Loop, depth_scale_said, measure, read_loops
 from loopclosure.closing.relative import METRIC, Relative
 from loopclosure.detector.export import relative_pose
 from loopclosure.errors import InputError
@@ -210,6 +210,30 @@ def test_missing_loops_are_reported_with_a_limit(tmp_path: Path, monkeypatch: py
     assert str(fault.value) == f"{expected}; relative paths start from {tmp_path}"
     with pytest.raises(InputError, match=f'; "{tmp_path}" has no "gone"$'):
         read_loops(tmp_path / "gone" / "loops.csv", ImageSequence.of_files([Path("a.png")]))
+
+
+@pytest.mark.parametrize("cell", ["", "-1", "1.5", "x", "\u00b2", "9" * 5000])
+def test_an_id_is_a_whole_number(cell: str, tmp_path: Path) -> None:
+    table = tmp_path / "l.csv"
+    table.write_text(f"query_id,match_id\n{cell},1\n")
+    with pytest.raises(InputError, match=r"l\.csv:2:1: no frame has the number"):
+        read_loops(table, ImageSequence.of_files([Path("a.png"), Path("b.png")]))
+
+
+def test_a_row_that_was_cut_is_refused(tmp_path: Path) -> None:
+    table = tmp_path / "l.csv"
+    table.write_text("query_id,match_id,score,query_name,match_name\n2,1,0.5,c.png,b.png\n2,1")
+    with pytest.raises(InputError, match=r"l\.csv:3:1: has another number of cells"):
+        read_loops(table, ImageSequence.of_files([Path(f"{name}.png") for name in "abc"]))
+
+
+@pytest.mark.parametrize("scale", [5000, 1000])
+def test_another_scale_of_the_depth_is_noticed(scale: int, walk: Path) -> None:
+    sequence = read_sequence(walk)
+    assert sequence.camera is not None
+    other = replace(sequence, odometry=sequence.poses, depth_per_m=5000.0 * 5000 / scale)
+    said = depth_scale_said(other, sequence.camera)
+    assert said == "" if scale == 5000 else "depth-scale=5000" in said
 
 
 def test_what_is_left_out_has_its_own_reason() -> None:

@@ -1,5 +1,6 @@
 """Each index finds what comparing with everything finds."""
 
+import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.errors import InputError
+from loopclosure.index.exact import ExactIndex
 from loopclosure.index.index import open_index
 
 NEEDED = {"exact": "numpy", "faiss": "faiss", "places.db": "milvus_lite"}
@@ -139,3 +141,15 @@ def test_descriptors_on_disk_are_found_as_those_in_memory(metric: str) -> None:
             np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(on_disk.rows(100, 1900), rows[100:1900])
     np.testing.assert_array_equal(on_disk.rows(1999, 2000), rows[1999:])
+
+
+def test_descriptors_on_disk_need_one_open_file() -> None:
+    index, rng = ExactIndex("euclidean", in_memory=100), np.random.default_rng(0)
+    rows = rng.standard_normal((2000, 8)).astype(np.float32)
+    counts = []
+    for row in rows:
+        index.add(row[None])
+        counts.append(len(os.listdir("/proc/self/fd")))
+    assert max(counts[500:]) - min(counts[500:]) <= 1
+    np.testing.assert_array_equal(index.rows(100, 1950), rows[100:1950])
+    assert index.search(rows[3], 1)[0].tolist() == [3]

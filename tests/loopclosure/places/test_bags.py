@@ -72,7 +72,9 @@ def test_odometry_is_not_the_truth(tmp_path: Path) -> None:
         sequence.with_poses()
     named = opened(tmp_path / "a.bag", tmp_path / "b", pose_topic="/odom")
     assert named.odometry is None
-    np.testing.assert_array_equal(named.with_poses().poses, sequence.odometry)
+    poses = named.with_poses().poses
+    assert poses is not None
+    np.testing.assert_allclose(poses[:, :3], sequence.odometry[:, :3])
 
 
 def test_the_type_and_the_name_tell_odometry_from_poses() -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import struct
 import subprocess
 import sys
 import threading
@@ -17,13 +18,16 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import (
     Selection,
     image_paths,
+    is_video,
     live_frames,
     read_bgr,
     video_frames,
     video_length,
     write_picture,
 )
+from loopclosure.places.sequences import read_sequence
 from netspec.errors import SpecError
+from places_layouts import write_video
 
 
 @pytest.mark.parametrize(
@@ -249,3 +253,92 @@ def test_a_video_that_cannot_be_decoded_prints_one_line(tmp_path: Path) -> None:
     done = subprocess.run(words, check=False, capture_output=True, text=True)
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"{tmp_path}/drive.mp4: cannot be decoded as a video by OpenCV ")
+
+
+def stalled(path: Path, parts: list[tuple[int, float]]) -> None:
+    """Give the frames of an .mp4 other durations: (how many frames, how many times as long) for each part."""
+    data = path.read_bytes()
+    table = data.index(b"stts") - 4
+    size, _, _, _, _, delta = struct.unpack(">I4sIIII", data[table : table + 24])
+    entries = b"".join(struct.pack(">II", count, round(delta * times)) for count, times in parts)
+    new = struct.pack(">I4sII", 16 + len(entries), b"stts", 0, len(parts)) + entries
+    changed = bytearray(data[:table] + new + data[table + size :])
+    for box in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):  # around the table, at the end of the file
+        at = data.index(box) - 4
+        (before,) = struct.unpack(">I", data[at : at + 4])
+        changed[at : at + 4] = struct.pack(">I", before + len(new) - size)
+    path.write_bytes(bytes(changed))
+
+
+def test_the_times_of_a_video_are_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "drive.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 2.0, (64, 48))
+    for number in range(20):
+        writer.write(np.full((48, 64, 3), 10 * number, np.uint8))
+    writer.release()
+    assert [seconds for seconds, _ in video_frames(path)] == [0.5 * i for i in range(20)]
+    stalled(path, [(10, 0.5), (10, 1.5)])
+    expected = [*(0.25 * i for i in range(10)), *(2.5 + 0.75 * i for i in range(10))]
+    np.testing.assert_allclose([seconds for seconds, _ in video_frames(path)], expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["drive.ts", "drive.3gp", "drive.wmv", "drive"])
+def test_a_video_may_have_any_name(name: str, tmp_path: Path) -> None:
+    video = write_video(tmp_path / "drive.avi").rename(tmp_path / name)
+    assert is_video(video)
+    assert len(read_sequence(video)) == len(list(video_frames(video)))
+
+
+def test_what_is_no_video(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text("a.png\n")
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
+    assert not any(is_video(tmp_path / name) for name in ("list.txt", "a.png", "gone", "."))
+
+
+@pytest.mark.parametrize(
+    ("head", "row"), [("", "{square}"), ("number,timestamp [ms]\n", "{number},{square}000")], ids=["one", "named"]
+)
+def test_a_file_of_times(head: str, row: str, tmp_path: Path) -> None:
+    text = head + "".join(row.format(number=i, square=i * i) + "\n" for i in range(48))
+    video, times = write_video(tmp_path / "drive.avi"), tmp_path / "times.txt"
+    times.write_text(text)
+    sequence = read_sequence(video, times=times)
+    assert [stamp for _, _, stamp in sequence.taken(Selection(start=3, stop=6)).frames()] == [9, 16, 25]
+    times.write_text("1\n2\n")
+    with pytest.raises(InputError, match=r"times\.txt: has 2 times, but there are 48 images"):
+        read_sequence(video, times=times)
+
+
+def test_an_unreadable_image_is_counted_once(tmp_path: Path) -> None:
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((24, 32, 3), number, np.uint8))
+    (tmp_path / "1.png").write_bytes(b"broken")
+    sequence = read_sequence(tmp_path)
+    for _ in range(3):
+        assert [index for index, _, _ in sequence.frames()] == [0, 2]
+    assert sequence.unreadable == [1]
+
+
+def test_photos_that_are_not_read_are_counted(tmp_path: Path) -> None:
+    for name in ("1.png", "frame-1.color.png", "frame-1.depth.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((4, 4, 3), np.uint8))
+    for name in ("a.HEIC", "b.HEIC", "c.gif", "notes.txt"):
+        (tmp_path / name).touch()
+    sequence = read_sequence(tmp_path)
+    assert sequence.names == ("1.png", "frame-1.color.png")
+    assert [doubt.split(" ")[:3] for doubt in sequence.doubts] == [
+        ["2", "files", ".HEIC"],
+        ["1", "files", ".gif"],
+        ["1", "depth", "images"],
+    ]
+
+
+@pytest.mark.parametrize(("folder", "inner"), [("image_02", True), (".", False)])
+def test_a_drive_of_kitti_raw(folder: str, inner: bool, tmp_path: Path) -> None:
+    (tmp_path / "image_02" / "data").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "image_02" / "data" / "0.png"), np.zeros((4, 4, 3), np.uint8))
+    if inner:
+        assert len(read_sequence(tmp_path / folder)) == 1
+    else:
+        with pytest.raises(SpecError, match="image_02/data has some: name one folder"):
+            read_sequence(tmp_path)
