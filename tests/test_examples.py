@@ -20,7 +20,7 @@ from paths import ROOT, shared
 
 pytestmark = pytest.mark.slow
 
-# test_ros2_node.py and test_table_1.py run the first three; shapes.py is a part of two others.
+# ros2_node.py needs ROS; test_table_1.py runs the next two; shapes.py is a part of two others.
 ELSEWHERE = {"ros2_node", "table_1", "figure_5", "shapes"}
 EXAMPLES = sorted(path for path in ROOT.glob("examples/*.py") if path.stem not in ELSEWHERE)
 FASTER = ROOT / "examples" / "faster_rcnn.prototxt"
