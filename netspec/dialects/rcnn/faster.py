@@ -34,7 +34,7 @@ ATTRIBUTES = 16  # number of attributes of an object (bottom-up attention)
 REGIONS_WITH_ATTRIBUTES, SHARE_WITH_ATTRIBUTES = 64, 0.5  # instead of REGIONS and REGION_SHARE
 DEVIATIONS = np.array([0.1, 0.1, 0.2, 0.2], np.float32)  # divisors of the classifier's targets
 SHORTEST, LONGEST = 600, 1000  # short and long side of scaled images
-MEANS = np.array([102.9801, 115.9465, 122.7717], np.float32)  # blue, green, red
+MEANS = np.array([102.9801, 115.9465, 122.7717])  # blue, green, red
 
 
 OWN_CODE = "--allow-python-layers runs the fork's own code"
@@ -320,7 +320,7 @@ class RoIData(_Sampling, DataLayer):
             raise self.error(str(fault)) from None
         if entry.get("flipped"):
             pixels = pixels[:, ::-1]
-        image, scale = scaled(pixels.astype(np.float32) - MEANS)
+        image, scale = scaled((pixels - MEANS).astype(np.float32))
         columns = [np.array(entry["boxes"]) * scale, np.array(entry["gt_classes"])[:, None]]
         if "gt_attributes" in entry:
             attributes = entry["gt_attributes"]
@@ -332,7 +332,12 @@ class RoIData(_Sampling, DataLayer):
 
 
 def scaled(image: Array) -> tuple[Array, float]:
-    """Scale an image (H, W, 3) to a short side of 600 pixels, or a long side of 1000; return it and the scale."""
+    """Scale an image (H, W, 3) to a short side of 600 pixels, or a long side of 1000, by the exact factor; return both.
+
+    Fork: py-faster-rcnn, lib/utils/blob.py
+    """
     short, long = sorted(image.shape[:2])
-    scale = min(SHORTEST / short, LONGEST / long)
+    scale = SHORTEST / short
+    if np.round(scale * long) > LONGEST:
+        scale = LONGEST / long
     return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR), scale

@@ -6,14 +6,25 @@ Forks: Intel's caffe and PVANet, src/caffe/layers/proposal_layer.cpp; the Python
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 Array = np.ndarray
 
 
-def base_anchors(base_size: int, ratios: Sequence[float], scales: Sequence[float]) -> Array:
+def half_up(number: float) -> float:
+    """Round a number as C++ does; NumPy rounds halves to even ones."""
+    return math.floor(number + 0.5)
+
+
+def base_anchors(
+    base_size: int,
+    ratios: Sequence[float],
+    scales: Sequence[float],
+    rounded: Callable[[float], float] = np.round,
+) -> Array:
     """Return the boxes (R S, 4) around the first pixel of the map, for each ratio and each scale.
 
     A ratio is height / width; sides are rounded to pixels before they are scaled.
@@ -21,8 +32,8 @@ def base_anchors(base_size: int, ratios: Sequence[float], scales: Sequence[float
     center = (base_size - 1) / 2
     anchors = []
     for ratio in ratios:
-        width = np.floor(np.sqrt(base_size * base_size / ratio) + 0.5)
-        height = np.floor(width * ratio + 0.5)
+        width = rounded(math.sqrt(base_size * base_size / ratio))
+        height = rounded(width * ratio)
         for scale in scales:
             x, y = (width * scale - 1) / 2, (height * scale - 1) / 2
             anchors.append([center - x, center - y, center + x, center + y])

@@ -17,7 +17,7 @@ import torch
 from netspec.dialects.boxes import as_array
 from netspec.dialects.rcnn.align import ROIAlign
 from netspec.dialects.rcnn.faster import AnchorTarget, ProposalTarget, RoIData, anchors_of, settings
-from netspec.dialects.rcnn.proposals import all_anchors, base_anchors, moved, suppress
+from netspec.dialects.rcnn.proposals import all_anchors, base_anchors, half_up, moved, suppress
 from netspec.dialects.rcnn.regions import RegionPooling, whole
 from netspec.dialects.rcnn.smooth import NORMALIZED, SmoothL1Loss
 from netspec.layers import Layer, register
@@ -184,6 +184,8 @@ class Proposal(Layer):
     bottoms = (3, 3)
     tops = (1, 2)
     label_bottoms = frozenset({0, 1, 2})
+    drops_small = False  # boxes below min_size, instead of giving them score 0
+    score_axes: Shape = ()  # further axes of top[1]
 
     def setup(self) -> None:
         """Compute the anchors of one pixel."""
@@ -194,7 +196,7 @@ class Proposal(Layer):
         for name in ("ratio", "scale"):
             if any(number <= 0 for number in getattr(param, name)):
                 raise self.error(f"{name} must be above 0", "proposal_param", name)
-        self.anchors = base_anchors(param.base_size, param.ratio or (0.5, 1, 2), param.scale or (8, 16, 32))
+        self.anchors = base_anchors(param.base_size, param.ratio or (0.5, 1, 2), param.scale or (8, 16, 32), half_up)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         scores, deltas, image = bottom_shapes
@@ -207,7 +209,7 @@ class Proposal(Layer):
         if image[:1] != (1,) or math.prod(image) not in (3, 4, 6):
             raise self.error(f"found an image's sizes of shape {image}, expected (1, 3), (1, 4) or (1, 6)", "bottom", 2)
         most = self.settings.post_nms_topn
-        return [(most, 5), (most,)][: self.num_tops]
+        return [(most, 5), (most, *self.score_axes)][: self.num_tops]
 
     def forward(self, scores: torch.Tensor, deltas: torch.Tensor, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
         param = self.settings
@@ -218,11 +220,13 @@ class Proposal(Layer):
         boxes = moved(anchors, moves, sizes[0], sizes[1])
         least = param.min_size * sizes[[3 if len(sizes) == 4 else 2, 2]]  # of width and height
         large = (boxes[:, 2:] - boxes[:, :2] + 1 >= least).all(axis=1)
-        found = np.where(large, as_array(scores)[0, count:].transpose(1, 2, 0).reshape(-1), np.float32(0))
+        found = as_array(scores)[0, count:].transpose(1, 2, 0).reshape(-1)
+        found = found[large] if self.drops_small else np.where(large, found, np.float32(0))
+        boxes = boxes[large] if self.drops_small else boxes
         order = np.argsort(-found, kind="stable")[: param.pre_nms_topn]
         order = order[suppress(boxes[order], param.nms_thresh, param.post_nms_topn)]
         regions = np.concatenate([np.zeros((len(order), 1), np.float32), boxes[order]], axis=1)
-        tops = (torch.from_numpy(regions), torch.from_numpy(found[order]))
+        tops = (torch.from_numpy(regions), torch.from_numpy(found[order].reshape(-1, *self.score_axes)))
         self.top_shapes = [tuple(top.shape) for top in tops[: self.num_tops]]
         return tuple(top.to(scores) for top in tops[: self.num_tops])
 
@@ -231,15 +235,19 @@ class Proposal(Layer):
 class ProposalLayer(Proposal):
     """Proposal with the settings of py-faster-rcnn. It replaces the Python layer rpn.proposal_layer.ProposalLayer.
 
-    In training, 2000 of 12000 regions are kept, in testing 300 of 6000. param_str has feat_stride, scales, ratios.
+    In training, 2000 of 12000 regions are kept, in testing 300 of 6000. Boxes below the minimum size are left out.
+    param_str has feat_stride, scales, ratios.
 
     bottom[0]  scores (1, 2 A, H, W): background, then object, of the A anchors
     bottom[1]  (1, 4 A, H, W): dx, dy, log dw, log dh of each anchor
     bottom[2]  (1, 3): height, width, scale of the image
     top[0]     regions (n, 5): 0, x1, y1, x2, y2
-    top[1]     optional: their scores (n,)
+    top[1]     optional: their scores (n, 1)
     Fork: rbgirshick/py-faster-rcnn, lib/rpn/proposal_layer.py
     """
+
+    drops_small = True
+    score_axes = (1,)
 
     def setup(self) -> None:
         found = settings(self, "feat_stride", "scales", "ratios")

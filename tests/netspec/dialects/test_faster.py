@@ -177,7 +177,26 @@ def test_python_layer_proposal_layer_equals_layer_proposal(build: Build) -> None
     for phase, before, after in ((TEST, 6000, 300), (TRAIN, 12000, 2000)):
         plain = f"type: 'Proposal' proposal_param {{ pre_nms_topn: {before} post_nms_topn: {after} }}"
         expected = build("rcnn", plain, *shapes, phase=phase).run(*bottoms)[0]
-        assert torch.equal(build("rcnn", text, *shapes, phase=phase).run(*bottoms)[0], expected)
+        large = (expected[:, 3:] - expected[:, 1:3] + 1 >= 16 * IMAGE[0, 2]).all(1)
+        assert torch.equal(build("rcnn", text, *shapes, phase=phase).run(*bottoms)[0], expected[large])
+
+
+def test_python_layer_proposal_layer_leaves_out_boxes_below_the_minimum_size(build: Build) -> None:
+    text = PYTHON.format("rpn.proposal_layer", "ProposalLayer", "'feat_stride': 16")
+    layer = build("rcnn", text, (1, 18, 1, 2), (1, 36, 1, 2), (1, 3), tops=2)
+    bottoms = torch.rand(1, 18, 1, 2), torch.zeros(1, 36, 1, 2)
+    shapes = [[tuple(top.shape) for top in layer.run(*bottoms, torch.tensor([[40.0, w, 1.0]]))] for w in (8, 40)]
+    assert shapes[0] == [(0, 5), (0, 1)]  # each box is clipped to 8 pixels
+    assert shapes[1] == [(len(layer.run(*bottoms, torch.tensor([[40.0, 40, 1]]))[0]), n) for n in (5, 1)]
+
+
+@pytest.mark.parametrize(
+    ("sides", "scale"),
+    [((600, 1000), 1), ((751, 1252), 600 / 751), ((750, 1251), 1000 / 1251), ((500, 900), 1000 / 900)],
+    ids=["none", "1000.3_is_rounded_to_1000", "1000.8_is_not", "long"],
+)
+def test_images_are_scaled_by_the_forks_factor(sides: tuple[int, int], scale: float) -> None:
+    assert faster.scaled(np.zeros((*sides, 3), np.float32))[1] == scale
 
 
 def test_allow_python_runs_the_forks_own_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from netspec.dialects import use_dialect
-from netspec.dialects.rcnn.proposals import base_anchors
+from netspec.dialects.rcnn.proposals import base_anchors, half_up
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer
@@ -84,6 +84,11 @@ ONE = f"type: 'Proposal' proposal_param {{ {SETTINGS} %s }}"
 
 def test_anchors_equal_those_of_faster_rcnn() -> None:
     np.testing.assert_array_equal(base_anchors(16, (0.5, 1, 2), (8, 16, 32)), ANCHORS)
+
+
+def test_half_a_pixel_is_rounded_to_even_in_python_and_up_in_the_forks_of_cpp() -> None:
+    assert base_anchors(16, (1.1,), (8,)).tolist() == [[-52, -56, 67, 71]]  # 15 x 1.1 = 16.5
+    assert base_anchors(16, (1.1,), (8,), half_up).tolist() == [[-52, -60, 67, 75]]
 
 
 def proposals(build: Build, scores: list[list[float]], more: str = "", **moves: float) -> tuple[np.ndarray, np.ndarray]:
