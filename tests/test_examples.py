@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import forked
+from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.evaluate import judge
 from loopclosure.methods.base import MethodContext
 from loopclosure.methods.named import make_method
@@ -20,9 +21,9 @@ from paths import ROOT, shared
 
 pytestmark = pytest.mark.slow
 
-# ros2_node.py needs ROS; test_table_1.py runs the next two; shapes.py is a part of two others.
-ELSEWHERE = {"ros2_node", "table_1", "figure_5", "shapes"}
-EXAMPLES = sorted(path for path in ROOT.glob("examples/*.py") if path.stem not in ELSEWHERE)
+# ros2_node.py needs ROS; test_table_1.py runs the next two; the others are parts of examples.
+ELSEWHERE = {"ros2_node", "table_1", "figure_5", "shapes", "light"}
+EXAMPLES = sorted(path for path in ROOT.glob("examples/**/*.py") if path.stem not in ELSEWHERE)
 FASTER = ROOT / "examples" / "faster_rcnn.prototxt"
 WORDS = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
 SHORTER: dict[str, list[object]] = {"faster_rcnn": [FASTER, FASTER, 20], "mobilenet_ssd": [80]}  # iterations
@@ -43,6 +44,9 @@ def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     if request.param.stem == "trained_head":
         given = [20, write_pairs(folder)]
         run(request.param.with_name("efficientnet_lite0.py"), folder)
+    if request.param.stem == "views":
+        write_pairs(folder)
+        given = [f"{folder}/index.csv,run,second", "--out", folder / "made", "--batches", 2, "--size", 9]
     if request.param.stem == "distilled_words":
         for name in ("deploy.prototxt", "places.caffemodel"):
             shutil.copy(WORDS.with_name("places") / name, folder / name.replace("deploy", "places"))
@@ -67,6 +71,8 @@ def write_pairs(folder: Path) -> Path:
             cv2.imwrite(str(folder / f"{k}_{side}.png"), place + light)
         rows.append(f"{k}_a.png {k}_b.png 1\n")
     (folder / "views.txt").write_text("# 64 pairs\n" + "".join(rows))
+    lines = [f"{k % 3},{5 * k},{k}_a.png" for k in range(64)]
+    (folder / "index.csv").write_text("\n".join(["run,second,image", *lines]) + "\n")
     return folder / "views.txt"
 
 
@@ -131,9 +137,16 @@ def check_faster_rcnn(said: str, folder: Path) -> None:
 
 def check_validation_set(said: str, folder: Path) -> None:
     assert numbers(said, r": (\d+) places") == [270, 330]
-    data = load_traverses(folder / "outdoor" / "season", folder / "outdoor" / "places", 1, 2)
+    data = load_traverses(folder / "outdoor" / "season", folder / "outdoor" / "places", 1)
     outcome = judge("thumbnails", make_method("thumbnails", MethodContext()), data)
     assert 0.4 < outcome.recall_at[1] < 1
+
+
+def check_views(said: str, folder: Path) -> None:
+    assert "18 pairs of 192 images" in said  # those of the table, and those of the folder
+    assert len(read_pair_list(folder / "made.txt")) == 18
+    a, b = (read_bgr(folder / "made" / f"000000_{side}.jpg") for side in "ab")
+    assert a.shape == b.shape == (96, 128, 3)
 
 
 def check_trained_head(said: str, folder: Path) -> None:

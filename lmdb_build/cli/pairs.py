@@ -7,14 +7,7 @@ import itertools
 from pathlib import Path
 
 from lmdb_build.pairs.build import Plan, build_lists
-from lmdb_build.pairs.by_list import (
-    MaskSource,
-    TraverseSource,
-    folders_source,
-    index_source,
-    singles_source,
-    table_source,
-)
+from lmdb_build.pairs.by_list import MaskSource, TraverseSource, folders_source
 from lmdb_build.pairs.by_pose import NEGATIVES, PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import SPLITS, PairSource
 from lmdb_build.pairs.list_file import common_folder, join_lists, root_of, write_contact_sheet
@@ -52,11 +45,7 @@ Or one source of another kind:
   images:     images in natural order, truth=MASK of loops (.mat .npy .txt or image), camera={"|".join(CAMERAS)}
   traverses:  queries, references=FOLDER, truth=MASK or ground_truth*.json
   nordland:   query/, ref/, ground_truth*.json, as in VPR benchmarks
-  folders:    a folder, references=FOLDER; files with equal names show the same place
-  table:      a CSV of positive pairs, in two columns of image names; group=COLUMN names the place; index=CSV of groups
-  index:      a CSV of frames; group=COLUMN names the place, track=COLUMN the clip, time=COLUMN the position in it;
-              frames at most max-gap=N (default: 1) apart are positive pairs
-  singles:    a folder in which each image shows a different place; positive pairs are an image and a warped copy"""
+  folders:    a folder, references=FOLDER; files with equal names show the same place"""
 # Options for sequences with poses only.
 POSED = (
     "max_distance",
@@ -198,13 +187,6 @@ def _add_pairs(commands: Commands) -> None:
         metavar="SHARE",
         help="share of the negatives that --hard-negatives chooses (default: %(default)g)",
     )
-    group.add_argument(
-        "--warp-share",
-        type=float,
-        default=0.0,
-        metavar="SHARE",
-        help="share of the pairs whose second image is a warped copy (default: %(default)g)",
-    )
     group.add_argument("--seed", type=seed, default=1, metavar="N", help="random seed (default: %(default)s)")
 
 
@@ -225,9 +207,8 @@ def _pairs(arguments: argparse.Namespace) -> None:
         at_most=arguments.at_most,
         features=read_features(arguments.hard_negatives) if arguments.hard_negatives else None,
         hard_share=arguments.hard_share,
-        warp_share=1.0 if arguments.source[0].kind == "singles" else arguments.warp_share,
     )
-    lists = build_lists(source, plan, root, arguments.out, bar)
+    lists = build_lists(source, plan, root, arguments.out)
     for written in lists.values():
         print(written.report)
         for doubt in written.doubts:
@@ -256,30 +237,21 @@ def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
     sequences = _sequences(arguments) if kind in SEQUENCES else []
     places = [sequence.source.resolve().parent for sequence in sequences]
     if kind not in SEQUENCES:
-        places = [path.parent if kind in ("table", "index") else path]
-        places += [other for other in (first.get("references", Path),) if other]
-    warped = [arguments.out] if arguments.warp_share or kind == "singles" else []
-    root = arguments.root or Path(relative(common_folder([p.resolve() for p in [*places, *warped]])))
+        places = [path, *(other for other in (first.get("references", Path),) if other)]
+    root = arguments.root or Path(relative(common_folder([place.resolve() for place in places])))
     if sequences:
         return _pose_source(arguments, sequences, root), root
     min_gap = None if arguments.min_gap is None else int(arguments.min_gap)
     truth, references = first.get("truth", Path), first.get("references", Path)
-    get = {name: first.get(name, str) for name in PAIRED.get(kind, ())}
     if kind == "traverses":
         if truth is None or references is None:
             raise WrongUsage(f"traverses:{first} needs ,truth=FILE (which images show the same place)")
         return TraverseSource(truth, path, references, root), root
-    if kind == "images" and truth is not None:
+    if kind == "images":
+        assert truth is not None
         return MaskSource(truth, path, root, min_gap, first.get("camera", str) or "all"), root
-    if kind == "folders":
-        return folders_source(path, Path(str(get["references"])), root, min_gap or 0), root
-    if kind == "table":
-        return table_source(path, root, get["group"], first.get("index", Path)), root
-    if kind == "index":
-        max_gap = first.get("max-gap", float)
-        group, track, time = (str(get[name]) for name in ("group", "track", "time"))
-        return index_source(path, root, group, track, time, 1.0 if max_gap is None else max_gap), root
-    return singles_source(path, root), root
+    assert references is not None
+    return folders_source(path, references, root, min_gap or 0), root
 
 
 def _sequences(arguments: argparse.Namespace) -> list[ImageSequence]:

@@ -1,4 +1,4 @@
-"""Sources of pairs from files: masks of loops, folders with equal names, tables, single images."""
+"""Sources of pairs from files: masks of loops, lists of the images of a place, folders with equal names."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdb_build.pairs.choose import LEFT_OUT, NEGATIVE, POSITIVE, Indices, PairSource
-from lmdb_build.pairs.runs import as_number, cell, read_table, relative
 from loopclosure.errors import InputError
 from loopclosure.places import masks
 from loopclosure.places.frames import image_paths
@@ -172,90 +171,9 @@ def folders_source(folder_a: Path, folder_b: Path, root: Path, min_gap: int = 0)
     return PlaceSource(list(zip(names, places * 2, strict=True)), positives, settings, min_gap=min_gap, sides=sides)
 
 
-def singles_source(folder: Path, root: Path) -> PlaceSource:
-    """Take each image of a folder (or list) as a different place; positives can only be made by warping."""
-    names = [relative(path, root) for path in image_paths(folder)]
-    return PlaceSource([(name, name) for name in names], [], {"source": f"single images of {folder.name}"}, "image")
-
-
-def table_source(table: Path, root: Path, group: str | None = None, index: Path | None = None) -> PlaceSource:
-    """Read a CSV table of positives: two columns with names of images, relative to the table's folder.
-
-    Negatives are images of different groups. A group is the value in column ``group`` of ``index`` (a table with one
-    column of images, which may have more images than the positives), or of the table itself. Without ``group``, images
-    that are linked by positives are one place. If no image is in both columns (as for queries and references), each
-    negative has one image of each column too.
-    """
-    lines, (column_a, column_b) = read_table(table, 2)
-    pairs = [(row[column_a], row[column_b]) for _, row in lines]
-    group_of: dict[str, str] = {}
-    if index is not None:
-        if group is None:
-            raise InputError("an index needs group=COLUMN, the column that names the places", index)
-        rows, (column,) = read_table(index, 1)
-        group_of = {row[column]: cell(index, number, row, group) for number, row in rows}
-    elif group is not None:
-        for number, row in lines:
-            value = cell(table, number, row, group)
-            for image in (row[column_a], row[column_b]):
-                if group_of.setdefault(image, value) != value:
-                    raise InputError(f'{image} has {group} "{group_of[image]}" above, "{value}" here', table, number, 1)
-    else:
-        group_of = _linked(pairs)
-    for (number, _), pair in zip(lines, pairs, strict=True):
-        for image in pair:
-            if image not in group_of:
-                raise InputError(f'image "{image}" is not in {index}', table, number, 1)
-    numbers = {image: number for number, image in enumerate(group_of)}
-    names = [relative(table.parent / image, root) for image in group_of]
-    settings = {"source": f"positives of {table.name}; negatives of different {group or 'places'}"}
-    positives = [(numbers[a], numbers[b]) for a, b in pairs]
-    of_second = {b for _, b in pairs}
-    two_sided = index is None and not of_second & {a for a, _ in pairs}
-    sides = [int(image in of_second) for image in group_of] if two_sided else None
-    images = list(zip(names, group_of.values(), strict=True))
-    return PlaceSource(images, positives, settings, group or "place", sides=sides)
-
-
-def index_source(index: Path, root: Path, group: str, track: str, time: str, max_gap: float) -> PlaceSource:
-    """Read a CSV table of frames: neighbors in time are positives, frames of different groups are negatives.
-
-    Two frames are positive if they have the same value in column ``track`` and their numbers in column ``time`` differ
-    by at most ``max_gap``.
-    """
-    rows, (column,) = read_table(index, 1)
-    tracks: dict[str, list[tuple[float, int]]] = {}
-    for number, (line, row) in enumerate(rows):
-        moment = as_number(index, line, row, time)
-        tracks.setdefault(cell(index, line, row, track), []).append((moment, number))
-    positives = []
-    for frames in tracks.values():
-        frames.sort()
-        for at, (moment, number) in enumerate(frames):
-            for later, other in frames[at + 1 :]:
-                if later - moment > max_gap:
-                    break
-                positives.append((number, other))
-    names = [relative(index.parent / row[column], root) for _, row in rows]
-    groups = [cell(index, line, row, group) for line, row in rows]
-    settings = {
-        "source": f"frames of {index.name}; negatives of different {group}",
-        "positive": f"at most {max_gap:g} in {time} apart, of one {track}",
-    }
-    return PlaceSource(list(zip(names, groups, strict=True)), positives, settings, group)
-
-
-def _linked(pairs: list[tuple[str, str]]) -> dict[str, str]:
-    """Name each image's place by one of the images that it is linked with, directly or indirectly."""
-    parent: dict[str, str] = {}
-
-    def root_of(image: str) -> str:
-        parent.setdefault(image, image)
-        while parent[image] != image:
-            parent[image] = parent[parent[image]]
-            image = parent[image]
-        return image
-
-    for a, b in pairs:
-        parent[root_of(b)] = root_of(a)
-    return {image: root_of(image) for image in list(parent)}
+def relative(path: Path, root: Path) -> str:
+    """Return the path relative to the root, with slashes. Raises InputError if it is not below the root."""
+    try:
+        return path.resolve().relative_to(root.resolve()).as_posix()
+    except ValueError:
+        raise InputError(f"is not below the root folder {root}; give another --root", path) from None

@@ -64,15 +64,11 @@ class PairSource:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Chosen pairs, in the order of the list: image indices (N,) and labels (N,), 1 for the same place.
-
-    ``warped`` (N,): a warped copy replaces the second image; both indices of a positive pair are then the same.
-    """
+    """Chosen pairs, in the order of the list: image indices (N,) and labels (N,), 1 for the same place."""
 
     first: Indices
     second: Indices
     labels: NDArray[np.uint8]
-    warped: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -149,52 +145,36 @@ class Wanted:
     """The pairs to choose for a split: ``count``, half of them positive.
 
     at_most         if there are not enough pairs, use as many as there are, half of them positive
-    warp_share      share of the positives that are an image and a warped copy of it; in the same share of the negatives
-                    the second image is warped too, so that a net does not learn to detect the warp
     hard_negatives  (K, 2) pairs that are used as negatives before others are drawn
     """
 
     count: int
     at_most: bool = False
-    warp_share: float = 0.0
     hard_negatives: Indices | None = None
 
 
 def choose_pairs(source: PairSource, images: Indices, wanted: Wanted, rng: np.random.Generator, split: str) -> Pairs:
     """Choose different pairs among ``images``, in shuffled order.
 
-    Each half is drawn uniformly from all pairs of its label, except for warped images and hard negatives.
+    Each half is drawn uniformly from all pairs of its label, except for hard negatives.
     Raises InputError, which names the ``split``, if there are not enough pairs.
     """
-    half, warp_share, hard_negatives = wanted.count // 2, wanted.warp_share, wanted.hard_negatives
-    warped = round(half * warp_share)
+    half, hard_negatives = wanted.count // 2, wanted.hard_negatives
     hard = np.zeros((0, 2), np.intp) if hard_negatives is None else hard_negatives[:half]
-    found = find_pairs(source, images, {POSITIVE: half - warped, NEGATIVE: half}, rng)
+    found = find_pairs(source, images, {POSITIVE: half, NEGATIVE: half}, rng)
     fresh = ~np.isin(_codes(found[NEGATIVE]), _codes(hard))
     negatives = np.concatenate([hard, found[NEGATIVE][fresh]])
-    available = {POSITIVE: len(found[POSITIVE]) + (warped if len(images) else 0), NEGATIVE: len(negatives)}
+    available = {POSITIVE: len(found[POSITIVE]), NEGATIVE: len(negatives)}
     half = _enough_pairs(available, half, len(images), split, wanted.at_most)
-    seen = found[POSITIVE][: half - round(half * warp_share)]
-    copies = np.repeat(_draw_images(images, half - len(seen), rng)[:, None], 2, axis=1)
-
-    pairs = np.concatenate([seen, copies, negatives[:half]])
+    pairs = np.concatenate([found[POSITIVE][:half], negatives[:half]])
     labels = np.repeat([POSITIVE, NEGATIVE], half).astype(np.uint8)
-    is_warped = np.zeros(len(pairs), bool)
-    is_warped[len(seen) : half] = True
-    is_warped[half + rng.permutation(half)[: len(copies)]] = True
     order = rng.permutation(len(pairs))  # Caffe's Data layer reads a database in its order
-    return Pairs(pairs[order, 0], pairs[order, 1], labels[order], is_warped[order])
+    return Pairs(pairs[order, 0], pairs[order, 1], labels[order])
 
 
 def _codes(pairs: Indices) -> Indices:
     """Return one number (n,) for each unordered pair (n, 2)."""
     return (np.minimum(pairs[:, 0], pairs[:, 1]) << 32) + np.maximum(pairs[:, 0], pairs[:, 1])
-
-
-def _draw_images(images: Indices, count: int, rng: np.random.Generator) -> Indices:
-    """Draw ``count`` images; no image is drawn again before all were drawn."""
-    rounds = [rng.permutation(images) for _ in range(-(-count // max(1, len(images))))]
-    return np.concatenate([images[:0], *rounds])[:count]
 
 
 def _enough_pairs(available: Mapping[int, int], half: int, images: int, split: str, at_most: bool) -> int:

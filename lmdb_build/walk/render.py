@@ -1,81 +1,54 @@
 """A small renderer for the synthetic house: textured rectangles in perspective, nearest first, with a depth buffer.
 
-Camera: pinhole, x to the right, y down, z forward; the center of pixel (column, row) is at exactly those coordinates.
+A camera looks along z, x is to the right, y is down.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdb_build.walk.house import House, Quad
-from lmdb_build.walk.textures import Image
+from lmdb_build.walk.house import House, Image
+from loopclosure.places.intrinsics import Intrinsics
 from netspec.files.opencv import cv2
 
 Array = NDArray[np.float64]
 
+FINER = 2  # pictures are drawn this much larger, and reduced
 NEAR_M = 0.05
-LIGHT_GRID_M = 0.1  # light varies slowly: it is computed on this grid and interpolated
+SUN = np.array([0.5, 0.3, 0.8])  # surfaces that face along this direction, either way, are brightest
 AHEAD = np.float32(1.0005)  # a new pixel must be nearer by this factor, or faces that touch would flicker
 
 
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera: picture size and focal length in pixels."""
-
-    width: int
-    height: int
-    focal: float
-
-    @property
-    def center(self) -> tuple[float, float]:
-        """The principal point (column, row): the center of the picture."""
-        return (self.width - 1) / 2, (self.height - 1) / 2
-
-    def project(self, points: Array) -> Array:
-        """Project points (..., 3) in camera coordinates, in front of the camera, to pixels (..., 2)."""
-        return points[..., :2] / points[..., 2:] * self.focal + np.array(self.center)
-
-
-@dataclass(frozen=True)
-class Light:
-    """The light of a lap: BGR factors of the ambient light and of one source per room, and the sources' positions."""
-
-    ambient: Array  # (3,)
-    sources: Array  # (rooms, 3)
-    places: Array  # (rooms, 3), in meters
-
-
 class Renderer:
-    """Draws a house as one camera sees it. :meth:`relight` takes about 0.1 s, :meth:`draw` a few milliseconds."""
+    """Draws a house as one camera sees it; ``light`` (rooms, 3) are the BGR factors of each room's light."""
 
-    def __init__(self, house: House, camera: Camera, light: Light) -> None:
-        self.house, self.camera = house, camera
+    def __init__(self, house: House, camera: Intrinsics, light: Array) -> None:
+        assert camera.size is not None
+        self._width, self._height = (FINER * pixels for pixels in camera.size)
+        fine = camera.of_size(self._width, self._height)
         self._origins, rights, downs = (
             np.array([getattr(quad, edge) for quad in house.quads]) for edge in ("origin", "right", "down")
         )
         self._corners = self._origins[:, None] + np.stack([0 * rights, rights, rights + downs, downs], axis=1)
         self._normals = np.cross(downs, rights)
+        facing = np.abs(self._normals @ SUN) / np.linalg.norm(self._normals, axis=1)
+        self._textures = [
+            np.clip(quad.texture * (light[quad.room] * (0.6 + 0.5 * lit)), 0, 255).astype(np.uint8)
+            for quad, lit in zip(house.quads, facing, strict=True)
+        ]
         self._across = rights / (rights**2).sum(axis=1, keepdims=True)
         self._along = downs / (downs**2).sum(axis=1, keepdims=True)
-        (u, v), f = camera.center, camera.focal
-        self._rays = np.array([[1 / f, 0, -u / f], [0, 1 / f, -v / f], [0, 0, 1]])
-        self.depth = np.zeros((camera.height, camera.width), np.float32)
-        self.relight(light)
+        self._matrix = np.array([[fine.fx, 0, fine.cx], [0, fine.fy, fine.cy], [0, 0, 1]])
+        self._rays = np.linalg.inv(self._matrix)
 
-    def relight(self, light: Light) -> None:
-        """Change the light, and compute all textures again."""
-        self._pyramids = [_pyramid(_lit(quad, light)) for quad in self.house.quads]
+    def draw(self, position: Array, rotation: Array) -> tuple[Image, NDArray[np.float32]]:
+        """Return what is seen from ``position`` (3,) with camera-to-world ``rotation`` (3, 3).
 
-    def draw(self, position: Array, rotation: Array) -> Image:
-        """Return the picture (H, W, 3), BGR, seen from ``position`` (3,) with camera-to-world ``rotation`` (3, 3).
-
-        ``depth`` then has the depth (H, W) of its pixels along the camera's axis, in meters, 0 where there is nothing.
+        A picture (H, W, 3) uint8, BGR, and the depth (H, W) of its pixels along the camera's axis, in meters, 0 where
+        there is nothing.
         """
-        shape = self.camera.height, self.camera.width
+        shape = self._height, self._width
         picture, nearness = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32)  # 1 / z: linear, unlike z
         facing = ((position - self._origins) * self._normals).sum(axis=1) > 0
         corners = (self._corners - position) @ rotation
@@ -91,17 +64,18 @@ class Renderer:
         at_corner = [(edge * corners[:, 0]).sum(axis=1, keepdims=True) * planes for edge in (across, along)]
         to_unit = np.stack([across - at_corner[0], along - at_corner[1], planes], axis=1) @ self._rays
         for index, outline, unit in zip(visible, corners, to_unit, strict=True):
-            self._draw_quad(picture, nearness, self._pyramids[index], outline, unit)
-        self.depth = np.divide(1, nearness, out=np.zeros_like(nearness), where=nearness > 0)
-        return picture
+            self._draw_quad(picture, nearness, self._textures[index], outline, unit)
+        nearness = nearness.reshape(shape[0] // FINER, FINER, shape[1] // FINER, FINER).max(axis=(1, 3))
+        depth = np.divide(1, nearness, out=np.zeros_like(nearness), where=nearness > 0)
+        return cv2.resize(picture, depth.shape[::-1], interpolation=cv2.INTER_AREA), depth
 
     def _draw_quad(
-        self, picture: Image, nearness: NDArray[np.float32], pyramid: list[Image], corners: Array, to_unit: Array
+        self, picture: Image, nearness: NDArray[np.float32], texture: Image, corners: Array, to_unit: Array
     ) -> None:
         """Paint a rectangle with ``corners`` (4, 3) where it is nearer than the picture so far."""
-        x0, y0, x1, y1 = 0, 0, self.camera.width, self.camera.height
+        x0, y0, x1, y1 = 0, 0, self._width, self._height
         if (corners[:, 2] > NEAR_M).all():  # otherwise it may be anywhere in the picture
-            outline = self.camera.project(corners)
+            outline = (corners @ self._matrix.T)[:, :2] / corners[:, 2:]
             (left, top), (right, bottom) = outline.min(axis=0), outline.max(axis=0)
             x0, y0, x1, y1 = max(x0, int(left)), max(y0, int(top)), min(x1, int(right) + 2), min(y1, int(bottom) + 2)
         if x1 <= x0 or y1 <= y0:
@@ -112,8 +86,6 @@ class Renderer:
         mask = (u >= 0) & (u <= near) & (v >= 0) & (v <= near) & (near > behind * AHEAD) & (near < 1 / NEAR_M)
         if not mask.any():
             return
-        y, x = (inside.mean() for inside in np.nonzero(mask))
-        texture = pyramid[_level(to_unit, np.array([x0 + x, y0 + y, 1]), pyramid)]
         to_texture = np.array([[texture.shape[1], 0, -0.5], [0, texture.shape[0], -0.5], [0, 0, 1]]) @ to_unit
         patch = cv2.warpPerspective(
             texture,
@@ -123,35 +95,3 @@ class Renderer:
             borderMode=cv2.BORDER_REPLICATE,
         )
         picture[y0:y1, x0:x1][mask], behind[mask] = patch[mask], near[mask]
-
-
-def _level(to_unit: Array, pixel: Array, pyramid: list[Image]) -> int:
-    """Choose the pyramid level with about one texel per pixel, at ``pixel`` (column, row, 1)."""
-    u, v, w = to_unit @ pixel
-    (a, b), (c, d) = to_unit[:2, :2] * w - np.outer([u, v], to_unit[2, :2])
-    tall, wide = pyramid[0].shape[:2]
-    texels = abs(a * d - b * c) / w**4 * tall * wide  # a pixel's area on the finest level
-    return min(max(round(0.5 * math.log2(max(texels, 1e-9))), 0), len(pyramid) - 1)
-
-
-def _pyramid(texture: Image) -> list[Image]:
-    levels = [texture]
-    while min(levels[-1].shape[:2]) > 4:
-        tall, wide = levels[-1].shape[:2]
-        levels.append(cv2.resize(levels[-1], (wide // 2, tall // 2), interpolation=cv2.INTER_AREA))
-    return levels
-
-
-def _lit(quad: Quad, light: Light) -> Image:
-    """Return the rectangle's texture, lit by the light of its room."""
-    wide, tall = np.linalg.norm(quad.right), np.linalg.norm(quad.down)
-    across = np.linspace(0, 1, max(2, round(wide / LIGHT_GRID_M)))
-    along = np.linspace(0, 1, max(2, round(tall / LIGHT_GRID_M)))
-    towards = light.places[quad.room] - quad.origin
-    towards = towards - along[:, None, None] * quad.down - across[None, :, None] * quad.right
-    distance = np.linalg.norm(towards, axis=-1)
-    cosine = towards @ np.cross(quad.down, quad.right) / (wide * tall) / np.maximum(distance, 0.01)
-    cosine = np.maximum(cosine, 0.15)  # walls also reflect light
-    power = light.ambient + (cosine / (0.6 + 0.35 * distance**2))[..., None] * light.sources[quad.room]
-    factor = cv2.resize(power.astype(np.float32), quad.texture.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    return np.clip(quad.texture * factor, 0, 255).astype(np.uint8)

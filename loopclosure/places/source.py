@@ -48,9 +48,6 @@ _KINDS: dict[str, tuple[Sequence[str] | None, Sequence[str] | None]] = {
     "fabmap": ((*FRAMES, "truth", "camera", "coordinates"), None),
     "pairs": (FRAMES, None),
     "folders": (None, ("references",)),
-    "table": (None, ("group", "index")),
-    "index": (None, ("group", "track", "time", "max-gap")),
-    "singles": (None, ()),
 }
 EVALUATED = {kind: settings for kind, (settings, _) in _KINDS.items() if settings is not None}
 PAIRED = {kind: settings for kind, (_, settings) in _KINDS.items() if settings is not None}
@@ -141,7 +138,6 @@ NEEDED = {
     "images": ("truth",),
     "traverses": ("references",),
     "folders": ("references",),
-    "index": ("group", "track", "time"),
 }
 MADE_FROM = "source.txt"  # the file and topics, then a line for each doubt about them
 MADE_BY = 2  # the version of what extract writes

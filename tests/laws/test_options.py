@@ -55,7 +55,6 @@ WAYS = {
     ],
     "lmdb_build": [
         "walk walk --frames 3 --size 32x24",
-        "views images --out views --batches 1 --size 1 --view-size 16x12",
         "sheet pairs.txt sheet.png",
         "join joined.txt pairs.txt pairs.txt",
         "convert ./ pairs.txt db",

@@ -31,7 +31,7 @@ from netspec.layers.utility.python import Python
 from netspec.layers.utility.shape import Flatten
 from netspec.net.net import Net
 from netspec.run.overwritten import Overwritten, reader_of_memory
-from netspec.run.walk import Loss, Step, walk
+from netspec.run.walk import Step, walk
 
 Hook = Callable[[int], object]
 
@@ -153,7 +153,7 @@ class BlobRunner:
             run = step.forward if which == "forward" else step.backward
             for hook in self.hooks[f"before_{which}"]:
                 yield Step(i, partial(hook, i), (), ())
-            losses = tuple(Loss(j, weight) for j, (_, weight) in enumerate(step.losses)) if which == "forward" else ()
+            losses = tuple((j, weight) for j, (_, weight) in enumerate(step.losses)) if which == "forward" else ()
             yield Step(i, run, (), (), losses)
             for hook in self.hooks[f"after_{which}"]:
                 yield Step(i, partial(hook, i), (), ())
@@ -217,7 +217,7 @@ class BlobRunner:
     def share_with(self, other: BlobRunner) -> None:
         """Use the learnable blobs of another net (Caffe: ShareTrainedLayersWith). Gradients are not shared."""
         other.upload()
-        mine = self.net.layers_by_name()
+        mine = {layer.param.name: layer for layer in reversed(self.net.layers)}
         for theirs in other.net.layers:
             layer = mine.get(theirs.param.name)
             if layer is None:

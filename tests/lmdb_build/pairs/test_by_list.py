@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from lmdb_build.pairs.by_list import MaskSource, PlaceSource, folders_source, index_source, singles_source, table_source
+from lmdb_build.pairs.by_list import MaskSource, PlaceSource, folders_source
 from lmdb_build.pairs.choose import (
     LEFT_OUT,
     NEGATIVE,
@@ -145,94 +145,7 @@ class TestFolders:
             folders_source(tmp_path / "a", tmp_path / "b", tmp_path)
 
 
-class TestTables:
-    INDEX = "image,floor,clip,second\n" + "".join(
-        f"f{floor}/{clip}_{second}.jpg,f{floor},{clip},{second}\n"
-        for floor, clip in ((1, "a"), (1, "b"), (2, "c"))
-        for second in (1, 2, 3, 7)
-    )
-
-    def write(self, path: Path, text: str) -> Path:
-        path.write_text(text)
-        return path
-
-    def test_positives_with_groups_from_an_index(self, tmp_path: Path) -> None:
-        table = self.write(tmp_path / "p.csv", "image_a,image_b,dt\nf1/a_1.jpg,f1/a_2.jpg,1\n")
-        index = self.write(tmp_path / "i.csv", self.INDEX)
-        source = table_source(table, tmp_path, "floor", index)
-        assert len(source.names) == 12
-        assert label(source, "f1/a_1.jpg", "f1/a_2.jpg") == POSITIVE
-        assert label(source, "f1/a_1.jpg", "f1/b_1.jpg") == LEFT_OUT  # one floor, not listed
-        assert label(source, "f1/a_1.jpg", "f2/c_1.jpg") == NEGATIVE
-
-    def test_queries_and_references_without_groups(self, tmp_path: Path) -> None:
-        table = self.write(tmp_path / "p.csv", "place_id,query,ref\n0,q/0.jpg,r/0.jpg\n1,q/1.jpg,r/1.jpg\n")
-        source = table_source(table, tmp_path)
-        assert label(source, "q/0.jpg", "r/0.jpg") == POSITIVE
-        assert label(source, "q/0.jpg", "r/1.jpg") == NEGATIVE
-        assert label(source, "q/0.jpg", "q/1.jpg") == LEFT_OUT
-
-    def test_linked_images_are_one_place(self, tmp_path: Path) -> None:
-        table = self.write(tmp_path / "p.csv", "a,b\n1.jpg,2.jpg\n2.jpg,3.jpg\n8.jpg,9.jpg\n")
-        source = table_source(table, tmp_path)
-        assert label(source, "1.jpg", "3.jpg") == LEFT_OUT
-        assert label(source, "1.jpg", "9.jpg") == NEGATIVE
-        assert len(source.group_names) == 2
-
-    def test_neighbors_in_time_of_an_index(self, tmp_path: Path) -> None:
-        index = self.write(tmp_path / "i.csv", self.INDEX)
-        source = index_source(index, tmp_path, "floor", "clip", "second", 2.0)
-        assert label(source, "f1/a_1.jpg", "f1/a_3.jpg") == POSITIVE
-        assert label(source, "f1/a_3.jpg", "f1/a_7.jpg") == LEFT_OUT
-        assert label(source, "f1/a_1.jpg", "f1/b_1.jpg") == LEFT_OUT
-        assert label(source, "f1/a_1.jpg", "f2/c_2.jpg") == NEGATIVE
-        assert len(source.positives()) == 3 * 3
-
-    @pytest.mark.parametrize(
-        ("text", "words"),
-        [
-            ("", "has no row below its header line"),
-            ("a,b\n1,2\n", r"p\.csv:1:1: has 0 columns of image names \(none\); expected 2"),
-            ("a,b\n1.jpg,2.jpg\n3.jpg,4.jpg\n", r'p\.csv:2:1: image "1\.jpg" is not in .*i\.csv'),
-        ],
-    )
-    def test_tables_without_information_are_refused(self, tmp_path: Path, text: str, words: str) -> None:
-        table = self.write(tmp_path / "p.csv", text)
-        index = self.write(tmp_path / "i.csv", self.INDEX)
-        with pytest.raises(InputError, match=words):
-            table_source(table, tmp_path, "floor", index)
-
-    def test_missing_columns_and_invalid_seconds_are_refused(self, tmp_path: Path) -> None:
-        index = self.write(tmp_path / "i.csv", self.INDEX)
-        with pytest.raises(InputError, match='has no column "storey"; there are: image, floor, clip, second'):
-            index_source(index, tmp_path, "storey", "clip", "second", 1)
-        self.write(index, "image,floor,clip,second\na.jpg,1,c,soon\n")
-        with pytest.raises(InputError, match=r'i\.csv:2:1: expected a number in column second, found "soon"'):
-            index_source(index, tmp_path, "floor", "clip", "second", 1)
-
-    def test_an_image_in_two_groups_is_refused(self, tmp_path: Path) -> None:
-        table = self.write(tmp_path / "p.csv", "a,b,floor\n1.jpg,2.jpg,x\n2.jpg,3.jpg,y\n")
-        with pytest.raises(InputError, match=r'p\.csv:3:1: 2\.jpg has floor "x" above, "y" here'):
-            table_source(table, tmp_path, "floor")
-
-    def test_ie_tower_and_place_pairs(self) -> None:
-        folder = shared("data", "ie_tower")
-        source = table_source(folder / "positives.csv", folder, "floor", folder / "index.csv")
-        assert (len(source.names), len(source.group_names), len(source.positives())) == (2877, 25, 656)
-        places = table_source(shared("data", "place_pairs", "ESSEX3IN1", "pairs.csv"), shared("data", "place_pairs"))
-        assert (len(places.names), len(places.positives())) == (400, 200)
-
-
-def test_single_images_have_only_warped_positives(tmp_path: Path) -> None:
-    images(tmp_path / "s", "1.png", "2.png", "3.png")
-    source = singles_source(tmp_path / "s", tmp_path)
-    assert label(source, "s/1.png", "s/2.png") == NEGATIVE
-    chosen = choose_pairs(source, np.arange(3), Wanted(6, warp_share=1.0), np.random.default_rng(0), "train")
-    assert chosen.warped.all()
-    assert sorted(chosen.first[chosen.labels == 1].tolist()) == [0, 1, 2]
-
-
 def test_images_outside_the_root_are_refused(tmp_path: Path) -> None:
-    images(tmp_path / "s", "1.png")
+    images(tmp_path, "day/1.png", "night/1.png")
     with pytest.raises(InputError, match="is not below the root folder"):
-        singles_source(tmp_path / "s", tmp_path / "elsewhere")
+        folders_source(tmp_path / "day", tmp_path / "night", tmp_path / "elsewhere")

@@ -184,7 +184,7 @@ def test_a_label_without_any_pair_is_an_error_even_with_at_most(tmp_path: Path) 
         (Plan({"train": 7}), "even, not 7"),
         (Plan({"train": 0}), "no pairs are asked for"),
         (Plan({"train": 2}, seed=-1), "seed"),
-        (Plan({"train": 2}, warp_share=1.5), "--warp-share must be 0 to 1"),
+        (Plan({"train": 2}, hard_share=1.5), "--hard-share must be 0 to 1"),
         (Plan({"train": 2, "val": 2}, shares={"train": 1.0, "val": 0.0, "test": 0.0}), "share of val is 0"),
     ],
 )
@@ -222,15 +222,6 @@ def test_pairs_are_drawn_evenly() -> None:
     assert times.min() > 3
     assert times.max() < 45
     assert abs(times.std() - 4.24) < 0.6  # binomial: sqrt(200 * 0.1 * 0.9)
-
-
-def test_warped_pairs_replace_their_share_of_both_labels() -> None:
-    source = pose_source()
-    chosen = choose_pairs(source, everything(source), Wanted(100, warp_share=0.3), np.random.default_rng(0), "train")
-    for label in (POSITIVE, NEGATIVE):
-        assert int(chosen.warped[chosen.labels == label].sum()) == 15
-    copies = chosen.warped & (chosen.labels == POSITIVE)
-    assert np.array_equal(chosen.first == chosen.second, copies)
 
 
 def test_given_hard_negatives_are_all_used_once() -> None:

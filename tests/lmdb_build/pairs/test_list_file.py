@@ -1,4 +1,4 @@
-"""Lists of pairs: as files, warped, with hard negatives, joined, reported and drawn."""
+"""Lists of pairs: as files, with hard negatives, joined, reported and drawn."""
 
 import os
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lmdb_build.pairs.build import Plan, Split, build_lists, report
-from lmdb_build.pairs.by_list import PlaceSource, singles_source
+from lmdb_build.pairs.by_list import PlaceSource
 from lmdb_build.pairs.choose import NEGATIVE, Wanted, choose_pairs, hard_negatives
 from lmdb_build.pairs.list_file import (
     common_folder,
@@ -20,7 +20,6 @@ from lmdb_build.pairs.list_file import (
     write_contact_sheet,
     write_pair_list,
 )
-from lmdb_build.picture import warp
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.errors import InputError
 from netspec.errors import SpecError
@@ -107,49 +106,6 @@ class TestFile:
             write_pair_list(tmp_path / "list.txt", [('my "photo".png', "b.png", 1)], {})
 
 
-class TestWarp:
-    def test_a_warp_keeps_the_size_and_changes_the_view(self) -> None:
-        original = picture(1)
-        warped = warp(original, np.random.default_rng(0))
-        assert warped.shape == original.shape
-        assert warped.dtype == np.uint8
-        assert np.abs(warped.astype(int) - original).mean() > 5
-        assert np.array_equal(warped, warp(original, np.random.default_rng(0)))
-        assert not np.array_equal(warped, warp(original, np.random.default_rng(1)))
-
-    def test_a_warp_has_no_border(self) -> None:
-        white = np.full((60, 80, 3), 200, np.uint8)
-        for seed in range(20):
-            warped = warp(white, np.random.default_rng(seed)).reshape(-1, 3)
-            assert (warped == warped[0]).all()
-
-    def test_warped_pairs_are_reproducible_next_to_the_list(self, photos: Path) -> None:
-        source = singles_source(photos / "photos", photos)
-        contents = []
-        for name in ("one", "two"):
-            plan = Plan({"train": 8}, by="group", warp_share=1.0)
-            path = build_lists(source, plan, photos, photos / name)["train"].path
-            pairs = read_pair_list(path)
-            assert all((photos / pair.second).is_file() for pair in pairs)
-            for pair in pairs:
-                assert pair.second.startswith(f"{name}/train_warped/")
-                same = Path(pair.second).name.split("_")[1] == Path(pair.first).name
-                assert same == bool(pair.label)
-            contents.append([(photos / pair.second).read_bytes() for pair in pairs])
-        assert contents[0] == contents[1]
-
-    def test_warped_images_must_be_below_the_root_and_originals_must_exist(self, photos: Path) -> None:
-        source = singles_source(photos / "photos", photos / "photos")
-        plan = Plan({"train": 4}, by="group", warp_share=1.0)
-        with pytest.raises(InputError, match="warped images must be below the root folder"):
-            build_lists(source, plan, photos / "photos", photos / "out")
-        source = singles_source(photos / "photos", photos)
-        for path in (photos / "photos").iterdir():
-            path.unlink()
-        with pytest.raises(InputError, match=r"photos/\d\.png: cannot be read: No such file"):
-            build_lists(source, plan, photos, photos / "o")
-
-
 class TestHardNegatives:
     def test_hard_negatives_are_the_nearest_negatives(self) -> None:
         source = ring()
@@ -217,12 +173,12 @@ class TestJoin:
 
 def test_the_report_counts_each_kind_and_every_pair() -> None:
     source = ring()
-    chosen = choose_pairs(source, np.arange(60), Wanted(40, warp_share=0.5), np.random.default_rng(0), "train")
+    chosen = choose_pairs(source, np.arange(60), Wanted(40), np.random.default_rng(0), "train")
     lines = report(source, Split("train", np.arange(60), chosen)).splitlines()
     assert lines[0].startswith("train: 40 pairs of 60 images, ")
     counts = {line[:46].strip(): int(line[46:]) for line in lines[1:]}
     assert sum(counts.values()) == 40
-    assert counts["positive, same place"] == 10
+    assert counts["positive, same place"] == 20
 
 
 class TestContactSheet:

@@ -27,7 +27,7 @@ RATE, WARM, SCALE, VIEWS = 8e-4, 30, 15, 128  # learning rate, iterations until 
 OWN = 0.3  # weight of the original net as a teacher
 folder, iterations, start, lists = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], [Path(n) for n in sys.argv[4:]]
 places = [folder / f"places.{kind}" for kind in ("prototxt", "caffemodel")]
-both = Path(__file__).parents[1] / "prototxt" / "many_negatives" / "siamese_words_256" / "train_val.prototxt"
+both = Path(__file__).parents[2] / "prototxt" / "many_negatives" / "siamese_words_256" / "train_val.prototxt"
 net, tower = read_net(both), folder / "tower.prototxt"
 names = [layer.name for layer in net.layer]
 del net.layer[names.index("parts") + 1 :], net.layer[: names.index("input")]

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-
-from lmdb_build.light import change_light
-from lmdb_build.views import cut_view
+from light import change_light
+from views import cut_view
 
 FRAMES = 30  # references of each sequence, and as many queries
 # Public sequences, by repository. None shows a place of another one, and no net is trained on any of them.

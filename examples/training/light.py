@@ -1,14 +1,11 @@
 """Changes how a view looks: light, season, weather, and objects in front of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from netspec.files.opencv import cv2
 
 Picture = NDArray[Any]  # (H, W, 3) float32, BGR, 0 to 1 for black to white
 

@@ -23,7 +23,7 @@ RATE, WARM, SCALE, VIEWS = 2e-3, 30, 20, 128  # learning rate, iterations until 
 LATE = 0.87  # after this share of the training, each pair also competes with all other pairs of its batch
 folder, iterations, lists = Path(sys.argv[1]), int(sys.argv[2]), [Path(name) for name in sys.argv[3:]]
 example = Path(__file__).with_suffix(".prototxt")
-many = Path(__file__).parents[1] / "prototxt" / "many_negatives" / "siamese_words_256"
+many = Path(__file__).parents[2] / "prototxt" / "many_negatives" / "siamese_words_256"
 source, prototxt = folder / "efficientnet_lite0.caffemodel", folder / "places.prototxt"
 net, layers, words = (read_net(p) for p in (source.with_suffix(".prototxt"), example, many / "deploy.prototxt"))
 del net.layer[[layer.name for layer in net.layer].index("block10") + 1 :]
