@@ -138,9 +138,9 @@ def _extract(arguments: argparse.Namespace) -> None:
 
 
 def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
+    from netspec.data.preprocess import Steps
     from netspec.files.image_list import list_images
     from netspec.inspect.features.images import ImageInput, ImageNet, extract_images
-    from netspec.inspect.features.scaling import Steps
 
     records = ("source", "iterations", "phase", "level", "stage", "allow_python_layers")
     refuse(arguments, records, "is for records; --images reads files and uses phase TEST")
@@ -261,8 +261,9 @@ def _add_export(commands: Commands) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
+    from netspec.data.mean import read_mean_option
     from netspec.export.formats.convert import export_net
-    from netspec.export.formats.preprocess import Preprocess, read_mean_option
+    from netspec.export.formats.preprocess import Preprocess
 
     steps = Preprocess(
         arguments.input,

@@ -17,6 +17,7 @@ from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
 from netspec.files.limits import read_bytes
 from netspec.files.opencv import cv2
+from netspec.files.table import text_lines
 
 _TOO_LARGE = 2**31  # for a Datum's label, an int32
 _MOST_DIGITS = 4000  # Python refuses to read more than 4300
@@ -67,16 +68,13 @@ def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Whe
     ``where`` is the position in the prototxt. Raises SpecError if the file cannot be read.
     """
     try:
-        lines = read_bytes(path).decode("utf-8-sig").splitlines()
+        lines = text_lines(path)
     except OSError as fault:
         raise SpecError(f'list file "{path}" {unreadable(path, fault)}', where or Where(path)) from None
-    except UnicodeDecodeError:
+    except ValueError:
         raise SpecError(f'list file "{path}" is not UTF-8 text', where or Where(path)) from None
-    if any("\0" in line for line in lines):
-        raise SpecError(f'list file "{path}" is not text: it contains a NUL character', where or Where(path))
-    for number, line in enumerate(lines, 1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            yield line.strip(), Where(path, number, 1)
+    for number, line in lines:
+        yield line.strip(), Where(path, number, 1)
 
 
 def read_image_list(path: str, where: Where | None = None) -> list[ListedImage]:

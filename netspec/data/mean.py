@@ -5,6 +5,8 @@ Caffe: src/caffe/data_transformer.cpp
 
 from __future__ import annotations
 
+from tokenize import TokenError
+
 import numpy as np
 from google.protobuf.message import DecodeError
 
@@ -43,3 +45,20 @@ def center(mean: np.ndarray, height: int, width: int) -> np.ndarray:
     """Return the center of a larger mean image (C, H, W), cropped as Caffe crops images in phase TEST."""
     top, left = (mean.shape[1] - height) // 2, (mean.shape[2] - width) // 2
     return mean[:, top : top + height, left : left + width]
+
+
+def read_mean_option(text: str) -> np.ndarray:
+    """Return the mean given by ``--mean``: numbers separated by commas, or a .binaryproto or .npy file (C, H, W)."""
+    try:
+        return np.array([float(part) for part in text.split(",")], np.float32)
+    except ValueError:
+        pass
+    if not text.endswith(".npy"):
+        return read_mean(text, Where("--mean"))
+    try:
+        mapped = np.load(text, mmap_mode="r", allow_pickle=False)  # the file size limits the size of the array
+        if not np.all(np.isfinite(mapped)):
+            raise ValueError("it contains a NaN or an infinity")
+        return np.array(mapped, np.float32)
+    except (OSError, ValueError, TypeError, EOFError, SyntaxError, OverflowError, TokenError) as fault:
+        raise SpecError(f"cannot be read as an array: {' '.join(str(fault).split())}", Where(text)) from None

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from netspec.errors import InputError
 from netspec.files.kinds import unreadable
+from netspec.files.limits import read_bytes
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of time, in seconds
 TIME = r"%?time.*|(?:.*[._])?(?:time)?stamp.*|ts(?:_.*)?|t|n?secs?"
@@ -50,6 +51,17 @@ class Table:
         return "ns" if _OF_ROSTOPIC.fullmatch(name) else f"{found[1] or ''}s" if found else ""
 
 
+def text_lines(path: str | Path) -> list[tuple[int, str]]:
+    """Return the lines of a text file that are not blank, with their numbers from 1.
+
+    Raises OSError if it cannot be read, and ValueError if it is not UTF-8 or has a NUL character.
+    """
+    text = read_bytes(path).decode("utf-8-sig")
+    if "\0" in text:
+        raise ValueError("a NUL character")
+    return [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+
+
 def read_table(path: str | Path, expected: str) -> Table:
     """Read a table. Empty lines are ignored, and so are lines that begin with #, except that the last one before the
     first row may have the names of the columns.
@@ -58,12 +70,11 @@ def read_table(path: str | Path, expected: str) -> Table:
     """
     path = Path(path)
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        told = text_lines(path)
     except OSError as fault:
         raise InputError(unreadable(path, fault, expected), path) from fault
-    except UnicodeDecodeError as fault:
+    except ValueError as fault:
         raise InputError(f"is not a text file; expected {expected}", path) from fault
-    told = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
     numbered = [(number, line) for number, line in told if not line.lstrip().startswith("#")]
     separator = next((each for each in ";," if numbered and each in numbered[0][1]), "")
     rows = [Row(number, _cells(line, separator)) for number, line in numbered]

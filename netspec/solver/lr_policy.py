@@ -23,10 +23,15 @@ Rate = Callable[[float, Any, int, int], Any]
 
 @dataclass(frozen=True)
 class Policy:
-    """``rate(base_lr, param, iteration, step)``, and the fields of SolverParameter that it requires."""
+    """``rate(base_lr, param, iteration, step)``, and the fields of SolverParameter that it requires, and also reads."""
 
     needs: tuple[str, ...]
     rate: Rate
+    also: tuple[str, ...] = ()
+
+
+def _inv(base: float, p: Any, iteration: int, step: int) -> float:
+    return base * _powf(1 + np.float32(p.gamma) * np.float32(iteration), -p.power)
 
 
 def _poly(base: float, p: Any, iteration: int, step: int) -> float:
@@ -52,9 +57,9 @@ POLICIES: dict[str, Policy] = {
     "fixed": Policy((), lambda base, p, i, step: base),
     "step": Policy(("gamma", "stepsize"), lambda base, p, i, step: base * _power(p.gamma, step)),
     "exp": Policy(("gamma",), lambda base, p, i, step: base * _power(p.gamma, i)),
-    "inv": Policy(("gamma",), lambda base, p, i, step: base * _powf(1 + np.float32(p.gamma) * np.float32(i), -p.power)),
-    "multistep": Policy(("gamma",), lambda base, p, i, step: base * _power(p.gamma, step)),
-    "poly": Policy(("max_iter",), _poly),
+    "inv": Policy(("gamma",), _inv, ("power",)),
+    "multistep": Policy(("gamma",), lambda base, p, i, step: base * _power(p.gamma, step), ("stepvalue",)),
+    "poly": Policy(("max_iter",), _poly, ("power",)),
     "sigmoid": Policy(("gamma", "stepsize"), _sigmoid),
 }
 

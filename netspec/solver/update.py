@@ -79,12 +79,14 @@ class Rule:
 
     ``compute(param, diffs, rates, history, iteration)`` turns gradients into the values to subtract from the weights
     (Caffe: ComputeUpdateValue) and updates the history. ``rates`` has the learning rate of each parameter, with its
-    lr_mult. ``sets`` is the number of history values per weight: the second set follows the first.
+    lr_mult. ``sets`` is the number of history values per weight: the second set follows the first. ``reads`` are the
+    fields of SolverParameter that only some types read.
     """
 
     compute: Compute
     sets: int = 1
     momentum: bool = True
+    reads: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -207,10 +209,10 @@ def adam(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, i
 RULES: dict[str, Rule] = {
     "SGD": Rule(sgd),
     "Nesterov": Rule(nesterov),
-    "AdaGrad": Rule(adagrad, momentum=False),
-    "RMSProp": Rule(rmsprop, momentum=False),
-    "AdaDelta": Rule(adadelta, sets=2),
-    "Adam": Rule(adam, sets=2),
+    "AdaGrad": Rule(adagrad, momentum=False, reads=("delta",)),
+    "RMSProp": Rule(rmsprop, momentum=False, reads=("delta", "rms_decay")),
+    "AdaDelta": Rule(adadelta, sets=2, reads=("delta",)),
+    "Adam": Rule(adam, sets=2, reads=("delta", "momentum2")),
 }
 
 

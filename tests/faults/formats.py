@@ -37,10 +37,9 @@ from netspec.data.database import open_reader
 from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
 from netspec.data.hdf5 import Hdf5Source
 from netspec.data.images import read_image, read_image_list
-from netspec.data.mean import read_mean
+from netspec.data.mean import read_mean, read_mean_option
 from netspec.data.windows import read_window_file
 from netspec.errors import SpecError, raise_fault
-from netspec.export.formats.preprocess import read_mean_option
 from netspec.files.image_list import list_images
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions

@@ -22,8 +22,8 @@ from loopclosure.places.frames import read_bgr
 from loopclosure.places.masks import read_truth_matrix
 from netspec.data.database import Writer, open_reader
 from netspec.data.images import read_image
+from netspec.data.mean import read_mean_option
 from netspec.errors import SpecError
-from netspec.export.formats.preprocess import read_mean_option
 from netspec.inspect.features.images import read_pixels as read_for_features
 from netspec.load import load_net, load_solver
 from netspec.net.weights import load_weights

@@ -6,13 +6,12 @@ Caffe: Transformer.preprocess (python/caffe/io.py), DataTransformer::Transform (
 from __future__ import annotations
 
 from dataclasses import dataclass
-from tokenize import TokenError
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from netspec.data.mean import center, read_mean
-from netspec.errors import SpecError, Where
+from netspec.data.mean import center
+from netspec.errors import SpecError
 
 if TYPE_CHECKING:
     from netspec.export.formats.shapes import Sizes  # which imports torch
@@ -99,20 +98,3 @@ class Preprocess:
         size = graph.constant([shape[2], shape[3]])
         start = graph.node("Div", graph.node("Sub", graph.shape_of(value, 2, 4), size), graph.constant([2, 2]))
         return graph.node("Slice", value, start, graph.node("Add", start, size), graph.constant([2, 3]))
-
-
-def read_mean_option(text: str) -> np.ndarray:
-    """Return the mean given by ``--mean``: numbers separated by commas, or a .binaryproto or .npy file (C, H, W)."""
-    try:
-        return np.array([float(part) for part in text.split(",")], np.float32)
-    except ValueError:
-        pass
-    if not text.endswith(".npy"):
-        return read_mean(text, Where("--mean"))
-    try:
-        mapped = np.load(text, mmap_mode="r", allow_pickle=False)  # the file size limits the size of the array
-        if not np.all(np.isfinite(mapped)):
-            raise ValueError("it contains a NaN or an infinity")
-        return np.array(mapped, np.float32)
-    except (OSError, ValueError, TypeError, EOFError, SyntaxError, OverflowError, TokenError) as fault:
-        raise SpecError(f"cannot be read as an array: {' '.join(str(fault).split())}", Where(text)) from None

@@ -10,23 +10,10 @@ from netspec.inspect.check.findings import SETTINGS, SOLVER, Findings, rule
 from netspec.inspect.check.net_rules import own_settings
 from netspec.net.net import Net
 from netspec.proto.source_map import Position
+from netspec.solver.lr_policy import POLICIES
+from netspec.solver.update import RULES
 
 TOLERANCE = 0.1  # share of the records that a test may skip or read twice
-#: The settings that each rate policy, and each update rule, reads.
-POLICY_SETTINGS = {
-    "step": ("gamma", "stepsize"),
-    "exp": ("gamma",),
-    "inv": ("gamma", "power"),
-    "multistep": ("gamma", "stepvalue"),
-    "poly": ("power",),
-    "sigmoid": ("gamma", "stepsize"),
-}
-RULE_SETTINGS = {
-    "adagrad": ("delta",),
-    "rmsprop": ("delta", "rms_decay"),
-    "adadelta": ("delta",),
-    "adam": ("delta", "momentum2"),
-}
 
 
 @rule("no-snapshot", SETTINGS)
@@ -139,8 +126,10 @@ def _untrained(solver: Any, node: Position, nets: Sequence[Net]) -> Findings:
 
 def settings_without_effect(solver: Any) -> Iterator[str]:
     """Yield the names of the settings that the solver's policy and rule do not read."""
-    for table, chosen in ((POLICY_SETTINGS, solver.lr_policy), (RULE_SETTINGS, solver.type.lower())):
-        used = table.get(chosen, ())
+    policies = {name: (*policy.needs, *policy.also) for name, policy in POLICIES.items()}
+    rules = {name: rule.reads for name, rule in RULES.items()}
+    for table, chosen in ((policies, solver.lr_policy), (rules, solver.type)):
+        used = (*table.get(chosen, ()), "max_iter")
         for name in dict.fromkeys(name for names in table.values() for name in names):
             given = len(getattr(solver, name)) if name == "stepvalue" else solver.HasField(name)
             if given and name not in used:

@@ -15,6 +15,7 @@ import numpy as np
 from netspec import log
 from netspec.data.blobs import Shape
 from netspec.data.datum import decode_pixels, planar
+from netspec.data.preprocess import Steps
 from netspec.data.resize import resized
 from netspec.errors import SpecError, Where
 from netspec.export.engines.cache import key_of
@@ -27,7 +28,7 @@ from netspec.files.opencv import cv2
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import TORCH, BuildOptions
 from netspec.graph.speed import speed
-from netspec.inspect.features.scaling import Steps, middle, scaling_of
+from netspec.inspect.features.scaling import middle, scaling_of
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap
@@ -134,7 +135,8 @@ class ImageNet:
     def fingerprint(self) -> str:
         """A hash of everything that determines the blob except the engine: net, weights and preprocessing."""
         s = self.scaling
-        done = f"{self.input} {self.blob} {self.shape} {self.zooms} {s.mean.tolist()} {s.scale} {s.raw_scale} {s.swap}"
+        mean = [0.0] if s.mean is None else s.mean.tolist()
+        done = f"{self.input} {self.blob} {self.shape} {self.zooms} {mean} {s.scale} {s.raw_scale} {s.swap}"
         digest = hashlib.sha256(self._read.SerializeToString(deterministic=True) + done.encode())
         for path in self._weights:
             digest.update(Path(path).read_bytes())
@@ -147,7 +149,7 @@ class ImageNet:
     def inputs(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """Return the input blob (N V, C, H, W) float32 for N images: the V views of each in order."""
         views = [fitted(middle(image, zoom), self.shape) for image in images for zoom in self.zooms]
-        return self.scaling(np.stack(views)).astype(np.float32)
+        return self.scaling(np.stack(views))
 
     def values(self, data: np.ndarray) -> np.ndarray:
         """Return the blob (N V, ...) float32, in its own shape, for a result of :meth:`inputs`."""

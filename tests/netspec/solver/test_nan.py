@@ -8,9 +8,8 @@ import pytest
 
 from lmdb_build.mean import write_mean
 from netspec.cli import main
-from netspec.data.mean import read_mean
+from netspec.data.mean import read_mean, read_mean_option
 from netspec.errors import SpecError
-from netspec.export.formats.preprocess import read_mean_option
 from netspec.load import load_solver
 
 NET = """
