@@ -47,6 +47,7 @@ class Drawn:
     """A net as it grows: its text, and the blobs that can be read, with their shapes."""
 
     draw: random.Random
+    images: int = 1
     text: list[str] = field(default_factory=list)
     blobs: list[str] = field(default_factory=list)
 
@@ -63,6 +64,21 @@ class Drawn:
         kernel, stride = self.draw.choice([1, 1, 2, 3]), self.draw.choice([1, 1, 2, 3])
         return f"kernel_size: {kernel} stride: {stride} pad: {self.draw.randrange(kernel)}"
 
+    def shared(self, blob: str, maps: bool) -> tuple[str, bool]:
+        """Add two layers that share their blobs: of a Scale, or recurrent ones over the images as steps in time."""
+        own, kind = f"p{len(self.text)}", "Scale" if maps else self.draw.choice(["Scale", "LSTM", "RNN"])
+        params = " ".join(f'param {{ name: "{own}{k}" }}' for k in range({"Scale": 2, "LSTM": 3, "RNN": 5}[kind]))
+        fields = 'scale_param { bias_term: true filler { type: "uniform" min: 0.5 } }'
+        more = []
+        if kind != "Scale":
+            blob = self.add('type: "Reshape" reshape_param { shape { dim: 0 dim: 1 dim: -1 } }', [blob])
+            filled = f"shape {{ dim: {self.images} dim: 1 }} data_filler {{ value: 1 }}"
+            more = [self.add(f'type: "DummyData" dummy_data_param {{ {filled} }}', [])]
+            fields = f"recurrent_param {{ num_output: 3 {W} }}"
+        blobs = blob, self.add('type: "AbsVal"', [blob])
+        top = self.add('type: "Eltwise"', [self.add(f'type: "{kind}" {params} {fields}', [b, *more]) for b in blobs])
+        return (self.add('type: "Reshape" reshape_param { shape { dim: 0 dim: -1 } }', [top]) if more else top), maps
+
     def step(self, blob: str, maps: bool) -> tuple[str, bool]:
         """Add a layer on a blob; return its top, and whether that has maps."""
         draw, kind = self.draw, self.draw.random()
@@ -72,6 +88,8 @@ class Drawn:
             self.add(draw.choice(POINTWISE), [blob], [blob])
             readers = [self.add(draw.choice([*POINTWISE, *OTHERS[:6]]), [blob]) for _ in range(2)]
             return self.add('type: "Eltwise"', readers), maps
+        if draw.random() < 0.08:
+            return self.shared(blob, maps)
         if kind < 0.35:
             return self.add(draw.choice(POINTWISE), [blob], [blob] if draw.random() < 0.6 else None), maps
         if kind < 0.5:
@@ -114,7 +132,7 @@ def drawn(seed: int) -> str:
     net = Drawn(random.Random(seed))
     images, sizes = net.draw.choice([1, 1, 2, 4]), net.draw.choice(["4 6 6", "4 6 2", "4 1 6", "6"]).split()
     shape = " ".join(f"dim: {size}" for size in (images, *sizes))
-    maps = len(sizes) == 3
+    net.images, maps = images, len(sizes) == 3
     head = "force_backward: true\n" if net.draw.random() < 0.3 else ""
     data = f'shape {{ {shape} }} data_filler {{ type: "gaussian" }}'
     net.text.append(f'layer {{ name: "x" type: "DummyData" top: "x" dummy_data_param {{ {data} }} }}')

@@ -63,7 +63,7 @@ def read_image(path: str, color: bool = True, size: tuple[int, int] | None = Non
 
 
 def list_lines(path: str, where: Where | None = None) -> Iterator[tuple[str, Where]]:
-    """Yield the lines of a list file with their positions, except blank lines and lines that begin with ``#``.
+    """Yield the lines of a list file with their positions, except blank lines.
 
     ``where`` is the position in the prototxt. Raises SpecError if the file cannot be read.
     """

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -78,8 +77,8 @@ def spread_by_channel(
     """
     (count, channels, *size), (down, across) = shape, sliding.stride
     spread_shape = (count, channels, (size[0] - 1) * down + 1, (size[1] - 1) * across + 1)
-    zeros = partial(values_of(weight).new_zeros, spread_shape)
-    spread = how.memo(f"spread {spread_shape}", lambda: zeros().contiguous(memory_format=torch.channels_last))
+    spread = values_of(weight).new_zeros(spread_shape).contiguous(memory_format=torch.channels_last)
+    how.keeps(spread.nbytes)
     pixels = spread[:, :, ::down, ::across]
     axes = zip(sliding.kernel, sliding.dilation, sliding.pad, strict=True)
     mirrored = replace(sliding, stride=(1, 1), pad=tuple(d * (k - 1) - p for k, d, p in axes))

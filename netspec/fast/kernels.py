@@ -49,8 +49,8 @@ class Inference:
     - ``activation``: the kernel must apply it to the top.
     - ``reuse``: the kernel may overwrite the first bottom.
     - ``lasts``: the next run must not overwrite the top.
-    - ``memo(name, make)``: returns the result of ``make()``. Kernels of the same layer at other shapes get the same
-      object, so ``make`` is called once.
+    - ``memo(name, make)``: returns the result of ``make()``, which must depend on the name and the blobs alone. Other
+      kernels of layers with these blobs get the same object, so it must not be written to.
     - ``pack``: weights may be stored in the layout that the kernel prefers.
     - ``keeps``: must be called with the number of bytes that the kernel keeps for its shapes.
 

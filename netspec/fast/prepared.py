@@ -31,7 +31,8 @@ from netspec.files.limits import give_back_freed_memory
 from netspec.graph.options import PACK
 from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
-from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias
+from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias, uncounted
+from netspec.run.parts import hooks_of
 from netspec.run.shapes import fitted
 from netspec.run.walk import Result, Step, Values, losses_of, walk
 
@@ -92,11 +93,11 @@ class Prepared:
         ]
         self.sequences: OrderedDict[Any, KernelSequence] = OrderedDict()
         self.memos: dict[Any, tuple[Seen, Any]] = {}  # tensors that kernels of several sequences share, by key
-        self._blobs = blobs_of(self._layers)
+        self._blobs, self._hooks = blobs_of(self._layers), hooks_of(self._layers)
         self._seen: dict[int, Seen] = {}
 
     def run(self, given: Mapping[int, torch.Tensor], kept: frozenset[int]) -> Result | None:
-        """Run the net on the values ``given``. Return None if torch records gradients or a graph."""
+        """Run the net on the values ``given``. Return None if torch records gradients or a layer has hooks."""
         found = self.run_in_any_layout(given, kept)
         return found and (found[0], {v: value.contiguous() for v, value in found[1].items()})
 
@@ -105,13 +106,14 @@ class Prepared:
 
         Layers without bottoms run first, because the shapes of records are known only after data layers have run.
         """
-        if torch.is_grad_enabled() or is_recorded():
+        if torch.is_grad_enabled() or is_recorded() or any(self._hooks):
             return None
         values: Values = dict(given)
-        loss = walk(self._sources, values, self._exact) if self._sources else None
-        sequence = self.sequence_for(tuple([(v, x.shape, x.dtype) for v, x in values.items()]), kept)
-        with one_thread() if sequence.one_thread else nullcontext():
-            term = walk(sequence.steps, values, self._exact)
+        with uncounted():
+            loss = walk(self._sources, values, self._exact) if self._sources else None
+            sequence = self.sequence_for(tuple([(v, x.shape, x.dtype) for v, x in values.items()]), kept)
+            with one_thread() if sequence.one_thread else nullcontext():
+                term = walk(sequence.steps, values, self._exact)
         origin = sequence.schedule.origin
         loss = term if loss is None else loss if term is None else loss + term
         return loss, {v: values[origin[v]] for v in kept}
@@ -221,7 +223,7 @@ class Prepared:
         def memo(name: str, make: Callable[[], Any]) -> Any:
             uses.append(name)
             # Layers that share blobs in one shape share their memos too, unless other layers are folded into them.
-            key = (name, step.node if step.chain else -1, *map(id, blobs), *own_shapes)
+            key = (name, step.chain, *map(id, blobs), *own_shapes)
             memos.add(key)
             kept = self.memos.get(key)
             if kept is None or not kept[0].are(blobs):

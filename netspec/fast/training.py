@@ -23,7 +23,7 @@ from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import Seen, blobs_of
 from netspec.run.overwritten import Overwritten
-from netspec.run.parts import Part
+from netspec.run.parts import Part, hooks_of
 from netspec.run.recorded import Backward, Kernels, recorded
 from netspec.run.walk import losses_of
 
@@ -37,6 +37,8 @@ def obstacle(plan: Plan, parts: Sequence[Part]) -> str:
     count = sum(math.prod(shape) for part in parts for shape in part.layer.top_shapes)
     if count > LARGEST:
         return f"its tops have {count:,} numbers, more than {LARGEST:,}"
+    if not layers:
+        return "it has no layers"
     for node, layer in zip(plan.nodes, layers, strict=True):
         if layer.context.device.type != "cpu":
             return "it runs on a GPU"
@@ -86,16 +88,7 @@ class TrainingStep:
         self._layers = layers = [layer for part in parts for layer in part.members]
         self._overwritten, self._weighted = overwritten, weighted
         self._sources = [i for i, node in enumerate(plan.nodes) if not node.bottoms and not len(layers[i].blobs)]
-        self._hooks: list[Any] = [
-            hooks
-            for layer in layers
-            for hooks in (
-                layer._forward_hooks,
-                layer._forward_pre_hooks,
-                layer._backward_hooks,
-                layer._backward_pre_hooks,
-            )
-        ]
+        self._hooks = hooks_of(layers)
         self._blobs = blobs_of(layers)
         self._made: dict[Any, _Prepared] = {}  # by shapes, and by the blobs that learn
         self._values: Values = []

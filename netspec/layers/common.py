@@ -83,7 +83,8 @@ class Dropout(Layer):
         """Return the kept values, scaled; in the test phase, the bottom."""
         if self.phase != TRAIN:
             return data
-        kept = torch.empty_like(data).bernoulli_(1 - self.ratio, generator=self.context.random.on(data.device))
+        kept = data.new_empty(data.shape)  # in Caffe's order, whatever the layout of the data
+        kept.bernoulli_(1 - self.ratio, generator=self.context.random.on(data.device))
         return data * kept.mul_(1 / (1 - self.ratio))
 
     @property

@@ -25,7 +25,7 @@ class BatchNorm(Layer):
     ``use_global_stats`` (the default in the test phase). Training adds to the sums: S = S moving_average_fraction + the
     batch's mean, its unbiased variance, or 1. Layers that share the blobs add one after the other.
 
-    bottom[0]  (N, C) or (N, C, ...)
+    bottom[0]  (N, C) or (N, C, ...); (N,) is one channel
     top[0]     the same shape
     blobs[0]   sum of means     (C,)
     blobs[1]   sum of variances (C,)
@@ -45,9 +45,9 @@ class BatchNorm(Layer):
         self.use_global_stats: bool = (
             param.use_global_stats if param.HasField("use_global_stats") else self.phase == TEST
         )
-        if len(self.bottom_shapes[0]) < 2:
-            raise self.error(f"BatchNorm needs at least 2 axes (N, C), found shape {self.bottom_shapes[0]}", "bottom")
-        self.channels = self.bottom_shapes[0][1]
+        if not self.bottom_shapes[0]:
+            raise self.error("BatchNorm needs at least 1 axis, found a scalar", "bottom")
+        self.channels = _with_channels(self.bottom_shapes[0])[1]
         for shape, start in (((self.channels,), 0.0), ((self.channels,), 0.0), ((1,), self.first_weight)):
             self.add_blob(shape, value=start)
 
@@ -63,10 +63,15 @@ class BatchNorm(Layer):
         return given or replace(super().param_spec(j, None), lr_mult=0.0)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return as_before(self, bottom_shapes, self.channels)
+        as_before(self, [_with_channels(bottom_shapes[0])], self.channels)
+        return bottom_shapes
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the normalized values; in training also add the batch's statistics to the sums."""
+        return self.normalized(data) if data.dim() > 1 else self.normalized(data[:, None])[:, 0]
+
+    def normalized(self, data: torch.Tensor) -> torch.Tensor:
+        """Do the same for (N, C, ...)."""
         arithmetic = self.arithmetic(data)
         if self.use_global_stats:
             return self.by_stored_statistics(arithmetic)(data)
@@ -114,6 +119,11 @@ class BatchNorm(Layer):
     @property
     def small(self) -> bool:
         return math.prod(self.bottom_shapes[0][1:]) <= SMALL_ITEM
+
+
+def _with_channels(shape: Shape) -> Shape:
+    """Return a shape (N, C, ...); a single axis is that of the items."""
+    return shape if len(shape) != 1 else (*shape, 1)
 
 
 def as_before(layer: Layer, shapes: Sequence[Shape], channels: int) -> Sequence[Shape]:

@@ -24,6 +24,7 @@ from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer, State
 from netspec.layers.contract.context import device_of
 from netspec.layers.contract.data_layer import DataLayer
+from netspec.layers.contract.learned import uncounted
 from netspec.net.assembly import Assembly
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST
@@ -179,7 +180,7 @@ class Net(torch.nn.Module):
 
     def forward_loss(self, /, **inputs: Array) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Run the net; return the weighted sum of its losses (a scalar; 0 if it has none) and the outputs."""
-        with self._passes.lock, self.positions:
+        with self._passes.lock, self.positions, uncounted():
             given, kept = self.input_tensors(inputs), self._values_to_keep()
             loss, values = next(found for runner in self.runners if (found := runner.run(given, kept)) is not None)
             blobs = self.plan.blobs
@@ -201,7 +202,7 @@ class Net(torch.nn.Module):
         trainer = self.trainer()
         if trainer is None or self.keep or trainer.is_watched():
             return None
-        with self._passes.lock, self.positions:
+        with self._passes.lock, self.positions, uncounted():
             loss, outputs = trainer.run()
             self._passes.of_thread.blobs = self._passes.last = outputs
             return loss, outputs
@@ -268,12 +269,16 @@ class Net(torch.nn.Module):
         }
         return {name: weights[v] for name, v in self.plan.outputs.items()}
 
+    def layers_by_name(self) -> dict[str, Layer]:
+        """Return the first layer of each name: the one that gets weights for this name, as in Caffe."""
+        return {layer.param.name: layer for layer in reversed(self.layers)}
+
     def share_weights_with(self, other: Net) -> None:
         """Use the learnable blobs of ``other`` in the layers with the same names (Caffe: ShareTrainedLayersWith).
 
         If the shapes of a layer's blobs differ, an error goes to ``plan.source.report``.
         """
-        mine = {layer.param.name: layer for layer in self.layers}
+        mine = self.layers_by_name()
         for theirs in other.layers:
             layer = mine.get(theirs.param.name)
             if layer is None:

@@ -223,7 +223,7 @@ def net_to_proto(net: Net, diff: bool = False) -> NetParameter:
 
 
 def _from_message(net: Net, message: Any, path: str, file: BinaryIO | None, report: Report) -> Copies:
-    targets = _layers_by_name(net)
+    targets = net.layers_by_name()
     copies: Copies = []
     for source in message.layer:
         target = targets.get(source.name)
@@ -274,7 +274,7 @@ def _from_safetensors(net: Net, path: str, report: Report) -> Copies:
 
 
 def _from_arrays(net: Net, layers: Iterable[tuple[str, Any]], path: str, report: Report) -> Copies:
-    targets = _layers_by_name(net)
+    targets = net.layers_by_name()
     shared = _shared(net)
     copies: Copies = []
     for name, arrays in layers:
@@ -300,11 +300,6 @@ def _from_arrays(net: Net, layers: Iterable[tuple[str, Any]], path: str, report:
 
 
 # Net
-
-
-def _layers_by_name(net: Net) -> dict[str, Any]:
-    """Return the layers by name. If several have the same name, the first is used, as in Caffe."""
-    return {layer.param.name: layer for layer in reversed(net.layers)}
 
 
 def _shared(net: Net) -> set[tuple[str, int]]:

@@ -7,8 +7,9 @@ which rounds once instead of three times. The results of a training therefore de
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -32,17 +33,17 @@ class Part:
 
     def run(self, *bottoms: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Run the joined layer, or the members one by one if a member has hooks."""
-        if len(self.members) > 1 and any(map(has_hooks, self.members)):
+        if len(self.members) > 1 and any(hooks_of(self.members)):
             for layer in self.members:
                 bottoms = layer.run(*bottoms)
             return bottoms
         return self.layer.run(*bottoms)
 
 
-def has_hooks(layer: Layer) -> bool:
-    """Return whether a program watches the runs of a layer, so that the layer must run by itself."""
-    hooks = (layer._forward_hooks, layer._forward_pre_hooks, layer._backward_hooks, layer._backward_pre_hooks)
-    return any(hooks)
+def hooks_of(layers: Iterable[Layer]) -> list[Any]:
+    """Return the dicts of the layers' hooks. If one is not empty, a program watches the layers: each runs by itself."""
+    names = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+    return [vars(layer)[name] for layer in layers for name in names]
 
 
 def parts_of(

@@ -11,7 +11,6 @@ Caffe: src/caffe/solvers/*.cpp
 # pyright: reportPrivateImportUsage=false
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -202,7 +201,9 @@ def adam(param: Any, diffs: Tensors, rates: Sequence[float], history: Tensors, i
     torch._foreach_copy_(diffs, means)
     _divide_by_root(diffs, squares, param.delta)
     t = iteration + 1
-    correction = np.float32(math.sqrt(1 - param.momentum2**t) / (1 - param.momentum**t))
+    with np.errstate(all="ignore"):  # for momenta of 1 or more, infinity or NaN as in Caffe
+        beta, beta2 = np.float64(param.momentum), np.float64(param.momentum2)
+        correction = np.float32(np.sqrt(1 - beta2**t) / (1 - beta**t))
     torch._foreach_mul_(diffs, [float(np.float32(rate) * correction) for rate in rates])
 
 

@@ -217,7 +217,7 @@ class BlobRunner:
     def share_with(self, other: BlobRunner) -> None:
         """Use the learnable blobs of another net (Caffe: ShareTrainedLayersWith). Gradients are not shared."""
         other.upload()
-        mine = {layer.param.name: layer for layer in reversed(self.net.layers)}
+        mine = self.net.layers_by_name()
         for theirs in other.net.layers:
             layer = mine.get(theirs.param.name)
             if layer is None:

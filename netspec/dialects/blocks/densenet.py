@@ -113,9 +113,8 @@ class DenseBlock(NotLearned):
                 maps = self._normalized(maps, 6 * self.steps, i)
             maps = F.conv2d(maps, self.blob(i), padding=1)
             if p.use_dropout and self.phase == TRAIN:
-                drawn = torch.empty_like(maps).bernoulli_(
-                    1 - p.dropout_amount, generator=self.context.random.on(maps.device)
-                )
+                drawn = maps.new_empty(maps.shape)  # in Caffe's order, whatever the layout of the maps
+                drawn.bernoulli_(1 - p.dropout_amount, generator=self.context.random.on(maps.device))
                 maps = maps * drawn / (1 - p.dropout_amount)
             data = torch.cat([data, maps], dim=1)
         return data

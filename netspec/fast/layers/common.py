@@ -102,15 +102,15 @@ def _learn_dropout(layer: Dropout, how: Learning) -> Kernels:
     """Return kernels that use the same random mask for the numbers and for their gradients."""
     if layer.phase != TRAIN:
         return Kernels(lambda data: data, lambda diff: diff)
-    draws, buffers, share = layer.context.random, (Buffer(), Buffer(), Buffer()), 1 - layer.ratio
+    draws, buffers, share = layer.context.random, (Buffer(), Buffer()), 1 - layer.ratio
+    kept = torch.empty(layer.bottom_shapes[0])
 
     def forward(data: torch.Tensor) -> torch.Tensor:
-        kept, top = buffers[0].like(data), buffers[1].like(data)
         kept.bernoulli_(share, generator=draws.on(data.device)).mul_(1 / share)
-        return torch.mul(data, kept, out=top)
+        return torch.mul(data, kept, out=buffers[0].like(data))
 
     def backward(diff: torch.Tensor) -> torch.Tensor:
-        return torch.mul(diff, buffers[0].like(diff), out=buffers[2].like(diff))
+        return torch.mul(diff, kept, out=buffers[1].like(diff))
 
     return Kernels(forward, backward)
 

@@ -27,7 +27,8 @@ def _folds(layer: BatchNorm) -> Folds:
 
 
 def _learn(layer: BatchNorm, how: Learning) -> Kernels | None:
-    if layer.use_global_stats or math.prod(layer.top_shapes[0]) == 0 or layer.arithmetic(layer.blob(0)).is_caffes:
+    shape = layer.top_shapes[0]
+    if layer.use_global_stats or math.prod(shape) == 0 or len(shape) == 1 or layer.arithmetic(layer.blob(0)).is_caffes:
         return None
     buffer, rectifies, sums = Buffer(), layer.rectifies, [*how.sums[3:], None, None][:2]
     needed = [how.wanted[0], *(total is not None for total in sums)]

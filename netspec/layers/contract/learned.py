@@ -6,7 +6,7 @@ of its weights in another form, folded or in the layout of a kernel, must notice
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from operator import is_
 from typing import Any
@@ -19,6 +19,19 @@ class Learned(torch.nn.Parameter):
     """A learnable blob that counts how often its memory was handed out."""
 
     handed_out = 0
+
+    @override
+    @classmethod
+    def __torch_function__(
+        cls, func: Callable[..., Any], types: Any, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        """Count the views that a program makes of blobs: it can write through them, and through their ``data``."""
+        with uncounted():
+            found = func(*args, **(kwargs or {}))
+            for view in found if isinstance(found, (tuple, list)) else (found,):
+                if isinstance(view, torch.Tensor) and isinstance(view._base, Learned):
+                    view._base.handed_out += 1
+        return found
 
     @property
     def data(self) -> torch.Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -47,6 +60,10 @@ class Learned(torch.nn.Parameter):
     def __array__(self, *arguments: Any, **named: Any) -> Any:
         self.handed_out += 1
         return super().__array__(*arguments, **named)
+
+
+#: A block in which views are not counted: in a pass, layers make views of their own blobs.
+uncounted = torch._C.DisableTorchFunctionSubclass
 
 
 def values_of(blob: torch.Tensor) -> torch.Tensor:

@@ -123,7 +123,7 @@ class MemoryData(DataLayer):
     """Return arrays that the program gives with ``set_input_arrays``, batch after batch, over and over.
 
     top[0]  images (batch_size, channels, height, width)
-    top[1]  labels (batch_size,)
+    top[1]  labels (batch_size, 1, 1, 1)
     Caffe: src/caffe/layers/memory_data_layer.cpp (Reset), python/caffe/_caffe.cpp (Net_SetInputArrays)
     """
 
@@ -139,7 +139,7 @@ class MemoryData(DataLayer):
         self._next = 0
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return self.shape, self.shape[:1]
+        return self.shape, (self.shape[0], 1, 1, 1)
 
     def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
         """Take images (n, C, H, W) and labels (n,), n a multiple of the batch size; they are not transformed."""
@@ -151,7 +151,7 @@ class MemoryData(DataLayer):
             raise self.error(message, "memory_data_param")
         if self.param.HasField("transform_param"):
             log.warning("memory_data_layer.cpp:88", "MemoryData does not transform array data on Reset()")
-        self._arrays = torch.from_numpy(data), torch.from_numpy(labels)
+        self._arrays = torch.from_numpy(data), torch.from_numpy(labels).view(-1, 1, 1, 1)
         self._next = 0
 
     def missing_input(self) -> SpecError | None:

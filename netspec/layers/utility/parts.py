@@ -58,7 +58,7 @@ class Slice(Layer):
     """Split the bottom along an axis (default 1; slice_dim is its older name), before each slice_point, or evenly.
 
     bottom[0]  any shape
-    top[i]     part i of that axis; the other axes are unchanged
+    top[i]     part i of that axis, of which the last may be empty; the other axes are unchanged
     Caffe: src/caffe/layers/slice_layer.cpp
     """
 
@@ -78,8 +78,8 @@ class Slice(Layer):
                 message = f"found {len(points)} slice_point, expected {self.num_tops - 1}: one fewer than tops"
                 raise self.error(message, "slice_param", "slice_point")
             self.sizes = [end - start for start, end in zip([0, *points], [*points, size], strict=True)]
-            if min(self.sizes) <= 0:
-                expected = f"increasing values above 0 and below {size}, the size of axis {axis}"
+            if min(self.sizes[:-1]) <= 0 or self.sizes[-1] < 0 or self.num_tops > size:
+                expected = f"increasing values from 1 to {size}, the size of axis {axis}"
                 message = f"found slice_point {points} for a bottom of shape {shape}, expected {expected}"
                 raise self.error(message, "slice_param", "slice_point")
         elif size % self.num_tops:

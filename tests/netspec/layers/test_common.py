@@ -85,6 +85,13 @@ def test_dropout_masks_are_determined_by_the_seed(build) -> None:
     assert set(first.flatten().tolist()) == {0.0, 2.0}  # 0.5 is the default ratio
 
 
+def test_dropout_masks_do_not_depend_on_the_layout(build) -> None:
+    data = torch.ones(2, 8, 5, 5)
+    laid_out = data.contiguous(memory_format=torch.channels_last)
+    one, other = (build('type: "Dropout"', data.shape, phase=TRAIN).run(x)[0] for x in (data, laid_out))
+    assert torch.equal(one, other)
+
+
 def test_dropout_changes_nothing_in_the_test_phase(build) -> None:
     data = torch.randn(3, 4)
     assert torch.equal(build('type: "Dropout"', (3, 4), phase=TEST).run(data)[0], data)

@@ -34,10 +34,14 @@ def _give_another_gradient(one: Learned) -> None:
         (_write, True, False),
         (lambda one: one.data, True, False),
         (lambda one: one.detach().numpy(), True, False),
+        (lambda one: one[0].data.zero_(), True, False),
+        (lambda one: torch.flatten(one.view(3, 1)).detach().zero_(), True, False),
+        (lambda one: [each.data.zero_() for each in one], True, False),
+        (lambda one: one.sum() + one.shape[0], True, True),
         (_move, False, False),
         (_give_another_gradient, False, True),
     ],
-    ids=["nothing", "write", "data", "array", "move", "gradient"],
+    ids=["nothing", "write", "data", "array", "view", "view_of_view", "rows", "reading", "move", "gradient"],
 )
 def test_changes_of_values_and_of_memory_are_detected(
     change: Callable[[Learned], object], memory: bool, values: bool

@@ -37,6 +37,13 @@ def test_batch_norm_normalizes_by_the_batch_in_training(build, shape: tuple) -> 
     assert layer.top_shapes == [shape]
 
 
+def test_batch_norm_of_one_axis_has_one_channel(build) -> None:
+    layer, data = build('type: "BatchNorm"', (4,), phase=TRAIN), torch.arange(4.0)
+    torch.testing.assert_close(layer.run(data)[0], normalized(data[:, None])[:, 0])
+    assert [tuple(blob.shape) for blob in layer.blobs] == [(1,)] * 3
+    assert layer.blob(0).tolist() == [1.5]
+
+
 def test_batch_norm_adds_to_sums_and_divides_them_by_their_weight(build) -> None:
     layer = build('type: "BatchNorm" batch_norm_param { moving_average_fraction: 0.9 }', (4, 3, 5, 5), phase=TRAIN)
     sums = [torch.zeros(3, dtype=torch.double), torch.zeros(3, dtype=torch.double), torch.zeros(1, dtype=torch.double)]

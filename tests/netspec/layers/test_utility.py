@@ -89,8 +89,9 @@ def test_concat_joins_along_an_axis(build, text: str, shapes: list, axis: int) -
         ("slice_dim: 2 slice_point: 3", 2, [3, 1], 2),
         ("axis: -3", 2, [1, 1], 0),
         ("", 1, [6], 1),
+        ("slice_point: 6", 2, [6, 0], 1),
     ],
-    ids=["equal_parts", "slice_points", "slice_dim", "negative_axis", "one_top"],
+    ids=["equal_parts", "slice_points", "slice_dim", "negative_axis", "one_top", "empty_last_top"],
 )
 def test_slice_cuts_an_axis(build, text: str, tops: int, sizes: list, axis: int) -> None:
     layer = build(f'type: "Slice" slice_param {{ {text} }}', (2, 6, 4), tops=tops)

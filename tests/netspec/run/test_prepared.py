@@ -202,6 +202,38 @@ def test_writes_through_an_alias_are_noticed(net_of: Callable[..., Net]) -> None
     assert last_sequence(net).kinds == ["packed"]
 
 
+def test_a_write_through_a_view_is_noticed(net_of: Callable[..., Net]) -> None:
+    net = trained(net_of(BLOCK))
+    for value in (0.1, 0.2):
+        quickly(net, data=images())
+        net.params["conv"][0][1].data.fill_(value)
+        assert_same(quickly(net, data=images()), slowly(net, data=images()))
+
+
+def test_forward_hooks_are_called_without_gradients_too(net_of: Callable[..., Net]) -> None:
+    net, called = trained(net_of(BLOCK)), list[str]()
+    hooks = [layer.register_forward_hook(lambda module, *_: called.append(module.type)) for layer in net.layers[1:]]
+    quickly(net, data=images())
+    assert called == [layer.type for layer in net.layers[1:]]
+    for hook in hooks:
+        hook.remove()
+    quickly(net, data=images())
+    assert len(called) == len(hooks)
+
+
+def test_deconvolutions_that_share_filters_have_buffers_of_their_own(net_of: Callable[..., Net]) -> None:
+    """Their maps with zeros between the pixels have one size, but other pixels are zeros."""
+    layer = """layer { name: "%s" type: "Input" top: "%s" input_param { shape { dim: 1 dim: 16 dim: %d dim: %d } } }
+        layer { name: "of_%s" type: "Deconvolution" bottom: "%s" top: "of_%s" param { name: "w" } convolution_param {
+            num_output: 16 group: 16 kernel_size: 4 pad: 1 bias_term: false stride: %d weight_filler { std: 1
+            type: "gaussian" } } }"""
+    sizes = {"a": (127, 1), "b": (64, 2)}
+    net = net_of("".join(layer % (n, n, size, size, n, n, n, step) for n, (size, step) in sizes.items()), seed=1)
+    inputs = {"a": images(1, 16, 127, 127), "b": images(1, 16, 64, 64)}
+    for _ in range(2):
+        assert_same(quickly(net, **inputs), slowly(net, **inputs))
+
+
 def test_shapes_may_change_from_run_to_run(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(BLOCK + SHARED))
     for shape in ((1, 8, 40, 40), (3, 8, 20, 31), (1, 8, 5, 5), (1, 8, 40, 40), (3, 8, 20, 31)):

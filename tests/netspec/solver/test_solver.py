@@ -131,6 +131,23 @@ def test_the_averaged_loss_restarts_with_each_step(make):
     assert shown == pytest.approx([raw[0], (raw[0] + raw[1]) / 2, (raw[1] + raw[2]) / 2, raw[3], (raw[3] + raw[4]) / 2])
 
 
+def test_a_net_without_layers_trains_nothing(make):
+    solver = make(net='name: "n"')
+    solver.step(2)
+    assert (solver.iteration, solver.loss) == (2, 0)
+
+
+def test_the_first_layer_of_a_name_is_shared_with_a_test_net(make):
+    layer = 'layer { name: "ip" type: "InnerProduct" bottom: "%s" top: "%s" include { phase: TEST } %s }'
+    product = "inner_product_param { num_output: 3 weight_filler { value: 2 } }"
+    net = NET.replace("num_output: 2", "num_output: 3").replace("dim: 4 dim: 2", "dim: 4 dim: 3")
+    solver = make(net=net + layer % ("ip", "second", product), more="test_iter: 1 test_interval: 5\n")
+    solver.step(1)
+    first, second = (layer.blob(0) for layer in solver.test_nets[0].layers if layer.type == "InnerProduct")
+    assert first is solver.net.params["ip"][0]
+    assert second.unique().tolist() == [2]
+
+
 def test_iter_size_takes_the_mean_of_its_passes(make):
     fixed = NET.replace('type: "gaussian" std: 1 } data', "value: 2 } data")
     once, thrice = make("", net=fixed), make("iter_size: 3", net=fixed)

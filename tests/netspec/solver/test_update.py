@@ -75,6 +75,13 @@ def test_adam_adds_delta_before_the_bias_correction():
     assert weights[0][0, 0].item() == pytest.approx(-expected, rel=1e-5)
 
 
+@pytest.mark.parametrize("momenta", [(1, 0.999), (0.9, 1.5), (2, 1.5)], ids=str)
+def test_adam_with_momenta_of_1_or_more_gives_what_ieee_gives(momenta: tuple[float, float]):
+    ones = [[torch.ones(shape) for shape in SHAPES]]
+    weights, _ = run(SolverParameter(type="Adam", momentum=momenta[0], momentum2=momenta[1]), ones, [1.0])
+    assert not weights[0].isfinite().any()
+
+
 def test_a_rate_of_0_updates_only_the_history(gradients):
     param = SolverParameter(momentum=0.9)
     history = [torch.ones(shape) for shape in SHAPES]
