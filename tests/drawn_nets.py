@@ -145,4 +145,12 @@ def drawn(seed: int) -> str:
     net.add(f'type: "Reduction" reduction_param {{ operation: {operation} }} loss_weight: 0.5', [end])
     if net.draw.random() < 0.3:
         net.add('type: "Reduction" reduction_param { operation: SUMSQ } loss_weight: 0.1', [blob])
+    if net.draw.random() < 0.3:  # a loss that is read again
+        weight = net.draw.choice(["", "loss_weight: 0.7", "loss_weight: 0"])
+        loss = net.add(f'type: "EuclideanLoss" {weight}', [end, net.add('type: "Sigmoid"', [end])])
+        for _ in range(net.draw.randint(1, 2)):
+            weight = net.draw.choice(["", "loss_weight: 0.2"])
+            net.add(f'type: "Power" power_param {{ scale: 2 }} {weight}', [loss])
+        if net.draw.random() < 0.2:
+            net.text.append(f'layer {{ name: "silence" type: "Silence" bottom: "{loss}" }}')
     return head + "\n".join(net.text) + "\n"

@@ -34,7 +34,7 @@ from netspec.layers.contract.base import Layer
 from netspec.layers.contract.learned import Seen, blobs_of, may_have_alias, uncounted
 from netspec.run.parts import hooks_of
 from netspec.run.shapes import fitted
-from netspec.run.walk import Result, Step, Values, losses_of, walk
+from netspec.run.walk import Losses, Result, Step, Values, walk
 
 MOST_SEQUENCES = 64  # that a net keeps; image pyramids need one for each size
 MEMORY_FACTOR = 4  # all sequences together may keep this many times the memory of one run
@@ -78,14 +78,14 @@ class Prepared:
         self,
         plan: Plan,
         layers: Sequence[Layer],
-        loss_weights: Sequence[Sequence[float]],
+        losses: Losses,
         exact: str,
         passes: Collection[str],
     ) -> None:
         self.passes = frozenset(passes)
         self._plan, self._layers, self._exact = plan, list(layers), exact
         self._device = layers[0].context.device if len(layers) else None
-        self._losses = losses_of(loss_weights)
+        self._losses = losses
         self._sources = [
             Step(i, layer.run, (), node.tops, self._losses[i])
             for i, (node, layer) in enumerate(zip(plan.nodes, self._layers, strict=True))

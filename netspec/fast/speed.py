@@ -28,7 +28,7 @@ class Fast:
         """Return the runner for passes without gradients."""
         from netspec.fast.prepared import Prepared
 
-        return Prepared(eager.plan, eager.layers, eager.loss_weights, eager.exact, passes)
+        return Prepared(eager.plan, eager.layers, eager.losses, eager.exact, passes)
 
     def trainer(self, eager: Eager) -> TrainingStep | str:
         """Return the prepared training step of a net, or the reason why it has none."""
@@ -39,7 +39,7 @@ class Fast:
         if why := obstacle(eager.plan, parts):
             return why
         weighted = partial(weighted_sum, exact=eager.exact)
-        return TrainingStep(eager.plan, parts, eager.loss_weights, eager.overwritten, weighted)
+        return TrainingStep(eager.plan, parts, eager.losses, eager.overwritten, weighted)
 
     def reads_at_once(self, decode: Callable[[Any], np.ndarray]) -> AtOnce:
         """Return a function that reads many raw Datums at once; ``decode`` returns the numbers of one."""

@@ -25,7 +25,7 @@ from netspec.layers.contract.learned import Seen, blobs_of
 from netspec.run.overwritten import Overwritten
 from netspec.run.parts import Part, hooks_of
 from netspec.run.recorded import Backward, Kernels, recorded
-from netspec.run.walk import losses_of
+from netspec.run.walk import Loss, Losses
 
 LARGEST = 2**22  # numbers in all tops: in larger nets the time of autograd is negligible, and it needs less memory
 Values = list[Any]  # by value number, a tensor or None
@@ -63,7 +63,7 @@ def obstacle(plan: Plan, parts: Sequence[Part]) -> str:
 class _Prepared:
     """The kernels of all layers for one set of shapes."""
 
-    forward: list[tuple[Kernel, tuple[int, ...], tuple[int, ...], tuple[tuple[int, float], ...]]]
+    forward: list[tuple[Kernel, tuple[int, ...], tuple[int, ...], tuple[Loss, ...]]]
     backward: list[tuple[Backward, tuple[int, ...], tuple[int, ...]]]
     start: Values  # the gradients at the start of the backward pass: those of the losses
     seen: Seen  # the state of the learnable blobs; kernels write to their gradients
@@ -72,19 +72,19 @@ class _Prepared:
 class TrainingStep:
     """Runs a net that trains forward and backward.
 
-    ``loss_weights[i][j]`` is the loss weight of top j of layer i, and ``weighted(top, weight)`` returns what the top
-    adds to the loss. ``overwritten[i]``: layer i, if its gradient reads memory that is overwritten in place.
+    ``losses`` are the tops with a loss weight, by layer, and ``weighted(top, weight)`` returns what the top adds to the
+    loss. ``overwritten[i]``: layer i, if its gradient reads memory that is overwritten in place.
     """
 
     def __init__(
         self,
         plan: Plan,
         parts: Sequence[Part],
-        loss_weights: Sequence[Sequence[float]],
+        losses: Losses,
         overwritten: Sequence[Overwritten | None],
         weighted: Callable[[torch.Tensor, float], torch.Tensor],
     ) -> None:
-        self._plan, self._parts, self._loss_of = plan, list(parts), losses_of(loss_weights)
+        self._plan, self._parts, self._loss_of = plan, list(parts), losses
         self._layers = layers = [layer for part in parts for layer in part.members]
         self._overwritten, self._weighted = overwritten, weighted
         self._sources = [i for i, node in enumerate(plan.nodes) if not node.bottoms and not len(layers[i].blobs)]
@@ -143,7 +143,7 @@ class TrainingStep:
                 if tops:
                     values[tops[0]] = made
                 made = (made,)
-            for j, weight in losses:
+            for j, weight, _ in losses:
                 term = made[j] if weight == 1 and not made[j].shape else self._weighted(made[j], weight)
                 loss = term if loss is None else loss + term
         diffs = list(prepared.start)
@@ -188,10 +188,11 @@ class TrainingStep:
         made.backward.reverse()
         return made
 
-    def _losses(self, i: int, layer: Layer, made: _Prepared) -> tuple[tuple[int, float], ...]:
-        """Add the gradients of a layer's losses to ``made.start``. Return (index of the top, loss weight) of each."""
-        for j, weight in self._loss_of[i]:
-            made.start[self._tops(i)[j]] = torch.full(layer.top_shapes[j], weight)
+    def _losses(self, i: int, layer: Layer, made: _Prepared) -> tuple[Loss, ...]:
+        """Add the gradients of a layer's losses to ``made.start``. Return the losses."""
+        for j, weight, learns in self._loss_of[i]:
+            if learns:
+                made.start[self._tops(i)[j]] = torch.full(layer.top_shapes[j], weight)
         return self._loss_of[i]
 
     def _tops(self, i: int) -> tuple[int, ...]:

@@ -29,7 +29,7 @@ from netspec.net.assembly import Assembly
 from netspec.net.table import table
 from netspec.proto.schema import PHASE_NAMES, TEST
 from netspec.run.eager import Eager
-from netspec.run.walk import Runner, Trainer
+from netspec.run.walk import Runner, Trainer, losses_of
 
 Array = np.ndarray | torch.Tensor
 
@@ -106,7 +106,8 @@ class Net(torch.nn.Module):
     def _set_runners(self) -> None:
         """Make the runners. The first one that can run a pass runs it; the last, ``eager``, can run any."""
         options = self.options
-        self.eager = Eager(self.plan, list(self.layers), self.loss_weights, options.exact)
+        losses = losses_of(self.plan, self.loss_weights, self.backward_plan)
+        self.eager = Eager(self.plan, list(self.layers), losses, options.exact)
         speed = options.speed if options.passes and self.phase == TEST else None
         self.prepared: Any = speed and speed.prepared(self.eager, options.passes)
         self._trainer: Trainer | str | None = None  # made at the first pass that trains

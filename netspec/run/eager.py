@@ -11,21 +11,17 @@ from netspec.graph.plan import Plan
 from netspec.layers.contract.base import Layer
 from netspec.run.overwritten import Memory, overwritten
 from netspec.run.parts import Part, parts_of
-from netspec.run.walk import Result, Step, Values, Visit, losses_of, walk
+from netspec.run.walk import Losses, Result, Step, Values, Visit, walk
 
 
 class Eager:
     """Runs the layers of a plan. Every net can be run this way.
 
-    ``loss_weights[i][j]`` is the loss weight of layer i's top j, and ``losses`` has those that are not 0. ``exact`` is
-    as in netspec/exact.
+    ``losses`` are the tops with a loss weight, by layer. ``exact`` is as in netspec/exact.
     """
 
-    def __init__(
-        self, plan: Plan, layers: Sequence[Layer], loss_weights: Sequence[Sequence[float]], exact: str
-    ) -> None:
-        self.plan, self.layers, self.loss_weights, self.exact = plan, list(layers), loss_weights, exact
-        self.losses = losses_of(loss_weights)
+    def __init__(self, plan: Plan, layers: Sequence[Layer], losses: Losses, exact: str) -> None:
+        self.plan, self.layers, self.losses, self.exact = plan, list(layers), losses, exact
         self.overwritten = [overwritten(layer, node, plan) for layer, node in zip(layers, plan.nodes, strict=True)]
         self._lines: dict[frozenset[int], list[Step]] = {}  # of the last run
 

@@ -8,23 +8,31 @@ from typing import Any, NamedTuple, Protocol
 import torch
 
 from netspec.exact.arithmetic import arithmetic
+from netspec.graph.plan import Backward, Plan
 
 Values = dict[int, torch.Tensor]  # by value number of a Plan
 Result = tuple[torch.Tensor | None, Values]  # the weighted sum of the losses (None: no losses), and all values
 
 
+class Loss(NamedTuple):
+    """A top with a loss weight, by its index. ``learns``: whether the weight is part of the gradient."""
+
+    top: int
+    weight: float
+    learns: bool = True
+
+
 class Step(NamedTuple):
     """One step of a run. ``run`` takes the values ``bottoms`` and returns the values ``tops``, one or a tuple.
 
-    ``node`` is the index of the last layer that the step runs. ``losses`` are pairs of a top's index and its loss
-    weight. The values ``ends`` are not needed after the step.
+    ``node`` is the index of the last layer that the step runs. The values ``ends`` are not needed after the step.
     """
 
     node: int
     run: Callable[..., Any]
     bottoms: tuple[int, ...]
     tops: tuple[int, ...]
-    losses: tuple[tuple[int, float], ...] = ()
+    losses: tuple[Loss, ...] = ()
     ends: tuple[int, ...] = ()
 
 
@@ -57,12 +65,25 @@ class Trainer(Protocol):
 Visit = Callable[[Step, list[torch.Tensor]], Any]  # runs a step on its bottoms, and returns its tops
 
 
-Losses = list[tuple[tuple[int, float], ...]]  # by layer: pairs of a top's index and its loss weight
+Losses = list[tuple[Loss, ...]]  # by layer
 
 
-def losses_of(loss_weights: Sequence[Sequence[float]]) -> Losses:
-    """Return the tops with a nonzero weight; ``loss_weights[i][j]`` is the loss weight of top j of layer i."""
-    return [tuple((j, weight) for j, weight in enumerate(row) if weight) for row in loss_weights]
+def losses_of(plan: Plan, loss_weights: Sequence[Sequence[float]], backward: Backward) -> Losses:
+    """Return the tops with a nonzero weight; ``loss_weights[i][j]`` is the loss weight of top j of layer i.
+
+    Caffe keeps the weight of a top in its ``diff``. A layer that reads the top, a Split too, overwrites it there with
+    its own gradient. If it computes none, the weight stays, but the layer of the top may have no backward pass.
+    """
+    written = [zip(node.bottoms, row, strict=True) for node, row in zip(plan.nodes, backward.written, strict=True)]
+    overwritten = {v for pairs in written for v, is_written in pairs if is_written}
+    return [
+        tuple(
+            Loss(j, weight, layer_learns and overwritten.isdisjoint(node.tops[j : j + 1]))
+            for j, weight in enumerate(row)
+            if weight
+        )
+        for node, row, layer_learns in zip(plan.nodes, loss_weights, backward.layers, strict=True)
+    ]
 
 
 def walk(steps: Iterable[Step], values: Values, exact: str, visit: Visit | None = None) -> torch.Tensor | None:
@@ -79,8 +100,8 @@ def walk(steps: Iterable[Step], values: Values, exact: str, visit: Visit | None 
         if not isinstance(made, tuple):
             made = (made,)
         values.update(zip(tops, made, strict=False))  # a loss may have no top
-        for j, weight in losses:
-            term = weighted_sum(made[j], weight, exact)
+        for j, weight, learns in losses:
+            term = weighted_sum(made[j] if learns else made[j].detach(), weight, exact)
             loss = term if loss is None else loss + term
         for v in ends:
             values.pop(v, None)

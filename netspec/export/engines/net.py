@@ -69,8 +69,8 @@ class Engine:
         self._blobs = blobs_of(net.layers)
         self._loaded = self._exported = Seen(self._blobs(), values=True)  # when it was loaded, and exported
         losses = [(node.tops, own) for node, own in zip(net.plan.nodes, net.eager.losses, strict=True)]
-        self._nameless = any(j >= len(tops) for tops, own in losses for j, _ in own)  # a loss without a top
-        self._losses = [] if self._nameless else [(tops[j], weight) for tops, own in losses for j, weight in own]
+        self._nameless = any(loss.top >= len(tops) for tops, own in losses for loss in own)  # a loss without a top
+        self._losses = [] if self._nameless else [(tops[loss.top], loss.weight) for tops, own in losses for loss in own]
         self._readers = [step for step in net.eager.one_by_one() if isinstance(self._layers[step.node], DataLayer)]
         ends = [node for node, layer in zip(net.plan.nodes, net.layers, strict=True) if is_given(layer)]
         self._ends = {v: net.plan.blobs[v] for node in ends for v in node.tops}  # what the exported net is given

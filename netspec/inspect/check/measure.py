@@ -117,7 +117,7 @@ def _timed(
     loss = walk(steps, values, exact, visit)
     gradients: dict[int, torch.Tensor] = {}
     for step, leaves, tops in reversed(made):
-        weights = dict(step.losses)
+        weights = {loss.top: loss.weight for loss in step.losses if loss.learns}
         ends = []
         for j, top in enumerate(tops):
             diff = gradients.get(step.tops[j]) if j < len(step.tops) else None

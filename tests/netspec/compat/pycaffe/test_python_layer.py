@@ -145,6 +145,6 @@ def test_a_python_loss_among_other_layers(python_net: Callable[..., caffe.Net]) 
     for net in nets:
         net.backward()
     mine, theirs = (net.params["fc"][0].diff for net in nets)
-    np.testing.assert_allclose(mine, theirs, rtol=1e-5)
+    np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-6)
     assert mine.any()
     assert not nets[0].blobs["wanted"].diff.any()
