@@ -31,7 +31,7 @@ from netspec.layers.utility.python import Python
 from netspec.layers.utility.shape import Flatten
 from netspec.net.net import Net
 from netspec.run.overwritten import Overwritten, reader_of_memory
-from netspec.run.walk import Step, walk
+from netspec.run.walk import Loss, Step, walk
 
 Hook = Callable[[int], object]
 
@@ -153,7 +153,7 @@ class BlobRunner:
             run = step.forward if which == "forward" else step.backward
             for hook in self.hooks[f"before_{which}"]:
                 yield Step(i, partial(hook, i), (), ())
-            losses = tuple((j, weight) for j, (_, weight) in enumerate(step.losses)) if which == "forward" else ()
+            losses = tuple(Loss(j, weight) for j, (_, weight) in enumerate(step.losses)) if which == "forward" else ()
             yield Step(i, run, (), (), losses)
             for hook in self.hooks[f"after_{which}"]:
                 yield Step(i, partial(hook, i), (), ())
