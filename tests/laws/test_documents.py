@@ -83,21 +83,6 @@ def test_commands_in_sentences_use_existing_commands_and_options(document: str) 
             assert not unknown_words(line), line
 
 
-@pytest.mark.parametrize(
-    ("line", "unknown"),
-    [
-        ("netspec", []),
-        ("netspec sow LMDB", ["sow"]),
-        ("netspec export NET --too onnx", ["--too"]),
-        ("netspec run x.py --any", []),
-        ("lmdb-build walk walk --seed=1", []),
-    ],
-    ids=["program_only", "unknown_command", "unknown_option", "options_of_a_script", "known_option"],
-)
-def test_unknown_words_finds_unknown_commands_and_options(line: str, unknown: list[str]) -> None:
-    assert unknown_words(line) == unknown
-
-
 @pytest.mark.parametrize("document", DOCUMENTS)
 def test_every_block_has_a_known_language(document: str) -> None:
     text = (ROOT / document).read_text()
@@ -109,37 +94,11 @@ def test_every_block_has_a_known_language(document: str) -> None:
             assert not PROGRAMS.keys() & set(first), f"{block.where}: commands stand in a block without a language"
 
 
-def test_shell_blocks_are_parsed_like_a_shell(tmp_path: Path) -> None:
-    text = 'W=a/b\nE="netspec $W/c"  # why\nfor s in x y; do $E \\\n  --of ${s}_; done\n'
-    text += 'source z && cd d\nloopclosure " e"\n'
-    found = commands(text, tmp_path)
-    assert [command.words for command in found] == [
-        ("netspec", "a/b/c", "--of", "x_"),
-        ("netspec", "a/b/c", "--of", "y_"),
-        ("loopclosure", " e"),
-    ]
-    assert [command.folder for command in found] == [tmp_path, tmp_path, tmp_path / "d"]
-
-
-@pytest.mark.parametrize(
-    "text", ["netspec check $NOT_SET", "netspce check", "netspec check 'a"], ids=["variable", "program", "quote"]
-)
-def test_invalid_shell_blocks_are_refused(text: str, tmp_path: Path) -> None:
-    with pytest.raises(AssertionError):
-        commands(text, tmp_path)
-
-
 @pytest.mark.parametrize("where", PYTHON)
 def test_python_blocks_use_names_that_exist(where: str) -> None:
     for node in ast.walk(ast.parse(BLOCKS[where].text)):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "netspec":
             assert hasattr(netspec, node.attr), node.attr
-
-
-@pytest.mark.parametrize("document", DOCUMENTS)
-def test_links_have_descriptive_texts(document: str) -> None:
-    names = re.findall(r"(?<!!)\[([^\[\]]*\.(?:md|py|cff|toml))\]\(", (ROOT / document).read_text())
-    assert names == []
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)

@@ -1,4 +1,4 @@
-"""The options of all commands: each is read or refused by name, and tests/laws/options.txt lists them."""
+"""The options of all commands: each is read or refused by name."""
 
 import argparse
 import ast
@@ -89,7 +89,6 @@ NOT_STARTED = {
 }
 SHARED = {"verbose", "plugin"}  # read before the command itself
 HIDDEN = argparse.SUPPRESS
-FROZEN = ROOT / "tests" / "laws" / "options.txt"
 PROGRAMS = ("netspec", "lmdb_build", "loopclosure")
 VALUES = {"shape": "data=1,1,28,28", "source": "pair_data=pairs/test_lmdb", "size": "8x8", "view_size": "8x8"}
 
@@ -215,26 +214,6 @@ def test_every_command_is_tested(program: str) -> None:
     assert {name for name in names if not any(f"{line} ".startswith(f"{name} ") for line in WAYS[program])} == set()
 
 
-def test_the_list_of_options_is_current() -> None:
-    """``PYTHONPATH=.:tests python tests/laws/test_options.py`` writes the list."""
-    assert FROZEN.read_text() == frozen()
-
-
-def frozen() -> str:
-    lines = []
-    for program in PROGRAMS:
-        for name, found in options(program).items():
-            names = " ".join(
-                next(s for s in option.option_strings if s.startswith("--") or len(s) == 2) for option in found
-            )
-            lines.append(f"{program} {name}: {names}".strip(": "))
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    FROZEN.write_text(frozen())
-
-
 OTHERS = {"--help", "--version", "--verbose", "--no-train"}
 OF_GLOG = {"--minloglevel", "--logtostderr", "--alsologtostderr", "--log_dir"}
 OF_OTHER_PROGRAMS = {"--nproc-per-node"}  # torchrun's
@@ -243,7 +222,8 @@ DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 def test_options_in_messages_exist() -> None:
     """Each ``--word`` of a string in the programs, except docstrings, is an option of some command."""
-    known = set(re.findall(r"--[a-z0-9_-]+", FROZEN.read_text())) | OTHERS | OF_GLOG | OF_OTHER_PROGRAMS
+    actions = [each for program in PROGRAMS for found in options(program).values() for each in found]
+    known = {word for each in actions for word in each.option_strings} | OTHERS | OF_GLOG | OF_OTHER_PROGRAMS
     found, gone = set(), []
     for path in [path for package in PROGRAMS for path in (ROOT / package).rglob("*.py")]:
         tree = ast.parse(path.read_text())
