@@ -22,7 +22,9 @@ IGNORED = POWER % ("p", "p", "", 2)
 
 def _by_autograd(steps: int) -> float:
     solver = load_solver("solver.prototxt")
-    solver.net.largest_trained = 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("netspec.fast.training.LARGEST", 0)
+        assert solver.net.trainer() is None
     solver.step(steps)
     return solver.net.params["w"][0][0, 0].item()
 
