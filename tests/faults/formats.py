@@ -18,7 +18,6 @@ import cv2
 import h5py
 import lmdb
 import numpy as np
-import scipy.io
 
 from faults import recordings, written
 from lmdb_build.mean import write_mean
@@ -179,10 +178,6 @@ def features(path: Path) -> None:
     )
 
 
-def truth(path: Path) -> None:
-    scipy.io.savemat(path, {"truth": np.eye(6), "note": "synthetic", "more": np.arange(5.0)}, do_compression=True)
-
-
 def rows(path: Path) -> None:
     with h5py.File(path, "w") as file:
         file["data"], file["label"] = numbers(5, 2, 3), np.arange(5.0)
@@ -275,7 +270,6 @@ FORMATS = {
     ),
     "word model": Format(".npz", word_model, WordModel.load, "", members, archive),
     "features": Format(".npz", features, read_features, "", members, archive),
-    "truth.mat": Format(".mat", truth, read_truth_matrix),
     "truth.npy": Format(".npy", lambda path: np.save(path, np.eye(6)), read_truth_matrix),
     "truth.txt": Format(".txt", lambda path: np.savetxt(path, np.eye(6), "%d"), read_truth_matrix),
     "coordinates": Format(".txt", text("a.png 1 2\nb.png 3 4\n"), read_coordinates),

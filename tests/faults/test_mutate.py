@@ -10,7 +10,7 @@ from faults.formats import FORMATS
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks; reads /proc")]
 
-SLOW = ("truth.mat", "exported net", "drawn net")  # each read takes a while
+SLOW = ("exported net", "drawn net")  # each read takes a while
 
 
 @pytest.mark.parametrize(
