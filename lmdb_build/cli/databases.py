@@ -174,9 +174,7 @@ def _add_mean(commands: Commands) -> None:
     parser.set_defaults(function=_mean)
     _add_backend(parser)
     parser.add_argument("input_db", metavar="INPUT_DB", help="the database to read")
-    parser.add_argument(
-        "output_file", nargs="?", metavar="OUTPUT_FILE", help="where to write the mean, as .binaryproto"
-    )
+    parser.add_output("output_file", nargs="?", metavar="OUTPUT_FILE", help="where to write the mean, as .binaryproto")
 
 
 def _mean(arguments: argparse.Namespace) -> None:
@@ -233,8 +231,9 @@ def _add_compare(commands: Commands) -> None:
         default=True,
         help="train the nets (the default); --no-train evaluates the snapshots of an earlier training",
     )
-    parser.add_argument(
+    parser.add_output(
         "--out",
+        folder=True,
         type=Path,
         default=Path("out/compare"),
         metavar="FOLDER",

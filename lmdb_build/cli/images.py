@@ -27,7 +27,7 @@ def _size(text: str) -> tuple[int, int]:
 def _add_walk(commands: Commands) -> None:
     parser = commands.add_parser("walk", help="render walks through textured rooms, as TUM RGB-D sequences")
     parser.set_defaults(function=_walk)
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder for the sequences walk_1, walk_2, ...")
+    parser.add_output("out", folder=True, type=Path, metavar="OUT", help="folder for the sequences walk_1, walk_2, ...")
     parser.add_argument(
         "--sequences",
         type=int,

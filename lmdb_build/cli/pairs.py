@@ -82,8 +82,13 @@ def _add_pairs(commands: Commands) -> None:
         metavar="SOURCE",
         help="sequences with poses, or one source of another kind (see below)",
     )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="FOLDER", help="folder for train.txt, val.txt and test.txt"
+    parser.add_output(
+        "--out",
+        folder=True,
+        type=Path,
+        required=True,
+        metavar="FOLDER",
+        help="folder for train.txt, val.txt and test.txt",
     )
     parser.add_argument(
         "--root",
@@ -335,7 +340,7 @@ def _sheet(arguments: argparse.Namespace) -> None:
 def _add_join(commands: Commands) -> None:
     parser = commands.add_parser("join", help="join several lists and shuffle the result")
     parser.set_defaults(function=_join)
-    parser.add_argument("out", type=Path, metavar="OUT", help="the list to write")
+    parser.add_output("out", type=Path, metavar="OUT", help="the list to write")
     parser.add_argument("list", nargs="+", type=Path, metavar="LIST", help="lists of pairs")
     parser.add_argument(
         "--root",

@@ -47,8 +47,8 @@ def _add_close(commands: Commands) -> None:
     parser.add_argument("--odometry-form", metavar="WORDS", help="how the --odometry file is written, as for pose-form")
     parser.add_argument("--seed", type=seed, metavar="N", help="seed of --drift (default: 1)")
     parser.add_argument("--camera", metavar="NUMBERS", help=f"{intrinsics.FORM}, if the source has no calibration")
-    parser.add_argument(
-        "--out", required=True, metavar="FOLDER", help="folder for closed.g2o, closed.txt and paths.png"
+    parser.add_output(
+        "--out", folder=True, required=True, metavar="FOLDER", help="folder for closed.g2o, closed.txt and paths.png"
     )
 
 

@@ -59,8 +59,12 @@ def _add_detect(commands: Commands) -> None:
         metavar="CAMERA|URL|FILE",
         help="find loops while images arrive, from camera 0, rtsp://HOST/PATH or a file",
     )
-    parser.add_argument(
-        "--out", required=True, metavar="FOLDER", help="folder for loops.csv, and for loops.g2o with poses or odometry"
+    parser.add_output(
+        "--out",
+        folder=True,
+        required=True,
+        metavar="FOLDER",
+        help="folder for loops.csv, and for loops.g2o with poses or odometry",
     )
     exclusive = parser.add_mutually_exclusive_group()
     exclusive.add_argument(
@@ -125,7 +129,7 @@ def _add_detect(commands: Commands) -> None:
         metavar="NUMBERS",
         help=f"{intrinsics.FORM}: measures the relative pose of each loop, if the source has no calibration",
     )
-    parser.add_argument("--save", metavar="F.npz", help="write the detector to this file, for --resume")
+    parser.add_output("--save", metavar="F.npz", help="write the detector to this file, for --resume")
 
 
 def _detect(a: argparse.Namespace) -> None:

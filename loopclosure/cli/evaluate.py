@@ -70,7 +70,7 @@ def _add_evaluate(commands: Commands) -> None:
         help="images to train vocabularies on, not those evaluated: a folder, list or TUM sequence, "
         "with start, stop, stride, limit; may be repeated",
     )
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the report")
+    parser.add_output("--out", folder=True, required=True, metavar="FOLDER", help="folder for the report")
     parser.add_argument("--title", default="", metavar="TEXT", help="heading of the report")
     parser.add_argument(
         "--seed", type=seed, default=0, metavar="N", help="random seed of the methods (default: %(default)s)"

@@ -121,7 +121,7 @@ def _add_query(commands: Commands) -> None:
     parser.add_argument("source", metavar="SOURCE", help="frames, as for detect")
     _add_index(parser)
     _add_camera(parser)
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for loops.csv")
+    parser.add_output("--out", folder=True, required=True, metavar="FOLDER", help="folder for loops.csv")
 
 
 def _query(a: argparse.Namespace) -> None:
@@ -164,7 +164,7 @@ def _add_close(commands: Commands) -> None:
     parser = commands.add_parser("close", help="join the sessions of a map by their loops, and correct their paths")
     parser.set_defaults(function=_close)
     _add_map(parser)
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the paths and closed.g2o")
+    parser.add_output("--out", folder=True, required=True, metavar="FOLDER", help="folder for the paths and closed.g2o")
 
 
 def _close(a: argparse.Namespace) -> None:

@@ -21,6 +21,7 @@ from netspec.files.environment import environment
 from netspec.files.image_list import IMAGE_ENDINGS, list_images
 from netspec.files.kinds import is_cut_png, nearest_existing, unreadable
 from netspec.files.opencv import cv2
+from netspec.files.whole_file import write_whole
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 FIRST_BYTES = 4096  # of a file tell whether it is text
@@ -129,13 +130,10 @@ def read_depth(path: str | Path, per_m: float = DEPTH_PER_M) -> np.ndarray:
 
 
 def write_picture(path: Path, image: np.ndarray, *settings: int) -> None:
-    """Write an image in the format of its suffix, with OpenCV's ``settings``. Raises InputError if that fails."""
+    """Write an image in the format of its suffix, with OpenCV's ``settings``. Raises SpecError if that fails."""
     # Encoded by OpenCV and written by Python, because imwrite aborts the process if a path is not UTF-8.
     _, data = cv2.imencode(path.suffix, image, settings)
-    try:
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", path) from None
+    write_whole(path, data.tobytes())
 
 
 def is_video(path: Path) -> bool:

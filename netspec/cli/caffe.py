@@ -66,7 +66,7 @@ def _add_train(commands: Commands) -> None:
         "--resume", action="store_true", help="resume from the newest complete snapshot, if there is one"
     )
     parser.add_argument("--weights", metavar="WEIGHTS", help="weights to start from, several separated by commas")
-    parser.add_argument(
+    parser.add_output(
         "--scores", metavar="F.json", help="write the scores of each test and the names of the snapshots to this file"
     )
     parser.add_argument(
@@ -267,7 +267,7 @@ def _add_test(commands: Commands) -> None:
     parser.add_argument(
         "--iterations", type=positive, default=50, metavar="N", help="batches to run (default: %(default)s)"
     )
-    parser.add_argument("--scores", metavar="F.json", help="also write the mean scores to this file")
+    parser.add_output("--scores", metavar="F.json", help="also write the mean scores to this file")
     add_gpu(parser)
     add_state(parser)
     add_python(parser)

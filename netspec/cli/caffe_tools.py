@@ -86,7 +86,7 @@ def _device_query(arguments: argparse.Namespace) -> None:
 
 def _add_files(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", metavar="IN", help="the file to read")
-    parser.add_argument("output", type=Path, metavar="OUT", help="the file to write")
+    parser.add_output("output", type=Path, metavar="OUT", help="the file to write")
 
 
 def _add_upgrade_net_proto_text(commands: Commands) -> None:

@@ -25,7 +25,7 @@ def _add_show(commands: Commands) -> None:
     parser = commands.add_parser("show", help="draw records with their labels, and statistics of all of them")
     parser.set_defaults(function=_show, **QUIET)
     parser.add_argument("source", metavar="DB", help="an LMDB, a LevelDB, an HDF5 file, or a list of HDF5 files")
-    parser.add_argument("--out", required=True, metavar="F.png|svg", help="the image to write")
+    parser.add_output("--out", required=True, metavar="F.png|svg", help="the image to write")
     parser.add_argument("--records", type=positive, metavar="N", help="read N evenly spaced records (default: all)")
     parser.add_argument(
         "--count", type=positive, default=40, metavar="N", help="number of records to draw (default: %(default)s)"
@@ -66,7 +66,7 @@ def _add_plot(commands: Commands) -> None:
     parser = commands.add_parser("plot", help="draw the curves of trainings from their logs, netspec's or Caffe's")
     parser.set_defaults(function=_plot, **QUIET)
     parser.add_argument("logs", nargs="+", metavar="LOG", help="log of a training (its stderr)")
-    parser.add_argument("--out", required=True, metavar="F.png|svg", help="the image to write")
+    parser.add_output("--out", required=True, metavar="F.png|svg", help="the image to write")
     parser.add_argument(
         "--names",
         metavar="NAMES,...",

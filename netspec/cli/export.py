@@ -38,7 +38,7 @@ from netspec.cli.arguments import (
 )
 from netspec.errors import SpecError
 from netspec.files.limits import amount
-from netspec.files.whole_file import whole_file, why_unwritable
+from netspec.files.whole_file import whole_file
 from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
 from netspec.terminal.commands import WrongUsage, refuse
@@ -82,7 +82,7 @@ def _add_extract(commands: Commands) -> None:
     parser.add_argument(
         "--blob", action="extend", nargs="+", required=True, default=[], metavar="BLOB", help="the blobs to write"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="the .npz to write")
+    parser.add_output("--out", type=Path, required=True, metavar="OUT", help="the .npz to write")
     parser.add_argument(
         "--source",
         action="append",
@@ -121,8 +121,6 @@ def _extract(arguments: argparse.Namespace) -> None:
 
     model(arguments)
     out = arguments.out
-    if reason := why_unwritable(out):
-        raise SpecError(f"--out {out}: cannot be written: {reason}")
     if not arguments.weights:
         log.logger.warning("no --weights given: the weights are random")
     arrays = _over_images(arguments) if arguments.images else _over_records(arguments)
@@ -240,7 +238,7 @@ def _add_export(commands: Commands) -> None:
     parser.add_argument("file", metavar="FILE", help="the net's prototxt")
     parser.add_argument("--to", required=True, choices=list(WRITTEN), help="the format")
     parser.add_argument("--weights", metavar="WEIGHTS", help="the trained weights (default: random weights)")
-    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="the file to write")
+    parser.add_output("--out", type=Path, required=True, metavar="OUT", help="the file to write")
     add_part(parser)
     parser.add_argument(
         "--no-labels", action="store_true", help="leave out labels, and the losses and accuracies that need them"

@@ -162,7 +162,7 @@ def _add_draw(commands: Commands) -> None:
     parser.set_defaults(function=_draw, **QUIET)
     add_plugin(parser)
     parser.add_argument("file", metavar="FILE", help="a net, or a solver (its training net is drawn)")
-    parser.add_argument("--out", type=Path, required=True, metavar="F.svg|F.png|F.html", help="the file to write")
+    parser.add_output("--out", type=Path, required=True, metavar="F.svg|F.png|F.html", help="the file to write")
     parser.add_argument(
         "--phase", type=str.upper, choices=["TEST", "TRAIN"], help="only this phase (default: both in one)"
     )

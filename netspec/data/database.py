@@ -264,7 +264,7 @@ def _message(fault: Exception) -> str:
 
 
 def _ends_within_a_record(log: Path) -> bool:
-    """Return whether a log of LevelDB is truncated, which the library takes for the work of an interrupted writer.
+    """Return whether a log of LevelDB is cut or ends in zeros, which the library takes for an interrupted writer's.
 
     LevelDB: doc/log_format.md
     """
@@ -279,8 +279,8 @@ def _ends_within_a_record(log: Path) -> bool:
                 continue
             file.seek(position)
             _, length, kind = struct.unpack("<IHB", file.read(header).ljust(header, b"\0"))
-            if kind == 0:  # unused reserved space
-                return False
+            if kind == 0:  # space that a writer reserved, or the zeros of an interrupted copy
+                return True
             position += header + length
     return position > size or kind not in (full, last)
 
@@ -419,7 +419,8 @@ class _LmdbStore:
 
 class _LevelDbStore:
     def __init__(self, folder: str) -> None:
-        self._db = leveldb().DB(folder, create_if_missing=True, error_if_exists=True)
+        self._library = leveldb()
+        self._db = self._library.DB(folder, create_if_missing=True, error_if_exists=True)
         self._batch = self._db.write_batch()
         self._bytes = self._records = 0
 
@@ -431,7 +432,10 @@ class _LevelDbStore:
             self.commit()
 
     def commit(self) -> None:
-        self._batch.write()
+        try:
+            self._batch.write()
+        except self._library.Error as fault:
+            raise OSError(_message(fault)) from None
         self._batch = self._db.write_batch()
         self._bytes = self._records = 0
 

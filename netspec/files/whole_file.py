@@ -144,7 +144,25 @@ def why_unwritable(path: str | Path) -> str:
     if stat.S_ISDIR(kind):
         return os.strerror(errno.EISDIR)
     renamed_over = not stat.S_ISREG(kind) or os.access(folder, os.W_OK | os.X_OK)  # a pipe or a device is not
-    return "" if renamed_over and (not path.exists() or os.access(path, os.W_OK)) else os.strerror(errno.EACCES)
+    return "" if renamed_over and (not path.exists() or os.access(path, os.W_OK)) else _denied(folder)
+
+
+def why_no_folder(path: str | Path) -> str:
+    """Return why no files can be written into the folder ``path``, which is made where it is missing, or ""."""
+    path = Path(os.path.abspath(path))
+    try:
+        while not path.exists():
+            path = path.parent
+    except (OSError, ValueError) as fault:
+        return getattr(fault, "strerror", None) or str(fault)
+    if not path.is_dir():
+        return os.strerror(errno.ENOTDIR)
+    return "" if os.access(path, os.W_OK | os.X_OK) else _denied(path)
+
+
+def _denied(folder: Path) -> str:
+    read_only = hasattr(os, "statvfs") and os.statvfs(folder).f_flag & os.ST_RDONLY  # Windows has no statvfs
+    return os.strerror(errno.EROFS if read_only else errno.EACCES)
 
 
 @contextmanager

@@ -126,6 +126,7 @@ class _Reader:
 
     def _read(self, name: str, path: str, index: int) -> tuple[NetParameter, SourceMap]:
         if not os.path.isfile(path):
-            message = f'{name} "{path}" is not a file{nearest_existing(path)}'
-            raise SpecError(message, self._node.find(name, index))
+            is_folder = os.path.isdir(path)
+            found = "is a folder, expected a prototxt" if is_folder else f"is not a file{nearest_existing(path)}"
+            raise SpecError(f'{name} "{path}" {found}', self._node.find(name, index))
         return parse_net(path, report=self._report)

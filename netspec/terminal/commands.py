@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 
-from netspec.errors import SpecError, printable
+from netspec.errors import Code, SpecError, Where, printable
 from netspec.files.limits import amount, is_out_of_memory, memory
 from netspec.files.paths import relative
 from netspec.terminal.output import INTERRUPTED, OUT_OF_MEMORY, SEVERITIES, VARIABLE, logging_to
@@ -54,6 +54,7 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
                 _level(arguments), arguments.log_form, arguments.log_dir, lambda fault: _ending(fault, arguments)[0]
             )
         with shown, interruptible():
+            _check_outputs(arguments)
             if arguments.prepare:
                 arguments.prepare(arguments)
             return arguments.function(arguments) or DONE
@@ -64,6 +65,14 @@ def run(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
         if line:
             print(line, file=sys.stderr)
         return status
+
+
+def _check_outputs(arguments: argparse.Namespace) -> None:
+    """Raise SpecError if something that the command will write cannot be written: before its work, not after it."""
+    for name, why in arguments.outputs.items():
+        path = getattr(arguments, name)
+        if path is not None and (reason := why(path)):
+            raise SpecError(f"cannot be written: {reason}", Where(str(path)), Code.UNWRITABLE, (reason,))
 
 
 def _ending(fault: BaseException, arguments: argparse.Namespace) -> tuple[str, int | None]:

@@ -17,6 +17,7 @@ from typing import Any
 
 from netspec.errors import did_you_mean
 from netspec.files.version import version
+from netspec.files.whole_file import why_no_folder, why_unwritable
 from netspec.terminal.commands import FAULT
 from netspec.terminal.output import GlogFormatter
 
@@ -75,6 +76,15 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*arguments, allow_abbrev=False, **options)
         self.register("action", "store_true", _Switch)
         self._has_commands = False
+
+    def add_output(self, *names: str, folder: bool = False, **options: Any) -> None:
+        """Add an argument that names a file to write, or a ``folder`` to write into, which is made where it is missing.
+
+        Whether it can be written is checked before the command begins.
+        """
+        action = self.add_argument(*names, **options)
+        check = why_no_folder if folder else why_unwritable
+        self.set_defaults(outputs={**(self.get_default("outputs") or {}), action.dest: check})
 
     def add_subparsers(self, **options: Any) -> Any:
         """Add subparsers; from then on they, and not this parser, read gflags' spellings."""
@@ -175,7 +185,7 @@ class Commands:
         user's files.
         """
         parser = self._add(name, help=help, **options)
-        parser.set_defaults(prog=parser.prog, prepare=None, fault_status=FAULT, **self._defaults)
+        parser.set_defaults(prog=parser.prog, prepare=None, outputs={}, fault_status=FAULT, **self._defaults)
         parser.add_argument("--minloglevel", type=int, choices=range(4), help=argparse.SUPPRESS)
         parser.add_argument("-q", dest="minloglevel", action="store_const", const=1, help=argparse.SUPPRESS)
         for flag in ("--logtostderr", "--alsologtostderr"):  # it always does

@@ -125,7 +125,7 @@ def test_pictures_are_written_into_a_folder_of_any_name(tmp_path):
     image = np.random.default_rng(0).integers(0, 256, (4, 5, 3), np.uint8)
     write_picture(folder / "a.png", image, cv2.IMWRITE_PNG_COMPRESSION, 1)
     assert np.array_equal(read_bgr(folder / "a.png"), image)
-    with pytest.raises(InputError, match="cannot be written: No such file or directory"):
+    with pytest.raises(SpecError, match="cannot be written: No such file or directory"):
         write_picture(folder / "nowhere" / "a.png", image)
 
 

@@ -158,7 +158,7 @@ def test_extract_from_images_needs_no_database_if_the_shape_is_given(run: Run, i
         ('input blob "sim" has shape (50,), expected N x 1 or 3 x ', "--images walk/rgb --input sim"),
         ('no data layer "pair" in this net; its data layers: pair_data', "--source pair=pairs/train_lmdb"),
         ('database "nowhere" does not exist', "--source pair_data=nowhere"),
-        ("--out nowhere/f.npz: cannot be written: No such file or directory", "--out nowhere/f.npz"),
+        ("nowhere/f.npz: cannot be written: No such file or directory", "--out nowhere/f.npz"),
         ("nowhere.caffemodel: cannot be read: No such file or directory", "--weights nowhere.caffemodel"),
     ],
 )

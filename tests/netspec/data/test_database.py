@@ -312,6 +312,14 @@ def cut(data: bytes) -> bytes:
     return data[: len(data) // 2]
 
 
+def cut_in_header(data: bytes) -> bytes:
+    return data[: 32768 + 3]  # a block begins with a header
+
+
+def end_in_zeros(data: bytes) -> bytes:
+    return data[:32768] + bytes(len(data) - 32768)
+
+
 def flip(data: bytes) -> bytes:
     return data[:-200] + bytes([data[-200] ^ 1]) + data[-199:]
 
@@ -320,6 +328,8 @@ def flip(data: bytes) -> bytes:
     ("kind", "damage", "says"),
     [
         pytest.param("*.log", cut, "000003.log is truncated", id="a log that is cut"),
+        pytest.param("*.log", cut_in_header, "000003.log is truncated", id="a log that is cut in a header"),
+        pytest.param("*.log", end_in_zeros, "000003.log is truncated", id="a log that ends in zeros"),
         pytest.param("*.log", flip, "checksum mismatch", id="a log with another bit"),
         pytest.param("*.ldb", cut, "Corruption|Invalid argument", id="a table that is cut"),
         pytest.param("*.ldb", flip, "checksum mismatch|Corruption", id="a table with another bit"),

@@ -5,6 +5,7 @@ import logging
 import re
 from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 
@@ -125,6 +126,37 @@ def test_commands_in_groups_have_their_own_options(capsys: pytest.CaptureFixture
     assert run(parser, ["look", "maps", "-v", "-out", "a.png", "-vmodule", "x=1"]) == 0
     assert (found[0].v, found[0].out) == (True, "a.png")
     assert capsys.readouterr().err == "program look maps: -vmodule is a flag of Caffe or glog that has no effect here\n"
+
+
+@pytest.mark.parametrize(
+    ("folder", "out", "line"),
+    [
+        (False, "no/x.png", "no/x.png: cannot be written: No such file or directory\n"),
+        (False, "file/x.png", "file/x.png: cannot be written: Not a directory\n"),
+        (True, "file/x", "file/x: cannot be written: Not a directory\n"),
+        (False, "x.png", ""),
+        (True, "new/x", ""),
+    ],
+    ids=["missing_folder", "file_for_folder", "folder_in_file", "file", "new_folders"],
+)
+def test_outputs_are_checked_before_the_command_begins(
+    folder: bool,
+    out: str,
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    parser = Parser("program")
+    command = Commands(parser).add_parser("draw", help="draw")
+    began: list[argparse.Namespace] = []
+    command.set_defaults(function=began.append)
+    command.add_output("--out", folder=folder)
+    assert run(parser, ["draw", "--out", out]) == (1 if line else 0)
+    assert capsys.readouterr().err == line
+    assert len(began) == (not line)
 
 
 def test_a_flag_of_one_letter_has_no_opposite(capsys: pytest.CaptureFixture[str]) -> None:
