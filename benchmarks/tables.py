@@ -49,16 +49,14 @@ METHODS = {
     "gray thumbnails, 32x24": ("thumbnails", ""),
     "bag of SIFT words, tf-idf": ("bow", TOWER),
     "bag of ORB words, tf-idf": ("bow", OF_ORB),
-    "FAB-MAP 2.0": ("fabmap", TOWER),
-    "FAB-MAP 2.0, words of the same kind of place": ("fabmap", SAME_KIND),
+    "FAB-MAP 2.0, 2,000 words of an office tower": ("fabmap", TOWER),
+    "FAB-MAP 2.0, 2,000 words of the same kind of place": ("fabmap", SAME_KIND),
     "the net": ("features", ""),
     "the small net": ("describe:small", ""),
     "verified+net": ("verified+features", ""),
     "SeqSLAM on the net": ("seqslam+features", ""),
     "verified, SeqSLAM on the net": ("verified+seqslam+features", ""),
     "auto, on the net": ("auto+features", ""),
-    "verified+FAB-MAP": ("verified+fabmap", TOWER),
-    "verified+bag of ORB words": ("verified+bow", OF_ORB),
 }
 TABLES = {
     "accuracy": [name for name in METHODS if not name.startswith(("verified", "auto"))],

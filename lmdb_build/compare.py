@@ -7,7 +7,7 @@ Files in the output folder, for each net:
     NAME.train.npz, NAME.validation.npz   the descriptors of both databases' pairs (netspec extract)
     NAME.test.npz                         those of the test pairs, if a database of them is given
 
-The tables and the pictures are made from runs.json.
+Each file has a log of the command that made it beside it. The tables and the pictures are made from runs.json.
 """
 
 from __future__ import annotations
@@ -81,19 +81,19 @@ def read_entry(path: str) -> Entry:
             f'its ContrastiveLoss "{losses[0].name}" has no top; name one, so that tests show the loss',
             Where(solver.net),
         )
-    sources: dict[str, dict[str, str]] = {}
-    for kind, phase in PHASES.items():
-        with log.silent():  # about the layers that belong to the other phase
-            filtered, places = filter_net(with_state(net, phase), source)
-        readers = [i for i, layer in enumerate(filtered.layer) if layer.HasField("data_param")]
-        sources[kind] = {filtered.layer[i].name: filtered.layer[i].data_param.source for i in readers}
+    with log.silent():  # about the layers that belong to the other phase
+        of = {kind: filter_net(with_state(net, phase), source) for kind, phase in PHASES.items()}
+    sources = {
+        kind: {layer.name: layer.data_param.source for layer in filtered.layer if layer.HasField("data_param")}
+        for kind, (filtered, _) in of.items()
+    }
     if len(sources["train"]) != len(sources["validation"]):
         found = " and ".join(f"{len(layers)} in {kind}" for kind, layers in sources.items())
         raise SpecError(f"found data layers: {found}; expected the same number in both phases", Where(solver.net))
     trained = {os.path.realpath(database) for database in sources["train"].values()}
-    for i in readers:  # of the last kind, validation
-        layer = filtered.layer[i]
-        if os.path.realpath(layer.data_param.source) in trained:
+    filtered, places = of["validation"]
+    for i, layer in enumerate(filtered.layer):
+        if layer.HasField("data_param") and os.path.realpath(layer.data_param.source) in trained:
             message = (
                 f'phase TEST reads "{layer.data_param.source}", which the net is trained on: its pairs are no '
                 "validation pairs; give phase TEST a data layer with another database"
@@ -174,7 +174,7 @@ def _judged(entry: Entry, out: Path, choices: Choices, say: Say) -> dict[str, An
         if iteration not in losses and choices.snapshot == "best":
             scores = out / f"{entry.stem}.{iteration}.scores.json"
             words = ["test", "--model", entry.net, "--weights", str(path), "--iterations", str(entry.tests)]
-            _netspec([*words, "--scores", str(scores), *_on(gpu)], out / f"{entry.stem}.test.log", say)
+            _netspec([*words, "--scores", str(scores), *_on(gpu)], scores.with_suffix(".log"), say)
             losses[iteration] = _loss(entry, read_scores(scores).tests[0], scores)
     chosen = max(saved) if choices.snapshot == "last" else best_snapshot(list(saved), losses)
     run: dict[str, Any] = {
@@ -194,7 +194,7 @@ def _judged(entry: Entry, out: Path, choices: Choices, say: Say) -> dict[str, An
         words += ["--blob", *entry.bottoms, "--out", str(features)]
         for layer, database in zip(entry.sources["validation"], sources, strict=True):
             words += ["--source", f"{layer}={database}"]
-        _netspec([*words, *_on(gpu)], out / f"{entry.stem}.extract.log", say)
+        _netspec([*words, *_on(gpu)], features.with_suffix(".log"), say)
         run[kind] = str(features)
     return run
 

@@ -282,20 +282,22 @@ def judge_pairs(
     return metrics_at(best_threshold(train_distances, train_labels), distances, labels)
 
 
-def intervals(runs: Sequence[Run], draws: int = 1000, seed: int = 0) -> dict[str, tuple[float, float]]:
-    """Return intervals that contain 95 % of the means of some runs, by bootstrap over the judged pairs.
+def summary(runs: Sequence[Run], draws: int = 1000, seed: int = 0) -> dict[str, str]:
+    """Return the means of precision, recall and ROC AUC over runs of one net with several seeds, as text.
 
-    The runs are of one net with several seeds, judged on the same pairs. The keys are precision, recall and roc_auc.
+    Each has an interval that contains 95 % of the means, by bootstrap over the judged pairs, the same ones in all runs.
     """
     rng = np.random.default_rng(seed)
-    found: dict[str, list[float]] = {"precision": [], "recall": [], "roc_auc": []}
-    for _ in range(draws):
-        drawn = rng.integers(0, len(runs[0].labels), len(runs[0].labels))
-        metrics = [metrics_at(run.metrics.threshold, run.distances[drawn], run.labels[drawn]) for run in runs]
-        for name, values in found.items():
-            values.append(float(np.mean([getattr(metric, name) for metric in metrics])))
-    ends = {name: np.nanquantile(values, [0.025, 0.975]) for name, values in found.items()}
-    return {name: (float(low), float(high)) for name, (low, high) in ends.items()}
+    fields = {"precision": "precision", "recall": "recall", "ROC AUC": "roc_auc"}
+
+    def means(drawn: np.ndarray) -> list[float]:
+        found = [metrics_at(run.metrics.threshold, run.distances[drawn], run.labels[drawn]) for run in runs]
+        return [float(np.mean([getattr(metrics, field) for metrics in found])) for field in fields.values()]
+
+    count = len(runs[0].labels)
+    ends = np.nanquantile([means(rng.integers(0, count, count)) for _ in range(draws)], [0.025, 0.975], axis=0)
+    rows = zip(fields, means(np.arange(count)), *ends, strict=True)
+    return {name: f"{mean:.3f} ({low:.3f} to {high:.3f})" for name, mean, low, high in rows}
 
 
 def _share(part: int, whole: int) -> float:

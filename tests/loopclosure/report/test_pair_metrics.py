@@ -1,5 +1,7 @@
 """The figures of the paper's Table I, against counting by hand and against scikit-learn."""
 
+import re
+
 import numpy as np
 import pytest
 from sklearn.metrics import accuracy_score, f1_score, precision_score, recall_score, roc_auc_score
@@ -8,11 +10,11 @@ from loopclosure.errors import InputError
 from loopclosure.report.table_one import (
     Run,
     best_threshold,
-    intervals,
     judge_pairs,
     metrics_at,
     pair_distances,
     roc_auc,
+    summary,
 )
 
 
@@ -116,10 +118,11 @@ def test_intervals_contain_the_figure_and_shrink_with_the_root_of_the_pairs() ->
     widths = {}
     for count in (200, 3200):
         one = run(count)
-        found = intervals([one], draws=200)
-        for name, (low, high) in found.items():
-            assert low < getattr(one.metrics, name) < high
+        for name, text in summary([one], draws=200).items():
+            middle, low, high = map(float, re.findall(r"[\d.]+", text))
+            assert middle == round(getattr(one.metrics, name.lower().replace(" ", "_")), 3)
+            assert low < middle < high
             widths[name, count] = high - low
-    for name in ("precision", "recall", "roc_auc"):
+    for name in ("precision", "recall", "ROC AUC"):
         assert 2.5 < widths[name, 200] / widths[name, 3200] < 6  # about 4
-    assert intervals([one, one], draws=20) == intervals([one], draws=20)
+    assert summary([one, one], draws=20) == summary([one], draws=20)
