@@ -10,6 +10,23 @@ from netspec.dialects.registry import Dialect, declare
 from netspec.errors import SpecError
 from netspec.proto.forks import Additions
 
+# Layers that people ask for and that no dialect has, with their forks
+ELSEWHERE = {
+    "CReLU": "forks for PVANet and FaceBoxes",
+    "DetectNetTransformation": "NVIDIA's Caffe",
+    "HardSwish": "forks for MobileNetV3",
+    "ImResize": "Convolutional Pose Machines",
+    "ImageSegData": "DeepLab",
+    "Local": "forks for DeepFace",
+    "MatWrite": "DeepLab",
+    "Mish": "forks for YOLOv4",
+    "MultiStageMeanfield": "CRF-RNN",
+    "Nms": "Convolutional Pose Machines",
+    "PredictBox": "forks for MTCNN",
+    "Region": "caffe-yolo",
+    "SpatialTransformer": "forks for spatial transformers",
+    "Yolo": "darknet2caffe",
+}
 _added: dict[str, Dialect] = {}  # for every net of the process
 
 
@@ -58,6 +75,7 @@ def _found() -> dict[str, Dialect]:
 @cache
 def _additions(added: tuple[Dialect, ...]) -> Additions:
     found = Additions()
+    found.elsewhere = ELSEWHERE
     for name, each in sorted({**_found(), **{one.name: one for one in added}}.items()):
         values = [(*key, value) for key, names in each.values().items() for value in names]
         for table, keys in (

@@ -22,7 +22,8 @@ class Additions:
     """What the known dialects add, and which of them have it. Messages have full names: ``caffe.LayerParameter``.
 
     ``fields`` is by message and field, ``values`` by message, field and added value of its enum, ``types`` by layer
-    type, ``messages`` by the name of a message or an enum without its package.
+    type, ``messages`` by the name of a message or an enum without its package. ``elsewhere`` names the forks of types
+    that no dialect has.
     """
 
     def __init__(self) -> None:
@@ -30,15 +31,17 @@ class Additions:
         self.values: dict[tuple[str, str, str], Names] = {}
         self.types: dict[str, Names] = {}
         self.messages: dict[str, Names] = {}
+        self.elsewhere: dict[str, str] = {}
 
     def with_field(self, field: str) -> "Names":
         """Return the dialects that have a field of any message."""
         return tuple(sorted({name for (_, each), names in self.fields.items() if each == field for name in names}))
 
     def advise(self, name: str, dialects: "Names") -> str:
-        """Return advice for using ``name``, which these dialects have; "" if there are none."""
+        """Return advice for using ``name``, which these dialects have; "" if there is none."""
         if not dialects:
-            return ""
+            fork = self.elsewhere.get(name) or self.elsewhere.get(name.title().replace("_", ""))  # MAT_WRITE
+            return f"it is of {fork}, and not here" if fork else ""
         first, *others = (f'"{dialect}"' for dialect in dialects)
         have = f"dialects {' and '.join([first, *others])} have" if others else f"dialect {first} has"
         use = f"add --plugin {dialects[0]}, in Python netspec.use_dialect({first})"

@@ -134,12 +134,13 @@ class _Reader:
 
     def _of_fork(self, message: str, name: str, dialects: Sequence[str]) -> Field | None:
         """Return the field of a message that one of these dialects adds, or None if it is not clear which one."""
-        named = [dialect for dialect in dialects if dialect in self._named]
-        meant = named or [dialect for dialect in dialects if dialect in self._dialects] or dialects
-        found = {dialect: forks().field(dialect, message, name) for dialect in meant}
+        found = {dialect: forks().field(dialect, message, name) for dialect in dialects}
         if len(found) > 1:
             inside, types = self._names_inside(), {d: f.descriptor.message_type for d, f in found.items()}
-            found = {d: found[d] for d, of in types.items() if of is None or inside <= fields_of(of).keys()}
+            found = {d: found[d] for d, of in types.items() if of is None or inside <= fields_of(of).keys()} or found
+        for shown in (self._named, self._dialects):
+            if len(found) > 1:
+                found = {d: field for d, field in found.items() if d in shown} or found
         if len(found) != 1:
             return None
         ((dialect, field),) = found.items()
@@ -298,7 +299,7 @@ class _Reader:
             dialects = additions.values.get((owner.full_name, field.name, word), ())
             names = [*values, *self._added_values(owner.full_name, field.name)]
             known = did_you_mean(word, names) or f"; it is one of {', '.join(names)}"
-            hint = f"; {additions.advise(word, dialects)}" if dialects else known
+            hint = f"; {advice}" if (advice := additions.advise(word, dialects)) else known
             error = self._error(f'"{field.name}" has no value "{word}"{hint}', start)
             raise ForkFault(error.message, error.where, "value", word, dialects, owner.name) if dialects else error
         negative = self._minus()

@@ -80,6 +80,13 @@ extend LayerParameter {
   optional DeephiResizeParameter deephi_resize_param = 1139;
   optional ReLU6Parameter relu6_param = 100000;
 }
+// DeepLab's files have the format before "layer"
+enum OldTypes { INTERP = 1; SEG_ACCURACY = 2; }
+extend V1LayerParameter {
+  optional OldTypes type = 2000;
+  optional InterpParameter interp_param = 2001;
+  optional SegAccuracyParameter seg_accuracy_param = 2002;
+}
 """
 
 

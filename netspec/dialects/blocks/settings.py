@@ -113,6 +113,10 @@ extend ConvolutionParameter {
   optional AlgorithmSeekers.Seeker cudnn_convolution_algo_seeker = 10301 [default = FINDEX];
   optional string conv_algos_override = 10302;
 }
+// MTCNN's: the C++ layer transposes cv::Mat; arrays are read as they are
+extend MemoryDataParameter { optional bool transpose = 10300 [default = false]; }
+// DeepLab's: weights of another shape and the same number are read
+extend V1LayerParameter { optional bool strict_dim = 10300 [default = true]; }
 extend DropoutParameter {
   optional AllEngines.Engine engine = 10300;
   optional int64 random_seed = 10301 [default = -1];

@@ -35,6 +35,18 @@ class PriorBox(Layer):
 
     def setup(self) -> None:
         param = value(self.param, "prior_box_param")
+        self.sizes = self.sizes_of(param)
+        if len(param.variance) not in (0, 1, 4) or any(v <= 0 for v in param.variance):
+            raise self.error("variance must be one number or four, each above 0", "prior_box_param", "variance")
+        self.variances = np.array(list(param.variance) or [0.1], np.float32) * np.ones(4, np.float32)
+        self.image = self._pair(param, "img_size", "img_h", "img_w")
+        self.step = self._pair(param, "step", "step_h", "step_w")
+        if self.image is None and len(self.bottom_shapes) < 2:
+            message = "the image is missing: give it as a second bottom, or img_size, or img_h and img_w"
+            raise self.error(message, "bottom")
+
+    def sizes_of(self, param: Any) -> Array:
+        """Return the widths and heights of the boxes of one pixel (K, 2). Raises SpecError for wrong ones."""
         if not param.min_size or min(param.min_size) < 1:
             raise self.error("min_size must be given and be at least 1", "prior_box_param", "min_size")
         if param.max_size and len(param.max_size) != len(param.min_size):
@@ -44,32 +56,24 @@ class PriorBox(Layer):
             if large <= small:
                 message = f"max_size {large:g} must be greater than its min_size {small:g}"
                 raise self.error(message, "prior_box_param", "max_size", i)
-        if len(param.variance) not in (0, 1, 4) or any(v <= 0 for v in param.variance):
-            raise self.error("variance must be one number or four, each above 0", "prior_box_param", "variance")
-        self.variances = np.array(list(param.variance) or [0.1], np.float32) * np.ones(4, np.float32)
-        self.sizes = self._sizes(param)
         self._warn_of_cut_sizes(param)
-        self.image = self._pair(param, "img_size", "img_h", "img_w")
-        self.step = self._pair(param, "step", "step_h", "step_w")
-        if self.image is None and len(self.bottom_shapes) < 2:
-            message = "the image is missing: give it as a second bottom, or img_size, or img_h and img_w"
-            raise self.error(message, "bottom")
-
-    def _sizes(self, param: Any) -> Array:
-        """Return the widths and heights of the boxes of one pixel (K, 2)."""
-        ratios = [1.0]
-        for ratio in param.aspect_ratio:
-            if ratio <= 0:
-                raise self.error(f"aspect_ratio must be above 0, found {ratio:g}", "prior_box_param", "aspect_ratio")
-            if all(abs(ratio - known) >= 1e-6 for known in ratios):
-                ratios += [ratio, 1 / ratio] if param.flip else [ratio]
-        sizes = []
+        sizes, ratios = [], self.ratios_of(param)
         for i, small in enumerate(map(self.pixels, param.min_size)):
             sizes.append((small, small))
             if param.max_size:
                 sizes.append((math.sqrt(small * self.pixels(param.max_size[i])),) * 2)
             sizes += [(small * math.sqrt(ratio), small / math.sqrt(ratio)) for ratio in ratios[1:]]
         return np.array(sizes, np.float32)
+
+    def ratios_of(self, param: Any) -> list[float]:
+        """Return 1 and the other aspect ratios."""
+        ratios = [1.0]
+        for ratio in param.aspect_ratio:
+            if ratio <= 0:
+                raise self.error(f"aspect_ratio must be above 0, found {ratio:g}", "prior_box_param", "aspect_ratio")
+            if all(abs(ratio - known) >= 1e-6 for known in ratios):
+                ratios += [ratio, 1 / ratio] if param.flip else [ratio]
+        return ratios
 
     def _warn_of_cut_sizes(self, param: Any) -> None:
         """Warn about truncated sizes, since other forks and OpenCV do not truncate them."""
@@ -107,16 +111,20 @@ class PriorBox(Layer):
         y = (np.arange(height, dtype=np.float32) + offset) * np.float32(step[0])
         x = (np.arange(width, dtype=np.float32) + offset) * np.float32(step[1])
         center = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)[:, :, None].astype(float)
-        half = self.sizes / 2.0
-        if param.denser_prior_boxes:
-            lower = center + np.array([0, (1 - float(offset)) * step[0]])
-            center = np.concatenate([center, lower] * len(half), axis=2)
-            half = half.repeat(2, axis=0)
+        center, half = self.placed(center, self.sizes / 2.0, step[0])
         extent = np.array(image[::-1], float)
         boxes = np.concatenate([(center - half) / extent, (center + half) / extent], axis=-1).astype(np.float32)
         boxes = boxes.clip(0, 1) if param.clip else boxes
         self.boxes = np.stack([boxes.reshape(-1), np.tile(self.variances, boxes.size // 4)])[None]
         return [self.boxes.shape]
+
+    def placed(self, center: Array, half: Array, step: float) -> tuple[Array, Array]:
+        """Return the centers and half sizes of all boxes, from (H, W, 1, 2) centers and K half sizes; step of rows."""
+        param = value(self.param, "prior_box_param")
+        if not param.denser_prior_boxes:
+            return center, half
+        lower = center + np.array([0, (1 - float(np.float32(param.offset))) * step])
+        return np.concatenate([center, lower] * len(half), axis=2), half.repeat(2, axis=0)
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:
         return torch.from_numpy(self.boxes).to(bottoms[0])

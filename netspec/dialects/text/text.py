@@ -6,6 +6,7 @@ Connectionist Temporal Classification, ICML 2006.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -154,9 +155,9 @@ class Lstm(Layer):
 
     With bottom[1], a sequence can continue from the previous pass; a new one begins where bottom[1] is 0.
 
-    bottom[0]  (T, N, C)
-    bottom[1]  optional: 0 where a sequence begins, else 1 (T, N); gets no gradient
-    top[0]     (T, N, num_output)
+    bottom[0]  (T, N, C); in junhyukoh's fork (T N, C), with N in batch_size
+    bottom[1]  optional: 0 where a sequence begins, else 1 (T, N), or (T N, 1); gets no gradient
+    top[0]     (T, N, num_output), or (T N, num_output)
     blobs[0]   weights of the input (4 num_output, C)
     blobs[1]   weights of the state (4 num_output, num_output)
     blobs[2]   biases (4 num_output,)
@@ -177,23 +178,29 @@ class Lstm(Layer):
         param, shape = value(self.param, "lstm_param"), self.bottom_shapes[0]
         if param.num_output < 1:
             raise self.error("num_output must be given and be at least 1", "lstm_param", "num_output")
-        if len(shape) != 3:
-            raise self.error(f"found a bottom of shape {shape}, expected (T, N, C)", "bottom", 0)
-        self.size, self.clip = param.num_output, param.clipping_threshold
-        for sizes, name in (((shape[2],), "weight_filler"), ((self.size,), "weight_filler"), ((), "bias_filler")):
+        if len(shape) not in (2, 3):
+            raise self.error(f"found a bottom of shape {shape}, expected (T, N, C) or (T N, C)", "bottom", 0)
+        self.size, self.clip, self.items = param.num_output, param.clipping_threshold, param.batch_size
+        for sizes, name in (((shape[-1],), "weight_filler"), ((self.size,), "weight_filler"), ((), "bias_filler")):
             self.add_blob((4 * self.size, *sizes), getattr(param, name) if has(param, name) else None)
         self.state: tuple[torch.Tensor, ...] = ()
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         data, *begins = bottom_shapes
-        if len(data) != 3 or data[2] != self.blob_shapes[0][1]:
-            raise self.error(f"found a bottom of shape {data}, expected (T, N, {self.blob_shapes[0][1]})", "bottom", 0)
-        if begins and begins[0][:2] != data[:2]:
-            raise self.error(f"found a bottom of shape {begins[0]}, expected {data[:2]}", "bottom", 1)
-        return [(*data[:2], self.size)]
+        columns = self.blob_shapes[0][1]
+        if data[-1] != columns or len(data) != len(self.bottom_shapes[0]):
+            raise self.error(f"found a bottom of shape {data}, expected {columns} columns", "bottom", 0)
+        if len(data) == 2 and (self.items < 1 or data[0] % self.items):
+            message = f"found {data[0]} rows, expected a multiple of batch_size {self.items}"
+            raise self.error(message, "bottom", 0)
+        if begins and (math.prod(begins[0]) != math.prod(data[:-1]) or begins[0][0] != data[0]):
+            raise self.error(f"found a bottom of shape {begins[0]}, expected {data[:-1]}", "bottom", 1)
+        return [(*data[:-1], self.size)]
 
     def forward(self, data: torch.Tensor, *begins: torch.Tensor) -> torch.Tensor:
         of_input, of_state, bias = (self.blob(i) for i in range(3))
+        shape = (*data.shape[:-1], self.size)
+        data = data if data.dim() == 3 else data.reshape(-1, self.items, data.shape[1])
         gates = data @ of_input.T + bias
         zeros = data.new_zeros(2, data.shape[1], self.size)
         h, c = self.state if begins and self.state and self.state[0].shape == zeros[0].shape else zeros.unbind()
@@ -214,13 +221,14 @@ class Lstm(Layer):
             tops.append(h)
         if begins:
             self.state = (h.detach(), c.detach())
-        return torch.stack(tops)
+        return torch.stack(tops).reshape(shape)
 
     def running_state(self) -> State:
         return {"state": self.state} if self.changes_itself else {}
 
     def resume(self, state: Mapping[str, Any]) -> None:
-        found, shape = state["state"], (self.bottom_shapes[0][1], self.size)
+        items = self.bottom_shapes[0][1] if len(self.bottom_shapes[0]) == 3 else self.items
+        found, shape = state["state"], (items, self.size)
         if found and [s.shape for s in found] != [shape] * 2:
             raise self.error(f"found states of shapes {[tuple(s.shape) for s in found]}, expected 2 of {shape}")
         self.state = tuple(s.to(self.context.device) for s in found)

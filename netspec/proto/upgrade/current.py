@@ -26,6 +26,7 @@ from netspec.proto.schema import (
     V1LayerParameter,
     copy_without,
     fields_of,
+    given,
 )
 from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.upgrade.rewrite import Draft
@@ -139,9 +140,11 @@ def upgrade_v1(net: NetParameter, source: SourceMap) -> Upgraded:
     for layer, position in zip(net.layers, source.layers, strict=True):
         draft = Draft(result.layer.add(), position.where)
         draft.copy(layer, position, {"type", *_PARAM_SPEC})
-        if layer.HasField("type"):
-            name = _V1_TYPES[V1LayerParameter.LayerType.Name(layer.type).replace("_", "")]
-            draft.put("type", name, position.fields.get("type", ()))
+        for field in given(layer):
+            if field.name == "type":  # Caffe's, or a fork's own ones
+                old = field.descriptor.enum_type.values_by_number[field.get(layer)].name
+                name = _V1_TYPES.get(old.replace("_", ""), old.title().replace("_", ""))
+                draft.put("type", name, position.fields.get("type", ()))
         _upgrade_param_specs(layer, position, draft)
         positions.append(draft.position())
     return result, source.with_layers(positions)

@@ -11,6 +11,7 @@ from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer, layer_class, layer_types
 from netspec.net.build import build_net
+from netspec.net.net import Net
 from netspec.proto.text import parse_net_text
 
 Build = Callable[..., Layer]
@@ -163,3 +164,23 @@ def test_merge_crop_computes_the_requested_gradients(build: Build, param: str, l
     if learns[1]:
         assert bottoms[1].grad is not None
         assert bottoms[1].grad[0, 0].tolist() == [[0, 0, 0, 0], [0, 1, 1, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
+
+
+def test_old_layers_of_deeplab_are_read(net_of: Callable[..., Net]) -> None:
+    net = net_of("""
+    input: "x" input_dim: [1, 2, 5, 5] input: "l" input_dim: [1, 1, 9, 9]
+    layers { name: "c" type: CONVOLUTION strict_dim: false bottom: "x" top: "c"
+             convolution_param { num_output: 3 kernel_size: 1 } }
+    layers { name: "i" type: INTERP bottom: "c" top: "i" interp_param { zoom_factor: 2 } }
+    layers { name: "a" type: SEG_ACCURACY bottom: "i" bottom: "l" top: "a" seg_accuracy_param { ignore_label: 255 } }
+    """)
+    assert [layer.type for layer in net.layers[1:]] == ["Convolution", "Interp", "SegAccuracy"]
+    assert net.shapes["i"] == (1, 3, 9, 9)
+
+
+@pytest.mark.parametrize(
+    "text", ['layer { type: "MatWrite" name: "m" }', 'layers { type: MAT_WRITE name: "m" }'], ids=["layer", "layers"]
+)
+def test_a_layer_that_no_dialect_has_is_refused_with_its_fork(net_of: Callable[..., Net], text: str) -> None:
+    with pytest.raises(SpecError, match="it is of DeepLab, and not here"):
+        net_of(text)

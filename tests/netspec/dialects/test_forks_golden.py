@@ -138,8 +138,8 @@ TABLE = ROOT / "benchmarks" / "results" / "forks.json"
 COLUMNS = ("layers", "dialect", "compared with", "largest difference")
 
 
-def test_the_table_of_the_page_is_current(monkeypatch: pytest.MonkeyPatch) -> None:
-    """``PYTHONPATH=.:tests python tests/netspec/dialects/test_forks_golden.py`` writes it, into docs/forks.md too."""
+def test_the_table_is_current(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``PYTHONPATH=.:tests python tests/netspec/dialects/test_forks_golden.py`` writes it."""
     stated = [tuple(row.values()) for row in json.loads(TABLE.read_text())["rows"]]
     found = table(monkeypatch)
     assert [row[:3] for row in stated] == [row[:3] for row in found]

@@ -73,9 +73,10 @@ def test_threads_caches_and_packings_of_data_layers_are_accepted() -> None:
           data_param { source: "db" batch_size: 1 cache: true precache: true threads: 2 parser_threads: 2 }
           transform_param { forward_packing: NHWC use_gpu_transform: true random_seed: 3 display: true } }
         layer { name: "i" type: "ImageData" top: "y"
-          image_data_param { source: "list.txt" batch_size: 1 threads: 2 cache: true precache: true } }"""
+          image_data_param { source: "list.txt" batch_size: 1 threads: 2 cache: true precache: true } }
+        layer { name: "m" type: "MemoryData" top: "z" top: "l" memory_data_param { batch_size: 1 transpose: true } }"""
     net, _ = parse_net_text(text, "n.prototxt")
-    assert [layer.name for layer in net.layer] == ["d", "i"]
+    assert [layer.name for layer in net.layer] == ["d", "i", "m"]
     solver, _ = parse_solver_text('engine: "MKLDNN" solver_data_type: FLOAT16 store_blobs_in_old_format: true', "s")
     assert not solver.HasField("type")
 

@@ -1,5 +1,6 @@
 """SSD's layers in special cases, its warnings, and a small detector that is trained."""
 
+import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -10,10 +11,12 @@ import torch
 
 from netspec.dialects import use_dialect
 from netspec.dialects.boxes import CENTER_SIZE, decode, overlaps, suppress
+from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer
 from netspec.load import load_solver
 from netspec.net.build import build_net
+from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
 
@@ -43,6 +46,47 @@ def test_normalize_scale_is_initialized_to_one(build: Build) -> None:
 
 
 # ---- PriorBox ----
+
+
+@pytest.mark.parametrize("ratios", [[], [1.0], [1.0, 4.0]], ids=["none", "1", "1_and_4"])
+def test_boxes_of_faceboxes_are_spread_over_their_size(build: Build, ratios: list[float]) -> None:
+    given = "".join(f"fixed_ratio: {ratio} " for ratio in ratios) or "aspect_ratio: 4 flip: false"
+    settings = f"fixed_size: 32 fixed_size: 65 density: 4 density: 2 step: 32 {given}"
+    bottoms = torch.zeros(1, 1, 2, 3), torch.zeros(1, 3, 64, 96)
+    layer = build("faceboxes", f"type: 'PriorBox' prior_box_param {{ {settings} }}", *(x.shape for x in bottoms))
+    found = layer.run(*bottoms)[0]
+    expected = []
+    for row, column in itertools.product(range(2), range(3)):
+        for size, density in ((32, 4), (65, 2)):
+            apart = size // density
+            for ratio, i, j in itertools.product(ratios or [1.0, 4.0], range(density), range(density)):
+                x, y = (32 * k + 16 - size // 2 + apart / 2 + apart * n for k, n in ((column, j), (row, i)))
+                wide, high = size * ratio**0.5 / 2, size / ratio**0.5 / 2
+                expected += [max(x - wide, 0) / 96, max(y - high, 0) / 64]
+                expected += [min((x + wide) / 96, 1), min((y + high) / 64, 1)]
+    np.testing.assert_allclose(found[0, 0], expected, atol=1e-6)
+
+
+def test_boxes_of_faceboxes_and_of_ssd_may_be_in_one_net(net_of: Callable[..., Net]) -> None:
+    net = net_of("""
+    layer { name: 'x' type: 'Input' top: 'x' input_param { shape { dim: [1, 1, 4, 4] } } }
+    layer { name: 'p' type: 'Permute' bottom: 'x' top: 'p' permute_param { order: 0 order: 2 } }
+    layer { name: 'f' type: 'PriorBox' bottom: 'x' bottom: 'x' top: 'f' prior_box_param { fixed_size: 2 density: 2 } }
+    layer { name: 's' type: 'PriorBox' bottom: 'x' bottom: 'x' top: 's' prior_box_param { min_size: 2 } }
+    """)
+    assert [net.shapes[name] for name in "fs"] == [(1, 2, 4 * 16 * 4), (1, 2, 4 * 16)]
+
+
+@pytest.mark.parametrize(
+    ("settings", "column"),
+    [("fixed_size: 2", 36), ("fixed_size: 2 density: 0", 36), ("fixed_size: 2 density: 1 fixed_ratio: 0", 61)],
+    ids=["no_density", "density_0", "ratio_0"],
+)
+def test_wrong_boxes_of_faceboxes_are_refused(build: Build, settings: str, column: int) -> None:
+    with pytest.raises(SpecError) as caught:
+        build("faceboxes", f"type: 'PriorBox' prior_box_param {{ {settings} }}", (1, 1, 2, 2), (1, 1, 2, 2))
+    assert caught.value.where is not None
+    assert (caught.value.where.type, caught.value.where.column) == ("PriorBox", column)
 
 
 def test_prior_box_warns_of_sizes_cut_to_whole_pixels(build: Build, caplog: pytest.LogCaptureFixture) -> None:

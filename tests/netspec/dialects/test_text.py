@@ -119,3 +119,23 @@ def test_an_invalid_label_is_refused(build: Build) -> None:
     layer = build("text", "type: 'CTCLoss'", (4, 2, 3), (2, 2))
     with pytest.raises(SpecError, match="found label 3, expected 0 to 2"):
         layer.run(torch.zeros(4, 2, 3), torch.tensor([[1.0, 3], [1, 1]]))
+
+
+@pytest.mark.parametrize("items", [1, 2])
+def test_lstm_of_rows_equals_that_of_steps_and_items(build: Build, items: int) -> None:
+    """junhyukoh's own layout: (T N, C), the items of a step behind each other."""
+    data, begins = torch.randn(4, items, 5), torch.ones(4, items).index_fill(0, torch.tensor([0, 2]), 0)
+    plain = build("text", LSTM % "", data.shape, begins.shape)
+    rows = build("text", LSTM % f"batch_size: {items}", (4 * items, 5), (4 * items, 1))
+    for ours, theirs in zip(rows.blobs, plain.blobs, strict=True):
+        ours.data.copy_(theirs.data)
+    for _ in range(2):  # the state continues
+        found = rows.run(data.reshape(-1, 5), begins.reshape(-1, 1))[0]
+        assert torch.equal(found, plain.run(data, begins)[0].reshape(-1, 3))
+
+
+def test_lstm_of_rows_that_are_no_multiple_of_the_items_is_refused(build: Build) -> None:
+    with pytest.raises(SpecError) as caught:
+        build("text", LSTM % "batch_size: 3", (4, 5))
+    assert caught.value.where is not None
+    assert caught.value.where.type == "Lstm"
