@@ -56,7 +56,8 @@ def load_net(
         >>> net(images)["prob"].shape
         torch.Size([2, 4])
     """
-    from netspec.net import build
+    from netspec.net.build import build_file
+    from netspec.net.weights import load_weights
 
     options = BuildOptions(
         str(device),
@@ -78,7 +79,9 @@ def load_net(
         from netspec.export.engines.choice import Choice
 
         choice = Choice.of(engine, precision, cache)
-    net = build.load_net(path, phase_of(phase), options, files)
+    net = build_file(path, phase_of(phase), options)
+    if files:
+        load_weights(net, files, strict)
     if choice is None:
         return net
     from netspec.export.engines.net import with_engine

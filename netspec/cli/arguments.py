@@ -293,7 +293,7 @@ def device(gpu: str) -> Any:
 
 def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str, write_files: bool = True) -> Any:
     """Return the net of ``--model`` on the device of ``--gpu``; the sites are where Caffe logs the device."""
-    from netspec.net.build import load_net
+    from netspec.net.build import build_file
 
     path, chosen = model(arguments), device(arguments.gpu)
     if chosen.type == "cpu":
@@ -301,15 +301,7 @@ def load(arguments: argparse.Namespace, phase: str, gpu_site: str, cpu_site: str
     else:
         log.info(gpu_site, f"Use GPU with device ID {chosen.index}")
     built = options(arguments, device=str(chosen), stages=stages(arguments, as_caffe=True), write_files=write_files)
-    return load_net(path, PHASES[phase], built)
-
-
-def load_weights(net: Any, paths: str | None, strict: bool) -> None:
-    """Load weights from files, whose paths are separated by commas. At least one layer must match."""
-    from netspec.net import weights
-
-    if paths:
-        weights.load_weights(net, split_paths(paths), strict, need_one=True)
+    return build_file(path, PHASES[phase], built)
 
 
 def run_by(net: Any, arguments: argparse.Namespace, weights: str | None) -> Any:

@@ -27,7 +27,6 @@ from netspec.cli.arguments import (
     add_strict,
     devices,
     load,
-    load_weights,
     options,
     positive,
     run_by,
@@ -279,10 +278,11 @@ def _add_test(commands: Commands) -> None:
 
 def _test(arguments: argparse.Namespace) -> None:
     from netspec.inspect.check.measure import test_net
+    from netspec.net.weights import load_weights
 
     check_readable(split_paths(arguments.weights))
     net = load(arguments, "TEST", "caffe.cpp:266", "caffe.cpp:275")
-    load_weights(net, arguments.weights, arguments.strict)
+    load_weights(net, split_paths(arguments.weights), arguments.strict, need_one=True)
     net = run_by(net, arguments, arguments.weights)
     means = test_net(net, arguments.iterations)
     net.close()

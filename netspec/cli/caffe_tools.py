@@ -9,6 +9,7 @@ from pathlib import Path
 from netspec import log
 from netspec.cli.arguments import add_limit, add_plugin, device, options, positive
 from netspec.files.whole_file import write_whole
+from netspec.proto.schema import TEST
 from netspec.terminal.parser import Commands
 
 
@@ -42,12 +43,14 @@ def _add_extract_features(commands: Commands) -> None:
 
 def _extract_features(arguments: argparse.Namespace) -> None:
     from netspec.inspect.features.records import extract_features as write_features
-    from netspec.net.build import load_net
+    from netspec.net.build import build_file
+    from netspec.net.weights import load_weights
 
     number = arguments.device.rpartition("=")[2]
     log.error("extract_features.cpp:62", "Using CPU" if arguments.mode == "CPU" else f"Using GPU {number}")
     chosen = options(arguments, device=str(device(number if arguments.mode == "GPU" else "")))
-    net = load_net(arguments.model, options=chosen, weights=[arguments.weights])
+    net = build_file(arguments.model, TEST, chosen)
+    load_weights(net, arguments.weights, chosen.strict)
     write_features(
         net, arguments.blobs.split(","), arguments.databases.split(","), arguments.batches, arguments.db_type
     )

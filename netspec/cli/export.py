@@ -29,7 +29,6 @@ from netspec.cli.arguments import (
     blob_shape,
     choice,
     device,
-    load_weights,
     model,
     options,
     positive,
@@ -170,6 +169,7 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     from netspec.graph.filter import with_state
     from netspec.inspect.features.records import extract_records, with_sources
     from netspec.net.build import build_net
+    from netspec.net.weights import load_weights
     from netspec.proto.text import parse_net
 
     images = ("input", "shape", "zooms", "swap", "raw_scale", "mean", "scale")
@@ -178,7 +178,8 @@ def _over_records(arguments: argparse.Namespace) -> dict[str, Any]:
     stated = with_state(message, PHASES[arguments.phase], arguments.level, stages(arguments))
     stated = with_sources(stated, source, dict(arguments.source))
     net = build_net(stated, source, options(arguments, device=str(device(arguments.gpu))))
-    load_weights(net, arguments.weights, arguments.strict)
+    if arguments.weights:
+        load_weights(net, split_paths(arguments.weights), arguments.strict, need_one=True)
     net = run_by(net, arguments, arguments.weights)
     arrays = extract_records(net, arguments.blob, arguments.iterations, partial(bar, stage="extract", unit="batch"))
     net.close()

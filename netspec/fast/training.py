@@ -60,7 +60,7 @@ def obstacle(plan: Plan, parts: Sequence[Part]) -> str:
 
 
 @dataclass
-class _Prepared:
+class _TrainingKernels:
     """The kernels of all layers for one set of shapes."""
 
     forward: list[tuple[Kernel, tuple[int, ...], tuple[int, ...], tuple[Loss, ...]]]
@@ -90,7 +90,7 @@ class TrainingStep:
         self._sources = [i for i, node in enumerate(plan.nodes) if not node.bottoms and not len(layers[i].blobs)]
         self._hooks = hooks_of(layers)
         self._blobs = blobs_of(layers)
-        self._made: dict[Any, _Prepared] = {}  # by shapes, and by the blobs that learn
+        self._made: dict[Any, _TrainingKernels] = {}  # by shapes, and by the blobs that learn
         self._values: Values = []
 
     def is_watched(self) -> bool:
@@ -130,7 +130,7 @@ class TrainingStep:
                 raise layer.error("the training needs more memory than available") from None
             raise
 
-    def _run(self, prepared: _Prepared, values: Values) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def _run(self, prepared: _TrainingKernels, values: Values) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         # netspec/run/walk.py would take up to 1.1 times as long: its values are in a dict, and it copies scalar losses.
         self._values = values
         loss: torch.Tensor | None = None
@@ -160,7 +160,7 @@ class TrainingStep:
         outputs = {name: values[v].clone() for name, v in self._plan.outputs.items()}
         return torch.zeros(()) if loss is None else loss, outputs
 
-    def _prepare(self, values: Values) -> _Prepared:
+    def _prepare(self, values: Values) -> _TrainingKernels:
         """Make the kernels for values of these shapes, and allocate the gradient of every learned blob."""
         plan = self._plan
         shapes = {v: tuple(x.shape) for v, x in enumerate(values) if x is not None}
@@ -169,7 +169,7 @@ class TrainingStep:
         for blob in blobs:
             if blob.requires_grad and blob.grad is None:
                 blob.grad = torch.zeros_like(blob, memory_format=torch.contiguous_format)
-        made = _Prepared([], [], [None] * (len(plan.blobs) + len(plan.nodes)), Seen(blobs))
+        made = _TrainingKernels([], [], [None] * (len(plan.blobs) + len(plan.nodes)), Seen(blobs))
         for part in self._parts:
             i, layer, node, tops = part.last, part.layer, plan.nodes[part.first], plan.nodes[part.last].tops
             if i in self._sources:
@@ -188,7 +188,7 @@ class TrainingStep:
         made.backward.reverse()
         return made
 
-    def _losses(self, i: int, layer: Layer, made: _Prepared) -> tuple[Loss, ...]:
+    def _losses(self, i: int, layer: Layer, made: _TrainingKernels) -> tuple[Loss, ...]:
         """Add the gradients of a layer's losses to ``made.start``. Return the losses."""
         for j, weight, learns in self._loss_of[i]:
             if learns:

@@ -1,4 +1,4 @@
-"""Builds a net from a prototxt: reads and filters it, inserts splits, makes a plan and the layers, loads weights.
+"""Builds a net from a prototxt: reads and filters it, inserts splits, makes a plan and the layers.
 
 Caffe: Net::Init (src/caffe/net.cpp)
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable
 from pathlib import Path
 
 from netspec import log
@@ -20,28 +19,17 @@ from netspec.graph.plan import make_plan
 from netspec.graph.splits import insert_splits
 from netspec.layers.contract.registry import source_of
 from netspec.net.net import Net
-from netspec.net.weights import copy_weights, load_weights
+from netspec.net.weights import copy_weights
 from netspec.proto.forks import forks
-from netspec.proto.schema import TEST, NetParameter, PhaseValue
+from netspec.proto.schema import NetParameter, PhaseValue
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net, write_text
 
 
-def load_net(
-    path: str | Path, phase: PhaseValue = TEST, options: BuildOptions | None = None, weights: Iterable[str | Path] = ()
-) -> Net:
-    """Build the net of a prototxt and load weights from files. Raises SpecError for every fault of the files.
-
-    ``netspec.load_net`` (netspec/load.py) has a keyword for each of the options.
-    """
-    options = options or BuildOptions()
+def build_file(path: str | Path, phase: PhaseValue, options: BuildOptions) -> Net:
+    """Build the net of a prototxt for a phase, and for the level and the stages of the options."""
     net, source = parse_net(path)
-    net = with_state(net, phase, options.level, options.stages)
-    net, source = filter_net(net, source)
-    built = build_filtered(net, source, options)
-    if files := list(weights):
-        load_weights(built, files, options.strict)
-    return built
+    return build_net(with_state(net, phase, options.level, options.stages), source, options)
 
 
 def build_net(net: NetParameter, source: SourceMap, options: BuildOptions | None = None) -> Net:
