@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,12 +23,11 @@ RATE, MOMENTUM, DECAY = 1e-4, 0.9, 5e-4  # of trainings; small, so that they do 
 
 @dataclass(frozen=True)
 class Case:
-    """One net at one batch size. ``folder`` has its files; ``twin`` is the name of its PyTorch twin, if it has one."""
+    """One net at one batch size. ``folder`` has its files."""
 
     name: str
     batch: int
     folder: Path
-    twin: str | None
 
     @property
     def prototxt(self) -> Path:
@@ -39,6 +38,11 @@ class Case:
     def caffemodel(self) -> Path:
         """The file of the weights."""
         return self.folder / "net.caffemodel"
+
+    @property
+    def torch(self) -> Path:
+        """The PyTorch module that ``netspec export --to torch`` wrote; missing if the net cannot be exported."""
+        return self.folder / "net.py"
 
     @property
     def onnx(self) -> Path:
@@ -57,9 +61,7 @@ class Case:
 
 
 @contextmanager
-def forward_case(
-    name: str, batch: int, weights: str | None = None, twin: str | None = None, onnx: bool = True
-) -> Iterator[Case]:
+def forward_case(name: str, batch: int, weights: str | None = None, onnx: bool = True) -> Iterator[Case]:
     """Write the files for forward passes of a net; ``name`` is in the catalog, or the path of a prototxt.
 
     Without ``weights``, random weights are written. Raises SpecError for faults in the files.
@@ -69,7 +71,7 @@ def forward_case(
     from netspec.proto.text import write_text
 
     with TemporaryDirectory(prefix="bench-") as folder:
-        case = Case(name, batch, Path(folder), name if name in CATALOG else twin)
+        case = Case(name, batch, Path(folder))
         case.prototxt.write_text(write_text(with_batch(deploy_of(name), batch)))
         net = netspec.load_net(case.prototxt, "TEST", weights, seed=0)
         if weights is None:
@@ -79,6 +81,7 @@ def forward_case(
         if weights is None:
             calm(net, inputs)
         netspec.save_weights(net, case.caffemodel)
+        write_torch(net, case.torch)
         if onnx:
             export_onnx(net, case.onnx)
         np.savez(case.inputs, allow_pickle=False, **inputs)
@@ -97,7 +100,7 @@ def training_case(name: str, batch: int) -> Iterator[Case]:
     if name not in CATALOG:
         raise SpecError(f'no training of "{name}"; there are: {", ".join(CATALOG)}')
     with TemporaryDirectory(prefix="bench-") as folder:
-        case = Case(name, batch, Path(folder), name)
+        case = Case(name, batch, Path(folder))
         source = str(case.folder / "records")
         case.prototxt.write_text(write_text(training_net(name, source, batch)))
         solver = SolverParameter(
@@ -120,8 +123,17 @@ def training_case(name: str, batch: int) -> Iterator[Case]:
         np.savez(case.inputs, allow_pickle=False, data=(records - np.float32(128)) / 128, label=labels)
         net = netspec.load_net(case.prototxt, "TRAIN", seed=0)
         netspec.save_weights(net, case.caffemodel)
+        write_torch(net, case.torch)
         net.close()
         yield case
+
+
+def write_torch(net: Any, path: Path) -> None:
+    """Write a net as a PyTorch module, if it can be exported."""
+    from netspec.export.formats.torch import export_torch
+
+    with suppress(SpecError):
+        export_torch(net, path)
 
 
 def deploy_of(name: str) -> Any:

@@ -165,7 +165,6 @@ def _add_forward(commands: Commands) -> None:
     parser = commands.add_parser("forward", help="compare the time of forward passes with other programs")
     parser.set_defaults(function=_forward)
     _add_nets_or_prototxts(parser)
-    parser.add_argument("--twin", help="net of the catalog whose PyTorch version the prototxt equals")
     _add_common(parser, FORWARD, (*ENGINES, "pytorch", "opencv4"))
 
 
@@ -174,7 +173,7 @@ def _forward(arguments: argparse.Namespace) -> None:
 
     def case(name: str, batch: int) -> Any:
         needs_onnx = any(program.startswith(("onnxruntime", "openvino")) for program in arguments.programs)
-        return forward_case(name, batch, arguments.weights, arguments.twin, needs_onnx)
+        return forward_case(name, batch, arguments.weights, needs_onnx)
 
     _compare(arguments, case, training=False)
 

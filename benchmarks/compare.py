@@ -87,17 +87,20 @@ def task_of(case: Case, threads: int) -> dict[str, Any]:
     read = {blob for layer in message.layer for blob in layer.bottom}
     outputs = sorted({blob for layer in message.layer for blob in layer.top} - read)
     return {
-        **{name: str(getattr(case, name)) for name in ("prototxt", "caffemodel", "onnx", "inputs", "solver", "folder")},
+        **{
+            name: str(getattr(case, name))
+            for name in ("prototxt", "caffemodel", "torch", "onnx", "inputs", "solver", "folder")
+        },
         "cache": str(case.folder / "cache"),
-        **{"twin": case.twin, "outputs": outputs, "threads": threads, "device": "cpu"},
+        **{"outputs": outputs, "threads": threads, "device": "cpu"},
         **{"rate": RATE, "momentum": MOMENTUM, "decay": DECAY},
     }
 
 
 def _worker(case: Case, program: str, task: dict[str, Any], suffix: str, separate_python: str | None) -> Contestant:
     name, options = parts(program)
-    if name == "pytorch" and case.twin is None:
-        return _Absent(program, "there is no twin of this net; --twin names one that fits")
+    if name == "pytorch" and not case.torch.is_file():
+        return _Absent(program, "netspec export --to torch cannot write this net")
     return Worker(program, python_of(program, separate_python), {**task, **options, "program": name + suffix})
 
 

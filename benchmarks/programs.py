@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.worker import Run, Task
+from benchmarks.worker import Run, Task, exported, parameter_groups
 from benchmarks.worker import main as answer
 
 MEAN, SCALE, BATCH = 128.0, 1 / 128, 10  # of pixels; images in a batch of the classifier
@@ -84,18 +84,14 @@ def mtcnn_dnn(dnn: Any, task: Task) -> Run:
 
 
 def mtcnn_pytorch(task: Task) -> Run:
-    """Find faces with PyTorch: the twins, each with its further heads."""
+    """Find faces with PyTorch."""
     torch = _torch(task)
-    from benchmarks import twins
-
-    nets = {name: twins.with_heads(name).eval() for name in task["nets"]}
-    for name, (_, caffemodel) in task["nets"].items():
-        twins.load(nets[name], caffemodel)
+    nets = {name: _exported(task, name) for name in task["nets"]}
 
     def forward(name: str, blob: Array) -> Sequence[Array]:
         with torch.inference_mode():
-            scores, *others = nets[name](torch.from_numpy(blob))
-            return [torch.softmax(scores, 1).numpy(), *(other.numpy() for other in others)]
+            found = nets[name](torch.from_numpy(blob))
+        return [found[each].numpy() for each in ("prob", *task["heads"][name])]
 
     return lambda: {"faces": cascade(_image(task["image"]), forward)}
 
@@ -126,16 +122,16 @@ def files_dnn(dnn: Any, task: Task) -> Run:
 
 
 def files_pytorch(task: Task, batch: int = 1) -> Run:
-    """Classify files in batches with the twin."""
+    """Classify files in batches with PyTorch."""
     torch = _torch(task)
-    net = _twin(task, "squeezenet")
+    net = _exported(task, "squeezenet")
 
     def run() -> dict[str, Any]:
         found = []
         for begin in range(0, len(task["files"]), batch):
             images = [cv2.resize(_image(path), (227, 227)) for path in task["files"][begin : begin + batch]]
             with torch.inference_mode():
-                found.append(torch.softmax(net(torch.from_numpy(_blob(np.stack(images)))), 1).numpy())
+                found.append(net(torch.from_numpy(_blob(np.stack(images)))).numpy())
         return {"prob": np.concatenate(found)}
 
     return run
@@ -173,14 +169,11 @@ def classifier_opencv4(task: Task) -> Run:
 def lenet_pytorch(task: Task) -> Run:
     """Train LeNet from an LMDB with torch's SGD."""
     torch = _torch(task)
-    from benchmarks import twins
     from netspec.data.database import open_reader
     from netspec.data.datum import datum_to_array, parse_datum
 
-    records, net = open_reader(task["source"]), twins.net("lenet").train()
-    twins.load(net, task["caffemodel"])
-    loss_of = twins.Classified(net)
-    groups = twins.parameter_groups(net, task["rate"], task["decay"])
+    records, net = open_reader(task["source"]), exported(task["torch"]).train()
+    groups = parameter_groups(net, task["rate"], task["decay"])
     optimizer = torch.optim.SGD(groups, lr=task["rate"], momentum=task["momentum"])
 
     def run() -> dict[str, Any]:
@@ -190,7 +183,7 @@ def lenet_pytorch(task: Task) -> Run:
             read = [parse_datum(record) for record in records.records(numbers)]
             data = (np.stack([datum_to_array(datum) for datum in read]).astype(np.float32) - MEAN) * SCALE
             optimizer.zero_grad()
-            loss = loss_of(torch.from_numpy(data.astype(np.float32)), torch.tensor([datum.label for datum in read]))
+            loss = net(torch.from_numpy(data.astype(np.float32)), torch.tensor([datum.label for datum in read]))
             loss.backward()
             optimizer.step()
         return {"loss": loss.detach().numpy()}
@@ -211,12 +204,8 @@ def _torch(task: Task) -> Any:
     return torch
 
 
-def _twin(task: Task, name: str) -> Any:
-    from benchmarks import twins
-
-    twin = twins.net(name).eval()
-    twins.load(twin, task["nets"][name][1])
-    return twin
+def _exported(task: Task, name: str) -> Any:
+    return exported(task["nets"][name][0].replace(".prototxt", ".py"))
 
 
 def _with_dnn(program: Callable[[Any, Task], Run], module: str, task: Task) -> Run:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.case import DECAY, MOMENTUM, RATE, Case, calm, randomize, training_case
+from benchmarks.case import DECAY, MOMENTUM, RATE, Case, calm, randomize, training_case, write_torch
 from benchmarks.compare import python_of, rows_of_times
 from benchmarks.detectors import HEADS, SOURCES, mtcnn, ssd300
 from benchmarks.report import Row
@@ -54,7 +54,7 @@ def measure(names: Sequence[str], how: How) -> Iterator[list[Row]]:
 
 
 def _rows(name: str, task: dict[str, Any], how: How) -> list[Row]:
-    case = Case(name, task.get("batch", 1), Path(task["folder"]), None)
+    case = Case(name, task.get("batch", 1), Path(task["folder"]))
     contestants = [_contestant(name, peer, task, how.separate_python) for peer in PEERS[name]]
     able = [one for one in contestants if not one.fault]
     times: dict[str, list[Pass]] = {one.name: [] for one in able}
@@ -107,7 +107,7 @@ def _training(case: Case) -> dict[str, Any]:
     text = case.solver.read_text()
     text = re.sub(r"max_iter: \d+", f"max_iter: {ITERATIONS}\ndisplay: 100\nsnapshot_after_train: false", text)
     case.solver.write_text(text)
-    files = {name: str(getattr(case, name)) for name in ("folder", "solver", "caffemodel")}
+    files = {name: str(getattr(case, name)) for name in ("folder", "solver", "caffemodel", "torch")}
     rates = {"rate": RATE, "momentum": MOMENTUM, "decay": DECAY}
     return {**files, **rates, "source": str(case.folder / "records"), "batch": BATCH, "iterations": ITERATIONS}
 
@@ -136,6 +136,7 @@ def net_files(
     random = np.random.default_rng(0)
     finish(net, {blob: random.standard_normal(net.shapes[blob], np.float32) / 2 for blob in net.inputs})
     netspec.save_weights(net, caffemodel)
+    write_torch(net, prototxt.with_suffix(".py"))
     return str(prototxt), str(caffemodel)
 
 

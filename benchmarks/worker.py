@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
 from typing import Any
 
 import numpy as np
@@ -54,23 +55,43 @@ def pycaffe(task: Task) -> Run:
 
 
 def pytorch(task: Task) -> Run:
-    """Run the hand-written twin in eval mode. netspec, which sets how OpenMP waits, is imported after torch."""
+    """Run the exported module. netspec sets how OpenMP waits, and is not imported here."""
     import torch
 
-    from benchmarks import twins
-
     torch.set_num_threads(task["threads"])
-    twin = twins.net(task["twin"]).eval()
-    twins.load(twin, task["caffemodel"])
-    softmax = task["twin"] in twins.CLASSIFIERS
-    ((_, value),) = _inputs(task).items()
-    data = torch.from_numpy(value)
+    net = exported(task["torch"])
+    inputs = {name: torch.from_numpy(value) for name, value in _inputs(task).items()}
 
     def run() -> dict[str, Any]:
         with torch.inference_mode():
-            return {task["outputs"][0]: torch.softmax(twin(data), 1) if softmax else twin(data)}
+            found = net(**inputs)
+        return found if isinstance(found, dict) else {task["outputs"][0]: found}
 
     return run
+
+
+def exported(path: str) -> Any:
+    """Return the net, with its weights, of a module that ``netspec export --to torch`` wrote."""
+    spec = spec_from_file_location("exported", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.load()
+
+
+def parameter_groups(net: Any, rate: float, decay: float) -> list[dict[str, Any]]:
+    """Return the parameter groups for torch.optim: biases have twice the learning rate and no weight decay."""
+    import torch
+
+    groups = []
+    for module in net.modules():
+        normalizes = isinstance(module, torch.nn.BatchNorm2d)
+        for name, blob in module.named_parameters(recurse=False):
+            fast = name == "bias" and not normalizes
+            weighs = name != "bias" and not normalizes
+            groups.append({"params": [blob], "lr": rate * (1 + fast), "weight_decay": decay if weighs else 0})
+    return groups
 
 
 def opencv4(task: Task) -> Run:
@@ -175,19 +196,15 @@ def pycaffe_training(task: Task) -> Run:
 
 
 def pytorch_training(task: Task) -> Run:
-    """Train the twin with torch's SGD on a batch in memory; in bf16 by autocast, and perhaps in channels_last."""
+    """Train the exported module by SGD on a batch in memory; in bf16 by autocast, and perhaps in channels_last."""
     import torch
-
-    from benchmarks import twins
 
     torch.set_num_threads(task["threads"])
     torch.backends.cudnn.allow_tf32 = False  # as in netspec
-    twin = twins.net(task["twin"]).train()
-    twins.load(twin, task["caffemodel"])
+    net = exported(task["torch"]).train()
     layout = torch.channels_last if task["engine"] == "channels_last" else torch.contiguous_format
-    twin.to(task["device"]).to(memory_format=layout)  # pyright: ignore[reportCallIssue]  not in its overloads
-    loss_of = twins.Classified(twin) if task["twin"] in twins.CLASSIFIERS else twins.Pairs(twin)
-    groups = twins.parameter_groups(twin, task["rate"], task["decay"])
+    net.to(task["device"]).to(memory_format=layout)
+    groups = parameter_groups(net, task["rate"], task["decay"])
     optimizer = torch.optim.SGD(groups, lr=task["rate"], momentum=task["momentum"])
     data, labels = (torch.from_numpy(value).to(task["device"]) for value in _inputs(task).values())
     data = data.contiguous(memory_format=layout)
@@ -196,7 +213,7 @@ def pytorch_training(task: Task) -> Run:
     def run() -> dict[str, Any]:
         optimizer.zero_grad()
         with torch.autocast(kind, torch.bfloat16) if task["precision"] == "bf16" else nullcontext():
-            loss = loss_of(data, labels)
+            loss = net(data, labels)
         loss.backward()
         optimizer.step()
         _finish(task)

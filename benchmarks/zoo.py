@@ -1,7 +1,7 @@
 """Prototxts of well-known architectures, so that benchmarks need no downloaded files.
 
 Each function adds the layers of a net to a NetParameter ``n`` with the blob ``data``, and returns the blob of the
-scores. The layers are in the order of the public files. benchmarks/twins.py has the same nets in PyTorch.
+scores. The layers are in the order of the public files.
 """
 
 from __future__ import annotations

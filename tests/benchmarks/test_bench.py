@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import netspec
-from benchmarks import environment, growth, whole
+from benchmarks import case, environment, growth, whole
 from benchmarks.cli import WHOLE, main
 from benchmarks.detectors import ssd300
 from benchmarks.report import Row, table
@@ -125,12 +125,15 @@ def test_trainings_are_compared_with_the_program_caffe_too(tmp_path: Path, capsy
     assert "/ pytorch | / caffe" in capsys.readouterr().out
 
 
-def test_what_cannot_run_is_reported_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_run_is_reported_in_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(case, "write_torch", lambda net, path: None)
     net = tmp_path / "net.prototxt"
-    net.write_text('layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 2 } } }')
+    net.write_text('layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 } } }')
     assert main(["forward", str(net), "--with", "pytorch", "--rounds", "1"]) == 0
     captured = capsys.readouterr()
-    assert captured.err.splitlines()[-1].startswith("pytorch: there is no twin of this net")
+    assert captured.err.splitlines()[-1].startswith("pytorch: netspec export --to torch cannot write this net")
     assert main(["train", "resnet51"]) == 1
     assert 'no training of "resnet51"' in capsys.readouterr().err
 
