@@ -1,21 +1,54 @@
 """Loop closure: which images show the same place, and how well a method finds them. It uses no networks.
 
-``LoopDetector`` is imported when it is first used, so that importing one module does not import all of them.
+The public names are loaded when they are first used, so that importing one of them does not import all.
 """
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
+    from loopclosure.closing.locate import Locator
+    from loopclosure.closing.online import LoopCloser
+    from loopclosure.descriptors.thumbnails import Thumbnailer
     from loopclosure.detector.decision import LoopResult
     from loopclosure.detector.detector import LoopDetector
+    from loopclosure.detector.map import Map
+    from loopclosure.detector.run import load_describe
+    from loopclosure.detector.visitor import Visitor
+    from loopclosure.places.intrinsics import Intrinsics as Camera
+    from loopclosure.places.sequences import read_sequence
 
-__all__ = ["LoopDetector", "LoopResult"]
+_HOMES = {
+    "Camera": "loopclosure.places.intrinsics:Intrinsics",
+    "Locator": "loopclosure.closing.locate:Locator",
+    "LoopCloser": "loopclosure.closing.online:LoopCloser",
+    "LoopDetector": "loopclosure.detector.detector:LoopDetector",
+    "LoopResult": "loopclosure.detector.decision:LoopResult",
+    "Map": "loopclosure.detector.map:Map",
+    "Thumbnailer": "loopclosure.descriptors.thumbnails:Thumbnailer",
+    "Visitor": "loopclosure.detector.visitor:Visitor",
+    "load_describe": "loopclosure.detector.run:load_describe",
+    "read_sequence": "loopclosure.places.sequences:read_sequence",
+}
+
+__all__ = [
+    "Camera",
+    "Locator",
+    "LoopCloser",
+    "LoopDetector",
+    "LoopResult",
+    "Map",
+    "Thumbnailer",
+    "Visitor",
+    "load_describe",
+    "read_sequence",
+]
 
 
 def __getattr__(name: str) -> "Any":
-    if name in __all__:
-        from loopclosure.detector import detector
+    if name not in _HOMES:
+        raise AttributeError(f"module 'loopclosure' has no attribute {name!r}")
+    from importlib import import_module
 
-        return getattr(detector, name)
-    raise AttributeError(f"module 'loopclosure' has no attribute {name!r}")
+    module, _, attribute = _HOMES[name].partition(":")
+    return getattr(import_module(module), attribute)
