@@ -66,15 +66,14 @@ class Dialects(Forks):
         for i, layer in enumerate(net.layer):
             where = source.at(i, "type", layer=layer.name, type=layer.type)
             try:
-                cls = class_of(layer, shown, options.allow_python)
+                if cls := class_of(layer, shown, options.allow_python):
+                    meaning.classes[i] = cls
                 if cls and layer.type in SIGNATURES and cls.__module__.startswith(__package__):  # no user's layer
                     meaning.forks[i], doubt = fork_of(layer, shown)
                     doubts.setdefault(doubt, where)
             except SpecError as fault:
                 source.report(SpecError(fault.message, fault.where or where))
-                continue
-            if cls:
-                meaning.classes[i] = cls
+                meaning.classes.setdefault(i)
         meaning.warnings = [*warnings, *(f"{where}: {doubt}" for doubt, where in doubts.items() if doubt)]
         return meaning
 

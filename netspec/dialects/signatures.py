@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
-from netspec.dialects.known import known
 from netspec.errors import SpecError
 from netspec.proto.schema import TRAIN, LayerParameter, given_fields, value
 
@@ -152,8 +151,10 @@ def chosen(layer_type: str, candidates: Sequence[Names], shown: Sequence[Collect
 
 
 def _conflict(layer_type: str, candidates: Sequence[Names]) -> SpecError:
-    advice = known().advise(layer_type, tuple(names[0] for names in candidates))
-    return SpecError(f"this net shows several forks that have different layers of this type: {advice}")
+    names = [names[0] for names in candidates]
+    found = " and ".join(f'"{name}"' for name in names)
+    advice = f'name one of them, and only one, by a line "# dialect: {names[0]}" in the prototxt'
+    return SpecError(f'this net shows {found}, which have different layers of type "{layer_type}"; {advice}')
 
 
 def fork_of(layer: LayerParameter, shown: Sequence[Collection[str]]) -> tuple[str, str]:

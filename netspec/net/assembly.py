@@ -96,6 +96,8 @@ class Assembly:
         this = _LayerInNet(self.plan, i)
         log.info("layer_factory.hpp:77", f"Creating layer {node.name}")
         cls = self.plan.meaning.classes.get(i) or registered(node.type)
+        if cls is None and i in self.plan.meaning.classes:
+            return None  # the fault was reported
         if cls is None:
             self._report(SpecError(unknown_type(node.type), this.at("type"), Code.UNKNOWN_TYPE, (node.type,)))
             return None

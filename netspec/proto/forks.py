@@ -69,8 +69,8 @@ class Rates:
 class Meaning:
     """What a net means by the forks that it uses, ``dialects``; here nothing. ``net`` is the net that is built.
 
-    By index of the layer: ``classes`` that Caffe lacks or that replace Caffe's, and ``forks`` of types that several
-    have.
+    By index of the layer: ``classes`` that Caffe lacks or that replace Caffe's, None where two forks were reported,
+    and ``forks`` of types that several have.
     """
 
     def __init__(self, net: "NetParameter", dialects: "Names" = ()) -> None:

@@ -162,9 +162,9 @@ def test_a_layer_of_two_added_dialects_is_that_of_the_one_that_the_file_names(fo
     use_dialect(tmp_path / "tripling.py")
     net = tmp_path / "net.prototxt"
     net.write_text(NET.replace("times_param { factor: 5 }", ""))
-    with pytest.raises(SpecError, match='dialects "doubling" and "tripling" have "Times"') as caught:
+    with pytest.raises(SpecError, match='shows "doubling" and "tripling"') as caught:
         netspec.load_net(net)
-    assert 'write a line "# dialect: doubling"' in caught.value.message
+    assert 'a line "# dialect: doubling"' in caught.value.message
     net.write_text("# dialect: tripling\n" + net.read_text())
     assert netspec.load_net(net)(x=np.ones((2, 3)))["y"].tolist() == [[3] * 3] * 2
 

@@ -8,7 +8,7 @@ import torch
 
 import netspec
 from netspec.dialects import use_dialect
-from netspec.errors import SpecError
+from netspec.errors import Code, SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers.vision.convolution import Convolution
 from netspec.net.net import Net
@@ -52,6 +52,7 @@ NORMALIZE = 'layer { name: "n" type: "Normalize" bottom: "data" top: "n" }'
 INTERP = 'layer { name: "v" type: "Interp" bottom: "n" top: "v" interp_param { zoom_factor: 2 } }'
 BN = 'layer { name: "n" type: "BN" bottom: "data" top: "n" }'
 SIGMOID = 'layer { name: "n" type: "SigmoidCrossEntropyLoss" bottom: "data" bottom: "data" top: "n" }'
+VIDEOS = ("ssd_video", "tsn")
 SMOOTH = 'layer { name: "n" type: "SmoothL1Loss" bottom: "data" bottom: "data" top: "n" %s }'
 FOCAL = """layer { name: "l" type: "DummyData" top: "l" dummy_data_param { shape { dim: [1, 7, 7] } } }
 layer { name: "n" type: "FocalLoss" bottom: "conv" bottom: "l" top: "n" focal_loss_param { %s } }"""
@@ -122,6 +123,18 @@ def test_a_layer_of_two_forks_at_once_is_refused_with_the_line_that_chooses(
     assert f"# dialect: {names[0]}" in caught.value.message
     if "# dialect" not in text:
         net_of(f"# dialect: {names[0]}\n" + PLAIN + text.replace('top: "l"', ""))
+
+
+@pytest.mark.parametrize(
+    ("layer", "named"),
+    [(NORMALIZE, ("ssd", "tsn")), (SIGMOID, ("hed", "rcf")), (NORMALIZE.replace("Normalize", "VideoData"), VIDEOS)],
+    ids=["Normalize", "of_Caffe", "of_two_classes"],
+)
+def test_two_forks_are_reported_once(net_of: Callable[..., Net], layer: str, named: tuple[str, str]) -> None:
+    faults: list[SpecError] = []
+    net_of("".join(f"# dialect: {name}\n" for name in named) + PLAIN + layer, report=faults.append)
+    assert ["# dialect: " in fault.message for fault in faults[:1]] == [True]
+    assert not [fault for fault in faults if fault.code is Code.UNKNOWN_TYPE]
 
 
 def test_dialects_that_solvers_name_are_those_of_the_nets_inside(tmp_path: Path) -> None:
