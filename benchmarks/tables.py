@@ -22,7 +22,7 @@ from loopclosure.evaluate import Outcome, judge
 from loopclosure.methods.base import MethodContext
 from loopclosure.methods.named import make_method
 from loopclosure.places.datasets import DataSet, load_folder, load_place_pairs, load_sequence
-from loopclosure.places.frames import Selection, image_paths
+from loopclosure.places.frames import Selection
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.truth import Exclusion
 
@@ -36,31 +36,19 @@ TITLES = {
     "ESSEX3IN1": "ESSEX3IN1",
     "SPED": "SPED",
 }
-# Visual words depend on the images that they are learned from. Those of the office tower serve every set. These are of
-# the same kind of place as a set, and of no place in it: the kitchen of 7-Scenes, two office corridors, another
-# synthetic house, and streets.
-KINDS = {"fr1_rpy": "kitchen", "corridor_loop": "corridors", "walk": "house", "ESSEX3IN1": "streets", "SPED": "streets"}
-CORRIDORS = ("office_corridor_rc", "rc_office_corridor")
-HOUSE = 900_002
-# By the names in the tables: the method, and what its words are learned from. Words of ORB with a check of the geometry
-# stand for what DBoW2 and DBoW3 do in many SLAM systems; there is no wheel of these.
-TOWER, OF_ORB, SAME_KIND = "words", "orb", "same kind"
+# By the names in the tables. The words are those of images of an office tower, for every set.
 METHODS = {
-    "gray thumbnails, 32x24": ("thumbnails", ""),
-    "bag of SIFT words, tf-idf": ("bow", TOWER),
-    "bag of ORB words, tf-idf": ("bow", OF_ORB),
-    "FAB-MAP 2.0, 2,000 words of an office tower": ("fabmap", TOWER),
-    "FAB-MAP 2.0, 2,000 words of the same kind of place": ("fabmap", SAME_KIND),
-    "the net": ("features", ""),
-    "the small net": ("describe:small", ""),
-    "verified+net": ("verified+features", ""),
-    "SeqSLAM on the net": ("seqslam+features", ""),
-    "verified, SeqSLAM on the net": ("verified+seqslam+features", ""),
-    "auto, on the net": ("auto+features", ""),
+    "gray thumbnails, 32x24": "thumbnails",
+    "bag of SIFT words, tf-idf": "bow",
+    "FAB-MAP 2.0, 2,000 words of an office tower": "fabmap",
+    "the net": "features",
+    "the small net": "describe:small",
+    "SeqSLAM on the net": "seqslam+features",
+    "auto, on the net": "auto+features",
 }
 TABLES = {
-    "accuracy": [name for name in METHODS if not name.startswith(("verified", "auto"))],
-    "recall": [name for name in METHODS if any(word in name for word in ("ORB", "FAB-MAP", "net"))],
+    "accuracy": [name for name in METHODS if not name.startswith("auto")],
+    "recall": [name for name in METHODS if any(word in name for word in ("FAB-MAP", "net"))],
 }
 AUTO = "auto, on the net"
 
@@ -93,19 +81,6 @@ def tower_images(folder: Path) -> list[Path]:
         return [folder / row["image"] for row in csv.DictReader(table)]
 
 
-def same_kind(kind: str, data: Path, work: Path) -> list[Path]:
-    """Return the training images of one of ``KINDS``, some hundreds."""
-    if kind == "house":
-        return list(read_sequence(walked(work, Walk(400, 160, 120, laps=3, seed=HOUSE)), "tum").paths)
-    if kind == "kitchen":
-        return image_paths(data / "seven_scenes" / "redkitchen" / "rgb")[::2]
-    with (data / "sequences" / "index.csv").open(encoding="utf-8") as table:
-        places = {row["name"]: row["environment"] for row in csv.DictReader(table)}
-    roads = [name for name, place in places.items() if place.startswith(("road", "outdoor, street"))]
-    names = CORRIDORS if kind == "corridors" else roads
-    return [path for name in names for path in image_paths(data / "sequences" / name)[::2]]
-
-
 def measure(
     data: Path,
     work: Path,
@@ -118,27 +93,23 @@ def measure(
     work.mkdir(parents=True, exist_ok=True)
     figures = {kind: _stored_rows(kind) for kind in TABLES}
     needed = [METHODS[name] for name in methods or METHODS]
-    tower = tower_images(data / "ie_tower")[::4] if any(words in (TOWER, OF_ORB) for _, words in needed) else []
+    tower = tower_images(data / "ie_tower")[::4] if {"bow", "fabmap"} & set(needed) else []
     for name in sets or SETS:
         held = data_set(name, data, work)
         cache = Cache(work / "kept" / f"{name}.pickle")
         images = [*held.queries.paths, *(() if held.references is None else held.references.paths)]
-        if any("features" in method for method, _ in needed):
+        if any("features" in method for method in needed):
             np.savez(work / f"{name}.npz", features=cache.descriptors(images), names=[str(image) for image in images])
         context = MethodContext(held.exclude_frames, pairs=cache.pairs)
         for label in methods or METHODS:
             if name in PAIRS and (label not in TABLES["accuracy"] or "SeqSLAM" in label):
                 continue
-            method, learned = METHODS[label]
-            inner, settings = method.rpartition("+")[2], {}
-            if inner == "features":
-                settings["features.file"] = str(work / f"{name}.npz")
-            elif learned:
-                stem = f"words_{KINDS[name]}" if learned == SAME_KIND else learned
-                settings[f"{inner}.model"] = str(work / f"{stem}.npz")
-                settings |= {f"{inner}.kind": "orb"} if learned == OF_ORB else {}
-            train = same_kind(KINDS[name], data, work) if learned == SAME_KIND else tower
-            outcome = judge(label, make_method(method, context, settings), held, train)
+            method = METHODS[label]
+            if "features" in method:
+                settings = {"features.file": str(work / f"{name}.npz")}
+            else:
+                settings = {f"{method}.model": str(work / "words.npz")} if method in ("bow", "fabmap") else {}
+            outcome = judge(label, make_method(method, context, settings), held, tower)
             for kind, value in _figures(label, outcome, name):
                 say(f"{name}, {label}, {kind}: {value}")
                 figures[kind][label][TITLES[name]] = value
