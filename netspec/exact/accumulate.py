@@ -15,6 +15,26 @@ from typing import Any
 import torch
 
 
+class _AddedAtOnce(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, parameter: torch.Tensor) -> torch.Tensor:
+        ctx.parameter = parameter
+        return parameter.view_as(parameter)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> None:
+        parameter = ctx.parameter
+        if parameter.grad is None:
+            parameter.grad = torch.zeros_like(parameter)
+        parameter.grad += gradients[0]
+
+
+def added_at_once(parameter: torch.Tensor | None) -> torch.Tensor | None:
+    """Return a parameter for one use; the gradient of this use is added to ``grad`` as soon as it is known."""
+    is_learned = isinstance(parameter, torch.nn.Parameter) and parameter.requires_grad
+    return _AddedAtOnce.apply(parameter) if is_learned and parameter.is_contiguous() else parameter
+
+
 class ParameterSums(torch.autograd.Function):
     """Base of functions that add up the gradients of their parameters themselves.
 

@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import libm, losses, lrn, sums
+from netspec.exact.accumulate import added_at_once
 from netspec.exact.blas import applies, is_recorded
 from netspec.exact.by_torch import (
     Floor,
@@ -42,7 +43,6 @@ from netspec.exact.products import (
     Columns,
     Filter,
     SpreadProducts,
-    SummedConvolutions,
     convolution,
     is_rounded,
 )
@@ -114,7 +114,7 @@ class AsTorch:
     ) -> torch.Tensor:
         """Return the result of torch's kernel, with gradients, for maps in the layout that ``lay_out`` makes."""
         if self.in_place and not is_recorded():
-            return SummedConvolutions.apply(maps, weight, bias, geometry, lay_out)
+            weight, bias = added_at_once(weight), added_at_once(bias)
         return convolution(lay_out(maps), weight, bias, *geometry)
 
     def columns(self, maps: torch.Tensor, sliding: Filter) -> torch.Tensor:

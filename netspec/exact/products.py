@@ -5,9 +5,6 @@
 from __future__ import annotations
 
 import math
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -18,7 +15,7 @@ from torch.nn import functional as F
 
 from netspec.exact.accumulate import ParameterSums
 from netspec.exact.blas import add_sums, gemm, one_thread
-from netspec.exact.layout import by_channel, laid_out_like, layout_of
+from netspec.exact.layout import by_channel
 
 Axes = tuple[int, ...]
 COLUMNS = 2**20  # numbers (4 MB): the columns of several images, which fit into a CPU's cache
@@ -205,127 +202,10 @@ class SpreadProducts(ParameterSums):
         return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None
 
 
-class _Rounded(threading.local):
-    """The copies of one thread, which computes one training at a time: by id, a weight and its rounded copy."""
-
-    weights: dict[int, tuple[torch.Tensor, torch.Tensor]] | None = None
-
-
-_rounded = _Rounded()
-
-
-@contextmanager
-def weights_rounded_once() -> Iterator[None]:
-    """A block in which :func:`rounded_weight` makes one copy of each weight. Weights must not change in it."""
-    before, _rounded.weights = _rounded.weights, {}
-    try:
-        yield
-    finally:
-        _rounded.weights = before
-
-
 def is_rounded(values: torch.Tensor) -> bool:
     """Return whether autocast computes products with these float32 values in another precision."""
     kind = values.device.type
     return kind in ("cpu", "cuda") and torch.is_autocast_enabled(kind) and values.dtype == torch.float32
-
-
-def rounded_weight(weight: torch.Tensor, layout: torch.memory_format = torch.contiguous_format) -> torch.Tensor | None:
-    """Return a weight in the precision of autocast, in a memory layout; None unless autocast rounds it.
-
-    Towers that share the weight, and their backward passes, use the same copy.
-    """
-    if not is_rounded(weight):
-        return None
-    weights = {} if _rounded.weights is None else _rounded.weights
-    if id(weight) not in weights:  # two steps take half the time of one
-        rounded = weight.to(torch.get_autocast_dtype(weight.device.type)).contiguous(memory_format=layout)
-        weights[id(weight)] = weight, rounded
-    return weights[id(weight)][1]
-
-
-class SummedConvolutions(ParameterSums):
-    """Like :class:`ColumnProducts` and :class:`SpreadProducts`, but with torch's kernels, on any device.
-
-    In contrast to torch's own functions, it adds each gradient of the filters to the sum at once. Autograd would hold
-    the gradients of one tower until it has those of all towers that share the filters. Also, it saves the given maps,
-    which others may have saved too, instead of the copy that ``lay_out`` makes for the kernel.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        maps: torch.Tensor,
-        weight: torch.Tensor,
-        bias: torch.Tensor | None,
-        geometry: tuple[Filter, int, bool],
-        lay_out: Callable[[torch.Tensor], torch.Tensor],
-    ) -> torch.Tensor:
-        """Return the responses, in the precision that autocast chooses.
-
-        ``geometry`` is the filter, the number of groups, and whether the convolution is transposed.
-        """
-        ParameterSums.keep(ctx, maps, (weight, bias), True)
-        ctx.geometry, ctx.lay_out = geometry, lay_out
-        maps = lay_out(maps)
-        ctx.rounded = rounded_weight(weight, layout_of(maps))
-        tops = convolution(maps, weight if ctx.rounded is None else ctx.rounded, bias, *geometry)
-        ctx.kind = tops.dtype
-        return tops
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
-        maps, weight, bias = ctx.saved_tensors
-        sums = ParameterSums.sums(ctx)
-        laid = ctx.lay_out(maps).to(ctx.kind)
-        if ctx.rounded is None:
-            maps_diff, *found = _gradients(ctx, tops_diff, laid, weight, bias, ctx.needs_input_grad[:3])
-        else:
-            maps_diff, *found = _rounded_gradients(ctx, tops_diff, laid, bias)
-        for total, gradient in zip(sums, found, strict=True):
-            if total is not None:
-                total += gradient
-        if maps_diff is not None:
-            maps_diff = laid_out_like(maps, maps_diff).to(maps.dtype)
-        return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None
-
-
-def _gradients(
-    ctx: Any,
-    tops_diff: torch.Tensor,
-    maps: torch.Tensor,
-    weight: torch.Tensor,
-    bias: torch.Tensor | None,
-    wanted: Sequence[bool],
-) -> tuple[Any, ...]:
-    """Return the gradients of maps, weight and bias that are ``wanted``, by torch's kernel; None for the others."""
-    sliding, group, transposed = ctx.geometry
-    return torch.ops.aten.convolution_backward(
-        tops_diff,
-        maps,
-        weight,
-        None if bias is None else list(bias.shape),
-        *(sliding.stride, sliding.pad, sliding.dilation, transposed, [0] * len(sliding.kernel), group),
-        wanted,
-    )
-
-
-def _rounded_gradients(
-    ctx: Any, tops_diff: torch.Tensor, maps: torch.Tensor, bias: torch.Tensor | None
-) -> tuple[Any, ...]:
-    """Return the gradients of a convolution with rounded weights.
-
-    If the filters have far more numbers than the maps, their gradient takes less time in Caffe's layout: the sums have
-    it too, and copying the maps costs little.
-    """
-    rounded, (of_maps, *of_others) = ctx.rounded, ctx.needs_input_grad[:3]
-    if layout_of(rounded) == torch.contiguous_format or 4 * maps.numel() > rounded.numel() or not of_others[0]:
-        return _gradients(ctx, tops_diff, maps, rounded, bias, (of_maps, *of_others))
-    maps_diff = _gradients(ctx, tops_diff, maps, rounded, bias, (True, False, False))[0] if of_maps else None
-    shape = torch.empty_like(rounded, memory_format=torch.contiguous_format)  # the kernel reads no values
-    found = _gradients(ctx, tops_diff.contiguous(), maps.contiguous(), shape, bias, (False, *of_others))
-    return maps_diff, *found[1:]
 
 
 def convolution(

@@ -15,8 +15,6 @@ from typing import Any
 
 import torch
 
-from netspec.exact.products import weights_rounded_once
-
 FP32, TF32, BF16, FP16 = PRECISIONS = ("fp32", "tf32", "bf16", "fp16")
 _ROUNDED = {BF16: torch.bfloat16, FP16: torch.float16}
 FIRST_SCALE, LARGEST_SCALE, PATIENCE = 2.0**16, 2.0**24, 2000
@@ -31,7 +29,7 @@ def computing(precision: str, device: torch.device) -> Iterator[None]:
         for library in cuda:
             library.allow_tf32 = precision == TF32
         kind = _ROUNDED.get(precision)
-        with torch.autocast(device.type, kind) if kind else nullcontext(), weights_rounded_once():
+        with torch.autocast(device.type, kind) if kind else nullcontext():
             yield
     finally:
         for library, allowed in zip(cuda, before, strict=True):

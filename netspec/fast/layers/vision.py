@@ -11,8 +11,8 @@ import torch
 import torch.nn.functional as F
 
 from netspec.exact import SMALL_PRODUCT
-from netspec.exact.layout import channels_side_by_side, in_shape, map_by_map, of_one_channel
-from netspec.exact.products import Filter, laid_out_like
+from netspec.exact.layout import channels_side_by_side, in_shape, laid_out_like, map_by_map, of_one_channel
+from netspec.exact.products import Filter
 from netspec.fast import fused
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Absorbed, Folds, blob_like, copy_of
@@ -70,7 +70,7 @@ def _convolutions(
     wanted: bool,
     lay_out: Callable[[torch.Tensor], torch.Tensor],
 ) -> Kernels:
-    """Return kernels with the numbers of SummedConvolutions (exact/products.py).
+    """Return kernels with the numbers of torch's convolution and of its gradients.
 
     ``lay_out`` returns maps in the memory layout that the kernels use.
     """

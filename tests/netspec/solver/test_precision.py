@@ -1,8 +1,6 @@
 """Trainings in other numbers than float32: what stays float32, and how far their losses are from Caffe's."""
 
-import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,6 @@ import torch
 
 from golden_cases import train
 from netspec.errors import SpecError
-from netspec.exact.products import rounded_weight
 from netspec.load import load_solver
 from netspec.solver import training
 from netspec.solver.precision import BF16, FIRST_SCALE, FP16, FP32, PATIENCE, TF32, LossScale, computing
@@ -60,28 +57,6 @@ def test_float32_on_gpus_does_not_use_tf32(precision: str) -> None:
     with computing(precision, torch.device("cpu")):
         assert [library.allow_tf32 for library in libraries] == [precision == TF32] * 2
     assert [library.allow_tf32 for library in libraries] == before
-
-
-def test_threads_have_copies_of_weights_of_their_own() -> None:
-    """Two trainings in bf16 whose passes overlap: no copy outlives the passes of its thread."""
-    inside, left = threading.Barrier(2), threading.Barrier(2)
-    weight = torch.full((3,), 1.001)
-
-    def run(first: bool) -> list[bool]:
-        with computing(BF16, torch.device("cpu")):
-            inside.wait(60)
-            mine = rounded_weight(weight)
-            same = mine is rounded_weight(weight)
-            if not first:
-                left.wait(60)  # the other thread has left its block
-                same = same and mine is rounded_weight(weight)
-        if first:
-            left.wait(60)
-        with torch.autocast("cpu", torch.bfloat16):
-            return [same, rounded_weight(weight) is not rounded_weight(weight)]
-
-    with ThreadPoolExecutor(2) as pool:
-        assert list(pool.map(run, [True, False])) == [[True, True]] * 2
 
 
 FP16_OVERFLOWS = """
