@@ -135,9 +135,9 @@ def _extract(arguments: argparse.Namespace) -> None:
 
 
 def _over_images(arguments: argparse.Namespace) -> dict[str, Any]:
-    from netspec.data.preprocess import Steps
     from netspec.files.image_list import list_images
     from netspec.inspect.features.images import ImageInput, ImageNet, extract_images
+    from netspec.inspect.features.scaling import Steps
 
     records = ("source", "iterations", "phase", "level", "stage", "allow_python_layers")
     refuse(arguments, records, "is for records; --images reads files and uses phase TEST")

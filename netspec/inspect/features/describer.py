@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from netspec.data.preprocess import Steps
 from netspec.export.engines.choice import Choice
 from netspec.graph.options import BuildOptions
 from netspec.graph.speed import speed
 from netspec.inspect.features.images import ImageInput, ImageNet
-from netspec.inspect.features.scaling import read_zooms
+from netspec.inspect.features.scaling import Steps, read_zooms
 from netspec.proto.binary import split_paths
 
 
@@ -22,7 +21,7 @@ class Describer:
     The net is the part of the prototxt ``model`` in phase TEST that computes the blob. ``weights`` are one file, or
     several separated by commas. The pixels are scaled by the data layer's transform_param or, if any of
     these is given, by ``swap``, ``raw_scale``, ``mean`` and ``scale``, in this order
-    (:class:`netspec.data.preprocess.Steps`), which can be texts, as on the command line.
+    (:class:`netspec.inspect.features.scaling.Steps`), which can be texts, as on the command line.
     ``zooms``, such as "1,0.7", describes several views of each image; ``views`` is their number. ``engine`` and
     ``precision`` choose what runs the net (docs/engines.md), and ``cache`` the folder for its model. Raises SpecError
     for errors in the files.

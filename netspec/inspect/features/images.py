@@ -15,7 +15,6 @@ import numpy as np
 from netspec import log
 from netspec.data.blobs import Shape
 from netspec.data.datum import decode_pixels, planar
-from netspec.data.preprocess import Steps
 from netspec.data.resize import resized
 from netspec.errors import SpecError, Where
 from netspec.export.engines.cache import key_of
@@ -28,7 +27,7 @@ from netspec.files.opencv import cv2
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import TORCH, BuildOptions
 from netspec.graph.speed import speed
-from netspec.inspect.features.scaling import middle, scaling_of
+from netspec.inspect.features.scaling import Steps, middle, scaling_of
 from netspec.proto.binary import read_net_binary
 from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap

@@ -1,17 +1,86 @@
-"""Scales the pixels of an image for a net, and cuts the views of an image."""
+"""What is done to the pixels of an image before a net, as a value; and the views of an image."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from netspec.data.blobs import Shape
-from netspec.data.mean import read_mean
-from netspec.data.preprocess import Steps
+from netspec.data.mean import center, read_mean, read_mean_option
+from netspec.data.preprocess import preprocessed
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import LayerParameter
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The steps, in this order: swap, raw_scale, mean, scale.
+
+    ``swap`` reverses the channels: images are as read by OpenCV, BGR, and a net may have been trained with RGB.
+    ``raw_scale`` multiplies. ``mean`` is subtracted: one number, or one per channel of the net, or a mean image
+    (C, H, W). ``scale`` multiplies. ``source`` describes their origin.
+    """
+
+    mean: np.ndarray | None = None
+    scale: float = 1.0
+    raw_scale: float = 1.0
+    swap: bool = False
+    source: str = ""
+
+    def __bool__(self) -> bool:
+        return self.mean is not None or (self.scale, self.raw_scale) != (1, 1) or self.swap
+
+    @staticmethod
+    def of(
+        mean: str | float | Sequence[float] | np.ndarray | None,
+        scale: str | float,
+        raw_scale: str | float,
+        swap: str | bool,
+    ) -> Steps:
+        """Return the steps, which can be texts as on the command line. Raises SpecError."""
+        values = read_mean_option(mean) if isinstance(mean, str) else mean
+        try:
+            factors = float(scale), float(raw_scale)
+        except ValueError as fault:
+            raise SpecError(f"scale and raw_scale are numbers: {fault}") from None
+        if str(swap).lower() not in ("true", "false", "1", "0"):
+            raise SpecError(f'found swap "{swap}", expected true or false')
+        reverses = str(swap).lower() in ("true", "1")
+        return Steps(None if values is None else np.asarray(values, np.float32), *factors, reverses, "from the options")
+
+    def fitted(self, shape: Shape, name: str, where: Where) -> Steps:
+        """Return the steps with a mean that broadcasts against images of ``shape`` (C, H, W); ``name`` is the mean's.
+
+        A mean image larger than the images is cropped to its center, as in Caffe in phase TEST. Raises SpecError for a
+        mean that does not fit.
+        """
+        if self.mean is None:
+            return self
+        mean, (channels, height, width) = self.mean, shape
+        if mean.ndim < 2:
+            if mean.size not in (1, channels):
+                raise SpecError(f"{name} has {mean.size} values, expected 1 or {channels}, one for each channel", where)
+            return replace(self, mean=mean.reshape(-1, 1, 1))
+        mean = mean[0] if mean.ndim == 4 and len(mean) == 1 else mean
+        if mean.ndim != 3 or mean.shape[0] != channels or mean.shape[1] < height or mean.shape[2] < width:
+            raise SpecError(f"{name} has shape {mean.shape}, expected at least {shape} for these images", where)
+        return replace(self, mean=center(mean, height, width))
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        """Return the input of the net, float32, for images (..., C, H, W); the mean must fit: see :meth:`fitted`."""
+        order = range(images.shape[-3])[::-1] if self.swap else None
+        return preprocessed(images.astype(np.float32), order, self.raw_scale, self.mean, self.scale)
+
+    def __str__(self) -> str:
+        values = np.zeros(1) if self.mean is None else self.mean.reshape(-1)
+        channels = values[:1] if np.all(values == values[0]) else values
+        subtracted = ", ".join(f"{value:g}" for value in channels) if len(channels) <= 3 else "a mean image"
+        mean = f", minus {subtracted}" if np.any(values) else ""
+        raw_scale, scale = (f", times {factor:g}" if factor != 1 else "" for factor in (self.raw_scale, self.scale))
+        return f"0 to 255{raw_scale}{mean}{scale} ({self.source})"
 
 
 def scaling_of(steps: Steps, layer: LayerParameter | None, shape: Shape, file: str) -> Steps:

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from lmdb_build.mean import write_mean
-from netspec.data.preprocess import Steps
 from netspec.errors import SpecError
 from netspec.inspect.features.describer import Describer
-from netspec.inspect.features.scaling import scaling_of
+from netspec.inspect.features.scaling import Steps, scaling_of
 from netspec.proto.schema import LayerParameter, TransformationParameter
 
 PIXEL = np.array([10, 20, 30], np.uint8).reshape(1, 3, 1, 1)  # blue, green, red
