@@ -144,7 +144,7 @@ class _LmdbReader(Reader):
     def records(self, numbers: Sequence[int]) -> list[bytes]:
         with self._reading() as transaction:
             self._list_keys(max(numbers), transaction)
-            return [transaction.get(self._keys[i]) for i in numbers]
+            return [bytes(transaction.get(self._keys[i], b"")) for i in numbers]
 
     @property
     def is_current(self) -> bool:
@@ -169,7 +169,7 @@ class _LmdbReader(Reader):
             if self._keys:
                 cursor.set_key(self._keys[-1])
                 cursor.next()
-            self._keys += islice(cursor.iternext(values=False), last + _SCAN - len(self._keys))
+            self._keys += map(bytes, islice(cursor.iternext(values=False), last + _SCAN - len(self._keys)))
 
 
 # While it is held, the library has a file open. A process is forked only in between.

@@ -29,7 +29,7 @@ class _AddedAtOnce(torch.autograd.Function):
         parameter.grad += gradients[0]
 
 
-def added_at_once(parameter: torch.Tensor | None) -> torch.Tensor | None:
+def added_at_once(parameter: torch.Tensor) -> torch.Tensor:
     """Return a parameter for one use; the gradient of this use is added to ``grad`` as soon as it is known."""
     is_learned = isinstance(parameter, torch.nn.Parameter) and parameter.requires_grad
     return _AddedAtOnce.apply(parameter) if is_learned and parameter.is_contiguous() else parameter

@@ -114,7 +114,7 @@ class AsTorch:
     ) -> torch.Tensor:
         """Return the result of torch's kernel, with gradients, for maps in the layout that ``lay_out`` makes."""
         if self.in_place and not is_recorded():
-            weight, bias = added_at_once(weight), added_at_once(bias)
+            weight, bias = added_at_once(weight), None if bias is None else added_at_once(bias)
         return convolution(lay_out(maps), weight, bias, *geometry)
 
     def columns(self, maps: torch.Tensor, sliding: Filter) -> torch.Tensor:

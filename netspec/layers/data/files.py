@@ -155,7 +155,6 @@ class ReadingLayer(DataLayer):
         return self._feed.waited if self._feed else 0.0
 
     def keys(self, iteration: int) -> list[str]:
-        """Return the keys (or file names) of the records of an iteration, one per row of the tops."""
         return self.source.keys(iteration)
 
     def restart(self, iteration: int = 0) -> None:
