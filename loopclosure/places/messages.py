@@ -34,10 +34,10 @@ def pixels_of(message: Any) -> np.ndarray:
     except ImportError:
         raise InputError(MISSING) from None
     encoding = message.format if hasattr(message, "format") else message.encoding
-    name = _ENCODINGS.get(encoding.strip().lower(), encoding.strip().lower())
+    name: Any = _ENCODINGS.get(encoding.strip().lower(), encoding.strip().lower())
     try:
         if hasattr(message, "format"):
-            if "compresseddepth" in name:
+            if "compresseddepth" in encoding.lower():
                 raise ValueError("depth, not an image")
             found = library.message_to_cvimage(message)
             return found if found.ndim == 3 else cv2.cvtColor(found, cv2.COLOR_GRAY2BGR)
@@ -45,7 +45,7 @@ def pixels_of(message: Any) -> np.ndarray:
         lines, wide = message.height * (3 if name in _HALF else 2) // 2, message.width * channels
         rows = np.frombuffer(message.data, np.uint8)[: lines * message.step].reshape(lines, message.step)
         data = np.ascontiguousarray(rows[:, : wide * np.dtype(kind).itemsize])  # a row may be longer than its pixels
-        tight = SimpleNamespace(encoding=name, height=lines, width=message.width, data=data)
+        tight: Any = SimpleNamespace(encoding=name, height=lines, width=message.width, data=data)
         tight.is_bigendian = bool(message.is_bigendian)
         return library.message_to_cvimage(tight, "bgr16" if bits == 16 else "bgr8")
     except (library.ImageError, AssertionError, TypeError, ValueError, cv2.error) as fault:
@@ -65,9 +65,8 @@ def camera_of(message: Any, rectified: bool = False) -> Intrinsics | None:
     sensor, of which the images may be a part, with pixels that are joined. None if it is not calibrated, or of another
     model than pinhole and fisheye.
     """
-    k, d, p = (getattr(message, name, None) for name in "KDP")  # ROS 1
-    if k is None:
-        k, d, p = message.k, message.d, message.p
+    names = "KDP" if hasattr(message, "K") else "kdp"  # ROS 1, or ROS 2
+    k, d, p = (getattr(message, name) for name in names)
     fisheye = message.distortion_model in (FISHEYE, "fisheye") and len(d) == 4 and not rectified
     pinhole = rectified or (message.distortion_model in PINHOLE and len(d) in COUNTS)
     fx, cx, fy, cy = (float(each) for each in ((p[0], p[2], p[5], p[6]) if rectified else (k[0], k[2], k[4], k[5])))

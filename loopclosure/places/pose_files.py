@@ -15,6 +15,7 @@ import math
 import os
 from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -115,7 +116,7 @@ def read_poses(path: str | os.PathLike[str], form: PoseForm = PoseForm()) -> Pos
 
     Raises InputError (file:line) if no row is usable, or if the columns are not those of poses.
     """
-    table = read_table(path, EXPECTED)
+    table = read_table(Path(path), EXPECTED)
     columns, found = _columns(table, form)
     values, faults = np.full((len(table.rows), len(columns)), np.nan), []
     for row, into in zip(table.rows, values, strict=True):

@@ -10,7 +10,7 @@ from netspec import log
 from netspec.cli.arguments import add_limit, add_plugin, device, options, positive
 from netspec.files.whole_file import write_whole
 from netspec.proto.schema import TEST
-from netspec.terminal.parser import Commands
+from netspec.terminal.parser import Commands, Parser
 
 
 def add_commands(commands: Commands) -> None:
@@ -87,7 +87,7 @@ def _device_query(arguments: argparse.Namespace) -> None:
             log.info("common.cpp:178", f"{title:<31}{value}")
 
 
-def _add_files(parser: argparse.ArgumentParser) -> None:
+def _add_files(parser: Parser) -> None:
     parser.add_argument("input", metavar="IN", help="the file to read")
     parser.add_output("output", type=Path, metavar="OUT", help="the file to write")
 

@@ -68,7 +68,9 @@ class Dialects(Forks):
             try:
                 if cls := class_of(layer, shown, options.allow_python):
                     meaning.classes[i] = cls
-                if cls and layer.type in SIGNATURES and cls.__module__.startswith(__package__):  # no user's layer
+                if (
+                    cls and layer.type in SIGNATURES and cls.__module__.startswith("netspec.dialects.")
+                ):  # no user's layer
                     meaning.forks[i], doubt = fork_of(layer, shown)
                     doubts.setdefault(doubt, where)
             except SpecError as fault:

@@ -89,9 +89,9 @@ def make_layer(text: str, shapes: Sequence[Shape], context: Context, tops: int |
     if cls is None:
         raise SpecError(unknown_type(param.type), at("type"), Code.UNKNOWN_TYPE, (param.type,))
     if tops is None:
-        fewest = len(shapes) if cls.same_tops else cls.tops[0]
-        tops = fewest or int(cls.tops[1] is None)
-        param.top.extend(f"top{i}" for i in range(len(param.top), tops))
+        fewest = len(shapes) if cls.same_tops else cls.tops[0] or 0
+        most = fewest or int(cls.tops[1] is None)
+        param.top.extend(f"top{i}" for i in range(len(param.top), most))
     for warning in meaning.warnings:
         log.logger.warning(warning)
     options = replace(context.options, dialects=meaning.dialects)

@@ -30,7 +30,7 @@ from loopclosure.places.masks import read_coordinates, read_truth_matrix
 from loopclosure.places.pose_files import read_poses
 from loopclosure.words.chow_liu import learn_tree
 from loopclosure.words.vocabulary import Extractor, Vocabulary
-from loopclosure.words.word_model import WordModel
+from loopclosure.words.word_model import Training, WordModel
 from netspec.cli.scores import Score, Scores, Snapshot, read_scores
 from netspec.data.database import open_reader
 from netspec.data.datum import array_to_datum, datum_to_array, parse_datum
@@ -169,7 +169,7 @@ def go_on(path: Path) -> None:
 def word_model(path: Path) -> None:
     words = np.random.default_rng(0).integers(0, 3, (12, 6)).astype(np.int32)
     vocabulary = Vocabulary(numbers(6, 128), Extractor(), "by hand")
-    WordModel(vocabulary, words, [Path(f"{i}.png") for i in range(12)], learn_tree(words)).save(path)
+    WordModel(vocabulary, words, [Path(f"{i}.png") for i in range(12)], learn_tree(words), Training()).save(path)
 
 
 def features(path: Path) -> None:

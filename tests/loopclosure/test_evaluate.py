@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,7 +109,7 @@ def test_methods_can_refine_a_refining_method():
 
 def test_settings_of_a_method_and_of_a_label():
     settings = {"seqslam.length": "6", "long, v1.0.length": "20", "thumbnails.width": "16"}
-    methods = named_methods(["seqslam+thumbnails", "long, v1.0=seqslam+thumbnails"], settings=settings)
+    methods: Any = named_methods(["seqslam+thumbnails", "long, v1.0=seqslam+thumbnails"], settings=settings)
     assert [(name, method.settings.length, method.inner.thumbnailer.width) for name, method in methods] == [
         ("seqslam+thumbnails", 6, 16),
         ("long, v1.0", 20, 16),

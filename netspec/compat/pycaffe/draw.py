@@ -11,7 +11,7 @@ from typing import Any
 from google.protobuf import text_format
 
 from netspec.files.whole_file import write_whole
-from netspec.proto.schema import TEST, TRAIN
+from netspec.proto.schema import TEST, TRAIN, phase_of
 from netspec.proto.text import parse_net_text
 
 
@@ -28,7 +28,7 @@ def draw_net(
     from netspec.inspect.draw.graphviz import render
 
     net, source = parse_net_text(text_format.MessageToString(caffe_net), caffe_net.name or "net")
-    text = dot_of(diagram_of(net, source, [TRAIN, TEST] if phase is None else [phase]))
+    text = dot_of(diagram_of(net, source, [TRAIN, TEST] if phase is None else [phase_of(phase)]))
     return text.encode() if ext in ("dot", "gv", "raw") else render(text, ext)
 
 

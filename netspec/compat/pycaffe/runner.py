@@ -15,7 +15,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -274,7 +274,7 @@ class LayerStep:
         self.reads = self.layer.gradient_reads
         self.reached, self.wanted = net.backward_plan.layers[i], net.backward_plan.written[i]
         self._reader = reader_of_memory(self.layer, self.node, net.plan) if self.reads else None
-        self._speed = net.options.speed
+        self._speed: Any = net.options.speed
         self._device = net.device
         self.records = self._is_asked() and not (self.reads or self.layer.shares)
         self.keeps_bottom = "kept" in self.reads and self._is_asked()

@@ -171,8 +171,10 @@ class Solver:
         An object with the methods ``on_start`` and ``on_gradients_ready`` may replace both.
         """
         if on_gradients_ready is None:
-            on_start, on_gradients_ready = on_start.on_start, on_start.on_gradients_ready
-        self._training.callbacks.append(_Functions(self.net, on_start, on_gradients_ready))
+            functions = _Functions(self.net, on_start.on_start, on_start.on_gradients_ready)
+        else:
+            functions = _Functions(self.net, on_start, on_gradients_ready)
+        self._training.callbacks.append(functions)
 
 
 class SGDSolver(Solver, type_name="SGD"):

@@ -128,7 +128,7 @@ class Engine:
             if self._prototxt is not None and as_loaded:
                 weights = hashlib.sha256()
                 for blob in self._blobs():
-                    weights.update(values_of(blob).contiguous().numpy())
+                    weights.update(values_of(blob).contiguous().numpy().data)
                 state = {"level": net.options.level, "stages": net.options.stages, "shapes": self._built}
                 key = key_of([self._prototxt], {**state, "blobs": blobs, "weights": weights.hexdigest()})
             self._model = Model(self._choice, key, lambda path: write_model(net, path, blobs))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from netspec import log
 from netspec.files.whole_file import write_whole
@@ -43,7 +44,7 @@ def write_picture(
 
 
 def _net_of(path: str | Path) -> tuple[NetParameter, SourceMap]:
-    read = parse_net_or_solver(path)
+    read: Any = parse_net_or_solver(path)
     if isinstance(read[0], NetParameter):
         return read
     described = solver_nets(*read)

@@ -51,7 +51,7 @@ def extract_records(
     if not readers:
         raise SpecError("no layer of this net reads records; use image files instead", Where(net.plan.source.file))
     check_blobs(blobs, net.shapes, net.plan.source.file)
-    reader = readers[0]
+    reader: Any = readers[0]
     batch = reader.top_shapes[0][0]
     records, first = reader.num_records, reader.iteration
     rounds = -(-records // batch) if iterations is None else iterations
