@@ -2,44 +2,56 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from netspec import log
+from netspec.data.blobs import Shape
 from netspec.errors import ForkFault, SpecError, Where
 from netspec.exact import NONE
 from netspec.files.kinds import unreadable
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
 from netspec.graph.speed import speed
-from netspec.layers.contract.base import Shape
-from netspec.net.build import build_filtered
-from netspec.net.net import Net
-from netspec.net.weights import copy_weights, load_weights
 from netspec.proto.binary import parse_binary
 from netspec.proto.schema import TEST, NetParameter
 from netspec.proto.source_map import SourceMap
 from netspec.proto.text import parse_net_text
 from netspec.proto.upgrade.current import upgrade_net
 
+if TYPE_CHECKING:
+    from netspec.net.net import Net
+
 FileOrBytes = str | os.PathLike[str] | bytes | bytearray | memoryview | np.ndarray
 
 _NOT_SKIPPED = ("ConvolutionParameter", "PoolingParameter")  # another field may change their windows
+OPENCV_LAYERS = ("PriorBox", "DetectionOutput")  # netspec/compat/dnn/opencv_layers.py
 PROTOTXT, WEIGHTS = "<prototxt>", "<caffeModel>"  # what errors call files that were given as bytes
 
 
 @dataclass(frozen=True)
 class CaffeFiles:
-    """A net in phase TEST as in its prototxt, and the source of its weights (None: no weights)."""
+    """A net in phase TEST as in its prototxt, and the source of its weights (None: no weights).
+
+    ``digest`` is the SHA-256 of the prototxt.
+    """
 
     net: NetParameter
     source: SourceMap
     weights: FileOrBytes | None = None
+    digest: str = ""
+
+    @property
+    def learns(self) -> bool:
+        """Whether a layer with weights must get them from a file, because the prototxt has none."""
+        learning = ("Convolution", "Deconvolution", "InnerProduct", "ConvolutionDepthwise", "DepthwiseConvolution")
+        return any(layer.type in learning and not layer.blobs for layer in self.net.layer)
 
     @property
     def inputs(self) -> dict[str, Shape | None]:
@@ -57,11 +69,16 @@ class CaffeFiles:
 
         SSD's layers are computed as in OpenCV (netspec/compat/dnn/opencv_layers.py).
         """
-        options = BuildOptions(device, exact=NONE, speed=speed())
-        with log.silent():  # warnings about fields without effect; OpenCV has none
+        import torch
+
+        from netspec.net.build import build_filtered
+
+        options = BuildOptions(device, seed=0, exact=NONE, speed=speed())
+        # A parameter that is made in inference mode can never be written. Warnings are of fields without effect.
+        with torch.inference_mode(False), log.silent():
             net = build_filtered(self._reshaped(shapes), self.source, options)
         for i, layer in enumerate(net.layers):
-            if layer.type in ("PriorBox", "DetectionOutput"):
+            if layer.type in OPENCV_LAYERS:
                 from netspec.compat.dnn.opencv_layers import (
                     LAYERS,  # it registers SSD's layers, for nets that have them
                 )
@@ -84,6 +101,8 @@ class CaffeFiles:
         return net
 
     def _load(self, net: Net, weights: FileOrBytes) -> None:
+        from netspec.net.weights import copy_weights, load_weights
+
         if isinstance(weights, str | os.PathLike):
             load_weights(net, os.fspath(weights))
             return
@@ -109,7 +128,8 @@ def read_files(prototxt: FileOrBytes, weights: FileOrBytes | None) -> CaffeFiles
             net.input_shape.add()
     with log.silent():  # of older formats
         net, source = upgrade_net(net, source)
-    return CaffeFiles(*filter_net(with_state(net, TEST), source), weights=weights)
+    filtered, source = filter_net(with_state(net, TEST), source)
+    return CaffeFiles(filtered, source, weights, hashlib.sha256(data).hexdigest())
 
 
 def _skip(fault: SpecError) -> None:

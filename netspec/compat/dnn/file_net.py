@@ -5,18 +5,24 @@ OpenCV: modules/dnn/src/net_impl.cpp (4.12)
 
 from __future__ import annotations
 
+import logging
 from functools import cached_property
-from typing import Any
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from netspec import log
 from netspec.compat.dnn.caffe_files import CaffeFiles
 from netspec.compat.dnn.errors import BAD_ARGUMENT, NOT_FOUND, DnnError, as_dnn_error
 from netspec.compat.dnn.table import INPUT, Entry, make_table, nodes_of
+from netspec.data.blobs import Shape
 from netspec.errors import Where, did_you_mean
-from netspec.layers.contract.base import Layer as CaffeLayer
-from netspec.layers.contract.base import Shape
-from netspec.net.net import Net as CaffeNet
+
+if TYPE_CHECKING:
+    from netspec.compat.dnn.engine import Engine
+    from netspec.layers.contract.base import Layer as CaffeLayer
+    from netspec.net.net import Net as CaffeNet
 
 Array = np.ndarray
 Shapes = list[Shape]
@@ -26,7 +32,8 @@ class FileNet:
     """A net read from Caffe's files: its layers by OpenCV's names and numbers, and the nets built from it.
 
     Without files it has no layers. ``declared`` has the shapes of its inputs, ``shown`` their names, which
-    setInputsNames may change, and ``values`` the arrays that were set.
+    setInputsNames may change, and ``values`` the arrays that were set. ``runnable`` is false as long as parameters are
+    missing. ``engine`` runs the net instead of PyTorch; it is None if parameters are missing or were changed.
     """
 
     def __init__(self, files: CaffeFiles | None = None) -> None:
@@ -37,9 +44,15 @@ class FileNet:
         self.shown = {blob: blob for blob in self.declared}
         self.values: dict[str, Array] = {}
         self.of_shapes: tuple[dict[str, Shape], CaffeNet] | None = None
-        if files is not None and None not in self.declared.values():
-            with as_dnn_error("readNetFromCaffe"):
-                _ = self.net
+        self.runnable = files is None or files.weights is not None or not files.learns
+        self.engine: Engine | None = None
+        if files is not None and self.runnable and find_spec("netspec.export"):
+            from netspec.compat.dnn.engine import Engine
+
+            self.engine = Engine(files, lambda: (self.net, self.is_silent))
+        stored = self.engine is not None and self.engine.is_stored
+        if files is not None and not stored and None not in self.declared.values():
+            _ = self.net
 
     def shaped(self, given: Any, func: str) -> CaffeNet:
         """Return the net, built without values, for inputs of these shapes: one shape, or one for each input."""
@@ -75,13 +88,35 @@ class FileNet:
         """The net, built when it is first needed: inputs without a shape in the prototxt get one from setInput."""
         assert self.files is not None
         given = {key: value.shape for key, value in self.values.items() if self.declared[key] is None}
-        return self.files.build(given)
+        records: list[logging.LogRecord] = []
+        try:
+            with as_dnn_error("forward" if given else "readNetFromCaffe"), log.held_back() as records:
+                return self.files.build(given)
+        finally:
+            log.write(records)
+            self.is_silent = not records  # a net with warnings is built by each process, which gives them again
+
+    @cached_property
+    def outputs(self) -> dict[tuple[int, int], str]:
+        """The blobs that the net computes and no layer reads, by layer and index of the top."""
+        assert self.files is not None
+        found: dict[str, tuple[int, int]] = {}
+        for i, layer in enumerate(self.files.net.layer):
+            for blob in layer.bottom:
+                found.pop(blob, None)
+            found.update({blob: (i, j) for j, blob in enumerate(layer.top)})
+        return {top: blob for blob, top in found.items()}
 
     @cached_property
     def nodes(self) -> list[int]:
         """The node of each layer in the plan."""
         assert self.files is not None
         return nodes_of(self.net.plan, self.files.net)
+
+    def tops(self, entry: Entry) -> int:
+        """Return the number of tops of a layer."""
+        assert self.files is not None
+        return len(self.declared if entry.name == INPUT else self.files.net.layer[entry.layer].top)
 
     def node(self, net: CaffeNet, entry: Entry) -> Any:
         """Return the node of a layer."""

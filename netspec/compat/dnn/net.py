@@ -8,21 +8,26 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-import torch
 
 from netspec.compat.dnn.caffe_files import CaffeFiles
 from netspec.compat.dnn.errors import BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED, UNSPECIFIED, DnnError, as_dnn_error
 from netspec.compat.dnn.file_net import FileNet
 from netspec.compat.dnn.table import INPUT, Entry, unconnected
+from netspec.data.blobs import Shape
 from netspec.files.opencv import cv2
-from netspec.layers.contract.base import Shape
-from netspec.net.net import Net as CaffeNet
-from netspec.run.walk import Step, walk
+from netspec.graph.options import OPENVINO
+
+if TYPE_CHECKING:
+    import torch
+
+    from netspec.net.net import Net as CaffeNet
+    from netspec.run.walk import Step
 
 Array = np.ndarray
+INFERENCE_ENGINE = 2  # DNN_BACKEND_INFERENCE_ENGINE
 BIASED = ("Convolution", "Deconvolution", "InnerProduct", "Scale")
 AS_WRITTEN = "{} cannot change a net of Caffe's files; write the layer into the prototxt"
 PICTURE = "{} is not supported; netspec draw shows the layers, shapes and connections"
@@ -79,7 +84,6 @@ class Net:
 
     def __init__(self, files: CaffeFiles | None = None) -> None:
         self._caffe = FileNet(files)
-        self._runnable = files is None or files.weights is not None or not any(_learns(files))
 
     # Its layers
 
@@ -162,17 +166,19 @@ class Net:
             if values.size != blobs[j].numel():
                 message = f"found an array of shape {values.shape}, expected {tuple(blobs[j].shape)}"
                 raise DnnError(message, code=BAD_ARGUMENT, func=func)
+        import torch
+
         with torch.no_grad():
             for j, values in made.items():
                 blobs[j].copy_(torch.tensor(values).reshape(blobs[j].shape))
-        self._runnable = True
+        self._caffe.runnable, self._caffe.engine = True, None
 
     def _blobs(self, entry: Entry) -> Sequence[torch.Tensor]:
         return () if entry.name == INPUT else list(self._caffe.layer(self._caffe.net, entry).blobs)
 
     def _parameter(self, entry: Entry, index: int) -> Array:
         """Return a copy of a learnable blob; vectors are columns, but the bias of an InnerProduct is a row."""
-        array = _array(self._caffe.layer(self._caffe.net, entry).blobs[index])
+        array = _array(self._caffe.layer(self._caffe.net, entry).blobs[index].detach().numpy())
         return array.reshape(1, -1) if entry.type == "InnerProduct" and index == 1 else array
 
     def _blob(self, entry: Entry, index: int, func: str) -> torch.Tensor:
@@ -230,8 +236,7 @@ class Net:
     def forwardAndRetrieve(self, outBlobNames: Sequence[str]) -> tuple[tuple[Array, ...], ...]:
         """Run the net; return all tops of each of the layers."""
         entries = [self._caffe.entry(name, "forwardAndRetrieve") for name in outBlobNames]
-        net = self._caffe.net
-        pins = [[(entry, top) for top in range(self._tops(net, entry))] for entry in entries]
+        pins = [[(entry, top) for top in range(self._caffe.tops(entry))] for entry in entries]
         found = iter(self._run([pin for row in pins for pin in row], "forwardAndRetrieve"))
         return tuple(tuple(_array(next(found)) for _ in row) for row in pins)
 
@@ -239,6 +244,8 @@ class Net:
         """Run again on the last inputs; return the ticks (cv2.getTickFrequency) in total and by layer, (n,)."""
         ticks = np.zeros(len(self._caffe.table) - 1)
         self._check_inputs("getPerfProfile")
+        import torch
+
         with as_dnn_error("getPerfProfile"), torch.inference_mode():
             seconds = dict[int, float]()
             self._walk(len(self._caffe.net.plan.nodes) - 1, seconds)
@@ -257,9 +264,6 @@ class Net:
         """The values that no later value of the same name replaces."""
         return frozenset({name: v for v, name in enumerate(self._caffe.net.plan.blobs)}.values())
 
-    def _tops(self, net: CaffeNet, entry: Entry) -> int:
-        return len(self._caffe.declared) if entry.name == INPUT else len(self._caffe.node(net, entry).tops)
-
     def _last(self) -> str:
         self._caffe.check_not_empty("forward")
         return self._caffe.table[-1].name
@@ -269,9 +273,24 @@ class Net:
         entries = [self._caffe.entry(name, "forward") for name in names]
         return tuple(map(_array, self._run([(entry, entry.top) for entry in entries], "forward")))
 
-    def _run(self, pins: Sequence[tuple[Entry, int]], func: str) -> list[torch.Tensor]:
+    def _run(self, pins: Sequence[tuple[Entry, int]], func: str) -> list[Array]:
         """Run the layers that the tops need, and return the tops; each is given as a layer and an index."""
         self._check_inputs(func)
+        found = self._by_engine(pins)
+        return self._by_torch(pins, func) if found is None else found
+
+    def _by_engine(self, pins: Sequence[tuple[Entry, int]]) -> list[Array] | None:
+        """Return the tops, or None if one is not an output of the net, or if PyTorch must run it."""
+        caffe = self._caffe
+        names = [caffe.outputs.get((entry.layer, top), "") for entry, top in pins]
+        if caffe.engine is None or not all(names):
+            return None
+        values = caffe.engine.run(caffe.values)
+        return [values[name] for name in names] if values is not None and values.keys() >= {*names} else None
+
+    def _by_torch(self, pins: Sequence[tuple[Entry, int]], func: str) -> list[Array]:
+        import torch
+
         with as_dnn_error(func), torch.inference_mode():
             net = self._caffe.net
             self._check_weights(func)
@@ -281,8 +300,8 @@ class Net:
             except ValueError as fault:
                 raise self._with_shapes(fault, func) from None
         found = iter(wanted)
-        given = [torch.from_numpy(self._caffe.values[blob]) for blob in self._caffe.declared]
-        return [given[max(top, 0)] if entry.name == INPUT else values[next(found)] for entry, top in pins]
+        given = [self._caffe.values[blob] for blob in self._caffe.declared]
+        return [given[max(top, 0)] if entry.name == INPUT else values[next(found)].numpy() for entry, top in pins]
 
     def _value(self, net: CaffeNet, entry: Entry, top: int, func: str) -> int:
         if top < 0:
@@ -302,6 +321,8 @@ class Net:
 
     def _walk(self, end: int, seconds: dict[int, float] | None = None) -> dict[int, torch.Tensor]:
         """Run the nodes up to ``end`` one by one; return all values, and store the time of each in ``seconds``."""
+        from netspec.run.walk import walk
+
         net = self._caffe.net
         values = net.input_tensors(self._caffe.values)
 
@@ -315,12 +336,21 @@ class Net:
         walk([step for step in net.eager.one_by_one() if step.node <= end], values, net.options.exact, visit)
         return values
 
-    # Settings without effect, and unsupported methods
+    # The engine, settings without effect, and unsupported methods
+
+    def setPreferableBackend(self, backendId: int) -> None:
+        """Run the net with OpenVINO (DNN_BACKEND_INFERENCE_ENGINE), or else with the default engine.
+
+        Raises DnnError if OpenVINO is not installed.
+        """
+        if self._caffe.engine is not None:
+            with as_dnn_error("setPreferableBackend"):
+                self._caffe.engine.choose(OPENVINO if backendId == INFERENCE_ENGINE else "")
 
     def _accept(self, *settings: Any, **named: Any) -> None:
-        """Accept and ignore a setting: the backend is torch, nets run on the CPU, and no switch changes a result."""
+        """Accept and ignore a setting: nets run on the CPU, and no switch changes a result."""
 
-    setPreferableBackend = setPreferableTarget = enableFusion = enableWinograd = setHalideScheduler = _accept
+    setPreferableTarget = enableFusion = enableWinograd = setHalideScheduler = _accept
 
     addLayer = _refused("addLayer", AS_WRITTEN)
     addLayerToPrev = _refused("addLayerToPrev", AS_WRITTEN)
@@ -359,7 +389,7 @@ class Net:
                 )
 
     def _check_weights(self, func: str) -> None:
-        if not self._runnable:
+        if not self._caffe.runnable:
             message = "this net was read without weights; also give the .caffemodel, or call setParam"
             raise DnnError(message, self._caffe.where(), func=func)
 
@@ -375,12 +405,6 @@ class Net:
         return DnnError(message, getattr(fault, "where", None), BAD_ARGUMENT, func)
 
 
-def _learns(files: CaffeFiles) -> Iterable[bool]:
-    """Yield for each layer with weights whether they must come from a file, because the prototxt has none."""
-    learning = ("Convolution", "Deconvolution", "InnerProduct", "ConvolutionDepthwise", "DepthwiseConvolution")
-    return (layer.type in learning and not layer.blobs for layer in files.net.layer)
-
-
 def _normalized(values: Array, scale: float, mean: Array) -> Array:
     """Return (values - mean) * scale; the mean has a number for each channel, or for the first channels."""
     if mean.any():
@@ -393,9 +417,9 @@ def _normalized(values: Array, scale: float, mean: Array) -> Array:
     return values
 
 
-def _array(values: torch.Tensor) -> Array:
+def _array(values: Array) -> Array:
     """Return a copy in OpenCV's form: at least two axes, (n, 1) for a vector."""
-    array = np.array(values.detach().numpy(), np.float32, order="C")
+    array = np.array(values, np.float32, order="C")
     return array if array.ndim > 1 else array.reshape(-1, 1)
 
 
