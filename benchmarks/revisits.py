@@ -18,13 +18,12 @@ import numpy as np
 from benchmarks import results
 from benchmarks.cache import Cache
 from benchmarks.pages import RESULTS
+from loopclosure.decision.constants import PRECISION
 from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.verification import Agreement, Between, GeometricCheck, LocalFeatures, Pairs
-from loopclosure.methods.auto import PRECISION, answer, find_matches
+from loopclosure.detector.verification import Agreement, GeometricCheck, LocalFeatures, Pairs
 from loopclosure.methods.base import earlier
-from loopclosure.methods.candidates import Compared
-from loopclosure.methods.contradiction import temporal
+from loopclosure.methods.drive import Drive, Request, speeds_between
 from loopclosure.places.datasets import load_folder
 from loopclosure.places.frames import image_paths
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
@@ -34,8 +33,11 @@ from loopclosure.places.trajectory import Poses
 GAP = 30  # frames nearer than this in one drive are not a loop
 NEAR, OVERLAP = 1, 4  # frames of one route: the same place, and views that overlap
 SOFT_DEG = 45.0  # views of one place (2 m) with a smaller angle are not a mistake
-FIRST = ("kitchen", "fr1_rpy", "nordland_1", "tower, floors 3 to 12")  # drives with these names were chosen on
-FIRST_ONLINE = (*FIRST, "road: ")  # the online detector's last rules were added after two of the roads had wrong loops
+# Drives with these names were chosen on: the last three only by rules that were added after a fault was seen on them.
+FIRST = ("kitchen", "fr1_rpy", "nordland_1", "tower, floors 3 to 12", "office_handheld_loop")
+FIRST += ("corridor", "nordland_2", "road: bridge_highway")
+# Handheld, and laps of small robots; where they come back is not known, so only what is accepted is counted.
+UNJUDGED = ("office_handheld_loop", "rc_exhibition_hall", "rc_hall_stone_floor", "rc_office_corridor")
 OVERLAPS = 0.25, 0.05  # of the footprint of a drone's image that another sees: the same place, and no mistake
 DESK_GAP = 90  # frames, 3 s: a hand-held camera turns to and fro
 HALVES = {"nordland_1": slice(596), "nordland_2": slice(596, None)}
@@ -50,6 +52,7 @@ class Real:
     rule    what must be found: less than 2 m and 15 degrees apart, or as the data set says
     wide    what is no mistake: less than 45 degrees apart
     judged  pairs that count
+    known   whether it is known where the drive comes back
     """
 
     name: str
@@ -58,6 +61,7 @@ class Real:
     wide: np.ndarray
     judged: np.ndarray
     gap: int = GAP
+    known: bool = True
 
     def third(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the frames of a third, 0 to 2, and the others."""
@@ -88,6 +92,10 @@ def _drives(data: Path) -> dict[str, Callable[[], Real]]:
     for floors, numbers in FLOORS.items():
         for rank, which in enumerate(("", ", second walks")):
             made[f"tower, floors {floors}{which}"] = lambda n=numbers, k=rank: _tower(data / "ie_tower", n, k)
+    made["tower, 21 floors"] = lambda: _walks(data / "ie_tower")
+    for name in UNJUDGED:
+        folder = data / "sequences" / name
+        made[name] = lambda folder=folder: replace(_without(image_paths(folder)), known=False)
     with (data / "sequences" / "index.csv").open(encoding="utf-8") as table:
         for row in csv.DictReader(table):
             if row["has_revisits"] == "no":
@@ -146,6 +154,12 @@ def _tower(folder: Path, floors: Sequence[int], rank: int) -> Real:
     return Real("", [path for one in walks for path in one], never, never, walk[:, None] != walk, gap=0)
 
 
+def _walks(folder: Path) -> Real:
+    """Make one drive of a walk through a hallway of each floor of the tower."""
+    listed = (folder / "one_walk_each.txt").read_text(encoding="utf-8").split()
+    return _without([folder / name for name in listed])
+
+
 def _without(images: list[Path]) -> Real:
     """Make a drive that never comes back."""
     never = np.zeros((len(images), len(images)), bool)
@@ -154,16 +168,16 @@ def _without(images: list[Path]) -> Real:
 
 @dataclass(frozen=True)
 class Known(GeometricCheck):
-    """A check whose images are named by their paths; their points and pairs are computed once."""
+    """A check whose images are named by their paths; their pairs are computed once."""
 
     pairs: Pairs = field(default_factory=lambda: Pairs(lambda path: path))
     names: dict[int, Any] = field(default_factory=dict, hash=False)
 
     def describe(self, image: Any) -> LocalFeatures:
-        """Return the points of the image with this path."""
-        local = self.pairs.features(GeometricCheck(), image)
-        self.names[id(local)] = image  # the pairs keep them
-        return local
+        """Return something that stands for the points of the image with this path."""
+        stands = LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))
+        self.names[id(stands)] = image  # the detector keeps it
+        return stands
 
     def agreement(self, a: LocalFeatures, b: LocalFeatures) -> Agreement:
         """Return how many points of two images agree."""
@@ -172,8 +186,14 @@ class Known(GeometricCheck):
 
 def as_detect(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
     """Return the match of each frame (N,), -1 without an accepted one, as ``detect`` without options decides."""
-    compared = Compared(similarity_matrix(rows), earlier(len(rows), 0), False)
-    return _answered(compared, cache, real.images, real.images)
+    scores, stamps = similarity_matrix(rows), np.full(len(rows), np.nan)
+
+    def block(queries: range) -> tuple[np.ndarray, np.ndarray]:
+        part = scores[queries.start : queries.stop]
+        return part, part
+
+    drive = Drive(len(rows), block, 0, lambda query: Request().possible(query, stamps))
+    return _decided(drive, cache, real.images, real.images)
 
 
 def as_query(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
@@ -181,19 +201,27 @@ def as_query(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
     match = np.full(len(rows), -1)
     for number in range(3):
         inside, others = real.third(number)
-        scores = similarity_matrix(rows[inside], rows[others])
-        before = temporal(similarity_matrix(rows[inside]))
-        compared = Compared(scores, np.ones(scores.shape, bool), True, temporal=before)
+
+        def block(queries: range, of: tuple[np.ndarray, np.ndarray] = (inside, others)) -> Any:
+            part = rows[of[0]][queries.start : queries.stop]
+            return similarity_matrix(part, rows[of[1]]), similarity_matrix(part, rows[of[0]])
+
+        drive = Drive(len(inside), block, None, speeds=speeds_between(len(inside), len(others)))
         queries, references = ([real.images[i] for i in frames] for frames in (inside, others))
-        found = _answered(compared, cache, queries, references)
+        found = _decided(drive, cache, queries, references)
         match[inside] = np.where(found >= 0, others[found], -1)
     return match
 
 
-def _answered(compared: Compared, cache: Cache, queries: Sequence[Path], references: Sequence[Path]) -> np.ndarray:
-    check = GeometricCheck()
-    found = answer(find_matches(compared), check, Between(check, cache.pairs, queries, references))
-    return np.where(found.accepted, found.match, -1)
+def _decided(drive: Drive, cache: Cache, queries: Sequence[Path], references: Sequence[Path]) -> np.ndarray:
+    check, pairs = GeometricCheck(), cache.pairs
+    _, decision = drive.decided(
+        PRECISION,
+        check,
+        lambda query, reference: pairs.agreement(check, queries[query], references[reference]),
+        lambda query, other: pairs.agreement(check, queries[query], queries[other]),
+    )
+    return np.where(decision.loops, decision.match, -1)
 
 
 def online(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
@@ -219,13 +247,14 @@ def judged(real: Real, match: np.ndarray, how: str) -> dict[str, Any]:
         count &= parts[:, None] != parts
     queries = np.flatnonzero(match >= 0)
     queries = queries[count[queries, match[queries]]]
-    chosen = real.name.startswith(FIRST_ONLINE if how == "online" else FIRST)
+    chosen = real.name.startswith(FIRST)
     row: dict[str, Any] = {"how": how, "drive": real.name, "chosen on": "yes" if chosen else ""}
     row |= {"frames": len(match), "accepted": len(queries)}
     for angle, same in (("15", real.rule), ("45", real.wide)):
         loops = np.any(same & count, axis=1)
         right = int(np.count_nonzero(same[queries, match[queries]]))
-        row |= {f"with a loop {angle}": int(np.count_nonzero(loops)), f"right {angle}": right}
+        found = right if real.known else None
+        row |= {f"with a loop {angle}": int(np.count_nonzero(loops)), f"right {angle}": found}
         row |= {f"recall {angle}": round(right / int(loops.sum()), 3) if loops.any() else None}
     return row
 
@@ -251,9 +280,17 @@ def measure(data: Path, work: Path, only: Sequence[str], say: Callable[[str], No
 
 
 def summary(rows: Sequence[dict[str, Any]], how: str) -> dict[str, Any]:
-    """Return on how many drives the matches are precise, and their mean recall, without drives that were chosen on."""
-    judges = [row for row in rows if row["how"] == how and not row["chosen on"]]
-    precise = [row["accepted"] - row["right 45"] <= (1 - PRECISION) * row["accepted"] for row in judges]
+    """Return on how many drives the matches are precise, and their mean recall, without drives that were chosen on.
+
+    Drives with loops and drives without are counted apart: on the latter nothing may be accepted.
+    """
+    judges = [row for row in rows if row["how"] == how and not row["chosen on"] and row["right 45"] is not None]
+    found: dict[str, Any] = {"how": how}
+    for name, some in (
+        ("precise drives with loops", [row for row in judges if row["with a loop 45"]]),
+        ("drives without loops in which none is accepted", [row for row in judges if not row["with a loop 45"]]),
+    ):
+        precise = [row["accepted"] - row["right 45"] <= (1 - PRECISION) * row["accepted"] for row in some]
+        found[name] = f"{sum(precise)} of {len(precise)}"
     recalls = [row["recall 45"] for row in judges if row["recall 45"] is not None]
-    mean = round(float(np.mean(recalls)), 2) if recalls else None
-    return {"how": how, "precise drives": f"{sum(precise)} of {len(precise)}", "mean recall 45": mean}
+    return found | {"mean recall 45": round(float(np.mean(recalls)), 2) if recalls else None}

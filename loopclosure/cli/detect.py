@@ -11,16 +11,16 @@ import numpy as np
 from loopclosure.cli.data_set import recording_of, warn_of_unreadable
 from loopclosure.closing.close import constraint
 from loopclosure.closing.measure import Loop, cells, depth_scale_said, errors_said, measure
+from loopclosure.decision.constants import PRECISION, RECENT
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
-from loopclosure.detector.decision import RECENT, DetectorSettings, LoopResult
+from loopclosure.detector.decision import DetectorSettings, LoopResult
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import RELATIVE, write_g2o, write_loops_csv
 from loopclosure.detector.saved import Describe
 from loopclosure.detector.verification import GeometricCheck
-from loopclosure.methods.auto import PRECISION
-from loopclosure.methods.drive import Request, last_session, later_threshold, whole_drive
+from loopclosure.methods.drive import Request, last_session, whole_drive
 from loopclosure.places import intrinsics
 from loopclosure.places.frames import live_frames
 from loopclosure.places.image_sequence import ImageSequence
@@ -99,7 +99,7 @@ def _add_detect(commands: Commands) -> None:
         type=int,
         metavar="FRAMES",
         help="number of recent frames that are never candidates "
-        f"(default: the length of a visit to a place; {RECENT} if decided frame by frame without --exclude-seconds)",
+        f"(default: {RECENT}, or those of --exclude-seconds, and the length of a visit to the place)",
     )
     parser.add_argument(
         "--exclude-seconds", type=float, metavar="S", help="frames of the last S seconds are never candidates"
@@ -149,11 +149,9 @@ def _detect(a: argparse.Namespace) -> None:
         reasons = [run.verdicts_said(results)]
         if a.threshold is None and not a.resume:
             seconds = a.exclude_seconds or 0.0
-            found = last_session(
-                detector, results, request=Request(visit=a.exclude_recent, seconds=seconds), progress=bar
-            )
+            found = last_session(detector, request=Request(recent=a.exclude_recent, seconds=seconds), progress=bar)
             results, reasons = found.results, [*found.reasons, run.verdicts_said(found.results)]
-            detector.decided([result for result in results if result], None)
+            detector.decided([result for result in results if result])
     elif a.threshold is None and not a.resume:
         precision = PRECISION if a.least_precision is None else a.least_precision
         path = recording.odometry  # after a jump, its poses are in another frame
@@ -162,8 +160,6 @@ def _detect(a: argparse.Namespace) -> None:
         found = whole_drive(detector, recording, features, request, bar)
         results = found.results
         reasons = [*found.reasons, run.verdicts_said(results)]
-        if a.save:
-            detector.decided(detector.loops, later_threshold(detector, found.accepted))
     else:
         results = run.run_detector(detector, recording, features, bar)
         by = "their scores alone" if detector.check is None else "their scores and their points"

@@ -23,7 +23,7 @@ from loopclosure.methods.drive import last_session
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import FORM
 from netspec.files.paths import inside
-from netspec.terminal.output import bar, warn
+from netspec.terminal.output import bar
 from netspec.terminal.parser import Commands
 
 
@@ -108,9 +108,7 @@ def _add_all(into: Map, describe: Describe, recordings: list[ImageSequence], ind
 
 def _decided(detector: LoopDetector, own: bool = True) -> list[LoopResult]:
     found = last_session(detector, own=own, progress=bar)
-    for limit in found.limits:
-        warn(limit)
-    print("\n".join(reason for reason in found.reasons if reason not in found.limits))
+    print("\n".join(found.reasons))
     return found.results
 
 

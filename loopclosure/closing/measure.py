@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loopclosure.closing.length import measured, neighbors
-from loopclosure.closing.relative import LEAST_INLIERS, METRIC, ROTATION_ONLY, Relative, View, relative_view
+from loopclosure.closing.relative import METRIC, ROTATION_ONLY, Relative, View, relative_view
 from loopclosure.csv_file import safe_cell
 from loopclosure.detector.export import relative_pose
 from loopclosure.detector.verification import GeometricCheck
@@ -27,8 +27,8 @@ from loopclosure.places.trajectory import pieces
 from loopclosure.progress import Progress, silent
 from netspec.files.kinds import nearest_existing
 
-# Images are not reduced: a larger image gives a better pose.
-CHECK = GeometricCheck(max_features=1000, min_inliers=LEAST_INLIERS, most_side=1_000_000)
+# The points from which a pose is measured. Images are not reduced: a larger image gives a better pose.
+CHECK = GeometricCheck(max_features=1000, most_side=1_000_000)
 LEAST_BASELINE_M = 0.1  # with less between two cameras, the true direction is as uncertain as the true poses
 SCALED, OFF_SCALE = 12, 1.25  # frames that show the scale of the depth; the ratio that is said
 KEPT_VIEWS = 500  # images with cached features

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from loopclosure.decision.constants import RECENT
 from loopclosure.descriptors.similarity import check_metric
 from loopclosure.errors import InputError
 
-RECENT = 50  # frames that are no candidates where nothing says how old one must be: 2 to 20 s at usual rates
 Runs = list[tuple[int, int]]  # of one frame: (candidate, number of consecutive frames that led to it)
 
 
@@ -29,6 +29,7 @@ class LoopResult:
     score_of    what the score compares: "image", or the "sequence" of frames around it; they are different scales
     late        loops of frames before it, at most ten, that the sequence up to this frame completes
     reason      what decided: the sequence of the frame or its points; empty where the verdict says all
+    wrong       the share of wrong ones that is expected among loops as good, None where that is not known
     """
 
     query_id: int
@@ -41,6 +42,7 @@ class LoopResult:
     reason: str = ""
     score_of: str = "image"
     late: tuple[LoopResult, ...] = ()
+    wrong: float | None = None
 
     @property
     def loops(self) -> tuple[LoopResult, ...]:
@@ -59,8 +61,8 @@ class DetectorSettings:
     views               the number of views of an image in a descriptor, one after the other; the score of two
                         frames is the score of their two most similar views
     exclude_recent      frames i - exclude_recent .. i - 1 are not candidates of frame i. None: 0 if exclude_seconds
-                        is given, else 50; in the latter case the geometric check also accepts no frame whose place
-                        the camera has not left since
+                        is given, else 20. Unless it is given, the geometric check accepts no frame whose place the
+                        camera has not left since
     exclude_seconds     frames less than this many seconds old are not candidates either
     top_k               how many candidates are examined
     threshold           a candidate needs score >= threshold. None: the geometric check decides alone; without a check,
@@ -106,6 +108,10 @@ def result_of(found: Any, count: int) -> LoopResult:
     ends = (loop.query_id, loop.accepted)
     if not all(isinstance(end, int) and 0 <= end < count for end in ends) or not isinstance(loop.score, float):
         raise ValueError(f"a loop of frames {ends} among {count}")
-    if not isinstance(loop.inliers, int | None) or not isinstance(loop.stamp, float | int | None):
+    if (
+        not isinstance(loop.wrong, float | None)
+        or not isinstance(loop.inliers, int | None)
+        or not isinstance(loop.stamp, float | int | None)
+    ):
         raise ValueError(f"a loop with {loop.inliers!r:.20} inliers at {loop.stamp!r:.20} s")
     return loop

@@ -2,9 +2,8 @@
 
     detector = LoopDetector(describe, check=GeometricCheck())
     for image in camera:
-        result = detector.add(image)
-        if result.accepted is not None:
-            ...  # this frame shows the same place as frame result.accepted
+        for loop in detector.add(image).loops:
+            ...  # frame loop.query_id shows the same place as frame loop.accepted
 
 An index (:mod:`loopclosure.index`) searches the earlier descriptors. The default index is exact: it multiplies all
 earlier descriptors by the new one. The cost of the search grows with the number of frames, and so does that of the
@@ -14,6 +13,7 @@ lines through all scores; all other costs are constant. See :meth:`LoopDetector.
 from __future__ import annotations
 
 import json
+from bisect import insort
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,22 +21,26 @@ from typing import Any
 
 import numpy as np
 
+from loopclosure.decision.constants import LOOKED_BACK
+from loopclosure.decision.decider import Decider
+from loopclosure.decision.lines import HALF
+from loopclosure.detector.answered import results_of
 from loopclosure.detector.decision import DetectorSettings, LoopResult, Runs, result_of
 from loopclosure.detector.frames import Frames, Local, LocalOnDisk, Points, checked_pose, points_of
-from loopclosure.detector.images import ImageDecision
-from loopclosure.detector.lines import HALF
+from loopclosure.detector.likely import Likely
 from loopclosure.detector.saved import FORMAT, SAVED, Describe, fingerprint_of, reading, refuse_another, starts
-from loopclosure.detector.sequences import Sequences
-from loopclosure.detector.verification import GeometricCheck, LocalFeatures
+from loopclosure.detector.verification import Agreement, GeometricCheck, LocalFeatures
 from loopclosure.errors import InputError
 from loopclosure.index.index import Index, open_index
 from loopclosure.stored import check_array, from_json
 from netspec.files.arrays import read_npz
 from netspec.files.whole_file import whole_file
 
+PART = "enough points agree, but only a part of those that match"
+
 
 class LoopDetector:
-    """Finds loops frame by frame; ``loops`` holds the results that were accepted, in order.
+    """Finds loops frame by frame; ``loops`` holds the results that were accepted, in the order of their queries.
 
     Frames are numbered from 0. The newest frames are not candidates: those of the last ``exclude_seconds``, or the last
     ``exclude_recent`` frames (:class:`DetectorSettings`).
@@ -85,8 +89,8 @@ class LoopDetector:
         rows = None if in_memory is None else in_memory * views
         opened = open_index(index, metric, in_memory=rows) if isinstance(index, str) else index
         self._frames = Frames(opened, views, metric, local=Local() if in_memory is None else LocalOnDisk(in_memory))
-        self._images = ImageDecision(chosen, check, self._frames)
-        self._sequences = Sequences(self._images, self._frames)
+        self._likely = Likely(chosen)
+        self._begin, self._decider = 0, self._decider_from(0)
         self._sessions = [0]  # the first frame of each
         self._runs: Runs = []  # of the last frame
         self._last = np.zeros((0, 0), np.float32)  # the descriptor of the last frame
@@ -97,7 +101,7 @@ class LoopDetector:
     @property
     def settings(self) -> DetectorSettings:
         """How loops are decided."""
-        return self._images.settings
+        return self._likely.settings
 
     @property
     def sessions(self) -> list[int]:
@@ -149,22 +153,87 @@ class LoopDetector:
         """Add a frame by its descriptor (D,); ``image`` is needed only for a geometric check."""
         path = checked_pose(pose), checked_pose(odometry)
         row = self._row(descriptor)
-        self._check_stamp(stamp)
+        stamp = self._checked_stamp(stamp)
         self._frames.settle(self._end(stamp))
-        query, settings = len(self), self.settings
-        candidates, scores = self._frames.search_all(row, settings.top_k) if self.check else (self._similar(row), None)
-        local = self._local(image)
-        found = self._found(query, candidates, stamp)
-        result, self._runs = self._images.decide(found, local, self._runs, self._left)
-        self._keep(row, stamp, path, local)
-        if result:
-            self.loops.append(result)
-        self._images.learn(result, row, local)
-        late = None if scores is None else self._sequences.add(scores, self._end(stamp), self._by_visit)
-        if late is None or late.query_id in {loop.query_id for loop in self.loops[-2 * HALF :]}:
+        local, end = self._local(image), self._end(stamp)
+        if self.check is None:
+            found = self._found(len(self), self._similar(row), stamp)
+            self._keep(row, stamp, path, None)
+            verdict, steady, self._runs = self._likely.of(found.candidates, self._runs, False)
+            result = _by_score(found, verdict, steady)
+        else:
+            candidates, scores = self._frames.search_all(row, self.settings.top_k)
+            found = self._found(len(self), candidates, stamp)
+            self._keep(row, stamp, path, local)
+            result = self._decided(found, scores, end)
+        for loop in result.loops:
+            insort(self.loops, loop, key=lambda each: each.query_id)
+        return result
+
+    def _decided(self, found: LoopResult, scores: np.ndarray, end: int) -> LoopResult:
+        """Decide on the newest frame by its points, and on the one ``HALF`` frames before it by its line.
+
+        scores  (N,) with all frames before it; of these, the first ``end`` are old enough to be its candidates
+        """
+        query = found.query_id
+        if len(self._decider) != query - self._begin:  # frames before it were only remembered
+            self._begin, self._decider = query, self._decider_from(query)
+        number, begin, decider = query - self._begin, self._begin, self._decider
+        visits = begin if self.settings.exclude_recent is None else None
+        possible = decider.add(scores, scores[begin:], visits, np.arange(query) < end)
+        result, self._runs = self._looked_at(decider, number, found, scores, possible, self._runs)
+        middle = number - HALF
+        if middle < 0 or self.settings.threshold is not None:
             return result
-        self.loops.append(late)
+        decider.lines.search(middle + 1)
+        first = max(0, middle + 1 - LOOKED_BACK)
+        decision = decider.decide(first, middle + 1, middle)
+        known = {loop.query_id for loop in self.loops[-2 * HALF :]}
+        if not decision.loops[-1] or begin + middle in known:
+            return result
+        (late,) = results_of(decision, begin + first, self._frames.stamps[begin + first :], middle - first)
         return replace(result, late=(late,))
+
+    def _looked_at(
+        self,
+        decider: Decider,
+        number: int,
+        found: LoopResult,
+        scores: np.ndarray,
+        possible: np.ndarray,
+        before: Runs,
+        every: bool = False,
+    ) -> tuple[LoopResult, Runs]:
+        """Decide on a frame, query ``number`` of a decider, by its points; return the result and its runs.
+
+        every  examine all its candidates, though no setting chooses among them by their scores
+        """
+        verdict, steady, runs = self._likely.of(found.candidates, before, True)
+        by_scores = every or self.settings.threshold is not None or self.settings.consistency > 0
+        if by_scores and not steady:
+            return replace(found, verdict=verdict), runs
+        looked = decider.look(number, [k for k, _ in steady if possible[k]] if by_scores else None)
+        if looked.match < 0:
+            return found, runs
+        points = replace(found, verdict="not verified", inliers=looked.inliers, reason=PART if looked.part else "")
+        if not decider.is_loop(looked.wrong):
+            return points, runs
+        score = float(scores[looked.match])
+        return replace(points, accepted=looked.match, verdict="accepted", score=score, wrong=looked.wrong), runs
+
+    def _decider_from(self, begin: int) -> Decider:
+        """Return a decider on the frames from ``begin`` on."""
+        check, local = self.check, self._frames.local
+
+        def agree(one: int, other: int) -> Agreement:
+            assert check is not None
+            return check.agreement(local[one], local[other])
+
+        return Decider(
+            check=check,
+            agree=None if check is None else lambda query, reference: agree(begin + query, reference),
+            among=lambda one, other: agree(begin + one, begin + other),
+        )
 
     def remember(
         self,
@@ -185,19 +254,17 @@ class LoopDetector:
             descriptor = self.describe(image)
         path = checked_pose(pose), checked_pose(odometry)
         row = self._row(descriptor)
-        self._check_stamp(stamp)
+        stamp = self._checked_stamp(stamp)
         self._runs = []
         self._keep(row, stamp, path, self._local(image))
 
     def look_up(self, frame: int) -> LoopResult:
-        """Look for the place of a frame of the last session in the sessions before it."""
+        """Look for the place of a frame of the last session in the sessions before it, by its scores."""
         row = self.descriptors_of(frame, frame + 1).reshape(self.settings.views, -1)
-        local = None if self.check is None else self.local_features(frame)
-        stamp = float(self._frames.stamps[frame])
-        before = self._sessions[-1]
+        stamp, before = float(self._frames.stamps[frame]), self._sessions[-1]
         known = [(number, score) for number, score in self._similar(row) if number < before]
         found = self._found(frame, known, None if np.isnan(stamp) else stamp)
-        return self._images.decide(found, local, [])[0]
+        return _by_score(found, *self._likely.of(known, [], False)[:2])
 
     def _keep(
         self,
@@ -208,7 +275,7 @@ class LoopDetector:
     ) -> None:
         """Store a frame; ``path`` is its pose and its odometry."""
         if len(self) > self._sessions[-1]:
-            self._images.steps.append(self._frames.score(self._last, row))
+            self._likely.steps.append(self._frames.score(self._last, row))
         self._last = row
         self._frames.append(row, stamp, *path)
         if local is not None:
@@ -219,19 +286,30 @@ class LoopDetector:
         query: int,
         descriptor: Sequence[float] | np.ndarray,
         stamp: float | None,
-        image: np.ndarray | None,
         before: Runs,
+        decider: Decider | None,
     ) -> tuple[LoopResult, Runs]:
-        """Look up frame ``query`` of another session without adding it. ``before``: the runs of the frame before it."""
-        candidates = self._frames.most_similar(self._row(descriptor), self.settings.top_k, True)
-        return self._images.decide(self._found(query, candidates, stamp), self._local(image), before)
+        """Look up frame ``query`` of another session without adding it. ``before``: the runs of the frame before it.
+
+        ``decider`` decides on that session; None: there is no geometric check.
+        """
+        row = self._row(descriptor)
+        candidates = self._frames.most_similar(row, self.settings.top_k, True)
+        found = self._found(query, candidates, stamp)
+        if decider is None:
+            verdict, steady, runs = self._likely.of(candidates, before, False)
+            return _by_score(found, verdict, steady), runs
+        _, scores = self._frames.search_all(row, 1)
+        possible = decider.add(scores, np.zeros(0), None)
+        return self._looked_at(decider, query, found, scores, possible, before, every=True)
 
     def begin_session(self) -> None:
         """Start another drive. All earlier frames are candidates for its frames, however recent they are."""
         self._frames.settle(len(self))
         if len(self) > self._sessions[-1]:
             self._sessions.append(len(self))
-            self._sequences.begin_session(len(self))
+        self._begin, self._decider = len(self), self._decider_from(len(self))
+        self._frames.begin_drive()
         self._runs = []
 
     @property
@@ -251,10 +329,9 @@ class LoopDetector:
         """Return the arrays that a file stores for the frames from ``frame`` on, without their descriptors."""
         return self._frames.arrays(self.check is not None, frame)
 
-    def decided(self, loops: Sequence[LoopResult], threshold: float | None) -> None:
-        """Set the loops, found from all frames at once, and the threshold for later frames."""
+    def decided(self, loops: Sequence[LoopResult]) -> None:
+        """Set the loops, found from all frames at once."""
         self.loops = list(loops)
-        self._images.settings = replace(self.settings, threshold=None if threshold is None else float(threshold))
 
     def save(self, path: str | Path) -> None:
         """Write everything except ``describe`` to an .npz file, from which ``load`` continues."""
@@ -264,14 +341,12 @@ class LoopDetector:
             "settings": asdict(self.settings),
             "check": None if self.check is None else asdict(self.check),
             "runs": self._runs,
-            "agreed": self._images.agreed,
-            "unlike": self._images.unlike,
-            "stretch": self._sequences.stretch(),
             "loops": [asdict(loop) for loop in self.loops],
             "sessions": self._sessions,
+            "begin": self._begin,
         }
         arrays: dict[str, Any] = {"rows": self.descriptors, **self._frames.arrays(self.check is not None)}
-        arrays |= self._sequences.lines.arrays()
+        arrays |= self._decider.arrays()
         with whole_file(path) as unfinished, unfinished.open("wb") as stream:
             np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 
@@ -302,13 +377,12 @@ class LoopDetector:
             detector._take(arrays)
             detector._sessions = starts(about.get("sessions", [0]), len(detector))
             detector._settle()
-            detector._images.steps, detector._last = detector._frames.steps(detector._sessions)
-            detector._images.agreed = [int(number) for number in about.get("agreed", (0, 0))]
-            detector._images.unlike = [(float(score), int(points)) for score, points in about.get("unlike", [])]
+            detector._likely.steps, detector._last = detector._frames.steps(detector._sessions)
             detector._runs = [(int(a), int(b)) for a, b in about["runs"]]
             detector.loops = [result_of(found, len(detector)) for found in about["loops"]]
-            if "lines_counts" in arrays:  # older files do not have them
-                detector._sequences.take(arrays, about["stretch"])
+            detector._begin = begin = int(about["begin"])
+            detector._decider = detector._decider_from(begin)
+            detector._decider.take(arrays, len(detector) - begin)
         return detector
 
     def _take(self, arrays: dict[str, np.ndarray]) -> None:
@@ -359,7 +433,7 @@ class LoopDetector:
             row = row / np.where(lengths > 0, lengths, 1)
         return row
 
-    def _check_stamp(self, stamp: float | None) -> None:
+    def _checked_stamp(self, stamp: float | None) -> float | None:
         frames, seconds = self._frames, self.settings.exclude_seconds
         if seconds and stamp is None:
             raise InputError(f"{seconds:g} s are to be excluded, but frame {frames.count} has no stamp")
@@ -367,6 +441,7 @@ class LoopDetector:
             raise InputError(f"frame {frames.count} has stamp {stamp}; expected seconds")
         if stamp is not None and frames.count > self._sessions[-1] and stamp < frames.stamps[frames.count - 1]:
             raise InputError(f"frame {frames.count} has stamp {stamp:.6f}, earlier than the one before it")
+        return None if stamp is None else float(stamp)
 
     def _end(self, stamp: float | None) -> int:
         """Return how many frames are candidates: all of earlier sessions, and those of this one that are not recent."""
@@ -391,10 +466,10 @@ class LoopDetector:
         score = candidates[0][1] if candidates else -np.inf
         return LoopResult(query, candidates, None, "no candidate", score, stamp=stamp)
 
-    @property
-    def _by_visit(self) -> bool:
-        """Whether the visit of a frame must have ended, because no setting says how old a candidate must be."""
-        return self.settings.exclude_recent is None and not self.settings.exclude_seconds
 
-    def _left(self, frame: int) -> bool:
-        return not self._by_visit or self._sequences.lines.left(frame)
+def _by_score(found: LoopResult, verdict: str, steady: Sequence[tuple[int, float]]) -> LoopResult:
+    """Return the result of a frame by its ``steady`` candidates, best first, or the verdict without any."""
+    if not steady:
+        return replace(found, verdict=verdict)
+    match, score = steady[0]
+    return replace(found, accepted=match, verdict="accepted", score=score)

@@ -148,6 +148,14 @@ class Frames:
     odometry: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
     waiting: list[np.ndarray] = field(default_factory=list)
     local: Local | LocalOnDisk = field(default_factory=Local)
+    drive: ExactIndex = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.begin_drive()
+
+    def begin_drive(self) -> None:
+        """Begin a drive: the frames before it are compared by the index alone."""
+        self.drive = ExactIndex(self.metric)
 
     def append(
         self, row: np.ndarray, stamp: float | None, pose: np.ndarray | None, odometry: np.ndarray | None = None
@@ -161,6 +169,8 @@ class Frames:
         self.poses[self.count] = np.nan if pose is None else pose
         self.odometry[self.count] = np.nan if odometry is None else odometry
         self.waiting.append(row)
+        if not isinstance(self.index, ExactIndex):
+            self.drive.add(row)
         self.count += 1
 
     @property
@@ -189,13 +199,19 @@ class Frames:
         found = [self.index.search(view, k * self.views) for view in row if self.settled]
         return self._best(found, row, k, waiting)
 
-    def search_all(self, row: np.ndarray, k: int) -> tuple[list[tuple[int, float]], np.ndarray | None]:
-        """Return the ``k`` most similar frames of the index, and the scores (N,) of all frames.
+    def search_all(self, row: np.ndarray, k: int) -> tuple[list[tuple[int, float]], np.ndarray]:
+        """Return the ``k`` most similar frames of the index, and the scores (N,) of all frames, NaN where not known.
 
-        The scores are None if the index does not compare all descriptors; only the exact one does.
+        Only the exact index compares all descriptors. With another one, the scores of this drive's frames, whose
+        descriptors are kept beside it, and of the most similar ones are known.
         """
         if not isinstance(self.index, ExactIndex):
-            return self.most_similar(row, k, False), None
+            best, scores = self.most_similar(row, k, False), np.full(self.count, np.nan, np.float32)
+            scores[[number for number, _ in best]] = [score for _, score in best]
+            own = [self.drive.search_all(view, 1)[2] for view in row]
+            if len(self.drive):
+                scores[-len(self.drive) // self.views :] = np.max(own, axis=0).reshape(-1, self.views).max(axis=1)
+            return best, scores
         found = [self.index.search_all(view, k * self.views) for view in row]
         of_views = np.max([scores for *_, scores in found], axis=0).reshape(-1, self.views)
         waiting = [self.score(each, row) for each in self.waiting]

@@ -15,16 +15,16 @@ in several parts of the image, because a sign or a printed code can appear in ma
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from loopclosure.decision.constants import SURE
 from loopclosure.descriptors.similarity import squared_distances
 from loopclosure.errors import InputError
-from loopclosure.lines.points import SURE
 from netspec.files.opencv import cv2
 
 # Fewer matches prove nothing: any seven have a fundamental matrix.
@@ -38,10 +38,6 @@ SHARE = 0.7
 SAMPLE, SOLUTIONS = 7, 3  # matches in a sample, and the largest number of fundamental matrices they give
 PARTS = (8, 6)  # of an image, across and down
 SPREAD = 5  # at most 1 / SPREAD of the needed inliers are counted in one part
-# A cell is fixed if points in it match at the same position in this share of the unlike pairs, and in at least this
-# many of them: a clock, a watermark, the hood of the car.
-FIXED, LEAST_FIXED = 0.1, 3
-CELLS = (48, 36)  # of an image, across and down; each is fixed or not
 # The largest factor by which an image is enlarged; a larger one adds no detail.
 MOST_ENLARGED = 4.0
 
@@ -82,7 +78,6 @@ class GeometricCheck:
     ratio          a match must be nearer than ``ratio`` times the second nearest (Lowe's test)
     max_error_px   largest distance of an inlier from its epipolar line, in pixels of the enlarged or reduced image
     confidence     of RANSAC
-    min_inliers    minimum number of inliers of a loop; 0: as many as rule out chance
     least_side     an image with a shorter side below this is enlarged to it, at most four times
     most_side      an image with a shorter side above this is reduced to it; SIFT takes 39 ms of 640x480 reduced to 320
                    (74 without), and of images of 240 reduced by as much, as many right pairs are verified at the desk
@@ -95,7 +90,6 @@ class GeometricCheck:
     ratio: float = 0.8
     max_error_px: float = 2.0
     confidence: float = 0.985
-    min_inliers: int = 0
     least_side: int = 240
     most_side: int = 320
     focal_px: float = 0.0
@@ -171,33 +165,25 @@ class GeometricCheck:
         return Agreement(len(matches), count if spread >= needed else min(count, spread), needed)
 
     def enough(self, found: Agreement) -> int:
-        """Return the inliers of an agreement; 0 if there are fewer than this check needs."""
-        return found.inliers if found.inliers >= (self.min_inliers or found.needed) else 0
+        """Return the inliers of an agreement; 0 if chance explains them."""
+        return found.inliers if found.inliers >= found.needed else 0
 
     def evidence(self, found: Agreement, unlike: float = 0.0) -> float:
-        """Return the inliers of an agreement divided by the number that this check needs; 1 is enough.
+        """Return the inliers of an agreement divided by the number that rules out chance; 1 is enough.
 
         unlike  how many inliers pairs of different places have: so many more are needed
         """
-        return found.inliers / ((self.min_inliers or found.needed) + unlike)
+        return found.inliers / (found.needed + unlike)
 
-    def sure(self, found: Agreement, unlike: float = 0.0, asked: float = SURE) -> int:
-        """Return the inliers of an agreement if they outweigh a low score: their evidence is as ``asked``; else 0."""
-        if self.min_inliers:
-            return self.enough(found)
-        return found.inliers if self.evidence(found, unlike) >= asked and found.whole else 0
+    def sure(self, found: Agreement) -> int:
+        """Return the inliers of an agreement if they outweigh a low score; 0 otherwise."""
+        return found.inliers if self.evidence(found) >= SURE and found.whole else 0
 
     def __post_init__(self) -> None:
-        if (
-            self.max_features < LEAST_MATCHES
-            or not (self.min_inliers == 0 or self.min_inliers >= LEAST_MATCHES)
-            or not 0 < self.ratio <= 1
-            or self.most_side < max(1, self.least_side)
-        ):
+        if self.max_features < LEAST_MATCHES or not 0 < self.ratio <= 1 or self.most_side < max(1, self.least_side):
             raise InputError(
-                f"geometric check: {self.max_features} features, {self.min_inliers} inliers, ratio {self.ratio:g}, "
-                f"sides {self.least_side} to {self.most_side}; expected at least {LEAST_MATCHES} of both, "
-                "a ratio in 0..1, and sides in order"
+                f"geometric check: {self.max_features} features, ratio {self.ratio:g}, sides {self.least_side} to "
+                f"{self.most_side}; expected at least {LEAST_MATCHES} features, a ratio in 0..1, and sides in order"
             )
         camera = (self.focal_px, self.center_x_px, self.center_y_px)
         if min(camera) < 0 or (any(camera) and not all(camera)):
@@ -237,11 +223,9 @@ class Pairs:
     """Verifies pairs of images. Results are cached: each image is described once, and each pair is matched once.
 
     image   reads an image: its key -> (H, W) or (H, W, 3) uint8, or its points
-    hidden  (CELLS) bool, row by row: points in these cells of an image are ignored; None: all points count
     """
 
     image: Callable[[Any], np.ndarray | LocalFeatures]
-    hidden: np.ndarray | None = None
     _local: dict[tuple[GeometricCheck, Any], LocalFeatures] = field(default_factory=dict)
     _found: dict[tuple[GeometricCheck, Any, Any], Agreement] = field(default_factory=dict)
 
@@ -251,58 +235,14 @@ class Pairs:
         if of not in self._local:
             seen = self.image(key)
             self._local[of] = seen if isinstance(seen, LocalFeatures) else check.describe(seen)
-        local = self._local[of]
-        if self.hidden is None:
-            return local
-        seen = ~self.hidden[_part(local.points, local.size, CELLS)]
-        return LocalFeatures(local.points[seen], local.descriptors[seen], local.size)
+        return self._local[of]
 
     def agreement(self, check: GeometricCheck, a: Any, b: Any) -> Agreement:
         """Return how many points of two images agree."""
-        of = (replace(check, min_inliers=0), a, b)
+        of = (check, a, b)
         if of not in self._found:
             self._found[of] = check.agreement(self.features(check, a), self.features(check, b))
         return self._found[of]
-
-    def without_fixed(self, check: GeometricCheck, unlike: Sequence[tuple[Any, Any]]) -> Pairs:
-        """Return pairs that ignore fixed cells, found from ``unlike`` pairs of images; itself if none is fixed."""
-        hits = np.zeros(CELLS[0] * CELLS[1], int)
-        for one, other in unlike:
-            a, b = self.features(check, one), self.features(check, other)
-            matches = check.matches(a, b)
-            points = a.points[matches[:, 0]]
-            still = np.abs(points - b.points[matches[:, 1]]).max(axis=1) <= check.max_error_px / check.scaled(a.size)
-            hits[np.unique(_part(points[still], a.size, CELLS))] += 1
-        fixed = (hits >= max(LEAST_FIXED, FIXED * len(unlike))).reshape(CELLS[1], CELLS[0])
-        if not fixed.any():
-            return self
-        around = cv2.dilate(fixed.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        return Pairs(self.image, around.reshape(-1), self._local)
-
-
-@dataclass(frozen=True)
-class Between:
-    """Verification of queries and references by number: their keys in ``pairs``."""
-
-    check: GeometricCheck
-    pairs: Pairs
-    queries: Sequence[Any]
-    references: Sequence[Any]
-
-    def __call__(self, query: int, reference: int) -> Agreement:
-        """Return how many points of the two agree."""
-        return self.pairs.agreement(self.check, self.queries[query], self.references[reference])
-
-    def without_fixed(self, unlike: Sequence[tuple[int, int]]) -> Between:
-        """Return a copy that ignores what is fixed in the images; itself if nothing is."""
-        keys = [(self.queries[query], self.references[reference]) for query, reference in unlike]
-        pairs = self.pairs.without_fixed(self.check, keys)
-        return self if pairs is self.pairs else replace(self, pairs=pairs)
-
-    @property
-    def hidden(self) -> float:
-        """The share of the image that is ignored."""
-        return 0.0 if self.pairs.hidden is None else float(self.pairs.hidden.mean())
 
 
 def _by_points(check: GeometricCheck) -> GeometricCheck:

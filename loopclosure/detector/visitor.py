@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from loopclosure.decision.decider import Decider
 from loopclosure.detector.decision import LoopResult, Runs
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.verification import GeometricCheck
@@ -23,6 +24,10 @@ class Visitor:
         self.detector = detector
         self._count = 0
         self._runs: Runs = []
+        check, known = detector.check, detector.local_features
+        self._decider, self._local = None, None
+        if check is not None:
+            self._decider = Decider(check=check, agree=lambda _, frame: check.agreement(self._local, known(frame)))
 
     @property
     def check(self) -> GeometricCheck | None:
@@ -50,6 +55,10 @@ class Visitor:
         odometry: Sequence[float] | np.ndarray | None = None,
     ) -> LoopResult:
         """Look up a frame by its descriptor (D,); ``pose`` and ``odometry`` are not used."""
-        result, self._runs = self.detector.looked_up(self._count, descriptor, stamp, image, self._runs)
+        if self.check is not None:
+            if image is None:
+                raise InputError("a geometric check needs the images")
+            self._local = self.check.describe(image)
+        result, self._runs = self.detector.looked_up(self._count, descriptor, stamp, self._runs, self._decider)
         self._count += 1
         return result

@@ -8,6 +8,7 @@ from tempfile import TemporaryFile
 import numpy as np
 
 LEAST_BLOCK, BLOCK = 64, 4096  # descriptors, which are stored and multiplied at a time
+CLEAR = 10  # standard deviations of the squared distances; the bound of the rounding is seldom reached
 
 
 class ExactIndex:
@@ -68,7 +69,7 @@ class ExactIndex:
         return self.search_all(row, k)[:2]
 
     def search_all(self, row: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what ``search`` returns, and the scores (N,) of all descriptors, which are rounded."""
+        """Return what ``search`` returns, and the scores (N,) of all descriptors."""
         k = min(k, self._count)
         if not k:
             return np.zeros(0, np.intp), np.zeros(0, np.float32), np.zeros(0, np.float32)
@@ -86,7 +87,13 @@ class ExactIndex:
         values = values.astype(np.float32)
         order = np.lexsort((near, -values))[:k]
         if self._metric != "cosine":
-            scores = -np.sqrt(np.maximum(row @ row - scores, 0))
+            squares = np.maximum(row @ row - scores, 0)
+            # Where descriptors lie far from 0 and near one another, the rounding hides how they differ.
+            if self._rounding(row) > CLEAR * squares.std():
+                for number, block in enumerate(self._parts()):
+                    part = squares[number * self._block : (number + 1) * self._block]
+                    part[:] = np.square(block[: len(part)] - row).sum(axis=1)
+            scores = -np.sqrt(squares)
         return near[order], values[order], scores
 
     def _rounding(self, row: np.ndarray) -> float:

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from loopclosure.decision.trajectories import SequenceSettings, trajectory_costs
 from loopclosure.descriptors.thumbnails import Thumbnailer
 from loopclosure.errors import InputError
-from loopclosure.lines.trajectories import SequenceSettings, trajectory_costs
 from loopclosure.methods.base import BLOCK, Images, Method, MethodContext, MethodResult, earlier
 from loopclosure.methods.baselines import ThumbnailMethod
 from loopclosure.methods.settings import configure

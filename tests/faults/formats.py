@@ -265,9 +265,7 @@ FORMATS = {
     ),
     "mean.npy": Format(".npy", lambda path: np.save(path, numbers(3, 4, 4)), lambda path: read_mean_option(str(path))),
     "detector": Format(".npz", detector, go_on, open=members, close=archive),
-    "detector with points": Format(
-        ".npz", lambda path: detector(path, GeometricCheck(min_inliers=8)), go_on, "", members, archive
-    ),
+    "detector with points": Format(".npz", lambda path: detector(path, GeometricCheck()), go_on, "", members, archive),
     "word model": Format(".npz", word_model, WordModel.load, "", members, archive),
     "features": Format(".npz", features, read_features, "", members, archive),
     "truth.npy": Format(".npy", lambda path: np.save(path, np.eye(6)), read_truth_matrix),

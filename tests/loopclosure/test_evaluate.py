@@ -97,10 +97,10 @@ def test_a_path_in_a_method_may_have_a_plus():
 
 
 def test_methods_can_refine_a_refining_method():
-    settings = {"verified.k": "7", "verified.min_inliers": "9", "verified.ratio": "0.7", "seqslam.length": "6"}
+    settings = {"verified.k": "7", "verified.max_features": "90", "verified.ratio": "0.7", "seqslam.length": "6"}
     outer = make_method("verified+seqslam+features:a.npz", MethodContext(3), settings)
     assert isinstance(outer, Verified)
-    assert (outer.k, outer.check.min_inliers, outer.check.ratio, outer.exclude_frames) == (7, 9, 0.7, 3)
+    assert (outer.k, outer.check.max_features, outer.check.ratio, outer.exclude_frames) == (7, 90, 0.7, 3)
     assert isinstance(outer.inner, SeqSlam)
     assert outer.inner.settings.length == 6
     assert outer.name == "verified+seqslam+a (euclidean)"

@@ -314,11 +314,11 @@ def test_images_do_not_wait_for_a_solution(monkeypatch: pytest.MonkeyPatch) -> N
     closer = closer_of()
     monkeypatch.setattr(closer, "_solve", slow)
     closer.start()
-    for number in (0, 1, 2, 0):
-        closer.add(picture(number), 20.0 * len(closer.path()[0]), at(len(closer.path()[0])))
+    for keyframe, number in enumerate((*range(12), 0)):
+        closer.add(picture(number), 20.0 * keyframe, at(keyframe))
     assert begun.wait(60)
-    assert closer.add(picture(1), 80.0, at(4))
-    assert (closer.solutions, len(closer.path()[0])) == (0, 5)
+    assert closer.add(picture(1), 260.0, at(13))
+    assert (closer.solutions, len(closer.path()[0])) == (0, 14)
     go_on.set()
     closer.stop()
     assert closer.solutions >= 1

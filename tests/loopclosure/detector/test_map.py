@@ -93,18 +93,14 @@ def test_build_add_and_query(
         "session 000001: 10 frames, 10 loops, 10 to earlier sessions: M/000001/loops.csv",
         "20 frames in 2 sessions: M",
     ]
-    assert said[0].startswith("one visit to a place lasts")
-    assert any(line.startswith("session 000000: verification: 10 of 10 matches") for line in said[first:])
-    assert said[-3] == "this drive with itself: no loop"
+    assert any(line.startswith("verification: 10 of 10 matches") for line in said[first:])
     expected = [(f"000001/{i:03d}.png", f"000000/{i:03d}.png") for i in range(PLACES)]
     assert loops(tmp_path / "M" / "000001" / "loops.csv") == expected
     before = contents(tmp_path / "M")
-    monkeypatch.setattr("loopclosure.methods.drive.MOST_PAIRS", 150)  # of two sessions, one
     assert main(["map", "query", "M", str(drives / "c"), *more, "--out", "found"]) == 0
     assert contents(tmp_path / "M") == before
     query = capsys.readouterr()
     assert "5 of 15 frames are in the map: found/loops.csv" in query.out
-    assert ("2 sessions are too many to compare at once: 1 are searched" in query.err) == (index != "p.db")
     found = loops(tmp_path / "found" / "loops.csv")
     assert [(query, match.partition("/")[2]) for query, match in found] == [
         (f"{i:03d}.png", f"{i + 5:03d}.png") for i in range(5)
@@ -112,10 +108,10 @@ def test_build_add_and_query(
 
 
 @pytest.mark.slow
-def test_each_frame_is_verified_in_the_most_similar_session_only(
+def test_the_time_of_a_query_does_not_grow_with_the_number_of_sessions(
     a_map: Map, drives: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The time of a query does not grow with the number of sessions: a match and an unlike pair for each frame."""
+    """The time of a query does not grow with the number of sessions: an image, a line and an unlike pair per frame."""
     for _ in range(3):
         a_map.add(read_sequence(drives / "b"), Thumbnailer())
     verified, agreement = [], GeometricCheck.agreement
@@ -124,11 +120,7 @@ def test_each_frame_is_verified_in_the_most_similar_session_only(
     remember_all(detector, read_sequence(drives / "c"))
     found = [result.accepted for result in last_session(detector, own=False).results]
     assert [None if match is None else match % PLACES for match in found] == [5, 6, 7, 8, 9] + [None] * PLACES
-    assert len(verified) <= 2 * len(found)
-    reasons = last_session(detector, own=False).reasons
-    sessions = {reason.partition(": ")[0] for reason in reasons}
-    assert sessions == {f"session {number:06d}" for number in range(len(a_map.sessions))}
-    assert f"session {len(a_map.sessions) - 1:06d}: no loop" in reasons  # and the reasons of those with loops
+    assert len(verified) <= 3 * len(found)
 
 
 DYING = (Path(__file__).parent / "programs" / "dying.py").read_text()

@@ -45,9 +45,7 @@ def test_features_replace_describe(two_laps, two_laps_features):
 
 @pytest.mark.slow
 def test_features_with_verification_read_the_images(two_laps, two_laps_features):
-    detector = LoopDetector(
-        exclude_recent=10, threshold=-0.2, check=GeometricCheck(max_features=100, min_inliers=8, ratio=0.9)
-    )
+    detector = LoopDetector(exclude_recent=10, threshold=-0.2, check=GeometricCheck(max_features=100, ratio=0.9))
     results = run_detector(detector, read_sequence(two_laps), read_features(two_laps_features))
     assert {r.verdict for r in results[20:]} <= {"accepted", "not verified"}
     assert all(r.inliers is not None for r in results[20:])

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loopclosure.decision.decider import Decider
 from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.images import ImageDecision
 from loopclosure.detector.run import put
 from loopclosure.detector.verification import Agreement, GeometricCheck, LocalFeatures
 
@@ -65,7 +65,7 @@ def test_a_lap_in_another_season_is_found_at_most_ten_frames_late(backwards: boo
 
 
 def test_points_of_which_only_a_part_agrees_speak_against_a_sequence(monkeypatch) -> None:
-    monkeypatch.setattr(ImageDecision, "points", 0.0)  # unlike pairs have none in common
+    monkeypatch.setattr(Decider, "_learn", lambda *_: None)  # unlike pairs have none in common
     assert not run_loops(LoopDetector(check=Alike()))
 
 
@@ -91,7 +91,8 @@ def test_a_saved_detector_continues_its_sequences(tmp_path) -> None:
     run(first, rows[:at])
     first.save(tmp_path / "x.npz")
     again = LoopDetector.load(tmp_path / "x.npz")
-    again._images.check = again.check = Said()
+    again._decider.check = again.check = Said()
+    again._decider._agree = lambda *_: Said.agreed
     image = np.zeros((2, 2), np.uint8)
     later = [again.add_descriptor(row, float(at + k), image=image) for k, row in enumerate(rows[at:])]
     assert [r.loops for r in later] == [r.loops for r in expected[at:]]

@@ -134,7 +134,7 @@ def test_settings_are_passed_to_their_part() -> None:
         ("unknown kind of features", "bow", "kind=surf"),
         (r"write verified\+METHOD", "verified", ""),
         ("k = 0; expected 1 or more", "verified+thumbnails", "k=0"),
-        ("expected at least 8", "verified+thumbnails", "min_inliers=3"),
+        ("expected at least 8", "verified+thumbnails", "max_features=3"),
         ("needs focal_px, center_x_px and center_y_px", "verified+thumbnails", "focal_px=300"),
         ('order of verified is "size"; expected score or inliers', "verified+thumbnails", "order=size"),
         ('verified has no setting "depth"', "verified+thumbnails", "depth=3"),

@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from loopclosure.decision.trajectories import SequenceSettings, trajectory_costs
 from loopclosure.errors import InputError
-from loopclosure.lines.trajectories import SequenceSettings, trajectory_costs
 from loopclosure.methods.base import Images, MethodContext, MethodResult, earlier
 from loopclosure.methods.named import make_method
 from loopclosure.methods.seqslam import (

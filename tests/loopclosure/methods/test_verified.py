@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from loopclosure.decision.trajectories import SequenceSettings
 from loopclosure.detector.verification import Agreement, GeometricCheck
-from loopclosure.lines.trajectories import SequenceSettings
 from loopclosure.methods.base import Images, MethodContext, MethodResult
 from loopclosure.methods.named import make_method
 from loopclosure.methods.seqslam import SeqSlam
@@ -112,8 +112,7 @@ def test_results_of_another_method_are_reused(walls, monkeypatch):
     scores = make_method("verified+thumbnails", context, {"verified.k": "6"}).score(images, silent).scores
     monkeypatch.setattr(GeometricCheck, "describe", None)
     monkeypatch.setattr(GeometricCheck, "agreement", None)
-    stricter = {"verified.k": "6", "verified.min_inliers": "25"}
-    again = make_method("verified+thumbnails", context, stricter).score(images, silent).scores
+    again = make_method("verified+thumbnails", context, {"verified.k": "6"}).score(images, silent).scores
     np.testing.assert_array_equal(scores, again)
 
 
@@ -150,7 +149,7 @@ def test_excluded_frames_are_not_candidates(walls):
 
 @pytest.mark.slow
 def test_a_known_camera(walls):
-    settings = {"focal_px": "260", "center_x_px": "160", "center_y_px": "120", "k": "12", "min_inliers": "25"}
+    settings = {"focal_px": "260", "center_x_px": "160", "center_y_px": "120", "k": "12"}
     method = make_method("verified+thumbnails", settings={f"verified.{key}": v for key, v in settings.items()})
     found = first(method.score(Images.of_files(walls), silent).scores, np.zeros(1))
     assert found == [(i, i - WALLS) for i in range(WALLS, 2 * WALLS)]

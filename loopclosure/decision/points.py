@@ -1,16 +1,19 @@
-"""Whether the points of the matches of a stretch speak against it."""
+"""What the points of two images say about a match: step 4 of the decision."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.special import betaln
 
-AGAINST = 0.01  # a stretch falls if the ratio of the likelihoods is less
-ALIKE = 0.25  # of the matches with enough points: if more of them agree only in part, places look alike
-# Evidence of a single image that is accepted by its points: once is not enough, the windows of a facade repeat and
-# agree more often than by chance. The more is needed where places look alike.
-SURE, SURE_AMONG_ALIKE = 1.5, 2.5
-LEAST_VERIFIED = 3  # fewer verified matches of a stretch do not tell whether they agree only in part
+from loopclosure.decision.constants import (
+    AGAINST,
+    ALIKE,
+    DECADE,
+    LEAST_VERIFIED,
+    PRECISION,
+    SURE,
+    SURE_AMONG_ALIKE,
+)
 
 Share = tuple[int, int]  # so many of so many
 
@@ -23,9 +26,10 @@ def look_alike(part: int | np.integer, many: int | np.integer) -> bool:
     return bool(part + 1 > ALIKE * (many + 2))
 
 
-def asked(alike: bool) -> float:
-    """Return the evidence that a single image needs."""
-    return SURE_AMONG_ALIKE if alike else SURE
+def wrong_share(evidence: np.ndarray, alike: bool) -> np.ndarray:
+    """Return the share (n,) of wrong ones that is expected among single images with this evidence."""
+    asked = SURE_AMONG_ALIKE if alike else SURE
+    return np.minimum(1, (1 - PRECISION) * 10 ** (-(evidence - asked) / DECADE))
 
 
 def in_part(verified: int, whole: int | np.integer) -> bool:
@@ -35,6 +39,10 @@ def in_part(verified: int, whole: int | np.integer) -> bool:
 
 def too_few(verified: Share, together: int, one: Share, two: Share) -> bool:
     """Return whether too few matches of a stretch are verified for one place.
+
+    Matches of one place are verified as often as frames of one visit that are as similar; matches of different places
+    as rarely as other pairs of different places. Where frames of one visit are not verified either, as in images of
+    64x32, points tell nothing.
 
     together  how many frames in a row tell no more than one
     one, two  how many pairs of frames of one visit, and of different places, are verified
