@@ -68,7 +68,7 @@ def test_a_query_says_where_the_camera_was(walks: Path, tmp_path: Path, capsys: 
     assert {row["relative"] for row in located} == {METRIC}
     assert len(located) >= 6
     position, rotation = np.median(errors(located, walks), axis=0)
-    assert position < 0.03
+    assert position < 0.04
     assert rotation < 1
     assert f"position {position:.2g} m (of {len(located)}), rotation {rotation:.2g} degrees" in said
     assert f"located in the frame of the map's poses: {len(located)} with position and rotation, 0 with" in said
@@ -82,7 +82,7 @@ def test_odometry_is_named_and_not_judged(walks: Path, tmp_path: Path, capsys: p
     rows, said = query(tmp_path / "map", walks, tmp_path / "out", capsys)
     located = [row for row in rows if row["map_by"]]
     assert {row["map_by"] for row in located} == {"odometry"}
-    assert np.median(errors(located, walks)[:, 0]) < 0.03
+    assert np.median(errors(located, walks)[:, 0]) < 0.04
     assert "by the map's odometry, which drifts" in said
     assert "median errors" not in said
 
