@@ -71,12 +71,6 @@ class Engine:
             return None
         try:
             model = self._model or self._open()
-        except Unable as fault:
-            self._give_up(str(fault))
-            return None
-        except SpecError:  # of the files
-            return None
-        try:
             found = model.run(inputs)
             if shapes not in self._passed:
                 self._check(inputs, found)
@@ -85,16 +79,17 @@ class Engine:
                     with suppress(OSError), (model.folder / SHAPES).open("a", encoding="utf-8") as file:
                         file.write(f"{shapes}\n")
             return found
-        except (Unable, ValueError):
+        except (Unable, ValueError) as fault:
+            if self._model is None and isinstance(fault, Unable):
+                self._give_up(str(fault))
             self._refused.add(shapes)
             return None
 
     def _open(self) -> Model:
         keep = self.is_stored or self._build()[1]
         self._model = Model(self._choice, self._key if keep else "", self._export)
-        listed = self._model.folder / SHAPES
-        if listed.is_file():
-            self._passed.update(listed.read_text("utf-8").splitlines())
+        with suppress(OSError):
+            self._passed.update((self._model.folder / SHAPES).read_text("utf-8").splitlines())
         return self._model
 
     def _export(self, path: Path) -> None:

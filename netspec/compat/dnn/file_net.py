@@ -15,7 +15,7 @@ import numpy as np
 from netspec import log
 from netspec.compat.dnn.caffe_files import CaffeFiles
 from netspec.compat.dnn.errors import BAD_ARGUMENT, NOT_FOUND, DnnError, as_dnn_error
-from netspec.compat.dnn.table import INPUT, Entry, make_table, nodes_of
+from netspec.compat.dnn.table import INPUT, Entry, make_table, nodes_of, outputs
 from netspec.data.blobs import Shape
 from netspec.errors import Where, did_you_mean
 
@@ -39,10 +39,12 @@ class FileNet:
     def __init__(self, files: CaffeFiles | None = None) -> None:
         self.files = files
         self.table: list[Entry] = make_table(files.net) if files else []
+        self.outputs = outputs(files.net) if files else {}
         self.numbers = {entry.name: number for number, entry in enumerate(self.table)}
         self.declared: dict[str, Shape | None] = files.inputs if files else {}
         self.shown = {blob: blob for blob in self.declared}
         self.values: dict[str, Array] = {}
+        self.device = "cpu"  # of PyTorch; the engine runs on the CPU
         self.of_shapes: tuple[dict[str, Shape], CaffeNet] | None = None
         self.runnable = files is None or files.weights is not None or not files.learns
         self.engine: Engine | None = None
@@ -91,21 +93,16 @@ class FileNet:
         records: list[logging.LogRecord] = []
         try:
             with as_dnn_error("forward" if given else "readNetFromCaffe"), log.held_back() as records:
-                return self.files.build(given)
+                return self.files.build(given, self.device)
         finally:
             log.write(records)
             self.is_silent = not records  # a net with warnings is built by each process, which gives them again
 
-    @cached_property
-    def outputs(self) -> dict[tuple[int, int], str]:
-        """The blobs that the net computes and no layer reads, by layer and index of the top."""
-        assert self.files is not None
-        found: dict[str, tuple[int, int]] = {}
-        for i, layer in enumerate(self.files.net.layer):
-            for blob in layer.bottom:
-                found.pop(blob, None)
-            found.update({blob: (i, j) for j, blob in enumerate(layer.top)})
-        return {top: blob for blob, top in found.items()}
+    def move(self, device: str) -> None:
+        """Run the net on this device from now on."""
+        self.device = device
+        if "net" in self.__dict__:
+            self.net.to(device)
 
     @cached_property
     def nodes(self) -> list[int]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from netspec import log
 from netspec.compat.dnn.caffe_files import CaffeFiles
 from netspec.compat.dnn.errors import BAD_ARGUMENT, NOT_FOUND, NOT_IMPLEMENTED, UNSPECIFIED, DnnError, as_dnn_error
 from netspec.compat.dnn.file_net import FileNet
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from netspec.run.walk import Step
 
 Array = np.ndarray
-INFERENCE_ENGINE = 2  # DNN_BACKEND_INFERENCE_ENGINE
+INFERENCE_ENGINE, CUDA = 2, 5  # DNN_BACKEND_...
 BIASED = ("Convolution", "Deconvolution", "InnerProduct", "Scale")
 AS_WRITTEN = "{} cannot change a net of Caffe's files; write the layer into the prototxt"
 PICTURE = "{} is not supported; netspec draw shows the layers, shapes and connections"
@@ -178,7 +179,7 @@ class Net:
 
     def _parameter(self, entry: Entry, index: int) -> Array:
         """Return a copy of a learnable blob; vectors are columns, but the bias of an InnerProduct is a row."""
-        array = _array(self._caffe.layer(self._caffe.net, entry).blobs[index].detach().numpy())
+        array = _array(self._caffe.layer(self._caffe.net, entry).blobs[index].detach().cpu().numpy())
         return array.reshape(1, -1) if entry.type == "InnerProduct" and index == 1 else array
 
     def _blob(self, entry: Entry, index: int, func: str) -> torch.Tensor:
@@ -283,7 +284,7 @@ class Net:
         """Return the tops, or None if one is not an output of the net, or if PyTorch must run it."""
         caffe = self._caffe
         names = [caffe.outputs.get((entry.layer, top), "") for entry, top in pins]
-        if caffe.engine is None or not all(names):
+        if caffe.engine is None or caffe.device != "cpu" or not all(names):
             return None
         values = caffe.engine.run(caffe.values)
         return [values[name] for name in names] if values is not None and values.keys() >= {*names} else None
@@ -293,7 +294,9 @@ class Net:
 
         with as_dnn_error(func), torch.inference_mode():
             net = self._caffe.net
-            self._check_weights(func)
+            if not self._caffe.runnable:
+                message = "this net was read without weights; also give the .caffemodel, or call setParam"
+                raise DnnError(message, self._caffe.where(), func=func)
             wanted = [self._value(net, entry, top, func) for entry, top in pins if entry.name != INPUT]
             try:
                 values = self._compute(net, wanted)
@@ -301,7 +304,7 @@ class Net:
                 raise self._with_shapes(fault, func) from None
         found = iter(wanted)
         given = [self._caffe.values[blob] for blob in self._caffe.declared]
-        return [given[max(top, 0)] if entry.name == INPUT else values[next(found)].numpy() for entry, top in pins]
+        return [given[max(top, 0)] if entry.name == INPUT else values[next(found)].cpu().numpy() for entry, top in pins]
 
     def _value(self, net: CaffeNet, entry: Entry, top: int, func: str) -> int:
         if top < 0:
@@ -339,16 +342,25 @@ class Net:
     # The engine, settings without effect, and unsupported methods
 
     def setPreferableBackend(self, backendId: int) -> None:
-        """Run the net with OpenVINO (DNN_BACKEND_INFERENCE_ENGINE), or else with the default engine.
+        """Run the net with OpenVINO (INFERENCE_ENGINE), with PyTorch on a GPU (CUDA), or else with the default engine.
 
-        Raises DnnError if OpenVINO is not installed.
+        Without a GPU there is a warning, as in OpenCV. Raises DnnError if OpenVINO is not installed.
         """
         if self._caffe.engine is not None:
             with as_dnn_error("setPreferableBackend"):
                 self._caffe.engine.choose(OPENVINO if backendId == INFERENCE_ENGINE else "")
+        device = "cpu"
+        if backendId == CUDA:
+            import torch
+
+            if torch.cuda.is_available():
+                device = "cuda"
+            else:
+                log.logger.warning("DNN_BACKEND_CUDA: torch finds no GPU on this machine; the net runs on the CPU")
+        self._caffe.move(device)
 
     def _accept(self, *settings: Any, **named: Any) -> None:
-        """Accept and ignore a setting: nets run on the CPU, and no switch changes a result."""
+        """Accept and ignore a setting: no switch changes a result."""
 
     setPreferableTarget = enableFusion = enableWinograd = setHalideScheduler = _accept
 
@@ -387,11 +399,6 @@ class Net:
                 raise DnnError(
                     f'no value for input "{shown}"; this net\'s inputs: {known}', self._caffe.where(), func=func
                 )
-
-    def _check_weights(self, func: str) -> None:
-        if not self._caffe.runnable:
-            message = "this net was read without weights; also give the .caffemodel, or call setParam"
-            raise DnnError(message, self._caffe.where(), func=func)
 
     def _with_shapes(self, fault: ValueError, func: str) -> DnnError:
         """Return an error of a run, with the shapes of the inputs that differ from the prototxt."""

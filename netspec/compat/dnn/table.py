@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 from netspec.graph.plan import Plan
 from netspec.proto.schema import LayerParameter, NetParameter
@@ -60,27 +59,29 @@ def _numbered(name: str, seen: Counter[str]) -> str:
     return name if seen[name] == 1 else f"{name}_{seen[name] - 1}"
 
 
-def edges(net: NetParameter, table: Sequence[Entry]) -> list[tuple[int, int]]:
-    """Return a pair of numbers (layer, reader) for each layer that reads a top of another."""
-    producer: dict[str, int] = {}
-    found: list[tuple[int, int]] = []
-    entries: dict[int, list[int]] = {}
-    for number, entry in enumerate(table):
-        entries.setdefault(entry.layer, []).append(number)
+def outputs(net: NetParameter) -> dict[tuple[int, int], str]:
+    """Return the blobs that no layer reads after the last one that writes them, by layer and index of the top."""
+    found: dict[str, tuple[int, int]] = {}
     for i, layer in enumerate(net.layer):
-        numbers = entries.get(i, [0])
-        readers = numbers if layer.type == "Convolution" else [numbers[0]] * len(layer.bottom)
-        found += [(producer[blob], n) for blob, n in zip(layer.bottom, readers, strict=False) if blob in producer]
-        found += pairwise(numbers) if layer.type == "Axpy" else ()
-        for j, blob in enumerate(layer.top):
-            producer[blob] = numbers[min(j, len(numbers) - 1)] if layer.type == "Convolution" else numbers[-1]
-    return found
+        for blob in layer.bottom:
+            found.pop(blob, None)
+        found.update({blob: (i, j) for j, blob in enumerate(layer.top)})
+    return {top: blob for blob, top in found.items()}
 
 
 def unconnected(net: NetParameter, table: Sequence[Entry]) -> list[int]:
     """Return the numbers of the layers whose tops no other layer reads."""
-    read = {number for number, _ in edges(net, table)}
-    return [number for number in range(len(table)) if number not in read]
+    unread = outputs(net)
+    inputs = [i for i, layer in enumerate(net.layer) if layer.type == "Input"]
+    found = []
+    for number, entry in enumerate(table):
+        tops = [(i, j) for i in (inputs if number == 0 else [entry.layer]) for j in range(len(net.layer[i].top))]
+        if entry.type == "Convolution":
+            tops = [(entry.layer, entry.top)]
+        is_half = number > 0 and entry.top < 0 and bool(tops)  # of an Axpy, which the other half reads
+        if not is_half and all(top in unread for top in tops):
+            found.append(number)
+    return found
 
 
 def nodes_of(plan: Plan, net: NetParameter) -> list[int]:

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from dnn_program import HERE, NETS
+from fake_gpu import GPUS, NAME, gpu
 from netspec import dnn
 from netspec.compat.dnn.engine import Engine
 from netspec.errors import SpecError
@@ -158,6 +160,34 @@ def test_an_engine_that_is_not_installed_is_an_error(monkeypatch: pytest.MonkeyP
         net.setPreferableBackend(dnn.DNN_BACKEND_INFERENCE_ENGINE)
     assert isinstance(caught.value, SpecError)
     assert caught.value.func == "setPreferableBackend"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not GPUS, reason="no GPU, and this torch cannot make a fake device")
+@pytest.mark.parametrize("name", sorted(NETS))
+def test_a_net_moves_to_a_gpu_and_back(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes = NETS[name][0]
+    expected = outputs(in_torch(read(name)), shapes)
+    if GPUS[-1] == NAME:  # it does not see operations in inference mode
+        monkeypatch.setattr(torch, "inference_mode", lambda mode=True: torch.set_grad_enabled(not mode))
+    with gpu(GPUS[-1]) as device:
+        for net in (read(name), in_torch(read(name))):  # not built yet, and built
+            net._caffe.move(device)
+            compare(outputs(net, shapes), expected)
+            assert net._caffe.net.device.type == device
+            layer = next(layer for layer in net.getLayerNames() if net.getLayer(layer).blobs)
+            net.setParam(layer, 0, net.getParam(layer))
+            compare(outputs(net, shapes), expected)
+            net.setPreferableBackend(dnn.DNN_BACKEND_DEFAULT)
+            compare(outputs(net, shapes), expected)
+
+
+@pytest.mark.skipif("cuda" in GPUS, reason="there is a GPU")
+def test_cuda_without_a_gpu_is_the_cpu_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    net, shapes = read("classify"), NETS["classify"][0]
+    net.setPreferableBackend(dnn.DNN_BACKEND_CUDA)
+    compare(outputs(net, shapes), outputs(in_torch(read("classify")), shapes))
+    assert len(caplog.records) == 1
 
 
 def test_ssds_layers_run_in_pytorch_with_a_warning_if_the_engine_was_chosen(caplog: pytest.LogCaptureFixture) -> None:
