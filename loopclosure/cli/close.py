@@ -58,9 +58,10 @@ def _close(a: argparse.Namespace) -> None:
         raise WrongUsage("--odometry-form needs --odometry")
     if a.seed is not None and a.drift is None:
         raise WrongUsage("--seed needs --drift")
+    given = intrinsics.from_text(a.camera) if a.camera else None
     source = typed(a.source, CLOSED)
     frames = sequence(source, out / "frames", odometry=a.odometry, form=a.odometry_form)
-    camera = intrinsics.from_text(a.camera) if a.camera else frames.camera
+    camera = given or frames.camera
     if camera is None:
         raise InputError(f"has no camera calibration; give --camera {intrinsics.FORM}", frames.source)
     odometry = _odometry(a, frames)[source.selection().numbers(len(frames))]

@@ -9,7 +9,7 @@ import numpy as np
 from loopclosure.decision.decider import Decider
 from loopclosure.detector.decision import LoopResult, Runs
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.verification import GeometricCheck
+from loopclosure.detector.verification import Agreement, GeometricCheck
 from loopclosure.errors import InputError
 
 
@@ -24,10 +24,16 @@ class Visitor:
         self.detector = detector
         self._count = 0
         self._runs: Runs = []
-        check, known = detector.check, detector.local_features
+        check = detector.check
         self._decider, self._local = None, None
         if check is not None:
-            self._decider = Decider(check=check, agree=lambda _, frame: check.agreement(self._local, known(frame)))
+            self._decider = Decider(check=check, agree=self._agreement)
+
+    def _agreement(self, _: int, frame: int) -> Agreement:
+        check, local = self.detector.check, self._local
+        assert check is not None, "only a detector with a check compares points"
+        assert local is not None
+        return check.agreement(local, self.detector.local_features(frame))
 
     @property
     def check(self) -> GeometricCheck | None:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.io import loadmat
 from scipy.sparse import issparse
 
 from loopclosure.errors import InputError
@@ -145,6 +144,8 @@ def _read_matrix(path: Path, keys: tuple[str, ...], what: str, last_columns: int
 
 
 def _read_mat(path: Path, keys: tuple[str, ...], what: str) -> np.ndarray:
+    from scipy.io import loadmat  # imported here: it imports threadpoolctl, which sets an environment variable
+
     try:
         found = loadmat(path)
     except NotImplementedError:

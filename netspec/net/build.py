@@ -10,8 +10,6 @@ import os
 from pathlib import Path
 
 from netspec import log
-from netspec.errors import SpecError
-from netspec.files.kinds import nearest_existing
 from netspec.files.limits import no_collection
 from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
@@ -55,13 +53,14 @@ def build_filtered(filtered: NetParameter, source: SourceMap, options: BuildOpti
     return built
 
 
-def check_sources(net: NetParameter, source: SourceMap) -> None:
+def check_sources(net: NetParameter, source: SourceMap, options: BuildOptions) -> None:
     """Raise SpecError for the first data layer of a filtered net whose source does not exist.
 
-    Building the net would raise an error too, but perhaps after a long log.
+    Building the whole net would raise the same error, but perhaps after a long log.
     """
     for i, layer in enumerate(net.layer):
         path = source_of(layer)
         if path and not os.path.exists(path):
-            where = source.at(i, layer=layer.name, type=layer.type)
-            raise SpecError(f'"{path}" does not exist{nearest_existing(path)}', where)
+            only = NetParameter(layer=[layer], state=net.state)
+            with log.silent():
+                build_filtered(only, source.with_layers([source.layers[i]]), options)  # the layer raises the error

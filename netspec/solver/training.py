@@ -110,7 +110,7 @@ class Training:
         with log.held_back() as lines:  # report missing files before Caffe's log, which is long
             filtered = [described.filtered() for described in nets.solver_nets(param, self.node)]
             for part in filtered if self.is_root else filtered[:1]:
-                check_sources(part.net, part.source)
+                check_sources(part.net, part.source, self.options.build)
         self.devices = self._chosen_devices()
         self.device = self.devices[0]
         log.dump("solver.cpp:45", "Initializing solver from parameters: ", write_text(param).rstrip("\n"))

@@ -105,6 +105,8 @@ DOORS = {
     "netspec/compat/pycaffe/detector.py: Detector.__init__",
     # Copied into the source that `netspec export` writes, where a call shows a layer's blobs and fields one by one.
     "netspec/export/layers/recurrent.py: rnn",
+    "loopclosure/decision/decider.py: Decider._fallen",
+    "loopclosure/detector/detector.py: LoopDetector._looked_at",
     "netspec/export/layers/recurrent.py: lstm",
     "netspec/export/dialects/ssd.py: detection_output",
     "netspec/export/dialects/ssd.py: prior_boxes",

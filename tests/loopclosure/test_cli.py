@@ -220,7 +220,7 @@ def expanded(line: str, **names: object) -> list[str]:
         ("NOWHERE.npz: no such file", "evaluate LAPS --method features:NOWHERE.npz --out OUT"),
         ("cannot be read", "detect NOWHERE --threshold 1 --out OUT"),
         ("expected module:function", "detect LAPS --threshold 1 --describe nothing --out OUT"),
-        ("FEATURES: File exists", "detect LAPS --threshold 0.5 --out FEATURES"),
+        ("FEATURES: cannot be written: Not a directory", "detect LAPS --threshold 0.5 --out FEATURES"),
         ("cannot exclude 0 frames, nan s", "evaluate LAPS --exclude-seconds nan --method thumbnails --out OUT"),
     ],
 )

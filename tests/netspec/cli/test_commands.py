@@ -271,11 +271,15 @@ def test_typos_are_reported_with_suggestions(run: Run, edited: Edit) -> None:
 
 
 @pytest.mark.parametrize(
-    "kind",
-    ['"Data" data_param { backend: LMDB', '"ImageData" image_data_param {', '"HDF5Data" hdf5_data_param {'],
+    ("kind", "says"),
+    [
+        ('"Data" data_param { backend: LMDB', 'database "gone" does not exist'),
+        ('"ImageData" image_data_param {', 'list file "gone" cannot be read: No such file or directory'),
+        ('"HDF5Data" hdf5_data_param {', 'list file "gone" cannot be read: No such file or directory'),
+    ],
     ids=["database", "images", "hdf5"],
 )
-def test_a_missing_source_is_reported_before_the_log(run: Run, kind: str) -> None:
+def test_a_missing_source_is_reported_before_the_log(run: Run, kind: str, says: str) -> None:
     """Even if it is the last one, of the net that tests."""
     Path("net.prototxt").write_text(
         'layer { name: "a" type: "DummyData" top: "a" dummy_data_param { shape { dim: 1 dim: 2 } } }\n'
@@ -290,7 +294,7 @@ def test_a_missing_source_is_reported_before_the_log(run: Run, kind: str) -> Non
     )
     line = run("train", "solver.prototxt").err.rstrip("\n")
     assert line.startswith("net.prototxt:2:")
-    assert line.endswith(f'"gone" does not exist; relative paths start from {Path.cwd()}')
+    assert line.endswith(f"{says}; relative paths start from {Path.cwd()}")
     assert "\n" not in line
 
 

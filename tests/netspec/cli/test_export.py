@@ -143,7 +143,7 @@ def test_preprocessing_is_exported(onnx: Any, net: Net, run: Run) -> None:
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("no/net.onnx: there is no folder no; create it first", "--to onnx --out no/net.onnx"),
+        ("no/net.onnx: cannot be written: No such file or directory", "--to onnx --out no/net.onnx"),
         ("--out net.txt: expected a name that ends in .py", "--to torch --out net.txt"),
         ('no data layer has a top "dat"; did you mean "data"?', "--to onnx --out n.onnx --shape dat=1,3,8,8"),
         ("no.npy: cannot be read as an array", "--to onnx --out n.onnx --mean no.npy"),

@@ -74,9 +74,9 @@ class X(caffe.Layer):
 memory = caffe.Net('memory.prototxt', caffe.TRAIN)
 memory.set_input_arrays(np.ones((4, 1, 2, 3), np.float32), np.float32([0, 1, 2, 0]))
 assert memory.forward()['loss'] > 0
-assert memory.blobs['label'].data.tolist() == [0, 1]
+assert memory.blobs['label'].data.ravel().tolist() == [0, 1]
 memory.forward()
-assert memory.blobs['label'].data.tolist() == [2, 0]
+assert memory.blobs['label'].data.ravel().tolist() == [2, 0]
 """,
     "net.blobs[..].data.copy": "a = net.blobs['data'].data.copy(); a += 1; assert not net.blobs['data'].data.any()",
     ".forward_all(**)": "assert net.forward_all(**{net.inputs[0]: images})['prob'].shape == (5, 5)",

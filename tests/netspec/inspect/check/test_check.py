@@ -49,7 +49,7 @@ def files(run: Run) -> None:
             writer.put(b"%d" % i, array_to_datum(np.zeros((3, 6, 8), np.uint8)).SerializeToString())
     write_mean("mean.binaryproto", np.zeros((3, 9, 9), np.float32))
     cv2.imwrite("0.png", np.zeros((6, 8, 3), np.uint8))
-    Path("empty.txt").write_text("# nothing\n")
+    Path("empty.txt").write_text("\n")
     Path("names.txt").write_text("0.png\n")
     Path("nix.txt").write_text("nix.png 0\n0.png 0\n")
     Path("rows.txt").write_text("rows.h5\n")
