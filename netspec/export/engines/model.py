@@ -124,6 +124,8 @@ def onnxruntime_runner(path: Path, precision: str) -> Runner:
     options: Any = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # errors
     options.intra_op_num_threads = threads()
+    # Threads that wait in a loop would take the cores from those of a program's other nets.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
     wanted = {given.name for given in session.get_inputs()}
