@@ -147,7 +147,7 @@ def in_torch(net: Net, inputs: Arrays) -> list[Arrays]:
 def in_engines(net: Net, inputs: Arrays, text: str) -> list[Arrays]:
     """Return the outputs of onnxruntime and of OpenVINO for the ONNX model, except what an engine cannot run."""
     model, _ = onnx_model(net)
-    if not net.outputs:
+    if not net.outputs or not model.graph.node:  # onnxruntime opens no graph without nodes
         return []
     found: list[Arrays] = [in_onnxruntime(model, inputs)]
     if importlib.util.find_spec("openvino") is None:
