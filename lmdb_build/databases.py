@@ -205,9 +205,8 @@ class _Workers:
     def __enter__(self) -> _Workers:
         if self._count > 1:
             # Fork on Linux: a spawned process could not import a script that was read from standard input. On macOS
-            # a forked process can crash in system libraries that were used before; Windows has no fork.
-            can_fork = sys.platform == "linux" and "fork" in multiprocessing.get_all_start_methods()
-            context = multiprocessing.get_context("fork" if can_fork else "spawn")
+            # a forked process can crash in system libraries that were used before.
+            context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
             self._pool = ProcessPoolExecutor(self._count, context, initializer=_start_worker)
             self._pool.submit(os.getpid)  # forks now, before the progress bar has a thread
         return self

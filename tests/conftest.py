@@ -26,7 +26,7 @@ LIBRARIES = (
     "QT",
 )  # libraries that set variables when they are used
 LOGGERS = [logging.getLogger(name) for name in ("", "netspec", "loopclosure", "lmdb_build")]
-SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)]  # Windows has no SIGHUP
+SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 VENV = Path(os.environ.get("VENV") or ROOT / ".venv").absolute()
-PROGRAMS = VENV / ("Scripts" if os.name == "nt" else "bin")
+PROGRAMS = VENV / "bin"
 TEMPORARY = VENV / "tmp"  # pip unpacks gigabytes, and the system's folder may be in memory
 JETSON = Path("/etc/nv_tegra_release")
 NVIDIA = Path("/proc/driver/nvidia")
@@ -28,7 +28,7 @@ SMALL_ON_ARM = ("torch<2.11",)  # the last versions whose wheel for ARM64 has no
 
 def program(name: str) -> str:
     """Return the path of a program of the environment."""
-    return str(PROGRAMS / (f"{name}.exe" if os.name == "nt" else name))
+    return str(PROGRAMS / name)
 
 
 def install(cpu: bool = False) -> None:

@@ -1,7 +1,6 @@
 """Used by each script in this folder: runs a command of the packages in this project."""
 
 import os
-import subprocess
 import sys
 from importlib import import_module
 from importlib.util import find_spec
@@ -9,7 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"  # made by tools/install.py
-PYTHON = VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+PYTHON = VENV / "bin" / "python"
 REQUIRED = ("torch", "google.protobuf", "lmdb", "cv2")  # commands import some of these late, or in another process
 
 
@@ -29,10 +28,7 @@ def run(module: str, *words: str) -> int:
         return import_module("netspec.terminal.main").program(module)
     except ModuleNotFoundError as fault:
         if PYTHON.is_file() and Path(sys.prefix).resolve() != VENV.resolve():
-            command = [str(PYTHON), *typed]
-            if os.name == "nt":  # its execv does not wait
-                return subprocess.call(command)
-            os.execv(PYTHON, command)
+            os.execv(PYTHON, [str(PYTHON), *typed])
         needed = f"to install the required packages: {sys.executable} {ROOT / 'tools' / 'install.py'}"
         print(f"{sys.argv[0]}: {fault.msg} for {sys.executable}; {needed}", file=sys.stderr)
         return 1

@@ -85,7 +85,6 @@ def print_results(folder: Path, log: Path) -> None:
     before, after = map(float, found.groups()) if found else (float("nan"), float("nan"))
     out = shown(folder)
     activate = PROGRAMS / "activate"
-    source = "" if os.name == "nt" else "source "
     print(f"A small net, trained here, labels {accuracy:.0f} of 100 pairs of a new house correctly: ", end="")
     print(out / "compare" / "distances.png")
     print("The loops reduce the error of the path through that house ", end="")
@@ -93,7 +92,7 @@ def print_results(folder: Path, log: Path) -> None:
     print(f"More pictures: {out / 'pairs.png'}, {out / 'compare' / 'losses.png'} ", end="")
     print(f"and the report {out / 'report' / 'report.html'}")
     print(f"What each command printed: {shown(log)}")
-    print(f"To continue there: {source}{shown(activate)} && cd {out}")
+    print(f"To continue there: source {shown(activate)} && cd {out}")
 
 
 def shown(path: Path) -> Path:

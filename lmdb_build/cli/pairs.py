@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import os
 from pathlib import Path
 
 from lmdb_build.pairs.build import Plan, build_lists
 from lmdb_build.pairs.by_list import MaskSource, TraverseSource, folders_source
 from lmdb_build.pairs.by_pose import NEGATIVES, PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import SPLITS, PairSource
-from lmdb_build.pairs.list_file import common_folder, join_lists, root_of, write_contact_sheet
+from lmdb_build.pairs.list_file import join_lists, root_of, write_contact_sheet
 from loopclosure.descriptors.feature_file import read_features
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
@@ -243,7 +244,7 @@ def _source(arguments: argparse.Namespace) -> tuple[PairSource, Path]:
     places = [sequence.source.resolve().parent for sequence in sequences]
     if kind not in SEQUENCES:
         places = [path, *(other for other in (first.get("references", Path),) if other)]
-    root = arguments.root or Path(relative(common_folder([place.resolve() for place in places])))
+    root = arguments.root or Path(relative(os.path.commonpath([place.resolve() for place in places])))
     if sequences:
         return _pose_source(arguments, sequences, root), root
     min_gap = None if arguments.min_gap is None else int(arguments.min_gap)

@@ -31,18 +31,6 @@ ROOT_FOLDER = (
 _WORD = re.compile(r'"([^"]*)"|(\S+)')
 
 
-def common_folder(paths: Sequence[Path]) -> Path:
-    """Return the innermost folder that contains all of the paths, which are absolute.
-
-    Raises SpecError if they are on different drives, as they can be on Windows.
-    """
-    try:
-        return Path(os.path.commonpath(paths))
-    except ValueError:
-        named = ", ".join(map(str, dict.fromkeys(paths)))
-        raise SpecError(f"{named}: are on different drives, so they have no common folder; move one of them") from None
-
-
 @dataclass(frozen=True)
 class ListedPair:
     """One line of a list: two image names below the root folder, and 1 for the same place, 0 for other places."""
@@ -122,7 +110,7 @@ def join_lists(lists: Sequence[Path], out: Path, seed: int, root: Path | None = 
     Image names become relative to ``root`` or to the common parent of the lists' roots.
     """
     roots = [root_of(path).resolve() for path in lists]
-    common = common_folder(roots) if root is None else root.resolve()
+    common = Path(os.path.commonpath(roots)) if root is None else root.resolve()
     pairs = []
     for path, own_root in zip(lists, roots, strict=True):
         prefix = relative(own_root, common)

@@ -145,9 +145,11 @@ def _solve(arguments: argparse.Namespace, path: str, processes: Processes) -> in
     if arguments.tensorboard and processes.is_root:
         writer_class()  # a missing package is reported before the log of the nets
 
-    effects = {signal.SIGINT: arguments.sigint_effect, signal.SIGTERM: "stop"}
-    if hasattr(signal, "SIGHUP"):  # Windows has none
-        effects[signal.SIGHUP] = arguments.sighup_effect
+    effects = {
+        signal.SIGINT: arguments.sigint_effect,
+        signal.SIGTERM: "stop",
+        signal.SIGHUP: arguments.sighup_effect,
+    }
     with _signals(effects) as action:
         processes.is_ending = lambda: bool(action.stopped_by)
         solver = processes.together(lambda: _load(arguments, path, action, processes))

@@ -174,10 +174,7 @@ class _LmdbReader(Reader):
 
 # While it is held, the library has a file open. A process is forked only in between.
 _lmdb_lock = threading.Lock()
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(
-        before=_lmdb_lock.acquire, after_in_parent=_lmdb_lock.release, after_in_child=_lmdb_lock.release
-    )
+os.register_at_fork(before=_lmdb_lock.acquire, after_in_parent=_lmdb_lock.release, after_in_child=_lmdb_lock.release)
 
 
 def _stamp(path: str) -> tuple[int, ...] | None:
@@ -205,7 +202,7 @@ class _LevelDbReader(Reader):
         for name in set(os.listdir(source)) - {"LOCK", "LOG", "LOG.old"}:
             if name.endswith(".log") and _ends_within_a_record(Path(source, name)):
                 raise ValueError(f"is damaged: its file {name} is truncated; copy or write the database again")
-            _link(os.path.abspath(os.path.join(source, name)), os.path.join(folder, name))
+            os.symlink(os.path.abspath(os.path.join(source, name)), os.path.join(folder, name))
         try:
             self._db = library.DB(folder, create_if_missing=False, paranoid_checks=True)
             with self._db.iterator(include_value=False, verify_checksums=True) as keys:
@@ -237,15 +234,6 @@ class _LevelDbReader(Reader):
     @property
     def is_current(self) -> bool:
         return _contents(self._source) == self._stamp
-
-
-def _link(file: str, link: str) -> None:
-    """Make a symbolic link to a file; where that is not allowed (Windows), a hard link; on another drive, a copy."""
-    for make in (os.symlink, os.link, shutil.copyfile):
-        with suppress(OSError):
-            make(file, link)
-            return
-    raise OSError(f"cannot be copied to {os.path.dirname(link)}")
 
 
 def _runs(numbers: Sequence[int]) -> Iterator[slice]:

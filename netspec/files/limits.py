@@ -33,33 +33,12 @@ def memory() -> int:
     """
     try:
         machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return _memory_of_windows() or 8 << 30
+    except (ValueError, OSError):
+        return 8 << 30
     try:
         return min(machine, int(_CONTAINER.read_text("ascii")))
     except (ValueError, OSError):  # no limit, or no container
         return machine
-
-
-class _MemoryStatus(ctypes.Structure):
-    """Windows: MEMORYSTATUSEX of sysinfoapi.h."""
-
-    _fields_ = (
-        ("length", ctypes.c_uint32),
-        ("load", ctypes.c_uint32),
-        ("total", ctypes.c_uint64),
-        ("others", ctypes.c_uint64 * 6),
-    )
-
-
-def _memory_of_windows() -> int:
-    """Return the bytes of the machine's memory on Windows; 0 elsewhere, or if Windows does not report it."""
-    status = _MemoryStatus(length=ctypes.sizeof(_MemoryStatus))
-    try:
-        done = ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))  # pyright: ignore
-    except (AttributeError, OSError):
-        return 0
-    return status.total if done else 0
 
 
 def is_out_of_memory(fault: BaseException) -> bool:

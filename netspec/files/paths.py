@@ -9,12 +9,8 @@ from netspec.errors import SpecError, Where
 
 
 def relative(path: str | Path, folder: str | Path = os.curdir) -> str:
-    """Return a path relative to a folder, with slashes; the absolute path if it is on another drive."""
-    try:
-        found = os.path.relpath(path, folder)
-    except ValueError:
-        found = os.path.abspath(path)
-    return Path(found).as_posix()
+    """Return a path relative to a folder, with slashes."""
+    return Path(os.path.relpath(path, folder)).as_posix()
 
 
 def inside(folder: str | Path, *names: str) -> Path:

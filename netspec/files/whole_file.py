@@ -1,13 +1,13 @@
 """Writing files and folders completely or not at all, lock files, and a check whether a path is writable.
 
 An unfinished file has a hidden name next to its path, ``.NAME.XXXXXXXX.unfinished``, and is locked. If its process is
-killed, the next process that writes into the same folder removes it. Windows can neither rename an open file nor open a
-folder: there, what a killed process left stays.
+killed, the next process that writes into the same folder removes it.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import re
 import secrets
@@ -17,22 +17,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from netspec.errors import Code, SpecError, Where
-
-try:
-    import fcntl
-except ImportError:
-    fcntl: Any = None
-    import msvcrt
 
 NO_NUL = "a file name cannot contain a NUL character"
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.unfinished")
 _MARK = re.compile(rb"a lock of netspec, held by process (\d+)\n")
-# No links, no waiting for pipes, no conversion of line ends.
-_AS_IT_IS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-_FAR = 0x7FFFFFFF  # Windows: a locked byte cannot be read, so one behind every content is locked
+_AS_IT_IS = os.O_NOFOLLOW | os.O_NONBLOCK  # no links, no waiting for pipes
 _swept: set[Path] = set()
 
 
@@ -59,7 +50,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
             if before is not None:
                 os.chmod(unfinished, 0o600)
             yield unfinished
-            if before is not None and hasattr(os, "fchown"):  # Windows has none
+            if before is not None:
                 _pass_on(before, held)
             os.fsync(held)
     except OSError as fault:
@@ -105,7 +96,6 @@ def only_one(path: str | Path, advice: str) -> Iterator[None]:
     except OSError as error:
         raise _unwritable(error.strerror, path) from None
     try:
-        os.lseek(held, 0, os.SEEK_SET)  # Windows: a lock that another process holds leaves it elsewhere
         text = os.read(held, 100)
         owner = _MARK.fullmatch(text)
         if text and not owner:
@@ -119,12 +109,9 @@ def only_one(path: str | Path, advice: str) -> Iterator[None]:
         try:
             yield
         finally:
-            if fcntl is not None:
-                _remove(path)  # while it is locked, so that it is not the next owner's
+            _remove(path)  # while it is locked, so that it is not the next owner's
     finally:
         os.close(held)
-    if fcntl is None:
-        _remove(path)  # Windows refuses this if the next owner has opened it
 
 
 def why_unwritable(path: str | Path) -> str:
@@ -161,8 +148,7 @@ def why_no_folder(path: str | Path) -> str:
 
 
 def _denied(folder: Path) -> str:
-    read_only = hasattr(os, "statvfs") and os.statvfs(folder).f_flag & os.ST_RDONLY  # Windows has no statvfs
-    return os.strerror(errno.EROFS if read_only else errno.EACCES)
+    return os.strerror(errno.EROFS if os.statvfs(folder).f_flag & os.ST_RDONLY else errno.EACCES)
 
 
 @contextmanager
@@ -170,22 +156,15 @@ def _unfinished(path: Path, folder: bool = False) -> Iterator[tuple[Path, int]]:
     """Yield a new file or folder, locked, and its descriptor; at the end rename it, or remove it if the block fails."""
     _sweep(path.parent)
     unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.unfinished")
-    held = -1
     try:
-        if not folder:
-            held, _ = _open_locked(unfinished, os.O_CREAT | os.O_EXCL | os.O_RDWR)
-        else:
+        if folder:
             unfinished.mkdir()
-            held = -1 if fcntl is None else _open_locked(unfinished, os.O_RDONLY)[0]
+        held, _ = _open_locked(unfinished, os.O_RDONLY if folder else os.O_CREAT | os.O_EXCL | os.O_RDWR)
         try:
             yield unfinished, held
-            if fcntl is not None:
-                unfinished.replace(path)  # while it is locked, so that no sweep removes it
+            unfinished.replace(path)  # while it is locked, so that no sweep removes it
         finally:
-            if held >= 0:
-                os.close(held)
-        if fcntl is None:
-            unfinished.replace(path)
+            os.close(held)
         _sync(path.parent)
     finally:
         _remove(unfinished)
@@ -201,13 +180,13 @@ def _pass_on(before: os.stat_result, held: int) -> None:
     os.fchmod(held, mode if os.fstat(held).st_gid == before.st_gid else mode & ~0o070)
 
 
-def _open_locked(path: Path, flags: int, mode: int = 0o666) -> tuple[int, bool]:
+def _open_locked(path: Path, flags: int) -> tuple[int, bool]:
     """Open a file and lock it; return its descriptor, and False if another process holds the lock.
 
     If another process removes the file before it is locked, it is opened again.
     """
     while True:
-        held = os.open(path, flags | _AS_IT_IS, mode)
+        held = os.open(path, flags | _AS_IT_IS, 0o666)
         locked = _lock(held) is not False
         with suppress(FileNotFoundError):
             if not locked or os.path.samestat(os.fstat(held), path.stat()):
@@ -218,13 +197,8 @@ def _open_locked(path: Path, flags: int, mode: int = 0o666) -> tuple[int, bool]:
 def _lock(descriptor: int) -> bool | None:
     """Lock an open file. Return False if another process holds the lock, and None if locks are not supported."""
     try:
-        if fcntl is not None:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        else:
-            os.lseek(descriptor, _FAR, os.SEEK_SET)
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
-            os.lseek(descriptor, 0, os.SEEK_SET)
-    except (BlockingIOError, PermissionError):
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
         return False
     except OSError:
         return None
@@ -233,7 +207,7 @@ def _lock(descriptor: int) -> bool | None:
 
 def _sweep(folder: Path) -> None:
     """Remove the unfinished files of killed processes, which nobody locks, from a folder, once per process."""
-    if folder in _swept or fcntl is None:
+    if folder in _swept:
         return
     _swept.add(folder)
     with suppress(OSError):
@@ -257,7 +231,7 @@ def _remove(path: Path) -> None:
 def _sync(path: Path) -> None:
     """Sync a file or a folder to disk: a power failure could undo a rename. Not all systems can do this for folders."""
     with suppress(OSError) if path.is_dir() else nullcontext():
-        descriptor = os.open(path, os.O_RDONLY if fcntl is not None else os.O_RDWR)  # Windows syncs what can be written
+        descriptor = os.open(path, os.O_RDONLY)
         try:
             os.fsync(descriptor)
         finally:

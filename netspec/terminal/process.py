@@ -33,9 +33,7 @@ def keep_freed_memory() -> None:
     """
     import ctypes
 
-    if any(name in os.environ for name in _MALLOC_SETTINGS) or not hasattr(os, "confstr"):
-        return
-    if "CS_GNU_LIBC_VERSION" not in os.confstr_names:
+    if any(name in os.environ for name in _MALLOC_SETTINGS) or "CS_GNU_LIBC_VERSION" not in os.confstr_names:
         return
     library = ctypes.CDLL(None)
     library.mallopt(_MMAP_THRESHOLD, _LARGEST)
@@ -49,8 +47,7 @@ def end_forked_processes_by_sigterm() -> None:
     A forked process inherits signal handlers. netspec's handlers wait for things that only the parent does, such as the
     end of an iteration. Python layers and scripts end their workers by SIGTERM, and then wait for them.
     """
-    if hasattr(os, "register_at_fork"):  # Windows has no fork
-        os.register_at_fork(after_in_child=_end_by_sigterm)
+    os.register_at_fork(after_in_child=_end_by_sigterm)
 
 
 def _end_by_sigterm() -> None:

@@ -44,7 +44,6 @@ _EXAMPLES: dict[str, tuple[str, list[str]]] = {  # in the build folder only
     "examples/siamese/convert_mnist_siamese_data": (_BUILD, ["mnist", "--pairs", "--backend=leveldb"]),
     "examples/cifar10/convert_cifar_data": (_BUILD, ["cifar"]),
 }
-_WINDOWS = sys.platform == "win32"
 
 
 def install_caffe() -> list[Path]:
@@ -108,7 +107,7 @@ def remove_build_folder(folder: Path) -> list[Path]:
 
 def _build_paths(folder: Path) -> dict[Path, tuple[str, list[str]]]:
     commands = {f"tools/{name}": command for name, command in _COMMANDS.items()} | _EXAMPLES
-    return {folder / _file(f"{name}{end}"): command for name, command in commands.items() for end in ("", ".bin")}
+    return {folder / f"{name}{end}": command for name, command in commands.items() for end in ("", ".bin")}
 
 
 def _package() -> Path:
@@ -116,18 +115,11 @@ def _package() -> Path:
 
 
 def _script(name: str) -> Path:
-    return Path(sysconfig.get_path("scripts"), _file(name))
-
-
-def _file(command: str) -> str:
-    """Return the name of a command's file. Windows starts only files whose extension it knows."""
-    return f"{command}.cmd" if _WINDOWS else command
+    return Path(sysconfig.get_path("scripts"), name)
 
 
 def _command(module: str, words: list[str]) -> str:
-    # On Windows the first line is a batch file that runs the other lines with Python, which skips the first (-x).
-    first = f'@"{sys.executable}" -x "%~f0" %* & exit /b' if _WINDOWS else f"#!{sys.executable}"
-    return f"""{first}
+    return f"""#!{sys.executable}
 {_MARK}
 import sys
 

@@ -11,7 +11,6 @@ from lmdb_build.pairs.build import Plan, Split, build_lists, report
 from lmdb_build.pairs.by_list import PlaceSource
 from lmdb_build.pairs.choose import NEGATIVE, Wanted, choose_pairs, hard_negatives
 from lmdb_build.pairs.list_file import (
-    common_folder,
     contact_sheet,
     join_lists,
     read_pair_list,
@@ -22,7 +21,6 @@ from lmdb_build.pairs.list_file import (
 )
 from loopclosure.descriptors.feature_file import Features
 from loopclosure.errors import InputError
-from netspec.errors import SpecError
 
 
 def picture(seed: int, height: int = 60, width: int = 80) -> np.ndarray:
@@ -44,19 +42,6 @@ def ring(count: int = 30) -> PlaceSource:
     places = [str(number) for number in range(count)]
     positives = [(number, number + count) for number in range(count)]
     return PlaceSource([(f"{side}/{place}.png", place) for side in "ab" for place in places], positives, {})
-
-
-class TestCommonFolder:
-    def test_paths_on_one_drive(self, tmp_path: Path) -> None:
-        assert common_folder([tmp_path / "a" / "b", tmp_path / "a" / "c"]) == tmp_path / "a"
-
-    def test_paths_on_two_drives(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        def refuse(paths: object) -> str:
-            raise ValueError("Paths don't have the same drive")
-
-        monkeypatch.setattr(os.path, "commonpath", refuse)
-        with pytest.raises(SpecError, match=r"^/c/a, /d/b: are on different drives, so they have no common folder"):
-            common_folder([Path("/c/a"), Path("/d/b")])
 
 
 class TestFile:

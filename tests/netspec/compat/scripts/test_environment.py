@@ -1,7 +1,6 @@
 """The switch that puts a package ``caffe`` and Caffe's commands into an environment, in one made for the test."""
 
 import subprocess
-import sys
 import sysconfig
 import venv
 from pathlib import Path
@@ -9,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from netspec.compat.scripts import environment as environment_module
 from paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -153,20 +151,3 @@ def test_a_real_build_is_not_changed(environment: Path) -> None:
     assert "build/tools/caffe: already exists and is not netspec's; choose another folder" in refused
     run(environment, "python", "-m", "netspec", "remove-caffe", "--build", "build")
     assert [path for path in (environment / "build").rglob("*") if path.is_file()] == [tool]
-
-
-def test_on_windows_a_command_is_a_batch_file_that_starts_python(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """cmd.exe runs the first line alone; Python skips it (-x) and runs the others."""
-    monkeypatch.setattr(environment_module, "_WINDOWS", True)
-    paths = environment_module.make_build_folder(tmp_path / "build")
-    command = tmp_path / "build" / "tools" / "caffe.cmd"
-    assert command in paths
-    first = command.read_text().splitlines()[0]
-    assert first == f'@"{sys.executable}" -x "%~f0" %* & exit /b'
-    done = subprocess.run(
-        [sys.executable, "-x", command, "--help"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.stdout.startswith("usage: ")
-    assert sorted(environment_module.remove_build_folder(tmp_path / "build")) == sorted(paths)

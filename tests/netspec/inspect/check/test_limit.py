@@ -1,11 +1,8 @@
 """The limit of memory: nets and files above it are refused in one line, with the size, the layer and the place."""
 
-import ctypes
 import math
-import os
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -317,17 +314,3 @@ def test_the_number_of_suggestions_is_limited(net_of: Callable[..., Net], monkey
     monkeypatch.setattr(splits, "did_you_mean", lambda blob, known: asked.append(blob) or "")
     net_of(unknown(100), report=lambda fault: None)
     assert len(asked) == splits.MOST_HINTS
-
-
-def test_windows_reports_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    def report(pointer: Any) -> int:
-        status = pointer._obj
-        assert status.length == ctypes.sizeof(status) == 64
-        status.total = 3 * MIB
-        return 1
-
-    monkeypatch.delattr(os, "sysconf")
-    assert limits.memory() == 8 << 30
-    kernel = SimpleNamespace(GlobalMemoryStatusEx=report)
-    monkeypatch.setattr(ctypes, "windll", SimpleNamespace(kernel32=kernel), raising=False)
-    assert limits.memory() == 3 * MIB
