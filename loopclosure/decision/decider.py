@@ -13,8 +13,6 @@ from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from loopclosure.decision.constants import AGES, PRECISION, SAMPLE, SURE, VELOCITIES, WINDOW
 from loopclosure.decision.growing import Growing
@@ -398,8 +396,13 @@ class Decider:
 def stretches(loops: np.ndarray, pairs: np.ndarray) -> list[np.ndarray]:
     """Return the queries of each stretch of loops (Q,): loops that are neighbors, and neighbors of these."""
     linked = pairs[loops[pairs].all(axis=1)]
-    links = coo_matrix((np.ones(len(linked)), linked.T), shape=(len(loops), len(loops)))
-    numbers, queries = connected_components(links, directed=False)[1], np.flatnonzero(loops)
+    numbers, queries = np.arange(len(loops)), np.flatnonzero(loops)
+    while len(linked):  # each gets the number of the first query that it is linked to, until that is the stretch's
+        np.minimum.at(numbers, linked.max(axis=1), linked.min(axis=1))
+        while not np.array_equal(numbers, first := numbers[numbers]):
+            numbers = first
+        linked = numbers[linked]
+        linked = linked[linked[:, 0] != linked[:, 1]]
     order = np.argsort(numbers[queries], kind="stable")
     return np.split(queries[order], np.flatnonzero(np.diff(numbers[queries][order])) + 1) if len(queries) else []
 

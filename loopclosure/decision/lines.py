@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
 from loopclosure.decision.constants import (
     LEAST_PIECES,
@@ -26,6 +25,7 @@ from loopclosure.decision.constants import (
 )
 from loopclosure.decision.growing import Growing
 from loopclosure.decision.trajectories import SequenceSettings, trajectory_costs
+from netspec.files.opencv import cv2
 
 HALF = LENGTHS[-1] // 2  # frames after one that its longest line needs
 NONE = -np.inf
@@ -179,7 +179,7 @@ class Lines:
         level = decoys[tail]
         scale = (decoys[:tail] - level).mean() * (1 + np.sqrt(course.length / 2 / tail)) + 1e-12
         odds = max(1.0, pairs / max(1.0, chances)) * len(self.courses) / len(LENGTHS)
-        whole = maximum_filter1d(np.maximum(score, chance), course.length + 1)
+        whole = cv2.dilate(np.maximum(score, chance)[None], np.ones((1, course.length + 1)))[0]
         wrong = odds * tail * np.exp(-np.maximum(score - level, 0) / scale)
         return wrong, (middle >= (chance + whole) / 2) & (score > level)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from math import lgamma
+
 import numpy as np
-from scipy.special import betaln
 
 from loopclosure.decision.constants import (
     AGAINST,
@@ -60,4 +61,8 @@ def _log_likelihood(counts: np.ndarray, hits: int, tries: int) -> float:
     The prior of the share is that of Jeffreys.
     """
     yes, no = hits + 0.5, tries - hits + 0.5
-    return float(betaln(counts[0] + yes, counts[1] + no) - betaln(yes, no))
+    return _log_beta(counts[0] + yes, counts[1] + no) - _log_beta(yes, no)
+
+
+def _log_beta(a: float, b: float) -> float:
+    return lgamma(a) + lgamma(b) - lgamma(a + b)

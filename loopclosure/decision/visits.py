@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from loopclosure.decision.constants import AGES, AWAY, DRIFT, FAR_M, LENGTHS, SETTLED
 from loopclosure.decision.growing import Growing
+from netspec.files.opencv import cv2
 
 AROUND = LENGTHS[-1] + 1  # frames around one, from whose scores its own stands out
 
@@ -124,7 +124,7 @@ def outstanding(scores: np.ndarray) -> np.ndarray:
 
 
 def _around(values: np.ndarray) -> np.ndarray:
-    return uniform_filter1d(values, AROUND, mode="constant")
+    return cv2.blur(values[None], (AROUND, 1), borderType=cv2.BORDER_CONSTANT)[0]
 
 
 def far_apart(poses: np.ndarray, frame: int) -> np.ndarray:
