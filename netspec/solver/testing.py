@@ -5,6 +5,7 @@ Caffe: Solver::TestAll, Solver::Test, Solver::Step (src/caffe/solver.cpp), test(
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -59,8 +60,8 @@ class Tally:
 
     @property
     def loss(self) -> float:
-        """The mean loss."""
-        return self._loss / self.batches
+        """The mean loss; NaN without a batch (``test_iter: 0``), as Caffe's division by zero."""
+        return self._loss / self.batches if self.batches else math.nan
 
     @property
     def scores(self) -> Outputs:
@@ -70,7 +71,7 @@ class Tally:
             for name, values in self._sums.items()
             if values is not None
         }
-        return means | {name: score(self._gathered[name]) for name, score in self._scorers.items()}
+        return means | {name: self._scorers[name](tops) for name, tops in self._gathered.items() if tops}
 
 
 def as_scores(outputs: Mapping[str, torch.Tensor]) -> Outputs:

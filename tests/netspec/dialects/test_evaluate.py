@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from annotated_records import annotated, write
+from netspec import load_solver
 from netspec.cli import main
 from netspec.dialects import use_dialect
 from netspec.errors import SpecError
@@ -87,6 +88,24 @@ def test_resuming_continues_at_the_next_line_of_name_size_file(build: Build, tmp
     assert second.running_state() == {"image": 1}
     with pytest.raises(SpecError, match="found image -1 to go on from"):
         second.restore({"image": -1})
+
+
+def test_a_test_of_no_batch_has_no_score(tmp_path: Path) -> None:
+    net = """
+    layer { name: "found" type: "DummyData" top: "found" top: "true" include { phase: TEST }
+      dummy_data_param { shape { dim: [1, 1, 1, 7] } shape { dim: [1, 1, 1, 8] } } }
+    layer { name: "map" type: "DetectionEvaluate" bottom: "found" bottom: "true" top: "map" include { phase: TEST }
+      detection_evaluate_param { num_classes: 3 } }
+    layer { name: "x" type: "DummyData" top: "x" top: "t" include { phase: TRAIN }
+      dummy_data_param { shape { dim: [1, 1] } shape { dim: [1, 1] } } }
+    layer { name: "loss" type: "EuclideanLoss" bottom: "x" bottom: "t" include { phase: TRAIN } }
+    """
+    (tmp_path / "net.prototxt").write_text(net)
+    settings = "base_lr: 0 lr_policy: 'fixed' test_iter: 0 test_interval: 1 test_compute_loss: true"
+    (tmp_path / "solver.prototxt").write_text(f"net: '{tmp_path}/net.prototxt' {settings}")
+    solver = load_solver(tmp_path / "solver.prototxt")
+    solver.step(2)
+    assert solver.iteration == 2
 
 
 def test_average_precision_of_each_version_equals_hand_computed_values() -> None:
