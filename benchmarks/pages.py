@@ -2,8 +2,8 @@
 
 A line ``<!-- table: NAME -->`` starts a table with the rows of ``results/NAME.json``, up to ``<!-- end -->``.
 ``<!-- figure: ... -->`` within a line marks one cell. The name can be followed by ``; COLUMN, COLUMN as TITLE``, which
-selects columns (default: all), and by ``; COLUMN=VALUE, ...``, which selects rows. ``COLUMN: OTHER`` as the last column
-makes a pivot table: each value of COLUMN becomes a column with the values of OTHER.
+selects columns (default: all), and by ``; COLUMN=VALUE, OTHER!=VALUE, ...``, which selects rows. ``COLUMN: OTHER`` as the
+last column makes a pivot table: each value of COLUMN becomes a column with the values of OTHER.
 """
 
 from __future__ import annotations
@@ -55,10 +55,12 @@ def _chosen(words: str, folder: Path) -> tuple[list[list[str]], list[str]]:
     if not path.is_file():
         raise SpecError(f"there is no {path}")
     rows: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["rows"]
-    needs = dict(condition.strip().split("=", 1) for condition in conditions.split(",") if condition)
+    needs = [condition.strip().rpartition("=") for condition in conditions.split(",") if condition]
     columns = [column.strip() for column in wanted.split(",")] if wanted else list(rows[0])
     try:
-        rows = [row for row in rows if all(str(row[column]) == value for column, value in needs.items())]
+        for column, _, value in needs:
+            other = column.endswith("!")
+            rows = [row for row in rows if (str(row[column.rstrip("!")]) == value) != other]
         if ": " in columns[-1]:
             rows = _spread(rows, columns[:-1], *columns.pop().split(": "))
             columns = list(rows[0])
