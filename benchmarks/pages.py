@@ -2,7 +2,7 @@
 
 A line ``<!-- table: NAME -->`` starts a table with the rows of ``results/NAME.json``, up to ``<!-- end -->``.
 ``<!-- figure: ... -->`` within a line marks one cell. The name can be followed by ``; COLUMN, COLUMN as TITLE``, which
-selects columns (default: all), and by ``; COLUMN=VALUE, OTHER!=VALUE, ...``, which selects rows. ``COLUMN: OTHER`` as the
+selects columns (default: all), and by ``; COLUMN=VALUE, OTHER!=VALUE``, which selects rows. ``COLUMN: OTHER`` as the
 last column makes a pivot table: each value of COLUMN becomes a column with the values of OTHER.
 """
 
