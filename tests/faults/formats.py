@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
-import shutil
-import struct
-import warnings
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -19,7 +13,7 @@ import h5py
 import lmdb
 import numpy as np
 
-from faults import recordings, written
+from faults import recordings
 from lmdb_build.mean import write_mean
 from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.descriptors.feature_file import read_features
@@ -43,7 +37,7 @@ from netspec.files.image_list import list_images
 from netspec.graph.filter import with_state
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
-from netspec.net.extra_file import Digest, extra_text
+from netspec.net.extra_file import Digest
 from netspec.net.net import Net
 from netspec.net.weights import load_weights, save_weights
 from netspec.proto.schema import TEST
@@ -61,24 +55,13 @@ SOLVER = (Path(__file__).parent / "nets" / "solver.prototxt").read_text()
 class Format:
     """``write(path)`` writes a good file, ``read(path)`` reads it; ``path`` ends in ``suffix``.
 
-    If the file of a format is in its own folder, ``x``, ``inside`` is its name there. If checksums would detect
-    most damage, ``open`` splits the file, and ``close`` makes a file with valid checksums from damaged parts.
+    If the file of a format is in its own folder, ``x``, ``inside`` is its name there.
     """
 
     suffix: str
     write: Callable[[Path], object]
     read: Callable[[Path], object]
     inside: str = ""
-    open: Callable[[bytes], bytes] = bytes
-    close: Callable[[bytes], bytes] = bytes
-
-    def good(self, folder: Path) -> bytes:
-        """Return the bytes of a good file after writing it to a folder."""
-        path = folder / ("x" if self.inside else f"good{self.suffix}")
-        if self.inside:
-            shutil.rmtree(path, ignore_errors=True)
-        self.write(path)
-        return (path / self.inside if self.inside else path).read_bytes()
 
 
 @cache
@@ -100,20 +83,6 @@ def extra(path: Path) -> None:
     carried = {"0": {"next": 7}, "3": {"state": arrays}}
     settings = {"solver": {"base_lr": 0.5, "stepvalue": [3, 9]}, "train net": {"data_param.source": "db"}}
     write_extra(path, Extra(1, [0.5, 0.25], [65536, 3], [carried, {}], settings, Digest(3, "ab"), Digest(4, "cd")))
-
-
-def unhashed(data: bytes) -> bytes:
-    """Return an .extra file without its hash and format."""
-    content = json.loads(data)
-    return json.dumps({name: value for name, value in content.items() if name not in ("format", "hash")}).encode()
-
-
-def hashed(data: bytes) -> bytes:
-    """Return an .extra file of damaged content with a valid hash, if the content is JSON."""
-    try:
-        return extra_text(json.loads(data)).encode()
-    except (ValueError, TypeError, RecursionError):
-        return data
 
 
 def read_and_compare(path: Path) -> None:
@@ -216,25 +185,6 @@ def either_picture(path: Path) -> None:
             continue
 
 
-def members(data: bytes) -> bytes:
-    """Return the files of a zip archive, one after the other: name and contents, each after its length."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        parts = [(name.encode(), archive.read(name)) for name in archive.namelist()]
-    return b"".join(struct.pack("<B", len(n)) + n + struct.pack("<I", len(c)) + c for n, c in parts)
-
-
-def archive(parts: bytes) -> bytes:
-    """Return the zip archive of files as :func:`members` returns them, possibly damaged."""
-    stream, made = io.BytesIO(parts), io.BytesIO()
-    with zipfile.ZipFile(made, "w") as archive, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # two of one name
-        while length := stream.read(1):
-            name = stream.read(length[0]).decode("latin-1").replace("\0", "") or "x"
-            size = int.from_bytes(stream.read(4), "little")
-            archive.writestr(zipfile.ZipInfo(name), stream.read(size))
-    return made.getvalue()
-
-
 POSES = "".join(f"{i}.5 {i} 0 1 0 0 0 1\n" for i in range(6))
 WINDOWS = "# 0\na.png\n3\n48\n64\n2\n4 0.9 0 0 20 20\n0 0.1 10 10 40 40\n# 1\nb.png\n3\n48\n64\n0\n"
 PARAM = SimpleNamespace(fg_threshold=0.5, bg_threshold=0.5, root_folder="")
@@ -248,8 +198,6 @@ def solved(path: Path) -> None:
 FORMATS = {
     "net.prototxt": Format(".prototxt", text(LAYERS), built),
     "solver.prototxt": Format(".prototxt", text(SOLVER), solved),
-    "exported net": Format(".prototxt", text(LAYERS), written.exported),
-    "drawn net": Format(".prototxt", text(LAYERS), written.drawn),
     "caffemodel": Format(".caffemodel", lambda path: save_weights(net(), path), lambda path: load_weights(net(), path)),
     "caffemodel.h5": Format(
         ".caffemodel.h5", lambda path: save_weights(net(), path), lambda path: load_weights(net(), path)
@@ -257,17 +205,16 @@ FORMATS = {
     "solverstate": Format(".solverstate", state, read_state),
     "solverstate.h5": Format(".solverstate.h5", state, read_state),
     "solverstate.extra": Format(".extra", extra, read_and_compare),
-    "solverstate.extra by value": Format(".extra", extra, read_and_compare, "", unhashed, hashed),
     "hdf5 data": Format(".h5", rows, all_rows),
     "lmdb": Format("", database, all_records, inside="data.mdb"),
     "mean": Format(
         ".binaryproto", lambda path: write_mean(str(path), numbers(3, 4, 4)), lambda path: read_mean(str(path))
     ),
     "mean.npy": Format(".npy", lambda path: np.save(path, numbers(3, 4, 4)), lambda path: read_mean_option(str(path))),
-    "detector": Format(".npz", detector, go_on, open=members, close=archive),
-    "detector with points": Format(".npz", lambda path: detector(path, GeometricCheck()), go_on, "", members, archive),
-    "word model": Format(".npz", word_model, WordModel.load, "", members, archive),
-    "features": Format(".npz", features, read_features, "", members, archive),
+    "detector": Format(".npz", detector, go_on),
+    "detector with points": Format(".npz", lambda path: detector(path, GeometricCheck()), go_on),
+    "word model": Format(".npz", word_model, WordModel.load),
+    "features": Format(".npz", features, read_features),
     "truth.npy": Format(".npy", lambda path: np.save(path, np.eye(6)), read_truth_matrix),
     "truth.txt": Format(".txt", lambda path: np.savetxt(path, np.eye(6), "%d"), read_truth_matrix),
     "coordinates": Format(".txt", text("a.png 1 2\nb.png 3 4\n"), read_coordinates),

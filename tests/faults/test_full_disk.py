@@ -9,12 +9,9 @@ import h5py
 import numpy as np
 import pytest
 
-import lmdb_build.cli
-from faults.commands import CASES, THUMBNAILS, Case, check_npz
+from faults.commands import CASES
 from netspec.cli import main
 from netspec.files import whole_file
-from netspec.load import load_net
-from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter
 
 resource = pytest.importorskip("resource", reason="limits the size of files")
@@ -63,47 +60,6 @@ def test_a_command_on_a_full_disk_reports_one_line_and_keeps_old_files(
     assert contents() == before
 
 
-def sheet() -> int:
-    return lmdb_build.cli.main(["sheet", "pairs.txt", "out/sheet.png"])
-
-
-def test_sheet_on_a_full_disk_reports_one_line_and_keeps_the_old_file(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    CASES["convert"].prepare()
-    assert sheet() == 0
-    before = contents()
-    with full_disk():
-        assert sheet() == 1
-    assert capsys.readouterr().err == "out/sheet.png: cannot be written: File too large\n"
-    assert contents() == before
-
-
-WRITERS = {
-    "upgrade": ["upgrade_net_proto_text", "old.prototxt", "out/new.prototxt"],
-    "fold": ["fold", "net.prototxt", "--weights", "w.caffemodel", "--out", "out/folded"],
-    "torch": ["export", "net.prototxt", "--to", "torch", "--out", "out/net.py"],
-    "safetensors": ["export", "net.prototxt", "--to", "safetensors", "--out", "out/net.safetensors"],
-}
-
-
-@pytest.mark.parametrize("name", WRITERS)
-def test_upgrade_fold_and_export_on_a_full_disk_report_one_line_and_keep_old_files(
-    name: str, here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    CASES["extract"].prepare()
-    save_weights(load_net("net.prototxt", seed=0), "w.caffemodel")
-    layers = [f'layers {{ name: "l{i}" type: RELU bottom: "data" top: "{i}" }}' for i in range(60)]
-    Path("old.prototxt").write_text("\n".join(['input: "data"', "input_dim: 2 " * 4, *layers]))
-    assert main(WRITERS[name]) == 0
-    before = contents()
-    capsys.readouterr()
-    with full_disk():
-        assert main(WRITERS[name]) == 1
-    assert "cannot be written: File too large" in capsys.readouterr().err.splitlines()[-1]
-    assert contents() == before
-
-
 @pytest.mark.parametrize("name", ["extract", "detect"])
 def test_a_missing_output_folder_is_reported(name: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     case = CASES[name]
@@ -114,17 +70,6 @@ def test_a_missing_output_folder_is_reported(name: str, here: Path, capsys: pyte
     assert case.main(words) == 1
     (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
     assert "No such file or directory" in line
-
-
-def test_detect_on_a_full_disk_keeps_the_state_that_it_resumed(here: Path) -> None:
-    case: Case = CASES["detect"]
-    case.prepare()
-    assert case.main(case.words) == 0
-    before = check_npz("out/d.npz")
-    with full_disk():
-        words = ["--describe", THUMBNAILS, "--resume", "out/d.npz", "--save", "out/d.npz", "--out", "out"]
-        assert case.main(["detect", "images", *words]) == 1
-    assert check_npz("out/d.npz") == before
 
 
 NET = """

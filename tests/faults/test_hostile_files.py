@@ -79,15 +79,6 @@ def test_an_npz_that_decompresses_to_too_much_is_refused(large_npz: Path) -> Non
         read_features(large_npz)
 
 
-@pytest.mark.parametrize("kind", ["<U4", ">U4"], ids=["little_endian", "big_endian"])
-def test_an_npz_with_invalid_unicode_is_refused(kind: str, tmp_path: Path) -> None:
-    names = np.array(["a.png", "b.png"], kind)
-    names.view(np.uint8)[1:3] = 0xEE
-    np.savez(tmp_path / "x.npz", features=np.ones((2, 3)), names=names)
-    with pytest.raises(InputError, match="an array with invalid Unicode characters"):
-        read_features(tmp_path / "x.npz")
-
-
 def test_an_npz_with_python_objects_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", features=np.array([{"a": 1}], object))
     with pytest.raises(InputError, match="bject arrays"):
@@ -137,14 +128,6 @@ def test_weights_and_states_with_links_to_another_file_are_refused(tmp_path: Pat
         file["history"] = h5py.ExternalLink("secret", "/")
     with pytest.raises(SpecError, match=r"/history is a link; this is not supported"):
         read_state(tmp_path / "x.solverstate.h5")
-
-
-def test_an_hdf5_group_that_contains_itself_is_refused(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "w.caffemodel.h5", "w") as file:
-        file.create_group("data/a")
-        file["data/a/b"] = file["data"]
-    with pytest.raises(SpecError, match="does it contain itself"):
-        load_weights(net(), tmp_path / "w.caffemodel.h5")
 
 
 HDF5_DATA = 'layer { name: "d" type: "HDF5Data" top: "a" hdf5_data_param { source: "SOURCE" batch_size: 1 } }'
@@ -224,33 +207,6 @@ def test_a_truncated_jpeg_is_refused_by_every_reader(tmp_path: Path) -> None:
             read_bgr(path)
 
 
-def png_chunk(name: bytes, body: bytes, size: int | None = None) -> bytes:
-    """Return a chunk of a PNG file, optionally with a false size."""
-    length = len(body) if size is None else size
-    return length.to_bytes(4, "big") + name + body + zlib.crc32(name + body).to_bytes(4, "big")
-
-
-@pytest.mark.parametrize("size", [5_000, (1 << 32) - 1])
-def test_a_png_chunk_with_a_false_size_is_refused(size: int, tmp_path: Path) -> None:
-    """OpenCV would first allocate that much memory, 4 GiB."""
-    header = png_chunk(b"IHDR", (24).to_bytes(4, "big") * 2 + b"\x08\x00\x00\x00\x00")
-    body = png_chunk(b"IDAT", zlib.compress(bytes(24 * 25)), size)
-    path = tmp_path / "x.png"
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + body + png_chunk(b"IEND", b""))
-    with pytest.raises(ValueError, match="image"):
-        read_image(str(path))
-    with pytest.raises(InputError, match="image"):
-        read_bgr(path)
-    with pytest.raises(InputError, match="image"):
-        read_truth_matrix(path)
-
-
-def test_a_truth_matrix_in_a_too_large_image_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_bytes(compressed_png(20_000))
-    with pytest.raises(InputError, match="is not a readable image"):
-        read_truth_matrix(tmp_path / "x.png")
-
-
 def packed_rows(path: Path, chunk: bytes, rows: int = 40) -> None:
     """Write an HDF5 file with a dataset of one chunk, which is stored as these bytes."""
     with h5py.File(path, "w") as file:
@@ -264,13 +220,6 @@ def test_an_hdf5_chunk_that_decompresses_to_too_much_is_refused(tmp_path: Path) 
     packed_rows(tmp_path / "x.h5", zlib.compress(bytes(640)))
     all_rows(tmp_path / "x.h5")
     packed_rows(tmp_path / "x.h5", zlib.compress(bytes(300 << 20)), 40_000)
-    with pytest.raises(SpecError, match="packed has a chunk of more than its"):
-        all_rows(tmp_path / "x.h5")
-
-
-@pytest.mark.slow
-def test_an_hdf5_chunk_that_is_too_large_is_refused(tmp_path: Path) -> None:
-    packed_rows(tmp_path / "x.h5", zlib.compress(bytes(300 << 20)))
     with pytest.raises(SpecError, match="packed has a chunk of more than its"):
         all_rows(tmp_path / "x.h5")
 

@@ -3,11 +3,9 @@
 import json
 import logging
 import os
-import random
 import re
 import runpy
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -31,35 +29,16 @@ NAMES = [
     f"\\'+{RUN}#",
     f"{{{RUN}}}",
     "{0.__class__}{missing}%s%(x)d",
-    "\x02v0\x03\x02m0\x03",
     "a, b) + (c[",
     "</title></script><script>alert(1)</script><img src=x onerror=alert(1)>",
-    "]]><!--&amp;",
-    "@BANDS@ @LAYERS@ @TITLE@",
-    "{{ 7 * 7 }}{% raw %}",
-    "$\\frac{x$ ${HOME} $(id) `id`",
     "a\nb\r\n\tc\x00\x1b[31m\x7f\x85\u2028\u2029\u202e",
     "\ufffe\uffff\U0001f600\u00e9",
     "None",
-    "True",
-    "False",
-    "Path",
-    "F",
-    "nn",
     "torch",
-    "check_shapes",
-    "contrastive_loss",
-    "load",
-    "forward",
-    "super",
     "__init__",
-    "__metadata__",
     "../../up",
-    "x" * 3000,
-    "\u0661\u0662",
     " ",
     "'",
-    '"',
     "\\",
 ]
 ENDINGS = {"onnx": "onnx", "torch": "py", "safetensors": "safetensors"}
@@ -87,41 +66,6 @@ layer {{ name: "split" type: "Slice" bottom: {ip} top: {quoted("tops" + "'" * 3)
 """
 
 
-def nets() -> Iterator[str]:
-    """Yield nets that together use each name in several places."""
-    shuffled = random.Random(0)
-    for start in range(0, len(NAMES), 9):
-        names = NAMES[start:] + NAMES[:start]
-        yield net(iter(names))
-        yield net(iter(shuffled.sample(names, 14)))
-
-
-class Page(HTMLParser):
-    """The texts of a page, and the parts that a browser would execute."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.handlers: list[str] = []
-        self.texts: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.handlers += [name for name, _ in attrs if name.startswith("on")]
-
-    def handle_data(self, data: str) -> None:
-        self.texts.append(data)
-
-
-def page(path: Path) -> Page:
-    found = Page()
-    found.feed(path.read_text(encoding="utf-8"))
-    assert not found.handlers
-    assert found.tags.count("script") <= 2
-    assert "img" not in found.tags
-    return found
-
-
 @pytest.fixture(autouse=True)
 def inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.chdir(tmp_path)
@@ -130,7 +74,7 @@ def inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     assert not TRAP.exists()
 
 
-NETS = [pytest.param(text, id=f"net_{i}") for i, text in enumerate(nets())]
+NETS = [pytest.param(net(iter(NAMES[start:] + NAMES[:start])), id=f"net_{start}") for start in (0, 9)]
 
 
 @pytest.mark.slow
@@ -158,9 +102,6 @@ def test_exports_of_nets_with_hostile_names_parse_and_compute_the_same(
     assert {output.name for output in model.graph.output} == set(expected)
     blobs = sum(len(layer.blobs) for layer in here.layers)
     assert len(safetensors.load_file("safetensors.safetensors")) == blobs
-    words = ["fold", "net.prototxt", "--weights", "net.caffemodel", "--blob", here.outputs[-1], "--out", "folded"]
-    assert main(words) == 0, capsys.readouterr().err
-    netspec.load_net("folded.prototxt", weights="folded.caffemodel")
 
 
 @pytest.mark.slow
@@ -170,36 +111,12 @@ def test_drawings_of_nets_with_hostile_names_parse(text: str, capsys: pytest.Cap
     for ending in ("svg", "html"):
         assert main(["draw", "net.prototxt", "--out", f"out.{ending}"]) == 0, capsys.readouterr().err
     ElementTree.parse("out.svg")
-    script = re.search(r"^const layers = (.*);$", Path("out.html").read_text(encoding="utf-8"), re.M)
+    html = Path("out.html").read_text(encoding="utf-8")
+    assert "<img" not in html
+    assert html.count("<script") <= 2
+    script = re.search(r"^const layers = (.*);$", html, re.M)
     assert script
-    names = [layer["name"] for layer in json.loads(script[1])]
-    assert names[0] == printable(netspec.load_net("net.prototxt", seed=0).plan.nodes[0].name)
-    page(Path("out.html"))
-
-
-@pytest.mark.slow
-def test_png_drawings_of_nets_with_hostile_names_are_written(capsys: pytest.CaptureFixture[str]) -> None:
-    for text in list(nets())[::4]:
-        Path("net.prototxt").write_text(text)
-        assert main(["draw", "net.prototxt", "--out", "out.png"]) == 0, capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("first", range(0, len(NAMES), 10))
-def test_plots_of_logs_with_hostile_names_parse(first: int, capsys: pytest.CaptureFixture[str]) -> None:
-    wanted = [name.replace(",", ";") for name in NAMES[first : first + 10]]
-    start = "I1121 00:36:27.939015 12135 solver.cpp:239] "
-    for k, name in enumerate(wanted):
-        outputs = [f"{start}    Test net output #0: {printable(name)} = {value}" for value in (0.5, 0.6)]
-        lines = [f"{start}Iteration 0, Testing net (#0)", outputs[0], f"{start}Iteration 0, loss = 1.5"]
-        lines += [f"{start}Iteration 10, Testing net (#0)", outputs[1], f"{start}Iteration 10, loss = 1.25"]
-        Path(f"log{k}").write_text("\n".join(lines), encoding="utf-8")
-    logs = [f"log{k}" for k in range(len(wanted))]
-    for ending in ("svg", "png"):
-        words = ["plot", *logs, "--out", f"out.{ending}", "--names", ",".join(wanted)]
-        assert main(words) == 0, capsys.readouterr().err
-    texts = " ".join("".join(text.itertext()) for text in ElementTree.parse("out.svg").iter())
-    assert all(printable(name).strip() in texts for name in wanted)
+    assert json.loads(script[1])[0]["name"] == printable(netspec.load_net("net.prototxt", seed=0).plan.nodes[0].name)
 
 
 EVIL = "a\\033[31m\\nI1122 10:00:00.000000     1 solver.cpp:239] Iteration 99999, loss = 0\\r\\302\\233"
@@ -215,9 +132,7 @@ SOLVER = (
 
 
 @pytest.mark.parametrize(
-    "words",
-    ["train solver.prototxt", "time --model net.prototxt --iterations 1", "check net.prototxt", "check odd.prototxt"],
-    ids=["train", "time", "check", "check_invalid"],
+    "words", ["train solver.prototxt", "check net.prototxt", "check odd.prototxt"], ids=["train", "check", "invalid"]
 )
 def test_control_characters_in_names_are_escaped_in_the_output_of_commands(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
