@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from typing_extensions import override
 
-from netspec.dialects.faces.margins import Margin, MarginProduct
+from netspec.dialects.faces.margins import MarginProduct
+from netspec.dialects.gradients import with_gradient_of
 from netspec.layers import register
 from netspec.layers.contract.base import Shape
 from netspec.layers.loss.base import Classified, Loss
@@ -114,31 +115,6 @@ class CenterLoss(Loss, Classified):
         return _Distance.apply(x.reshape(-1, self.length), self.blob(0), labels, self.absolute, self.n_times)
 
 
-class _SphereProduct(torch.autograd.Function):
-    """Products with the margin at the labels, where the gradient's two parts are divided by their common length."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, x: torch.Tensor, weight: torch.Tensor, labels: torch.Tensor, margin: Margin, share: float
-    ) -> torch.Tensor:
-        rows, top = torch.arange(len(x), device=x.device), x @ weight.t()
-        length = x.norm(dim=1)
-        found, slope = margin(top[rows, labels] / length)
-        along = (found - top[rows, labels] / length * slope) / length  # the factor of x in the derivative
-        ctx.save_for_backward(x, weight, labels, slope, along)
-        ctx.share = share
-        top[rows, labels] += share * (length * found - top[rows, labels])
-        return top
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        x, weight, labels, slope, along = ctx.saved_tensors
-        both = torch.hypot(slope, along)
-        at_label = grads[0].gather(1, labels[:, None]) * ctx.share
-        step = (slope / both - 1)[:, None] * weight[labels] + (along / both)[:, None] * x
-        return grads[0] @ weight + at_label * step, grads[0].t() @ x, None, None, None
-
-
 @register("MarginInnerProduct", "margin_inner_product_param")
 class MarginInnerProduct(MarginProduct):
     """The angular softmax of SphereFace: products with weights that each pass normalizes to length 1.
@@ -155,6 +131,14 @@ class MarginInnerProduct(MarginProduct):
         weight = self.blob(0)
         with torch.no_grad():
             weight.div_(weight.norm(dim=1, keepdim=True))
+        top, at_labels = x @ weight.t(), labels[:, None]
         if self.margin is None:
-            return x @ weight.t()
-        return _SphereProduct.apply(x, weight, labels, self.margin, share)
+            return top
+        with torch.no_grad():
+            length, plain = x.norm(dim=1, keepdim=True), top.gather(1, at_labels)
+            found, slope = self.margin(plain / length)
+            along = (found - plain / length * slope) / length  # the factor of x in the derivative
+            both = torch.hypot(slope, along)
+            step = share * ((slope / both - 1) * weight[labels] + along / both * x)
+            value = top.scatter_add(1, at_labels, share * (length * found - plain))
+        return with_gradient_of(lambda: top.scatter_add(1, at_labels, (step * x).sum(1, keepdim=True)), value)

@@ -15,9 +15,11 @@ import torch.nn.functional as F
 from typing_extensions import override
 
 from netspec.dialects.faces.margins import MarginProduct
+from netspec.dialects.gradients import with_gradient_of
 from netspec.dialects.layers import replace
 from netspec.dialects.not_learned import NotLearned
 from netspec.layers import Layer, common, register
+from netspec.layers.activation import Activation
 from netspec.layers.contract.base import Shape, State
 from netspec.layers.loss.base import VALID, Classified, Loss, ignore_label, normalization_mode, normalizer
 from netspec.layers.loss.scores import FLT_MIN
@@ -216,26 +218,15 @@ class TripletLoss(Loss):
 ONEADDP = 2  # FocalLossParameter.Type
 
 
-class _Focal(torch.autograd.Function):
-    """-(base -+ p)^gamma log(p) for each label's p. The gradient is the fork's, which is correct if base is 1."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, x: torch.Tensor, labels: torch.Tensor, base: float, gamma: float, sign: int
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        softmax = x.softmax(1)
-        p = softmax.gather(1, labels)
-        factor, log = (base + sign * p) ** gamma, p.clamp(min=FLT_MIN).log()
-        along = sign * gamma * (factor / (1 + sign * p).clamp(min=1e-10)) * log * p + factor
-        ctx.save_for_backward(softmax, labels, along)
-        ctx.mark_non_differentiable(softmax)
-        return -factor * log, softmax
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        softmax, labels, along = ctx.saved_tensors
-        minus_one = -torch.ones_like(along)
-        return softmax.scatter_add(1, labels, minus_one) * along * grads[0], None, None, None, None
+def _focal(
+    x: torch.Tensor, labels: torch.Tensor, base: float, gamma: float, sign: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return -(base -+ p)^gamma log(p) for each label's p, and the softmax. The gradient is right if base is 1."""
+    softmax = x.detach().softmax(1)
+    p = softmax.gather(1, labels)
+    factor, log = (base + sign * p) ** gamma, p.clamp(min=FLT_MIN).log()
+    along = sign * gamma * (factor / (1 + sign * p).clamp(min=1e-10)) * log * p + factor
+    return with_gradient_of(lambda: -along * x.log_softmax(1).gather(1, labels), -factor * log), softmax
 
 
 @register("FocalLoss", "focal_loss_param", "loss_param", "softmax_param")
@@ -275,14 +266,14 @@ class FocalLoss(Loss, Classified):
         x, labels = self.scores_and_labels(scores, labels)
         valid, p = self.valid(labels, self.ignored), self.settings
         used = (labels if valid is None else labels * valid).unsqueeze(1)
-        losses, softmax = _Focal.apply(x, used, self.base, p.gamma, 1 if p.type == ONEADDP else -1)
+        losses, softmax = _focal(x, used, self.base, p.gamma, 1 if p.type == ONEADDP else -1)
         losses = losses.squeeze(1) if valid is None else losses.squeeze(1) * valid
         loss = self.factor * losses.sum() / normalizer(self.normalization, self.outer, self.inner, valid)
         return loss if self.num_tops == 1 else (loss, softmax.reshape(scores.shape))
 
 
 @register("Flip", "flip_param")
-class Flip(Layer):
+class Flip(Activation):
     """Mirror maps: horizontally unless flip_width is false, and vertically if flip_height is true.
 
     bottom[0]  (N, C, H, W)
@@ -295,29 +286,8 @@ class Flip(Layer):
         flipped = ((2, param.flip_height), (3, param.flip_width))
         self.axes = [axis for axis, wanted in flipped if wanted and axis < axes]
 
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return bottom_shapes
-
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.flip(self.axes)
-
-
-class _Scaled(torch.autograd.Function):
-    """x times factor; the gradients, if needed, are those of x times scale."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, x: torch.Tensor, scale: torch.Tensor, factor: torch.Tensor, to_x: bool, to_scale: bool
-    ) -> torch.Tensor:
-        ctx.save_for_backward(x, scale)
-        ctx.wanted = to_x, to_scale
-        return x * factor
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        (x, scale), (to_x, to_scale) = ctx.saved_tensors, ctx.wanted
-        to_scale = (x * grads[0]).sum(1, keepdim=True) if to_scale else torch.zeros_like(scale)
-        return grads[0] * scale if to_x else grads[0], to_scale, None, None, None
 
 
 @register("ChannelScale", "channel_scale_param")
@@ -361,7 +331,9 @@ class ChannelScale(NotLearned):
                 factor = self._averaged(self.blob(0), scales.abs().mean()).clone()
         used = factor if p.do_forward else torch.ones_like(factor)
         used = used.reshape(1, *[1] * (maps.dim() - 1)) if p.global_scale else used
-        top = _Scaled.apply(maps, scales, used, p.do_backward_feature, p.do_backward_scale)
+        of_maps = maps * scales.detach() if p.do_backward_feature else maps
+        of_scales = maps.detach() * int(p.do_backward_scale) * scales
+        top = with_gradient_of(lambda: of_maps + of_scales, maps * used)
         return top if self.num_tops == 1 else (top, factor)
 
     def _averaged(self, scale: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
@@ -373,7 +345,7 @@ class ChannelScale(NotLearned):
 
 
 @register("Cosine")
-class Cosine(Layer):
+class Cosine(Activation):
     """The cosine of each number.
 
     bottom[0]  any shape
@@ -381,24 +353,8 @@ class Cosine(Layer):
     Fork: happynear/caffe-windows, src/caffe/layers/cosine_layer.cu; its gradient for CPUs omits that of the top
     """
 
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return bottom_shapes
-
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.cos()
-
-
-class _Arccos(torch.autograd.Function):
-    """The arc cosine. Above 0.99, its gradient is that at 0.99."""
-
-    @staticmethod
-    def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
-        ctx.save_for_backward(x)
-        return x.acos()
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> torch.Tensor:
-        return -grads[0] / (1 - ctx.saved_tensors[0].clamp(max=0.99) ** 2).sqrt()
 
 
 @register("Arccos")
@@ -409,4 +365,4 @@ class Arccos(Cosine):
     """
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
-        return _Arccos.apply(data)
+        return with_gradient_of(lambda: -data / (1 - data.detach().clamp(max=0.99) ** 2).sqrt(), data.acos())

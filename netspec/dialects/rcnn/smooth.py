@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
+from netspec.dialects.gradients import with_gradient_of
 from netspec.dialects.registry import added_value
 from netspec.errors import Code
 from netspec.layers import Layer
@@ -31,18 +31,6 @@ def divisor(layer: Layer, items: int, each: int, valid: torch.Tensor | None) -> 
     if added_value(param, "normalization") == "PRE_FIXED":
         return max(1.0, value(param, "pre_fixed_normalizer"))
     return normalizer(normalization_mode(param, VALID), items, each, valid)
-
-
-class _Weighted(torch.autograd.Function):
-    """weight x, with a gradient that omits the weight, as in R-FCN (whose weights are 0 and 1)."""
-
-    @staticmethod
-    def forward(ctx: Any, x: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-        return x * weight
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return grads[0], None
 
 
 class SmoothL1Loss(Loss):
@@ -99,9 +87,10 @@ class SmoothL1Loss(Loss):
     ) -> torch.Tensor | tuple[torch.Tensor, ...]:
         inside, outside = (*(weight.detach().reshape_as(predictions) for weight in weights), None, None)[:2]
         difference = predictions - targets.reshape_as(predictions)
-        if inside is not None:
-            difference = _Weighted.apply(difference, inside) if self.by_pixel else difference * inside
-        losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none", beta=self.knee)
+        weighted = difference if inside is None else difference * inside
+        if self.by_pixel:
+            weighted = with_gradient_of(lambda: difference, weighted)
+        losses = F.smooth_l1_loss(weighted, torch.zeros_like(weighted), reduction="none", beta=self.knee)
         if not self.by_pixel:
             return (losses if outside is None else losses * outside).sum() / len(predictions)
         items, _, *pixels = four(tuple(losses.shape))

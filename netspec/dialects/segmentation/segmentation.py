@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import torch
 from typing_extensions import override
@@ -12,6 +11,7 @@ from netspec.data.images import read_image
 from netspec.data.random_words import words
 from netspec.data.sources import Source
 from netspec.data.transformer import contradictions
+from netspec.dialects.gradients import with_gradient_of
 from netspec.dialects.layers import replace
 from netspec.dialects.segmentation.pairs import Array, Pair, PairSource, read_labels, read_pairs
 from netspec.errors import SpecError
@@ -168,28 +168,11 @@ class SoftmaxWithLoss(losses.SoftmaxWithLoss):
         return super().sum_up(losses * self._each, valid, total)
 
 
-class _Dice(torch.autograd.Function):
-    """1 minus the mean of r = (2 x.y + 1) / (x.x + y.y + 1); the gradient is that of the sum, as in the fork."""
-
-    @staticmethod
-    def forward(ctx: Any, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-        below = x.square().sum(1, keepdim=True) + y.square().sum(1, keepdim=True) + 1
-        ratio = (2 * (x * y).sum(1, keepdim=True) + 1) / below
-        ctx.save_for_backward(x, y, ratio, below)
-        return 1 - ratio.abs().sum() / len(x)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        x, y, ratio, below = ctx.saved_tensors
-        factor = 2 * grads[0] / below
-        return factor * (x * ratio - y), factor * (y * ratio - x)
-
-
 @register("DiceCoefLoss")
 class DiceCoefLoss(Loss):
     """1 minus the mean over the items of (2 x.y + 1) / (x.x + y.y + 1).
 
-    The gradient is not divided by the number of items. Other forks compute other values: over the whole batch, with
+    The gradient is that of the sum. Other forks compute other values: over the whole batch, with
     sums instead of squares, or with dice_coef_loss_param, which is not supported.
 
     bottom[0]  x (N, ...)
@@ -211,4 +194,9 @@ class DiceCoefLoss(Loss):
         return [()]
 
     def forward(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-        return _Dice.apply(x.flatten(1), y.flatten(1))
+        x, y = x.flatten(1), y.flatten(1)
+        with torch.no_grad():
+            below = x.square().sum(1, keepdim=True) + y.square().sum(1, keepdim=True) + 1
+            ratio = (2 * (x * y).sum(1, keepdim=True) + 1) / below
+            of_x, of_y = 2 / below * (x * ratio - y), 2 / below * (y * ratio - x)
+        return with_gradient_of(lambda: (of_x * x + of_y * y).sum(), 1 - ratio.abs().sum() / len(x))

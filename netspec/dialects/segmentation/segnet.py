@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 
+from netspec.dialects.gradients import with_gradient_of
 from netspec.dialects.not_learned import NotLearned
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
@@ -16,23 +16,6 @@ from netspec.proto.schema import TRAIN, given_fields, value
 
 INFERENCE = 1  # BNParameter.BNMode
 SEGNET_EPS = 1e-9  # added to the variance by SegNet's BN
-
-
-class _Unpool(torch.autograd.Function):
-    """Copy each value to the pixel in its mask; the last one wins, but every one gets the gradient of the pixel."""
-
-    @staticmethod
-    def forward(ctx: Any, values: torch.Tensor, mask: torch.Tensor, pixels: int) -> torch.Tensor:
-        ctx.save_for_backward(mask)
-        order = torch.arange(mask.shape[2], device=mask.device).expand_as(mask)
-        nobody = torch.full((*mask.shape[:2], pixels), -1, device=mask.device)
-        last = nobody.scatter_reduce(2, mask, order, "amax")
-        return values.gather(2, last.clamp(min=0)).where(last >= 0, 0)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None, None]:
-        (mask,) = ctx.saved_tensors
-        return grads[0].gather(2, mask), None, None
 
 
 class Upsample(Layer):
@@ -89,7 +72,12 @@ class Upsample(Layer):
         if index.numel() and not 0 <= int(index.amin()) <= int(index.amax()) < height * width:
             message = f"the mask names pixel {int(index.amax())}, the top has {height} x {width}; check the scale"
             raise self.error(message, "bottom", 1)
-        top: torch.Tensor = _Unpool.apply(data.flatten(2), index.flatten(2), height * width)
+        values, index = data.flatten(2), index.flatten(2)
+        order = torch.arange(index.shape[2], device=index.device).expand_as(index)
+        empty = (*index.shape[:2], height * width)
+        last = torch.full(empty, -1, device=index.device).scatter_reduce(2, index, order, "amax")
+        top = values.gather(2, last.clamp(min=0)).where(last >= 0, 0)
+        top = with_gradient_of(lambda: values.new_zeros(empty).scatter_add(2, index, values), top)
         return top.reshape(self.top_shapes[0])
 
 

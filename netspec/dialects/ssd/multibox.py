@@ -29,6 +29,7 @@ from netspec.dialects.boxes import (
     outside,
     suppress_all,
 )
+from netspec.dialects.gradients import with_gradient_of
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.loss.base import BATCH_SIZE, FULL, VALID, normalization_mode
 from netspec.layers.loss.scores import FLT_MIN
@@ -274,8 +275,8 @@ class MultiBoxLoss(Layer):
         if p.encode_variance_in_target:
             # The fork divides the difference, but not its gradient.
             divisor = torch.from_numpy(prior_variances).to(codes)
-            target = target / divisor
-            predicted = predicted + (predicted / divisor - predicted).detach()
+            given, target = predicted, target / divisor
+            predicted = with_gradient_of(lambda: given, given / divisor)
         if p.loc_loss_type == SMOOTH_L1:
             return F.smooth_l1_loss(predicted, target, reduction="none")
         return (predicted - target).square() / 2

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
+from netspec.dialects.gradients import with_gradient_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import value
@@ -118,24 +119,6 @@ class LabelsequenceAccuracy(Layer):
         return scores.new_tensor(sum(right) / len(right))
 
 
-class _Ctc(torch.autograd.Function):
-    """The mean of the costs, 0 for a text that does not fit; the gradient is that of their sum, as in warp-ctc."""
-
-    @staticmethod
-    def forward(ctx: Any, scores: torch.Tensor, given: tuple[Any, ...], blank: int) -> torch.Tensor:
-        flat, steps, lengths = given
-        with torch.enable_grad():
-            leaf = scores.detach().requires_grad_()
-            costs = F.ctc_loss(F.log_softmax(leaf, 2), flat, steps, lengths, blank, "none", zero_infinity=True)
-            total = costs.sum()
-        ctx.save_for_backward(*(torch.autograd.grad(total, leaf) if scores.requires_grad else ()))
-        return total.detach() / len(lengths)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None, None]:
-        return ctx.saved_tensors[0] * grads[0], None, None
-
-
 class _CtcLoss(Layer):
     """Base of the two CTC losses."""
 
@@ -149,13 +132,18 @@ class _CtcLoss(Layer):
             raise self.error(f"found scores of shape {scores}, expected (T, N, C)", "bottom", 0)
 
     def loss(self, scores: torch.Tensor, texts: Sequence[Sequence[int]], steps: Sequence[int], blank: int) -> Any:
-        """Return the loss of scores (T, N, C) for the text and the number of steps of each sequence."""
+        """Return the mean of the costs, with the gradient of their sum, for the text and the steps of each sequence.
+
+        Scores are (T, N, C). A text that does not fit costs 0, as in warp-ctc.
+        """
         scores = scores.flatten(2)
         classes, labels = scores.shape[2], [label for text in texts for label in text]
         if wrong := [label for label in labels if not 0 <= label < classes]:
             raise self.error(f"found label {wrong[0]}, expected 0 to {classes - 1}", "bottom")
         flat = torch.tensor(labels, dtype=torch.long, device=scores.device)
-        return _Ctc.apply(scores, (flat, list(steps), [len(text) for text in texts]), blank)
+        given = flat, list(steps), [len(text) for text in texts]
+        total = F.ctc_loss(F.log_softmax(scores, 2), *given, blank, "sum", zero_infinity=True)
+        return with_gradient_of(lambda: total, total / len(texts))
 
 
 class CTCLoss(_CtcLoss):

@@ -22,6 +22,7 @@ from netspec.dialects.text.ctc import (
     WarpCTCLoss,
 )
 from netspec.layers import Layer, register
+from netspec.layers.activation import Activation
 from netspec.layers.contract.base import Shape, State
 from netspec.proto.schema import has, value
 
@@ -102,7 +103,7 @@ class ContinuationIndicator(Layer):
 
 
 @register("Reverse", "reverse_param")
-class Reverse(Layer):
+class Reverse(Activation):
     """Reverse an axis, by default axis 0, the time.
 
     bottom[0]  any shape
@@ -112,9 +113,6 @@ class Reverse(Layer):
 
     def setup(self) -> None:
         self.axis = self.canonical_axis(value(self.param, "reverse_param").axis, self.bottom_shapes[0], "reverse_param")
-
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return bottom_shapes
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return data.flip(self.axis)

@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
+from netspec.dialects.gradients import with_gradient_of
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
 from netspec.layers.vision.convolution import Convolution
@@ -197,28 +198,6 @@ class _VolumePooling(Layer):
         return F.max_pool3d(volume, kernel, stride)
 
 
-class _AllLargest(torch.autograd.Function):
-    """The maximum of each window. As in C3D, every pixel equal to it gets the whole gradient, not only the first."""
-
-    @staticmethod
-    def forward(ctx: Any, volume: torch.Tensor, kernel: Shape, stride: Shape) -> torch.Tensor:
-        top = F.max_pool3d(volume, kernel, stride)
-        ctx.save_for_backward(volume, top)
-        ctx.kernel, ctx.stride = kernel, stride
-        return top
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        volume, top = ctx.saved_tensors
-        diff = torch.zeros_like(volume)
-        counts = top.shape[2:]
-        for offset in torch.cartesian_prod(*map(torch.arange, ctx.kernel)).tolist():
-            pixels = [slice(o, o + (n - 1) * s + 1, s) for o, n, s in zip(offset, counts, ctx.stride, strict=True)]
-            at = (slice(None), slice(None), *pixels)
-            diff[at] += grads[0] * (volume[at] == top)
-        return diff, None, None
-
-
 @register("Pooling3D", "pooling3d_param")
 class Pooling3D(_VolumePooling):
     """Reduce each window over time, height and width to its maximum or its average.
@@ -250,7 +229,17 @@ class Pooling3D(_VolumePooling):
 
     @override
     def largest(self, volume: torch.Tensor) -> torch.Tensor:
-        return _AllLargest.apply(volume, *self.windows)
+        (kernel, stride), top = self.windows, super().largest(volume)
+
+        def largest() -> torch.Tensor:
+            total = torch.zeros_like(top)
+            for offset in torch.cartesian_prod(*map(torch.arange, kernel)).tolist():
+                ends = zip(offset, top.shape[2:], stride, strict=True)
+                pixels = volume[(..., *(slice(o, o + (n - 1) * s + 1, s) for o, n, s in ends))]
+                total = total + pixels.where(pixels == top, 0)
+            return total
+
+        return with_gradient_of(largest, top)
 
 
 @register("NdPooling", "pooling_param", *(f"pooling_param.{name}" for name in SHAPES))

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 
 from netspec.data.mean import read_mean
 from netspec.layers import Layer, register
+from netspec.layers.activation import Activation
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import value
 
@@ -381,16 +382,13 @@ class L1Loss(Layer):
 
 
 @register("NegReLU", "relu_param")
-class NegReLU(Layer):
+class NegReLU(Activation):
     """min(x, 0) + negative_slope max(x, 0); the gradient at 0 is that of the positive side.
 
     bottom[0]  any shape
     top[0]     the same shape
     Fork: src/caffe/layers/neg_relu_layer.cpp
     """
-
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return bottom_shapes
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         return torch.where(data < 0, data, data * self.param.relu_param.negative_slope)

@@ -6,13 +6,13 @@ Fork: eric612/MobileNet-YOLO, src/caffe/layers/region_loss_layer.cpp, yolov3_lay
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from typing_extensions import override
 
 from netspec.dialects.boxes import Array, around, as_array, overlaps, sigmoid
+from netspec.dialects.gradients import with_gradient_of
 from netspec.layers.contract.base import Shape
 from netspec.layers.loss.base import Loss
 from netspec.proto.schema import value
@@ -49,7 +49,8 @@ class _DarknetLoss(Loss):
         boxes = as_array(truth).reshape(items, -1, 5)
         moves = np.stack([self._moves(*each) for each in zip(cells, boxes, strict=True)])
         diff = self._gradient(moves, cells)
-        return _Moved.apply(maps, *(torch.from_numpy(a.reshape(maps.shape)).to(maps) for a in (moves, diff)))
+        moves, diff = (torch.from_numpy(each.reshape(maps.shape)).to(maps) for each in (moves, diff))
+        return with_gradient_of(lambda: (maps * diff).sum() / items, moves.square().sum() / items)
 
     def _moves(self, cells: Array, truth: Array) -> Array:
         """Return the negative of the desired changes of the values (num, 5 + num_class, H, W) of an image.
@@ -229,17 +230,3 @@ class Yolov3(_DarknetLoss):
         slope = share * (1 - share)
         slope[:, :, 2:4] = 1
         return moves * slope
-
-
-class _Moved(torch.autograd.Function):
-    """The sum of the squares of moves / N; its gradient is computed as in the fork, and is not the derivative."""
-
-    @staticmethod
-    def forward(ctx: Any, maps: torch.Tensor, moves: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-        ctx.save_for_backward(diff)
-        return moves.square().sum() / len(maps)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        (diff,) = ctx.saved_tensors
-        return diff * (grads[0] / len(diff)), None, None

@@ -10,8 +10,10 @@ import torch
 from typing_extensions import override
 
 from netspec.dialects.boxes import Array, around, as_array, detections, overlaps, sigmoid
+from netspec.dialects.gradients import with_gradient_of
 from netspec.dialects.yolo.region_loss import CLASSES, OBJECT, RegionLoss, Yolov3
 from netspec.layers import Layer, register
+from netspec.layers.activation import Activation
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import value
 
@@ -237,29 +239,14 @@ class Yolov3DetectionOutput(_YoloOutput):
         return np.concatenate(columns, axis=1, dtype=np.float32)
 
 
-class _HardSigmoid(torch.autograd.Function):
-    """x / 5 + 1/2, clipped to 0..1. As in the fork, the gradient is 1/5 everywhere, because it tests the top."""
-
-    @staticmethod
-    def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
-        return (0.2 * x + 0.5).clamp(0, 1)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> torch.Tensor:
-        return 0.2 * grads[0]
-
-
 @register("HardSigmoid")
-class HardSigmoid(Layer):
-    """min(max(0.2 x + 0.5, 0), 1); the gradient is 0.2 everywhere.
+class HardSigmoid(Activation):
+    """min(max(0.2 x + 0.5, 0), 1); the gradient is 0.2 everywhere, because the fork tests the top.
 
     bottom[0]  any shape
     top[0]     the same shape
     Fork: eric612/MobileNet-YOLO, src/caffe/layers/hard_sigmoid_layer.cpp
     """
 
-    def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
-        return bottom_shapes
-
-    def forward(self, data: torch.Tensor) -> torch.Tensor:
-        return _HardSigmoid.apply(data)
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return with_gradient_of(lambda: 0.2 * x, (0.2 * x + 0.5).clamp(0, 1))
