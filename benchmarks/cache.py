@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.detector.run import load_describe
+from loopclosure.detector.describers import load_describe
 from loopclosure.detector.verification import Agreement, Pairs
 from loopclosure.places.frames import read_bgr, read_gray
 from netspec.files.whole_file import whole_file

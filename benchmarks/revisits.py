@@ -226,13 +226,13 @@ def _decided(drive: Drive, cache: Cache, queries: Sequence[Path], references: Se
 
 def online(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
     """Return the match of each frame (N,), -1 without one, as ``LoopDetector`` with a geometric check decides."""
-    detector = LoopDetector(check=Known(pairs=cache.pairs))
+    detector = LoopDetector(None, check=Known(pairs=cache.pairs))
     images: list[Any] = [*real.images]  # the check knows images by their paths
     for row, image in zip(rows, images, strict=True):
         detector.add_descriptor(row, image=image)
     match = np.full(len(rows), -1)
     for loop in detector.loops:
-        match[loop.query_id] = loop.accepted
+        match[loop.query] = loop.match
     return match
 
 

@@ -11,9 +11,9 @@ if TYPE_CHECKING:
     from loopclosure.closing.online import LoopCloser
     from loopclosure.descriptors.thumbnails import Thumbnailer
     from loopclosure.detector.decision import LoopResult
+    from loopclosure.detector.describers import load_describe
     from loopclosure.detector.detector import LoopDetector
     from loopclosure.detector.map import Map
-    from loopclosure.detector.run import load_describe
     from loopclosure.detector.visitor import Visitor
     from loopclosure.places.intrinsics import Intrinsics as Camera
     from loopclosure.places.sequences import read_sequence
@@ -27,7 +27,7 @@ _HOMES = {
     "Map": "loopclosure.detector.map:Map",
     "Thumbnailer": "loopclosure.descriptors.thumbnails:Thumbnailer",
     "Visitor": "loopclosure.detector.visitor:Visitor",
-    "load_describe": "loopclosure.detector.run:load_describe",
+    "load_describe": "loopclosure.detector.describers:load_describe",
     "read_sequence": "loopclosure.places.sequences:read_sequence",
 }
 

@@ -136,9 +136,9 @@ def test_an_editable_installation_has_the_nets_also_in_the_folder_of_the_clone(s
         "\n".join({sysconfig.get_path("purelib"), sysconfig.get_path("platlib")})
     )
     run(*PIP, "--python", site / "bin" / "python", *editable, cwd=tmp_path)
-    code = "from loopclosure.detector.run import load_describe; import netspec; print(netspec.__file__, load_describe"
+    code = "from loopclosure import LoopDetector; import netspec; print(netspec.__file__, LoopDetector"
     for folder in (tmp_path, source.parent):
-        said = run(site / "bin" / "python", "-c", f"{code}('small', {{}}).views)", cwd=folder).stdout.split()
+        said = run(site / "bin" / "python", "-c", f"{code}('small').settings.views)", cwd=folder).stdout.split()
         assert said == [str(source / "netspec" / "__init__.py"), "1"]
     assert "usage: netspec" in run(site / "bin" / "python", "-m", "netspec", "--help", cwd=source.parent).stdout
 

@@ -16,6 +16,7 @@ from loopclosure.descriptors.feature_file import read_features
 from loopclosure.descriptors.similarity import METRICS
 from loopclosure.detector import run
 from loopclosure.detector.decision import DetectorSettings, LoopResult
+from loopclosure.detector.describers import load_describe
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import RELATIVE, write_g2o, write_loops_csv
 from loopclosure.detector.saved import Describe
@@ -136,9 +137,8 @@ def _detect(a: argparse.Namespace) -> None:
     options = _checked_options(a)
     recording = None if a.video else recording_of(a.source, Path(a.out) / "frames", a.camera, a.odometry)
     features = read_features(a.features) if a.features else None
-    describe = run.load_describe(a.describe, options) if features is None else None
-    net, views = describe, run.views_of(describe, features)
-    detector = _detector(a, describe, views)
+    describe = load_describe(a.describe, options) if features is None else None
+    detector = _detector(a, describe, {} if features is None else {"views": features.views})
     # The names of the frames before --resume are not known.
     names, ended = [""] * len(detector), None
     out = Path(a.out)
@@ -182,10 +182,10 @@ def _detect(a: argparse.Namespace) -> None:
     write_drive(out / "report.html", results, reasons, recording, a.command_line)
     if recording is not None and len(recording.unreadable) > read:
         warn(f"{len(recording.unreadable) - read} images cannot be read; the report shows no pairs with them")
-    count = sum(result.accepted is not None for result in results)
+    count = sum(result.match is not None for result in results)
     print(f"{count} loops in {len(results)} frames: {out / 'loops.csv'}; report: {out / 'report.html'}")
     print("\n".join(reasons))
-    if engine := getattr(net, "engine", ""):
+    if engine := getattr(describe, "engine", ""):
         print(f"descriptors: {a.describe}, computed by {engine}")
     poses, odometry = detector.poses, detector.odometry
     driven = np.isfinite(odometry).any()
@@ -211,10 +211,11 @@ def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResu
     results: list[LoopResult] = []
     try:
         for stamp, image in live_frames(a.video):
-            run.put(results, detector.add(image, stamp))
-            for loop in results[-1].loops:
-                place = f"shows the place of frame {loop.accepted}"
-                print(f"frame {loop.query_id}, {loop.stamp:.1f} s: {place}", flush=True)
+            loops = detector.add(image, stamp)
+            run.put(results, detector.newest, loops)
+            for loop in loops:
+                place = f"shows the place of frame {loop.match}"
+                print(f"frame {loop.query}, {loop.stamp:.1f} s: {place}", flush=True)
     except KeyboardInterrupt as end:
         return results, end
     return results, None
@@ -223,7 +224,7 @@ def _watch(a: argparse.Namespace, detector: LoopDetector) -> tuple[list[LoopResu
 def _measured(detector: LoopDetector, recording: ImageSequence, camera: Intrinsics) -> list[Loop]:
     """Return the loops within this drive, numbered as by the detector, with their relative poses."""
     first = len(detector) - len(recording)
-    found = [(loop.query_id - first, loop.accepted - first) for loop in detector.loops if loop.accepted is not None]
+    found = [(loop.query - first, loop.match - first) for loop in detector.loops if loop.match is not None]
     own = [Loop(query, match) for query, match in found if match >= 0]
     measured = measure(recording, own, camera, recording.odometry, bar)
     return [Loop(loop.query + first, loop.match + first, loop.relative) for loop in measured]
@@ -261,16 +262,16 @@ def _changes(a: argparse.Namespace) -> dict[str, Any]:
     return {name: getattr(a, name) for name in SETTINGS if getattr(a, name) is not None}
 
 
-def _detector(a: argparse.Namespace, describe: Describe | None, views: int) -> LoopDetector:
+def _detector(a: argparse.Namespace, describe: Describe | None, views: dict[str, int]) -> LoopDetector:
     if a.resume:
         detector = LoopDetector.load(a.resume, describe)
         if detector.fingerprint is None:
             warn(f"{a.resume} does not name the net that described its frames; use the same net")
         return detector
     check = None
-    changes = _changes(a)
+    changes = {**views, **_changes(a)}
     if a.video:
         changes.setdefault("exclude_seconds", RECENT_SECONDS)
     if a.verify or ((a.video or a.save) and a.threshold is None):
         check = GeometricCheck()
-    return LoopDetector(describe, check=check, views=views, **changes)
+    return LoopDetector(describe, check=check, **changes)

@@ -13,6 +13,7 @@ from loopclosure.closing.locate import LOCATED, Located, Locator, located_said, 
 from loopclosure.closing.sessions import close_map, write_closed_map
 from loopclosure.detector import run
 from loopclosure.detector.decision import LoopResult
+from loopclosure.detector.describers import load_describe
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.map import EXTRACTED, Map, checked_name
@@ -70,7 +71,7 @@ def _add_build(commands: Commands) -> None:
 
 
 def _build(a: argparse.Namespace) -> None:
-    describe = run.load_describe(checked_name(a.describe))
+    describe = load_describe(checked_name(a.describe))
     recordings = _recordings(a, 0)  # before the map is made, in case a name is mistyped
     _add_all(Map.create(a.map, a.describe), describe, recordings, a.index)
 
@@ -83,7 +84,7 @@ def _add_add(commands: Commands) -> None:
 
 def _add(a: argparse.Namespace) -> None:
     into = Map(a.map)
-    _add_all(into, run.load_describe(into.describer), _recordings(a, len(into.sessions)), a.index)
+    _add_all(into, load_describe(into.describer), _recordings(a, len(into.sessions)), a.index)
 
 
 def _recordings(a: argparse.Namespace, first: int) -> list[ImageSequence]:
@@ -97,7 +98,7 @@ def _add_all(into: Map, describe: Describe, recordings: list[ImageSequence], ind
         before = len(into)
         results = into.add(recording, describe, index, bar, _decided)
         warn_of_unreadable(recording)
-        loops = [result.accepted for result in results if result.accepted is not None]
+        loops = [result.match for result in results if result.match is not None]
         between = sum(frame < before for frame in loops)
         summary = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
         folder = into.sessions[-1].folder
@@ -125,11 +126,11 @@ def _add_query(commands: Commands) -> None:
 def _query(a: argparse.Namespace) -> None:
     known, out = Map(a.map), Path(a.out)
     recording = recording_of(a.source, out / "frames", a.camera)
-    detector, before = known.detector(run.load_describe(known.describer), a.index), len(known)
+    detector, before = known.detector(load_describe(known.describer), a.index), len(known)
     if a.index in INDEXES:  # in memory: the frames are added to the detector, not to the map
         run.remember_all(detector, recording, progress=bar)
         results = _decided(detector, own=False)
-        results = [replace(result, query_id=result.query_id - before) for result in results]
+        results = [replace(result, query=result.query - before) for result in results]
     else:
         results = run.run_detector(Visitor(detector), recording, progress=bar)
     recording = warn_of_unreadable(recording)

@@ -88,8 +88,8 @@ class Locator:
     def locate_all(
         self, recording: ImageSequence, loops: Sequence[LoopResult], progress: Progress = silent
     ) -> dict[int, Located]:
-        """Return query_id -> where the camera was, for the accepted frames of a recording whose pose is measured."""
-        matches = {loop.query_id: loop.accepted for loop in loops if loop.accepted is not None}
+        """Return query -> where the camera was, for the accepted frames of a recording whose pose is measured."""
+        matches = {loop.query: loop.match for loop in loops if loop.match is not None}
         found = {}
         for frame, image, _ in progress(recording.frames(matches), "locating", len(matches)):
             depth = None if recording.depths is None else recording.depths[frame]
@@ -112,7 +112,7 @@ def located_said(found: Mapping[int, Located], loops: Sequence[LoopResult], loca
             said.append(f"located {words}: {whole} with position and rotation, {len(poses) - whole} with rotation only")
     if bare := sum(each.pose is None for each in found.values()):
         said.append(f"not located: {bare}, whose matches have no poses; their relative poses are in loops.csv")
-    sessions = [locator.map.session_of(loop.accepted)[0] for loop in loops if loop.accepted is not None]
+    sessions = [locator.map.session_of(loop.match)[0] for loop in loops if loop.match is not None]
     without = [session.folder.name for session in sessions if session.camera is None]
     if without:
         names = ", ".join(sorted(set(without)))

@@ -1,6 +1,6 @@
 """Closes the loops of a robot while it drives: keyframes, loops as constraints of a pose graph, the corrected path.
 
-    closer = LoopCloser(LoopDetector(describe, check=CHECK, exclude_seconds=10), camera)
+    closer = LoopCloser(LoopDetector(exclude_seconds=10), camera)
     closer.start()
     for stamp, image, pose in robot:  # the pose of the robot by its wheels
         closer.add(image, stamp, pose)
@@ -125,8 +125,8 @@ class LoopCloser:
         except InputError as fault:
             self.warn(f"the image at {stamp:.6f} is left out: {fault.message}")
             return []
-        number, drive = found.query_id, (graph.drives[-1] if graph.drives else 0) + another
-        measured = [self._measured(each.query_id, each.accepted, image, (pose, drive)) for each in found.loops]
+        number, drive = len(self.detector) - 1, (graph.drives[-1] if graph.drives else 0) + another
+        measured = [self._measured(each.query, each.match, image, (pose, drive)) for each in found]
         loops = [loop for loop in measured if loop is not None]
         with self._lock:
             if number and not another:

@@ -16,41 +16,34 @@ Runs = list[tuple[int, int]]  # of one frame: (candidate, number of consecutive 
 
 @dataclass(frozen=True)
 class LoopResult:
-    """The result of adding one frame. It is true if the frame itself closes a loop; see also ``loops``.
+    """What was decided about one frame. It is true if the frame closes a loop.
 
-    query_id    the frame's number, from 0
-    candidates  (id, score) of the best earlier frames, best first, higher = more similar
-    accepted    the earlier frame that this one closes a loop with, or None
+    query       the frame's number, from 0
+    candidates  (number, score) of the best earlier frames, best first, higher = more similar
+    match       the earlier frame that this one closes a loop with, or None
     verdict     the reason: "accepted", "no candidate", "too early" (to choose a threshold), "below threshold",
                 "not consistent", "not verified"
     score       of the accepted frame, or of the best candidate; -inf without one
     inliers     inliers of the accepted candidate, or the most of any candidate tried; None if none was tried
     stamp       seconds, as given
     score_of    what the score compares: "image", or the "sequence" of frames around it; they are different scales
-    late        loops of frames before it, at most ten, that the sequence up to this frame completes
     reason      what decided: the sequence of the frame or its points; empty where the verdict says all
     wrong       the share of wrong ones that is expected among loops as good, None where that is not known
     """
 
-    query_id: int
+    query: int
     candidates: list[tuple[int, float]]
-    accepted: int | None
+    match: int | None
     verdict: str
     score: float
     inliers: int | None = None
     stamp: float | None = None
     reason: str = ""
     score_of: str = "image"
-    late: tuple[LoopResult, ...] = ()
     wrong: float | None = None
 
-    @property
-    def loops(self) -> tuple[LoopResult, ...]:
-        """All loops that became known with this frame: those of earlier frames, then its own."""
-        return (*self.late, *((self,) if self else ()))
-
     def __bool__(self) -> bool:
-        return self.accepted is not None
+        return self.match is not None
 
 
 @dataclass(frozen=True)
@@ -104,8 +97,8 @@ def result_of(found: Any, count: int) -> LoopResult:
     """Return a loop read from a file of ``count`` frames. Raises ValueError, LookupError or TypeError."""
     candidates = [(int(number), float(score)) for number, score in found["candidates"]]
     words = {name: str(found[name]) for name in ("reason", "score_of") if name in found}
-    loop = LoopResult(**{**found, "candidates": candidates, "late": (), **words})
-    ends = (loop.query_id, loop.accepted)
+    loop = LoopResult(**{**found, "candidates": candidates, **words})
+    ends = (loop.query, loop.match)
     if not all(isinstance(end, int) and 0 <= end < count for end in ends) or not isinstance(loop.score, float):
         raise ValueError(f"a loop of frames {ends} among {count}")
     if (

@@ -1,9 +1,9 @@
 """Loop closure frame by frame, for use inside a running robot.
 
-    detector = LoopDetector(describe, check=GeometricCheck())
+    detector = LoopDetector()
     for image in camera:
-        for loop in detector.add(image).loops:
-            ...  # frame loop.query_id shows the same place as frame loop.accepted
+        for loop in detector.add(image):
+            ...  # frame loop.query shows the same place as frame loop.match
 
 An index (:mod:`loopclosure.index`) searches the earlier descriptors. The default index is exact: it multiplies all
 earlier descriptors by the new one. The cost of the search grows with the number of frames, and so does that of the
@@ -13,6 +13,7 @@ lines through all scores; all other costs are constant. See :meth:`LoopDetector.
 from __future__ import annotations
 
 import json
+import re
 from bisect import insort
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
@@ -26,6 +27,7 @@ from loopclosure.decision.decider import Decider
 from loopclosure.decision.lines import HALF
 from loopclosure.detector.answered import results_of
 from loopclosure.detector.decision import DetectorSettings, LoopResult, Runs, result_of
+from loopclosure.detector.describers import NAME, load_describe
 from loopclosure.detector.frames import Frames, Local, LocalOnDisk, Points, checked_pose, points_of
 from loopclosure.detector.likely import Likely
 from loopclosure.detector.saved import FORMAT, SAVED, Describe, fingerprint_of, reading, refuse_another, starts
@@ -37,49 +39,52 @@ from netspec.files.arrays import read_npz
 from netspec.files.whole_file import whole_file
 
 PART = "enough points agree, but only a part of those that match"
+CHECK = GeometricCheck()  # the one that docs/results.md measured
 
 
 class LoopDetector:
-    """Finds loops frame by frame; ``loops`` holds the results that were accepted, in the order of their queries.
+    """Finds loops frame by frame; ``loops`` has all of them, in the order of their queries.
 
     Frames are numbered from 0. The newest frames are not candidates: those of the last ``exclude_seconds``, or the last
-    ``exclude_recent`` frames (:class:`DetectorSettings`).
+    ``exclude_recent`` frames (:class:`DetectorSettings`). ``newest`` is the result of the newest frame, a loop or not.
 
-        >>> detector = LoopDetector(exclude_recent=1, threshold=-0.5)
+        >>> detector = LoopDetector(None, check=None, exclude_recent=1, threshold=-0.5)
         >>> for place in (0, 1, 2, 0):
-        ...     result = detector.add_descriptor(numpy.eye(3)[place])
-        >>> result.accepted, result.verdict
-        (0, 'accepted')
+        ...     loops = detector.add_descriptor(numpy.eye(3)[place])
+        >>> loops[0].query, loops[0].match, loops[0].reason
+        (3, 0, 'score')
     """
+
+    newest: LoopResult
 
     def __init__(
         self,
-        describe: Describe | None = None,
+        describe: Describe | str | None = "default",
         settings: DetectorSettings | None = None,
         *,
-        check: GeometricCheck | None = None,
+        check: GeometricCheck | None = CHECK,
         index: Index | str = "exact",
         in_memory: int | None = None,
         **changes: Any,
     ) -> None:
-        """Make an empty detector.
+        """Make an empty detector. Without arguments, it is the one that docs/results.md measured.
 
-        describe  image (H, W, 3) uint8 BGR -> descriptor (D,), the same D each time, or (views D,); None: use
-                  ``add_descriptor``
-        settings  the settings; single fields can also be given by name:
-                  ``LoopDetector(describe, exclude_recent=50, top_k=5)``
-        check     verifies candidates by their geometry, best first; None: no verification
+        describe  the name of an included net, "default" or "small"; or a function, image (H, W, 3) uint8 BGR ->
+                  descriptor (D,), the same D each time, or (views D,); None: use ``add_descriptor``
+        settings  the settings; single fields can also be given by name: ``LoopDetector(exclude_recent=50, top_k=5)``
+        check     verifies candidates by their geometry, best first; None: no verification, which needs no images
         index     an empty index that stores and searches the descriptors, or a name for
                   :func:`loopclosure.index.index.open_index`
         in_memory keep the descriptors and points of about this many frames in memory, and the others in temporary files
                   (``TMPDIR`` names their folder); None: all of them
         """
-        given = asdict(settings or DetectorSettings())
+        self.describer = describe if isinstance(describe, str) else ""
+        self.describe = load_describe(describe) if isinstance(describe, str) else describe
+        given = asdict(settings or DetectorSettings(views=getattr(self.describe, "views", 1)))
         unknown = set(changes) - set(given)
         if unknown:
             raise TypeError(f"LoopDetector has no setting {', '.join(sorted(unknown))}; known: {', '.join(given)}")
-        self.describe = describe
-        self.fingerprint: str | None = fingerprint_of(describe)  # None: unknown, from an older file
+        self.fingerprint: str | None = fingerprint_of(self.describe)  # None: unknown, from an older file
         chosen = DetectorSettings(**{**given, **changes})
         self.check = check
         self.loops: list[LoopResult] = []
@@ -129,9 +134,10 @@ class LoopDetector:
         stamp: float | None = None,
         pose: Sequence[float] | np.ndarray | None = None,
         odometry: Sequence[float] | np.ndarray | None = None,
-    ) -> LoopResult:
-        """Add the next frame, (H, W, 3) uint8 BGR, and return whether it closes a loop.
+    ) -> list[LoopResult]:
+        """Add the next frame, (H, W, 3) uint8 BGR, and return the loops that become certain with it.
 
+        They are its own, and those of at most ten frames before it that the sequence up to this frame completes.
         ``stamp`` is in seconds. ``pose`` is tx ty tz qx qy qz qw, camera-to-world, and ``odometry`` is such a pose as
         the robot measures it; both are only stored for the export.
 
@@ -149,33 +155,37 @@ class LoopDetector:
         pose: Sequence[float] | np.ndarray | None = None,
         image: np.ndarray | None = None,
         odometry: Sequence[float] | np.ndarray | None = None,
-    ) -> LoopResult:
-        """Add a frame by its descriptor (D,); ``image`` is needed only for a geometric check."""
+    ) -> list[LoopResult]:
+        """Add a frame by its descriptor (D,), as ``add`` does; only a geometric check needs the ``image``."""
         path = checked_pose(pose), checked_pose(odometry)
         row = self._row(descriptor)
         stamp = self._checked_stamp(stamp)
         self._frames.settle(self._end(stamp))
         local, end = self._local(image), self._end(stamp)
+        loops: list[LoopResult] = []
         if self.check is None:
             found = self._found(len(self), self._similar(row), stamp)
             self._keep(row, stamp, path, None)
             verdict, steady, self._runs = self._likely.of(found.candidates, self._runs, False)
-            result = _by_score(found, verdict, steady)
+            self.newest = _by_score(found, verdict, steady)
         else:
             candidates, scores = self._frames.search_all(row, self.settings.top_k)
             found = self._found(len(self), candidates, stamp)
             self._keep(row, stamp, path, local)
-            result = self._decided(found, scores, end)
-        for loop in result.loops:
-            insort(self.loops, loop, key=lambda each: each.query_id)
-        return result
+            self.newest, loops = self._decided(found, scores, end)
+        loops += [self.newest] if self.newest else []
+        for loop in loops:
+            insort(self.loops, loop, key=lambda each: each.query)
+        return loops
 
-    def _decided(self, found: LoopResult, scores: np.ndarray, end: int) -> LoopResult:
+    def _decided(self, found: LoopResult, scores: np.ndarray, end: int) -> tuple[LoopResult, list[LoopResult]]:
         """Decide on the newest frame by its points, and on the one ``HALF`` frames before it by its line.
+
+        Returns the result of the newest, and that of the other if it is a loop.
 
         scores  (N,) with all frames before it; of these, the first ``end`` are old enough to be its candidates
         """
-        query = found.query_id
+        query = found.query
         if len(self._decider) != query - self._begin:  # frames before it were only remembered
             self._begin, self._decider = query, self._decider_from(query)
         number, begin, decider = query - self._begin, self._begin, self._decider
@@ -184,15 +194,14 @@ class LoopDetector:
         result, self._runs = self._looked_at(decider, number, found, scores, possible, self._runs)
         middle = number - HALF
         if middle < 0 or self.settings.threshold is not None:
-            return result
+            return result, []
         decider.lines.search(middle + 1)
         first = max(0, middle + 1 - LOOKED_BACK)
         decision = decider.decide(first, middle + 1, middle)
-        known = {loop.query_id for loop in self.loops[-2 * HALF :]}
+        known = {loop.query for loop in self.loops[-2 * HALF :]}
         if not decision.loops[-1] or begin + middle in known:
-            return result
-        (late,) = results_of(decision, begin + first, self._frames.stamps[begin + first :], middle - first)
-        return replace(result, late=(late,))
+            return result, []
+        return result, results_of(decision, begin + first, self._frames.stamps[begin + first :], middle - first)
 
     def _looked_at(
         self,
@@ -218,8 +227,9 @@ class LoopDetector:
         points = replace(found, verdict="not verified", inliers=looked.inliers, reason=PART if looked.part else "")
         if not decider.is_loop(looked.wrong):
             return points, runs
-        score = float(scores[looked.match])
-        return replace(points, accepted=looked.match, verdict="accepted", score=score, wrong=looked.wrong), runs
+        score, reason = float(scores[looked.match]), f"points: {looked.inliers} agree"
+        accepted = replace(points, match=looked.match, verdict="accepted", score=score, reason=reason)
+        return replace(accepted, wrong=looked.wrong), runs
 
     def _decider_from(self, begin: int) -> Decider:
         """Return a decider on the frames from ``begin`` on."""
@@ -337,6 +347,7 @@ class LoopDetector:
         """Write everything except ``describe`` to an .npz file, from which ``load`` continues."""
         about = {
             "format": FORMAT,
+            "describer": self.describer,
             "fingerprint": self.fingerprint,
             "settings": asdict(self.settings),
             "check": None if self.check is None else asdict(self.check),
@@ -354,11 +365,13 @@ class LoopDetector:
     def load(
         cls,
         path: str | Path,
-        describe: Describe | None = None,
+        describe: Describe | str | None = None,
         index: Index | str = "exact",
         in_memory: int | None = None,
     ) -> LoopDetector:
-        """Read a file that ``save`` wrote; ``describe`` must be the function that the detector was made with.
+        """Read a file that ``save`` wrote.
+
+        ``describe`` must be the function that the detector was made with; None: the included net, if it was one.
 
         Raises InputError for any other file, or if the file and ``describe`` have different fingerprints.
         """
@@ -371,9 +384,11 @@ class LoopDetector:
             if about["check"] is not None:  # older files lack newer settings
                 check = from_json(GeometricCheck, {**asdict(GeometricCheck()), **about["check"]})
             settings = from_json(DetectorSettings, about["settings"])
+            if describe is None and re.fullmatch(NAME, name := about.get("describer", "")):
+                describe = name  # never a file or a module that a detector's file names
             detector = cls(describe, settings, check=check, index=index, in_memory=in_memory)
-            detector.fingerprint = about.get("fingerprint")
-            refuse_another(fingerprint_of(describe), detector.fingerprint, "or start a new file", path)
+            described, detector.fingerprint = detector.fingerprint, about.get("fingerprint")
+            refuse_another(described or "", detector.fingerprint, "or start a new file", path)
             detector._take(arrays)
             detector._sessions = starts(about.get("sessions", [0]), len(detector))
             detector._settle()
@@ -456,7 +471,7 @@ class LoopDetector:
         if self.check is None:
             return None
         if image is None:
-            raise InputError("a geometric check needs the images")
+            raise InputError("a geometric check needs the images; give them, or make the detector with check=None")
         return self.check.describe(image)
 
     def _similar(self, row: np.ndarray) -> list[tuple[int, float]]:
@@ -472,4 +487,4 @@ def _by_score(found: LoopResult, verdict: str, steady: Sequence[tuple[int, float
     if not steady:
         return replace(found, verdict=verdict)
     match, score = steady[0]
-    return replace(found, accepted=match, verdict="accepted", score=score)
+    return replace(found, match=match, verdict="accepted", score=score, reason="score")

@@ -100,12 +100,12 @@ def write_loops_csv(
     unknown = [""] * len(columns)
     rows = []
     for loop in loops:
-        assert loop.accepted is not None
-        ends = (loop.query_id, loop.accepted)
+        assert loop.match is not None
+        ends = (loop.query, loop.match)
         times = ["" if of is None or np.isnan(of[i]) else f"{of[i]:.6f}" for of, i in zip(every, ends, strict=True)]
         names_of_ends = ["" if of is None else of[i] for of, i in zip(all_names, ends, strict=True)]
         inliers = "" if loop.inliers is None else loop.inliers
-        more = cells.get(loop.query_id, unknown)
+        more = cells.get(loop.query, unknown)
         rows.append([*ends, f"{loop.score:.9g}", inliers, *times, *names_of_ends, loop.score_of, *more])
     write_csv(path, (*LOOPS, *columns), rows, "surrogateescape")
 
@@ -143,12 +143,12 @@ def write_g2o(
     left_out = 0
     with_pose = set(known)
     for loop in loops:
-        assert loop.accepted is not None
-        edge = relative(loop.query_id, loop.accepted)
-        if edge is None or not {loop.query_id, loop.accepted} <= with_pose:
+        assert loop.match is not None
+        edge = relative(loop.query, loop.match)
+        if edge is None or not {loop.query, loop.match} <= with_pose:
             left_out += 1
             continue
-        edges.append((loop.accepted, loop.query_id, *edge))
+        edges.append((loop.match, loop.query, *edge))
     write_pose_graph(path, {i: poses[i] for i in known}, edges)
     return left_out
 

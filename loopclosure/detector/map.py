@@ -24,12 +24,12 @@ from typing import Any
 import numpy as np
 
 from loopclosure.detector.decision import LoopResult
+from loopclosure.detector.describers import NAME
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.frames import Points, points_of
-from loopclosure.detector.run import NAME, remember_all, run_detector, views_of
+from loopclosure.detector.run import remember_all, run_detector
 from loopclosure.detector.saved import Describe, fingerprint_of, reading, refuse_another
-from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.index.index import open_index
 from loopclosure.places.depth import read_depths
@@ -152,10 +152,10 @@ class Map:
         """
         instead = "or build the map again from its drives"
         refuse_another(fingerprint_of(describe), self.fingerprint, instead, self.folder)
-        views = views_of(describe, None)
+        views = getattr(describe, "views", 1)
         opened = open_index(index, METRIC, len(self) * views)
         there = len(opened) // views
-        detector = LoopDetector(describe, check=GeometricCheck(), index=opened, metric=METRIC, views=views)
+        detector = LoopDetector(describe, index=opened, metric=METRIC)
         for session in self.sessions:
             skipped = min(there, len(session.names))
             there -= skipped

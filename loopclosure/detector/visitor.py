@@ -16,9 +16,11 @@ from loopclosure.errors import InputError
 class Visitor:
     """Looks up the frames of one session, in order; all frames of the detector are candidates.
 
-    The ``query_id`` of its results counts its own frames from 0. Several visitors, also in several threads, can use one
-    detector as long as nothing is added to it.
+    The ``query`` of its results counts its own frames from 0. Several visitors, also in several threads, can use one
+    detector as long as nothing is added to it. ``newest`` is the result of the newest frame, a loop or not.
     """
+
+    newest: LoopResult
 
     def __init__(self, detector: LoopDetector) -> None:
         self.detector = detector
@@ -46,8 +48,8 @@ class Visitor:
         stamp: float | None = None,
         pose: Sequence[float] | np.ndarray | None = None,
         odometry: Sequence[float] | np.ndarray | None = None,
-    ) -> LoopResult:
-        """Look up this session's next frame, (H, W, 3) uint8 BGR; ``accepted`` is a frame of the detector."""
+    ) -> list[LoopResult]:
+        """Look up this session's next frame, (H, W, 3) uint8 BGR; the ``match`` of a loop is one of the detector."""
         if self.detector.describe is None:
             raise InputError("this detector has no describe function; give one, or use add_descriptor")
         return self.add_descriptor(self.detector.describe(image), stamp, pose, image, odometry)
@@ -59,12 +61,12 @@ class Visitor:
         pose: Sequence[float] | np.ndarray | None = None,
         image: np.ndarray | None = None,
         odometry: Sequence[float] | np.ndarray | None = None,
-    ) -> LoopResult:
+    ) -> list[LoopResult]:
         """Look up a frame by its descriptor (D,); ``pose`` and ``odometry`` are not used."""
         if self.check is not None:
             if image is None:
                 raise InputError("a geometric check needs the images")
             self._local = self.check.describe(image)
-        result, self._runs = self.detector.looked_up(self._count, descriptor, stamp, self._runs, self._decider)
+        self.newest, self._runs = self.detector.looked_up(self._count, descriptor, stamp, self._runs, self._decider)
         self._count += 1
-        return result
+        return [self.newest] if self.newest else []

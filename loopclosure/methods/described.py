@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopclosure.descriptors.similarity import METRICS, check_metric
-from loopclosure.detector.run import load_describe, views_of
+from loopclosure.detector.describers import load_describe
 from loopclosure.errors import InputError
 from loopclosure.methods.base import Images, Method, MethodContext, MethodResult, compared
 from loopclosure.methods.settings import configure
@@ -40,7 +40,7 @@ class DescribedMethod:
                 rows.append(np.asarray(describe(read_bgr(path)), np.float32).reshape(-1))
             if len(rows[-1]) != len(rows[0]):
                 raise InputError(f"{self.function} gave {len(rows[-1])} numbers, and {len(rows[0])} before", path)
-        result = compared(rows, images, self.metric, seconds, views_of(describe, None))
+        result = compared(rows, images, self.metric, seconds, getattr(describe, "views", 1))
         return replace(result, training_stages=("loading",))
 
 

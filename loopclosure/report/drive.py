@@ -63,11 +63,11 @@ def _dots(results: Sequence[LoopResult]) -> Figure:
         figure = Figure(figsize=(6, 3.6), layout="constrained")
         axis = figure.subplots()
         for accepted, color, size in ((False, MISSED, 2), (True, FOUND, 5)):
-            some = [(r.query_id, r.candidates[0][0]) for r in results if bool(r) is accepted and r.candidates]
+            some = [(r.query, r.candidates[0][0]) for r in results if bool(r) is accepted and r.candidates]
             axis.plot(*np.array(some).reshape(-1, 2).T, ".", color=color, markersize=size)
         axis.set_xlabel("frame")
         axis.set_ylabel("earlier frame")
-        first, last = (results[0].query_id, results[-1].query_id) if results else (0, 1)
+        first, last = (results[0].query, results[-1].query) if results else (0, 1)
         axis.set_xlim(first - 0.5, last + 0.5)
         axis.set_ylim(-0.5, last + 0.5)
         axis.grid(color=GRID, linewidth=0.5)
@@ -96,30 +96,30 @@ def _path(poses: np.ndarray, results: Sequence[LoopResult]) -> Figure:
 
 def _loops_in_drive(results: Sequence[LoopResult]) -> list[tuple[int, int]]:
     """Return the loops as pairs of frames (query, match) of this drive. Loops to frames of earlier runs are omitted."""
-    first = results[0].query_id if results else 0
-    ends = [(r.query_id - first, r.accepted - first) for r in results if r.accepted is not None]
+    first = results[0].query if results else 0
+    ends = [(r.query - first, r.match - first) for r in results if r.match is not None]
     return [pair for pair in ends if pair[1] >= 0]
 
 
 def _kinds(results: Sequence[LoopResult], recording: ImageSequence) -> list[Kind]:
     """Return the loops with the highest and the lowest scores, and the rejected pairs with the highest scores."""
-    first = results[0].query_id if results else 0
+    first = results[0].query if results else 0
     there = [r for r in results if r.candidates and r.candidates[0][0] >= first]
     loops = sorted((r for r in there if r), key=lambda r: -r.score)
     best = _spread(loops, BEST, len(results))
-    taken = {r.query_id for r in best}
-    worst = _spread([r for r in reversed(loops) if r.query_id not in taken], WORST, len(results))
+    taken = {r.query for r in best}
+    worst = _spread([r for r in reversed(loops) if r.query not in taken], WORST, len(results))
     rejected = _spread(sorted((r for r in there if not r), key=lambda r: -r.score), REJECTED, len(results))
     groups = {
         ("found", "loops with the highest scores"): best,
         ("found", "loops with the lowest scores"): worst,
         ("rejected", "not accepted, with the highest scores"): rejected,
     }
-    wanted = {end - first for some in groups.values() for r in some for end in (r.query_id, _match(r))}
+    wanted = {end - first for some in groups.values() for r in some for end in (r.query, _match(r))}
     images = _read(recording, wanted)
     kinds = []
     for (name, title), some in groups.items():
-        seen = [r for r in some if {r.query_id - first, _match(r) - first} <= set(images)]
+        seen = [r for r in some if {r.query - first, _match(r) - first} <= set(images)]
         kinds.append(Kind(name, title, [_pair(r, images, first) for r in seen]))
     return kinds
 
@@ -133,16 +133,15 @@ def _read(recording: ImageSequence, wanted: set[int]) -> dict[int, np.ndarray]:
 
 
 def _match(result: LoopResult) -> int:
-    return result.candidates[0][0] if result.accepted is None else result.accepted
+    return result.candidates[0][0] if result.match is None else result.match
 
 
 def _pair(result: LoopResult, images: dict[int, np.ndarray], first: int) -> Pair:
     match = _match(result)
-    points = "" if not result.inliers else f"{result.inliers} points agree"
-    why = result.reason or (points if result else IN_WORDS.get(result.verdict, result.verdict))
-    picture = side_by_side(images[result.query_id - first], images[match - first])
-    return Pair(picture, f"{result.query_id} and {match}{', ' if why else ''}{why}")
+    why = result.reason or IN_WORDS.get(result.verdict, result.verdict)
+    picture = side_by_side(images[result.query - first], images[match - first])
+    return Pair(picture, f"{result.query} and {match}{', ' if why else ''}{why}")
 
 
 def _spread(results: Sequence[LoopResult], count: int, frames: int) -> list[LoopResult]:
-    return [results[i] for i in spread([result.query_id for result in results], count, frames / PARTS)]
+    return [results[i] for i in spread([result.query for result in results], count, frames / PARTS)]

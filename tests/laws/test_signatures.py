@@ -54,7 +54,7 @@ ONE_OF_SEVERAL = {
     "stages": "deploy", "passes": "fold", "weights": WEIGHTS, "path": WEIGHTS, "device": "cpu",
     "blobs": "ip", "diffs": "ip",
 }  # fmt: skip
-CHOICES = {"phase", "exact", "engine", "precision", "nan", "passes", "device", "metric", "index"}
+CHOICES = {"phase", "exact", "engine", "precision", "nan", "passes", "device", "metric", "index", "describe"}
 
 
 def parameters(*words: str) -> list[Any]:

@@ -37,7 +37,7 @@ def build(into: Path, walks: Path) -> Map:
 
 @pytest.fixture(autouse=True)
 def thumbnails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("loopclosure.detector.run._entry_point", lambda name: Thumbnailer)
+    monkeypatch.setattr("loopclosure.detector.describers._entry_point", lambda name: Thumbnailer)
 
 
 def query(known: Path, walks: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> tuple[list[dict[str, str]], str]:

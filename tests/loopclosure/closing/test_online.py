@@ -325,9 +325,9 @@ def test_images_do_not_wait_for_a_solution(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_detector_with_frames_or_without_a_check_is_refused() -> None:
-    used = LoopDetector(check=CHECK)
+    used = LoopDetector(None, check=CHECK)
     used.add_descriptor(np.ones(3), image=picture(0))
-    for detector in (used, LoopDetector()):
+    for detector in (used, LoopDetector(None, check=None)):
         with pytest.raises(InputError, match="the detector must be empty and have a check"):
             LoopCloser(detector, CAMERA)
 

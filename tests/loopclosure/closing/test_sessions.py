@@ -69,7 +69,7 @@ def test_the_sessions_of_a_map_are_in_one_frame(
 def test_a_camera_on_the_command_line(
     known: tuple[Path, ImageSequence], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:
-    monkeypatch.setattr("loopclosure.detector.run._entry_point", lambda name: Thumbnailer)
+    monkeypatch.setattr("loopclosure.detector.describers._entry_point", lambda name: Thumbnailer)
     images = str(known[1].source / "rgb")
     line = ["map", "build", str(tmp_path / "bare"), f"{images},stop=3"]
     assert main(line) == 0

@@ -189,7 +189,7 @@ def test_frames_are_decided_online_as_in_a_recording_that_ends_then():
 
 @pytest.mark.slow
 def test_a_real_corridor_is_decided_online_as_in_a_recording_that_ends_then():
-    from loopclosure.detector.run import load_describe
+    from loopclosure.detector.describers import load_describe
     from loopclosure.detector.verification import Pairs
     from loopclosure.places.frames import image_paths, read_bgr, read_gray
 

@@ -50,7 +50,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def thumbnails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("loopclosure.detector.run._entry_point", lambda name: Thumbnailer)
+    monkeypatch.setattr("loopclosure.detector.describers._entry_point", lambda name: Thumbnailer)
 
 
 def loops(path: Path) -> list[tuple[str, str]]:
@@ -118,7 +118,7 @@ def test_the_time_of_a_query_does_not_grow_with_the_number_of_sessions(
     monkeypatch.setattr(GeometricCheck, "agreement", lambda *given: verified.append(1) or agreement(*given))
     detector = a_map.detector(Thumbnailer())
     remember_all(detector, read_sequence(drives / "c"))
-    found = [result.accepted for result in last_session(detector, own=False).results]
+    found = [result.match for result in last_session(detector, own=False).results]
     assert [None if match is None else match % PLACES for match in found] == [5, 6, 7, 8, 9] + [None] * PLACES
     assert len(verified) <= 3 * len(found)
 

@@ -8,8 +8,9 @@ import pytest
 
 from loopclosure.descriptors.feature_file import Features, read_features
 from loopclosure.descriptors.thumbnails import Thumbnailer
+from loopclosure.detector.describers import load_describe
 from loopclosure.detector.detector import LoopDetector
-from loopclosure.detector.run import judged_by_poses, load_describe, run_detector
+from loopclosure.detector.run import judged_by_poses, run_detector
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.frames import Selection
@@ -29,23 +30,23 @@ def test_sequence_with_poses(two_laps):
     assert recording.stamps is not None
     assert recording.poses is not None
     np.testing.assert_allclose(recording.poses[5, :3], [0, 5, 1], atol=1e-3)
-    detector = LoopDetector(small, exclude_recent=10, metric="cosine", threshold=0.95)
+    detector = LoopDetector(small, exclude_recent=10, metric="cosine", threshold=0.95, check=None)
     results = run_detector(detector, recording)
-    assert [r.accepted for r in results] == [None] * 20 + list(range(20))
+    assert [r.match for r in results] == [None] * 20 + list(range(20))
     assert judged_by_poses(detector) == "20 of 20 loops are the same place by their poses (2 m, 15 degrees)"
 
 
 def test_features_replace_describe(two_laps, two_laps_features):
-    detector = LoopDetector(exclude_recent=5, threshold=-0.2)
+    detector = LoopDetector(None, check=None, exclude_recent=5, threshold=-0.2)
     results = run_detector(
         detector, read_sequence(two_laps).taken(Selection(stride=2)), read_features(two_laps_features)
     )
-    assert [r.accepted for r in results] == [None] * 10 + list(range(10))
+    assert [r.match for r in results] == [None] * 10 + list(range(10))
 
 
 @pytest.mark.slow
 def test_features_with_verification_read_the_images(two_laps, two_laps_features):
-    detector = LoopDetector(exclude_recent=10, threshold=-0.2, check=GeometricCheck(max_features=100, ratio=0.9))
+    detector = LoopDetector(None, exclude_recent=10, threshold=-0.2, check=GeometricCheck(max_features=100, ratio=0.9))
     results = run_detector(detector, read_sequence(two_laps), read_features(two_laps_features))
     assert {r.verdict for r in results[20:]} <= {"accepted", "not verified"}
     assert all(r.inliers is not None for r in results[20:])
@@ -64,9 +65,9 @@ def test_video(tmp_path):
     write_video(tmp_path / "walk.avi")
     recording = read_sequence(tmp_path / "walk.avi").taken(Selection(stride=3))
     assert list(recording.names[:2]) == ["frame 0", "frame 3"]
-    detector = LoopDetector(small, exclude_recent=2, metric="cosine", threshold=0.98)
+    detector = LoopDetector(small, exclude_recent=2, metric="cosine", threshold=0.98, check=None)
     results = run_detector(detector, recording)
-    assert [r.accepted for r in results] == [None] * 5 + list(range(5))
+    assert [r.match for r in results] == [None] * 5 + list(range(5))
     assert detector.stamps[1] == pytest.approx(0.3)
     with pytest.raises(InputError, match="no names to find features by"):
         run_detector(detector, recording, Features(tmp_path / "f.npz", np.zeros((1, 2))))
@@ -135,7 +136,7 @@ def test_a_video_shorter_than_its_header_is_accepted(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"v\.avi: ends after 30 frames, though .* 99 is wanted .* write .*,stop=30"):
         next(frames)
     with pytest.raises(InputError, match="threshold is nan"):
-        LoopDetector(threshold=float("nan"))
+        LoopDetector(None, check=None, threshold=float("nan"))
 
 
 @pytest.fixture

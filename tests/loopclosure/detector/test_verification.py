@@ -8,6 +8,7 @@ from loopclosure.decision.decider import Decider
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.verification import Agreement, GeometricCheck, LocalFeatures, Pairs
 from loopclosure.errors import InputError
+from newest import newest
 
 
 def wall(seed):
@@ -82,15 +83,15 @@ def test_invalid_settings_are_refused():
 def test_geometry_is_checked_last(tmp_path, check):
     """Descriptors that call all walls alike: only the true pair survives, also after saving and loading."""
     detector = LoopDetector(lambda image: np.ones(2), exclude_recent=0, threshold=-1.0, check=check)
-    assert detector.add(wall(0)).verdict == "no candidate"
-    wrong = detector.add(wall(1))
-    assert (wrong.accepted, wrong.verdict) == (None, "not verified")
+    assert newest(detector.add, wall(0)).verdict == "no candidate"
+    wrong = newest(detector.add, wall(1))
+    assert (wrong.match, wrong.verdict) == (None, "not verified")
     assert wrong.inliers is not None
     assert wrong.inliers < 20
     detector.save(tmp_path / "walls.npz")
     for again in (detector, LoopDetector.load(tmp_path / "walls.npz", lambda image: np.ones(2))):
-        right = again.add(seen_from_the_side(wall(1)))
-        assert (right.accepted, right.verdict) == (1, "accepted")
+        right = newest(again.add, seen_from_the_side(wall(1)))
+        assert (right.match, right.verdict) == (1, "accepted")
         assert right.inliers is not None
         assert right.inliers > 60
     with pytest.raises(InputError, match="needs the images"):
@@ -111,7 +112,7 @@ def test_an_online_loop_needs_more_points_than_rule_out_chance(check, monkeypatc
     monkeypatch.setattr(GeometricCheck, "agreement", lambda *_: found)
     detector = LoopDetector(lambda image: np.ones(2), exclude_recent=0, check=check)
     detector.add(wall(0))
-    result = detector.add(wall(1))
+    result = newest(detector.add, wall(1))
     assert (result.verdict, result.inliers) == (verdict, found.inliers)
 
 
@@ -122,7 +123,7 @@ def test_online_more_points_are_needed_where_places_look_alike(check, monkeypatc
     monkeypatch.setattr(GeometricCheck, "agreement", lambda *_: found)
     detector = LoopDetector(lambda image: np.ones(2), exclude_recent=0, check=check)
     for number in range(3):
-        result = detector.add(wall(number))
+        result = newest(detector.add, wall(number))
     assert (result.verdict, result.reason) == (
         "not verified",
         "enough points agree, but only a part of those that match",
@@ -130,7 +131,7 @@ def test_online_more_points_are_needed_where_places_look_alike(check, monkeypatc
     detector.save(tmp_path / "d.npz")
     found = Agreement(40, 36, 20)
     for one in (detector, LoopDetector.load(tmp_path / "d.npz", detector.describe)):
-        results = [one.add(wall(number)) for number in range(14)]
+        results = [newest(one.add, wall(number)) for number in range(14)]
         accepted = [bool(result) for result in results]
         assert accepted == sorted(accepted)
         assert True in accepted[6:]

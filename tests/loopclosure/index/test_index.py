@@ -11,6 +11,7 @@ from loopclosure.detector.detector import LoopDetector
 from loopclosure.errors import InputError
 from loopclosure.index.exact import ExactIndex
 from loopclosure.index.index import open_index
+from newest import newest
 
 NEEDED = {"exact": "numpy", "faiss": "faiss", "places.db": "milvus_lite"}
 NAMES = [
@@ -57,8 +58,8 @@ def test_a_detector_finds_the_same_loops(name: str, tmp_path: Path, monkeypatch:
     monkeypatch.chdir(tmp_path)
     lap = directions(60)
     rows = np.concatenate([lap, lap + 0.01 * directions(60, seed=1)])
-    detector = LoopDetector(exclude_recent=10, threshold=-0.5, index=name)
-    assert [detector.add_descriptor(row).accepted for row in rows] == [None] * 60 + list(range(60))
+    detector = LoopDetector(None, check=None, exclude_recent=10, threshold=-0.5, index=name)
+    assert [newest(detector.add_descriptor, row).match for row in rows] == [None] * 60 + list(range(60))
     np.testing.assert_allclose(detector.descriptors, rows, atol=ROUNDED[name])
 
 

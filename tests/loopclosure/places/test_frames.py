@@ -229,7 +229,7 @@ def test_ctrl_c_ends_a_stream_and_keeps_results(camera, tmp_path, monkeypatch) -
             raise KeyboardInterrupt
         return image.reshape(-1)
 
-    monkeypatch.setattr("loopclosure.detector.run._entry_point", lambda name: lambda: describe)
+    monkeypatch.setattr("loopclosure.detector.describers._entry_point", lambda name: lambda: describe)
     assert main(["detect", "--video", "0", "--out", str(tmp_path), "--save", str(tmp_path / "d.npz")]) == 130
     assert (tmp_path / "loops.csv").is_file()
     with np.load(tmp_path / "d.npz") as saved:
